@@ -1,0 +1,43 @@
+# Every target sets up what it needs in .venv; a second run installs nothing.
+
+PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 python3.11,\
+	$(shell $(name) -c 'import sys; sys.version_info >= (3, 11) and print("$(name)")' 2>/dev/null)))
+POLICY := policies/lpac_l2_k3_n10_512
+RUN := .venv/bin/python -m
+
+.PHONY: help demo test lint bench export clean
+.DEFAULT_GOAL := help
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
+
+demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
+	.venv/bin/lpac demo --out out/demo
+
+test: lint ## style, types, and every test
+	.venv/bin/pytest
+
+lint: .venv/test ## style and strict types
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+bench: .venv/test ## measure against torch: a table, and out/bench/*.json
+	$(RUN) bench
+
+export: .venv/export ## rebuild the shipped policy's bundle from its checkpoint
+	.venv/bin/lpac export $(POLICY).pt --params $(POLICY).toml -o $(POLICY)
+
+clean: ## remove .venv and everything made
+	rm -rf .venv out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+# Stamps: .venv/EXTRA is newer than pyproject.toml when that extra is installed.
+.venv/%: pyproject.toml | .venv/bin/python
+	.venv/bin/pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	@touch $@
+
+.venv/bin/python:
+	@test -n '$(PYTHON)' || { echo 'make: Python 3.11 or newer is needed: sudo apt install python3'; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+		{ echo 'make: the venv module is missing: sudo apt install python3-venv'; exit 1; }
+	$(PYTHON) -m venv .venv

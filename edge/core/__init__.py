@@ -1,0 +1,7 @@
+"""The pure part: no clock, thread, file or socket; the caller passes the time."""
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]

@@ -1,0 +1,99 @@
+"""The aggregated message of a graph neural network, and its update from the neighbours' messages.
+
+Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
+Perception-Action-Communication Loops", section "Decentralized Graph Neural Networks".
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.core import F32
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """Sizes of the graph neural network: L layers of K hops, F_0 .. F_L features.
+
+    Raises ValueError that names the size for an impossible value.
+    """
+
+    hops: int
+    feature_sizes: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if self.hops < 1:
+            raise ValueError(f"hops = {self.hops}: must be at least 1")
+        if len(self.feature_sizes) < 2 or min(self.feature_sizes) < 1:
+            raise ValueError(
+                f"feature_sizes = {self.feature_sizes}: must be two or more positive sizes"
+            )
+
+    @property
+    def layers(self) -> int:
+        """L, the number of layers."""
+        return len(self.feature_sizes) - 1
+
+    @property
+    def message_size(self) -> int:
+        """Number of floats in a message: (y)_kl for k = 0..K-1 and l = 1..L."""
+        return self.hops * sum(self.feature_sizes[:-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AggregatedMessage:
+    """What one robot tells its neighbours: Y_j, and where it is.
+
+    `payload` is (message_size,), float32 or float16: (y_j)_kl in the order [l][k][feature],
+    already multiplied by 1/sqrt(d_j), d_j being the sender's number of neighbours.
+    `position_m` is in the mission frame; `sent_at_s` is the sender's Unix time.
+    `boot_epoch` grows with every start of the sender, `sequence` with every message of one start.
+    """
+
+    robot_id: int
+    boot_epoch: int
+    sequence: int
+    sent_at_s: float
+    position_m: tuple[float, float, float]
+    payload: F32
+
+
+class HopBuffer:
+    """One robot's y_kl for k = 0..K and l = 1..L, updated in place once per policy tick.
+
+    Not thread-safe: it belongs to the policy thread.
+    """
+
+    def __init__(self, geometry: Geometry) -> None:
+        self._hops = geometry.hops
+        inputs = geometry.feature_sizes[:-1]
+        # One block per layer, (1, K + 1, F_{l-1}): what the layer's graph takes, batch of one.
+        self.layers: tuple[F32, ...] = tuple(
+            np.zeros((1, geometry.hops + 1, size), np.float32) for size in inputs
+        )
+        self._sum = np.zeros(geometry.message_size, np.float32)
+        ends = np.cumsum([geometry.hops * size for size in inputs])
+        self._parts = tuple(
+            self._sum[end - geometry.hops * size : end].reshape(geometry.hops, size)
+            for end, size in zip(ends, inputs, strict=True)
+        )
+
+    def diffuse(self, payloads: Sequence[F32]) -> None:
+        """y_kl = sum over neighbours j of S_ij (y_j)_{k-1,l}, for k = 1..K and all layers at once.
+
+        `payloads` are the neighbours' messages, (message_size,) each; their number is d_i.
+        S_ij = 1/sqrt(d_i d_j): the sender has multiplied by its own part.
+        """
+        self._sum[:] = 0.0
+        for payload in payloads:
+            self._sum += payload
+        if payloads:
+            self._sum *= np.float32(1.0 / np.sqrt(len(payloads)))
+        for layer, part in zip(self.layers, self._parts, strict=True):
+            layer[0, 1:] = part
+
+    def message(self, degree: int) -> F32:
+        """A new (message_size,) payload: y_kl for k = 0..K-1, times 1/sqrt(degree); 0 if none."""
+        scale = np.float32(1.0 / np.sqrt(degree) if degree else 0.0)
+        return np.concatenate([layer[0, : self._hops].ravel() for layer in self.layers]) * scale

@@ -1,0 +1,138 @@
+"""The frames that positions and velocities are given in, and the transforms between them.
+
+Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
+Perception-Action-Communication Loops". It prints the rotation as R_z(3 pi/2 - theta) R_x(pi), which
+contradicts its own convention; the convention is what holds here.
+
+| frame | axes | origin |
+| --- | --- | --- |
+| mission M | x right, y forward, z up, m | the operator's: latitude, longitude, heading theta |
+| local L | x north, y east, z down, m | the autopilot's estimator origin, which may jump |
+| model | x and y of M, times `env_scale` | as M; the corner of the world that the policy covers |
+
+theta is the compass heading of the mission y axis: rad, clockwise from true north.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from geographiclib.geodesic import Geodesic
+
+from edge.core import F32, F64
+
+_Array = TypeVar("_Array", F32, F64)
+
+
+@dataclass(frozen=True, slots=True)
+class MissionFrame:
+    """Where the mission frame lies on the earth: WGS84 degrees, and heading theta in [0, 2 pi).
+
+    Raises ValueError if one of them is not finite or out of its range.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    heading_rad: float
+
+    def __post_init__(self) -> None:
+        _require_on_earth("mission origin", self.latitude_deg, self.longitude_deg)
+        if not 0.0 <= self.heading_rad < math.tau:
+            raise ValueError(f"mission heading = {self.heading_rad} rad: must be in [0, 2 pi)")
+
+    def relative_to(
+        self, local_origin_latitude_deg: float, local_origin_longitude_deg: float
+    ) -> "LocalTransform":
+        """The transform for one local origin, which is good until that origin jumps.
+
+        R = [[-sin theta, cos theta, 0], [cos theta, sin theta, 0], [0, 0, -1]], and the geodesic of
+        length d and azimuth alpha leads from the mission origin to the local one. North at the two
+        origins is taken to be the same direction. That costs d^2 tan(latitude) / 6371 km: 1.6 mm
+        at d = 100 m and 45 degrees.
+
+        Raises ValueError if the local origin is not finite or out of range.
+        """
+        _require_on_earth("local origin", local_origin_latitude_deg, local_origin_longitude_deg)
+        geodesic = Geodesic.WGS84.Inverse(
+            self.latitude_deg,
+            self.longitude_deg,
+            local_origin_latitude_deg,
+            local_origin_longitude_deg,
+        )
+        d_m, alpha_rad = geodesic["s12"], math.radians(geodesic["azi1"])
+        sin, cos = math.sin(self.heading_rad), math.cos(self.heading_rad)
+        rotation = np.array([[-sin, cos, 0.0], [cos, sin, 0.0], [0.0, 0.0, -1.0]])
+        local_origin_m = rotation @ (d_m * math.cos(alpha_rad), d_m * math.sin(alpha_rad), 0.0)
+        rotation.setflags(write=False)
+        local_origin_m.setflags(write=False)
+        return LocalTransform(rotation, local_origin_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalTransform:
+    """Between one local frame and the mission frame; `MissionFrame.relative_to` makes it.
+
+    `rotation` is R, (3, 3), its own inverse. `local_origin_m` is (3,), in the mission frame.
+    Every method takes and returns (3,) float64.
+    """
+
+    rotation: F64
+    local_origin_m: F64
+
+    def local_to_mission(self, position_local_m: F64) -> F64:
+        """p_M = R (p_L + d (cos alpha, sin alpha, 0)), m."""
+        return self.rotation @ position_local_m + self.local_origin_m
+
+    def mission_to_local(self, position_mission_m: F64) -> F64:
+        """p_L = R p_M - d (cos alpha, sin alpha, 0), m."""
+        return self.rotation @ (position_mission_m - self.local_origin_m)
+
+    def velocity_to_mission(self, velocity_local_m_s: F64) -> F64:
+        """v_M = R v_L, m/s."""
+        return self.rotation @ velocity_local_m_s
+
+    def velocity_to_local(self, velocity_mission_m_s: F64) -> F64:
+        """v_L = R v_M, m/s."""
+        return self.rotation @ velocity_mission_m_s
+
+
+@dataclass(frozen=True, slots=True)
+class ModelScale:
+    """Between the mission frame and the units that the policy was trained in.
+
+    `env_scale` is in model units per m; `velocity_scale` is in m/s per model velocity. They are
+    independent of each other. Arrays may have any shape, and keep their dtype.
+
+    Raises ValueError if a scale is not finite and above 0.
+    """
+
+    env_scale: float
+    velocity_scale: float
+
+    def __post_init__(self) -> None:
+        for name, scale in (
+            ("env_scale", self.env_scale),
+            ("velocity_scale", self.velocity_scale),
+        ):
+            if not 0.0 < scale < math.inf:
+                raise ValueError(f"{name} = {scale}: must be finite and above 0")
+
+    def position_to_model(self, position_mission_m: _Array) -> _Array:
+        """Mission position, m, in model units."""
+        return position_mission_m * self.env_scale
+
+    def position_to_mission_m(self, position_model: _Array) -> _Array:
+        """Model position in m of the mission frame."""
+        return position_model / self.env_scale
+
+    def velocity_to_mission_m_s(self, velocity_model: _Array) -> _Array:
+        """The policy's velocity as the one to fly, m/s in the mission frame."""
+        return velocity_model * self.velocity_scale
+
+
+def _require_on_earth(what: str, latitude_deg: float, longitude_deg: float) -> None:
+    if not -90.0 <= latitude_deg <= 90.0:
+        raise ValueError(f"{what} latitude = {latitude_deg} deg: must be in [-90, 90]")
+    if not -180.0 <= longitude_deg <= 180.0:
+        raise ValueError(f"{what} longitude = {longitude_deg} deg: must be in [-180, 180]")

@@ -1,0 +1,145 @@
+"""The newest message of each neighbour, between the link's threads and the robot's loops.
+
+Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
+Perception-Action-Communication Loops", section "Inter-Robot Communication". Of its two buffers this
+is the receive buffer; the message to transmit is what a policy tick returns.
+"""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from threading import Lock
+from typing import NamedTuple
+
+from edge.core.aggregation import AggregatedMessage
+from edge.core.wire import Rejection
+
+# After a cut, TCP delivers data that is up to 2 s old; nothing is taken to be in transit longer
+# than this. A clock that is wrong after power-up is off by far more, one that is synchronised over
+# the network by far less than the half second that a message may come from the future.
+_LONGEST_TRANSIT_S = 5.0
+_CLOCK_TOLERANCE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbour:
+    """Another robot: `position_m` in the mission frame, m, as it was `age_s` ago."""
+
+    robot_id: int
+    position_m: tuple[float, float, float]
+    age_s: float
+
+
+class _Received(NamedTuple):
+    message: AggregatedMessage
+    born_s: float
+
+
+class _Heard(NamedTuple):
+    boot_epoch: int
+    sequence: int
+    at_s: float
+
+
+class Mailbox:
+    """One robot's receive buffer. Every method may be called from any thread.
+
+    `now_s` is a monotonic clock, `unix_now_s` the wall clock, both the robot's own, s. A message's
+    age counts from its receipt, or from its sending where the two robots' clocks agree. `swap` and
+    `neighbours` leave out what is not younger than `max_message_age_s`. With 0 age plays no part,
+    and the paper's rule holds: `swap` hands each message out once, and a neighbour is in
+    `neighbours` until a `swap` that finds nothing new from it.
+
+    Raises ValueError if `max_message_age_s` is not finite or below 0.
+    """
+
+    def __init__(self, robot_id: int, max_message_age_s: float = 0.8) -> None:
+        if not 0.0 <= max_message_age_s < math.inf:
+            raise ValueError(
+                f"max_message_age_s = {max_message_age_s}: must be finite and at least 0"
+            )
+        self._robot_id = robot_id
+        self._max_message_age_s = max_message_age_s
+        # A robot without a battery-backed clock may come back with a smaller boot epoch. Once it
+        # was silent for longer than a message can be in transit, nothing of an earlier start can
+        # still arrive, so whatever does is of a new one.
+        self._restart_silence_s = max(max_message_age_s, _LONGEST_TRANSIT_S)
+        self._lock = Lock()
+        self._received: dict[int, _Received] = {}
+        self._handed_out: dict[int, _Received] = {}  # the paper's rule only
+        # Outlives the messages: a late duplicate must not pass for news.
+        self._heard: dict[int, _Heard] = {}
+        self._counts: Counter[str] = Counter(
+            dict.fromkeys(["accepted", *(reason.value for reason in Rejection)], 0)
+        )
+
+    def receive(
+        self, message: AggregatedMessage, now_s: float, unix_now_s: float
+    ) -> Rejection | None:
+        """Keep `message` if it is its sender's newest, else say why not: OWN, OUTDATED or STALE.
+
+        Nobody may change the message or its payload afterwards.
+        """
+        transit_s = unix_now_s - message.sent_at_s
+        clocks_agree = -_CLOCK_TOLERANCE_S <= transit_s <= _LONGEST_TRANSIT_S
+        born_s = now_s - max(transit_s, 0.0) if clocks_agree else now_s
+        with self._lock:
+            rejection = self._rejection(message, born_s, now_s)
+            if rejection is None:
+                sender = message.robot_id
+                self._heard[sender] = _Heard(message.boot_epoch, message.sequence, now_s)
+                self._received[sender] = _Received(message, born_s)
+            self._counts[rejection or "accepted"] += 1
+        return rejection
+
+    def swap(self, now_s: float) -> tuple[AggregatedMessage, ...]:
+        """The messages for one policy tick, by robot id: their order of arrival is no matter."""
+        with self._lock:
+            handed_out = self._received
+            if self._max_message_age_s == 0.0:
+                self._handed_out, self._received = self._received, {}
+            received = sorted(handed_out.items())
+        return tuple(entry.message for _, entry in received if self._is_fresh(entry.born_s, now_s))
+
+    def neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
+        """Who is near and where, by robot id; takes nothing away."""
+        with self._lock:
+            received = sorted((self._handed_out | self._received).items())
+        return tuple(
+            Neighbour(robot_id, entry.message.position_m, max(now_s - entry.born_s, 0.0))
+            for robot_id, entry in received
+            if self._is_fresh(entry.born_s, now_s)
+        )
+
+    def reject(self, reason: Rejection) -> None:
+        """Count a message that did not come this far."""
+        with self._lock:
+            self._counts[reason] += 1
+
+    def counts(self) -> dict[str, int]:
+        """How many messages were accepted, and how many rejected for each reason, so far."""
+        with self._lock:
+            return dict(self._counts)
+
+    def clear(self) -> None:
+        """Forget the messages, for a new mission; not the counts, nor what was the newest."""
+        with self._lock:
+            self._received = {}
+            self._handed_out = {}
+
+    def _is_fresh(self, born_s: float, now_s: float) -> bool:
+        return self._max_message_age_s == 0.0 or now_s - born_s < self._max_message_age_s
+
+    def _rejection(
+        self, message: AggregatedMessage, born_s: float, now_s: float
+    ) -> Rejection | None:
+        if message.robot_id == self._robot_id:
+            return Rejection.OWN
+        heard = self._heard.get(message.robot_id)
+        if heard is not None and (message.boot_epoch, message.sequence) <= heard[:2]:
+            silent = now_s - heard.at_s > self._restart_silence_s
+            if message.boot_epoch == heard.boot_epoch or not silent:
+                return Rejection.OUTDATED
+        if not self._is_fresh(born_s, now_s):
+            return Rejection.STALE
+        return None

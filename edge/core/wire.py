@@ -1,0 +1,146 @@
+"""AggregatedMessage <-> the bytes that travel between robots.
+
+Little-endian, a header of 80 bytes and then the payload:
+
+| offset | type | field | unit |
+| --- | --- | --- | --- |
+| 0 | 8 bytes | magic, `LPAC-MSG` | |
+| 8 | uint8 | version of this layout, 1 | |
+| 9 | uint8 | payload type: 1 float32, 2 float16 | |
+| 10 | uint16 | robot id | |
+| 12 | uint32 | sequence | |
+| 16 | 16 bytes | first half of the bundle id (SHA-256 of the manifest) | |
+| 32 | uint64 | boot epoch | |
+| 40 | float64 | send time | Unix s |
+| 48 | 3 x float64 | position x, y, z in the mission frame | m |
+| 72 | uint32 | payload length | floats |
+| 76 | uint32 | CRC-32 (zlib) of all other bytes, payload included | |
+| 80 | float32 or float16 | payload | |
+
+Magic and version stay where they are in every version.
+"""
+
+import math
+import struct
+import zlib
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.aggregation import AggregatedMessage
+
+_MAGIC = b"LPAC-MSG"
+_VERSION = 1
+_VERSION_AT = len(_MAGIC)
+_FIELDS = struct.Struct("<8sBBHI16sQ4dI")
+_CHECKSUM = struct.Struct("<I")
+# A multiple of 8, so that the payload is aligned wherever the message is.
+_HEADER_SIZE = _FIELDS.size + _CHECKSUM.size
+_BUNDLE_ID_SIZE = 16
+
+_PAYLOAD_TYPES: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<f2")}
+
+
+class Rejection(StrEnum):
+    """Why a message was not listened to."""
+
+    MAGIC = "magic"
+    VERSION = "version"
+    TRUNCATED = "truncated"
+    TOO_LONG = "too_long"
+    PAYLOAD_TYPE = "payload_type"
+    CHECKSUM = "checksum"
+    OTHER_BUNDLE = "other_bundle"
+    OWN = "own"
+    PAYLOAD_LENGTH = "payload_length"
+    NON_FINITE = "non_finite"
+    OUTDATED = "outdated"
+    STALE = "stale"
+
+
+def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTypeLike) -> bytes:
+    """The bytes of `message`; `bundle_id` is the 32 bytes of the manifest's SHA-256.
+
+    float16 rounds to nearest and saturates at +-65504. A value that is not finite stays so, and the
+    receivers refuse the message.
+
+    Raises ValueError if `payload_dtype` is neither float32 nor float16, and struct.error if a
+    number does not fit its field.
+    """
+    dtype = np.dtype(payload_dtype)
+    payload_type = next((code for code, known in _PAYLOAD_TYPES.items() if known == dtype), None)
+    if payload_type is None:
+        raise ValueError(f"payload dtype = {dtype}: must be float32 or float16")
+    limit = np.finfo(dtype).max
+    saturated = np.clip(message.payload, -limit, limit)
+    payload = np.where(np.isfinite(message.payload), saturated, message.payload)
+    data = payload.astype(_PAYLOAD_TYPES[payload_type]).tobytes()
+    fields = _FIELDS.pack(
+        _MAGIC,
+        _VERSION,
+        payload_type,
+        message.robot_id,
+        message.sequence,
+        bundle_id[:_BUNDLE_ID_SIZE],
+        message.boot_epoch,
+        message.sent_at_s,
+        *message.position_m,
+        message.payload.size,
+    )
+    return b"".join((fields, _CHECKSUM.pack(zlib.crc32(data, zlib.crc32(fields))), data))
+
+
+def decode(
+    data: bytes | memoryview, *, bundle_id: bytes, own_robot_id: int, message_size: int
+) -> AggregatedMessage | Rejection:
+    """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
+
+    `bundle_id` is the 32 bytes of the own manifest's SHA-256, `message_size` the number of floats
+    that the own network takes. The payload is a read-only view of `data`, float32 or float16, not a
+    copy: `data` must not change afterwards.
+    """
+    view = memoryview(data).toreadonly()
+    # Nothing behind the version can be read in a layout that is not this one.
+    start = bytes(view[: len(_MAGIC)])
+    if start != _MAGIC[: len(start)]:
+        return Rejection.MAGIC
+    if len(view) > _VERSION_AT and view[_VERSION_AT] != _VERSION:
+        return Rejection.VERSION
+    if len(view) < _HEADER_SIZE:
+        return Rejection.TRUNCATED
+    (
+        _,
+        _,
+        payload_type,
+        robot_id,
+        sequence,
+        sender_bundle_id,
+        boot_epoch,
+        sent_at_s,
+        x_m,
+        y_m,
+        z_m,
+        payload_length,
+    ) = _FIELDS.unpack_from(view)
+    # First whether these are the bytes that were sent; only then does what they say mean anything.
+    dtype = _PAYLOAD_TYPES.get(payload_type)
+    if dtype is None:
+        return Rejection.PAYLOAD_TYPE
+    sent_size = _HEADER_SIZE + payload_length * dtype.itemsize
+    if len(view) != sent_size:
+        return Rejection.TRUNCATED if len(view) < sent_size else Rejection.TOO_LONG
+    (checksum,) = _CHECKSUM.unpack_from(view, _FIELDS.size)
+    if zlib.crc32(view[_HEADER_SIZE:], zlib.crc32(view[: _FIELDS.size])) != checksum:
+        return Rejection.CHECKSUM
+    if sender_bundle_id != bundle_id[:_BUNDLE_ID_SIZE]:
+        return Rejection.OTHER_BUNDLE
+    if robot_id == own_robot_id:
+        return Rejection.OWN
+    if payload_length != message_size:
+        return Rejection.PAYLOAD_LENGTH
+    payload = np.frombuffer(view, dtype, offset=_HEADER_SIZE)
+    if not (all(map(math.isfinite, (sent_at_s, x_m, y_m, z_m))) and np.isfinite(payload).all()):
+        return Rejection.NON_FINITE
+    return AggregatedMessage(robot_id, boot_epoch, sequence, sent_at_s, (x_m, y_m, z_m), payload)

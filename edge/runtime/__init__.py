@@ -1,0 +1,1 @@
+"""The policy and one robot's steps, built on the core."""

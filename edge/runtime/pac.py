@@ -1,0 +1,178 @@
+"""One robot's perception, action and communication, as steps that somebody else times.
+
+Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
+Perception-Action-Communication Loops". The robot calls these steps from threads, the simulator in
+simulated time; both run this code.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from edge.core import F32, F64
+from edge.core.aggregation import AggregatedMessage, HopBuffer
+from edge.core.frames import ModelScale
+from edge.core.mailbox import Mailbox
+from edge.core.perception import Perception, neighbours_in_range
+from edge.core.ports import PositionSource, Sensor
+from edge.core.safety import limit_speed
+from edge.core.wire import Rejection, decode, encode
+from edge.runtime.bundle import BundleError
+from edge.runtime.policy import Policy
+
+Position = tuple[float, float, float]  # in the mission frame, m
+
+
+@dataclass(frozen=True, slots=True)
+class PacParameters:
+    """The fleet's settings of the loop; ages in s, see `Mailbox` for `max_message_age_s`.
+
+    Features, and then an action, that are older than `max_input_age_s` are not used: two ticks of
+    the policy may be missed, then the robot stops.
+    """
+
+    scale: ModelScale
+    max_speed_m_s: float
+    max_message_age_s: float = 0.8
+    max_input_age_s: float = 1.0
+    payload: Literal["float16", "float32"] = "float16"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timed:
+    """A value that one thread replaces whole and another reads."""
+
+    value: F32
+    time_s: float
+
+
+class Pac:
+    """The steps of one robot.
+
+    `perceive`, `infer` and `control` belong to one thread each, `receive` to any number. They
+    exchange immutable values by reference and never wait for one another.
+    """
+
+    def __init__(
+        self,
+        *,
+        robot_id: int,
+        boot_epoch: int,
+        policy: Policy,
+        sensor: Sensor,
+        position: PositionSource,
+        parameters: PacParameters,
+    ) -> None:
+        """Raises BundleError if the policy has no perception."""
+        manifest = policy.manifest
+        if manifest.images is None or manifest.perception is None:
+            raise BundleError(
+                f"bundle {manifest.name!r} has no perception: it cannot drive a robot"
+            )
+        self._robot_id = robot_id
+        self._boot_epoch = boot_epoch
+        self._policy = policy
+        self._sensor = sensor
+        self._position = position
+        self._parameters = parameters
+        self._world_size = manifest.perception.world_size
+        self._communication_range = manifest.perception.communication_range
+        self._perception = Perception(
+            manifest.perception, len(manifest.images.channels), manifest.images.size
+        )
+        self._hops = HopBuffer(manifest.geometry)
+        self._sequence = 0
+        self._features: _Timed | None = None
+        self._action: _Timed | None = None
+        self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+
+    def receive(self, data: bytes, now_s: float, unix_now_s: float) -> Rejection | None:
+        """Put a neighbour's message into the mailbox; returns, and counts, why it was not."""
+        message = decode(
+            data,
+            bundle_id=self._policy.bundle_id,
+            own_robot_id=self._robot_id,
+            message_size=self._policy.manifest.geometry.message_size,
+        )
+        if isinstance(message, Rejection):
+            self.mailbox.reject(message)
+            return message
+        return self.mailbox.receive(message, now_s, unix_now_s)
+
+    def perceive(self, now_s: float) -> None:
+        """Sensor view -> robot map -> images -> features x_i (32 of the CNN, 2 of the position)."""
+        position_m = self._position.position_m()
+        if position_m is None:
+            return
+        (own,) = self._to_model([position_m])
+        view = self._sensor.view(own)
+        if view is None:
+            return
+        self._perception.observe(own, view)
+        heard = self._to_model([n.position_m for n in self.mailbox.neighbours(now_s)])
+        neighbours = heard[neighbours_in_range(own, heard, self._communication_range)]
+        images = self._perception.images(own, neighbours)
+        features = np.concatenate(
+            [self._policy.image_features(images), position_feature(own, self._world_size)]
+        )
+        self._features = _Timed(features, now_s)
+
+    def infer(self, now_s: float, unix_now_s: float) -> bytes | None:
+        """Neighbours' messages and x_i -> action; returns the message Y_i for the neighbours.
+
+        None when there is nothing to send: no fresh features, no position, or a result that is
+        not finite. Then the action is left to grow old, and `control` stops the robot.
+        """
+        features, position_m = self._features, self._position.position_m()
+        if features is None or position_m is None or self._is_old(features, now_s):
+            return None
+        messages = self._messages_in_range(position_m, now_s)
+        self._hops.diffuse([message.payload for message in messages])
+        velocity = self._policy.velocity(features.value, self._hops)
+        payload = self._hops.message(degree=len(messages))
+        if not (np.isfinite(velocity).all() and np.isfinite(payload).all()):
+            return None
+        self._action = _Timed(velocity, now_s)
+        self._sequence += 1
+        message = AggregatedMessage(
+            robot_id=self._robot_id,
+            boot_epoch=self._boot_epoch,
+            sequence=self._sequence,
+            sent_at_s=unix_now_s,
+            position_m=position_m,
+            payload=payload,
+        )
+        return encode(message, self._policy.bundle_id, self._parameters.payload)
+
+    def control(self, now_s: float) -> F64:
+        """The velocity (2,) in the mission frame, m/s, within the speed limit; 0 if no action."""
+        action = self._action
+        if action is None or self._is_old(action, now_s):
+            return np.zeros(2)
+        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
+            action.value.astype(np.float64)
+        )
+        return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+
+    def _messages_in_range(self, position_m: Position, now_s: float) -> list[AggregatedMessage]:
+        messages = self.mailbox.swap(now_s)
+        (own,) = self._to_model([position_m])
+        positions = self._to_model([message.position_m for message in messages])
+        near = neighbours_in_range(own, positions, self._communication_range)
+        return [message for message, is_near in zip(messages, near, strict=True) if is_near]
+
+    def _to_model(self, positions_m: Sequence[Position]) -> F64:
+        """Horizontal positions (n, 2) in model units."""
+        horizontal = np.array(positions_m, np.float64).reshape(-1, 3)[:, :2]
+        return self._parameters.scale.position_to_model(horizontal)
+
+    def _is_old(self, timed: _Timed, now_s: float) -> bool:
+        return now_s - timed.time_s > self._parameters.max_input_age_s
+
+
+def position_feature(position: F64, world_size: int) -> F32:
+    """(p + W/2) / W, with p taken into the world: in [0.5, 1.5], as policies were trained."""
+    inside = np.clip(position, 0.0, world_size)
+    return ((inside + world_size / 2.0) / world_size).astype(np.float32)

@@ -1,0 +1,84 @@
+"""Does this machine compute what torch computed? Needs no torch: the bundle holds its outputs."""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F32
+from edge.core.aggregation import HopBuffer
+from edge.runtime.bundle import GOLDEN, Bundle, BundleError
+from edge.runtime.policy import Policy
+
+# Of the largest value of a row. Float32 rounding stays below a third of it on x86-64 and AArch64.
+TOLERANCE = 1e-5
+SWARM = "swarm"
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """How far one graph, or the whole swarm, is from its golden outputs."""
+
+    name: str
+    max_relative_error: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within TOLERANCE (a NaN is not)."""
+        return self.max_relative_error <= TOLERANCE
+
+
+def verify(bundle: Bundle) -> Iterator[Check]:
+    """Run every graph on its golden inputs, then a swarm through its rounds of messages.
+
+    Raises BundleError if the golden vectors cannot be read or do not fit the graphs.
+    """
+    policy = Policy(bundle)
+    try:
+        golden = dict(np.load(io.BytesIO(bundle.files[GOLDEN]), allow_pickle=False))
+        for graph in bundle.manifest.graphs:
+            output = policy.run(graph, golden[f"{graph}/input"])
+            yield Check(graph, _max_relative_error(output, golden[f"{graph}/output"]))
+        velocities = swarm_velocities(
+            policy,
+            golden[f"{SWARM}/neighbours"],
+            golden[f"{SWARM}/features"],
+            rounds=len(golden[f"{SWARM}/velocities"]) - 1,
+        )
+        yield Check(SWARM, _max_relative_error(velocities, golden[f"{SWARM}/velocities"]))
+    except KeyError as error:
+        raise BundleError(f"{GOLDEN}: {error} is missing") from None
+    except Exception as error:
+        if isinstance(error, BundleError):
+            raise
+        raise BundleError(f"{GOLDEN}: does not fit the graphs: {error}") from None
+
+
+def swarm_velocities(
+    policy: Policy, neighbours: npt.NDArray[np.bool_], features: F32, rounds: int
+) -> F32:
+    """Velocities (rounds + 1, N, 2) of a swarm after 0, 1, ... synchronous exchanges of messages.
+
+    `neighbours` (N, N) is the static graph, known to the robots from the start; `features` is
+    (N, F_0). After K L rounds they are those of the centralised network.
+    """
+    robots = range(len(features))
+    buffers = [HopBuffer(policy.manifest.geometry) for _ in robots]
+    payloads: list[F32] | None = None
+    velocities = np.empty((rounds + 1, len(features), 2), np.float32)
+    for exchanged in range(rounds + 1):
+        for i in robots:
+            if payloads:
+                buffers[i].diffuse([payloads[j] for j in np.flatnonzero(neighbours[i])])
+            velocities[exchanged, i] = policy.velocity(features[i], buffers[i])
+        payloads = [buffers[i].message(int(neighbours[i].sum())) for i in robots]
+    return velocities
+
+
+def _max_relative_error(output: F32, expected: F32) -> float:
+    """The largest error of a row, relative to the row's largest value."""
+    axes = tuple(range(1, expected.ndim))
+    errors = np.abs(output.astype(np.float64) - expected).max(axis=axes)
+    return float((errors / np.abs(expected).max(axis=axes)).max())

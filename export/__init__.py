@@ -1,0 +1,1 @@
+"""From a torch checkpoint to a bundle (the only user of torch)."""

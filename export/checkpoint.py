@@ -1,0 +1,410 @@
+"""A trained LPAC network from disk, checked tensor by tensor.
+
+Two sources: the state dict of CoverageControl's LPAC module, and the folder of one file per tensor
+in which the paper's authors published their graph neural network and action network.
+"""
+
+import hashlib
+import io
+import math
+import pickle
+import re
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from edge.core import F32
+from edge.core.aggregation import Geometry
+from edge.core.perception import MAP_CHANNELS
+
+# What a state dict does not hold: torch's default for batch norms, and CoverageControl's slope.
+BATCH_NORM_EPS = 1e-5
+LEAKY_RELU_SLOPE = 0.01
+
+ACTION_SIZE = 2
+# The position that is appended to the CNN's features.
+POSITION_SIZE = 2
+
+_COMPILED = "_orig_mod."  # torch.compile puts this in front of every name
+_NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
+_IGNORED_PART = "num_batches_tracked"
+
+# The folder's file names, and the same tensors' names in a state dict.
+_FOLDER_NAMES = (
+    ("lin_{}_{}.pt", "gnn_backbone.graph_conv_{}.lins.{}.weight"),
+    ("bias_{}.pt", "gnn_backbone.graph_conv_{}.bias"),
+    ("mlp_lin_{}.pt", "gnn_mlp.lins.{}.weight"),
+    ("mlp_bias_{}.pt", "gnn_mlp.lins.{}.bias"),
+    *(
+        (f"mlp_norm_{{}}_{part}.pt", f"gnn_mlp.norms.{{}}.module.{part}")
+        for part in (*_NORM_PARTS, _IGNORED_PART)
+    ),
+    ("outlayer_wts.pt", "output_linear.weight"),
+    ("outlayer_bias.pt", "output_linear.bias"),
+    ("actions_mean.pt", "actions_mean"),
+    ("actions_std.pt", "actions_std"),
+)
+
+
+class CheckpointError(ValueError):
+    """The checkpoint is not a usable LPAC network; the text names the tensor and says why."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """weight (out, in), bias (out,)."""
+
+    weight: F32
+    bias: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchNorm:
+    """Four times (features,)."""
+
+    weight: F32
+    bias: F32
+    mean: F32
+    variance: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Convolution:
+    """weight (out, in, kernel, kernel), bias (out,); no padding, stride 1."""
+
+    weight: F32
+    bias: F32
+    norm: BatchNorm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cnn:
+    """Convolutions with batch norm and leaky ReLU, then `linear` with leaky ReLU."""
+
+    convolutions: tuple[Convolution, ...]
+    linear: Linear
+    channels: int
+    image_size: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GnnLayer:
+    """taps (K + 1, F_{l-1}, F_l): the paper's H_lk; bias (F_l,). ReLU follows."""
+
+    taps: F32
+    bias: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActionNetwork:
+    """Hidden layers with batch norm and ReLU, then two linear layers with nothing in between.
+
+    The velocity is the output times `std` (2,) plus `mean` (2,), in model units/s.
+    """
+
+    hidden: tuple[tuple[Linear, BatchNorm], ...]
+    last: Linear
+    output: Linear
+    mean: F32
+    std: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checkpoint:
+    """A trained network, all weights float32 and finite. `cnn` is None if the source has none.
+
+    `sha256` is that of the file; of a folder, what `sha256sum *.pt | sha256sum` prints.
+    """
+
+    geometry: Geometry
+    cnn: Cnn | None
+    gnn: tuple[GnnLayer, ...]
+    action: ActionNetwork
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Tensors by their names in a state dict; `name` gives back what the source calls them."""
+
+    path: Path
+    tensors: Mapping[str, torch.Tensor]
+    name: Callable[[str], str]
+    has_cnn: bool
+    sha256: str
+
+    def error(self, name: str, found: str, expected: str) -> CheckpointError:
+        return CheckpointError(
+            f"{self.path}: {self.name(name)}: found {found}, expected {expected}"
+        )
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a state dict's file or a folder of tensors; every size follows from the tensors.
+
+    Raises CheckpointError, one line that names the file and the tensor as the source calls it, for
+    a missing, unknown or misshapen tensor, one that is not of finite floating point numbers, and
+    whatever is not an LPAC network at all.
+    """
+    source = _read_folder(path) if path.is_dir() else _read_state_dict(path)
+    layers = max(_count(source, r"gnn_backbone\.graph_conv_(\d+)\..*"), 1)
+    taps = max(_count(source, r"gnn_backbone\.graph_conv_\d+\.lins\.(\d+)\..*"), 2)
+    convolutions = max(_count(source, r"cnn_backbone\.conv(\d+)\..*"), 1) if source.has_cnn else 0
+    mlp_layers = max(_count(source, r"gnn_mlp\.lins\.(\d+)\..*"), 1)
+
+    layout = _layout(layers, taps, convolutions, mlp_layers)
+    sizes = _sizes(layout, source.tensors)
+    weights = _checked(source, layout, sizes)
+
+    def linear(name: str) -> Linear:
+        return Linear(weights[f"{name}.weight"], weights[f"{name}.bias"])
+
+    def norm(name: str) -> BatchNorm:
+        return BatchNorm(*(weights[f"{name}.{part}"] for part in _NORM_PARTS))
+
+    cnn = None
+    if source.has_cnn:
+        cnn = Cnn(
+            convolutions=tuple(
+                Convolution(
+                    weights[f"cnn_backbone.conv{i}.weight"],
+                    weights[f"cnn_backbone.conv{i}.bias"],
+                    norm(f"cnn_backbone.batch_norm{i}"),
+                )
+                for i in range(convolutions)
+            ),
+            linear=linear("cnn_backbone.linear_1"),
+            channels=_channels(source, sizes),
+            image_size=_image_size(source, sizes, convolutions),
+        )
+    gnn = tuple(
+        GnnLayer(
+            np.stack(
+                [weights[f"gnn_backbone.graph_conv_{i}.lins.{k}.weight"].T for k in range(taps)]
+            ),
+            weights[f"gnn_backbone.graph_conv_{i}.bias"],
+        )
+        for i in range(layers)
+    )
+    action = ActionNetwork(
+        hidden=tuple(
+            (linear(f"gnn_mlp.lins.{i}"), norm(f"gnn_mlp.norms.{i}.module"))
+            for i in range(mlp_layers - 1)
+        ),
+        last=linear(f"gnn_mlp.lins.{mlp_layers - 1}"),
+        output=linear("output_linear"),
+        mean=weights["actions_mean"],
+        std=weights["actions_std"],
+    )
+    features = (gnn[0].taps.shape[1], *(layer.taps.shape[2] for layer in gnn))
+    return Checkpoint(Geometry(taps - 1, features), cnn, gnn, action, source.sha256)
+
+
+def _read_state_dict(path: Path) -> _Source:
+    content = _read_bytes(path)
+    state = _load(content, path)
+    if not isinstance(state, dict):
+        raise CheckpointError(
+            f"{path}: found a {type(state).__name__}, expected a state dict (tensors by name)"
+        )
+    for name, value in state.items():
+        if not isinstance(name, str) or not isinstance(value, torch.Tensor):
+            raise CheckpointError(
+                f"{path}: {name}: found a {type(value).__name__}, expected tensors by name: "
+                "save model.state_dict() alone"
+            )
+    prefix = _COMPILED if all(name.startswith(_COMPILED) for name in state) else ""
+    tensors = {name.removeprefix(prefix): tensor for name, tensor in state.items()}
+    if not any(name.startswith("gnn_backbone.") for name in tensors):
+        raise CheckpointError(
+            f"{path}: found {len(state)} tensors ({', '.join([*state][:3])}, ...), expected those "
+            "of an LPAC network, such as gnn_backbone.graph_conv_0.lins.0.weight"
+        )
+    sha256 = hashlib.sha256(content).hexdigest()
+    return _Source(path, tensors, lambda name: prefix + name, has_cnn=True, sha256=sha256)
+
+
+def _read_folder(path: Path) -> _Source:
+    tensors: dict[str, torch.Tensor] = {}
+    listing = ""
+    for file in sorted(path.iterdir(), key=lambda file: file.name):
+        if file.name == "README.md":
+            continue
+        name = _translate(file.name, _FOLDER_NAMES)
+        if name is None:
+            raise CheckpointError(
+                f"{path}: {file.name}: expected only tensors of an LPAC network "
+                "(lin_<layer>_<hop>.pt, bias_<layer>.pt, mlp_lin_<layer>.pt, ...)"
+            )
+        content = _read_bytes(file)
+        tensor = _load(content, file)
+        if not isinstance(tensor, torch.Tensor):
+            raise CheckpointError(f"{file}: found a {type(tensor).__name__}, expected a tensor")
+        tensors[name] = tensor
+        listing += f"{hashlib.sha256(content).hexdigest()}  {file.name}\n"
+
+    def file_name(name: str) -> str:
+        return _translate(name, ((there, here) for here, there in _FOLDER_NAMES)) or name
+
+    sha256 = hashlib.sha256(listing.encode()).hexdigest()
+    return _Source(path, tensors, file_name, has_cnn=False, sha256=sha256)
+
+
+def _translate(name: str, templates: Iterable[tuple[str, str]]) -> str | None:
+    for template, translation in templates:
+        pattern = re.escape(template).replace(r"\{\}", "([0-9]+)")
+        if match := re.fullmatch(pattern, name):
+            return translation.format(*match.groups())
+    return None
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror}") from None
+
+
+def _load(content: bytes, path: Path) -> object:
+    """What the file holds, as long as that is tensors and plain containers."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the error below says all that they would
+            loaded: object = torch.load(io.BytesIO(content), "cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        kind = re.search(r"GLOBAL (\S+)", str(error))
+        if kind is None:
+            raise CheckpointError(f"{path}: found no torch file, expected a state dict") from None
+        raise CheckpointError(
+            f"{path}: found a pickled {kind[1]}, expected tensors: save model.state_dict() alone"
+        ) from None
+    except Exception:  # torch raises many kinds on what it cannot read
+        raise CheckpointError(f"{path}: found no torch file, expected a state dict") from None
+    return loaded
+
+
+def _count(source: _Source, pattern: str) -> int:
+    """One more than the highest number that `pattern` finds; a gap then is a missing tensor."""
+    matches = (re.fullmatch(pattern, name, re.ASCII) for name in source.tensors)
+    numbers = [int(match[1]) for match in matches if match and len(match[1]) < 9]
+    # Numbers beyond the number of tensors leave a gap below it too.
+    return min(max(numbers, default=-1) + 1, len(source.tensors))
+
+
+_Layout = dict[str, tuple[str | int, ...]]
+
+
+def _layout(layers: int, taps: int, convolutions: int, mlp_layers: int) -> _Layout:
+    """All tensors and their shapes: numbers, names of sizes, or a name plus a number."""
+    layout: _Layout = {}
+
+    def norm(name: str, size: str) -> None:
+        layout.update({f"{name}.{part}": (size,) for part in _NORM_PARTS})
+
+    for i in range(convolutions):
+        inputs = f"conv{i - 1}" if i else "channels"
+        layout[f"cnn_backbone.conv{i}.weight"] = (f"conv{i}", inputs, "kernel", "kernel")
+        layout[f"cnn_backbone.conv{i}.bias"] = (f"conv{i}",)
+        norm(f"cnn_backbone.batch_norm{i}", f"conv{i}")
+    if convolutions:
+        layout["cnn_backbone.linear_1.weight"] = ("features", "pixels")
+        layout["cnn_backbone.linear_1.bias"] = ("features",)
+    for i in range(layers):
+        inputs = f"gnn{i - 1}" if i else f"features+{POSITION_SIZE}"
+        for k in range(taps):
+            layout[f"gnn_backbone.graph_conv_{i}.lins.{k}.weight"] = (f"gnn{i}", inputs)
+        layout[f"gnn_backbone.graph_conv_{i}.bias"] = (f"gnn{i}",)
+    for i in range(mlp_layers):
+        inputs = f"mlp{i - 1}" if i else f"gnn{layers - 1}"
+        layout[f"gnn_mlp.lins.{i}.weight"] = (f"mlp{i}", inputs)
+        layout[f"gnn_mlp.lins.{i}.bias"] = (f"mlp{i}",)
+        if i < mlp_layers - 1:
+            norm(f"gnn_mlp.norms.{i}.module", f"mlp{i}")
+    layout["output_linear.weight"] = (ACTION_SIZE, f"mlp{mlp_layers - 1}")
+    layout["output_linear.bias"] = (ACTION_SIZE,)
+    layout["actions_mean"] = (ACTION_SIZE,)
+    layout["actions_std"] = (ACTION_SIZE,)
+    return layout
+
+
+def _sizes(layout: _Layout, tensors: Mapping[str, torch.Tensor]) -> dict[str, int]:
+    """Each named size as most of its tensors have it, so that the odd one out is the one blamed."""
+    votes: dict[str, Counter[int]] = {}
+    for name, shape in layout.items():
+        if name in tensors and tensors[name].dim() == len(shape):
+            for size, number in zip(shape, tensors[name].shape, strict=True):
+                if isinstance(size, str):
+                    symbol, _, extra = size.partition("+")
+                    votes.setdefault(symbol, Counter())[number - int(extra or 0)] += 1
+    return {symbol: counter.most_common(1)[0][0] for symbol, counter in votes.items()}
+
+
+def _shape(shape: tuple[str | int, ...], sizes: Mapping[str, int]) -> list[int | None]:
+    """`shape` in numbers; None where no tensor of the right rank tells the number."""
+    numbers: list[int | None] = []
+    for size in shape:
+        if isinstance(size, int):
+            numbers.append(size)
+        else:
+            symbol, _, extra = size.partition("+")
+            numbers.append(sizes[symbol] + int(extra or 0) if symbol in sizes else None)
+    return numbers
+
+
+def _checked(source: _Source, layout: _Layout, sizes: Mapping[str, int]) -> dict[str, F32]:
+    """All tensors of the layout as float32 arrays."""
+    shapes = {name: _shape(shape, sizes) for name, shape in layout.items()}
+    for name, shape in shapes.items():
+        if name not in source.tensors:
+            raise source.error(name, "no such tensor", f"one of shape {_text(shape)}")
+    norms = {name.rpartition(".")[0] for name in layout if name.endswith("running_var")}
+    ignored = {f"{norm}.{_IGNORED_PART}" for norm in norms}
+    for name in source.tensors.keys() - layout.keys() - ignored:
+        found = f"a tensor of shape {_text(source.tensors[name].shape)}"
+        raise source.error(name, found, "no tensor of that name in this LPAC network")
+    return {name: _array(source, name, shape) for name, shape in shapes.items()}
+
+
+def _array(source: _Source, name: str, shape: list[int | None]) -> F32:
+    tensor = source.tensors[name].detach()
+    if not tensor.is_floating_point() or tensor.layout != torch.strided or tensor.is_meta:
+        found = f"{tensor.dtype}, {tensor.layout}, on {tensor.device}"
+        raise source.error(name, found, "dense floating point numbers")
+    if list(tensor.shape) != shape or 0 in shape:
+        raise source.error(name, f"shape {_text(tensor.shape)}", _text(shape))
+    array: F32 = tensor.to(torch.float32).contiguous().numpy()
+    if not np.isfinite(array).all():
+        found = "NaN" if np.isnan(array).any() else "infinity (in float32)"
+        raise source.error(name, found, "finite numbers")
+    if name.endswith("running_var") and array.min() < 0:
+        raise source.error(name, f"{array.min():g}", "variances of at least 0")
+    return array
+
+
+def _text(shape: Iterable[int | None]) -> str:
+    return f"[{', '.join('*' if size is None else str(size) for size in shape)}]"
+
+
+def _channels(source: _Source, sizes: Mapping[str, int]) -> int:
+    if sizes["channels"] not in MAP_CHANNELS:
+        allowed = " or ".join(map(str, MAP_CHANNELS))
+        raise source.error(
+            "cnn_backbone.conv0.weight", f"{sizes['channels']} map channels", allowed
+        )
+    return sizes["channels"]
+
+
+def _image_size(source: _Source, sizes: Mapping[str, int], convolutions: int) -> int:
+    """Side of the square images: every convolution takes a border of kernel - 1 off them."""
+    channels = sizes[f"conv{convolutions - 1}"]
+    side = math.isqrt(sizes["pixels"] // channels)
+    if channels * side**2 != sizes["pixels"]:
+        shape = source.tensors["cnn_backbone.linear_1.weight"].shape
+        expected = f"[{sizes['features']}, {channels} * n * n] for square images"
+        raise source.error("cnn_backbone.linear_1.weight", f"shape {_text(shape)}", expected)
+    return side + convolutions * (sizes["kernel"] - 1)

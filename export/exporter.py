@@ -1,0 +1,67 @@
+"""From a checkpoint and its parameters to a bundle."""
+
+import hashlib
+import tomllib
+from pathlib import Path
+
+import torch
+
+from edge.core.perception import MAP_CHANNELS
+from edge.runtime.bundle import (
+    GOLDEN,
+    SCHEMA_VERSION,
+    Bundle,
+    Images,
+    Manifest,
+    Provenance,
+    make_bundle,
+)
+from export.checkpoint import read_checkpoint
+from export.golden import golden_vectors
+from export.graphs import OPSET, build_graphs
+from export.parameters import read_parameters
+
+
+def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -> Bundle:
+    """Make the bundle of a checkpoint: a state dict's file, or a folder of one file per tensor.
+
+    `parameters` is our parameter file or a coverage_control_params.toml. `name` is the policy's
+    name, by default the checkpoint's. A folder holds no CNN: its bundle is without perception.
+
+    Raises CheckpointError or ConfigError, one line each.
+    """
+    network = read_checkpoint(checkpoint)
+    perception, training = read_parameters(parameters)
+    files = {**build_graphs(network), GOLDEN: golden_vectors(network)}
+    images = None
+    if network.cnn:
+        images = Images(
+            MAP_CHANNELS[network.cnn.channels],
+            network.cnn.image_size,
+            len(network.cnn.linear.bias),
+        )
+    manifest = Manifest(
+        schema=SCHEMA_VERSION,
+        name=name or checkpoint.stem,
+        opset=OPSET,
+        geometry=network.geometry,
+        images=images,
+        perception=perception if images else None,
+        training=training,
+        provenance=Provenance(
+            checkpoint=checkpoint.name,
+            checkpoint_sha256=network.sha256,
+            parameters=parameters.name,
+            parameters_sha256=hashlib.sha256(parameters.read_bytes()).hexdigest(),
+            exporter=f"lpac-edge {_version()}",
+            torch=torch.__version__,
+        ),
+        files=dict.fromkeys(files, ""),  # make_bundle puts the hashes in
+    )
+    return make_bundle(manifest, files)
+
+
+def _version() -> str:
+    """This repository's version: export always runs from it, installed or not."""
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
+    return str(project["project"]["version"])

@@ -1,0 +1,102 @@
+"""The parameters that a policy was trained with, from our TOML file or CoverageControl's."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from edge.core.perception import PerceptionParameters
+from edge.runtime.bundle import Training
+from edge.runtime.config import ConfigError, from_mapping
+
+
+@dataclass(frozen=True, slots=True)
+class _Parameters:
+    """Our file: these two tables."""
+
+    perception: PerceptionParameters
+    training: Training
+
+
+def read_parameters(path: Path) -> tuple[PerceptionParameters, Training]:
+    """Read our parameter file, or a coverage_control_params.toml: that has [Environment.Maps].
+
+    Raises ConfigError that names the file and the line or key.
+    """
+    try:
+        document = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not UTF-8 text, expected TOML") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is not TOML: {error}") from None
+    environment = document.get("Environment")
+    if isinstance(environment, Mapping) and "Maps" in environment:
+        document = _from_coverage_control(_Reader(document, path))
+    parameters = from_mapping(_Parameters, document, str(path))
+    return parameters.perception, parameters.training
+
+
+@dataclass(frozen=True, slots=True)
+class _Reader:
+    """Single values of a TOML document; a missing one or one of another type is a ConfigError."""
+
+    document: Mapping[str, object]
+    path: Path
+
+    def value(self, table: str, key: str, kind: type) -> object:
+        where = f"{self.path}: [{table}] {key}"
+        values: object = self.document
+        for name in (*table.split("."), key):
+            if not isinstance(values, Mapping) or name not in values:
+                raise ConfigError(f"{where} is missing")
+            values = values[name]
+        if type(values) is not kind and not (kind is float and type(values) is int):
+            raise ConfigError(f"{where} = {values!r}: expected {kind.__name__}")
+        return values
+
+    def integer(self, table: str, key: str) -> int:
+        value = self.value(table, key, int)
+        assert isinstance(value, int)
+        return value
+
+    def number(self, table: str, key: str) -> float:
+        value = self.value(table, key, float)
+        assert isinstance(value, int | float)
+        return float(value)
+
+
+def _from_coverage_control(reader: _Reader) -> dict[str, object]:
+    """CoverageControl's names and units in our file's form."""
+    maps, idf, robot = "Environment.Maps", "Environment.IDF", "RobotModel"
+    resolution = reader.number(maps, "Resolution")
+    if resolution != 1:
+        raise ConfigError(f"{reader.path}: [{maps}] Resolution = {resolution:g}: allowed is 1")
+    world_size = reader.integer(maps, "WorldMapSize")
+    robot_map_size = reader.integer(maps, "RobotMapSize")
+    if robot_map_size != world_size:
+        raise ConfigError(
+            f"{reader.path}: [{maps}] RobotMapSize = {robot_map_size}: "
+            f"allowed is WorldMapSize = {world_size}"
+        )
+    norm = reader.number(idf, "Norm")
+    # There it is a fraction of the largest importance, which is the norm.
+    unknown = 0.0
+    if reader.value(idf, "RobotMapUseUnknownImportance", bool):
+        unknown = reader.number(idf, "UnknownImportance") * norm
+    return {
+        "perception": {
+            "world_size": world_size,
+            "local_map_size": reader.integer(maps, "LocalMapSize"),
+            "sensor_size": reader.integer(robot, "SensorSize"),
+            "communication_range": reader.number(robot, "CommunicationRange"),
+            "unknown_importance": unknown,
+        },
+        "training": {
+            "max_speed": reader.number(robot, "MaxRobotSpeed"),
+            "time_step": reader.number(robot, "TimeStep"),
+            "idf_truncation": reader.number(idf, "TruncationBND"),
+            "idf_norm": norm,
+        },
+    }

@@ -1,0 +1,1 @@
+"""N robots in one process, each with its own perception, mailbox, policy and clock."""

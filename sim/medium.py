@@ -1,0 +1,46 @@
+"""The air between the robots: who hears a message, and when."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from edge.core import F64
+
+
+class Medium:
+    """Broadcast with range, loss and delay; counts what it lost."""
+
+    def __init__(
+        self, *, range_m: float, loss: float, delay_s: float, rng: np.random.Generator
+    ) -> None:
+        """`loss` is the probability that one receiver misses one message.
+
+        A message travels `delay_s` on average, anything from half to one and a half of it.
+        Raises ValueError that names an impossible value.
+        """
+        if not range_m > 0.0:
+            raise ValueError(f"range_m = {range_m}: must be positive")
+        if not 0.0 <= loss <= 1.0:
+            raise ValueError(f"loss = {loss}: must be from 0 to 1")
+        if not 0.0 <= delay_s < np.inf:
+            raise ValueError(f"delay_s = {delay_s}: must be at least 0 and finite")
+        self._range_m = range_m
+        self._loss = loss
+        self._delay_s = delay_s
+        self._rng = rng
+        self.sent = 0
+        self.lost = 0
+
+    def broadcast(self, sender: int, positions_m: F64) -> Iterator[tuple[int, float]]:
+        """The receivers of a message sent now, with its travel time in s."""
+        self.sent += 1
+        distances = np.hypot(*(positions_m - positions_m[sender]).T)
+        distances[sender] = np.inf
+        for receiver in np.flatnonzero(distances < self._range_m):
+            # Both numbers are drawn for every receiver, so that a run with another loss or delay
+            # differs by that alone.
+            chance, travel = self._rng.random(2)
+            if chance < self._loss:
+                self.lost += 1
+            else:
+                yield int(receiver), self._delay_s * (0.5 + travel)

@@ -1,0 +1,154 @@
+"""The robot's memory and its images: against plain dense arrays, torch, and by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.core.perception import (
+    TILE_SIZE,
+    Perception,
+    PerceptionParameters,
+    RobotMap,
+    neighbour_maps,
+    neighbours_in_range,
+    part_in_world,
+    resize_matrix,
+    window_corner,
+)
+
+PARAMETERS = PerceptionParameters(
+    world_size=512, local_map_size=256, sensor_size=64, communication_range=256.0
+)
+corners = st.tuples(st.integers(-150, 400), st.integers(-150, 400))
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    world_size=st.sampled_from([1, 100, TILE_SIZE, TILE_SIZE + 1, 300]),
+    unknown=st.sampled_from([0.0, 0.5]),
+    views=st.lists(corners, max_size=6),
+    window=corners,
+)
+def test_robot_map_is_a_dense_map_clipped_to_the_world(
+    world_size: int, unknown: float, views: list[tuple[int, int]], window: tuple[int, int]
+) -> None:
+    rng = np.random.default_rng(0)
+    robot_map = RobotMap(world_size, unknown)
+    dense = np.full((world_size, world_size), unknown, np.float32)
+    for corner in views:
+        view = rng.random((64, 64), np.float32)
+        robot_map.insert(view, corner)
+        in_world, in_view = part_in_world(corner, 64, world_size)
+        dense[in_world] = view[in_view]
+    expected = np.zeros((256, 256), np.float32)
+    in_world, in_window = part_in_world(window, 256, world_size)
+    expected[in_window] = dense[in_world]
+    found = robot_map.window(window, np.full((256, 256), np.nan, np.float32))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("size", "new_size"), [(256, 32), (128, 32), (100, 32), (32, 32), (16, 32)]
+)
+def test_resize_is_torchs_antialiased_bilinear_one(size: int, new_size: int) -> None:
+    torch = pytest.importorskip("torch", reason="torch is the oracle here")
+    image = np.random.default_rng(1).random((size, size), np.float32)
+    matrix = resize_matrix(size, new_size)
+    expected = torch.nn.functional.interpolate(
+        torch.from_numpy(image)[None, None], (new_size, new_size), mode="bilinear", antialias=True
+    )[0, 0].numpy()
+    np.testing.assert_allclose(matrix @ image @ matrix.T, expected, atol=1e-6)
+
+
+def images_at(position: tuple[float, float], neighbours: list[tuple[float, float]]) -> np.ndarray:
+    perception = Perception(PARAMETERS, channels=4, image_size=32)
+    return perception.images(
+        np.array(position), np.array(neighbours, np.float64).reshape(-1, 2)
+    ).copy()[0]
+
+
+def test_images_keep_x_and_y_and_left_and_right_apart() -> None:
+    position = np.array([200.0, 300.0])
+    perception = Perception(PARAMETERS, channels=4, image_size=32)
+    view = np.zeros((64, 64), np.float32)
+    view[60, 8] = 1.0  # 28 to the right (+x) and 24 behind (-y)
+    perception.observe(position, view)
+    neighbour = np.array([300.0, 250.0])
+    importance, neighbours_x, neighbours_y, obstacles = perception.images(
+        position, neighbour[None]
+    )[0]
+    # 128 + 28 and 128 - 24 cells into a local map of 256, eight of them to one of the image.
+    assert np.unravel_index(importance.argmax(), importance.shape) == (19, 13)
+    cell = (22, 12)  # rint(100 / 16 + 15.5), rint(-50 / 16 + 15.5)
+    assert neighbours_x[cell] == pytest.approx(100 / 256)
+    assert neighbours_y[cell] == pytest.approx(-50 / 256)
+    assert np.count_nonzero(neighbours_x) == np.count_nonzero(neighbours_y) == 1
+    np.testing.assert_allclose(obstacles, 0.0, atol=1e-6)
+
+
+def test_obstacles_are_on_the_side_of_the_border() -> None:
+    left, bottom = images_at((0.0, 256.0), [])[3], images_at((256.0, 0.0), [])[3]
+    np.testing.assert_allclose(left[:15], 1.0, atol=1e-6)
+    np.testing.assert_allclose(left[17:], 0.0, atol=1e-6)
+    np.testing.assert_array_equal(bottom, left.T)
+
+
+def test_two_channels_leave_the_neighbours_out() -> None:
+    perception = Perception(PARAMETERS, channels=2, image_size=32)
+    images = perception.images(np.array([0.0, 256.0]), np.array([[10.0, 256.0]]))
+    assert images.shape == (1, 2, 32, 32)
+    np.testing.assert_array_equal(images[0, 1], images_at((0.0, 256.0), [])[3])
+
+
+@given(st.tuples(*[st.floats(-2000.0, 2000.0)] * 2))
+@settings(deadline=None, max_examples=30)
+def test_outside_the_world_the_view_is_that_from_its_border(position: tuple[float, float]) -> None:
+    clipped = tuple(np.clip(position, 0.0, 512.0))
+    np.testing.assert_array_equal(images_at(position, []), images_at(clipped, []))
+
+
+@given(st.lists(st.tuples(*[st.floats(-255.9, 255.9)] * 2), max_size=12))
+def test_neighbour_maps_hold_every_neighbour(offsets: list[tuple[float, float]]) -> None:
+    array = np.array(offsets, np.float64).reshape(-1, 2)
+    maps = neighbour_maps(array, 256.0, 32)
+    np.testing.assert_allclose(maps.sum(axis=(1, 2)), array.sum(axis=0) / 256.0, atol=1e-4)
+    np.testing.assert_allclose(
+        neighbour_maps(array[:, ::-1], 256.0, 32), maps[::-1].transpose(0, 2, 1), atol=1e-6
+    )
+
+
+def test_range_is_open_and_two_robots_at_one_point_are_neighbours() -> None:
+    own = np.array([10.0, 10.0])
+    others = own + np.array([[0.0, 0.0], [256.0, 0.0], [0.0, -255.999]])
+    assert neighbours_in_range(own, others, 256.0).tolist() == [True, False, True]
+    assert neighbours_in_range(own, others[:0], 256.0).tolist() == []
+    assert np.all(neighbour_maps(np.zeros((1, 2)), 256.0, 32) == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("position", "corner"),
+    [((100.0, 200.0), (68, 168)), ((100.49, 199.5), (68, 168)), ((0.0, -0.6), (-32, -33))],
+)
+def test_window_is_centred_at_the_nearest_cell_corner(
+    position: tuple[float, float], corner: tuple[int, int]
+) -> None:
+    assert window_corner(np.array(position), 64) == corner
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"world_size": 0}, "world_size = 0: must be positive"),
+        ({"sensor_size": 63}, "sensor_size = 63: must be positive and even"),
+        ({"local_map_size": -2}, "local_map_size = -2: must be positive and even"),
+        ({"communication_range": float("nan")}, "communication_range = nan"),
+        ({"unknown_importance": -1.0}, "unknown_importance = -1.0"),
+    ],
+)
+def test_impossible_parameters_are_named(change: dict[str, float], text: str) -> None:
+    sizes = {
+        "world_size": 512, "local_map_size": 256, "sensor_size": 64, "communication_range": 256.0
+    }  # fmt: skip
+    with pytest.raises(ValueError, match=text):
+        PerceptionParameters(**{**sizes, **change})

@@ -1,0 +1,236 @@
+"""Wire: what is sent arrives, and whatever else arrives is refused for the right reason."""
+
+import dataclasses
+import hashlib
+import math
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from edge.core import F32
+from edge.core.aggregation import AggregatedMessage
+from edge.core.wire import Rejection, decode, encode
+
+BUNDLE_ID = hashlib.sha256(b"manifest").digest()
+OTHER_BUNDLE_ID = hashlib.sha256(b"another manifest").digest()
+HEADER_SIZE = 80
+OWN_ID = 9
+FLOAT16_MAX = 65504.0
+TYPES = pytest.mark.parametrize("payload_dtype", [np.float32, np.float16])
+
+MESSAGE = AggregatedMessage(
+    robot_id=3,
+    boot_epoch=0x0102030405060708,
+    sequence=258,
+    sent_at_s=1.5,
+    position_m=(1.0, -2.0, 0.5),
+    payload=np.array([0.0, 1.0, -2.5, 100.0, 0.125], np.float32),
+)
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+def messages(payload: st.SearchStrategy[F32]) -> st.SearchStrategy[AggregatedMessage]:
+    return st.builds(
+        AggregatedMessage,
+        robot_id=st.integers(0, 2**16 - 1).filter(lambda robot_id: robot_id != OWN_ID),
+        boot_epoch=st.integers(0, 2**64 - 1),
+        sequence=st.integers(0, 2**32 - 1),
+        sent_at_s=finite,
+        position_m=st.tuples(finite, finite, finite),
+        payload=payload,
+    )
+
+
+payloads = hnp.arrays(
+    np.float32,
+    st.integers(0, 40),
+    elements=st.floats(width=32, allow_nan=False, allow_infinity=False),
+)
+
+
+def receive(
+    data: bytes | memoryview,
+    *,
+    message_size: int = MESSAGE.payload.size,
+    bundle_id: bytes = BUNDLE_ID,
+    own_robot_id: int = OWN_ID,
+) -> AggregatedMessage | Rejection:
+    return decode(data, bundle_id=bundle_id, own_robot_id=own_robot_id, message_size=message_size)
+
+
+def accepted(data: bytes | memoryview, message_size: int) -> AggregatedMessage:
+    message = receive(data, message_size=message_size)
+    assert isinstance(message, AggregatedMessage)
+    return message
+
+
+def seal(data: bytes) -> bytes:
+    """The same message with the checksum that its content asks for."""
+    checksum = zlib.crc32(data[HEADER_SIZE:], zlib.crc32(data[:76]))
+    return data[:76] + struct.pack("<I", checksum) + data[HEADER_SIZE:]
+
+
+def without_payload(message: AggregatedMessage) -> tuple[object, ...]:
+    fields = dataclasses.fields(message)
+    return tuple(getattr(message, field.name) for field in fields if field.name != "payload")
+
+
+@settings(deadline=None)
+@given(messages(payloads))
+def test_float32_arrives_exactly(message: AggregatedMessage) -> None:
+    received = accepted(encode(message, BUNDLE_ID, np.float32), message.payload.size)
+    assert without_payload(received) == without_payload(message)
+    assert received.payload.dtype == np.float32
+    np.testing.assert_array_equal(received.payload, message.payload)
+
+
+@settings(deadline=None)
+@given(messages(payloads))
+def test_float16_arrives_rounded_and_never_infinite(message: AggregatedMessage) -> None:
+    received = accepted(encode(message, BUNDLE_ID, np.float16), message.payload.size)
+    assert without_payload(received) == without_payload(message)
+    assert received.payload.dtype == np.float16
+    saturated = np.clip(message.payload, -FLOAT16_MAX, FLOAT16_MAX)
+    # Half a unit in the last of 11 bits, or half the smallest subnormal.
+    allowed = np.maximum(np.abs(saturated) * 2.0**-11, 2.0**-25)
+    assert (np.abs(received.payload.astype(np.float64) - saturated) <= allowed).all()
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=300), st.integers(0, 60))
+def test_arbitrary_bytes_are_refused(data: bytes, message_size: int) -> None:
+    assert isinstance(receive(data, message_size=message_size), Rejection)
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=200), st.booleans(), st.integers(0, 60))
+def test_arbitrary_bytes_behind_a_good_start_never_raise(
+    data: bytes, sealed: bool, message_size: int
+) -> None:
+    data = encode(MESSAGE, BUNDLE_ID, np.float32)[:9] + data
+    if sealed and len(data) >= HEADER_SIZE:
+        data = seal(data)
+    assert isinstance(receive(data, message_size=message_size), Rejection)
+
+
+@settings(deadline=None)
+@given(st.binary(min_size=20, max_size=20), st.binary(min_size=32, max_size=32))
+def test_arbitrary_floats_in_a_sealed_message_arrive_or_are_not_finite(
+    payload: bytes, header_floats: bytes
+) -> None:
+    good = encode(MESSAGE, BUNDLE_ID, np.float32)
+    data = seal(good[:40] + header_floats + good[72:HEADER_SIZE] + payload)
+    floats = struct.unpack("<4d", header_floats) + struct.unpack("<5f", payload)
+    if all(map(math.isfinite, floats)):
+        message = accepted(data, 5)
+        assert (message.sent_at_s, *message.position_m, *message.payload.tolist()) == floats
+    else:
+        assert receive(data) is Rejection.NON_FINITE
+
+
+@TYPES
+def test_every_changed_byte_is_noticed(payload_dtype: type) -> None:
+    good = encode(MESSAGE, BUNDLE_ID, payload_dtype)
+    for place in range(len(good)):
+        for change in range(1, 256):
+            data = bytearray(good)
+            data[place] ^= change
+            assert isinstance(receive(bytes(data)), Rejection), (place, change)
+
+
+@TYPES
+def test_every_truncation_and_extension_is_named(payload_dtype: type) -> None:
+    good = encode(MESSAGE, BUNDLE_ID, payload_dtype)
+    for size in range(len(good)):
+        assert receive(good[:size]) is Rejection.TRUNCATED
+    for tail in (b"\0", b"\0" * 2, b"\0" * 4, good):
+        assert receive(good + tail) is Rejection.TOO_LONG
+
+
+def test_the_layout_is_a_contract() -> None:
+    head = (
+        "4c5041432d4d5347"  # LPAC-MSG
+        "01"  # version
+        "{payload_type}"
+        "0300"  # robot id 3
+        "02010000"  # sequence 258
+        "05b3abf2579a5eb66403cd78be557fd8"  # the first 16 bytes of BUNDLE_ID
+        "0807060504030201"  # boot epoch
+        "000000000000f83f"  # sent at 1.5
+        "000000000000f03f"  # x 1
+        "00000000000000c0"  # y -2
+        "000000000000e03f"  # z 0.5
+        "05000000"  # payload length
+    )
+    # CRC-32, and then 0, 1, -2.5, 100, 0.125.
+    float32 = (
+        head.format(payload_type="01") + "d4f33629" + "000000000000803f000020c00000c8420000003e"
+    )
+    float16 = head.format(payload_type="02") + "6e795475" + "0000003c00c140560030"
+    assert encode(MESSAGE, BUNDLE_ID, np.float32).hex() == float32
+    assert encode(MESSAGE, BUNDLE_ID, np.float16).hex() == float16
+    assert accepted(bytes.fromhex(float32), 5).sequence == 258
+
+
+@TYPES
+def test_the_payload_is_an_aligned_read_only_view(payload_dtype: type) -> None:
+    data = encode(MESSAGE, BUNDLE_ID, payload_dtype)
+    for buffer in (data, memoryview(data), memoryview(bytearray(data))):
+        payload = accepted(buffer, MESSAGE.payload.size).payload
+        assert np.shares_memory(payload, np.frombuffer(buffer, np.uint8))
+        assert payload.flags.aligned
+        assert not payload.flags.writeable
+        with pytest.raises(ValueError, match="read-only"):
+            payload[0] = 1.0
+
+
+def test_the_reason_is_the_most_telling_one() -> None:
+    good = encode(MESSAGE, BUNDLE_ID, np.float32)
+    longer = dataclasses.replace(MESSAGE, payload=np.ones(7, np.float32))
+    reasons = {
+        Rejection.MAGIC: b"lpac" + good[4:],
+        # Another version may have any length and any checksum.
+        Rejection.VERSION: good[:8] + b"\2" + good[9:70],
+        Rejection.PAYLOAD_TYPE: good[:9] + b"\3" + good[10:],
+        Rejection.CHECKSUM: good[:-1] + b"\x7f",
+        # Another bundle's payload may have any length; its robots' ids are not ours.
+        Rejection.OTHER_BUNDLE: encode(
+            dataclasses.replace(longer, robot_id=OWN_ID), OTHER_BUNDLE_ID, np.float16
+        ),
+        Rejection.OWN: encode(dataclasses.replace(MESSAGE, robot_id=OWN_ID), BUNDLE_ID, np.float16),
+        Rejection.PAYLOAD_LENGTH: encode(longer, BUNDLE_ID, np.float32),
+    }
+    assert {reason: receive(data) for reason, data in reasons.items()} == {
+        reason: reason for reason in reasons
+    }
+
+
+def test_damage_is_not_taken_for_another_bundle() -> None:
+    good = encode(MESSAGE, BUNDLE_ID, np.float32)
+    assert receive(good[:16] + bytes([good[16] ^ 1]) + good[17:]) is Rejection.CHECKSUM
+
+
+@TYPES
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_refused(payload_dtype: type, value: float) -> None:
+    payload = MESSAGE.payload.copy()
+    payload[-1] = value
+    for message in (
+        dataclasses.replace(MESSAGE, payload=payload),
+        dataclasses.replace(MESSAGE, sent_at_s=value),
+        dataclasses.replace(MESSAGE, position_m=(value, 0.0, 0.0)),
+        dataclasses.replace(MESSAGE, position_m=(0.0, value, 0.0)),
+        dataclasses.replace(MESSAGE, position_m=(0.0, 0.0, value)),
+    ):
+        assert receive(encode(message, BUNDLE_ID, payload_dtype)) is Rejection.NON_FINITE
+
+
+def test_a_wrong_payload_type_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^payload dtype = float64: must be float32 or float16$"):
+        encode(MESSAGE, BUNDLE_ID, np.float64)
