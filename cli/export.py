@@ -24,18 +24,7 @@ def export(
 ) -> None:
     """Export a trained torch checkpoint as a bundle that runs without torch."""
     from edge.runtime.bundle import write_bundle
-
-    try:
-        from export.exporter import export_bundle
-    except ModuleNotFoundError as error:
-        if error.name == "export":
-            hint = "is part of the repository, not of the robot's install"
-        elif error.name in ("torch", "onnx"):
-            hint = f"needs {error.name}: pip install 'lpac-edge[export]'"
-        else:
-            raise
-        typer.echo(f"lpac: export {hint}", err=True)
-        raise typer.Exit(1) from None
+    from export.exporter import export_bundle
 
     bundle = export_bundle(checkpoint, params, name)
     write_bundle(bundle, output)

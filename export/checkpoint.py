@@ -153,7 +153,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """
     source = _read_folder(path) if path.is_dir() else _read_state_dict(path)
     layers = max(_count(source, r"gnn_backbone\.graph_conv_(\d+)\..*"), 1)
-    taps = max(_count(source, r"gnn_backbone\.graph_conv_\d+\.lins\.(\d+)\..*"), 2)
+    taps = _count_taps(source)
     convolutions = max(_count(source, r"cnn_backbone\.conv(\d+)\..*"), 1) if source.has_cnn else 0
     mlp_layers = max(_count(source, r"gnn_mlp\.lins\.(\d+)\..*"), 1)
 
@@ -294,6 +294,15 @@ def _count(source: _Source, pattern: str) -> int:
     numbers = [int(match[1]) for match in matches if match and len(match[1]) < 9]
     # Numbers beyond the number of tensors leave a gap below it too.
     return min(max(numbers, default=-1) + 1, len(source.tensors))
+
+
+def _count_taps(source: _Source) -> int:
+    """K + 1 as most layers have it, the larger if two are as common, but at least 2."""
+    matches = (re.fullmatch(r"gnn_backbone\.(\w+)\.lins\..*", name) for name in source.tensors)
+    taps_of_layer = Counter(match[1] for match in matches if match)
+    layers_with = Counter(taps_of_layer.values())
+    usual = max(layers_with, key=lambda taps: (layers_with[taps], taps), default=0)
+    return max(usual, 2)
 
 
 _Layout = dict[str, tuple[str | int, ...]]

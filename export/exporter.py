@@ -16,7 +16,8 @@ from edge.runtime.bundle import (
     Provenance,
     make_bundle,
 )
-from export.checkpoint import read_checkpoint
+from edge.runtime.verify import TOLERANCE, verify
+from export.checkpoint import CheckpointError, read_checkpoint
 from export.golden import golden_vectors
 from export.graphs import OPSET, build_graphs
 from export.parameters import read_parameters
@@ -28,7 +29,8 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     `parameters` is our parameter file or a coverage_control_params.toml. `name` is the policy's
     name, by default the checkpoint's. A folder holds no CNN: its bundle is without perception.
 
-    Raises CheckpointError or ConfigError, one line each.
+    The bundle has passed `verify` on this machine. Raises CheckpointError or ConfigError, one line
+    each.
     """
     network = read_checkpoint(checkpoint)
     perception, training = read_parameters(parameters)
@@ -58,7 +60,14 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
         ),
         files=dict.fromkeys(files, ""),  # make_bundle puts the hashes in
     )
-    return make_bundle(manifest, files)
+    bundle = make_bundle(manifest, files)
+    for check in verify(bundle):
+        if not check.passed:
+            raise CheckpointError(
+                f"{checkpoint}: {check.name}: float32 rounding alone gives a relative error of "
+                f"{check.relative_error:.1e}, allowed is {TOLERANCE:g}"
+            )
+    return bundle
 
 
 def _version() -> str:

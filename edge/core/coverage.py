@@ -114,6 +114,7 @@ class _Block(NamedTuple):
 def _blocks(importance: F32, positions: F64) -> Iterator[_Block]:
     """Cuts the raster into blocks with few robots each, leaving out blocks without importance."""
     x, y = (np.arange(cells, dtype=np.float64) + 0.5 for cells in importance.shape)
+    # Of a crowd at one point only the first owns anything; the others would only be in the way.
     first_at_point = np.sort(np.unique(positions, axis=0, return_index=True)[1])
     todo = [(0, len(x), 0, len(y), first_at_point)]
     while todo:

@@ -98,14 +98,37 @@ def test_baselines_match_the_library_along_their_way(name, our_goals, features, 
         environment.SetGlobalRobotPositions(point_vector(positions))
 
 
-@pytest.mark.parametrize("shift", [0.0, 3.7])
-def test_empty_cells_of_a_regular_swarm_match_the_library(shift):
-    """The corners of four cells coincide, and must count once."""
-    grid = np.arange(3) * 160.0 + 60.0
-    positions = np.stack(np.meshgrid(grid, grid + shift, indexing="ij"), axis=-1).reshape(-1, 2)
+@pytest.mark.parametrize("factor", [1e-13, 1e-14])
+def test_a_cell_counts_as_empty_from_the_librarys_mass_on(factor):
+    positions = np.array([(60.0, 410.0), (400.0, 100.0)])
+    environment = reference_environment((SPARSE[0],), positions)
+    environment.GetWorldMapMutable()[:] *= np.float32(factor)
+    goals, _ = library_goals_and_actions("ClairvoyantCVT", environment, 2)
+    np.testing.assert_allclose(clairvoyant_goals(environment, positions), goals, atol=1e-9)
+
+
+def square_grid(spacing, angle=0.0):
+    """9 robots around the world's centre; the fifth is in the middle."""
+    steps = (np.arange(3) - 1.0) * spacing
+    grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return grid @ rotation.T + SIZE / 2
+
+
+@pytest.mark.parametrize("spacing", [110.3, 160.0])
+def test_empty_cells_of_a_grid_match_the_library(spacing):
+    positions = square_grid(spacing)
     goals, _ = library_goals_and_actions("ClairvoyantCVT", reference_environment((), positions), 9)
     empty = np.zeros((SIZE, SIZE), np.float32)
     np.testing.assert_allclose(voronoi_cells(empty, positions).centroid, goals, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.3, 0.7])
+def test_a_corner_that_four_cells_share_counts_once(angle):
+    """Also where rounding tears it apart; the library's goal then jumps."""
+    positions = square_grid(110.3, angle)
+    empty = np.zeros((SIZE, SIZE), np.float32)
+    np.testing.assert_allclose(voronoi_cells(empty, positions).centroid[4], positions[4])
 
 
 def brute_force(raster, positions):

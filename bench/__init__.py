@@ -1,0 +1,1 @@
+"""Measurements of this project against torch and against the baselines (`make bench`)."""

@@ -1,0 +1,116 @@
+"""What every bench hands back, and how it is shown and kept."""
+
+import json
+import os
+import platform
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+ROOT = Path(__file__).resolve().parents[1]
+BUNDLE = ROOT / "policies" / "lpac_l2_k3_n10_512"
+CHECKPOINT = BUNDLE.with_suffix(".pt")
+
+_PACKAGES = ("numpy", "onnxruntime", "torch", "torch-geometric")
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A figure that the project wants to reach."""
+
+    what: str
+    measured: float
+    limit: float
+    at_least: bool
+
+    @property
+    def met(self) -> bool:
+        """Whether it does."""
+        return self.measured >= self.limit if self.at_least else self.measured <= self.limit
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text under their columns."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """One bench's result: `figures` for the file, tables for people, and both in `targets`."""
+
+    name: str
+    figures: dict[str, Any]
+    tables: list[Table]
+    targets: list[Target]
+    notes: list[str] = field(default_factory=list)
+
+    def as_json(self) -> dict[str, Any]:
+        """What is kept of it."""
+        return {
+            "bench": self.name,
+            "machine": _machine(),
+            "figures": self.figures,
+            "targets": [asdict(target) | {"met": target.met} for target in self.targets],
+            "notes": self.notes,
+        }
+
+    def show(self, console: Console) -> None:
+        """Print the tables, and which targets are met."""
+        for table in self.tables:
+            _print_table(console, table)
+        if self.targets:
+            rows = [
+                (
+                    target.what,
+                    f"{target.measured:.3g}",
+                    f"{'at least' if target.at_least else 'at most'} {target.limit:.3g}",
+                    "met" if target.met else "MISSED",
+                )
+                for target in self.targets
+            ]
+            columns = ("target", "measured", "wanted", "")
+            _print_table(console, Table(f"{self.name}: targets", columns, rows))
+        for note in self.notes:
+            console.print(note, markup=False, highlight=False)
+
+    def write(self, folder: Path) -> None:
+        """Write `folder`/<name>.json."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{self.name}.json").write_text(json.dumps(self.as_json(), indent=2) + "\n")
+
+
+def progress(text: str) -> None:
+    """Tell a waiting person what goes on."""
+    Console(stderr=True).print(text, style="dim", markup=False, highlight=False)
+
+
+def _print_table(console: Console, table: Table) -> None:
+    rich = RichTable(title=table.title, title_justify="left", title_style="bold")
+    for i, column in enumerate(table.columns):
+        rich.add_column(column, justify="right" if i else "left", overflow="fold")
+    for row in table.rows:
+        rich.add_row(*row)
+    console.print(rich)
+
+
+def _machine() -> dict[str, Any]:
+    models = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
+    return {
+        "processor": models[0] if models else platform.machine(),
+        "cores": os.cpu_count(),
+        "load_average": os.getloadavg()[0],
+        "python": platform.python_version(),
+        "packages": {package: version(package) for package in _PACKAGES},
+    }

@@ -1,0 +1,21 @@
+"""Runs a graph with onnxruntime, and measures how far its outputs are from others."""
+
+import numpy as np
+import onnxruntime
+
+from edge.core import F32
+
+
+def run_graph(content: bytes, inputs: F32) -> F32:
+    """The graph's one output for its one input."""
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    (output,) = session.run(None, {session.get_inputs()[0].name: inputs})
+    return output
+
+
+def relative_error(output: F32, truth: F32) -> float:
+    """The largest error of a row by the row's largest value, or a tenth of the largest of all."""
+    errors, sizes = (
+        np.abs(values).reshape(len(truth), -1).max(axis=1) for values in (output - truth, truth)
+    )
+    return float((errors / np.maximum(sizes, sizes.max() / 10)).max())

@@ -1,0 +1,65 @@
+"""Random LPAC state dicts of any geometry, with batch norms that have seen data."""
+
+import math
+
+import numpy as np
+import torch
+
+State = dict[str, torch.Tensor]
+
+
+def random_state(
+    layers: int = 2,
+    hops: int = 1,
+    latent: int = 16,
+    channels: int = 4,
+    image_size: int = 16,
+    kernel: int = 3,
+    convolutions: int = 2,
+    cnn_latent: int = 8,
+    seed: int = 0,
+) -> State:
+    """The keys and shapes of CoverageControl's LPAC module."""
+    random = np.random.default_rng(seed)
+    state: State = {}
+
+    def put(name: str, values: np.ndarray) -> None:
+        state[name] = torch.from_numpy(np.asarray(values, np.float32))
+
+    def weight(name: str, *shape: int) -> None:
+        bound = 1 / math.sqrt(math.prod(shape[1:]))
+        put(name, random.uniform(-bound, bound, shape))
+
+    def bias(name: str, size: int) -> None:
+        put(name, random.uniform(-0.1, 0.1, size))
+
+    def norm(name: str, size: int) -> None:
+        put(f"{name}.weight", random.uniform(0.5, 1.5, size))
+        put(f"{name}.bias", random.uniform(-0.3, 0.3, size))
+        put(f"{name}.running_mean", random.uniform(-1, 1, size))
+        put(f"{name}.running_var", random.uniform(0.1, 4, size))
+        state[f"{name}.num_batches_tracked"] = torch.tensor(1)
+
+    put("actions_mean", random.uniform(-0.1, 0.1, 2))
+    put("actions_std", random.uniform(1, 3, 2))
+    for i in range(convolutions):
+        inputs = cnn_latent if i else channels
+        weight(f"cnn_backbone.conv{i}.weight", cnn_latent, inputs, kernel, kernel)
+        bias(f"cnn_backbone.conv{i}.bias", cnn_latent)
+        norm(f"cnn_backbone.batch_norm{i}", cnn_latent)
+    pixels = cnn_latent * (image_size - convolutions * (kernel - 1)) ** 2
+    weight("cnn_backbone.linear_1.weight", cnn_latent, pixels)
+    bias("cnn_backbone.linear_1.bias", cnn_latent)
+    for i in range(layers):
+        for k in range(hops + 1):
+            inputs = latent if i else cnn_latent + 2
+            weight(f"gnn_backbone.graph_conv_{i}.lins.{k}.weight", latent, inputs)
+        bias(f"gnn_backbone.graph_conv_{i}.bias", latent)
+    weight("gnn_mlp.lins.0.weight", 32, latent)
+    bias("gnn_mlp.lins.0.bias", 32)
+    norm("gnn_mlp.norms.0.module", 32)
+    weight("gnn_mlp.lins.1.weight", 32, 32)
+    bias("gnn_mlp.lins.1.bias", 32)
+    weight("output_linear.weight", 2, 32)
+    bias("output_linear.bias", 2)
+    return state

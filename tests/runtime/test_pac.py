@@ -1,0 +1,172 @@
+"""One robot's steps: what they do, and what they do when something is missing."""
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from edge.core import F32, F64
+from edge.core.aggregation import AggregatedMessage
+from edge.core.frames import ModelScale
+from edge.core.wire import Rejection, encode
+from edge.runtime.bundle import Bundle, BundleError
+from edge.runtime.pac import Pac, PacParameters, position_feature
+from edge.runtime.policy import Policy
+
+PARAMETERS = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=1.25)
+
+
+@dataclass
+class World:
+    """A sensor and a position that a test can change or take away."""
+
+    position: tuple[float, float, float] | None = (16.0, 16.0, 3.0)
+    seen: F32 | None = field(default_factory=lambda: np.full((64, 64), 0.5, np.float32))
+
+    def view(self, position: F64) -> F32 | None:
+        assert position.shape == (2,)
+        return self.seen
+
+    def position_m(self) -> tuple[float, float, float] | None:
+        return self.position
+
+
+def make_robot(
+    policy: Policy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
+) -> Pac:
+    return Pac(
+        robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, position=world,
+        parameters=parameters,
+    )  # fmt: skip
+
+
+def fill(policy: Policy, value: float) -> F32:
+    return np.full(policy.manifest.geometry.message_size, value, np.float32)
+
+
+def message(policy: Policy, robot_id: int = 2, value: float = 0.1, **changes: object) -> bytes:
+    fields = {
+        "robot_id": robot_id, "boot_epoch": 1, "sequence": 1, "sent_at_s": 0.0,
+        "position_m": (18.0, 16.0, 3.0), "payload": fill(policy, value), **changes,
+    }  # fmt: skip
+    return encode(AggregatedMessage(**fields), policy.bundle_id, "float32")  # type: ignore[arg-type]
+
+
+def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(shipped_policy: Policy) -> None:
+    slow = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=0.01)
+    world = World()
+    fast_robot = make_robot(shipped_policy, world)
+    slow_robot = make_robot(shipped_policy, world, parameters=slow)
+    for robot in (fast_robot, slow_robot):
+        robot.perceive(0.0)
+        assert robot.infer(0.0, 0.0) is not None
+    fast, slowed = fast_robot.control(0.1), slow_robot.control(0.1)
+    assert 0.01 < np.hypot(*fast) <= 1.25
+    assert np.hypot(*slowed) == pytest.approx(0.01)
+    np.testing.assert_allclose(slowed / 0.01, fast / np.hypot(*fast))
+
+
+def test_nothing_moves_before_the_first_inference(shipped_policy: Policy) -> None:
+    robot = make_robot(shipped_policy, World())
+    assert robot.infer(0.0, 0.0) is None
+    robot.perceive(0.0)
+    assert robot.control(0.0).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("missing", ["position", "seen"])
+def test_without_position_or_sensor_the_robot_stops(shipped_policy: Policy, missing: str) -> None:
+    world = World()
+    robot = make_robot(shipped_policy, world)
+    robot.perceive(0.0)
+    robot.infer(0.0, 0.0)
+    setattr(world, missing, None)
+    for tick in range(1, 10):
+        now_s = tick * 0.4
+        robot.perceive(now_s)
+        sent = robot.infer(now_s, now_s)
+        assert (sent is not None) == (missing == "seen" and now_s <= 1.0)
+    assert np.any(robot.control(1.0 if missing == "position" else 1.8) != 0.0)
+    assert robot.control(2.0).tolist() == [0.0, 0.0]
+
+
+def test_an_action_without_a_successor_grows_old(shipped_policy: Policy) -> None:
+    robot = make_robot(shipped_policy, World())
+    robot.perceive(0.0)
+    robot.infer(0.0, 0.0)
+    assert np.any(robot.control(1.0) != 0.0)
+    assert robot.control(1.001).tolist() == [0.0, 0.0]
+
+
+def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
+    shipped_policy: Policy,
+) -> None:
+    velocities = []
+    for heard in ([], [message(shipped_policy)], [message(shipped_policy, position_m=(40, 16, 3))]):
+        robot = make_robot(shipped_policy, World())
+        for data in heard:
+            assert robot.receive(data, 0.0, 0.0) is None
+        robot.perceive(0.0)
+        robot.infer(0.0, 0.0)
+        velocities.append(robot.control(0.0))
+    alone, beside_near, beside_far = velocities
+    assert not np.allclose(alone, beside_near)
+    np.testing.assert_array_equal(alone, beside_far)  # 24 m is beyond the range of 16 m
+
+    robot = make_robot(shipped_policy, World())
+    robot.receive(message(shipped_policy), 0.0, 0.0)
+    robot.perceive(0.8)
+    robot.infer(0.8, 0.8)
+    np.testing.assert_array_equal(robot.control(0.8), alone)
+
+
+def test_what_a_robot_must_not_hear_is_counted(shipped_policy: Policy) -> None:
+    robot = make_robot(shipped_policy, World())
+    good = message(shipped_policy)
+    other = encode(
+        AggregatedMessage(3, 1, 1, 0.0, (0.0, 0.0, 0.0), fill(shipped_policy, 0.0)),
+        bytes(32), "float32",
+    )  # fmt: skip
+    cases = {
+        Rejection.OWN: message(shipped_policy, robot_id=1),
+        Rejection.OTHER_BUNDLE: other,
+        Rejection.TRUNCATED: good[:-1],
+        Rejection.CHECKSUM: good[:-1] + bytes([good[-1] ^ 1]),
+        Rejection.NON_FINITE: message(shipped_policy, value=float("nan")),
+        Rejection.STALE: message(shipped_policy, sent_at_s=-1.0),
+    }
+    for reason, data in cases.items():
+        assert robot.receive(data, 0.0, 0.0) is reason
+        assert robot.mailbox.counts()[reason] == 1
+    assert robot.mailbox.counts()["accepted"] == 0
+
+
+def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: Policy) -> None:
+    robot = make_robot(shipped_policy, World())
+    robot.receive(message(shipped_policy, value=3e38), 0.0, 0.0)
+    robot.receive(message(shipped_policy, robot_id=3, value=3e38), 0.0, 0.0)
+    robot.receive(message(shipped_policy, robot_id=4, position_m=(1e300, -1e300, 0.0)), 0.0, 0.0)
+    robot.perceive(0.0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        assert robot.infer(0.0, 0.0) is None
+    assert robot.control(0.0).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("position", "feature"),
+    [((0.0, 512.0), (0.5, 1.5)), ((256.0, 128.0), (1.0, 0.75)), ((-90.0, 600.0), (0.5, 1.5))],
+)
+def test_position_features_are_those_of_training(
+    position: tuple[float, float], feature: tuple[float, float]
+) -> None:
+    assert tuple(position_feature(np.array(position), 512)) == feature
+
+
+def test_a_bundle_without_perception_drives_no_robot(shipped_bundle: Bundle) -> None:
+    blind = Policy(shipped_bundle)
+    blind.manifest = dataclasses.replace(
+        blind.manifest, images=None, perception=None,
+        files={n: h for n, h in blind.manifest.files.items() if n != "cnn.onnx"},
+    )  # fmt: skip
+    with pytest.raises(BundleError, match="has no perception"):
+        make_robot(blind, World())

@@ -1,0 +1,173 @@
+"""Simulated flights: repeatable, defined at the edges, and the policy covers."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from edge.core.frames import ModelScale
+from edge.core.world import GaussianFeature
+from edge.runtime.bundle import Bundle, BundleError
+from sim.experiment import Controller, Flight, Scenario, fly
+
+CONTROLLERS: tuple[Controller, ...] = (
+    "lpac", "decentralized-cvt", "centralized-cvt", "clairvoyant-cvt",
+)  # fmt: skip
+MAX_SPEED_M_S = 1.25
+
+
+def short(bundle: Bundle, **changes: object) -> Flight:
+    return fly(Scenario(**{"duration_s": 6.0, "robots": 4, **changes}), bundle)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_seed_gives_one_flight(shipped_bundle: Bundle, controller: Controller) -> None:
+    texts = [
+        json.dumps(short(shipped_bundle, controller=controller, seed=seed, loss=0.2).summary())
+        for seed in (7, 7, 8)
+    ]
+    assert texts[0] == texts[1] != texts[2]
+
+
+def test_controllers_and_losses_meet_the_same_world_and_starts(shipped_bundle: Bundle) -> None:
+    flights = [short(shipped_bundle, controller=controller) for controller in CONTROLLERS]
+    flights.append(short(shipped_bundle, loss=1.0))
+    for flight in flights[1:]:
+        np.testing.assert_array_equal(flight.importance, flights[0].importance)
+        np.testing.assert_array_equal(flight.positions_m[0], flights[0].positions_m[0])
+        assert flight.cost[0] == flights[0].cost[0]
+
+
+def test_the_policy_covers_better_than_what_knows_as_much(shipped_bundle: Bundle) -> None:
+    """A coarse guard; the bench holds it against the baselines over many worlds."""
+    ratios = [
+        fly(Scenario(seed=seed, duration_s=30.0), shipped_bundle).normalized_cost[-1]
+        / fly(
+            Scenario(seed=seed, duration_s=30.0, controller="decentralized-cvt"), shipped_bundle
+        ).normalized_cost[-1]
+        for seed in range(3)
+    ]
+    assert np.median(ratios) < 0.8
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("robots", [1, 2])
+def test_one_robot_and_two_at_one_point(
+    shipped_bundle: Bundle, controller: Controller, robots: int
+) -> None:
+    starts_m = ((12.0, 20.0),) * robots
+    flight = short(shipped_bundle, controller=controller, robots=robots, starts_m=starts_m)
+    assert np.isfinite(flight.positions_m).all()
+    assert np.any(flight.positions_m[-1] != flight.positions_m[0])
+    if controller != "decentralized-cvt" and robots == 2:  # there each takes itself for the owner
+        assert np.any(flight.positions_m[-1, 0] != flight.positions_m[-1, 1])
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_robots_on_the_border_and_outside_come_no_further_out(
+    shipped_bundle: Bundle, controller: Controller
+) -> None:
+    starts_m = ((0.0, 0.0), (32.0, 16.0), (-3.0, 16.0), (40.0, 40.0))
+    flight = short(shipped_bundle, controller=controller, starts_m=starts_m)
+    lowest = np.minimum(starts_m, 0.0)
+    highest = np.maximum(starts_m, 32.0)
+    assert np.all((flight.positions_m >= lowest) & (flight.positions_m <= highest))
+    assert np.isfinite(flight.cost).all()
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_world_without_features_costs_nothing(
+    shipped_bundle: Bundle, controller: Controller
+) -> None:
+    flight = short(shipped_bundle, controller=controller, features=())
+    assert not flight.importance.any()
+    assert not flight.cost.any()
+    assert not flight.normalized_cost.any()
+    assert np.isfinite(flight.positions_m).all()
+
+
+@pytest.mark.parametrize(
+    ("scale", "max_speed_m_s"), [(ModelScale(16.0, 0.25), 1.25), (ModelScale(1.0, 1.0), 5.0)]
+)
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_no_robot_is_faster_than_allowed(
+    shipped_bundle: Bundle, controller: Controller, scale: ModelScale, max_speed_m_s: float
+) -> None:
+    flight = short(shipped_bundle, controller=controller, scale=scale)
+    steps_m = np.linalg.norm(np.diff(flight.positions_m, axis=0), axis=2)
+    limits_m = max_speed_m_s * np.diff(flight.time_s)
+    assert np.all(steps_m <= limits_m[:, None] + 1e-9)
+    assert steps_m.max() > 0.5 * limits_m.max()
+
+
+def test_messages_are_lost_delayed_and_out_of_range_as_asked(shipped_bundle: Bundle) -> None:
+    together = ((16.0, 16.0), (17.0, 16.0), (16.0, 17.0))
+    heard = short(shipped_bundle, robots=3, starts_m=together).messages
+    assert heard["accepted"] == 2 * heard["sent"] and heard["lost"] == 0
+
+    lossy = short(shipped_bundle, robots=3, starts_m=together, loss=0.3, duration_s=60.0).messages
+    share = lossy["lost"] / (lossy["lost"] + lossy["accepted"])
+    assert share == pytest.approx(0.3, abs=0.1)
+
+    late = short(shipped_bundle, robots=3, starts_m=together, delay_s=2.0).messages
+    assert late["accepted"] == 0 and late["stale"] > 0
+
+    apart = ((1.0, 1.0), (31.0, 31.0))
+    deaf = short(shipped_bundle, robots=2, starts_m=apart, duration_s=2.0).messages
+    assert deaf["sent"] > 0 and deaf["accepted"] == 0
+
+
+def test_the_papers_mailbox_rule_flies_too(shipped_bundle: Bundle) -> None:
+    flight = short(shipped_bundle, max_message_age_s=0.0, delay_s=0.1)
+    assert flight.messages["accepted"] > 0 and flight.messages["stale"] == 0
+
+
+def test_what_the_swarm_does_depends_on_its_messages(shipped_bundle: Bundle) -> None:
+    heard, deaf = (short(shipped_bundle, loss=loss) for loss in (0.0, 1.0))
+    assert deaf.messages["accepted"] == 0
+    assert np.any(heard.positions_m[-1] != deaf.positions_m[-1])
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"robots": 0}, "robots = 0: must be at least 1"),
+        ({"duration_s": -1.0}, "duration = -1.0: must be positive"),
+        ({"random_feature_count": -1}, "features = -1"),
+        ({"loss": 1.5}, "loss = 1.5: must be from 0 to 1"),
+        ({"delay_s": -0.1}, "delay_s = -0.1"),
+        ({"max_message_age_s": float("nan")}, "max_message_age_s = nan"),
+        ({"starts_m": ((0.0, 0.0),)}, "starts_m: 1 positions for 4 robots"),
+    ],
+)
+def test_impossible_scenarios_are_named(
+    shipped_bundle: Bundle, change: dict[str, object], text: str
+) -> None:
+    with pytest.raises(ValueError, match=text):
+        short(shipped_bundle, **change)
+
+
+@pytest.mark.parametrize("place", [(300.0, 180.0), (180.0, 300.0), (340.0, 256.0)])
+def test_robots_go_to_the_important_side(
+    shipped_bundle: Bundle, place: tuple[float, float]
+) -> None:
+    """One important place, whose edge the robots can see from the middle of the world."""
+    feature = GaussianFeature(mean=place, sigma=(40.0, 40.0))
+    starts_m = ((15.5, 15.5), (16.5, 16.5), (15.5, 16.5))
+    flight = short(shipped_bundle, robots=3, starts_m=starts_m, features=(feature,))
+    others = np.array([place[::-1], 512.0 - np.array(place)])
+    to_place, *to_others = np.linalg.norm(
+        flight.positions_m[-1] - np.array([place, *others])[:, None] / 16.0, axis=2
+    ).mean(axis=1)
+    assert to_place < min(to_others)
+
+
+def test_a_bundle_without_perception_cannot_fly(shipped_bundle: Bundle) -> None:
+    manifest = dataclasses.replace(
+        shipped_bundle.manifest, images=None, perception=None,
+        files={n: h for n, h in shipped_bundle.manifest.files.items() if n != "cnn.onnx"},
+    )  # fmt: skip
+    blind = dataclasses.replace(shipped_bundle, manifest=manifest)
+    with pytest.raises(BundleError, match="has no perception"):
+        short(blind)
