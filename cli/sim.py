@@ -127,7 +127,8 @@ def _fly(scenarios: list[tuple[str, "Scenario"]], bundle_path: Path) -> list["Fl
 
     bundle = load_bundle(bundle_path)
     flights = []
-    with Progress(console=Console(stderr=True)) as progress:
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
         for name, scenario in scenarios:
             task = progress.add_task(name, total=scenario.duration_s)
             flights.append(fly(scenario, bundle, partial(_show, progress, task)))

@@ -34,7 +34,7 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     """
     network = read_checkpoint(checkpoint)
     perception, training = read_parameters(parameters)
-    files = {**build_graphs(network), GOLDEN: golden_vectors(network)}
+    files = {GOLDEN: golden_vectors(network), **build_graphs(network)}
     images = None
     if network.cnn:
         images = Images(

@@ -99,8 +99,8 @@ def _images(cnn: Cnn) -> F32:
     blank = np.zeros((1, *shape))
     alone = np.zeros((cnn.channels, *shape))
     for channel in range(cnn.channels):
-        alone[channel, channel] = random.uniform(-0.5, 0.5, shape[1:])
-    dense = random.uniform(-0.5, 0.5, (2, *shape))
+        alone[channel, channel] = random.uniform(-0.05, 0.05, shape[1:])
+    dense = random.uniform(-0.05, 0.05, (2, *shape))
     flight = _flight_images(cnn, 4, random)
     return np.concatenate([blank, alone, dense, flight]).astype(np.float32)
 
@@ -119,7 +119,7 @@ def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
             "importance": np.clip(importance, 0, 1) * seen,
             "obstacles": np.maximum(x > random.uniform(0.6, 1), y < random.uniform(0, 0.4)),
         }
-        offsets = random.uniform(-0.9, 0.9, (random.integers(1, 6), 2))
+        offsets = random.uniform(-0.05, 0.05, (random.integers(1, 6), 2))
         maps["neighbours_x"], maps["neighbours_y"] = neighbour_maps(offsets, 1.0, size)
         image[:] = [maps[channel] for channel in MAP_CHANNELS[cnn.channels]]
     return images

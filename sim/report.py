@@ -71,16 +71,16 @@ def write_demo(flights: Mapping[str, Flight], folder: Path) -> None:
 def _figure(shown: Flight, flights: Mapping[str, Flight]) -> Figure:
     """Snapshots of one flight above the cost curves of all."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(7.16, 4.3), layout="constrained")
-        grid = figure.add_gridspec(2, len(SNAPSHOTS), height_ratios=(1.0, 1.15))
-        for column, share in enumerate(SNAPSHOTS):
-            axes = figure.add_subplot(grid[0, column])
+        figure = Figure(figsize=(7.16, 4.2), layout="constrained")
+        above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.95))
+        for column, share in enumerate(SNAPSHOTS, 1):
+            axes = above.add_subplot(1, len(SNAPSHOTS), column)
             _draw_snapshot(axes, shown, share * shown.scenario.duration_s)
-            if column:
-                axes.set_yticklabels([])
-            else:
+            if column == 1:
                 axes.set_ylabel("y (m)")
-        _draw_costs(figure.add_subplot(grid[1, :]), flights)
+            else:
+                axes.set_yticklabels([])
+        _draw_costs(below.add_subplot(), flights)
         return figure
 
 
@@ -110,7 +110,7 @@ def _draw_snapshot(axes: Axes, flight: Flight, time_s: float) -> None:
     )  # fmt: skip
     axes.set(
         title=f"$t$ = {time_s:g} s", xlabel="x (m)", xlim=(0.0, size_m), ylim=(0.0, size_m),
-        xticks=np.linspace(0.0, size_m, 5), yticks=np.linspace(0.0, size_m, 5), aspect="equal",
+        xticks=np.linspace(0.0, size_m, 3), yticks=np.linspace(0.0, size_m, 3), aspect="equal",
     )  # fmt: skip
 
 
@@ -131,7 +131,7 @@ def _draw_costs(axes: Axes, flights: Mapping[str, Flight]) -> None:
         cost = flight.normalized_cost
         axes.plot(
             flight.cost_time_s, cost, color=color, linestyle=style, linewidth=width,
-            label=f"{name} ({cost[-1]:.2f})",
+            label=f"{cost[-1]:.2f}  {name}",
         )  # fmt: skip
     end_s = max(flight.cost_time_s[-1] for flight in flights.values())
     axes.set(
@@ -142,7 +142,10 @@ def _draw_costs(axes: Axes, flights: Mapping[str, Flight]) -> None:
     )
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", color="#d9d9d9", linewidth=0.4)
-    axes.legend(loc="upper right", ncols=2, frameon=False, title="after the last second")
+    axes.legend(
+        loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False,
+        title=f"$J$({end_s:g} s) / $J$(0)", alignment="left", handlelength=2.8,
+    )  # fmt: skip
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -1,0 +1,143 @@
+"""The `lpac` command as a user types it."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT, SHIPPED
+
+
+def lpac(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "cli.main", *map(str, arguments)],
+        cwd=cwd, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"},
+    )  # fmt: skip
+
+
+def error_line(result: subprocess.CompletedProcess[str]) -> str:
+    """The one line that a failed command leaves."""
+    assert result.returncode != 0
+    (line,) = result.stderr.strip().splitlines()
+    assert line.startswith("lpac: ")
+    return line
+
+
+def test_help_names_the_commands() -> None:
+    result = lpac("--help")
+    assert result.returncode == 0
+    for command in ("export", "bundle", "sim", "demo"):
+        assert command in result.stdout
+
+
+def test_bundle_info_for_people_and_for_scripts() -> None:
+    text = lpac("bundle", "info", SHIPPED)
+    assert text.returncode == 0
+    assert "L = 2 layers (34 -> 256 -> 256), K = 3 hops" in text.stdout
+    assert "870 values: 3,480 B in float32" in text.stdout
+    manifest = json.loads(lpac("bundle", "info", SHIPPED, "--json").stdout)
+    assert manifest["geometry"] == {"hops": 3, "feature_sizes": [34, 256, 256]}
+    assert manifest["id"] == (SHIPPED / "bundle.id").read_text().strip()
+
+
+def test_bundle_verify_reports_the_error_of_each_graph() -> None:
+    result = lpac("bundle", "verify", SHIPPED, "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert set(report["errors"]) == {
+        "cnn.onnx", "gnn_1.onnx", "gnn_2.onnx", "action.onnx", "swarm",
+    }  # fmt: skip
+    assert max(report["errors"].values()) <= report["tolerance"] and report["failed"] == []
+    assert "computes what torch computed" in lpac("bundle", "verify", SHIPPED).stdout
+
+
+def test_bundle_verify_after_one_flipped_byte(tmp_path: Path) -> None:
+    copy = tmp_path / "bundle"
+    shutil.copytree(SHIPPED, copy)
+    content = bytearray((copy / "gnn_2.onnx").read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    (copy / "gnn_2.onnx").write_bytes(content)
+    line = error_line(lpac("bundle", "verify", copy))
+    assert line.endswith("gnn_2.onnx does not have the hash that manifest.json states")
+
+
+def test_sim_json_is_the_same_twice() -> None:
+    runs = [lpac("sim", "--seed", 7, "--duration", 5, "--json") for _ in range(2)]
+    assert runs[0].returncode == 0, runs[0].stderr
+    assert runs[0].stdout == runs[1].stdout
+    result = json.loads(runs[0].stdout)
+    assert result["seed"] == 7 and result["robots"] == 10
+    assert 0.0 < result["cost"]["final_normalized"] < 1.0
+
+
+def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
+    world = tmp_path / "world.env"
+    world.write_text("CircularBND 300 200 40 6\nUniform 3 0.001\n10 10\n100 10\n10 90\n")
+    out = tmp_path / "flight"
+    result = lpac(
+        "sim", "--world", world, "--duration", 2, "--robots", 3, "--loss", 0.1, "--delay", 0.1,
+        "--out", out,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert "of the initial cost" in result.stdout
+    assert {path.name for path in out.iterdir()} == {
+        "flight.json", "flight.npz", "flight.png", "flight.pdf",
+    }  # fmt: skip
+    assert json.loads((out / "flight.json").read_text())["robots"] == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["sim", "--robots", "0"], "robots = 0: must be at least 1"),
+        (["sim", "--loss", "2"], "loss = 2.0: must be from 0 to 1"),
+        (["sim", "--world", "absent.env"], "absent.env"),
+        (["sim", "--bundle", "absent"], "absent: No such file or directory"),
+        (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),
+        (["bundle", "info", "docs"], "manifest.json is missing"),
+        (["export", "absent.pt", "--params", f"{SHIPPED}.toml", "-o", "x"], "absent.pt"),
+        (["export", "README.md", "--params", f"{SHIPPED}.toml", "-o", "x"], "README.md"),
+        (["export", f"{SHIPPED}.pt", "--params", "absent.toml", "-o", "x"], "absent.toml"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
+    assert text in error_line(lpac(*arguments))
+
+
+def test_a_bad_world_file_is_named(tmp_path: Path) -> None:
+    world = tmp_path / "world.env"
+    world.write_text("CircularBND 300 200 forty 6\n")
+    assert "forty" in error_line(lpac("sim", "--world", world))
+
+
+def test_export_then_verify(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="export needs torch")
+    for output in ("bundle", "bundle.zip"):
+        result = lpac(
+            "export", f"{SHIPPED}.pt", "--params", f"{SHIPPED}.toml", "-o", tmp_path / output
+        )
+        assert result.returncode == 0, result.stderr
+        assert lpac("bundle", "verify", tmp_path / output).returncode == 0
+
+
+def test_verify_imports_no_torch() -> None:
+    result = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "cli.main", "bundle", "verify", str(SHIPPED)],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "onnxruntime" in result.stderr and "torch" not in result.stderr
+
+
+def test_nothing_is_written_into_the_home_folder(tmp_path: Path) -> None:
+    """onnxruntime would leave a telemetry database there."""
+    subprocess.run(
+        [sys.executable, "-m", "cli.main", "bundle", "verify", str(SHIPPED)],
+        cwd=ROOT, check=True, capture_output=True,
+        env={**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)},
+    )  # fmt: skip
+    assert list(tmp_path.iterdir()) == []
