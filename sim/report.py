@@ -72,7 +72,9 @@ def _figure(shown: Flight, flights: Mapping[str, Flight]) -> Figure:
     """Snapshots of one flight above the cost curves of all."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(7.16, 4.2), layout="constrained")
-        above, below = figure.subfigures(2, 1, height_ratios=(1.0, 0.95))
+        rows = figure.add_gridspec(2, 1, height_ratios=(1.0, 0.95))
+        above = figure.add_subfigure(rows[0])
+        below = figure.add_subfigure(rows[1])
         for column, share in enumerate(SNAPSHOTS, 1):
             axes = above.add_subplot(1, len(SNAPSHOTS), column)
             _draw_snapshot(axes, shown, share * shown.scenario.duration_s)

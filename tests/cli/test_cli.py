@@ -99,7 +99,7 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--world", "absent.env"], "absent.env"),
         (["sim", "--bundle", "absent"], "absent: No such file or directory"),
         (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),
-        (["bundle", "info", "docs"], "manifest.json is missing"),
+        (["bundle", "info", "tests"], "manifest.json is missing"),
         (["export", "absent.pt", "--params", f"{SHIPPED}.toml", "-o", "x"], "absent.pt"),
         (["export", "README.md", "--params", f"{SHIPPED}.toml", "-o", "x"], "README.md"),
         (["export", f"{SHIPPED}.pt", "--params", "absent.toml", "-o", "x"], "absent.toml"),

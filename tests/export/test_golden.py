@@ -61,7 +61,7 @@ def test_every_tensor_of_a_graph_shows(kind: str, tmp_path: Path) -> None:
         for tensor, altered in scaled_weights(content, checkpoint.geometry.hops + 1):
             # The authors' mean velocity: half a millimetre per second in five metres per second.
             if (kind, name, tensor) != ("authors", "action.onnx", "bias_1 0"):
-                assert relative_error(run_graph(altered, inputs), truth) > 2 * TOLERANCE, tensor
+                assert relative_error(run_graph(altered, inputs), truth) > 1.5 * TOLERANCE, tensor
 
 
 def test_every_tensor_of_the_shipped_checkpoint_shows(tmp_path: Path) -> None:
@@ -72,7 +72,8 @@ def test_every_tensor_of_the_shipped_checkpoint_shows(tmp_path: Path) -> None:
             torch.save({**state, name: tensor * 1.01}, tmp_path / "altered.pt")
             graphs = build_graphs(read_checkpoint(tmp_path / "altered.pt"))
             caught = [
-                relative_error(run_graph(content, golden[f"{graph}/input"]), truth) > 2 * TOLERANCE
+                relative_error(run_graph(content, golden[f"{graph}/input"]), truth)
+                > 1.5 * TOLERANCE
                 for graph, content in graphs.items()
                 for truth in [golden[f"{graph}/output"]]
                 if graph != CNN or name.startswith("cnn_backbone.")
@@ -88,7 +89,7 @@ def test_a_tap_that_is_very_small_shows(tmp_path: Path) -> None:
     golden = golden_of(checkpoint)
     for tensor, altered in scaled_weights(build_graphs(checkpoint)["gnn_2.onnx"], 4):
         output = run_graph(altered, golden["gnn_2.onnx/input"])
-        assert relative_error(output, golden["gnn_2.onnx/output"]) > 2 * TOLERANCE, tensor
+        assert relative_error(output, golden["gnn_2.onnx/output"]) > 1.5 * TOLERANCE, tensor
 
 
 @pytest.mark.parametrize("bias", [0.0, -0.1, 1e-30])
