@@ -1,1 +1,7 @@
 """Measurements of this project against torch and against the baselines (`make bench`)."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+BUNDLE = ROOT / "policies" / "lpac_l2_k3_n10_512"
+CHECKPOINT = BUNDLE.with_suffix(".pt")

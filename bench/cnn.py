@@ -29,9 +29,7 @@ def measure(bundle: Bundle, images: F32, rounds: int, round_s: float) -> dict[st
     policy = Policy(bundle)
     flops = _flops(bundle.files[CNN])
     gemm_flop = 2 * _GEMM_SIZE**3
-    times = interleaved(
-        {"CNN": lambda: policy.image_features(images), **_gemms()}, rounds, round_s
-    )
+    times = interleaved({"CNN": lambda: policy.image_features(images), **_gemms()}, rounds, round_s)
     cnn_gflops = sum(flops) / times.pop("CNN") / 1e9
     gemm_gflops = {name: gemm_flop / t / 1e9 for name, t in times.items()}
     peak = max(gemm_gflops, key=lambda name: float(np.median(gemm_gflops[name])))

@@ -1,24 +1,23 @@
-"""A robot's policy process, ours or torch's: prints a line after the first tick, one after twenty.
-
-`python -m bench.first_tick edge|torch`; each imports only what that robot would.
-"""
+"""What a robot's policy process tells `footprint` about itself, ours and torch's alike."""
 
 import json
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
-from bench.report import BUNDLE, CHECKPOINT
+from bench.memory import memory_mb
 
+TICKED = "ticked\n"
 TICKS = 20
-_NEIGHBOURS = 10
+
+# Mission frame, m; the neighbours are all in range.
+POSITION_M = (16.0, 16.0, 0.0)
+NEIGHBOURS_M = tuple((10.0 + i, 12.0, 0.0) for i in range(10))
+ENV_SCALE = 16.0
 
 
-def main() -> None:
-    """Tick, and say so."""
-    tick = {"edge": _edge, "torch": _torch}[sys.argv[1]]()
+def run(tick: Callable[[], object]) -> None:
+    """Print TICKED after the first tick, and the memory, as JSON, after TICKS."""
     tick()
-    print("ticked", flush=True)
+    print(TICKED, end="", flush=True)
     for _ in range(TICKS - 1):
         tick()
     print(json.dumps(memory_mb()), flush=True)

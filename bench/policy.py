@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bench import cnn
+from bench import BUNDLE, CHECKPOINT, cnn
 from bench.moment import NEIGHBOURS, Moment, moment_in_flight
-from bench.report import BUNDLE, CHECKPOINT, Report, Table, Target, progress
+from bench.report import Report, Table, Target, progress
 from bench.timing import interleaved, quartiles, with_quartiles
 from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_inputs, load_network
-from edge.core import F32, F64
+from edge.core import F32
 from edge.core.aggregation import HopBuffer
 from edge.core.wire import decode, encode
 from edge.runtime.bundle import ACTION, gnn_graph, load_bundle
@@ -202,7 +202,8 @@ def _torch_exchanges(
 
 def _frozen(module: nn.Module, inputs: tuple[Tensor, ...]) -> Callable[..., Any]:
     with torch.inference_mode():
-        frozen: Callable[..., Any] = torch.jit.freeze(torch.jit.trace(module, inputs))
+        traced = torch.jit.trace(module, inputs)  # type: ignore[no-untyped-call]
+        frozen: Callable[..., Any] = torch.jit.freeze(traced)
     return frozen
 
 

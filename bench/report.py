@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -10,10 +11,6 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table as RichTable
-
-ROOT = Path(__file__).resolve().parents[1]
-BUNDLE = ROOT / "policies" / "lpac_l2_k3_n10_512"
-CHECKPOINT = BUNDLE.with_suffix(".pt")
 
 _PACKAGES = ("numpy", "onnxruntime", "torch", "torch-geometric")
 
@@ -39,7 +36,7 @@ class Table:
 
     title: str
     columns: tuple[str, ...]
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from time import perf_counter
 
 import numpy as np
-import numpy.typing as npt
 
 from edge.core import F64
 
@@ -34,7 +33,7 @@ def interleaved(
     return times
 
 
-def quartiles(values: npt.ArrayLike) -> dict[str, float]:
+def quartiles(values: F64 | list[float]) -> dict[str, float]:
     """The median, and the quartiles around it."""
     q1, median, q3 = np.percentile(values, (25, 50, 75))
     return {"median": float(median), "q1": float(q1), "q3": float(q3)}

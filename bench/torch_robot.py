@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch_geometric.nn import MLP, TAGConv
+from torch_geometric.nn import MLP, TAGConv  # type: ignore[import-untyped]
 
 from edge.core import F32, F64
 from edge.core.perception import (
@@ -29,7 +29,7 @@ _LEAKY_RELU_SLOPE = 0.01
 Layer = Callable[[int, int, int], nn.Module]
 
 
-class PygLayer(TAGConv):
+class PygLayer(TAGConv):  # type: ignore[misc]
     """torch_geometric's TAGConv on a star: the neighbours' messages flow to the robot."""
 
     def __init__(self, inputs: int, outputs: int, hops: int) -> None:
@@ -120,11 +120,12 @@ class Network(nn.Module):
     def exchange(self, features: Tensor, payloads: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
         """The graph neural network: x_L (1, F_L) from x_0 (1, F_0), and the own payload."""
         sizes = [hops * inputs for hops, inputs in self.held_shapes]
+        parts = torch.split(payloads, sizes, 1)
         own = []
         for layer, held, shape in zip(
-            self.gnn_backbone.values(), payloads.split(sizes, 1), self.held_shapes, strict=True
+            self.gnn_backbone.values(), parts, self.held_shapes, strict=True
         ):
-            features, hops = layer(features, held.unflatten(1, shape), scale)
+            features, hops = layer(features, held.reshape(-1, *shape), scale)
             own.append(hops.flatten())
         return features, torch.cat(own) * scale
 

@@ -4,7 +4,6 @@ Nothing is folded here, and nothing is shared with the ONNX graphs. Everything i
 inputs' precision.
 """
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -88,7 +87,7 @@ def decentralised(checkpoint: Checkpoint, shift: Tensor, features: Tensor) -> Te
 
 
 def _like(values: Tensor, array: F32) -> Tensor:
-    return torch.from_numpy(np.asarray(array)).to(values.dtype)
+    return torch.from_numpy(array).to(values.dtype)
 
 
 def _linear(linear: Linear, values: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ Perception-Action-Communication Loops". The robot calls these steps from threads
 simulated time; both run this code.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -103,7 +104,7 @@ class Pac:
 
     def perceive(self, now_s: float) -> None:
         """Sensor view -> robot map -> images -> features x_i (32 of the CNN, 2 of the position)."""
-        position_m = self._position.position_m()
+        position_m = self._position_m()
         if position_m is None:
             return
         (own,) = self._to_model([position_m])
@@ -125,7 +126,7 @@ class Pac:
         None when there is nothing to send: no fresh features, no position, or a result that is
         not finite. Then the action is left to grow old, and `control` stops the robot.
         """
-        features, position_m = self._features, self._position.position_m()
+        features, position_m = self._features, self._position_m()
         if features is None or position_m is None or self._is_old(features, now_s):
             return None
         messages = self._messages_in_range(position_m, now_s)
@@ -155,6 +156,10 @@ class Pac:
             action.value.astype(np.float64)
         )
         return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+
+    def _position_m(self) -> Position | None:
+        position_m = self._position.position_m()
+        return position_m if position_m and all(map(math.isfinite, position_m)) else None
 
     def _messages_in_range(self, position_m: Position, now_s: float) -> list[AggregatedMessage]:
         messages = self.mailbox.swap(now_s)

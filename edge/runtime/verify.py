@@ -12,7 +12,7 @@ from edge.core.aggregation import HopBuffer
 from edge.runtime.bundle import GOLDEN, Bundle, BundleError
 from edge.runtime.policy import Policy
 
-# Of the largest golden output of a graph. Float32 rounding stays a factor of ten below it.
+# Float32 rounding stays a factor of six below it, on x86-64 and on AArch64.
 TOLERANCE = 1e-5
 SWARM = "swarm"
 
@@ -78,5 +78,13 @@ def swarm_velocities(
 
 
 def _relative_error(output: F32, golden: F32) -> float:
-    """The largest error, relative to the largest golden value: rows are of one magnitude."""
-    return float(np.abs(output.astype(np.float64) - golden).max() / np.abs(golden).max())
+    """The largest error of a row by the row's largest value, or by a third of the largest of all.
+
+    By row, so that a weight that shows in a few rows only is seen; not by less than that third,
+    since a velocity whose parts cancel is rounding alone.
+    """
+    errors, sizes = (
+        np.abs(values).reshape(len(golden), -1).max(axis=1)
+        for values in (output.astype(np.float64) - golden, golden)
+    )
+    return float((errors / np.maximum(sizes, sizes.max() / 3.0)).max())

@@ -99,12 +99,11 @@ def scaled(graph: bytes, tensor: str, part: slice) -> bytes:
 
 
 def weights(bundle: Bundle) -> list[tuple[str, str, slice]]:
-    """Graph, tensor and rows: every matrix and kernel of every graph, the taps one by one."""
+    """Graph, tensor and rows: every weight and bias of every graph, the taps one by one."""
     found = []
     for name in GRAPHS:
         for weight in onnx.load_from_string(bundle.files[name]).graph.initializer:
-            if weight.data_type != onnx.TensorProto.FLOAT or len(weight.dims) < 2:
-                continue
+            assert weight.data_type == onnx.TensorProto.FLOAT
             if weight.name == "taps":
                 taps = bundle.manifest.geometry.hops + 1
                 rows = weight.dims[0] // taps
@@ -118,7 +117,7 @@ def test_a_weight_scaled_by_a_hundredth_with_mended_hashes_is_found_and_named(
     shipped_bundle: Bundle,
 ) -> None:
     altered = weights(shipped_bundle)
-    assert {graph for graph, _, _ in altered} == set(GRAPHS) and len(altered) == 4 + 2 * 4 + 2
+    assert {graph for graph, _, _ in altered} == set(GRAPHS) and len(altered) == 8 + 2 * 5 + 4
     for graph, tensor, part in altered:
         content = scaled(shipped_bundle.files[graph], tensor, part)
         files = with_files(shipped_bundle, **{graph: content})

@@ -90,6 +90,12 @@ def test_without_position_or_sensor_the_robot_stops(shipped_policy: Policy, miss
     assert robot.control(2.0).tolist() == [0.0, 0.0]
 
 
+def test_a_position_that_is_not_a_number_is_none(shipped_policy: Policy) -> None:
+    robot = make_robot(shipped_policy, World(position=(16.0, float("nan"), 3.0)))
+    robot.perceive(0.0)
+    assert robot.infer(0.0, 0.0) is None
+
+
 def test_an_action_without_a_successor_grows_old(shipped_policy: Policy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.perceive(0.0)

@@ -1,0 +1,50 @@
+"""`python -m bench.first_tick_edge`: a robot's policy process."""
+
+import numpy as np
+
+from bench import BUNDLE
+from bench.first_tick import ENV_SCALE, NEIGHBOURS_M, POSITION_M, run
+from edge.adapters.idf_sensor import IdfSensor
+from edge.core.aggregation import AggregatedMessage
+from edge.core.frames import ModelScale
+from edge.core.wire import encode
+from edge.runtime.bundle import load_bundle
+from edge.runtime.pac import Pac, PacParameters
+from edge.runtime.policy import Policy
+
+
+class _Standing:
+    """A robot that does not move."""
+
+    def position_m(self) -> tuple[float, float, float]:
+        return POSITION_M
+
+
+def main() -> None:
+    """Load the bundle, hear ten neighbours, tick."""
+    policy = Policy(load_bundle(BUNDLE))
+    perception = policy.manifest.perception
+    assert perception
+    importance = np.ones((perception.world_size,) * 2, np.float32)
+    robot = Pac(
+        robot_id=0,
+        boot_epoch=1,
+        policy=policy,
+        sensor=IdfSensor(importance, perception.sensor_size),
+        position=_Standing(),
+        parameters=PacParameters(scale=ModelScale(ENV_SCALE, 0.25), max_speed_m_s=1.25),
+    )
+    payload = np.zeros(policy.manifest.geometry.message_size, np.float32)
+    for number, position_m in enumerate(NEIGHBOURS_M, 1):
+        message = AggregatedMessage(number, 1, 1, 0.0, position_m, payload)
+        robot.receive(encode(message, policy.bundle_id, "float16"), now_s=0.0, unix_now_s=0.0)
+
+    def tick() -> None:
+        robot.perceive(now_s=0.0)
+        assert robot.infer(now_s=0.0, unix_now_s=0.0)
+
+    run(tick)
+
+
+if __name__ == "__main__":
+    main()

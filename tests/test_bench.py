@@ -1,0 +1,59 @@
+"""Every bench runs, at its smallest size; how fast anything is plays no part."""
+
+import json
+
+import pytest
+from rich.console import Console
+
+pytest.importorskip("torch_geometric", reason="the benches compare with it")
+
+from bench import closed_loop, footprint, policy, scaling
+from bench.report import Report
+
+
+def kept(report: Report, folder) -> dict:
+    """The report as a reader of its file finds it, after it was shown."""
+    report.show(Console(quiet=True))
+    report.write(folder)
+    return json.loads((folder / f"{report.name}.json").read_text())
+
+
+def check_frame(result: dict, name: str, targets: int) -> None:
+    assert result["bench"] == name
+    assert result["machine"]["packages"]["onnxruntime"]
+    assert len(result["targets"]) == targets
+    assert all(isinstance(target["met"], bool) for target in result["targets"])
+
+
+def test_policy(tmp_path):
+    result = kept(policy.measure(rounds=2, round_s=0.001), tmp_path)
+    check_frame(result, "policy", targets=4)
+    variants = {policy.EDGE, policy.TRACED, policy.EAGER}
+    for name in ("tick", "gnn"):
+        figures = result["figures"][name]
+        assert figures["largest_difference"] <= policy.TOLERANCE
+        assert set(figures["slower_than_edge"]) == variants
+        assert figures["slower_than_edge"][policy.EDGE]["median"] == 1.0
+    cnn = result["figures"]["cnn"]
+    assert sum(operator["flop"] for operator in cnn["operators"]) == cnn["flop"] > 30e6
+
+
+def test_footprint(tmp_path):
+    result = kept(footprint.measure(runs=1), tmp_path)
+    check_frame(result, "footprint", targets=2)
+    for kind in (footprint.EDGE, footprint.TORCH):
+        assert {"first_tick_s", "rss"} <= result["figures"][kind].keys()
+
+
+def test_scaling(tmp_path):
+    result = kept(scaling.measure([(1, 0.4, 1), (2, 0.4, 1)]), tmp_path)
+    check_frame(result, "scaling", targets=1)
+    assert [flight["world_size"] for flight in result["figures"].values()] == [162, 229]
+
+
+def test_closed_loop(tmp_path):
+    result = kept(closed_loop.measure(worlds=2, duration_s=0.4, draws=1), tmp_path)
+    check_frame(result, "closed_loop", targets=2)
+    costs = result["figures"]["normalized_cost"]
+    assert set(costs) == {closed_loop.LPAC, closed_loop.LOSSY, *closed_loop.BASELINES}
+    assert all(len(cost["by_world"]) == 2 for cost in costs.values())
