@@ -53,7 +53,7 @@ def sim(
     ] = 0.8,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for flight.json, flight.npz and figures.")
+        Path | None, typer.Option(help="Folder for the flight, its world and a figure.")
     ] = None,
 ) -> None:
     """Fly a swarm over an unknown world in simulated time and print how well it covers it."""

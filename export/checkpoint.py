@@ -373,7 +373,7 @@ def _checked(source: _Source, layout: _Layout, sizes: Mapping[str, int]) -> dict
             raise source.error(name, "no such tensor", f"one of shape {_text(shape)}")
     norms = {name.rpartition(".")[0] for name in layout if name.endswith("running_var")}
     ignored = {f"{norm}.{_IGNORED_PART}" for norm in norms}
-    for name in source.tensors.keys() - layout.keys() - ignored:
+    for name in sorted(source.tensors.keys() - layout.keys() - ignored):
         found = f"a tensor of shape {_text(source.tensors[name].shape)}"
         raise source.error(name, found, "no tensor of that name in this LPAC network")
     return {name: _array(source, name, shape) for name, shape in shapes.items()}

@@ -11,7 +11,7 @@ from edge.core.coverage import coverage_cost
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
 from edge.core.world import Feature, random_features, rasterize
-from edge.runtime.bundle import Bundle, BundleError, Training
+from edge.runtime.bundle import Bundle, BundleError
 from edge.runtime.pac import PacParameters
 from edge.runtime.policy import Policy
 from sim.baselines import BaselineName, BaselineSwarm, make_baseline
@@ -76,6 +76,7 @@ class Flight:
     scenario: Scenario
     bundle_id: str
     perception: PerceptionParameters
+    features: tuple[Feature, ...]
     importance: F32
     time_s: F64
     positions_m: F64
@@ -133,7 +134,12 @@ def fly(
         raise BundleError(f"bundle {bundle.manifest.name!r} has no perception: it cannot fly")
     seeds = np.random.SeedSequence(scenario.seed).spawn(4)
     world_rng, start_rng, clock_rng, medium_rng = (np.random.default_rng(seed) for seed in seeds)
-    importance = _importance(scenario, perception.world_size, training, world_rng)
+    features = scenario.features
+    if features is None:
+        features = random_features(world_rng, scenario.random_feature_count, perception.world_size)
+    importance = rasterize(
+        features, perception.world_size, training.idf_truncation, training.idf_norm
+    )
     starts_m = _starts_m(scenario, perception.world_size, start_rng)
     max_speed_m_s = training.max_speed * scenario.scale.velocity_scale
     swarm: Swarm | BaselineSwarm
@@ -175,6 +181,7 @@ def fly(
         scenario=scenario,
         bundle_id=bundle.id,
         perception=perception,
+        features=features,
         importance=importance,
         time_s=np.array(times),
         positions_m=np.array(positions),
@@ -182,15 +189,6 @@ def fly(
         cost=np.array(list(costs.values())),
         messages=swarm.message_counts(),
     )
-
-
-def _importance(
-    scenario: Scenario, world_size: int, training: Training, rng: np.random.Generator
-) -> F32:
-    features = scenario.features
-    if features is None:
-        features = random_features(rng, scenario.random_feature_count, world_size)
-    return rasterize(features, world_size, training.idf_truncation, training.idf_norm)
 
 
 def _starts_m(scenario: Scenario, world_size: int, rng: np.random.Generator) -> F64:

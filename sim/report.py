@@ -13,6 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from edge.core.perception import part_in_world, window_corner
+from edge.core.world import format_world
 from sim.experiment import Flight
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of the flight's duration
@@ -46,9 +47,10 @@ _CURVES = (
 
 
 def write_flight(flight: Flight, folder: Path) -> None:
-    """Write flight.json, flight.npz and the figure flight.png / flight.pdf into `folder`."""
+    """Write flight.json, flight.npz, world.env and flight.png / flight.pdf into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "flight.json").write_text(json.dumps(flight.summary(), indent=2) + "\n")
+    (folder / "world.env").write_text(format_world(flight.features))
     np.savez(
         folder / "flight.npz",
         time_s=flight.time_s,

@@ -166,9 +166,9 @@ def load_bundle(path: Path) -> Bundle:
         raise BundleError(str(error)) from None
     except ValueError as error:
         raise BundleError(f"{path}: {MANIFEST} is not JSON: {error}") from None
-    for name in manifest.files.keys() - files.keys():
+    for name in sorted(manifest.files.keys() - files.keys()):
         raise BundleError(f"{path}: {name} is missing")
-    for name in files.keys() - manifest.files.keys() - {MANIFEST, BUNDLE_ID}:
+    for name in sorted(files.keys() - manifest.files.keys() - {MANIFEST, BUNDLE_ID}):
         raise BundleError(f"{path}: {name} does not belong to the bundle")
     for name, expected in manifest.files.items():
         if _sha256(files[name]) != expected:
@@ -219,11 +219,12 @@ def _archive(files: Mapping[str, bytes]) -> bytes:
 def _read(path: Path) -> dict[str, bytes]:
     try:
         if path.is_dir():
-            entries = sorted(path.iterdir())
-            for entry in entries:
-                if not entry.is_file():
-                    raise BundleError(f"{path}: {entry.name} does not belong to the bundle")
-            return {entry.name: entry.read_bytes() for entry in entries}
+            if not (path / MANIFEST).is_file():
+                return {}  # perhaps a large folder of something else
+            return {
+                entry.name: entry.read_bytes() if entry.is_file() else b""
+                for entry in path.iterdir()
+            }
         content = path.read_bytes()
     except OSError as error:
         raise BundleError(f"{path}: {error.strerror}") from None

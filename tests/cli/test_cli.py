@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from edge.core.world import parse_world
 from tests.conftest import ROOT, SHIPPED
 
 
@@ -86,9 +87,10 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "of the initial cost" in result.stdout
     assert {path.name for path in out.iterdir()} == {
-        "flight.json", "flight.npz", "flight.png", "flight.pdf",
+        "flight.json", "flight.npz", "flight.png", "flight.pdf", "world.env",
     }  # fmt: skip
     assert json.loads((out / "flight.json").read_text())["robots"] == 3
+    assert parse_world((out / "world.env").read_text()) == parse_world(world.read_text())
 
 
 @pytest.mark.parametrize(
