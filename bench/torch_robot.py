@@ -30,7 +30,11 @@ Layer = Callable[[int, int, int], nn.Module]
 
 
 class PygLayer(TAGConv):  # type: ignore[misc]
-    """torch_geometric's TAGConv on a star: the neighbours' messages flow to the robot."""
+    """torch_geometric's TAGConv on the star of a robot, node 0, and its neighbours, 1..n.
+
+    As TAGConv does, it propagates hop by hop and applies the taps at every node. It is spared the
+    normalisation by degree, which is in the messages and in `scale`.
+    """
 
     def __init__(self, inputs: int, outputs: int, hops: int) -> None:
         super().__init__(inputs, outputs, hops, normalize=False)
@@ -43,18 +47,17 @@ class PygLayer(TAGConv):  # type: ignore[misc]
         """
         neighbours = len(held)
         edge_index = torch.stack(
-            [torch.arange(neighbours), torch.zeros(neighbours, dtype=torch.long)]
+            [torch.arange(1, neighbours + 1), torch.zeros(neighbours, dtype=torch.long)]
         )
         edge_weight = scale.expand(neighbours)
-        out = self.lins[0](own)
+        nodes = torch.cat([own.new_zeros(1, *held.shape[1:]), held])
+        out = self.lins[0](torch.cat([own, held[:, 0]]))
         hops = [own]
         for k, tap in enumerate(self.lins[1:]):
-            y = self.propagate(
-                edge_index, x=(held[:, k], None), edge_weight=edge_weight, size=(neighbours, 1)
-            )
+            y = self.propagate(edge_index, x=nodes[:, k], edge_weight=edge_weight)
             out = out + tap(y)
-            hops.append(y)
-        return (out + self.bias).relu(), torch.cat(hops[:-1])
+            hops.append(y[:1])
+        return (out[:1] + self.bias).relu(), torch.cat(hops[:-1])
 
 
 class TapLayer(nn.Module):

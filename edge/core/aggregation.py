@@ -4,6 +4,7 @@ Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
 Perception-Action-Communication Loops", section "Decentralized Graph Neural Networks".
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -85,15 +86,17 @@ class HopBuffer:
         `payloads` are the neighbours' messages, (message_size,) each; their number is d_i.
         S_ij = 1/sqrt(d_i d_j): the sender has multiplied by its own part.
         """
-        self._sum[:] = 0.0
-        for payload in payloads:
-            self._sum += payload
-        if payloads:
-            self._sum *= np.float32(1.0 / np.sqrt(len(payloads)))
+        degree = len(payloads)
+        if degree:
+            received = np.concatenate(payloads, dtype=np.float32).reshape(degree, -1)
+            np.add.reduce(received, axis=0, out=self._sum)
+            self._sum *= np.float32(1.0 / math.sqrt(degree))
+        else:
+            self._sum[:] = 0.0
         for layer, part in zip(self.layers, self._parts, strict=True):
             layer[0, 1:] = part
 
     def message(self, degree: int) -> F32:
         """A new (message_size,) payload: y_kl for k = 0..K-1, times 1/sqrt(degree); 0 if none."""
-        scale = np.float32(1.0 / np.sqrt(degree) if degree else 0.0)
+        scale = np.float32(1.0 / math.sqrt(degree) if degree else 0.0)
         return np.concatenate([layer[0, : self._hops].ravel() for layer in self.layers]) * scale

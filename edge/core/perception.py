@@ -132,17 +132,43 @@ class RobotMap:
             low = high
 
 
-def resize_matrix(size: int, new_size: int) -> F32:
-    """A (new_size, size) with A @ x @ A.T the bilinear, antialiased resize of x (size, size).
+class Resize:
+    """Bilinear, antialiased resize from `size` to `new_size` cells: A @ x @ A.T for an image x.
 
-    Each row is a triangle as wide as two new cells, cut at the border and summing to one.
+    Each row of A (new_size, size) is a triangle as wide as two new cells, cut at the border and
+    summing to one; as torch and torchvision resize.
     """
-    scale = size / new_size
-    centres = (np.arange(new_size) + 0.5) * scale
-    distances = np.abs(np.arange(size) + 0.5 - centres[:, None]) / max(scale, 1.0)
-    weights = np.clip(1.0 - distances, 0.0, None)
-    weights /= weights.sum(axis=1, keepdims=True)
-    return weights.astype(np.float32)
+
+    # Rows of A that are multiplied together, without the columns that are zero in all of them.
+    _BAND = 8
+
+    def __init__(self, size: int, new_size: int) -> None:
+        scale = size / new_size
+        centres = (np.arange(new_size) + 0.5) * scale
+        distances = np.abs(np.arange(size) + 0.5 - centres[:, None]) / max(scale, 1.0)
+        weights = np.clip(1.0 - distances, 0.0, None)
+        weights /= weights.sum(axis=1, keepdims=True)
+        self._cumulated = np.concatenate([np.zeros((1, new_size)), weights.T.cumsum(axis=0)])
+        matrix = weights.astype(np.float32)
+        self._transposed = np.ascontiguousarray(matrix.T)
+        self._bands = []
+        for start in range(0, new_size, self._BAND):
+            rows = slice(start, start + self._BAND)
+            used = np.flatnonzero(matrix[rows].any(axis=0))
+            columns = slice(used[0], used[-1] + 1)
+            self._bands.append((rows, columns, matrix[rows, columns].copy()))
+        self._half = np.empty((new_size, size), np.float32)
+
+    def image(self, image: F32, out: F32) -> None:
+        """Resize `image` (size, size) into `out` (new_size, new_size)."""
+        for rows, columns, band in self._bands:
+            np.matmul(band, image[columns], out=self._half[rows])
+        np.matmul(self._half, self._transposed, out=out)
+
+    def interval(self, part: slice) -> F64:
+        """Resize the line (size,) that is 1 in `part` and 0 elsewhere to (new_size,)."""
+        resized: F64 = self._cumulated[part.stop] - self._cumulated[part.start]
+        return resized
 
 
 def neighbour_maps(offsets: F64, communication_range: float, image_size: int) -> F32:
@@ -180,7 +206,7 @@ class Perception:
         self._parameters = parameters
         self._map = RobotMap(parameters.world_size, parameters.unknown_importance)
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
-        self._resize = resize_matrix(parameters.local_map_size, image_size)
+        self._resize = Resize(parameters.local_map_size, image_size)
         self._images = np.empty((1, channels, image_size, image_size), np.float32)
 
     def observe(self, position: F64, view: F32) -> None:
@@ -196,20 +222,12 @@ class Perception:
         own = np.clip(position, 0.0, parameters.world_size)
         corner = window_corner(own, parameters.local_map_size)
         self._map.window(corner, self._local)
-        np.matmul(self._resize @ self._local, self._resize.T, out=self._images[0, 0])
-        self._images[0, -1] = self._obstacles(corner)
+        self._resize.image(self._local, out=self._images[0, 0])
+        _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)
+        self._images[0, -1] = 1.0 - np.outer(*map(self._resize.interval, inside))
         if self._images.shape[1] == len(MAP_CHANNELS[4]):
             others = np.clip(neighbours, 0.0, parameters.world_size)
             self._images[0, 1:3] = neighbour_maps(
                 others - own, parameters.communication_range, self._images.shape[-1]
             )
         return self._images
-
-    def _obstacles(self, corner: tuple[int, int]) -> F32:
-        """The resized map that is 1 outside the world: one less the product of two 1-D masks."""
-        cells = np.arange(self._parameters.local_map_size)
-        inside_x, inside_y = (
-            self._resize @ ((cells + low >= 0) & (cells + low < self._parameters.world_size))
-            for low in corner
-        )
-        return 1.0 - np.outer(inside_x, inside_y)
