@@ -18,9 +18,9 @@ from sim.experiment import SAMPLE_S, Flight, Scenario, fly
 # Of training: ten robots and ten features in one world.
 _ROBOTS_PER_WORLD = 10
 # (robots, simulated seconds, flights)
-_FLIGHTS = ((10, 30.0, 3), (100, 10.0, 1), (1000, 3.0, 1))
+_FLIGHTS = ((10, 30.0, 3), (100, 6.0, 1), (1000, 2.0, 1))
 # Robots see more of the world the longer they fly, so all are weighed at the same age.
-_MEMORY_AT_S = 3.0
+_MEMORY_AT_S = 2.0
 
 
 def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
