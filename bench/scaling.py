@@ -1,5 +1,6 @@
 """The simulator with more and more robots at constant density."""
 
+import gc
 import math
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -87,6 +88,7 @@ def _measure_flight(robots: int, duration_s: float, seed: int) -> dict[str, floa
     bundle = world_for(load_bundle(BUNDLE), robots)
     # What the libraries allocate once is not the robots'.
     fly(Scenario(robots=1, duration_s=1.0, random_feature_count=1), world_for(bundle, 1))
+    gc.freeze()  # as `lpac sim` does
     empty_mb = memory_mb()["rss"]
     flying_mb = wall_s = cpu_s = 0.0
 

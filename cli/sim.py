@@ -1,5 +1,6 @@
 """`lpac sim` and `lpac demo`: a swarm in this process."""
 
+import gc
 import json
 from enum import StrEnum
 from functools import partial
@@ -126,6 +127,7 @@ def _fly(scenarios: list[tuple[str, "Scenario"]], bundle_path: Path) -> list["Fl
     from sim.experiment import fly
 
     bundle = load_bundle(bundle_path)
+    gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
     flights = []
     console = Console(stderr=True)
     with Progress(console=console, disable=not console.is_terminal) as progress:

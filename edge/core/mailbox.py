@@ -7,7 +7,6 @@ is the receive buffer; the message to transmit is what a policy tick returns.
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 from threading import Lock
 from typing import NamedTuple
 
@@ -21,8 +20,7 @@ _LONGEST_TRANSIT_S = 5.0
 _CLOCK_TOLERANCE_S = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Neighbour:
+class Neighbour(NamedTuple):
     """Another robot: `position_m` in the mission frame, m, as it was `age_s` ago."""
 
     robot_id: int

@@ -61,6 +61,12 @@ def window_corner(position: F64, size: int) -> tuple[int, int]:
     return x, y
 
 
+def clamp_to_world(positions: F64, world_size: int) -> F64:
+    """The points of the world that are nearest to `positions` (..., 2)."""
+    inside: F64 = np.minimum(np.maximum(positions, 0.0), world_size)
+    return inside
+
+
 def part_in_world(
     corner: tuple[int, int], size: int, world_size: int
 ) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -219,14 +225,14 @@ class Perception:
         `neighbours` (n, 2) are the positions of the robots in range, in model units.
         """
         parameters = self._parameters
-        own = np.clip(position, 0.0, parameters.world_size)
+        own = clamp_to_world(position, parameters.world_size)
         corner = window_corner(own, parameters.local_map_size)
         self._map.window(corner, self._local)
         self._resize.image(self._local, out=self._images[0, 0])
         _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)
         self._images[0, -1] = 1.0 - np.outer(*map(self._resize.interval, inside))
         if self._images.shape[1] == len(MAP_CHANNELS[4]):
-            others = np.clip(neighbours, 0.0, parameters.world_size)
+            others = clamp_to_world(neighbours, parameters.world_size)
             self._images[0, 1:3] = neighbour_maps(
                 others - own, parameters.communication_range, self._images.shape[-1]
             )

@@ -16,7 +16,7 @@ from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage, HopBuffer
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
-from edge.core.perception import Perception, neighbours_in_range
+from edge.core.perception import Perception, clamp_to_world, neighbours_in_range
 from edge.core.ports import PositionSource, Sensor
 from edge.core.safety import limit_speed
 from edge.core.wire import Rejection, decode, encode
@@ -179,5 +179,5 @@ class Pac:
 
 def position_feature(position: F64, world_size: int) -> F32:
     """(p + W/2) / W, with p taken into the world: in [0.5, 1.5], as policies were trained."""
-    inside = np.clip(position, 0.0, world_size)
+    inside = clamp_to_world(position, world_size)
     return ((inside + world_size / 2.0) / world_size).astype(np.float32)

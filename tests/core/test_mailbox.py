@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import FrozenInstanceError, dataclass
+from dataclasses import dataclass
 from threading import Barrier
 
 import numpy as np
@@ -213,7 +213,7 @@ def test_what_is_handed_out_does_not_change() -> None:
     assert orders(handed_out) == [(1, 10, 1)]
     assert neighbours[0].position_m == (1.0, 1.0, 0.0)
     assert counts["accepted"] == 1
-    with pytest.raises(FrozenInstanceError):
+    with pytest.raises(AttributeError):
         neighbours[0].age_s = 1.0  # type: ignore[misc]
 
 
