@@ -5,7 +5,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo test lint bench export clean
+.PHONY: help demo setup test lint bench export clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -13,6 +13,8 @@ help: ## show this list
 
 demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
 	.venv/bin/lpac demo --out out/demo
+
+setup: .venv/sim .venv/export ## install what a workstation needs: simulator, plots, torch, onnx
 
 test: lint ## style, types, and every test
 	.venv/bin/pytest
@@ -32,11 +34,11 @@ clean: ## remove .venv and everything made
 	rm -rf .venv out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 # Stamps: .venv/EXTRA is newer than pyproject.toml when that extra is installed.
-.venv/%: pyproject.toml | .venv/bin/python
+.venv/%: pyproject.toml | .venv/bin/pip
 	.venv/bin/pip install --quiet --disable-pip-version-check --editable '.[$*]'
 	@touch $@
 
-.venv/bin/python:
+.venv/bin/pip:
 	@test -n '$(PYTHON)' || { echo 'make: Python 3.11 or newer is needed: sudo apt install python3'; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
 		{ echo 'make: the venv module is missing: sudo apt install python3-venv'; exit 1; }

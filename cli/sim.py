@@ -111,7 +111,7 @@ def demo(
     names = [name for name, _ in scenarios]
     flights = dict(zip(names, _fly(scenarios, DEFAULT_BUNDLE), strict=True))
     write_demo(flights, out)
-    costs = ", ".join(
+    costs = "; ".join(
         f"{name} {flight.normalized_cost[-1]:.3f}" for name, flight in flights.items()
     )
     typer.echo(f"coverage cost after 60 s over initial cost: {costs}")
