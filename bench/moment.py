@@ -71,7 +71,8 @@ def moment_in_flight(policy: Policy) -> Moment:
         rng=rng,
     )
     paths: list[F64] = []
-    for now_s, positions_m in swarm.run(_LATEST_S, _SAMPLE_S):
+    times_s = np.arange(0.0, _LATEST_S, _SAMPLE_S).tolist()
+    for now_s, positions_m in zip(times_s, swarm.run(times_s), strict=True):
         positions = FIELD_SCALE.position_to_model(positions_m)
         paths.append(positions)
         for robot, position, path in zip(

@@ -4,7 +4,9 @@ As in CoverageControl, all robots step at once and know the true positions (the 
 those within communication range), whatever happens to messages.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Literal, Protocol
 
 import numpy as np
@@ -123,15 +125,15 @@ class BaselineSwarm:
         self._scale = scale
         self._max_speed_m_s = max_speed_m_s
 
-    def run(self, duration_s: float, sample_s: float) -> Iterator[tuple[float, F64]]:
-        """Yields the time and the positions (N, 2), m, every `sample_s` from 0 on."""
-        for sample in range(round(duration_s / sample_s) + 1):
-            self._vehicles.now_s = sample * sample_s
+    def run(self, times_s: Sequence[float]) -> Iterator[F64]:
+        """Yields the positions (N, 2), m, at each of `times_s`, which ascend."""
+        for now_s, next_s in pairwise([*times_s, math.inf]):
+            self._vehicles.now_s = now_s
             positions_m = self._vehicles.positions_m()
-            yield self._vehicles.now_s, positions_m
+            yield positions_m
             goals = self._baseline.goals(self._scale.position_to_model(positions_m))
             goals_m = self._scale.position_to_mission_m(goals)
-            velocities_m_s = cvt_velocity(positions_m, goals_m, self._max_speed_m_s, sample_s)
+            velocities_m_s = cvt_velocity(positions_m, goals_m, self._max_speed_m_s, next_s - now_s)
             for robot, velocity_m_s in enumerate(velocities_m_s):
                 self._vehicles.fly(robot, velocity_m_s)
 

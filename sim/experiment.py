@@ -1,5 +1,6 @@
 """One simulated flight: who flies what, over which world; and what came out."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -168,11 +169,12 @@ def fly(
             scenario.scale,
             max_speed_m_s,
         )
-    times, positions, costs = [], [], {}
-    for sample, (time_s, positions_m) in enumerate(swarm.run(scenario.duration_s, SAMPLE_S)):
-        times.append(time_s)
+    times_s = _sample_times_s(scenario.duration_s)
+    positions, costs = [], {}
+    for sample, positions_m in enumerate(swarm.run(times_s)):
+        time_s = times_s[sample]
         positions.append(positions_m)
-        if sample % SAMPLES_PER_COST == 0 or time_s >= scenario.duration_s:
+        if sample % SAMPLES_PER_COST == 0 or time_s == times_s[-1]:
             model_positions = scenario.scale.position_to_model(positions_m)
             costs[time_s] = coverage_cost(importance, model_positions)
         if progress:
@@ -183,12 +185,18 @@ def fly(
         perception=perception,
         features=features,
         importance=importance,
-        time_s=np.array(times),
+        time_s=np.array(times_s),
         positions_m=np.array(positions),
         cost_time_s=np.array(list(costs)),
         cost=np.array(list(costs.values())),
         messages=swarm.message_counts(),
     )
+
+
+def _sample_times_s(duration_s: float) -> list[float]:
+    """From 0 to the duration, every SAMPLE_S and at its end."""
+    samples = math.ceil(duration_s / SAMPLE_S - 1e-9)
+    return [*(sample * SAMPLE_S for sample in range(samples)), duration_s]
 
 
 def _starts_m(scenario: Scenario, world_size: int, rng: np.random.Generator) -> F64:

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -70,15 +70,14 @@ class Swarm:
         self._scheduled = 0
         self._start_clocks(clocks or Clocks())
 
-    def run(self, duration_s: float, sample_s: float) -> Iterator[tuple[float, F64]]:
-        """Yields the time and the true positions (N, 2), m, every `sample_s` from 0 on."""
-        for sample in range(round(duration_s / sample_s) + 1):
-            until_s = sample * sample_s
+    def run(self, times_s: Iterable[float]) -> Iterator[F64]:
+        """Yields the true positions (N, 2), m, at each of `times_s`, which ascend."""
+        for until_s in times_s:
             while self._events[0][0] <= until_s:
                 self._vehicles.now_s, _, do = heapq.heappop(self._events)
                 do()
             self._vehicles.now_s = until_s
-            yield until_s, self._vehicles.positions_m()
+            yield self._vehicles.positions_m()
 
     def message_counts(self) -> dict[str, int]:
         """Broadcasts sent, and what became of them at all the receivers together."""

@@ -30,6 +30,18 @@ def test_a_seed_gives_one_flight(shipped_bundle: Bundle, controller: Controller)
     assert texts[0] == texts[1] != texts[2]
 
 
+@pytest.mark.parametrize("duration_s", [0.05, 0.2, 1.0, 2.5])
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_flight_lasts_as_long_as_asked(
+    shipped_bundle: Bundle, controller: Controller, duration_s: float
+) -> None:
+    flight = short(shipped_bundle, controller=controller, duration_s=duration_s)
+    assert flight.time_s[0] == flight.cost_time_s[0] == 0.0
+    assert flight.time_s[-1] == flight.cost_time_s[-1] == duration_s
+    assert np.all(np.diff(flight.time_s) > 0.0) and np.all(np.diff(flight.time_s) < 0.21)
+    assert len(flight.positions_m) == len(flight.time_s)
+
+
 def test_controllers_and_losses_meet_the_same_world_and_starts(shipped_bundle: Bundle) -> None:
     flights = [short(shipped_bundle, controller=controller) for controller in CONTROLLERS]
     flights.append(short(shipped_bundle, loss=1.0))
