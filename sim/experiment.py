@@ -25,6 +25,7 @@ Controller = Literal["lpac"] | BaselineName
 # The paper's field tests: 32 m x 32 m for a world of 512 x 512 model units.
 FIELD_SCALE = ModelScale(env_scale=16.0, velocity_scale=0.25)
 
+MAX_ROBOTS = 2**16  # as many as a message can tell apart
 SAMPLE_S = 0.2
 SAMPLES_PER_COST = 5
 
@@ -52,8 +53,8 @@ class Scenario:
     max_message_age_s: float = 0.8
 
     def __post_init__(self) -> None:
-        if self.robots < 1:
-            raise ValueError(f"robots = {self.robots}: must be at least 1")
+        if not 1 <= self.robots <= MAX_ROBOTS:
+            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
         if self.starts_m is not None and len(self.starts_m) != self.robots:
             raise ValueError(f"starts_m: {len(self.starts_m)} positions for {self.robots} robots")
         if not 0.0 < self.duration_s < np.inf:

@@ -96,7 +96,7 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["sim", "--robots", "0"], "robots = 0: must be at least 1"),
+        (["sim", "--robots", "0"], "robots = 0: must be from 1 to 65536"),
         (["sim", "--loss", "2"], "loss = 2.0: must be from 0 to 1"),
         (["sim", "--world", "absent.env"], "absent.env"),
         (["sim", "--bundle", "absent"], "absent: No such file or directory"),
