@@ -109,12 +109,12 @@ class EdgeRobot:
         moment, policy = self._moment, self._policy
         images = moment.perception.images(moment.position, moment.neighbours)
         features = self._with_position(policy.image_features(images))
-        self._hops.diffuse(moment.payloads)
+        self._hops.diffuse(moment.payloads, NEIGHBOURS)
         return policy.velocity(features, self._hops), self._hops.message(NEIGHBOURS)
 
     def exchange(self) -> Outputs:
         """The graph neural network alone: x_L (F_L,) and message (message_size,)."""
-        self._hops.diffuse(self._moment.payloads)
+        self._hops.diffuse(self._moment.payloads, NEIGHBOURS)
         return self._layers(), self._hops.message(NEIGHBOURS)
 
     def parts(self) -> dict[str, Callable[[], object]]:
@@ -137,7 +137,7 @@ class EdgeRobot:
             f"decode {NEIGHBOURS} messages": decode_all,
             "images": lambda: moment.perception.images(moment.position, moment.neighbours),
             "CNN": lambda: policy.image_features(self.images),
-            "aggregation": lambda: self._hops.diffuse(moment.payloads),
+            "aggregation": lambda: self._hops.diffuse(moment.payloads, NEIGHBOURS),
             "layers": self._layers,
             "action": lambda: policy.run(ACTION, last),
             "own message": lambda: self._hops.message(NEIGHBOURS),

@@ -64,18 +64,19 @@ def verify(path: BundlePath, as_json: AsJson = False) -> None:
     from edge.runtime.verify import verify as run_checks
 
     bundle = load_bundle(path)
-    checks = list(run_checks(bundle))
+    checks = []
+    for check in run_checks(bundle):
+        checks.append(check)
+        if not as_json:
+            verdict = "ok" if check.passed else "FAILED"
+            typer.echo(f"{check.name:12} relative error {check.relative_error:.1e}  {verdict}")
     failed = [check.name for check in checks if not check.passed]
     if as_json:
         errors = {check.name: check.relative_error for check in checks}
         report = {"id": bundle.id, "tolerance": TOLERANCE, "failed": failed, "errors": errors}
         typer.echo(json.dumps(report, indent=2))
-    else:
-        for check in checks:
-            verdict = "ok" if check.passed else "FAILED"
-            typer.echo(f"{check.name:12} relative error {check.relative_error:.1e}  {verdict}")
-        if not failed:
-            typer.echo(f"{bundle.manifest.name} {bundle.id[:12]} computes what torch computed")
+    elif not failed:
+        typer.echo(f"{bundle.manifest.name} {bundle.id[:12]} computes what torch computed")
     if failed:
         raise ValueError(
             f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of torch's golden outputs"

@@ -11,7 +11,8 @@ from cli import bundle, export, sim
 # numpy reads this when it is first imported, and no sub-command has imported it yet.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-_EXTRAS = {"torch": "export", "onnx": "export", "matplotlib": "sim"}
+# What the robot's install leaves out.
+_WORKSTATION = {"torch", "onnx", "matplotlib", "rich", "export", "sim"}
 
 app = typer.Typer(
     name="lpac",
@@ -31,13 +32,9 @@ def main() -> None:
     try:
         app()
     except ModuleNotFoundError as error:
-        if error.name in _EXTRAS:
-            remedy = f"pip install 'lpac-edge[{_EXTRAS[error.name]}]'"
-        elif error.name in ("export", "sim"):
-            remedy = "this command is used from the repository, not from the robot's install"
-        else:
+        if error.name not in _WORKSTATION:
             raise
-        sys.exit(f"lpac: {error.name} is not installed: {remedy}")
+        sys.exit(f"lpac: {error.name} is not installed here: run `make setup` in the repository")
     except (ValueError, OSError) as error:
         sys.exit(f"lpac: {error}")
 

@@ -67,13 +67,15 @@ def sim(
         robots=robots,
         seed=seed,
         duration_s=duration,
-        features=parse_world(world.read_text(), str(world)) if world else None,
+        features=parse_world(_text(world), str(world)) if world else None,
         random_feature_count=features,
         scale=FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0),
         loss=loss,
         delay_s=delay,
         max_message_age_s=max_message_age,
     )
+    if out:
+        out.mkdir(parents=True, exist_ok=True)
     [flight] = _fly([(controller.value, scenario)], bundle)
     if out:
         from sim.report import write_flight
@@ -82,10 +84,13 @@ def sim(
     if as_json:
         typer.echo(json.dumps(flight.summary(), indent=2))
         return
-    typer.echo(
-        f"{controller.value}, {robots} robots, seed {seed}: after {duration:g} s the coverage cost "
-        f"is {flight.normalized_cost[-1]:.3f} of the initial cost"
+    result = (
+        f"after {duration:g} s the coverage cost is {flight.normalized_cost[-1]:.3f} "
+        "of the initial cost"
+        if flight.importance.any()
+        else "the world has no importance anywhere, so that there was nothing to cover"
     )
+    typer.echo(f"{controller.value}, {robots} robots, seed {seed}: {result}")
     if out:
         typer.echo(f"see {out / 'flight.png'}")
 
@@ -101,6 +106,7 @@ def demo(
     from sim.experiment import Scenario
     from sim.report import write_demo
 
+    out.mkdir(parents=True, exist_ok=True)
     scenarios = [
         ("LPAC", Scenario(seed=seed)),
         ("LPAC, 30 % loss", Scenario(seed=seed, loss=0.3)),
@@ -135,6 +141,13 @@ def _fly(scenarios: list[tuple[str, "Scenario"]], bundle_path: Path) -> list["Fl
             task = progress.add_task(name, total=scenario.duration_s)
             flights.append(fly(scenario, bundle, partial(_show, progress, task)))
     return flights
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: is not a text file") from None
 
 
 def _show(progress: "Progress", task: "TaskID", time_s: float) -> None:

@@ -30,7 +30,7 @@ ACTION_SIZE = 2
 # The position that is appended to the CNN's features.
 POSITION_SIZE = 2
 
-_COMPILED = "_orig_mod."  # torch.compile puts this in front of every name
+_COMPILED = "_orig_mod."
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 _IGNORED_PART = "num_batches_tracked"
 
@@ -218,15 +218,26 @@ def _read_state_dict(path: Path) -> _Source:
                 f"{path}: {name}: found a {type(value).__name__}, expected tensors by name: "
                 "save model.state_dict() alone"
             )
+    # torch.compile puts its mark in front of the part that it compiled: of all, or of some.
     prefix = _COMPILED if all(name.startswith(_COMPILED) for name in state) else ""
-    tensors = {name.removeprefix(prefix): tensor for name, tensor in state.items()}
+    source_names = {name.replace(_COMPILED, ""): name for name in state}
+    if len(source_names) < len(state):
+        (twice, _), *_ = Counter(name.replace(_COMPILED, "") for name in state).most_common(1)
+        raise CheckpointError(f"{path}: {twice}: found with and without {_COMPILED}, expected once")
+    tensors = {name: state[source] for name, source in source_names.items()}
     if not any(name.startswith("gnn_backbone.") for name in tensors):
         raise CheckpointError(
             f"{path}: found {len(state)} tensors ({', '.join([*state][:3])}, ...), expected those "
             "of an LPAC network, such as gnn_backbone.graph_conv_0.lins.0.weight"
         )
     sha256 = hashlib.sha256(content).hexdigest()
-    return _Source(path, tensors, lambda name: prefix + name, has_cnn=True, sha256=sha256)
+    return _Source(
+        path,
+        tensors,
+        lambda name: source_names.get(name, prefix + name),
+        has_cnn=True,
+        sha256=sha256,
+    )
 
 
 def _read_folder(path: Path) -> _Source:

@@ -11,6 +11,7 @@ from edge.core import F32, F64
 from edge.core.coverage import coverage_cost
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
+from edge.core.wire import MAX_ROBOT_ID
 from edge.core.world import Feature, random_features, rasterize
 from edge.runtime.bundle import Bundle, BundleError
 from edge.runtime.pac import PacParameters
@@ -25,7 +26,7 @@ Controller = Literal["lpac"] | BaselineName
 # The paper's field tests: 32 m x 32 m for a world of 512 x 512 model units.
 FIELD_SCALE = ModelScale(env_scale=16.0, velocity_scale=0.25)
 
-MAX_ROBOTS = 2**16  # as many as a message can tell apart
+MAX_ROBOTS = MAX_ROBOT_ID + 1
 SAMPLE_S = 0.2
 SAMPLES_PER_COST = 5
 
@@ -55,6 +56,8 @@ class Scenario:
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS:
             raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
+        if self.seed < 0:
+            raise ValueError(f"seed = {self.seed}: must be at least 0")
         if self.starts_m is not None and len(self.starts_m) != self.robots:
             raise ValueError(f"starts_m: {len(self.starts_m)} positions for {self.robots} robots")
         if not 0.0 < self.duration_s < np.inf:

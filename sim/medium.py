@@ -28,17 +28,17 @@ class Medium:
         self._loss = loss
         self._delay_s = delay_s
         self._rng = rng
-        self.sent = 0
+        self.broadcasts = 0
         self.lost = 0
 
     def broadcast(self, sender: int, positions_m: F64) -> Iterator[tuple[int, float]]:
         """The receivers of a message sent now, with its travel time in s."""
-        self.sent += 1
+        self.broadcasts += 1
         distances = np.hypot(*(positions_m - positions_m[sender]).T)
         distances[sender] = np.inf
         for receiver in np.flatnonzero(distances < self._range_m):
-            # Both numbers are drawn for every receiver, so that a run with another loss or delay
-            # differs by that alone.
+            # Both numbers are drawn for every receiver: another loss or delay alone does not change
+            # the chances of the messages after it.
             chance, travel = self._rng.random(2)
             if chance < self._loss:
                 self.lost += 1

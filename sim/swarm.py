@@ -80,8 +80,8 @@ class Swarm:
             yield self._vehicles.positions_m()
 
     def message_counts(self) -> dict[str, int]:
-        """Broadcasts sent, and what became of them at all the receivers together."""
-        counts = Counter({"sent": self._medium.sent, "lost": self._medium.lost})
+        """Broadcasts, and what became of them at each receiver in range, in all."""
+        counts = Counter({"broadcasts": self._medium.broadcasts, "lost": self._medium.lost})
         for robot in self.robots:
             counts.update(robot.mailbox.counts())
         return dict(counts)

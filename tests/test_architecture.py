@@ -31,6 +31,7 @@ ONLY_IN = {
     "matplotlib": {"sim/"},
     "mavsdk": {"edge/adapters/"},
     "zenoh": {"edge/adapters/"},
+    "pymavlink": {"sim/"},
     "typer": {"cli/"},
     "rich": {"cli/"},
 }

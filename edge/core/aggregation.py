@@ -80,15 +80,15 @@ class HopBuffer:
             for end, size in zip(ends, inputs, strict=True)
         )
 
-    def diffuse(self, payloads: Sequence[F32]) -> None:
+    def diffuse(self, payloads: Sequence[F32], degree: int) -> None:
         """y_kl = sum over neighbours j of S_ij (y_j)_{k-1,l}, for k = 1..K and all layers at once.
 
-        `payloads` are the neighbours' messages, (message_size,) each; their number is d_i.
+        `payloads` are the neighbours' messages, (message_size,) each, and `degree` is d_i: larger
+        than their number if some neighbours were not heard this time.
         S_ij = 1/sqrt(d_i d_j): the sender has multiplied by its own part.
         """
-        degree = len(payloads)
-        if degree:
-            received = np.concatenate(payloads, dtype=np.float32).reshape(degree, -1)
+        if payloads:
+            received = np.concatenate(payloads, dtype=np.float32).reshape(len(payloads), -1)
             np.add.reduce(received, axis=0, out=self._sum)
             self._sum *= np.float32(1.0 / math.sqrt(degree))
         else:

@@ -13,10 +13,10 @@ from typing import NamedTuple
 from edge.core.aggregation import AggregatedMessage
 from edge.core.wire import Rejection
 
-# After a cut, TCP delivers data that is up to 2 s old; nothing is taken to be in transit longer
-# than this. A clock that is wrong after power-up is off by far more, one that is synchronised over
-# the network by far less than the half second that a message may come from the future.
+# After a cut, TCP delivers data that is up to 2 s old; nothing is in transit longer than this.
 _LONGEST_TRANSIT_S = 5.0
+# Clocks that are synchronised over the network are off by far less than this, one that is wrong
+# after power-up by far more.
 _CLOCK_TOLERANCE_S = 0.5
 
 
@@ -37,16 +37,20 @@ class _Heard(NamedTuple):
     boot_epoch: int
     sequence: int
     at_s: float
+    # Of this start: the clocks' difference and the link's delay.
+    shortest_transit_s: float
 
 
 class Mailbox:
     """One robot's receive buffer. Every method may be called from any thread.
 
     `now_s` is a monotonic clock, `unix_now_s` the wall clock, both the robot's own, s. A message's
-    age counts from its receipt, or from its sending where the two robots' clocks agree. `swap` and
-    `neighbours` leave out what is not younger than `max_message_age_s`. With 0 age plays no part,
-    and the paper's rule holds: `swap` hands each message out once, and a neighbour is in
-    `neighbours` until a `swap` that finds nothing new from it.
+    age counts from its sending where the two robots' clocks agree, which the quickest message since
+    the sender's start tells. Where they do not agree, that one counts as not delayed at all.
+
+    `swap` and `neighbours` leave out what is not younger than `max_message_age_s`, and take nothing
+    away. With 0 age plays no part, and the paper's rule holds: `swap` hands each message out once,
+    and a neighbour is in `neighbours` until a `swap` that finds nothing new from it.
 
     Raises ValueError if `max_message_age_s` is not finite or below 0.
     """
@@ -78,14 +82,22 @@ class Mailbox:
 
         Nobody may change the message or its payload afterwards.
         """
+        sender = message.robot_id
         transit_s = unix_now_s - message.sent_at_s
-        clocks_agree = -_CLOCK_TOLERANCE_S <= transit_s <= _LONGEST_TRANSIT_S
-        born_s = now_s - max(transit_s, 0.0) if clocks_agree else now_s
         with self._lock:
+            heard = self._heard.get(sender)
+            shortest_s = transit_s
+            # After a silence the sender's clock may have been set: nothing is known of it any more.
+            if heard and heard.boot_epoch == message.boot_epoch and not self._silent(heard, now_s):
+                shortest_s = min(transit_s, heard.shortest_transit_s)
+            clocks_agree = abs(shortest_s) <= _CLOCK_TOLERANCE_S
+            delay_s = transit_s if clocks_agree else transit_s - shortest_s
+            born_s = now_s - max(delay_s, 0.0)
             rejection = self._rejection(message, born_s, now_s)
             if rejection is None:
-                sender = message.robot_id
-                self._heard[sender] = _Heard(message.boot_epoch, message.sequence, now_s)
+                self._heard[sender] = _Heard(
+                    message.boot_epoch, message.sequence, now_s, shortest_s
+                )
                 self._received[sender] = _Received(message, born_s)
             self._counts[rejection or "accepted"] += 1
         return rejection
@@ -125,6 +137,9 @@ class Mailbox:
             self._received = {}
             self._handed_out = {}
 
+    def _silent(self, heard: _Heard, now_s: float) -> bool:
+        return now_s - heard.at_s > self._restart_silence_s
+
     def _is_fresh(self, born_s: float, now_s: float) -> bool:
         return self._max_message_age_s == 0.0 or now_s - born_s < self._max_message_age_s
 
@@ -134,10 +149,12 @@ class Mailbox:
         if message.robot_id == self._robot_id:
             return Rejection.OWN
         heard = self._heard.get(message.robot_id)
-        if heard is not None and (message.boot_epoch, message.sequence) <= heard[:2]:
-            silent = now_s - heard.at_s > self._restart_silence_s
-            if message.boot_epoch == heard.boot_epoch or not silent:
-                return Rejection.OUTDATED
+        if (
+            heard is not None
+            and (message.boot_epoch, message.sequence) <= heard[:2]
+            and (message.boot_epoch == heard.boot_epoch or not self._silent(heard, now_s))
+        ):
+            return Rejection.OUTDATED
         if not self._is_fresh(born_s, now_s):
             return Rejection.STALE
         return None

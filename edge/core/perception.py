@@ -22,6 +22,7 @@ MAP_CHANNELS = {
 }
 
 TILE_SIZE = 128
+MAX_WORLD_SIZE = 2**15  # whose raster takes 4 GiB
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +40,8 @@ class PerceptionParameters:
     unknown_importance: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.world_size <= 0:
-            raise ValueError(f"world_size = {self.world_size}: must be positive")
+        if not 0 < self.world_size <= MAX_WORLD_SIZE:
+            raise ValueError(f"world_size = {self.world_size}: must be from 1 to {MAX_WORLD_SIZE}")
         for name in ("local_map_size", "sensor_size"):
             size = getattr(self, name)
             if size <= 0 or size % 2:

@@ -40,6 +40,7 @@ _CHECKSUM = struct.Struct("<I")
 _HEADER_SIZE = _FIELDS.size + _CHECKSUM.size
 _BUNDLE_ID_SIZE = 16
 
+MAX_ROBOT_ID = 2**16 - 1
 _PAYLOAD_TYPES: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<f2")}
 
 

@@ -22,6 +22,8 @@ from edge.core import F32, F64
 # What the library's C++ streams read as one number; Python's own float() takes more, such as 1_0.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COUNT = re.compile(r"\+?\d+", re.ASCII)
+# Far beyond every world, and small enough to be squared without loss.
+_LONGEST = 1e7
 # Offsets from a cell's centre, and weights, of the quadrature along one axis of a cell.
 _NODES, _WEIGHTS = (0.5 * values for values in np.polynomial.legendre.leggauss(4))
 
@@ -42,6 +44,7 @@ class GaussianFeature:
         numbers = (*self.mean, *self.sigma, self.correlation, self.scale)
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"{self} has a number that is not finite")
+        _check_lengths((*self.mean, *self.sigma))
         for name, sigma in zip(("sigma_x", "sigma_y"), self.sigma, strict=True):
             if sigma <= 0.0:
                 raise ValueError(f"{name} is {sigma}, must be > 0")
@@ -67,8 +70,15 @@ class PolygonFeature:
         numbers = (self.importance, *(c for vertex in self.vertices for c in vertex))
         if not all(map(math.isfinite, numbers)):
             raise ValueError("importance or a vertex is not finite")
+        _check_lengths(numbers[1:])
         if self.importance < 0.0:
             raise ValueError(f"importance is {self.importance}, must be >= 0")
+
+
+def _check_lengths(lengths: tuple[float, ...]) -> None:
+    for length in lengths:
+        if abs(length) > _LONGEST:
+            raise ValueError(f"{length} is too far, must be within {_LONGEST:g} of the world")
 
 
 Feature = GaussianFeature | PolygonFeature
@@ -135,18 +145,24 @@ def rasterize(
     """
     raster = np.zeros((world_size, world_size), np.float32)
     polygons = np.zeros_like(raster)
+    # Relative to the largest weight, since float32 does not hold every number that a file may.
+    largest = max((_weight(feature) for feature in features), default=0.0)
+    if largest == 0.0:
+        return raster
     for feature in features:
         if isinstance(feature, GaussianFeature):
             reach = (truncation * feature.sigma[0], truncation * feature.sigma[1])
             lower = (feature.mean[0] - reach[0], feature.mean[1] - reach[1])
             upper = (feature.mean[0] + reach[0], feature.mean[1] + reach[1])
             box = _cells_between(lower, upper, world_size)
-            raster[box] += _gaussian_cells(feature, truncation, *_centres(box))
+            raster[box] += _gaussian_cells(feature, truncation, *_centres(box)) * (
+                feature.scale / largest
+            )
         else:
             xs, ys = zip(*feature.vertices, strict=True)
             box = _cells_between((min(xs), min(ys)), (max(xs), max(ys)), world_size)
             inside = _inside(feature.vertices, *_centres(box))
-            layer = np.where(inside, np.float32(feature.importance), np.float32(0.0))
+            layer = np.where(inside, np.float32(feature.importance / largest), np.float32(0.0))
             np.maximum(polygons[box], layer, out=polygons[box])
     raster += polygons
     maximum = raster.max(initial=0.0)
@@ -154,6 +170,10 @@ def rasterize(
         raster /= maximum
         raster *= norm
     return raster
+
+
+def _weight(feature: Feature) -> float:
+    return feature.scale if isinstance(feature, GaussianFeature) else feature.importance
 
 
 _Box = tuple[slice, slice]
@@ -174,16 +194,16 @@ def _centres(box: _Box) -> tuple[F64, F64]:
 
 
 def _gaussian_cells(feature: GaussianFeature, truncation: float, x: F64, y: F64) -> F64:
-    """(len(x), len(y)): the feature's integral over the cells with these centres, truncated."""
+    """(len(x), len(y)): of the feature's integral the share in the cells with these centres."""
     rho = feature.correlation
     u = (x - feature.mean[0]) / feature.sigma[0]
     v = (y - feature.mean[1]) / feature.sigma[1]
     if rho == 0.0:
         in_x = _normal_integral(u, 0.5 / feature.sigma[0])
         in_y = _normal_integral(v, 0.5 / feature.sigma[1])
-        cells = feature.scale * np.outer(in_x, in_y)
+        cells = np.outer(in_x, in_y)
     else:
-        peak = feature.scale / (2 * math.pi * math.prod(feature.sigma) * math.sqrt(1 - rho * rho))
+        peak = 1.0 / (2 * math.pi * math.prod(feature.sigma) * math.sqrt(1 - rho * rho))
         cells = np.zeros((len(x), len(y)))
         for dx, weight_x in zip(_NODES, _WEIGHTS, strict=True):
             for dy, weight_y in zip(_NODES, _WEIGHTS, strict=True):

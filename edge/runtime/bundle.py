@@ -1,7 +1,7 @@
 """A policy as a bundle: ONNX graphs, golden outputs, and a manifest that pins every byte.
 
 On disk a bundle is a directory, or its archive (an uncompressed zip whose bytes follow from the
-content). See DESIGN: `manifest.json`, `bundle.id`, `cnn.onnx`, `gnn_<l>.onnx`, `action.onnx`,
+content): `manifest.json`, `bundle.id`, `cnn.onnx`, `gnn_<l>.onnx`, `action.onnx`,
 `golden.npz`.
 """
 
@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import io
 import json
+import re
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -179,13 +180,22 @@ def load_bundle(path: Path) -> Bundle:
 def write_bundle(bundle: Bundle, path: Path) -> None:
     """Write the bundle as an archive if `path` ends in .zip, else as a directory.
 
-    Replaces a bundle of that name; raises BundleError if something else is there.
+    Replaces a bundle of that name; raises BundleError if something else is there, or if it cannot
+    be written.
     """
+    try:
+        _write(bundle, path.resolve())
+    except OSError as error:
+        raise BundleError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def _write(bundle: Bundle, path: Path) -> None:
     is_archive = path.suffix == ".zip"
-    if path.is_dir() and (is_archive or (any(path.iterdir()) and not (path / MANIFEST).exists())):
-        raise BundleError(f"{path}: is a directory that holds no bundle; choose another name")
-    if path.is_file() and not is_archive:
-        raise BundleError(f"{path}: is a file; name a directory, or an archive that ends in .zip")
+    if path.exists() and (path.is_file() != is_archive or not _holds_a_bundle(path)):
+        raise BundleError(
+            f"{path}: is there already and is no bundle: choose another name "
+            "(an archive's ends in .zip, a directory's does not)"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     # Built beside its place and moved there, so that no half-written bundle is ever found.
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as scratch:
@@ -199,6 +209,19 @@ def write_bundle(bundle: Bundle, path: Path) -> None:
             if path.is_dir():
                 path.rename(Path(scratch) / "old")
         new.replace(path)
+
+
+def _holds_a_bundle(path: Path) -> bool:
+    """Whether there is nothing but a bundle's files, or nothing at all, at `path`."""
+    if path.is_dir():
+        names = {entry.name for entry in path.iterdir()}
+    else:
+        try:
+            names = set(zipfile.ZipFile(path).namelist())
+        except zipfile.BadZipFile:
+            return False
+    belongs = re.compile(r"manifest\.json|bundle\.id|golden\.npz|(cnn|gnn_\d+|action)\.onnx")
+    return not names or (BUNDLE_ID in names and all(map(belongs.fullmatch, names)))
 
 
 def _sha256(content: bytes) -> str:

@@ -62,7 +62,10 @@ def _value(hint: Any, value: object, where: str) -> Any:
     if origin is dict and isinstance(value, Mapping):
         return {key: _value(arguments[1], v, f"{where}: {key}") for key, v in value.items()}
     if hint is float and type(value) is int:
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ConfigError(f"{where}: is too large a number") from None
     if type(value) is hint:
         return value
     expected = {tuple: "a list", dict: "a table"}.get(origin or hint, getattr(hint, "__name__", ""))

@@ -8,9 +8,10 @@ simulated time; both run this code.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage, HopBuffer
@@ -19,11 +20,12 @@ from edge.core.mailbox import Mailbox
 from edge.core.perception import Perception, clamp_to_world, neighbours_in_range
 from edge.core.ports import PositionSource, Sensor
 from edge.core.safety import limit_speed
-from edge.core.wire import Rejection, decode, encode
+from edge.core.wire import MAX_ROBOT_ID, Rejection, decode, encode
 from edge.runtime.bundle import BundleError
 from edge.runtime.policy import Policy
 
 Position = tuple[float, float, float]  # in the mission frame, m
+PayloadType = Literal["float16", "float32"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +40,15 @@ class PacParameters:
     max_speed_m_s: float
     max_message_age_s: float = 0.8
     max_input_age_s: float = 1.0
-    payload: Literal["float16", "float32"] = "float16"
+    payload: PayloadType = "float16"
+
+    def __post_init__(self) -> None:
+        for name in ("max_speed_m_s", "max_input_age_s"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: must be positive and finite")
+        if self.payload not in get_args(PayloadType):
+            raise ValueError(f"payload = {self.payload!r}: must be 'float16' or 'float32'")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,7 +76,9 @@ class Pac:
         position: PositionSource,
         parameters: PacParameters,
     ) -> None:
-        """Raises BundleError if the policy has no perception."""
+        """Raises BundleError if the policy has no perception, ValueError for an impossible id."""
+        if not 0 <= robot_id <= MAX_ROBOT_ID:
+            raise ValueError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
         manifest = policy.manifest
         if manifest.images is None or manifest.perception is None:
             raise BundleError(
@@ -79,6 +91,7 @@ class Pac:
         self._position = position
         self._parameters = parameters
         self._world_size = manifest.perception.world_size
+        self._sensor_size = manifest.perception.sensor_size
         self._communication_range = manifest.perception.communication_range
         self._perception = Perception(
             manifest.perception, len(manifest.images.channels), manifest.images.size
@@ -109,7 +122,7 @@ class Pac:
             return
         (own,) = self._to_model([position_m])
         view = self._sensor.view(own)
-        if view is None:
+        if view is None or not self._is_valid(view):
             return
         self._perception.observe(own, view)
         heard = self._to_model([n.position_m for n in self.mailbox.neighbours(now_s)])
@@ -129,10 +142,16 @@ class Pac:
         features, position_m = self._features, self._position_m()
         if features is None or position_m is None or self._is_old(features, now_s):
             return None
-        messages = self._messages_in_range(position_m, now_s)
-        self._hops.diffuse([message.payload for message in messages])
+        (own,) = self._to_model([position_m])
+        # Before the swap, which may clear the mailbox: the neighbours are more than the messages.
+        heard = [n.position_m for n in self.mailbox.neighbours(now_s)]
+        messages = self.mailbox.swap(now_s)
+        near = self._in_range(own, [message.position_m for message in messages])
+        degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
+        payloads = [m.payload for m, is_near in zip(messages, near, strict=True) if is_near]
+        self._hops.diffuse(payloads, degree)
         velocity = self._policy.velocity(features.value, self._hops)
-        payload = self._hops.message(degree=len(messages))
+        payload = self._hops.message(degree)
         if not (np.isfinite(velocity).all() and np.isfinite(payload).all()):
             return None
         self._action = _Timed(velocity, now_s)
@@ -161,12 +180,13 @@ class Pac:
         position_m = self._position.position_m()
         return position_m if position_m and all(map(math.isfinite, position_m)) else None
 
-    def _messages_in_range(self, position_m: Position, now_s: float) -> list[AggregatedMessage]:
-        messages = self.mailbox.swap(now_s)
-        (own,) = self._to_model([position_m])
-        positions = self._to_model([message.position_m for message in messages])
-        near = neighbours_in_range(own, positions, self._communication_range)
-        return [message for message, is_near in zip(messages, near, strict=True) if is_near]
+    def _is_valid(self, view: F32) -> bool:
+        """Whether it may go into the map: one cell that is not finite would stay in it."""
+        return view.shape == (self._sensor_size,) * 2 and bool(np.isfinite(view).all())
+
+    def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
+        """(n,): which of the positions are within communication range of `own`, in model units."""
+        return neighbours_in_range(own, self._to_model(positions_m), self._communication_range)
 
     def _to_model(self, positions_m: Sequence[Position]) -> F64:
         """Horizontal positions (n, 2) in model units."""

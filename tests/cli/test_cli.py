@@ -97,6 +97,9 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
     ("arguments", "text"),
     [
         (["sim", "--robots", "0"], "robots = 0: must be from 1 to 65536"),
+        (["sim", "--seed", "-1"], "seed = -1: must be at least 0"),
+        (["sim", "--world", "docs/demo.png"], "docs/demo.png: is not a text file"),
+        (["sim", "--out", "README.md"], "README.md"),
         (["sim", "--loss", "2"], "loss = 2.0: must be from 0 to 1"),
         (["sim", "--world", "absent.env"], "absent.env"),
         (["sim", "--bundle", "absent"], "absent: No such file or directory"),
@@ -109,6 +112,25 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
 )
 def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
     assert text in error_line(lpac(*arguments))
+
+
+def test_a_world_with_nothing_to_cover_is_said_to_be_one(tmp_path: Path) -> None:
+    result = lpac("sim", "--features", 0, "--duration", 0.2)
+    assert "nothing to cover" in result.stdout
+
+
+def test_what_is_not_installed_is_said_in_one_line() -> None:
+    code = (
+        "import sys; sys.modules['torch'] = None; sys.argv = ['lpac', 'export', "
+        f"'{SHIPPED}.pt', '--params', '{SHIPPED}.toml', '-o', 'x']; import cli.main as m; m.main()"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (
+        error_line(result)
+        == "lpac: torch is not installed here: run `make setup` in the repository"
+    )
 
 
 def test_a_bad_world_file_is_named(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def test_window_is_centred_at_the_nearest_cell_corner(
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"world_size": 0}, "world_size = 0: must be positive"),
+        ({"world_size": 0}, "world_size = 0: must be from 1 to 32768"),
         ({"sensor_size": 63}, "sensor_size = 63: must be positive and even"),
         ({"local_map_size": -2}, "local_map_size = -2: must be positive and even"),
         ({"communication_range": float("nan")}, "communication_range = nan"),

@@ -79,6 +79,18 @@ def test_prefix_of_torch_compile_is_taken_off(state: State, tmp_path: Path) -> N
     assert build_graphs(plain) == build_graphs(compiled)
 
 
+def test_a_compiled_part_is_read_too(state: State, tmp_path: Path) -> None:
+    compiled = {
+        name.replace("gnn_backbone.", "gnn_backbone._orig_mod."): tensor
+        for name, tensor in state.items()
+    }
+    np.testing.assert_array_equal(
+        read(compiled, tmp_path).gnn[0].taps, read(state, tmp_path).gnn[0].taps
+    )
+    both = {**state, "_orig_mod.actions_mean": state["actions_mean"]}
+    assert "actions_mean: found with and without _orig_mod." in error_of(both, tmp_path)
+
+
 def test_errors_use_the_names_of_the_source(state: State, tmp_path: Path) -> None:
     compiled = {f"_orig_mod.{name}": tensor for name, tensor in state.items()}
     del compiled[f"_orig_mod.{TAP}"]

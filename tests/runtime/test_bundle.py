@@ -214,7 +214,13 @@ def test_writing_never_destroys_something_else(shipped_bundle: Bundle, tmp_path:
     for path in (home, home / "thesis.tex"):
         with pytest.raises(BundleError, match=str(path)):
             write_bundle(shipped_bundle, path)
+    (home / "manifest.json").write_text("{}")  # as a web page has one
+    (tmp_path / "photos.zip").write_bytes(b"PK")
+    for path in (home, tmp_path / "photos.zip"):
+        with pytest.raises(BundleError, match="is there already and is no bundle"):
+            write_bundle(shipped_bundle, path)
     assert (home / "thesis.tex").read_text() == "years of work"
+    assert (tmp_path / "photos.zip").read_bytes() == b"PK"
 
 
 def test_a_bundle_without_perception_says_so(shipped_bundle: Bundle) -> None:

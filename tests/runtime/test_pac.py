@@ -9,7 +9,7 @@ import pytest
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
-from edge.core.wire import Rejection, encode
+from edge.core.wire import Rejection, decode, encode
 from edge.runtime.bundle import Bundle, BundleError
 from edge.runtime.pac import Pac, PacParameters, position_feature
 from edge.runtime.policy import Policy
@@ -96,6 +96,62 @@ def test_a_position_that_is_not_a_number_is_none(shipped_policy: Policy) -> None
     assert robot.infer(0.0, 0.0) is None
 
 
+@pytest.mark.parametrize(
+    "view",
+    [np.full((64, 64), np.nan, np.float32), np.zeros((32, 32), np.float32)],
+    ids=["not finite", "wrong size"],
+)
+def test_a_bad_view_does_not_enter_the_map(shipped_policy: Policy, view: F32) -> None:
+    world = World(seen=view)
+    robot = make_robot(shipped_policy, world)
+    robot.perceive(0.0)
+    assert robot.infer(0.0, 0.0) is None
+    world.seen = np.zeros((64, 64), np.float32)
+    robot.perceive(0.2)
+    assert robot.infer(0.2, 0.2) is not None
+
+
+def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(shipped_policy: Policy) -> None:
+    """The degree is that of the neighbour table, not the number of messages in this tick."""
+    once = PacParameters(
+        scale=ModelScale(16.0, 0.25), max_speed_m_s=1.25, max_message_age_s=0.0, payload="float32"
+    )
+    robot = make_robot(shipped_policy, World(), parameters=once)
+    own = []
+    for tick, heard in enumerate(((2, 3), (2,), ())):
+        now_s = 0.4 * tick
+        for robot_id in heard:
+            robot.receive(message(shipped_policy, robot_id, sequence=tick + 1), now_s, now_s)
+        robot.perceive(now_s)
+        sent = robot.infer(now_s, now_s)
+        assert sent is not None
+        own.append(
+            decode(sent, bundle_id=shipped_policy.bundle_id, own_robot_id=9, message_size=870)
+        )
+    # The last values of x_0 are the position, times 1/sqrt(degree).
+    x = [m.payload[33] for m in own if isinstance(m, AggregatedMessage)]
+    np.testing.assert_allclose(x, np.array([1.0, 1.0, np.sqrt(2.0)]) / np.sqrt(2.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"max_speed_m_s": float("nan")}, "max_speed_m_s = nan: must be positive and finite"),
+        ({"max_input_age_s": -1.0}, "max_input_age_s = -1.0"),
+        ({"payload": "float64"}, "payload = 'float64'"),
+    ],
+)
+def test_impossible_settings_are_named(change: dict[str, object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        dataclasses.replace(PARAMETERS, **change)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("robot_id", [-1, 2**16])
+def test_an_id_that_no_message_can_hold_is_refused(shipped_policy: Policy, robot_id: int) -> None:
+    with pytest.raises(ValueError, match=f"robot_id = {robot_id}: must be from 0 to 65535"):
+        make_robot(shipped_policy, World(), robot_id)
+
+
 def test_an_action_without_a_successor_grows_old(shipped_policy: Policy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.perceive(0.0)
@@ -139,12 +195,13 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: Policy) -> None:
         Rejection.TRUNCATED: good[:-1],
         Rejection.CHECKSUM: good[:-1] + bytes([good[-1] ^ 1]),
         Rejection.NON_FINITE: message(shipped_policy, value=float("nan")),
-        Rejection.STALE: message(shipped_policy, sent_at_s=-1.0),
+        Rejection.STALE: message(shipped_policy, sequence=2, sent_at_s=-1.0),
     }
+    assert robot.receive(good, 0.0, 0.0) is None
     for reason, data in cases.items():
         assert robot.receive(data, 0.0, 0.0) is reason
         assert robot.mailbox.counts()[reason] == 1
-    assert robot.mailbox.counts()["accepted"] == 0
+    assert robot.mailbox.counts()["accepted"] == 1
 
 
 def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: Policy) -> None:
