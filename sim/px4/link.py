@@ -1,0 +1,590 @@
+"""MAVLink 2 for one simulated vehicle: datagrams in, datagrams out; no socket and no clock.
+
+Rates and protocol details are PX4's: the mode is told once a second, parameters travel with their
+bytes in the float, an unknown parameter gets no answer, a fence is uploaded as a mission.
+"""
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from edge.core import F64
+from sim.px4.modes import PILOTED, Action, Mode, Result
+from sim.px4.vehicle import GRAVITY_M_S2, Px4Vehicle, Setpoint
+from sim.px4.world import FencePolygon
+
+FORCE = 21196.0  # MAV_CMD_COMPONENT_ARM_DISARM: param 2 that skips the checks
+FIRMWARE_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255  # 1.17.0, release
+PARAMETERS_AT_ONCE = 10
+MAX_DATAGRAM_BYTES = 1400
+
+_MODES = {mode.value: mode for mode in Mode}
+_SENSORS = (
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+)
+_FENCE_VERTICES = {
+    mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION: True,
+    mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False,
+}
+_FENCE = mavlink.MAV_MISSION_TYPE_FENCE
+_UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
+
+
+class Px4Link:
+    """What one vehicle says and understands. Give it datagrams; take from it what is due."""
+
+    def __init__(
+        self, vehicle: Px4Vehicle, *, system_id: int, hardware_uid: int | None = None
+    ) -> None:
+        """`hardware_uid` is the system id unless given; on some boards it is the same on all."""
+        self.vehicle = vehicle
+        self.system_id = system_id
+        vehicle.parameters["MAV_SYS_ID"] = system_id
+        self._hardware_uid = system_id if hardware_uid is None else hardware_uid
+        self._mavlink: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
+        self._mavlink.robust_parsing = True
+        self._out: list[bytes] = []
+        self._parameters_to_send: list[str] = []
+        self._upload: list[Any] = []
+        self._upload_count = 0
+        # Message id -> builder; PX4's default rates on the onboard link, Hz.
+        streams: dict[int, tuple[float, Callable[[], Any]]] = {
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: (1.0, self._heartbeat),
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS: (1.0, self._sys_status),
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: (1.0, self._extended_sys_state),
+            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: (1.0, self._gps_global_origin),
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: (0.5, self._battery_status),
+            mavlink.MAVLINK_MSG_ID_HOME_POSITION: (0.5, self._home_position),
+            mavlink.MAVLINK_MSG_ID_RC_CHANNELS: (1.0, self._rc_channels),
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: (8.0, self._gps_raw_int),
+            mavlink.MAVLINK_MSG_ID_ATTITUDE: (50.0, self._attitude),
+            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: (50.0, self._global_position_int),
+            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: (30.0, self._local_position_ned),
+            mavlink.MAVLINK_MSG_ID_ODOMETRY: (30.0, self._odometry),
+            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: (0.0, self._autopilot_version),
+        }
+        self._builders = {message: build for message, (_, build) in streams.items()}
+        self._default_rates_hz = {message: rate_hz for message, (rate_hz, _) in streams.items()}
+        self._intervals_s: dict[int, float] = {}
+        self._due_s: dict[int, float] = {}
+        for message, rate_hz in self._default_rates_hz.items():
+            self._set_interval(message, 1.0 / rate_hz if rate_hz else math.inf)
+        self._handlers: dict[str, Callable[[Any], None]] = {
+            "HEARTBEAT": self._on_heartbeat,
+            "COMMAND_LONG": self._on_command,
+            "COMMAND_INT": self._on_command,
+            "SET_MODE": self._on_set_mode,
+            "SET_POSITION_TARGET_LOCAL_NED": self._on_setpoint,
+            "PARAM_REQUEST_LIST": self._on_param_request_list,
+            "PARAM_REQUEST_READ": self._on_param_request_read,
+            "PARAM_SET": self._on_param_set,
+            "MISSION_COUNT": self._on_mission_count,
+            "MISSION_ITEM_INT": self._on_mission_item,
+            "MISSION_REQUEST_LIST": self._on_mission_request_list,
+            "MISSION_REQUEST_INT": self._on_mission_request,
+            "MISSION_CLEAR_ALL": self._on_mission_clear_all,
+        }
+        self._commands: dict[int, Callable[[Any], Result]] = {
+            mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_or_disarm,
+            mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
+            mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
+            mavlink.MAV_CMD_NAV_LAND: lambda _: vehicle.set_mode(Mode.LAND),
+            mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: vehicle.set_mode(Mode.RETURN),
+            mavlink.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
+            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
+        }
+
+    def receive(self, datagram: bytes) -> None:
+        """Act on what a client sent; anything that is no MAVLink, or not for us, is ignored."""
+        for message in self._mavlink.parse_buffer(datagram) or ():
+            handler = self._handlers.get(message.get_type())
+            target = getattr(message, "target_system", 0)
+            if handler is not None and target in (0, self.system_id):
+                handler(message)
+
+    def due(self) -> list[bytes]:
+        """The datagrams to send now: answers first, then the streams whose time has come."""
+        vehicle = self.vehicle
+        for event in vehicle.take_events():
+            warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
+            severity = warning if event.is_warning else info
+            self._send(mavlink.MAVLink_statustext_message(severity, event.text.encode()[:50]))
+        for name in self._parameters_to_send[:PARAMETERS_AT_ONCE]:
+            self._send_parameter(name)
+        del self._parameters_to_send[:PARAMETERS_AT_ONCE]
+        now_s = vehicle.time_s + 1e-6
+        for message, due_s in self._due_s.items():
+            if due_s <= now_s:
+                # A late message does not make the next one early.
+                interval_s = self._intervals_s[message]
+                self._due_s[message] = max(due_s + interval_s, now_s)
+                self._send_now(message)
+        datagrams = [b""]
+        for packet in self._out:
+            if len(datagrams[-1]) + len(packet) > MAX_DATAGRAM_BYTES:
+                datagrams.append(b"")
+            datagrams[-1] += packet
+        self._out.clear()
+        return [datagram for datagram in datagrams if datagram]
+
+    def _send(self, message: Any) -> None:
+        self._out.append(bytes(message.pack(self._mavlink)))
+        self._mavlink.seq = (self._mavlink.seq + 1) % 256
+
+    def _send_now(self, message_id: int) -> bool:
+        """Whether there was something to tell."""
+        message = self._builders[message_id]()
+        if message is not None:
+            self._send(message)
+        return message is not None
+
+    def _set_interval(self, message_id: int, interval_s: float) -> None:
+        self._intervals_s[message_id] = interval_s
+        self._due_s[message_id] = self.vehicle.time_s if interval_s < math.inf else math.inf
+
+    # Streams
+
+    def _boot_ms(self) -> int:
+        return int(self.vehicle.time_s * 1e3)
+
+    def _heartbeat(self) -> Any:
+        vehicle = self.vehicle
+        main, sub = vehicle.mode.value
+        flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+        if vehicle.mode in PILOTED:
+            flags |= mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+        else:
+            flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED | mavlink.MAV_MODE_FLAG_AUTO_ENABLED
+        status = mavlink.MAV_STATE_STANDBY
+        if vehicle.armed:
+            flags |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+            in_failsafe = vehicle.failsafe >= Action.HOLD
+            status = mavlink.MAV_STATE_CRITICAL if in_failsafe else mavlink.MAV_STATE_ACTIVE
+        return mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_QUADROTOR,
+            mavlink.MAV_AUTOPILOT_PX4,
+            flags,
+            main << 16 | sub << 24,
+            status,
+            3,
+        )
+
+    def _sys_status(self) -> Any:
+        vehicle = self.vehicle
+        present = _SENSORS | mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+        healthy = _SENSORS
+        if vehicle.position_valid and not vehicle.gps_lost:
+            healthy |= mavlink.MAV_SYS_STATUS_SENSOR_GPS
+        if vehicle.armable:
+            healthy |= mavlink.MAV_SYS_STATUS_PREARM_CHECK
+        if vehicle.rc_connected:
+            present |= mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+            healthy |= mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+        return mavlink.MAVLink_sys_status_message(
+            present,
+            present,
+            healthy,
+            300,
+            self._battery_mv(),
+            -1,
+            round(vehicle.battery_remaining * 100.0),
+            *(0,) * 6,
+        )
+
+    def _battery_mv(self) -> int:
+        """A battery of four cells: 3.5 V each when empty, 4.2 V when full."""
+        return round(14000.0 + 2800.0 * self.vehicle.battery_remaining)
+
+    def _extended_sys_state(self) -> Any:
+        vehicle = self.vehicle
+        if vehicle.landed:
+            state = mavlink.MAV_LANDED_STATE_ON_GROUND
+        elif vehicle.mode is Mode.TAKEOFF:
+            state = mavlink.MAV_LANDED_STATE_TAKEOFF
+        elif vehicle.mode is Mode.LAND:
+            state = mavlink.MAV_LANDED_STATE_LANDING
+        else:
+            state = mavlink.MAV_LANDED_STATE_IN_AIR
+        return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
+
+    def _gps_global_origin(self) -> Any:
+        if not self.vehicle.position_valid:
+            return None
+        return mavlink.MAVLink_gps_global_origin_message(
+            *_as_integers(self.vehicle.global_origin), self._boot_ms() * 1000
+        )
+
+    def _battery_status(self) -> Any:
+        cell_mv = self._battery_mv() // 4
+        return mavlink.MAVLink_battery_status_message(
+            0,
+            mavlink.MAV_BATTERY_FUNCTION_ALL,
+            mavlink.MAV_BATTERY_TYPE_LIPO,
+            2500,
+            [cell_mv] * 4 + [0xFFFF] * 6,
+            -1,
+            -1,
+            -1,
+            round(self.vehicle.battery_remaining * 100.0),
+        )
+
+    def _home_position(self) -> Any:
+        home, home_m = self.vehicle.global_home, self.vehicle.home_m
+        if home is None or home_m is None:
+            return None
+        local_m = (home_m - self.vehicle.estimator_origin_m).tolist()
+        no_rotation, no_approach = [1.0, 0.0, 0.0, 0.0], [math.nan] * 3
+        return mavlink.MAVLink_home_position_message(
+            *_as_integers(home), *local_m, no_rotation, *no_approach, self._boot_ms() * 1000
+        )
+
+    def _rc_channels(self) -> Any:
+        if not self.vehicle.rc_connected:
+            return None
+        return mavlink.MAVLink_rc_channels_message(
+            self._boot_ms(), 8, *(1500,) * 8, *(0xFFFF,) * 10, 254
+        )
+
+    def _gps_raw_int(self) -> Any:
+        vehicle = self.vehicle
+        speed_cm_s = round(100.0 * math.hypot(vehicle.velocity_m_s[0], vehicle.velocity_m_s[1]))
+        fix, satellites = (1, 0) if vehicle.gps_lost else (3, 14)
+        dilution = 9999 if vehicle.gps_lost else 80
+        return mavlink.MAVLink_gps_raw_int_message(
+            self._boot_ms() * 1000,
+            fix,
+            *_as_integers(vehicle.global_position),
+            dilution,
+            dilution,
+            speed_cm_s,
+            0xFFFF,
+            satellites,
+        )
+
+    def _attitude(self) -> Any:
+        roll, pitch = self._tilt_rad()
+        yaw_rad = math.remainder(self.vehicle.heading_rad, math.tau)
+        return mavlink.MAVLink_attitude_message(
+            self._boot_ms(), roll, pitch, yaw_rad, 0.0, 0.0, self.vehicle.yaw_rate_rad_s
+        )
+
+    def _body(self, vector: F64) -> tuple[float, float, float]:
+        """From the world frame to the level body frame: forward, right, down."""
+        north, east, down = vector.tolist()
+        cos, sin = math.cos(self.vehicle.heading_rad), math.sin(self.vehicle.heading_rad)
+        return cos * north + sin * east, cos * east - sin * north, down
+
+    def _tilt_rad(self) -> tuple[float, float]:
+        """Roll and pitch that the horizontal acceleration takes."""
+        forward, right, _ = self._body(self.vehicle.acceleration_m_s2)
+        return math.atan2(right, GRAVITY_M_S2), math.atan2(-forward, GRAVITY_M_S2)
+
+    def _global_position_int(self) -> Any:
+        vehicle = self.vehicle
+        if not vehicle.position_valid:
+            return None
+        latitude, longitude, altitude_mm = _as_integers(vehicle.global_position)
+        home = vehicle.global_home
+        relative_mm = 0 if home is None else altitude_mm - round(home[2] * 1e3)
+        velocity_cm_s = np.rint(vehicle.velocity_m_s * 100.0).astype(int).tolist()
+        heading_cdeg = round(math.degrees(vehicle.heading_rad) * 100.0) % 36000
+        return mavlink.MAVLink_global_position_int_message(
+            self._boot_ms(),
+            latitude,
+            longitude,
+            altitude_mm,
+            relative_mm,
+            *velocity_cm_s,
+            heading_cdeg,
+        )
+
+    def _local_position_ned(self) -> Any:
+        if not self.vehicle.position_valid:
+            return None
+        position_m, velocity_m_s = self.vehicle.local_position_m, self.vehicle.velocity_m_s
+        return mavlink.MAVLink_local_position_ned_message(
+            self._boot_ms(), *position_m.tolist(), *velocity_m_s.tolist()
+        )
+
+    def _odometry(self) -> Any:
+        vehicle = self.vehicle
+        if not vehicle.position_valid:
+            return None
+        half_yaw_rad = vehicle.heading_rad / 2.0
+        level = [math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad)]
+        return mavlink.MAVLink_odometry_message(
+            self._boot_ms() * 1000,
+            mavlink.MAV_FRAME_LOCAL_NED,
+            mavlink.MAV_FRAME_BODY_FRD,
+            *vehicle.local_position_m.tolist(),
+            level,
+            *self._body(vehicle.velocity_m_s),
+            0.0,
+            0.0,
+            vehicle.yaw_rate_rad_s,
+            _UNKNOWN_COVARIANCE,
+            _UNKNOWN_COVARIANCE,
+            estimator_type=mavlink.MAV_ESTIMATOR_TYPE_AUTOPILOT,
+        )
+
+    def _autopilot_version(self) -> Any:
+        capabilities = (
+            mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+            | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+            | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+            | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+            | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+            | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+        )
+        return mavlink.MAVLink_autopilot_version_message(
+            capabilities,
+            FIRMWARE_VERSION,
+            0,
+            0,
+            0,
+            [0] * 8,
+            [0] * 8,
+            [0] * 8,
+            0,
+            0,
+            self._hardware_uid,
+            list(self._hardware_uid.to_bytes(18, "little")),
+        )
+
+    # Commands
+
+    def _on_heartbeat(self, message: Any) -> None:
+        if message.type == mavlink.MAV_TYPE_GCS:
+            self.vehicle.ground_station_heartbeat()
+
+    def _on_command(self, message: Any) -> None:
+        run = self._commands.get(message.command)
+        result = Result.UNSUPPORTED if run is None else run(message)
+        self._send(
+            mavlink.MAVLink_command_ack_message(
+                message.command,
+                result,
+                target_system=message.get_srcSystem(),
+                target_component=message.get_srcComponent(),
+            )
+        )
+
+    def _arm_or_disarm(self, message: Any) -> Result:
+        change = self.vehicle.arm if message.param1 > 0.5 else self.vehicle.disarm
+        return change(force=message.param2 == FORCE)
+
+    def _set_mode(self, message: Any) -> Result:
+        return self._enter(_to_int(message.param2), _to_int(message.param3))
+
+    def _on_set_mode(self, message: Any) -> None:
+        self._enter(message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24)
+
+    def _enter(self, main_mode: int, sub_mode: int) -> Result:
+        mode = _MODES.get((main_mode, sub_mode))
+        return Result.DENIED if mode is None else self.vehicle.set_mode(mode)
+
+    def _take_off(self, message: Any) -> Result:
+        long = message.get_type() == "COMMAND_LONG"
+        return self.vehicle.take_off(message.param7 if long else message.z)
+
+    def _terminate(self, message: Any) -> Result:
+        return self.vehicle.disarm(force=True) if message.param1 > 0.5 else Result.ACCEPTED
+
+    def _set_message_interval(self, message: Any) -> Result:
+        """Interval in us; 0 is the default rate, below 0 is off."""
+        message_id, interval_us = _to_int(message.param1), message.param2
+        if message_id not in self._builders:
+            return Result.UNSUPPORTED
+        if interval_us == 0.0:
+            rate_hz = self._default_rates_hz[message_id]
+            self._set_interval(message_id, 1.0 / rate_hz if rate_hz else math.inf)
+        else:
+            self._set_interval(message_id, interval_us * 1e-6 if interval_us > 0.0 else math.inf)
+        return Result.ACCEPTED
+
+    def _request_message(self, message: Any) -> Result:
+        message_id = _to_int(message.param1)
+        if message_id not in self._builders:
+            return Result.UNSUPPORTED
+        sent = self._send_now(message_id)
+        return Result.ACCEPTED if sent else Result.TEMPORARILY_REJECTED
+
+    def _request_capabilities(self, _: Any) -> Result:
+        self._send(self._autopilot_version())
+        return Result.ACCEPTED
+
+    def _on_setpoint(self, message: Any) -> None:
+        if message.coordinate_frame != mavlink.MAV_FRAME_LOCAL_NED:
+            return
+        values = [message.x, message.y, message.z, message.vx, message.vy, message.vz]
+        commanded = [
+            math.nan if message.type_mask >> bit & 1 or not math.isfinite(value) else value
+            for bit, value in enumerate(values)
+        ]
+        no_yaw = message.type_mask & mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+        yaw_rad = math.nan if no_yaw or not math.isfinite(message.yaw) else message.yaw
+        self.vehicle.offboard(Setpoint(np.array(commanded[:3]), np.array(commanded[3:]), yaw_rad))
+
+    # Parameters
+
+    def _send_parameter(self, name: str) -> None:
+        value = self.vehicle.parameters[name]
+        if isinstance(value, int):
+            kind = mavlink.MAV_PARAM_TYPE_INT32
+            value = struct.unpack("<f", struct.pack("<i", value))[0]
+        else:
+            kind = mavlink.MAV_PARAM_TYPE_REAL32
+        names = list(self.vehicle.parameters)
+        self._send(
+            mavlink.MAVLink_param_value_message(
+                name.encode(), value, kind, len(names), names.index(name)
+            )
+        )
+
+    def _on_param_request_list(self, _: Any) -> None:
+        self._parameters_to_send = list(self.vehicle.parameters)
+
+    def _on_param_request_read(self, message: Any) -> None:
+        names = list(self.vehicle.parameters)
+        if 0 <= message.param_index < len(names):
+            self._send_parameter(names[message.param_index])
+        elif message.param_id in self.vehicle.parameters:
+            self._send_parameter(message.param_id)
+
+    def _on_param_set(self, message: Any) -> None:
+        name, parameters = message.param_id, self.vehicle.parameters
+        if name not in parameters:
+            return
+        is_int = isinstance(parameters[name], int)
+        kind = mavlink.MAV_PARAM_TYPE_INT32 if is_int else mavlink.MAV_PARAM_TYPE_REAL32
+        if message.param_type != kind:
+            self._send(
+                mavlink.MAVLink_statustext_message(
+                    mavlink.MAV_SEVERITY_ERROR, f"[pm] param types mismatch: {name}".encode()
+                )
+            )
+            return
+        packed = struct.pack("<f", message.param_value)
+        parameters[name] = struct.unpack("<i" if is_int else "<f", packed)[0]
+        self._send_parameter(name)
+
+    # Fence, by the mission protocol
+
+    def _answer_mission(self, message: Any, result: int) -> None:
+        self._send(
+            mavlink.MAVLink_mission_ack_message(
+                message.get_srcSystem(), message.get_srcComponent(), result, message.mission_type
+            )
+        )
+
+    def _on_mission_count(self, message: Any) -> None:
+        if message.mission_type != _FENCE:
+            self._answer_mission(message, mavlink.MAV_MISSION_UNSUPPORTED)
+            return
+        self._upload, self._upload_count = [], message.count
+        self._ask_for_next_item(message)
+
+    def _on_mission_item(self, message: Any) -> None:
+        if message.mission_type != _FENCE or message.seq != len(self._upload):
+            return
+        if message.command not in _FENCE_VERTICES:
+            self._answer_mission(message, mavlink.MAV_MISSION_UNSUPPORTED)
+            return
+        self._upload.append(message)
+        self._ask_for_next_item(message)
+
+    def _ask_for_next_item(self, message: Any) -> None:
+        if len(self._upload) < self._upload_count:
+            self._send(
+                mavlink.MAVLink_mission_request_int_message(
+                    message.get_srcSystem(), message.get_srcComponent(), len(self._upload), _FENCE
+                )
+            )
+            return
+        polygons = _to_polygons(self._upload)
+        if polygons is None:
+            self._answer_mission(message, mavlink.MAV_MISSION_INVALID_PARAM1)
+            return
+        self.vehicle.fence = polygons
+        self._answer_mission(message, mavlink.MAV_MISSION_ACCEPTED)
+
+    def _on_mission_request_list(self, message: Any) -> None:
+        vertices = 0
+        if message.mission_type == _FENCE:
+            vertices = sum(len(polygon.vertices_deg) for polygon in self.vehicle.fence)
+        self._send(
+            mavlink.MAVLink_mission_count_message(
+                message.get_srcSystem(), message.get_srcComponent(), vertices, message.mission_type
+            )
+        )
+
+    def _on_mission_request(self, message: Any) -> None:
+        items = [(polygon, v) for polygon in self.vehicle.fence for v in polygon.vertices_deg]
+        if message.mission_type != _FENCE or message.seq >= len(items):
+            self._answer_mission(message, mavlink.MAV_MISSION_INVALID_SEQUENCE)
+            return
+        polygon, (latitude_deg, longitude_deg) = items[message.seq]
+        command = next(c for c, inside in _FENCE_VERTICES.items() if inside is polygon.inclusion)
+        self._send(
+            mavlink.MAVLink_mission_item_int_message(
+                message.get_srcSystem(),
+                message.get_srcComponent(),
+                message.seq,
+                mavlink.MAV_FRAME_GLOBAL_INT,
+                command,
+                0,
+                0,
+                float(len(polygon.vertices_deg)),
+                0.0,
+                0.0,
+                0.0,
+                round(latitude_deg * 1e7),
+                round(longitude_deg * 1e7),
+                0.0,
+                _FENCE,
+            )
+        )
+
+    def _on_mission_clear_all(self, message: Any) -> None:
+        if message.mission_type in (_FENCE, mavlink.MAV_MISSION_TYPE_ALL):
+            self.vehicle.fence = ()
+        self._answer_mission(message, mavlink.MAV_MISSION_ACCEPTED)
+
+
+def _to_int(parameter: float) -> int:
+    """A command's parameter that should be a whole number; -1 if it is none at all."""
+    return int(parameter) if math.isfinite(parameter) else -1
+
+
+def _as_integers(place: tuple[float, float, float]) -> tuple[int, int, int]:
+    """Degrees and metres as MAVLink has them: 1e-7 degrees and mm."""
+    latitude_deg, longitude_deg, altitude_m = place
+    return round(latitude_deg * 1e7), round(longitude_deg * 1e7), round(altitude_m * 1e3)
+
+
+def _to_polygons(items: list[Any]) -> tuple[FencePolygon, ...] | None:
+    """Each vertex says in param 1 how many its polygon has; None where that does not fit."""
+    polygons: list[FencePolygon] = []
+    while items:
+        count = max(_to_int(items[0].param1), 0)
+        polygon, items = items[:count], items[count:]
+        if count < 3 or [item.param1 for item in polygon] != [count] * count:
+            return None
+        polygons.append(
+            FencePolygon(
+                _FENCE_VERTICES[polygon[0].command],
+                tuple((item.x * 1e-7, item.y * 1e-7) for item in polygon),
+            )
+        )
+    return tuple(polygons)

@@ -1,0 +1,59 @@
+"""Where the simulated world lies on the earth, and polygons on it."""
+
+import math
+from dataclasses import dataclass
+
+from edge.core import F64
+
+
+@dataclass(frozen=True, slots=True)
+class WorldOrigin:
+    """Where the world frame lies: WGS84 degrees, and the ground's height above mean sea level."""
+
+    latitude_deg: float = 39.9526
+    longitude_deg: float = -75.1652
+    altitude_m: float = 10.0
+
+    def to_global(self, position_m: F64) -> tuple[float, float, float]:
+        """Latitude and longitude, deg, and height above mean sea level, m, of a world position."""
+        north_m, east_m = self._m_per_deg()
+        return (
+            self.latitude_deg + float(position_m[0]) / north_m,
+            self.longitude_deg + float(position_m[1]) / east_m,
+            self.altitude_m - float(position_m[2]),
+        )
+
+    def to_world(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """North and east of a place, m."""
+        north_m, east_m = self._m_per_deg()
+        return (
+            (latitude_deg - self.latitude_deg) * north_m,
+            (longitude_deg - self.longitude_deg) * east_m,
+        )
+
+    def _m_per_deg(self) -> tuple[float, float]:
+        """Lengths of a degree on the WGS84 ellipsoid; good to 1 cm within 1 km."""
+        semi_major_m, eccentricity_2 = 6378137.0, 6.69437999014e-3
+        latitude = math.radians(self.latitude_deg)
+        w_2 = 1.0 - eccentricity_2 * math.sin(latitude) ** 2
+        meridian_m = semi_major_m * (1.0 - eccentricity_2) / w_2**1.5
+        normal_m = semi_major_m / math.sqrt(w_2) * math.cos(latitude)
+        return math.radians(meridian_m), math.radians(normal_m)
+
+
+@dataclass(frozen=True, slots=True)
+class FencePolygon:
+    """Where the vehicle must stay (or must not go): (latitude, longitude) in deg, in order."""
+
+    inclusion: bool
+    vertices_deg: tuple[tuple[float, float], ...]
+
+    def contains(self, world: WorldOrigin, north_m: float, east_m: float) -> bool:
+        """Whether a place of the world lies inside the polygon (even-odd rule)."""
+        corners_m = [world.to_world(*vertex_deg) for vertex_deg in self.vertices_deg]
+        inside = False
+        for (n_1, e_1), (n_2, e_2) in zip(corners_m, corners_m[1:] + corners_m[:1], strict=True):
+            crosses = (e_1 > east_m) != (e_2 > east_m)
+            if crosses and north_m < n_1 + (east_m - e_1) * (n_2 - n_1) / (e_2 - e_1):
+                inside = not inside
+        return inside

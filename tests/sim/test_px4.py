@@ -1,0 +1,657 @@
+"""The simulated vehicle: its behaviour by itself, and as the real MAVSDK sees it."""
+
+import asyncio
+import math
+import socket
+from collections.abc import AsyncGenerator, Callable, Iterator
+from contextlib import aclosing, contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
+from mavsdk.asyncio.plugins.action import ActionAsync, ActionError, ActionResult
+from mavsdk.asyncio.plugins.geofence import (
+    FenceType,
+    GeofenceAsync,
+    GeofenceData,
+    Point,
+    Polygon,
+)
+from mavsdk.asyncio.plugins.offboard import (
+    OffboardAsync,
+    OffboardError,
+    OffboardResult,
+    PositionNedYaw,
+    VelocityNedYaw,
+)
+from mavsdk.asyncio.plugins.param import ParamAsync
+from mavsdk.asyncio.plugins.telemetry import FlightMode, LandedState, TelemetryAsync
+from pymavlink.dialects.v20 import common as mavlink
+
+from sim.px4.link import Px4Link
+from sim.px4.modes import Mode, Result
+from sim.px4.server import Instance, Px4Server
+from sim.px4.vehicle import Px4Vehicle, Setpoint
+from sim.px4.world import FencePolygon, WorldOrigin
+
+STEP_S = 0.02
+NAN_3 = np.full(3, math.nan)
+
+
+def run(vehicle: Px4Vehicle, duration_s: float, setpoint: Setpoint | None = None) -> None:
+    """Let time pass, with the setpoint streamed at 10 Hz."""
+    for step in range(round(duration_s / STEP_S)):
+        if setpoint is not None and step % 5 == 0:
+            vehicle.offboard(setpoint)
+        vehicle.step(STEP_S)
+
+
+def run_until(vehicle: Px4Vehicle, condition: Callable[[], bool], timeout_s: float) -> float:
+    start_s = vehicle.time_s
+    while not condition():
+        assert vehicle.time_s - start_s < timeout_s, vehicle.truth[-1]
+        vehicle.step(STEP_S)
+    return vehicle.time_s - start_s
+
+
+def hovering(seed: int = 1, altitude_m: float = 5.0, *, rc: bool = False) -> Px4Vehicle:
+    vehicle = Px4Vehicle(seed=seed, ready_after_s=0.0)
+    vehicle.rc_connected = rc
+    vehicle.parameters["MIS_TAKEOFF_ALT"] = altitude_m
+    vehicle.step(STEP_S)
+    assert vehicle.arm() is Result.ACCEPTED
+    assert vehicle.take_off(math.nan) is Result.ACCEPTED
+    run_until(vehicle, lambda: vehicle.mode is Mode.HOLD, 20.0)
+    run(vehicle, 2.0)
+    return vehicle
+
+
+def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Setpoint:
+    return Setpoint(NAN_3, np.array([north, east, down]))
+
+
+def in_offboard(setpoint: Setpoint, *, rc: bool = False, **parameters: int) -> Px4Vehicle:
+    """Flying a setpoint whose last packet has just arrived."""
+    vehicle = hovering(rc=rc)
+    vehicle.parameters |= parameters
+    vehicle.offboard(setpoint)
+    assert vehicle.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+    run(vehicle, 3.0, setpoint)
+    assert vehicle.mode is Mode.OFFBOARD
+    vehicle.offboard(setpoint)
+    return vehicle
+
+
+def speed_m_s(vehicle: Px4Vehicle) -> float:
+    return float(np.linalg.norm(vehicle.velocity_m_s))
+
+
+def texts(vehicle: Px4Vehicle) -> list[str]:
+    return [event.text for event in vehicle.take_events()]
+
+
+# Arming
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_arming_is_denied_until_health_is_good(seed: int) -> None:
+    vehicle = Px4Vehicle(seed=seed)
+    assert vehicle.arm() is Result.DENIED
+    assert texts(vehicle) == ["Arming denied: no global position"]
+    assert 3.0 <= run_until(vehicle, lambda: vehicle.armable, 10.0) <= 6.1
+    assert vehicle.arm() is Result.ACCEPTED
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda v: setattr(v, "gps_lost", True), "no global position"),
+        (lambda v: setattr(v, "battery_remaining", 0.1), "low battery"),
+        (lambda v: v.set_mode(Mode.LAND), "mode LAND"),
+        (lambda v: v.set_mode(Mode.POSCTL), "no manual control"),
+        (lambda v: v.parameters.update(NAV_DLL_ACT=2), "no connection to a ground station"),
+    ],
+)
+def test_arming_is_denied_with_a_reason(spoil: Callable[[Any], object], reason: str) -> None:
+    vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
+    run(vehicle, 0.1)
+    spoil(vehicle)
+    assert vehicle.arm() is Result.DENIED
+    assert texts(vehicle) == [f"Arming denied: {reason}"]
+    assert vehicle.arm(force=True) is Result.ACCEPTED
+
+
+def test_an_armed_vehicle_that_stays_on_the_ground_disarms_itself() -> None:
+    vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
+    vehicle.step(STEP_S)
+    vehicle.arm()
+    assert 10.0 <= run_until(vehicle, lambda: not vehicle.armed, 15.0) <= 12.5
+    assert vehicle.landed
+
+
+def test_disarming_in_the_air_is_denied_but_a_kill_drops_the_vehicle() -> None:
+    vehicle = hovering()
+    assert vehicle.disarm() is Result.DENIED
+    assert vehicle.armed
+    assert vehicle.disarm(force=True) is Result.ACCEPTED
+    assert run_until(vehicle, lambda: vehicle.landed, 5.0) < 2.5
+
+
+# Flight
+
+
+def test_take_off_and_landing_take_as_long_as_measured() -> None:
+    vehicle = Px4Vehicle(seed=2, ready_after_s=0.0)
+    vehicle.step(STEP_S)
+    vehicle.parameters["MIS_TAKEOFF_ALT"] = 5.0
+    vehicle.arm()
+    vehicle.take_off(math.nan)
+    assert 6.0 <= run_until(vehicle, lambda: vehicle.mode is Mode.HOLD, 20.0) <= 9.0
+    assert vehicle.position_m[2] == pytest.approx(-5.0, abs=0.6)
+    vehicle.set_mode(Mode.LAND)
+    assert 8.0 <= run_until(vehicle, lambda: not vehicle.armed, 20.0) <= 19.0
+    assert vehicle.landed
+    assert vehicle.arm() is Result.ACCEPTED
+
+
+def test_a_velocity_setpoint_lags_and_lets_the_height_drift() -> None:
+    vehicle = hovering()
+    before_m = vehicle.position_m
+    vehicle.offboard(velocity(1.0))
+    vehicle.set_mode(Mode.OFFBOARD)
+    run(vehicle, 10.0, velocity(1.0))
+    moved_m = vehicle.position_m - before_m
+    assert 7.0 <= moved_m[0] <= 8.8
+    assert abs(moved_m[1]) < 0.3
+    assert 0.01 < abs(moved_m[2]) < 1.6
+
+
+def test_an_offboard_position_is_one_of_the_local_frame() -> None:
+    vehicle = hovering()
+    target_m = vehicle.local_position_m + np.array([2.0, -3.0, -1.0])
+    setpoint = Setpoint(target_m, NAN_3, yaw_rad=1.0)
+    vehicle.offboard(setpoint)
+    vehicle.set_mode(Mode.OFFBOARD)
+    run(vehicle, 12.0, setpoint)
+    assert vehicle.local_position_m == pytest.approx(target_m, abs=0.3)
+    assert vehicle.heading_rad == pytest.approx(1.0)
+    assert speed_m_s(vehicle) < 0.2
+
+
+def test_hold_stops_at_once() -> None:
+    vehicle = in_offboard(velocity(1.0))
+    run(vehicle, 5.0, velocity(1.0))
+    vehicle.set_mode(Mode.HOLD)
+    run(vehicle, 1.0)
+    assert speed_m_s(vehicle) < 0.2
+
+
+def test_return_climbs_flies_home_and_lands() -> None:
+    vehicle = in_offboard(velocity(3.0))
+    vehicle.parameters["RTL_RETURN_ALT"] = 12.0
+    run(vehicle, 5.0, velocity(3.0))
+    vehicle.set_mode(Mode.RETURN)
+    run_until(vehicle, lambda: not vehicle.armed, 90.0)
+    assert np.linalg.norm(vehicle.position_m) < 1.5
+    assert min(sample.position_m[2] for sample in vehicle.truth) == pytest.approx(-12.0, abs=1.0)
+
+
+# Offboard
+
+
+def test_offboard_needs_a_stream() -> None:
+    vehicle = hovering()
+    assert vehicle.set_mode(Mode.OFFBOARD) is Result.DENIED
+    vehicle.offboard(velocity(0.0))
+    run(vehicle, 2.0)
+    assert vehicle.set_mode(Mode.OFFBOARD) is Result.DENIED
+
+
+@pytest.mark.parametrize(
+    ("offboard_loss", "manual_loss", "first", "then"),
+    [
+        (4, 2, Mode.HOLD, Mode.LAND),
+        (5, 2, Mode.HOLD, Mode.HOLD),
+        (3, 0, Mode.HOLD, Mode.RETURN),
+        (0, 2, Mode.HOLD, Mode.RETURN),
+        (0, 3, Mode.HOLD, Mode.LAND),
+        (0, 0, Mode.OFFBOARD, Mode.OFFBOARD),
+    ],
+)
+def test_what_a_lost_stream_leads_to(
+    offboard_loss: int, manual_loss: int, first: Mode, then: Mode
+) -> None:
+    vehicle = in_offboard(velocity(1.0), COM_OBL_RC_ACT=offboard_loss, NAV_RCL_ACT=manual_loss)
+    run(vehicle, 0.98)
+    assert vehicle.mode is Mode.OFFBOARD
+    run(vehicle, 0.12)
+    assert vehicle.mode is first
+    run(vehicle, 5.2)
+    assert vehicle.mode is then
+    if then is Mode.OFFBOARD:
+        assert vehicle.velocity_m_s[0] == pytest.approx(1.0, abs=0.1)
+    if then is Mode.RETURN:
+        run(vehicle, 2.0)
+        assert vehicle.velocity_m_s[2] < -0.5
+    if then is Mode.LAND:
+        run_until(vehicle, lambda: not vehicle.armed, 30.0)
+        assert vehicle.mode is Mode.OFFBOARD
+        assert vehicle.arm() is Result.DENIED
+
+
+def test_a_lost_stream_gives_the_vehicle_to_a_pilot_who_is_there() -> None:
+    vehicle = in_offboard(velocity(1.0), rc=True)
+    run(vehicle, 3.0)
+    assert vehicle.mode is Mode.POSCTL
+    assert speed_m_s(vehicle) < 0.2
+
+
+def test_a_stream_that_comes_back_takes_the_vehicle_along_again() -> None:
+    vehicle = in_offboard(velocity(1.0), COM_OBL_RC_ACT=5)
+    run(vehicle, 3.0)
+    assert vehicle.mode is Mode.HOLD
+    run(vehicle, 4.0, velocity(1.0))
+    assert vehicle.mode is Mode.OFFBOARD
+    assert vehicle.velocity_m_s[0] > 0.8
+    run(vehicle, 3.0)
+    vehicle.set_mode(Mode.HOLD)
+    run(vehicle, 3.0, velocity(1.0))
+    assert vehicle.mode is Mode.HOLD
+
+
+# The pilot
+
+
+def test_a_pilot_takes_over_and_the_client_gets_the_vehicle_back() -> None:
+    vehicle = in_offboard(velocity(1.0), rc=True)
+    assert vehicle.pilot(Mode.POSCTL, (0.0, -2.0, 0.0)) is Result.ACCEPTED
+    run(vehicle, 3.0, velocity(1.0))
+    assert vehicle.mode is Mode.POSCTL
+    assert vehicle.velocity_m_s == pytest.approx([0.0, -2.0, 0.0], abs=0.1)
+    vehicle.move_sticks(())
+    run(vehicle, 3.0, velocity(1.0))
+    assert speed_m_s(vehicle) < 0.2
+    assert vehicle.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+    run(vehicle, 1.0, velocity(1.0))
+    assert vehicle.mode is Mode.OFFBOARD
+
+
+@pytest.mark.parametrize(("override", "mode"), [(1, Mode.OFFBOARD), (2, Mode.POSCTL)])
+def test_sticks_alone_leave_offboard_only_where_a_parameter_allows_it(
+    override: int, mode: Mode
+) -> None:
+    vehicle = in_offboard(velocity(1.0), rc=True, COM_RC_OVERRIDE=override)
+    vehicle.move_sticks((1.0, 0.0, 0.0))
+    run(vehicle, 0.2)
+    assert vehicle.mode is mode
+
+
+@pytest.mark.parametrize(("excepted", "mode"), [(0, Mode.LAND), (4, Mode.OFFBOARD)])
+def test_a_lost_remote_control_counts_unless_excepted(excepted: int, mode: Mode) -> None:
+    vehicle = in_offboard(velocity(0.0), rc=True, COM_RCL_EXCEPT=excepted, NAV_RCL_ACT=3)
+    vehicle.rc_connected = False
+    run(vehicle, 5.2, velocity(0.0))
+    assert vehicle.mode is mode
+
+
+def test_manual_modes_need_a_remote_control() -> None:
+    assert hovering().set_mode(Mode.POSCTL) is Result.DENIED
+
+
+# Other failsafes
+
+
+def test_without_gps_it_descends_where_the_wind_takes_it() -> None:
+    vehicle = hovering()
+    vehicle.gps_lost = True
+    run(vehicle, 4.5)
+    assert vehicle.mode is Mode.HOLD
+    run(vehicle, 1.0)
+    assert vehicle.mode is Mode.LAND
+    vehicle.wind_m_s = np.array([0.0, 1.5, 0.0])
+    east_m = vehicle.position_m[1]
+    run_until(vehicle, lambda: not vehicle.armed, 30.0)
+    assert vehicle.position_m[1] - east_m > 3.0
+    assert not vehicle.armable
+    vehicle.gps_lost = False
+    run(vehicle, 0.1)
+    assert vehicle.armable
+
+
+@pytest.mark.parametrize(
+    ("setting", "remaining", "mode"),
+    [
+        (0, 0.01, Mode.HOLD),
+        (2, 0.10, Mode.HOLD),
+        (2, 0.06, Mode.LAND),
+        (3, 0.06, Mode.RETURN),
+        (3, 0.04, Mode.LAND),
+    ],
+)
+def test_low_battery(setting: int, remaining: float, mode: Mode) -> None:
+    vehicle = hovering()
+    vehicle.parameters["COM_LOW_BAT_ACT"] = setting
+    vehicle.battery_remaining = remaining
+    run(vehicle, 5.2)
+    assert vehicle.mode is mode
+    assert vehicle.battery_remaining < remaining
+    assert any("battery" in text for text in texts(vehicle))
+
+
+def test_a_silent_ground_station_counts_only_if_a_parameter_says_so() -> None:
+    vehicle = hovering()
+    vehicle.parameters["NAV_DLL_ACT"] = 3
+    vehicle.ground_station_heartbeat()
+    run(vehicle, 9.0)
+    assert vehicle.mode is Mode.HOLD
+    run(vehicle, 7.0)
+    assert vehicle.mode is Mode.LAND
+
+
+@pytest.mark.parametrize("polygon", [False, True])
+def test_the_fence_acts_once_on_a_breach(polygon: bool) -> None:
+    vehicle = in_offboard(velocity(2.0))
+    if polygon:
+        assert vehicle.home_m is not None
+        offsets_m = np.array([(-10, -10, 0), (10, -10, 0), (10, 10, 0), (-10, 10, 0)])
+        corners = [WorldOrigin().to_global(vehicle.home_m + offset_m) for offset_m in offsets_m]
+        vehicle.fence = (FencePolygon(True, tuple(corner[:2] for corner in corners)),)
+    else:
+        vehicle.parameters["GF_MAX_HOR_DIST"] = 10.0
+    run(vehicle, 8.0, velocity(2.0))
+    assert vehicle.mode is Mode.HOLD
+    assert vehicle.home_m is not None
+    assert 10.0 < (vehicle.estimated_position_m - vehicle.home_m)[0] < 12.0
+    vehicle.set_mode(Mode.OFFBOARD)
+    run(vehicle, 1.0, velocity(-2.0))
+    assert vehicle.mode is Mode.OFFBOARD
+
+
+# Where it is
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_gps_is_wrong_by_one_to_five_metres(seed: int) -> None:
+    bias_m = Px4Vehicle(seed=seed).gps_bias_m
+    assert 1.0 <= math.hypot(bias_m[0], bias_m[1]) <= 5.0
+
+
+def test_the_same_seed_flies_the_same_flight() -> None:
+    assert hovering(3).truth == hovering(3).truth
+    assert hovering(3).truth != hovering(4).truth
+
+
+def test_wind_pushes_at_first_and_a_storm_carries_away() -> None:
+    vehicle = hovering()
+    before_m = vehicle.position_m
+    vehicle.wind_m_s = np.array([6.0, 0.0, 0.0])
+    run(vehicle, 2.0)
+    assert 0.1 < vehicle.position_m[0] - before_m[0] < 4.0
+    run(vehicle, 30.0)
+    assert np.linalg.norm((vehicle.position_m - before_m)[:2]) < 1.0
+    vehicle.wind_m_s = np.array([20.0, 0.0, 0.0])
+    run(vehicle, 10.0)
+    assert vehicle.position_m[0] - before_m[0] > 30.0
+
+
+def test_gusts_shake_it() -> None:
+    vehicle = hovering()
+    vehicle.gust_m_s = 2.0
+    run(vehicle, 20.0)
+    speeds = [np.linalg.norm(sample.velocity_m_s) for sample in vehicle.truth[-300:]]
+    assert max(speeds) > 0.15
+
+
+def test_an_origin_jump_moves_local_positions_and_what_follows_them() -> None:
+    vehicle = hovering()
+    local_m, place = vehicle.local_position_m, vehicle.global_position
+    vehicle.jump_estimator_origin(7.0, 0.0)
+    assert vehicle.local_position_m - local_m == pytest.approx([-7.0, 0.0, 0.0])
+    assert vehicle.global_position == place
+    north_m = vehicle.position_m[0]
+    run(vehicle, 3.0)
+    assert vehicle.position_m[0] == pytest.approx(north_m, abs=0.5)
+    setpoint = Setpoint(local_m, NAN_3)
+    vehicle.offboard(setpoint)
+    vehicle.set_mode(Mode.OFFBOARD)
+    run(vehicle, 10.0, setpoint)
+    assert vehicle.position_m[0] - north_m == pytest.approx(7.0, abs=1.0)
+
+
+# MAVLink
+
+
+@given(
+    st.binary(max_size=80),
+    st.integers(0, 1000),
+    st.lists(st.floats(width=32), min_size=7, max_size=7),
+)
+def test_no_datagram_upsets_the_link(noise: bytes, command: int, values: list[float]) -> None:
+    vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
+    link = Px4Link(vehicle, system_id=1)
+    client = mavlink.MAVLink(None, srcSystem=245, srcComponent=191)
+    link.receive(noise)
+    for message in (
+        mavlink.MAVLink_command_long_message(1, 1, command, 0, *values),
+        mavlink.MAVLink_command_long_message(1, 1, mavlink.MAV_CMD_DO_SET_MODE, 0, *values),
+        mavlink.MAVLink_command_long_message(
+            1, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *values
+        ),
+        mavlink.MAVLink_set_position_target_local_ned_message(
+            0, 1, 1, 1, 0, *values, 0.0, 0.0, values[0], 0.0
+        ),
+    ):
+        link.receive(message.pack(client))
+    vehicle.arm()
+    vehicle.set_mode(Mode.OFFBOARD)
+    run(vehicle, 0.1)
+    assert all(len(datagram) <= 1400 for datagram in link.due())
+    assert np.isfinite(vehicle.position_m).all()
+
+
+def test_a_message_for_another_system_is_not_obeyed() -> None:
+    vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
+    vehicle.step(STEP_S)
+    link = Px4Link(vehicle, system_id=2)
+    client = mavlink.MAVLink(None, srcSystem=245, srcComponent=191)
+    arm = mavlink.MAV_CMD_COMPONENT_ARM_DISARM
+    for target, armed in ((1, False), (2, True)):
+        message = mavlink.MAVLink_command_long_message(target, 1, arm, 0, 1, 0, 0, 0, 0, 0, 0)
+        link.receive(message.pack(client))
+        assert vehicle.armed is armed
+
+
+# The real MAVSDK
+
+T = TypeVar("T")
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", 0))
+        return int(udp.getsockname()[1])
+
+
+@contextmanager
+def served(vehicle: Px4Vehicle, system_id: int) -> Iterator[tuple[Px4Server, str]]:
+    """The vehicle on ports of its own, and the address for MAVSDK."""
+    port = free_port()
+    link = Px4Link(vehicle, system_id=system_id)
+    with Px4Server([Instance(link, free_port(), port)]) as server:
+        yield server, f"udpin://127.0.0.1:{port}"
+
+
+def client() -> Mavsdk:
+    companion = ComponentType.COMPANION_COMPUTER
+    return Mavsdk(Configuration.create_with_component_type(companion))
+
+
+async def connected(mavsdk: Mavsdk, address: str) -> System:
+    await mavsdk.add_any_connection(address)
+    system = await mavsdk.first_autopilot(10.0)
+    assert system is not None
+    return system
+
+
+async def until(
+    stream: AsyncGenerator[T, None], condition: Callable[[T], bool], timeout_s: float = 15.0
+) -> T:
+    async with asyncio.timeout(timeout_s), aclosing(stream):
+        async for value in stream:
+            if condition(value):
+                return value
+    raise AssertionError("the stream ended")
+
+
+def test_mavsdk_prepares_a_vehicle() -> None:
+    vehicle = Px4Vehicle(seed=5)
+
+    async def refused(system: System) -> None:
+        with pytest.raises(ActionError) as denied:
+            await ActionAsync(system).arm()
+        assert denied.value.result is ActionResult.COMMAND_DENIED
+        with pytest.raises(OffboardError) as empty:
+            await OffboardAsync(system).start()
+        assert empty.value.result is OffboardResult.NO_SETPOINT_SET
+
+    async def set_parameters(system: System) -> None:
+        parameters = ParamAsync(system)
+        assert await parameters.get_param_int("COM_OBL_RC_ACT") == 0
+        await parameters.set_param_int("COM_OBL_RC_ACT", -4)
+        assert await parameters.get_param_int("COM_OBL_RC_ACT") == -4
+        await parameters.set_param_float("COM_OF_LOSS_T", 0.75)
+        assert vehicle.parameters["COM_OF_LOSS_T"] == 0.75
+        everything = await parameters.get_all_params()
+        listed = {p.name: p.value for p in (*everything.int_params, *everything.float_params)}
+        assert listed == pytest.approx(vehicle.parameters)
+
+    async def upload_fence(system: System) -> None:
+        latitude, longitude, altitude = vehicle.global_origin
+        origin = await TelemetryAsync(system).get_gps_global_origin()
+        assert origin.latitude_deg == pytest.approx(latitude, abs=1e-7)
+        assert origin.longitude_deg == pytest.approx(longitude, abs=1e-7)
+        assert origin.altitude_m == pytest.approx(altitude, abs=1e-3)
+        geofence = GeofenceAsync(system)
+        corners = [(-1e-3, -2e-3), (2e-3, -1e-3), (0.0, 1e-3)]
+        points = [Point(latitude + n, longitude + e) for n, e in corners]
+        await geofence.upload_geofence(GeofenceData([Polygon(points, FenceType.INCLUSION)]))
+        (polygon,) = vehicle.fence
+        assert polygon.inclusion
+        sent_deg = np.array([(p.latitude_deg, p.longitude_deg) for p in points])
+        assert np.array(polygon.vertices_deg) == pytest.approx(sent_deg, abs=1e-6)
+        (copy,) = (await geofence.download_geofence()).polygons
+        copied_deg = np.array([(p.latitude_deg, p.longitude_deg) for p in copy.points])
+        assert copied_deg == pytest.approx(sent_deg, abs=1e-6)
+        await geofence.clear_geofence()
+        assert vehicle.fence == ()
+
+    async def prepare(address: str) -> None:
+        async with client() as mavsdk:
+            system = await connected(mavsdk, address)
+            assert await system.get_system_id() == 42
+            await refused(system)
+            await until(TelemetryAsync(system).subscribe_health_all_ok(), bool)
+            await set_parameters(system)
+            await upload_fence(system)
+
+    with served(vehicle, 42) as (_, address):
+        asyncio.run(prepare(address))
+
+
+def test_mavsdk_flies_from_take_off_to_landing() -> None:
+    vehicle = Px4Vehicle(seed=5, ready_after_s=0.0)
+
+    async def in_mode(telemetry: TelemetryAsync, mode: FlightMode) -> None:
+        await until(telemetry.subscribe_flight_mode(), lambda m: m is mode)
+
+    async def take_off(action: ActionAsync, telemetry: TelemetryAsync) -> None:
+        await until(telemetry.subscribe_health_all_ok(), bool)
+        await action.set_takeoff_altitude(3.0)
+        await action.arm()
+        await action.takeoff()
+        await until(telemetry.subscribe_landed_state(), lambda s: s is LandedState.TAKING_OFF)
+        await in_mode(telemetry, FlightMode.HOLD)
+        with pytest.raises(ActionError):
+            await action.disarm()
+
+    async def fly(offboard: OffboardAsync, telemetry: TelemetryAsync) -> None:
+        await offboard.set_velocity_ned(VelocityNedYaw(2.0, 0.0, 0.0, 90.0))
+        await offboard.start()
+        await in_mode(telemetry, FlightMode.OFFBOARD)
+        await until(telemetry.subscribe_velocity_ned(), lambda v: v.north_m_s > 1.5)
+        await until(telemetry.subscribe_heading(), lambda h: abs(h.heading_deg - 90.0) < 5.0)
+        here = await until(telemetry.subscribe_position_velocity_ned(), lambda _: True)
+        goal_m = here.position.north_m + 3.0
+        await offboard.set_position_ned(
+            PositionNedYaw(goal_m, here.position.east_m, here.position.down_m, 90.0)
+        )
+        await until(
+            telemetry.subscribe_position_velocity_ned(),
+            lambda p: abs(p.position.north_m - goal_m) < 0.5,
+        )
+        await offboard.stop()
+        await in_mode(telemetry, FlightMode.HOLD)
+
+    async def mission(address: str) -> None:
+        async with client() as mavsdk:
+            system = await connected(mavsdk, address)
+            telemetry, action = TelemetryAsync(system), ActionAsync(system)
+            await take_off(action, telemetry)
+            await fly(OffboardAsync(system), telemetry)
+            await action.land()
+            await until(telemetry.subscribe_landed_state(), lambda s: s is LandedState.LANDING)
+            await until(telemetry.subscribe_armed(), lambda armed: not armed, 30.0)
+            assert vehicle.landed
+
+    with served(vehicle, 1) as (_, address):
+        asyncio.run(mission(address))
+
+
+async def take_off_in_offboard(system: System) -> None:
+    telemetry, action, offboard = TelemetryAsync(system), ActionAsync(system), OffboardAsync(system)
+    await until(telemetry.subscribe_health_all_ok(), bool)
+    await offboard.set_velocity_ned(VelocityNedYaw(1.0, 0.0, -1.5, 0.0))
+    await action.arm()
+    await offboard.start()
+    await until(telemetry.subscribe_in_air(), bool)
+    await until(telemetry.subscribe_velocity_ned(), lambda v: v.down_m_s < -1.0)
+
+
+def test_a_client_that_goes_away_leaves_the_vehicle_to_its_failsafe() -> None:
+    vehicle = Px4Vehicle(seed=6, ready_after_s=0.0)
+    vehicle.parameters |= {"COM_OBL_RC_ACT": 4, "COM_FAIL_ACT_T": 0.0}
+
+    async def fly_and_leave(address: str) -> None:
+        async with client() as mavsdk:
+            await take_off_in_offboard(await connected(mavsdk, address))
+
+    with served(vehicle, 1) as (server, address):
+        asyncio.run(fly_and_leave(address))
+        left_s = vehicle.time_s
+        assert server.wait_for(lambda: vehicle.mode is Mode.LAND, 5.0)
+        assert vehicle.time_s - left_s < 1.5
+        assert server.wait_for(lambda: not vehicle.armed and vehicle.landed, 30.0)
+
+
+def test_mavsdk_sees_a_pilot_take_over_and_kills() -> None:
+    vehicle = Px4Vehicle(seed=7, ready_after_s=0.0)
+
+    async def fly(server: Px4Server, address: str) -> None:
+        async with client() as mavsdk:
+            system = await connected(mavsdk, address)
+            telemetry, action = TelemetryAsync(system), ActionAsync(system)
+            await take_off_in_offboard(system)
+            with server.stepped:
+                assert vehicle.pilot(Mode.POSCTL) is Result.ACCEPTED
+            await until(telemetry.subscribe_flight_mode(), lambda m: m is FlightMode.POSCTL)
+            await until(telemetry.subscribe_rc_status(), lambda rc: bool(rc.is_available))
+            await action.kill()
+            await until(telemetry.subscribe_armed(), lambda armed: not armed)
+            await until(telemetry.subscribe_in_air(), lambda in_air: not in_air)
+
+    with served(vehicle, 1) as (server, address):
+        asyncio.run(fly(server, address))
