@@ -76,7 +76,8 @@ def verify(path: BundlePath, as_json: AsJson = False) -> None:
         report = {"id": bundle.id, "tolerance": TOLERANCE, "failed": failed, "errors": errors}
         typer.echo(json.dumps(report, indent=2))
     elif not failed:
-        typer.echo(f"{bundle.manifest.name} {bundle.id[:12]} computes what torch computed")
+        name = f"{bundle.manifest.name} {bundle.id[:12]}"
+        typer.echo(f"{name}: this machine computes the golden outputs")
     if failed:
         raise ValueError(
             f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of torch's golden outputs"
