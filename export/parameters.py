@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edge.core.perception import PerceptionParameters
 from edge.runtime.bundle import Training
-from edge.runtime.config import ConfigError, from_mapping
+from edge.core.schema import ConfigError, from_mapping
 
 
 @dataclass(frozen=True, slots=True)

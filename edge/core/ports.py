@@ -1,8 +1,10 @@
-"""The outside world as the robot's steps see it; adapters and the simulator implement these."""
+"""The outside world as the robot sees it; adapters and the simulator implement these."""
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
 
 from edge.core import F32, F64
+from edge.core.vehicle import Action, Setpoint, VehicleState
 
 
 class Sensor(Protocol):
@@ -19,11 +21,58 @@ class Sensor(Protocol):
         """
 
 
-class PositionSource(Protocol):
+class Odometry(NamedTuple):
+    """Where the robot is and how it moves: the mission frame, m and m/s."""
+
+    position_m: tuple[float, float, float]
+    velocity_m_s: tuple[float, float, float]
+
+
+class OdometrySource(Protocol):
     """Knows where the robot is."""
 
-    def position_m(self) -> tuple[float, float, float] | None:
-        """The newest position in the mission frame, m, or None when it is not known.
+    def odometry(self) -> Odometry | None:
+        """The newest estimate, or None when it is not known.
 
         Called from several threads at once.
         """
+
+
+class Autopilot(Protocol):
+    """The vehicle. No method waits for it, and none raises."""
+
+    def state(self) -> VehicleState:
+        """The newest of everything. Called from any thread."""
+
+    def send(self, setpoint: Setpoint) -> Setpoint | None:
+        """Send it once, and return what was really sent; None if nothing was.
+
+        Nothing sends it again: when the calls stop, the autopilot's own failsafe sees the silence.
+        Called from the control thread alone.
+        """
+
+    def command(self, action: Action) -> None:
+        """Ask for `action`; the outcome comes as `VehicleState.result`. Called from any thread.
+
+        Commands are carried out one after another; KILL goes before all others.
+        """
+
+
+class PeerLink(Protocol):
+    """The radio: one's own message to the neighbours, and who is there."""
+
+    def publish(self, topic: str, data: bytes) -> None:
+        """Send on `lpac/<fleet>/robot/<own id>/<topic>`; dropped when the link is congested."""
+
+    def present(self) -> frozenset[int]:
+        """The other robots whose programs are connected now."""
+
+    def duplicate(self) -> bool:
+        """Whether another program says that it is this robot."""
+
+
+class Recorder(Protocol):
+    """The flight log."""
+
+    def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
+        """Keep one message: plain values, bytes and numpy arrays. Never waits; any thread."""

@@ -19,7 +19,7 @@ from typing import Literal
 
 from edge.core.aggregation import Geometry
 from edge.core.perception import MAP_CHANNELS, PerceptionParameters
-from edge.runtime.config import ConfigError, from_mapping
+from edge.core.schema import ConfigError, from_mapping
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"

@@ -6,7 +6,7 @@ import pytest
 
 from edge.core.perception import PerceptionParameters
 from edge.runtime.bundle import Training
-from edge.runtime.config import ConfigError
+from edge.core.schema import ConfigError
 from export.parameters import read_parameters
 
 ROOT = Path(__file__).parents[2]

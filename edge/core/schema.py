@@ -4,7 +4,8 @@ import dataclasses
 import types
 import typing
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from enum import StrEnum
+from typing import Any, Literal, TypeVar
 
 T = TypeVar("T")
 
@@ -17,8 +18,8 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
     """Build the dataclass `cls` from `mapping`; nested dataclasses from nested mappings.
 
     `where` names the file, and then the path of keys, in errors. Field types may be bool, int,
-    float, str, Literal, tuple[X, ...], dict[str, X], dataclasses, and unions of one of these
-    with None. The dataclass checks its own values in __post_init__ with a ValueError.
+    float, str, Literal, StrEnum, tuple[X, ...], dict[str, X], dataclasses, and unions of one of
+    these with None. The dataclass checks its own values in __post_init__ with a ValueError.
 
     Raises ConfigError for an unknown or missing key, a wrong type or an impossible value.
     """
@@ -52,11 +53,13 @@ def _value(hint: Any, value: object, where: str) -> Any:
         return _value(hint, value, where)
     if dataclasses.is_dataclass(hint):
         return from_mapping(typing.cast(type[Any], hint), value, where)
-    if origin is typing.Literal:
+    if origin is Literal:
         if value not in arguments:
             allowed = ", ".join(repr(argument) for argument in arguments)
             raise ConfigError(f"{where} = {value!r}: allowed are {allowed}")
         return value
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return hint(_value(Literal[tuple(str(member) for member in hint)], value, where))
     if origin is tuple and isinstance(value, list):
         return tuple(_value(arguments[0], v, f"{where}[{i}]") for i, v in enumerate(value))
     if origin is dict and isinstance(value, Mapping):
