@@ -7,6 +7,7 @@ from bench.first_tick import ENV_SCALE, NEIGHBOURS_M, POSITION_M, run
 from edge.adapters.idf_sensor import IdfSensor
 from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
+from edge.core.ports import Odometry
 from edge.core.wire import encode
 from edge.runtime.bundle import load_bundle
 from edge.runtime.pac import Pac, PacParameters
@@ -16,8 +17,8 @@ from edge.runtime.policy import Policy
 class _Standing:
     """A robot that does not move."""
 
-    def position_m(self) -> tuple[float, float, float]:
-        return POSITION_M
+    def odometry(self) -> Odometry:
+        return Odometry(POSITION_M, (0.0, 0.0, 0.0))
 
 
 def main() -> None:
@@ -31,12 +32,14 @@ def main() -> None:
         boot_epoch=1,
         policy=policy,
         sensor=IdfSensor(importance, perception.sensor_size),
-        position=_Standing(),
+        odometry=_Standing(),
         parameters=PacParameters(scale=ModelScale(ENV_SCALE, 0.25), max_speed_m_s=1.25),
     )
     payload = np.zeros(policy.manifest.geometry.message_size, np.float32)
     for number, position_m in enumerate(NEIGHBOURS_M, 1):
-        message = AggregatedMessage(number, 1, 1, 0.0, position_m, payload)
+        message = AggregatedMessage(
+            number, 1, 1, 0.0, position_m, velocity_m_s=(0.0, 0.0, 0.0), frame_id=0, payload=payload
+        )
         robot.receive(encode(message, policy.bundle_id, "float16"), now_s=0.0, unix_now_s=0.0)
 
     def tick() -> None:

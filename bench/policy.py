@@ -129,6 +129,7 @@ class EdgeRobot:
                 decode(
                     data,
                     bundle_id=policy.bundle_id,
+                    frame_id=0,
                     own_robot_id=-1,
                     message_size=policy.manifest.geometry.message_size,
                 )

@@ -14,7 +14,7 @@ from edge.runtime.bundle import BundleError
 from edge.runtime.pac import Pac, PacParameters
 from edge.runtime.policy import Policy
 from sim.medium import Medium
-from sim.vehicles import PointVehicles, VehiclePosition
+from sim.vehicles import PointVehicles, VehicleOdometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Swarm:
                 boot_epoch=1,
                 policy=policy,
                 sensor=sensor,
-                position=VehiclePosition(self._vehicles, robot),
+                odometry=VehicleOdometry(self._vehicles, robot),
                 parameters=parameters,
             )
             for robot in range(len(positions_m))
@@ -121,15 +121,16 @@ class Swarm:
         self.robots[robot].perceive(self._vehicles.now_s)
 
     def _control(self, robot: int) -> None:
-        self._vehicles.fly(robot, self.robots[robot].control(self._vehicles.now_s))
+        velocity_m_s = self.robots[robot].control(self._vehicles.now_s)
+        self._vehicles.fly(robot, np.zeros(2) if velocity_m_s is None else velocity_m_s)
 
     def _infer(self, robot: int) -> None:
         now_s = self._vehicles.now_s
-        message = self.robots[robot].infer(now_s, unix_now_s=now_s)
-        if message is None:
+        tick = self.robots[robot].infer(now_s, unix_now_s=now_s)
+        if tick is None:
             return
         for receiver, travel_s in self._medium.broadcast(robot, self._vehicles.positions_m()):
-            self._schedule(now_s + travel_s, partial(self._deliver, receiver, message))
+            self._schedule(now_s + travel_s, partial(self._deliver, receiver, tick.message))
 
     def _deliver(self, receiver: int, message: bytes) -> None:
         now_s = self._vehicles.now_s

@@ -3,6 +3,7 @@
 import numpy as np
 
 from edge.core import F64
+from edge.core.ports import Odometry
 
 
 class PointVehicles:
@@ -32,6 +33,11 @@ class PointVehicles:
         moved_m = start_m + self._velocity_m_s[robot] * (self.now_s - self._since_s[robot])
         return self._held_inside(moved_m, start_m)
 
+    def velocity_m_s(self, robot: int) -> F64:
+        """The velocity (2,) that one vehicle was told."""
+        velocity_m_s: F64 = self._velocity_m_s[robot]
+        return velocity_m_s
+
     def fly(self, robot: int, velocity_m_s: F64) -> None:
         """From now on the vehicle moves with `velocity_m_s` (2,)."""
         self._start_m[robot] = self.position_m(robot)
@@ -44,14 +50,15 @@ class PointVehicles:
         return np.minimum(np.maximum(moved_m, lowest_m), highest_m)
 
 
-class VehiclePosition:
-    """Where one vehicle is, as its robot is told (a PositionSource)."""
+class VehicleOdometry:
+    """Where one vehicle is, as its robot is told (an OdometrySource)."""
 
     def __init__(self, vehicles: PointVehicles, robot: int) -> None:
         self._vehicles = vehicles
         self._robot = robot
 
-    def position_m(self) -> tuple[float, float, float]:
-        """The true position; the vehicles are planar."""
-        x_m, y_m = self._vehicles.position_m(self._robot)
-        return float(x_m), float(y_m), 0.0
+    def odometry(self) -> Odometry:
+        """The truth; the vehicles are planar."""
+        x_m, y_m = self._vehicles.position_m(self._robot).tolist()
+        x_m_s, y_m_s = self._vehicles.velocity_m_s(self._robot).tolist()
+        return Odometry((x_m, y_m, 0.0), (x_m_s, y_m_s, 0.0))

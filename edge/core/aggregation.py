@@ -48,7 +48,8 @@ class AggregatedMessage:
 
     `payload` is (message_size,), float32 or float16: (y_j)_kl in the order [l][k][feature],
     already multiplied by 1/sqrt(d_j), d_j being the sender's number of neighbours.
-    `position_m` is in the mission frame; `sent_at_s` is the sender's Unix time.
+    `position_m` and `velocity_m_s` are in the mission frame that `frame_id` stands for
+    (`MissionFrame.frame_id`); `sent_at_s` is the sender's Unix time.
     `boot_epoch` grows with every start of the sender, `sequence` with every message of one start.
     """
 
@@ -57,6 +58,8 @@ class AggregatedMessage:
     sequence: int
     sent_at_s: float
     position_m: tuple[float, float, float]
+    velocity_m_s: tuple[float, float, float]
+    frame_id: int
     payload: F32
 
 

@@ -14,6 +14,8 @@ theta is the compass heading of the mission y axis: rad, clockwise from true nor
 """
 
 import math
+import struct
+import zlib
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -40,6 +42,13 @@ class MissionFrame:
         _require_on_earth("mission origin", self.latitude_deg, self.longitude_deg)
         if not 0.0 <= self.heading_rad < math.tau:
             raise ValueError(f"mission heading = {self.heading_rad} rad: must be in [0, 2 pi)")
+
+    @property
+    def frame_id(self) -> int:
+        """CRC-32 of the three numbers: positions in frames of different ids do not compare."""
+        return zlib.crc32(
+            struct.pack("<3d", self.latitude_deg, self.longitude_deg, self.heading_rad)
+        )
 
     def relative_to(
         self, local_origin_latitude_deg: float, local_origin_longitude_deg: float

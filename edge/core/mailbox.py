@@ -21,10 +21,11 @@ _CLOCK_TOLERANCE_S = 0.5
 
 
 class Neighbour(NamedTuple):
-    """Another robot: `position_m` in the mission frame, m, as it was `age_s` ago."""
+    """Another robot: its position and velocity in the mission frame, as they were `age_s` ago."""
 
     robot_id: int
     position_m: tuple[float, float, float]
+    velocity_m_s: tuple[float, float, float]
     age_s: float
 
 
@@ -116,7 +117,12 @@ class Mailbox:
         with self._lock:
             received = sorted((self._handed_out | self._received).items())
         return tuple(
-            Neighbour(robot_id, entry.message.position_m, max(now_s - entry.born_s, 0.0))
+            Neighbour(
+                robot_id,
+                entry.message.position_m,
+                entry.message.velocity_m_s,
+                max(now_s - entry.born_s, 0.0),
+            )
             for robot_id, entry in received
             if self._is_fresh(entry.born_s, now_s)
         )

@@ -1,11 +1,11 @@
 """AggregatedMessage <-> the bytes that travel between robots.
 
-Little-endian, a header of 80 bytes and then the payload:
+Little-endian, a header of 96 bytes and then the payload:
 
 | offset | type | field | unit |
 | --- | --- | --- | --- |
 | 0 | 8 bytes | magic, `LPAC-MSG` | |
-| 8 | uint8 | version of this layout, 1 | |
+| 8 | uint8 | version of this layout, 2 | |
 | 9 | uint8 | payload type: 1 float32, 2 float16 | |
 | 10 | uint16 | robot id | |
 | 12 | uint32 | sequence | |
@@ -13,9 +13,11 @@ Little-endian, a header of 80 bytes and then the payload:
 | 32 | uint64 | boot epoch | |
 | 40 | float64 | send time | Unix s |
 | 48 | 3 x float64 | position x, y, z in the mission frame | m |
-| 72 | uint32 | payload length | floats |
-| 76 | uint32 | CRC-32 (zlib) of all other bytes, payload included | |
-| 80 | float32 or float16 | payload | |
+| 72 | 3 x float32 | velocity x, y, z in the mission frame | m/s |
+| 84 | uint32 | the mission frame's `frame_id` | |
+| 88 | uint32 | payload length | floats |
+| 92 | uint32 | CRC-32 (zlib) of all other bytes, payload included | |
+| 96 | float32 or float16 | payload | |
 
 Magic and version stay where they are in every version.
 """
@@ -32,9 +34,9 @@ import numpy.typing as npt
 from edge.core.aggregation import AggregatedMessage
 
 _MAGIC = b"LPAC-MSG"
-_VERSION = 1
+_VERSION = 2
 _VERSION_AT = len(_MAGIC)
-_FIELDS = struct.Struct("<8sBBHI16sQ4dI")
+_FIELDS = struct.Struct("<8sBBHI16sQ4d3f2I")
 _CHECKSUM = struct.Struct("<I")
 # A multiple of 8, so that the payload is aligned wherever the message is.
 _HEADER_SIZE = _FIELDS.size + _CHECKSUM.size
@@ -54,6 +56,7 @@ class Rejection(StrEnum):
     PAYLOAD_TYPE = "payload_type"
     CHECKSUM = "checksum"
     OTHER_BUNDLE = "other_bundle"
+    OTHER_FRAME = "other_frame"
     OWN = "own"
     PAYLOAD_LENGTH = "payload_length"
     NON_FINITE = "non_finite"
@@ -88,18 +91,25 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTyp
         message.boot_epoch,
         message.sent_at_s,
         *message.position_m,
+        *message.velocity_m_s,
+        message.frame_id,
         message.payload.size,
     )
     return b"".join((fields, _CHECKSUM.pack(zlib.crc32(data, zlib.crc32(fields))), data))
 
 
 def decode(
-    data: bytes | memoryview, *, bundle_id: bytes, own_robot_id: int, message_size: int
+    data: bytes | memoryview,
+    *,
+    bundle_id: bytes,
+    frame_id: int,
+    own_robot_id: int,
+    message_size: int,
 ) -> AggregatedMessage | Rejection:
     """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
 
-    `bundle_id` is the 32 bytes of the own manifest's SHA-256, `message_size` the number of floats
-    that the own network takes. The payload is a read-only view of `data`, float32 or float16, not a
+    `bundle_id` is the 32 bytes of the own manifest's SHA-256, `frame_id` that of the own mission
+    frame, `message_size` the number of floats that the own network takes. The payload is a read-only view of `data`, float32 or float16, not a
     copy: `data` must not change afterwards.
     """
     view = memoryview(data).toreadonly()
@@ -123,6 +133,8 @@ def decode(
         x_m,
         y_m,
         z_m,
+        *velocity_m_s,
+        sender_frame_id,
         payload_length,
     ) = _FIELDS.unpack_from(view)
     # First whether these are the bytes that were sent; only then does what they say mean anything.
@@ -141,7 +153,19 @@ def decode(
         return Rejection.OWN
     if payload_length != message_size:
         return Rejection.PAYLOAD_LENGTH
+    if sender_frame_id != frame_id:
+        return Rejection.OTHER_FRAME
     payload = np.frombuffer(view, dtype, offset=_HEADER_SIZE)
-    if not (all(map(math.isfinite, (sent_at_s, x_m, y_m, z_m))) and np.isfinite(payload).all()):
+    header = (sent_at_s, x_m, y_m, z_m, *velocity_m_s)
+    if not (all(map(math.isfinite, header)) and np.isfinite(payload).all()):
         return Rejection.NON_FINITE
-    return AggregatedMessage(robot_id, boot_epoch, sequence, sent_at_s, (x_m, y_m, z_m), payload)
+    return AggregatedMessage(
+        robot_id,
+        boot_epoch,
+        sequence,
+        sent_at_s,
+        (x_m, y_m, z_m),
+        (velocity_m_s[0], velocity_m_s[1], velocity_m_s[2]),
+        frame_id,
+        payload,
+    )

@@ -8,6 +8,7 @@ simulated time; both run this code.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -18,7 +19,7 @@ from edge.core.aggregation import AggregatedMessage, HopBuffer
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
 from edge.core.perception import Perception, clamp_to_world, neighbours_in_range
-from edge.core.ports import PositionSource, Sensor
+from edge.core.ports import Odometry, OdometrySource, Sensor
 from edge.core.safety import limit_speed
 from edge.core.wire import MAX_ROBOT_ID, Rejection, decode, encode
 from edge.runtime.bundle import BundleError
@@ -59,6 +60,35 @@ class _Timed:
     time_s: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PerceptionTick:
+    """What `Pac.perceive` did.
+
+    `images` (1, channels, size, size) is valid until the next call; `position_feature` (2,);
+    `features` (F_0,) are the images' and then the position's.
+    """
+
+    images: F32
+    position_feature: F32
+    features: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolicyTick:
+    """What `Pac.infer` did.
+
+    From `features` (F_0,) and the `payloads` of `senders`, for a node of `degree` neighbours, came
+    `velocity` (2,), in model units, and `message`, the bytes for the neighbours.
+    """
+
+    features: F32
+    senders: tuple[int, ...]
+    payloads: tuple[F32, ...]
+    degree: int
+    velocity: F32
+    message: bytes
+
+
 class Pac:
     """The steps of one robot.
 
@@ -73,7 +103,7 @@ class Pac:
         boot_epoch: int,
         policy: Policy,
         sensor: Sensor,
-        position: PositionSource,
+        odometry: OdometrySource,
         parameters: PacParameters,
     ) -> None:
         """Raises BundleError if the policy has no perception, ValueError for an impossible id."""
@@ -88,25 +118,36 @@ class Pac:
         self._boot_epoch = boot_epoch
         self._policy = policy
         self._sensor = sensor
-        self._position = position
+        self._odometry = odometry
         self._parameters = parameters
         self._world_size = manifest.perception.world_size
         self._sensor_size = manifest.perception.sensor_size
         self._communication_range = manifest.perception.communication_range
-        self._perception = Perception(
-            manifest.perception, len(manifest.images.channels), manifest.images.size
+        self._new_perception = partial(
+            Perception, manifest.perception, len(manifest.images.channels), manifest.images.size
         )
+        self._perception = self._new_perception()
+        self._forget_map = False
         self._hops = HopBuffer(manifest.geometry)
         self._sequence = 0
         self._features: _Timed | None = None
         self._action: _Timed | None = None
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+        # Replaced whole when the ground sets another origin, which it does while nobody flies.
+        self.frame_id = 0
+
+    def forget(self) -> None:
+        """Start anew: no explored map, no messages, no action. From any thread."""
+        self._forget_map = True
+        self._features = self._action = None
+        self.mailbox.clear()
 
     def receive(self, data: bytes, now_s: float, unix_now_s: float) -> Rejection | None:
         """Put a neighbour's message into the mailbox; returns, and counts, why it was not."""
         message = decode(
             data,
             bundle_id=self._policy.bundle_id,
+            frame_id=self.frame_id,
             own_robot_id=self._robot_id,
             message_size=self._policy.manifest.geometry.message_size,
         )
@@ -115,40 +156,47 @@ class Pac:
             return message
         return self.mailbox.receive(message, now_s, unix_now_s)
 
-    def perceive(self, now_s: float) -> None:
-        """Sensor view -> robot map -> images -> features x_i (32 of the CNN, 2 of the position)."""
-        position_m = self._position_m()
-        if position_m is None:
-            return
-        (own,) = self._to_model([position_m])
+    def perceive(self, now_s: float) -> PerceptionTick | None:
+        """Sensor view -> robot map -> images -> features x_i (32 of the CNN, 2 of the position).
+
+        None when there is nothing to perceive: no position, or no valid view.
+        """
+        if self._forget_map:
+            self._forget_map = False
+            self._perception = self._new_perception()
+        odometry = self._finite_odometry()
+        if odometry is None:
+            return None
+        (own,) = self._to_model([odometry.position_m])
         view = self._sensor.view(own)
         if view is None or not self._is_valid(view):
-            return
+            return None
         self._perception.observe(own, view)
         heard = self._to_model([n.position_m for n in self.mailbox.neighbours(now_s)])
         neighbours = heard[neighbours_in_range(own, heard, self._communication_range)]
         images = self._perception.images(own, neighbours)
-        features = np.concatenate(
-            [self._policy.image_features(images), position_feature(own, self._world_size)]
-        )
+        position = position_feature(own, self._world_size)
+        features = np.concatenate([self._policy.image_features(images), position])
         self._features = _Timed(features, now_s)
+        return PerceptionTick(images, position, features)
 
-    def infer(self, now_s: float, unix_now_s: float) -> bytes | None:
-        """Neighbours' messages and x_i -> action; returns the message Y_i for the neighbours.
+    def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
+        """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
 
         None when there is nothing to send: no fresh features, no position, or a result that is
         not finite. Then the action is left to grow old, and `control` stops the robot.
         """
-        features, position_m = self._features, self._position_m()
-        if features is None or position_m is None or self._is_old(features, now_s):
+        features, odometry = self._features, self._finite_odometry()
+        if features is None or odometry is None or self._is_old(features, now_s):
             return None
-        (own,) = self._to_model([position_m])
+        (own,) = self._to_model([odometry.position_m])
         # Before the swap, which may clear the mailbox: the neighbours are more than the messages.
         heard = [n.position_m for n in self.mailbox.neighbours(now_s)]
         messages = self.mailbox.swap(now_s)
         near = self._in_range(own, [message.position_m for message in messages])
         degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
-        payloads = [m.payload for m, is_near in zip(messages, near, strict=True) if is_near]
+        heeded = [message for message, is_near in zip(messages, near, strict=True) if is_near]
+        payloads = tuple(message.payload for message in heeded)
         self._hops.diffuse(payloads, degree)
         velocity = self._policy.velocity(features.value, self._hops)
         payload = self._hops.message(degree)
@@ -161,24 +209,39 @@ class Pac:
             boot_epoch=self._boot_epoch,
             sequence=self._sequence,
             sent_at_s=unix_now_s,
-            position_m=position_m,
+            position_m=odometry.position_m,
+            velocity_m_s=odometry.velocity_m_s,
+            frame_id=self.frame_id,
             payload=payload,
         )
-        return encode(message, self._policy.bundle_id, self._parameters.payload)
+        return PolicyTick(
+            features=features.value,
+            senders=tuple(message.robot_id for message in heeded),
+            payloads=payloads,
+            degree=degree,
+            velocity=velocity,
+            message=encode(message, self._policy.bundle_id, self._parameters.payload),
+        )
 
-    def control(self, now_s: float) -> F64:
-        """The velocity (2,) in the mission frame, m/s, within the speed limit; 0 if no action."""
+    def control(self, now_s: float) -> F64 | None:
+        """The velocity (2,) in the mission frame, m/s, within the speed limit.
+
+        None when there is no fresh action.
+        """
         action = self._action
         if action is None or self._is_old(action, now_s):
-            return np.zeros(2)
+            return None
         velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
             action.value.astype(np.float64)
         )
         return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
 
-    def _position_m(self) -> Position | None:
-        position_m = self._position.position_m()
-        return position_m if position_m and all(map(math.isfinite, position_m)) else None
+    def _finite_odometry(self) -> Odometry | None:
+        odometry = self._odometry.odometry()
+        if odometry is None:
+            return None
+        numbers = (*odometry.position_m, *odometry.velocity_m_s)
+        return odometry if all(map(math.isfinite, numbers)) else None
 
     def _is_valid(self, view: F32) -> bool:
         """Whether it may go into the map: one cell that is not finite would stay in it."""

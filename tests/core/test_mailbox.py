@@ -30,7 +30,9 @@ def message(
     """With the default `sent_at_s` it counts as sent when it is received, by another clock."""
     payload = np.array([sequence], np.float32)
     position_m = (float(robot_id), float(sequence), 0.0)
-    return AggregatedMessage(robot_id, boot_epoch, sequence, sent_at_s, position_m, payload)
+    return AggregatedMessage(
+        robot_id, boot_epoch, sequence, sent_at_s, position_m, (0.5, 0.0, -0.5), 7, payload
+    )
 
 
 def receive(mailbox: Mailbox, received: AggregatedMessage, now_s: float = 0.0) -> Rejection | None:

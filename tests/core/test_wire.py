@@ -18,7 +18,8 @@ from edge.core.wire import Rejection, decode, encode
 
 BUNDLE_ID = hashlib.sha256(b"manifest").digest()
 OTHER_BUNDLE_ID = hashlib.sha256(b"another manifest").digest()
-HEADER_SIZE = 80
+HEADER_SIZE = 96
+FRAME_ID = 0x0A0B0C0D
 OWN_ID = 9
 FLOAT16_MAX = 65504.0
 TYPES = pytest.mark.parametrize("payload_dtype", [np.float32, np.float16])
@@ -29,10 +30,13 @@ MESSAGE = AggregatedMessage(
     sequence=258,
     sent_at_s=1.5,
     position_m=(1.0, -2.0, 0.5),
+    velocity_m_s=(0.25, -1.5, 0.125),
+    frame_id=FRAME_ID,
     payload=np.array([0.0, 1.0, -2.5, 100.0, 0.125], np.float32),
 )
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
+finite32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
 def messages(payload: st.SearchStrategy[F32]) -> st.SearchStrategy[AggregatedMessage]:
@@ -43,6 +47,8 @@ def messages(payload: st.SearchStrategy[F32]) -> st.SearchStrategy[AggregatedMes
         sequence=st.integers(0, 2**32 - 1),
         sent_at_s=finite,
         position_m=st.tuples(finite, finite, finite),
+        velocity_m_s=st.tuples(finite32, finite32, finite32),
+        frame_id=st.just(FRAME_ID),
         payload=payload,
     )
 
@@ -61,7 +67,13 @@ def receive(
     bundle_id: bytes = BUNDLE_ID,
     own_robot_id: int = OWN_ID,
 ) -> AggregatedMessage | Rejection:
-    return decode(data, bundle_id=bundle_id, own_robot_id=own_robot_id, message_size=message_size)
+    return decode(
+        data,
+        bundle_id=bundle_id,
+        frame_id=FRAME_ID,
+        own_robot_id=own_robot_id,
+        message_size=message_size,
+    )
 
 
 def accepted(data: bytes | memoryview, message_size: int) -> AggregatedMessage:
@@ -72,8 +84,8 @@ def accepted(data: bytes | memoryview, message_size: int) -> AggregatedMessage:
 
 def seal(data: bytes) -> bytes:
     """The same message with the checksum that its content asks for."""
-    checksum = zlib.crc32(data[HEADER_SIZE:], zlib.crc32(data[:76]))
-    return data[:76] + struct.pack("<I", checksum) + data[HEADER_SIZE:]
+    checksum = zlib.crc32(data[HEADER_SIZE:], zlib.crc32(data[:92]))
+    return data[:92] + struct.pack("<I", checksum) + data[HEADER_SIZE:]
 
 
 def without_payload(message: AggregatedMessage) -> tuple[object, ...]:
@@ -120,16 +132,21 @@ def test_arbitrary_bytes_behind_a_good_start_never_raise(
 
 
 @settings(deadline=None)
-@given(st.binary(min_size=20, max_size=20), st.binary(min_size=32, max_size=32))
+@given(st.binary(min_size=20, max_size=20), st.binary(min_size=44, max_size=44))
 def test_arbitrary_floats_in_a_sealed_message_arrive_or_are_not_finite(
     payload: bytes, header_floats: bytes
 ) -> None:
     good = encode(MESSAGE, BUNDLE_ID, np.float32)
-    data = seal(good[:40] + header_floats + good[72:HEADER_SIZE] + payload)
-    floats = struct.unpack("<4d", header_floats) + struct.unpack("<5f", payload)
+    data = seal(good[:40] + header_floats + good[84:HEADER_SIZE] + payload)
+    floats = struct.unpack("<4d3f", header_floats) + struct.unpack("<5f", payload)
     if all(map(math.isfinite, floats)):
         message = accepted(data, 5)
-        assert (message.sent_at_s, *message.position_m, *message.payload.tolist()) == floats
+        assert (
+            message.sent_at_s,
+            *message.position_m,
+            *message.velocity_m_s,
+            *message.payload.tolist(),
+        ) == floats
     else:
         assert receive(data) is Rejection.NON_FINITE
 
@@ -156,7 +173,7 @@ def test_every_truncation_and_extension_is_named(payload_dtype: type) -> None:
 def test_the_layout_is_a_contract() -> None:
     head = (
         "4c5041432d4d5347"  # LPAC-MSG
-        "01"  # version
+        "02"  # version
         "{payload_type}"
         "0300"  # robot id 3
         "02010000"  # sequence 258
@@ -166,13 +183,17 @@ def test_the_layout_is_a_contract() -> None:
         "000000000000f03f"  # x 1
         "00000000000000c0"  # y -2
         "000000000000e03f"  # z 0.5
+        "0000803e"  # velocity x 0.25
+        "0000c0bf"  # y -1.5
+        "0000003e"  # z 0.125
+        "0d0c0b0a"  # frame id
         "05000000"  # payload length
     )
     # CRC-32, and then 0, 1, -2.5, 100, 0.125.
     float32 = (
-        head.format(payload_type="01") + "d4f33629" + "000000000000803f000020c00000c8420000003e"
+        head.format(payload_type="01") + "a6270351" + "000000000000803f000020c00000c8420000003e"
     )
-    float16 = head.format(payload_type="02") + "6e795475" + "0000003c00c140560030"
+    float16 = head.format(payload_type="02") + "1b3a0aab" + "0000003c00c140560030"
     assert encode(MESSAGE, BUNDLE_ID, np.float32).hex() == float32
     assert encode(MESSAGE, BUNDLE_ID, np.float16).hex() == float16
     assert accepted(bytes.fromhex(float32), 5).sequence == 258
@@ -196,7 +217,7 @@ def test_the_reason_is_the_most_telling_one() -> None:
     reasons = {
         Rejection.MAGIC: b"lpac" + good[4:],
         # Another version may have any length and any checksum.
-        Rejection.VERSION: good[:8] + b"\2" + good[9:70],
+        Rejection.VERSION: good[:8] + b"\1" + good[9:70],
         Rejection.PAYLOAD_TYPE: good[:9] + b"\3" + good[10:],
         Rejection.CHECKSUM: good[:-1] + b"\x7f",
         # Another bundle's payload may have any length; its robots' ids are not ours.
@@ -205,6 +226,9 @@ def test_the_reason_is_the_most_telling_one() -> None:
         ),
         Rejection.OWN: encode(dataclasses.replace(MESSAGE, robot_id=OWN_ID), BUNDLE_ID, np.float16),
         Rejection.PAYLOAD_LENGTH: encode(longer, BUNDLE_ID, np.float32),
+        Rejection.OTHER_FRAME: encode(
+            dataclasses.replace(MESSAGE, frame_id=FRAME_ID + 1), BUNDLE_ID, np.float32
+        ),
     }
     assert {reason: receive(data) for reason, data in reasons.items()} == {
         reason: reason for reason in reasons
@@ -227,6 +251,7 @@ def test_what_is_not_finite_is_refused(payload_dtype: type, value: float) -> Non
         dataclasses.replace(MESSAGE, position_m=(value, 0.0, 0.0)),
         dataclasses.replace(MESSAGE, position_m=(0.0, value, 0.0)),
         dataclasses.replace(MESSAGE, position_m=(0.0, 0.0, value)),
+        dataclasses.replace(MESSAGE, velocity_m_s=(0.0, value, 0.0)),
     ):
         assert receive(encode(message, BUNDLE_ID, payload_dtype)) is Rejection.NON_FINITE
 

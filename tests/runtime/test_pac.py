@@ -9,6 +9,7 @@ import pytest
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
+from edge.core.ports import Odometry
 from edge.core.wire import Rejection, decode, encode
 from edge.runtime.bundle import Bundle, BundleError
 from edge.runtime.pac import Pac, PacParameters, position_feature
@@ -28,15 +29,15 @@ class World:
         assert position.shape == (2,)
         return self.seen
 
-    def position_m(self) -> tuple[float, float, float] | None:
-        return self.position
+    def odometry(self) -> Odometry | None:
+        return Odometry(self.position, (0.5, 0.0, 0.0)) if self.position else None
 
 
 def make_robot(
     policy: Policy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
 ) -> Pac:
     return Pac(
-        robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, position=world,
+        robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, odometry=world,
         parameters=parameters,
     )  # fmt: skip
 
@@ -48,7 +49,8 @@ def fill(policy: Policy, value: float) -> F32:
 def message(policy: Policy, robot_id: int = 2, value: float = 0.1, **changes: object) -> bytes:
     fields = {
         "robot_id": robot_id, "boot_epoch": 1, "sequence": 1, "sent_at_s": 0.0,
-        "position_m": (18.0, 16.0, 3.0), "payload": fill(policy, value), **changes,
+        "position_m": (18.0, 16.0, 3.0), "velocity_m_s": (0.0, 0.0, 0.0), "frame_id": 0,
+        "payload": fill(policy, value), **changes,
     }  # fmt: skip
     return encode(AggregatedMessage(**fields), policy.bundle_id, "float32")  # type: ignore[arg-type]
 
@@ -62,6 +64,7 @@ def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(shipped_polic
         robot.perceive(0.0)
         assert robot.infer(0.0, 0.0) is not None
     fast, slowed = fast_robot.control(0.1), slow_robot.control(0.1)
+    assert fast is not None and slowed is not None
     assert 0.01 < np.hypot(*fast) <= 1.25
     assert np.hypot(*slowed) == pytest.approx(0.01)
     np.testing.assert_allclose(slowed / 0.01, fast / np.hypot(*fast))
@@ -71,7 +74,7 @@ def test_nothing_moves_before_the_first_inference(shipped_policy: Policy) -> Non
     robot = make_robot(shipped_policy, World())
     assert robot.infer(0.0, 0.0) is None
     robot.perceive(0.0)
-    assert robot.control(0.0).tolist() == [0.0, 0.0]
+    assert robot.control(0.0) is None
 
 
 @pytest.mark.parametrize("missing", ["position", "seen"])
@@ -86,8 +89,8 @@ def test_without_position_or_sensor_the_robot_stops(shipped_policy: Policy, miss
         robot.perceive(now_s)
         sent = robot.infer(now_s, now_s)
         assert (sent is not None) == (missing == "seen" and now_s <= 1.0)
-    assert np.any(robot.control(1.0 if missing == "position" else 1.8) != 0.0)
-    assert robot.control(2.0).tolist() == [0.0, 0.0]
+    assert robot.control(1.0 if missing == "position" else 1.8) is not None
+    assert robot.control(2.0) is None
 
 
 def test_a_position_that_is_not_a_number_is_none(shipped_policy: Policy) -> None:
@@ -126,7 +129,13 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(shipped_policy:
         sent = robot.infer(now_s, now_s)
         assert sent is not None
         own.append(
-            decode(sent, bundle_id=shipped_policy.bundle_id, own_robot_id=9, message_size=870)
+            decode(
+                sent.message,
+                bundle_id=shipped_policy.bundle_id,
+                frame_id=0,
+                own_robot_id=9,
+                message_size=870,
+            )  # fmt: skip
         )
     # The last values of x_0 are the position, times 1/sqrt(degree).
     x = [m.payload[33] for m in own if isinstance(m, AggregatedMessage)]
@@ -156,8 +165,8 @@ def test_an_action_without_a_successor_grows_old(shipped_policy: Policy) -> None
     robot = make_robot(shipped_policy, World())
     robot.perceive(0.0)
     robot.infer(0.0, 0.0)
-    assert np.any(robot.control(1.0) != 0.0)
-    assert robot.control(1.001).tolist() == [0.0, 0.0]
+    assert robot.control(1.0) is not None
+    assert robot.control(1.001) is None
 
 
 def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
@@ -170,7 +179,9 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
             assert robot.receive(data, 0.0, 0.0) is None
         robot.perceive(0.0)
         robot.infer(0.0, 0.0)
-        velocities.append(robot.control(0.0))
+        velocity = robot.control(0.0)
+        assert velocity is not None
+        velocities.append(velocity)
     alone, beside_near, beside_far = velocities
     assert not np.allclose(alone, beside_near)
     np.testing.assert_array_equal(alone, beside_far)  # 24 m is beyond the range of 16 m
@@ -179,14 +190,16 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
     robot.receive(message(shipped_policy), 0.0, 0.0)
     robot.perceive(0.8)
     robot.infer(0.8, 0.8)
-    np.testing.assert_array_equal(robot.control(0.8), alone)
+    velocity = robot.control(0.8)
+    assert velocity is not None
+    np.testing.assert_array_equal(velocity, alone)
 
 
 def test_what_a_robot_must_not_hear_is_counted(shipped_policy: Policy) -> None:
     robot = make_robot(shipped_policy, World())
     good = message(shipped_policy)
     other = encode(
-        AggregatedMessage(3, 1, 1, 0.0, (0.0, 0.0, 0.0), fill(shipped_policy, 0.0)),
+        AggregatedMessage(3, 1, 1, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)),
         bytes(32), "float32",
     )  # fmt: skip
     cases = {
@@ -212,7 +225,7 @@ def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: 
     robot.perceive(0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         assert robot.infer(0.0, 0.0) is None
-    assert robot.control(0.0).tolist() == [0.0, 0.0]
+    assert robot.control(0.0) is None
 
 
 @pytest.mark.parametrize(
@@ -233,3 +246,26 @@ def test_a_bundle_without_perception_drives_no_robot(shipped_bundle: Bundle) -> 
     )  # fmt: skip
     with pytest.raises(BundleError, match="has no perception"):
         make_robot(blind, World())
+
+
+def test_a_new_mission_forgets_map_messages_and_action(shipped_policy: Policy) -> None:
+    flown, fresh = (make_robot(shipped_policy, World()) for _ in range(2))
+    flown.receive(message(shipped_policy), 0.0, 0.0)
+    flown.perceive(0.0)
+    assert flown.infer(0.0, 0.0) is not None
+    flown.forget()
+    assert flown.control(0.0) is None
+    assert flown.mailbox.neighbours(0.0) == ()
+    dark = World(seen=np.zeros((64, 64), np.float32))
+    for robot in (flown, fresh):
+        robot._sensor = dark
+    ticks = [robot.perceive(0.2) for robot in (flown, fresh)]
+    assert ticks[0] and ticks[1]
+    np.testing.assert_array_equal(ticks[0].images, ticks[1].images)
+
+
+def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: Policy) -> None:
+    robot = make_robot(shipped_policy, World())
+    robot.frame_id = 8
+    assert robot.receive(message(shipped_policy), 0.0, 0.0) is Rejection.OTHER_FRAME
+    assert robot.receive(message(shipped_policy, frame_id=8), 0.0, 0.0) is None

@@ -10,6 +10,7 @@ import pytest
 from edge.core import F32, F64
 from edge.core.aggregation import Geometry
 from edge.core.frames import ModelScale
+from edge.core.ports import Odometry
 from edge.runtime.bundle import Bundle
 from edge.runtime.pac import Pac, PacParameters, position_feature
 from edge.runtime.policy import Policy
@@ -215,8 +216,8 @@ class Still:
         self._position_m = position_m
         self._seen = seen
 
-    def position_m(self) -> tuple[float, float, float]:
-        return self._position_m
+    def odometry(self) -> Odometry:
+        return Odometry(self._position_m, (0.0, 0.0, 0.0))
 
     def view(self, position: F64) -> F32:
         return self._seen
@@ -231,7 +232,7 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: P
     still = [Still((*place, 2.0), random.random((64, 64), np.float32)) for place in places_m]
     robots = [
         Pac(
-            robot_id=i, boot_epoch=1, policy=shipped_policy, sensor=still[i], position=still[i],
+            robot_id=i, boot_epoch=1, policy=shipped_policy, sensor=still[i], odometry=still[i],
             parameters=parameters,
         )
         for i in range(10)
@@ -242,11 +243,11 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: P
         now_s = 0.4 * tick
         for robot in robots:
             robot.perceive(now_s)
-        messages = [robot.infer(now_s, now_s) for robot in robots]
+        ticks = [robot.infer(now_s, now_s) for robot in robots]
         for i, robot in enumerate(robots):
-            for j, data in enumerate(messages):
+            for j, sent in enumerate(ticks):
                 if i != j:
-                    assert data is not None and robot.receive(data, now_s, now_s) is None
+                    assert sent and robot.receive(sent.message, now_s, now_s) is None
     velocities = np.array([robot.control(now_s) for robot in robots], np.float32)
 
     neighbours = np.hypot(*(places_m[:, None] - places_m[None]).T) < 16.0
