@@ -5,7 +5,7 @@ import sys
 
 import typer
 
-from cli import bundle, export, sim
+from cli import bundle, export, replay, robot, sim
 
 # One process is one robot, or a simulation on one core: BLAS threads would only disturb the loops.
 # numpy reads this when it is first imported, and no sub-command has imported it yet.
@@ -24,7 +24,9 @@ app = typer.Typer(
 app.command()(export.export)
 app.command()(sim.sim)
 app.command()(sim.demo)
+app.command()(replay.replay)
 app.add_typer(bundle.app)
+app.add_typer(robot.app)
 
 
 def main() -> None:

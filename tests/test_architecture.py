@@ -31,6 +31,7 @@ ONLY_IN = {
     "matplotlib": {"sim/"},
     "mavsdk": {"edge/adapters/"},
     "zenoh": {"edge/adapters/"},
+    "mcap": {"edge/adapters/"},
     "pymavlink": {"sim/"},
     "typer": {"cli/"},
     "rich": {"cli/"},

@@ -50,6 +50,18 @@ class MissionFrame:
             struct.pack("<3d", self.latitude_deg, self.longitude_deg, self.heading_rad)
         )
 
+    def to_global_deg(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Latitude and longitude, deg, of a place of the mission frame."""
+        sin, cos = math.sin(self.heading_rad), math.cos(self.heading_rad)
+        north_m, east_m = cos * y_m - sin * x_m, sin * y_m + cos * x_m
+        place = Geodesic.WGS84.Direct(
+            self.latitude_deg,
+            self.longitude_deg,
+            math.degrees(math.atan2(east_m, north_m)),
+            math.hypot(north_m, east_m),
+        )
+        return place["lat2"], place["lon2"]
+
     def relative_to(
         self, local_origin_latitude_deg: float, local_origin_longitude_deg: float
     ) -> "LocalTransform":

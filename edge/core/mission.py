@@ -70,7 +70,8 @@ class GroundState:
 
     `enabled` lets robots run their preflight checks. `calm` asks the fleet to hold, to return to
     the landing points, or to land; `robot_calm` (robot id as text) overrides it for one robot.
-    Withdrawing it sets nothing in motion. `origin` is taken up on the ground only.
+    Withdrawing it sets nothing in motion. `origin` is taken up on the ground only. `unix_time_s` is
+    the ground's clock when it said so.
     """
 
     sequence: int
@@ -79,6 +80,7 @@ class GroundState:
     enabled: bool = False
     calm: Calm = "none"
     robot_calm: dict[str, Calm] = field(default_factory=dict)
+    unix_time_s: float | None = None
 
     def calm_for(self, robot_id: int) -> Calm:
         """What is asked of one robot."""
@@ -175,6 +177,6 @@ def from_json(kind: type[T], data: bytes) -> T:
     """The message of that kind in `data`. Raises ConfigError that says what is wrong with it."""
     try:
         mapping = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ConfigError(f"{kind.__name__}: not JSON") from None
     return from_mapping(kind, mapping, kind.__name__)

@@ -1,6 +1,6 @@
 """The outside world as the robot sees it; adapters and the simulator implement these."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from edge.core import F32, F64
@@ -56,6 +56,22 @@ class Autopilot(Protocol):
 
         Commands are carried out one after another; KILL goes before all others.
         """
+
+
+class AutopilotSetup(Protocol):
+    """What is done with a vehicle before a flight. Each method waits for it, and may raise OSError.
+
+    Called from the main thread alone.
+    """
+
+    def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
+        """PX4's parameters; None for one that it does not have."""
+
+    def set_parameter(self, name: str, value: int | float) -> None:
+        """Set one."""
+
+    def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
+        """Replace PX4's fence by one polygon to stay in: latitude and longitude."""
 
 
 class PeerLink(Protocol):

@@ -1,8 +1,174 @@
-"""Limits on what the vehicle is told to do."""
+"""Limits on what the vehicle is told to do.
+
+Mission frame: x right, y forward, z up, m, heights above the robot's own takeoff point. Positions
+and velocities are (3,) float64 unless said otherwise.
+
+What is commanded passes `limit_speed` and `limit_acceleration` first, then `brake`, and
+`keep_inside` last: nothing may soften a stop.
+
+Nothing here raises in flight. A number that is not finite, or beyond 1000 km, is no measurement:
+where one comes in, a velocity goes out as 0, and a point as None.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from edge.core import F64
+
+_ABSURD = 1e6
+_LARGEST_FENCE_M = 1e4
+# A slack is used up no faster than in this time: five control periods, which leaves room for the
+# age of the estimate.
+_SLACK_TIME_S = 0.5
+_RECOVERY_SHARE = 0.5
+_ROUNDING_M_S = 1e-9
+_HEIGHT_GAIN_PER_S = 1.0
+# An angle, rad, below which three vertices lie on one line.
+_STRAIGHT_RAD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Fence:
+    """Where the robot may fly: a convex polygon, m, and heights from `floor_m` to `ceiling_m`.
+
+    `vertices_m` are (x, y), three or more, either way round; the last is joined to the first.
+    Robots stop `buffer_m` inside the line.
+
+    Raises ValueError if the polygon is not convex, has no room within the buffer, or a number is
+    not finite or out of its range.
+    """
+
+    vertices_m: tuple[tuple[float, ...], ...]
+    buffer_m: float
+    floor_m: float
+    ceiling_m: float
+
+    def __post_init__(self) -> None:
+        if len(self.vertices_m) < 3:
+            raise ValueError(f"vertices_m has {len(self.vertices_m)} vertices: must be 3 or more")
+        for vertex in self.vertices_m:
+            if len(vertex) != 2 or not all(abs(c) <= _LARGEST_FENCE_M for c in vertex):
+                raise ValueError(
+                    f"vertices_m has {list(vertex)}: must be [x, y], each within "
+                    f"{_LARGEST_FENCE_M:g} m"
+                )
+        if not 0.0 < self.buffer_m < math.inf:
+            raise ValueError(f"buffer_m = {self.buffer_m}: must be finite and above 0")
+        if not 0.0 <= self.floor_m < math.inf:
+            raise ValueError(f"floor_m = {self.floor_m}: must be finite and at least 0")
+        if not self.floor_m < self.ceiling_m < math.inf:
+            raise ValueError(
+                f"ceiling_m = {self.ceiling_m}: must be finite and above floor_m = {self.floor_m}"
+            )
+        corners = np.array(self.vertices_m)
+        if not _is_convex(corners):
+            raise ValueError(
+                f"vertices_m = {[list(vertex) for vertex in self.vertices_m]}: must be the "
+                "corners of a convex polygon, in order, none twice"
+            )
+        depth_m = self.distance_m(*_centroid(corners))
+        if not depth_m > self.buffer_m:
+            raise ValueError(
+                f"buffer_m = {self.buffer_m}: must be below {depth_m:.3g}, "
+                "the distance from the fence's centroid to its line"
+            )
+
+    def distance_m(self, x_m: float, y_m: float) -> float:
+        """Distance to the line, m: positive inside; outside, minus how far beyond the worst edge.
+
+        NaN where x or y is.
+        """
+        return float(self._edges().distances_m(np.array([x_m, y_m])).min())
+
+    def grown_m(self, margin_m: float) -> tuple[tuple[float, float], ...]:
+        """Corners (x, y) of the polygon whose every line lies `margin_m` further out."""
+        after = self._edges().inward
+        before = np.roll(after, 1, axis=0)
+        outward = (before + after) / (1.0 + (before * after).sum(axis=1, keepdims=True))
+        corners = np.array(self.vertices_m) - margin_m * outward
+        return tuple((float(x_m), float(y_m)) for x_m, y_m in corners)
+
+    def contains(self, position_m: Sequence[float] | F64) -> bool:
+        """Whether a position (3,) is inside, heights included; False where it is not finite."""
+        x_m, y_m, z_m = position_m
+        return self.distance_m(x_m, y_m) >= 0.0 and self.floor_m <= z_m <= self.ceiling_m
+
+    def _edges(self) -> "_Edges":
+        corners = np.array(self.vertices_m)
+        along = np.roll(corners, -1, axis=0) - corners
+        along = along / np.hypot(along[:, :1], along[:, 1:])
+        left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        inward = left if _area(corners) > 0.0 else -left
+        return _Edges(inward, (inward * corners).sum(axis=1))
+
+
+class _Edges(NamedTuple):
+    """A polygon's half planes: inward unit normals (n, 2), and offsets (n,), m."""
+
+    inward: F64
+    offsets_m: F64
+
+    def distances_m(self, point_m: F64) -> F64:
+        """(n,): how far inside each edge's line a point (2,) is."""
+        return self.inward @ point_m - self.offsets_m
+
+
+@dataclass(frozen=True, slots=True)
+class MotionLimits:
+    """How fast the robot may move, and how its vehicle answers.
+
+    `max_acceleration_m_s2` is at most 0.7 of what the vehicle reaches: it may have to brake and to
+    turn at once. `lag_s` is the measured time constant of its answer to a velocity setpoint: PX4 in
+    offboard mode takes 1.3 s.
+
+    Raises ValueError if one is not finite and above 0 (the lag: at least 0).
+    """
+
+    max_speed_m_s: float
+    max_climb_m_s: float
+    max_acceleration_m_s2: float
+    lag_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("max_speed_m_s", "max_climb_m_s", "max_acceleration_m_s2"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: must be finite and above 0")
+        if not 0.0 <= self.lag_s < math.inf:
+            raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
+
+
+class MovingNeighbour(NamedTuple):
+    """Another robot: where it was `age_s` ago, and its velocity then; (3,) each."""
+
+    robot_id: int
+    position_m: Sequence[float] | F64
+    velocity_m_s: Sequence[float] | F64
+    age_s: float
+
+
+class Closest(NamedTuple):
+    """The nearest other robot, and its 3-D distance, m."""
+
+    robot_id: int
+    distance_m: float
+
+
+def nearest(
+    position_m: Sequence[float], neighbours: Iterable[MovingNeighbour]
+) -> Closest | None:
+    """Who is nearest by 3-D distance, each taken to have flown on as it did; None if nobody is."""
+    closest: Closest | None = None
+    for robot_id, seen_at_m, velocity_m_s, age_s in neighbours:
+        there_m = [p + v * age_s for p, v in zip(seen_at_m, velocity_m_s, strict=True)]
+        distance_m = math.dist(there_m, position_m)
+        if closest is None or distance_m < closest.distance_m:
+            closest = Closest(robot_id, distance_m)
+    return closest
 
 
 def limit_speed(velocity: F64, max_speed: float) -> F64:
@@ -14,3 +180,208 @@ def limit_speed(velocity: F64, max_speed: float) -> F64:
     if not np.isfinite(speed):
         return np.zeros(2)
     return velocity if speed <= max_speed else velocity * (max_speed / speed)
+
+
+def limit_acceleration(
+    previous_m_s: F64, wanted_m_s: F64, max_acceleration_m_s2: float, dt_s: float
+) -> F64:
+    """`wanted_m_s`, or as far on the way to it from `previous_m_s` as `dt_s` allows."""
+    if not _plausible(previous_m_s, wanted_m_s, (dt_s,)):
+        return np.zeros(3)
+    change = wanted_m_s - previous_m_s
+    largest = max_acceleration_m_s2 * max(dt_s, 0.0)
+    size = math.hypot(*change)
+    return wanted_m_s if size <= largest else previous_m_s + change * (largest / size)
+
+
+def hold_height(height_m: float, wanted_height_m: float, max_climb_m_s: float) -> float:
+    """The climb rate, m/s, up positive, towards a height: K_p (wanted - height), K_p = 1 / s."""
+    if not _plausible((height_m, wanted_height_m)):
+        return 0.0
+    climb_m_s = _HEIGHT_GAIN_PER_S * (wanted_height_m - height_m)
+    return min(max(climb_m_s, -max_climb_m_s), max_climb_m_s)
+
+
+def leash(target_m: F64, position_m: F64, length_m: float) -> F64 | None:
+    """`target_m`, or the point towards it that is `length_m` away from the position.
+
+    So a position setpoint does not make the vehicle dash when its estimate jumps. None if there is
+    no telling where that is: then command no velocity instead.
+    """
+    if not _plausible(target_m, position_m):
+        return None
+    offset_m = target_m - position_m
+    distance_m = math.hypot(*offset_m)
+    return target_m if distance_m <= length_m else position_m + offset_m * (length_m / distance_m)
+
+
+def approach_speed(distance_m: float, limits: MotionLimits) -> float:
+    """The largest speed v that `distance_m` is enough to stop from: v lag + v^2 / 2a; 0 if none."""
+    if not 0.0 < distance_m < math.inf:
+        return 0.0
+    lag_s, acceleration = limits.lag_s, limits.max_acceleration_m_s2
+    return 2.0 * distance_m / (lag_s + math.sqrt(lag_s * lag_s + 2.0 * distance_m / acceleration))
+
+
+def keep_inside(
+    fence: Fence,
+    position_m: F64,
+    velocity_m_s: F64,
+    wanted_m_s: F64,
+    limits: MotionLimits,
+    recovering: bool,
+) -> tuple[F64, bool]:
+    """What may be flown of `wanted_m_s`, so that the vehicle stops at the buffer inside the line.
+
+    `velocity_m_s` is the vehicle's own, as estimated: for its lag it moves on, whatever is told.
+    Towards each edge the velocity is shortened, along it not. A vehicle that was carried outside is
+    brought back, at half the greatest speed, until it is half the buffer inside: pass the second
+    result in again as `recovering`. Heights stop at the floor and at the ceiling themselves, and
+    come back to them. Not for takeoff and landing, which pass through the floor.
+    """
+    if not _plausible(position_m, velocity_m_s, wanted_m_s):
+        return np.zeros(3), recovering
+    edges = fence._edges()
+    distances_m = edges.distances_m(position_m[:2])
+    depth_m = float(distances_m.min())
+    recovering = depth_m < 0.0 or (recovering and depth_m < fence.buffer_m / 2.0)
+    if recovering:
+        # Downhill on the sum of the squared shortfalls, which is convex: it ends inside, in
+        # corners too.
+        inward = np.maximum(fence.buffer_m - distances_m, 0.0) @ edges.inward
+        speed_m_s = _RECOVERY_SHARE * limits.max_speed_m_s
+        horizontal = inward * (speed_m_s / max(math.hypot(*inward), 1e-9))
+    else:
+        outward_speeds = -(edges.inward @ velocity_m_s[:2])
+        caps = [
+            _speed_towards(slack_m, speed, limits)
+            for slack_m, speed in zip(
+                (distances_m - fence.buffer_m).tolist(), outward_speeds.tolist(), strict=True
+            )
+        ]
+        horizontal = _limit_towards(wanted_m_s[:2], -edges.inward, caps)
+    climb_m_s = _keep_height(fence, position_m[2], velocity_m_s[2], wanted_m_s[2], limits)
+    return np.array([*horizontal, climb_m_s]), recovering
+
+
+def brake(
+    position_m: F64,
+    velocity_m_s: F64,
+    wanted_m_s: F64,
+    neighbours: Iterable[MovingNeighbour],
+    min_separation_m: float,
+    limits: MotionLimits,
+) -> tuple[F64, Closest | None]:
+    """What may be flown of `wanted_m_s`, so that the robot stays `min_separation_m` from others.
+
+    `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
+    did. One that is `min_separation_m` or more above or below brakes nothing, since robots cross in
+    their height slots. Towards another one the robot may close half the slack: that one does the
+    same. Away from it, it may always fly. Climbing is not limited.
+
+    Also returns who is nearest. What is not known of one neighbour stops the robot.
+    """
+    if not _plausible(position_m, velocity_m_s, wanted_m_s):
+        return np.zeros(3), None
+    closest: Closest | None = None
+    directions: list[F64] = []
+    caps: list[float] = []
+    known = True
+    for robot_id, seen_at_m, its_velocity_m_s, age_s in neighbours:
+        if not _plausible(seen_at_m, its_velocity_m_s, (age_s,)):
+            known = False
+            continue
+        offset_m = np.asarray(seen_at_m) + np.asarray(its_velocity_m_s) * age_s - position_m
+        distance_m = math.hypot(*offset_m)
+        if closest is None or distance_m < closest.distance_m:
+            closest = Closest(robot_id, distance_m)
+        up_m = float(offset_m[2])
+        if abs(up_m) >= min_separation_m:
+            continue
+        apart_m = math.hypot(offset_m[0], offset_m[1])
+        if apart_m == 0.0:
+            known = False  # Every way may be the wrong one.
+            continue
+        direction = offset_m[:2] / apart_m
+        # Squares of far smaller numbers than a separation may vanish: never below 0.
+        needed_m = math.sqrt(max(min_separation_m * min_separation_m - up_m * up_m, 0.0))
+        speed = float(direction @ velocity_m_s[:2])
+        directions.append(direction)
+        caps.append(_speed_towards((apart_m - needed_m) / 2.0, speed, limits))
+    if not known:
+        return np.zeros(3), closest
+    if not directions:
+        return wanted_m_s, closest
+    horizontal = _limit_towards(wanted_m_s[:2], np.array(directions), caps)
+    return np.array([*horizontal, wanted_m_s[2]]), closest
+
+
+def _speed_towards(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
+    """How fast to be told to fly towards a line `slack_m` away, already doing `speed_m_s`.
+
+    `approach_speed` alone is overshot by a third of the way: the vehicle follows a falling command
+    late. What the slack leaves after the way that it needs to stop falls by itself no faster than
+    by what is commanded, and never below 0 if that is a small part of it.
+    """
+    stopping_m = 0.0
+    if speed_m_s > 0.0:
+        stopping_m = speed_m_s * (limits.lag_s + speed_m_s / (2.0 * limits.max_acceleration_m_s2))
+    return min(approach_speed(slack_m, limits), max(slack_m - stopping_m, 0.0) / _SLACK_TIME_S)
+
+
+def _limit_towards(velocity: F64, directions: F64, caps: Sequence[float]) -> F64:
+    """`velocity` (2,) with at most `caps` (n,), 0 or more, along each of `directions` (n, 2)."""
+    limited = velocity
+    for direction, cap in zip(directions, caps, strict=True):
+        limited = limited - direction * max(float(direction @ limited) - cap, 0.0)
+    # Where directions oppose each other, mending one breaks another: the whole vector gives way.
+    share = 1.0
+    for direction, cap in zip(directions, caps, strict=True):
+        speed = float(direction @ limited)
+        if speed > cap + _ROUNDING_M_S:
+            share = min(share, cap / speed)
+    return limited * share
+
+
+def _keep_height(
+    fence: Fence, height_m: float, climb_m_s: float, wanted_m_s: float, limits: MotionLimits
+) -> float:
+    highest, lowest = (
+        hold_height(height_m, limit_m, limits.max_climb_m_s)
+        if (limit_m - height_m) * sign < 0.0
+        else sign * _speed_towards((limit_m - height_m) * sign, climb_m_s * sign, limits)
+        for limit_m, sign in ((fence.ceiling_m, 1.0), (fence.floor_m, -1.0))
+    )
+    return max(min(wanted_m_s, highest), lowest)
+
+
+def _plausible(*vectors: Iterable[float]) -> bool:
+    return all(abs(number) < _ABSURD for vector in vectors for number in vector)
+
+
+def _area(corners: F64) -> float:
+    """The area inside corners (n, 2), positive if they run counterclockwise."""
+    x, y = corners.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def _centroid(corners: F64) -> tuple[float, float]:
+    base, rest = corners[0], corners[1:] - corners[0]
+    x, y = rest.T
+    weights = x[:-1] * y[1:] - y[:-1] * x[1:]
+    x_m, y_m = base + (weights[:, None] * (rest[:-1] + rest[1:])).sum(axis=0) / (3 * weights.sum())
+    return float(x_m), float(y_m)
+
+
+def _is_convex(corners: F64) -> bool:
+    """Whether the corners turn one way all round, and once."""
+    if abs(_area(corners - corners[0])) < 1e-9:
+        return False
+    along = np.roll(corners, -1, axis=0) - corners
+    if not (np.abs(along).max(axis=1) > 0.0).all():
+        return False
+    after = np.roll(along, -1, axis=0)
+    turns = np.arctan2(
+        along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
+    ) * math.copysign(1.0, _area(corners))
+    return bool((turns > -_STRAIGHT_RAD).all()) and math.isclose(turns.sum(), math.tau)

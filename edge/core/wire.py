@@ -102,14 +102,14 @@ def decode(
     data: bytes | memoryview,
     *,
     bundle_id: bytes,
-    frame_id: int,
+    frame_id: int | None,
     own_robot_id: int,
     message_size: int,
 ) -> AggregatedMessage | Rejection:
     """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
 
     `bundle_id` is the 32 bytes of the own manifest's SHA-256, `frame_id` that of the own mission
-    frame, `message_size` the number of floats that the own network takes. The payload is a read-only view of `data`, float32 or float16, not a
+    frame (None: of any), `message_size` the number of floats that the own network takes. The payload is a read-only view of `data`, float32 or float16, not a
     copy: `data` must not change afterwards.
     """
     view = memoryview(data).toreadonly()
@@ -153,7 +153,7 @@ def decode(
         return Rejection.OWN
     if payload_length != message_size:
         return Rejection.PAYLOAD_LENGTH
-    if sender_frame_id != frame_id:
+    if frame_id is not None and sender_frame_id != frame_id:
         return Rejection.OTHER_FRAME
     payload = np.frombuffer(view, dtype, offset=_HEADER_SIZE)
     header = (sent_at_s, x_m, y_m, z_m, *velocity_m_s)
@@ -166,6 +166,6 @@ def decode(
         sent_at_s,
         (x_m, y_m, z_m),
         (velocity_m_s[0], velocity_m_s[1], velocity_m_s[2]),
-        frame_id,
+        sender_frame_id,
         payload,
     )

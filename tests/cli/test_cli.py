@@ -32,7 +32,7 @@ def error_line(result: subprocess.CompletedProcess[str]) -> str:
 def test_help_names_the_commands() -> None:
     result = lpac("--help")
     assert result.returncode == 0
-    for command in ("export", "bundle", "sim", "demo"):
+    for command in ("export", "bundle", "sim", "demo", "robot", "replay"):
         assert command in result.stdout
 
 

@@ -1,0 +1,54 @@
+"""`lpac robot`: fly one robot, or check whether it could fly."""
+
+import json
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(name="robot", help="Fly one robot, or check whether it could.")
+
+ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configuration, TOML.")]
+
+
+@app.command()
+def run(config: ConfigPath = Path("robot.toml")) -> None:
+    """Fly this robot, under the ground's commands, until SIGTERM or Ctrl-C.
+
+    A vehicle that is flying then holds, or lands if the configuration says so.
+    """
+    from edge.robot import run as run_robot
+    from edge.runtime.config import load_config
+
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    run_robot(load_config(config), stop)
+
+
+@app.command()
+def check(
+    config: ConfigPath = Path("robot.toml"),
+    wait: Annotated[float, typer.Option(help="How long the robot may take to be ready, s.")] = 15.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say what PX4 would do when something fails, and what still keeps the robot from flying."""
+    from edge.robot import check as check_robot
+    from edge.runtime.config import load_config
+
+    report = check_robot(load_config(config), wait)
+    if as_json:
+        typer.echo(json.dumps(report._asdict(), indent=2))
+    else:
+        for line in report.explanations:
+            typer.echo(line)
+        for line in report.changes:
+            typer.echo(f"set: {line}")
+        for line in report.failed:
+            typer.echo(f"FAILED  {line}")
+    if report.failed:
+        count = len(report.failed)
+        raise ValueError(f"not ready to fly: {count} check{'s' if count > 1 else ''} failed")
+    typer.echo("ready to fly", err=as_json)

@@ -1,0 +1,295 @@
+"""What PX4 says, as one `VehicleState`: MAVLink messages in; no socket, thread or clock.
+
+Messages come as MAVLink's common dialect names them, with their fields in MAVLink's units.
+"""
+
+import math
+import re
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from threading import Lock
+from typing import Any
+
+from edge.core.vehicle import Gps, Mode, Vector, VehicleState
+
+Fields = Mapping[str, Any]
+
+# PX4 sends a heartbeat at least every second.
+_CONNECTED_WITHIN_S = 2.5
+# PX4 sends no position while its estimator vouches for none.
+_POSITION_WITHIN_S = 1.0
+_TEXT_KEPT_S = 15.0
+
+# A position is taken for a jump if it lies further from where motion led than this, plus as much
+# for every second between.
+_JUMP_M, _JUMP_M_S = 1.0, 1.0
+_ORIGIN_ANSWER_S = 0.5
+
+_SENSOR_GPS, _PREARM_CHECK = 1 << 5, 1 << 28
+_SAFETY_ARMED = 1 << 7
+_AUTOPILOT_INVALID = 8
+_WARNING = 4
+_ON_GROUND = 1
+_UNKNOWN_UINT16 = 0xFFFF
+_AUTO = 4
+_MAIN_MODES = {
+    1: Mode.MANUAL,
+    2: Mode.ALTITUDE,
+    3: Mode.POSITION,
+    5: Mode.MANUAL,  # acro
+    6: Mode.OFFBOARD,
+    7: Mode.STABILIZED,
+}
+_AUTO_MODES = {2: Mode.TAKEOFF, 3: Mode.HOLD, 4: Mode.MISSION, 5: Mode.RETURN, 6: Mode.LAND}
+_REFUSAL = re.compile(r"^(?:\w+ denied|preflight fail)[:!]?\s*", re.IGNORECASE)
+
+
+class Px4Telemetry:
+    """The newest of everything that one vehicle said. Every method may be called from any thread.
+
+    Times are the robot's monotonic clock, s.
+
+    Messages that were held up, because this process or the link stood still, arrive in one go: the
+    vehicle's own clock tells how old they are, and `position_at_s` and `heartbeat_at_s` count from
+    when they were due.
+
+    Position and origin always belong together. A position that jumps is held back until the origin
+    is known anew, half a second at most, and a new origin counts from the next position on.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._state = VehicleState()
+        self._clock = _VehicleClock()
+        self._twin = _TwinWatch()
+        self._satellite_position_ok = False
+        self._global_position_at_s = -math.inf
+        self._jump_at_s: float | None = None
+        self._origin_deg: tuple[float, float] | None = None
+        self._origin_at_s = -math.inf
+        self._texts: deque[tuple[float, str]] = deque(maxlen=16)
+        self._handlers = {
+            "HEARTBEAT": self._on_heartbeat,
+            "SYS_STATUS": self._on_sys_status,
+            "GPS_RAW_INT": self._on_gps_raw_int,
+            "LOCAL_POSITION_NED": self._on_local_position_ned,
+            "GLOBAL_POSITION_INT": self._on_global_position_int,
+            "GPS_GLOBAL_ORIGIN": self._on_gps_global_origin,
+            "EXTENDED_SYS_STATE": self._on_extended_sys_state,
+            "STATUSTEXT": self._on_statustext,
+            "AUTOPILOT_VERSION": self._on_autopilot_version,
+        }
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """The names of the messages that `hear` understands."""
+        return tuple(self._handlers)
+
+    def hear(self, name: str, fields: Fields, now_s: float) -> None:
+        """Take in one message of the autopilot.
+
+        Raises KeyError, TypeError or ValueError for one that is no such message: nothing changes.
+        """
+        with self._lock:
+            self._handlers[name](fields, now_s)
+
+    def state(self, now_s: float) -> VehicleState:
+        """All fields but those of the link: system ids and command results are not known here."""
+        with self._lock:
+            state = self._state
+            texts = {text: None for at_s, text in self._texts if now_s - at_s < _TEXT_KEPT_S}
+            fresh_from_s = now_s - _POSITION_WITHIN_S
+            return replace(
+                state,
+                connected=now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S,
+                position_ok=self._satellite_position_ok
+                and state.position_at_s > fresh_from_s
+                and self._global_position_at_s > fresh_from_s,
+                problems=() if state.armable or state.armed else tuple(texts),
+            )
+
+    def needs_origin(self) -> bool:
+        """Whether the position jumped, and an origin that is as new has not come yet."""
+        with self._lock:
+            return self._jump_at_s is not None
+
+    def has_twin(self, now_s: float) -> bool:
+        """Whether two vehicles seem to speak with the same system id."""
+        with self._lock:
+            return self._twin.seen(now_s)
+
+    def restarts(self) -> int:
+        """How often the vehicle was found to have been switched on anew."""
+        with self._lock:
+            return self._clock.restarts
+
+    def warnings_since(self, since_s: float) -> tuple[str, ...]:
+        """The reasons for a refusal that were heard since then, without the words of refusal."""
+        with self._lock:
+            return tuple({text: None for at_s, text in self._texts if at_s >= since_s})
+
+    def _change(self, **changes: Any) -> None:
+        self._state = replace(self._state, **changes)
+
+    def _on_heartbeat(self, fields: Fields, now_s: float) -> None:
+        if fields["autopilot"] == _AUTOPILOT_INVALID:
+            return
+        main, sub = fields["custom_mode"] >> 16 & 0xFF, fields["custom_mode"] >> 24 & 0xFF
+        modes, key = (_AUTO_MODES, sub) if main == _AUTO else (_MAIN_MODES, main)
+        self._change(
+            mode=modes.get(key, Mode.OTHER),
+            armed=bool(fields["base_mode"] & _SAFETY_ARMED),
+            heartbeat_at_s=now_s - self._clock.delay_s,
+        )
+
+    def _on_sys_status(self, fields: Fields, _: float) -> None:
+        present = fields["onboard_control_sensors_present"]
+        healthy = fields["onboard_control_sensors_health"]
+        percent = fields["battery_remaining"]
+        self._satellite_position_ok = bool(present & healthy & _SENSOR_GPS)
+        self._change(
+            armable=bool(healthy & _PREARM_CHECK) if present & _PREARM_CHECK else None,
+            battery=percent / 100.0 if percent >= 0 else None,
+        )
+
+    def _on_gps_raw_int(self, fields: Fields, _: float) -> None:
+        hundredths = fields["eph"]
+        hdop = math.inf if hundredths == _UNKNOWN_UINT16 else hundredths / 100.0
+        satellites = fields["satellites_visible"]
+        self._change(gps=Gps(fields["fix_type"], 0 if satellites == 0xFF else satellites, hdop))
+
+    def _on_global_position_int(self, fields: Fields, now_s: float) -> None:
+        changes: dict[str, float] = {"height_above_home_m": fields["relative_alt"] / 1e3}
+        if fields["hdg"] != _UNKNOWN_UINT16:
+            changes["heading_rad"] = math.radians(fields["hdg"] / 100.0 % 360.0)
+        self._change(**changes)
+        self._global_position_at_s = now_s - self._clock.delay_s
+
+    def _on_extended_sys_state(self, fields: Fields, _: float) -> None:
+        state = fields["landed_state"]
+        self._change(in_air=state > _ON_GROUND if state else None)
+
+    def _on_gps_global_origin(self, fields: Fields, now_s: float) -> None:
+        self._origin_deg = (fields["latitude"] / 1e7, fields["longitude"] / 1e7)
+        self._origin_at_s = now_s
+        if self._state.position_local_m is None:
+            self._change(origin_deg=self._origin_deg)
+
+    def _on_local_position_ned(self, fields: Fields, now_s: float) -> None:
+        position_m = _vector(fields, "x", "y", "z")
+        velocity_m_s = _vector(fields, "vx", "vy", "vz")
+        boot_s = fields["time_boot_ms"] / 1e3
+        self._twin.vehicle_time(boot_s, now_s)
+        at_s = now_s - self._clock.hear(boot_s, now_s)
+        if self._is_held_back(position_m, at_s, now_s):
+            return
+        self._change(
+            position_local_m=position_m,
+            velocity_local_m_s=velocity_m_s,
+            position_at_s=at_s,
+            origin_deg=self._origin_deg,
+        )
+
+    def _is_held_back(self, position_m: Vector, at_s: float, now_s: float) -> bool:
+        """Whether the position may belong to another origin than the one that is known."""
+        if self._origin_deg != self._state.origin_deg:
+            self._jump_at_s = None
+        elif self._jump_at_s is not None:
+            answered = self._origin_at_s > self._jump_at_s
+            if answered or now_s - self._jump_at_s > _ORIGIN_ANSWER_S:
+                self._jump_at_s = None
+        elif self._jumped(position_m, at_s):
+            self._jump_at_s = now_s
+        return self._jump_at_s is not None
+
+    def _jumped(self, position_m: Vector, at_s: float) -> bool:
+        last_m, velocity_m_s = self._state.position_local_m, self._state.velocity_local_m_s
+        if last_m is None or velocity_m_s is None:
+            return False
+        between_s = max(at_s - self._state.position_at_s, 0.0)
+        off_m = math.hypot(
+            *(position_m[i] - last_m[i] - velocity_m_s[i] * between_s for i in (0, 1))
+        )
+        return off_m > _JUMP_M + _JUMP_M_S * between_s
+
+    def _on_statustext(self, fields: Fields, now_s: float) -> None:
+        text = fields["text"].strip()
+        if fields["chunk_seq"] and self._texts:
+            at_s, start = self._texts.pop()
+            self._texts.append((at_s, start + text))
+        elif fields["severity"] <= _WARNING:
+            self._texts.append((now_s, _REFUSAL.sub("", text)))
+
+    def _on_autopilot_version(self, fields: Fields, now_s: float) -> None:
+        self._twin.hardware((fields["uid"], *fields["uid2"]), now_s)
+
+
+class _VehicleClock:
+    """How long messages were held up, from the vehicle's own clock.
+
+    While a backlog drains, the vehicle's time passes faster than ours. Once messages come at the
+    vehicle's pace again, there is none: what then still differs is the clocks.
+    """
+
+    _RESTART_S = 1.0
+    _AT_PACE = 10
+
+    def __init__(self) -> None:
+        self.delay_s = 0.0
+        self.restarts = 0
+        self._last: tuple[float, float] | None = None
+        self._at_pace = 0
+
+    def hear(self, vehicle_s: float, now_s: float) -> float:
+        """The delay of a message that the vehicle sent at its own time, s."""
+        last_vehicle_s, last_now_s = self._last or (vehicle_s, now_s)
+        self._last = vehicle_s, now_s
+        sent_between_s, between_s = vehicle_s - last_vehicle_s, now_s - last_now_s
+        if sent_between_s < -self._RESTART_S:
+            self.restarts += 1
+            self.delay_s = 0.0
+            return 0.0
+        self.delay_s = max(self.delay_s + between_s - sent_between_s, 0.0)
+        regular = 0.5 * sent_between_s <= between_s <= 2.0 * sent_between_s + 0.1
+        self._at_pace = self._at_pace + 1 if regular else 0
+        if self._at_pace >= self._AT_PACE:
+            self._at_pace = 0
+            self.delay_s = 0.0
+        return self.delay_s
+
+
+class _TwinWatch:
+    """Notices that two vehicles speak with one system id: MAVSDK takes them for one.
+
+    Their clocks differ, so that time seems to go back again and again; and so may their hardware
+    ids, which some boards have all in common.
+    """
+
+    _WITHIN_S = 5.0
+    _BACK_S = 0.03
+    _TIMES = 3
+
+    def __init__(self) -> None:
+        self._last_s = -math.inf
+        self._back_at_s: deque[float] = deque(maxlen=self._TIMES)
+        self._hardware_at_s: dict[tuple[int, ...], float] = {}
+
+    def vehicle_time(self, vehicle_s: float, now_s: float) -> None:
+        if vehicle_s < self._last_s - self._BACK_S:
+            self._back_at_s.append(now_s)
+        self._last_s = vehicle_s
+
+    def hardware(self, uid: tuple[int, ...], now_s: float) -> None:
+        self._hardware_at_s[uid] = now_s
+
+    def seen(self, now_s: float) -> bool:
+        since_s = now_s - self._WITHIN_S
+        back = len(self._back_at_s) == self._TIMES and self._back_at_s[0] > since_s
+        return back or sum(at_s > since_s for at_s in self._hardware_at_s.values()) > 1
+
+
+def _vector(fields: Fields, *names: str) -> Vector:
+    """Raises TypeError if one is not finite: then it has no value in the message."""
+    x, y, z = (float(fields[name]) for name in names)
+    return x, y, z

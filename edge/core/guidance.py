@@ -1,0 +1,131 @@
+"""Where to fly in each flight state: one control tick's setpoint in the mission frame.
+
+Heights are above the robot's own takeoff point. HOLD, TAKEOFF and RETURN are flown as positions a
+short way ahead of the estimate, which PX4 stops at much sooner than at a velocity of 0, and which
+never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.flight import Flight, FlightInputs, Robot, height_m, is_silent
+from edge.core.mission import FlightState
+from edge.core.safety import MotionLimits, brake, hold_height, keep_inside, limit_acceleration
+from edge.core.vehicle import Vector
+
+# PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P).
+_HOLD_LEASH_M = 0.5
+_AHEAD_S = 1.0
+# RETURN flies nowhere before it is this near its own height.
+_AT_OWN_HEIGHT_M = 1.0
+
+
+class MissionVelocity(NamedTuple):
+    """Fly with this velocity: the mission frame, m/s."""
+
+    velocity_m_s: Vector
+
+
+class MissionPosition(NamedTuple):
+    """Fly to x and y of the mission frame, at this height, m."""
+
+    position_m: Vector
+
+
+MissionSetpoint = MissionVelocity | MissionPosition
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guidance:
+    """What guidance remembers: the last commanded velocity (3,), and a recovery to the fence."""
+
+    velocity_m_s: F64 = field(default_factory=lambda: np.zeros(3))
+    recovering: bool = False
+
+
+def guide(
+    robot: Robot,
+    flight: Flight,
+    inputs: FlightInputs,
+    guidance: Guidance,
+    dt_s: float,
+) -> tuple[MissionSetpoint | None, Guidance]:
+    """The setpoint of this tick, None when nothing is to be sent, and the memory for the next."""
+    state, limits = flight.state, robot.limits
+    if is_silent(flight, inputs.now_s):
+        return None, Guidance()
+    if state is FlightState.ARMING:
+        return MissionVelocity((0.0, 0.0, 0.0)), Guidance()
+    if state not in (
+        FlightState.TAKEOFF,
+        FlightState.HOLD,
+        FlightState.MISSION,
+        FlightState.RETURN,
+    ):
+        return None, Guidance()
+    height = height_m(flight, inputs.odometry)
+    if inputs.odometry is None or height is None:
+        return MissionVelocity((0.0, 0.0, 0.0)), Guidance()
+    x_m, y_m, _ = inputs.odometry.position_m
+    position_m = np.array([x_m, y_m, height])
+    if state in (FlightState.TAKEOFF, FlightState.HOLD):
+        return _towards(flight.target_m, position_m, limits), Guidance()
+    if state is FlightState.RETURN:
+        wanted_m_s = _homewards(robot, position_m, limits)
+    else:
+        wanted_m_s = np.zeros(3)
+        if inputs.policy_velocity_m_s is not None:
+            wanted_m_s[:2] = inputs.policy_velocity_m_s
+        wanted_m_s = limit_acceleration(
+            guidance.velocity_m_s, wanted_m_s, limits.max_acceleration_m_s2, dt_s
+        )
+    wanted_m_s[2] = hold_height(height, robot.parameters.slot_height_m, limits.max_climb_m_s)
+    velocity_m_s = np.array(inputs.odometry.velocity_m_s)
+    braked_m_s = brake(
+        position_m,
+        velocity_m_s,
+        wanted_m_s,
+        inputs.neighbours,
+        robot.parameters.min_separation_m,
+        limits,
+    )
+    safe_m_s, recovering = keep_inside(
+        robot.fence, position_m, velocity_m_s, braked_m_s, limits, guidance.recovering
+    )
+    remembered = Guidance(np.array([*safe_m_s[:2], 0.0]), recovering)
+    if state is FlightState.RETURN:
+        return MissionPosition(_vector(position_m + safe_m_s * _AHEAD_S)), remembered
+    return MissionVelocity(_vector(safe_m_s)), remembered
+
+
+def _towards(target_m: Vector | None, position_m: F64, limits: MotionLimits) -> MissionSetpoint:
+    """A position on the way to the target: near in the plane, and a second's climb away."""
+    if target_m is None:
+        return MissionVelocity((0.0, 0.0, 0.0))
+    offset_m = np.array(target_m) - position_m
+    distance_m = float(np.hypot(*offset_m[:2]))
+    if distance_m > _HOLD_LEASH_M:
+        offset_m[:2] *= _HOLD_LEASH_M / distance_m
+    climb_m = limits.max_climb_m_s * _AHEAD_S
+    offset_m[2] = min(max(offset_m[2], -climb_m), climb_m)
+    return MissionPosition(_vector(position_m + offset_m))
+
+
+def _homewards(robot: Robot, position_m: F64, limits: MotionLimits) -> F64:
+    """(3,), without climb: towards the landing point, once at the robot's own height."""
+    wanted_m_s = np.zeros(3)
+    if abs(position_m[2] - robot.parameters.slot_height_m) < _AT_OWN_HEIGHT_M:
+        offset_m = np.array(robot.parameters.landing_point_m) - position_m[:2]
+        distance_m = float(np.hypot(*offset_m))
+        wanted_m_s[:2] = offset_m * min(
+            1.0 / _AHEAD_S, limits.max_speed_m_s / max(distance_m, 1e-9)
+        )
+    return wanted_m_s
+
+
+def _vector(values: F64) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,167 @@
+"""One robot's configuration: TOML into frozen dataclasses.
+
+Relative paths are meant from the file's own folder. Every mistake is one line that names the file,
+the key, the value and what is allowed.
+"""
+
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from edge.core.flight import FlightParameters
+from edge.core.frames import ModelScale
+from edge.core.preflight import PreflightLimits
+from edge.core.safety import Fence, MotionLimits
+from edge.core.schema import ConfigError, from_mapping
+from edge.core.wire import MAX_ROBOT_ID
+from edge.runtime.pac import PacParameters, PayloadType
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotConfig:
+    """Where PX4 is (`url` as MAVSDK has it, e.g. udpin://127.0.0.1:14551), and which one."""
+
+    url: str
+    system_id: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.system_id <= 255:
+            raise ValueError(f"system_id = {self.system_id}: must be from 1 to 255")
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting."""
+
+    mode: Literal["peer", "client"] = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    scouting: bool = False
+
+    def __post_init__(self) -> None:
+        if not (self.listen or self.connect or self.scouting):
+            raise ValueError("listen, connect and scouting: one of them must be set")
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """How often the three loops run, Hz."""
+
+    perception_hz: float = 5.0
+    policy_hz: float = 2.5
+    control_hz: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("perception_hz", "policy_hz", "control_hz"):
+            if not 0.1 <= getattr(self, name) <= 100.0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0.1 to 100")
+        if self.control_hz < 4.0:
+            raise ValueError(f"control_hz = {self.control_hz}: PX4 needs setpoints at 4 Hz or more")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyConfig:
+    """The bundle, the world it flies over, and the paper's scales."""
+
+    bundle: str
+    world: str
+    env_scale: float = 16.0
+    velocity_scale: float = 0.25
+    max_message_age_s: float = 0.8
+    max_input_age_s: float = 1.0
+    payload: PayloadType = "float16"
+
+    def __post_init__(self) -> None:
+        ModelScale(self.env_scale, self.velocity_scale)
+
+
+@dataclass(frozen=True, slots=True)
+class FailsafeConfig:
+    """What PX4 does when something fails: for an RC pilot, or for none.
+
+    `parameters`: whether wrong PX4 parameters are set before flight, or arming is refused.
+    `fence_margin_m`: how far outside our fence PX4's own is.
+    """
+
+    rc: Literal["pilot", "none"]
+    parameters: Literal["set", "refuse"] = "refuse"
+    fence_margin_m: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.fence_margin_m < math.inf:
+            raise ValueError(f"fence_margin_m = {self.fence_margin_m}: must be 0 or above")
+
+
+@dataclass(frozen=True, slots=True)
+class LogConfig:
+    """The flight log's folder and size, MB."""
+
+    folder: str = "logs"
+    max_total_mb: float = 2000.0
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.max_total_mb < math.inf:
+            raise ValueError(f"max_total_mb = {self.max_total_mb}: must be 1 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotConfig:
+    """All of robot.toml. `on_stop` is what a stopped program leaves a flying vehicle to do."""
+
+    fleet: str
+    robot_id: int
+    policy: PolicyConfig
+    autopilot: AutopilotConfig
+    link: LinkConfig
+    flight: FlightParameters
+    fence: Fence
+    limits: MotionLimits
+    failsafe: FailsafeConfig
+    rates: Rates = field(default_factory=Rates)
+    preflight: PreflightLimits = field(default_factory=PreflightLimits)
+    log: LogConfig = field(default_factory=LogConfig)
+    on_stop: Literal["hold", "land"] = "hold"
+
+    def __post_init__(self) -> None:
+        if not self.fleet or set(self.fleet) & set("/*$#? "):
+            raise ValueError(f"fleet = {self.fleet!r}: must be a name without / * $ # ? or spaces")
+        if not 0 <= self.robot_id <= MAX_ROBOT_ID:
+            raise ValueError(f"robot_id = {self.robot_id}: must be from 0 to {MAX_ROBOT_ID}")
+        if self.flight.command_timeout_s * self.rates.control_hz < 2.0:
+            raise ValueError(
+                f"flight: command_timeout_s = {self.flight.command_timeout_s}: must be at least "
+                f"two periods of rates: control_hz = {self.rates.control_hz}"
+            )
+
+    @property
+    def pac(self) -> PacParameters:
+        """The part of it that the perception-action-communication loop takes."""
+        policy = self.policy
+        return PacParameters(
+            scale=ModelScale(policy.env_scale, policy.velocity_scale),
+            max_speed_m_s=self.limits.max_speed_m_s,
+            max_message_age_s=policy.max_message_age_s,
+            max_input_age_s=policy.max_input_age_s,
+            payload=policy.payload,
+        )
+
+
+def load_config(path: Path) -> RobotConfig:
+    """The configuration in the file, its paths made absolute. Raises ConfigError."""
+    try:
+        mapping = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: no TOML: {error}") from None
+    folder = path.resolve().parent
+    for table, key in (("policy", "bundle"), ("policy", "world"), ("log", "folder")):
+        section = mapping.get(table)
+        if isinstance(section, dict) and isinstance(section.get(key), str):
+            section[key] = str(folder / section[key])
+    mapping.setdefault("log", {})
+    if isinstance(mapping["log"], dict):
+        mapping["log"].setdefault("folder", str(folder / "logs"))
+    return from_mapping(RobotConfig, mapping, str(path))

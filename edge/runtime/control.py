@@ -1,0 +1,159 @@
+"""One control tick of a robot: what it knows -> flight state -> setpoint and commands."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+
+import structlog
+
+from edge.core.flight import Flight, FlightInputs, Robot, height_m, step
+from edge.core.guidance import Guidance, MissionSetpoint, guide
+from edge.core.mission import FlightState, Origin
+from edge.core.ports import Autopilot, Recorder
+from edge.core.safety import nearest
+from edge.core.vehicle import Action, Setpoint
+from edge.runtime.inbox import Inbox
+from edge.runtime.navigation import Navigation
+from edge.runtime.pac import Pac
+from edge.runtime.readiness import Checks
+
+_log = structlog.get_logger(__name__)
+
+# Checks that are older say nothing about now.
+_MAX_CHECKS_AGE_S = 5.0
+_GROUNDED = (FlightState.INIT, FlightState.IDLE, FlightState.PREFLIGHT, FlightState.LANDED)
+_BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
+
+
+class FlightControl:
+    """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
+
+    Another thread sets `checks`, and `peer_states` (robot id -> what it says of its state), whole.
+    `obeyed_sequence` and `operator` are the last ground state's; `origin` is the mission's.
+    """
+
+    def __init__(
+        self,
+        *,
+        robot: Robot,
+        autopilot: Autopilot,
+        navigation: Navigation,
+        pac: Pac,
+        inbox: Inbox,
+        recorder: Recorder,
+        unix_clock_s: Callable[[], float],
+        started_s: float,
+    ) -> None:
+        self._robot = robot
+        self._autopilot = autopilot
+        self._navigation = navigation
+        self._pac = pac
+        self._inbox = inbox
+        self._recorder = recorder
+        self._unix_clock_s = unix_clock_s
+        self._started_s = started_s
+        self._guidance = Guidance()
+        self._last_tick_s: float | None = None
+        self.flight = Flight()
+        self.alarms: tuple[str, ...] = ()
+        self.checks: Checks | None = None
+        self.peer_states: Mapping[int, FlightState] = {}
+        self.origin: Origin | None = None
+        self.obeyed_sequence = -1
+        self.operator = ""
+
+    def tick(self, now_s: float) -> None:
+        """One tick: reads the newest of everything, sends at most one setpoint."""
+        vehicle = self._autopilot.state()
+        ground, ground_age_s = self._inbox.ground(now_s)
+        if ground is not None:
+            self.obeyed_sequence, self.operator = ground.sequence, ground.operator
+            self._take_origin(ground.origin, vehicle.armed)
+        odometry = self._navigation.estimate(vehicle)
+        own = self._navigation.odometry()
+        neighbours = self._pac.mailbox.neighbours(now_s)
+        policy_velocity_m_s = self._pac.control(now_s)
+        inputs = FlightInputs(
+            now_s=now_s,
+            vehicle=vehicle,
+            odometry=odometry,
+            policy_velocity_m_s=policy_velocity_m_s,
+            neighbours=neighbours,
+            closest=None if own is None else nearest(own.position_m, neighbours),
+            busy_neighbours=tuple(r for r, s in self.peer_states.items() if s in _BUSY),
+            ground=ground,
+            ground_age_s=ground_age_s,
+            failed_checks=self._failed_checks(now_s),
+            order=self._inbox.order(),
+            uptime_s=now_s - self._started_s,
+        )
+        before = self.flight
+        decision = step(self._robot, before, inputs)
+        self.flight, self.alarms = decision.flight, decision.alarms
+        self._navigation.datum_m = decision.flight.datum_m
+        if decision.new_trial:
+            self._pac.forget()
+        for action in decision.actions:
+            self._autopilot.command(action)
+        dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s
+        self._last_tick_s = now_s
+        setpoint, self._guidance = guide(self._robot, decision.flight, inputs, self._guidance, dt_s)
+        local = None if setpoint is None else self._navigation.to_local(setpoint, vehicle)
+        sent = None if local is None else self._autopilot.send(local)
+        if decision.flight.state is not before.state:
+            flight = decision.flight
+            _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
+        self._record(inputs, setpoint, sent, decision.actions)
+
+    def leave(self, on_stop: Action) -> Action | None:
+        """The program ends: what it asks of the vehicle it was flying; None if it was not."""
+        state = self.flight.state
+        if state is FlightState.ARMING:
+            return Action.DISARM
+        flying = (
+            FlightState.TAKEOFF, FlightState.HOLD, FlightState.MISSION, FlightState.RETURN,
+        )  # fmt: skip
+        return on_stop if state in flying else None
+
+    def _take_origin(self, origin: Origin | None, armed: bool | None) -> None:
+        """The mission frame stays where it is while the vehicle is armed."""
+        grounded = armed is False and self.flight.state in _GROUNDED
+        if origin is None or origin == self.origin or not (grounded or self.origin is None):
+            return
+        frame = origin.frame()
+        self.origin, self._navigation.frame, self._pac.frame_id = origin, frame, frame.frame_id
+        self._pac.forget()
+
+    def _failed_checks(self, now_s: float) -> tuple[str, ...] | None:
+        checks = self.checks
+        return checks.failed if checks and now_s - checks.at_s <= _MAX_CHECKS_AGE_S else None
+
+    def _record(
+        self,
+        inputs: FlightInputs,
+        setpoint: MissionSetpoint | None,
+        sent: Setpoint | None,
+        actions: tuple[Action, ...],
+    ) -> None:
+        odometry, velocity_m_s = inputs.odometry, inputs.policy_velocity_m_s
+        self._recorder.record(
+            "control",
+            self._unix_clock_s(),
+            {
+                "state": self.flight.state,
+                "reason": self.flight.reason,
+                "height_m": height_m(self.flight, odometry),
+                "position_m": odometry and odometry.position_m,
+                "velocity_m_s": odometry and odometry.velocity_m_s,
+                "policy_velocity_m_s": None if velocity_m_s is None else velocity_m_s.tolist(),
+                "setpoint_kind": None if setpoint is None else type(setpoint).__name__,
+                "setpoint": None if setpoint is None else setpoint[0],
+                "sent_local": None if sent is None else sent[0],
+                "actions": actions,
+                "closest_m": inputs.closest and inputs.closest.distance_m,
+            },
+        )
+        if inputs.order is not None:
+            answer = self.flight.answers[-1] if self.flight.answers else None
+            self._recorder.record(
+                "order", self._unix_clock_s(), {**asdict(inputs.order), "answer": answer}
+            )

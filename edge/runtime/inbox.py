@@ -1,0 +1,98 @@
+"""What came by radio, kept for the loops: the ground's state and orders, and others' statuses.
+
+The link's threads only put bytes in; whoever takes something out decodes it.
+"""
+
+import math
+from collections import deque
+from threading import Lock
+from typing import NamedTuple, TypeVar
+
+from edge.core.mission import GroundState, Order, RobotStatus, from_json
+from edge.core.preflight import HeardStatus
+from edge.core.schema import ConfigError
+
+T = TypeVar("T")
+
+_MOST_ORDERS = 64
+_STATUS_LIFETIME_S = 3.0
+
+
+class _Arrived(NamedTuple):
+    data: bytes
+    at_s: float
+    unix_s: float
+
+
+class Inbox:
+    """`put_*` may be called from any thread, each other method from one thread."""
+
+    def __init__(self, robot_id: int, ground_timeout_s: float) -> None:
+        """A ground state with a smaller sequence counts once no other came for the timeout."""
+        self._robot_id = robot_id
+        self._ground_timeout_s = ground_timeout_s
+        self._lock = Lock()
+        self._ground_arrived: _Arrived | None = None
+        self._orders: deque[bytes] = deque(maxlen=_MOST_ORDERS)
+        self._statuses: dict[str, _Arrived] = {}
+        self._ground: GroundState | None = None
+        self._ground_at_s = -math.inf
+        # The ground's wall clock minus this one, None while it is not known.
+        self.ground_clock_offset_s: float | None = None
+        self.malformed = 0
+
+    def put_ground(self, data: bytes, now_s: float, unix_now_s: float) -> None:
+        """The ground's state arrived."""
+        self._ground_arrived = _Arrived(data, now_s, unix_now_s)
+
+    def put_order(self, data: bytes) -> None:
+        """An order arrived."""
+        self._orders.append(data)
+
+    def put_status(self, key: str, data: bytes, now_s: float, unix_now_s: float) -> None:
+        """Another robot's status arrived, with `key`."""
+        with self._lock:
+            self._statuses[key] = _Arrived(data, now_s, unix_now_s)
+
+    def ground(self, now_s: float) -> tuple[GroundState | None, float]:
+        """The ground's newest state and its age, s (infinite if none came). Control thread."""
+        arrived, self._ground_arrived = self._ground_arrived, None
+        if arrived is not None:
+            state = self._decode(GroundState, arrived.data)
+            lost = now_s - self._ground_at_s > self._ground_timeout_s
+            if state and (self._ground is None or lost or state.sequence >= self._ground.sequence):
+                self._ground, self._ground_at_s = state, arrived.at_s
+                if state.unix_time_s is not None:
+                    self.ground_clock_offset_s = state.unix_time_s - arrived.unix_s
+        return self._ground, now_s - self._ground_at_s
+
+    def ground_age_s(self, now_s: float) -> float:
+        """The age of the ground's newest state, s; infinite if none came. From any thread."""
+        return now_s - self._ground_at_s
+
+    def order(self) -> Order | None:
+        """The next order for this robot, if one has come. Control thread."""
+        while self._orders:
+            order = self._decode(Order, self._orders.popleft())
+            if order and order.robot_id == self._robot_id:
+                return order
+        return None
+
+    def peers(self, now_s: float) -> tuple[HeardStatus, ...]:
+        """The fresh statuses of the other robots. Main thread."""
+        with self._lock:
+            self._statuses = {
+                key: arrived
+                for key, arrived in sorted(self._statuses.items())
+                if now_s - arrived.at_s <= _STATUS_LIFETIME_S
+            }
+            arrivals = tuple(self._statuses.values())
+        decoded = ((self._decode(RobotStatus, arrived.data), arrived) for arrived in arrivals)
+        return tuple(HeardStatus(s, a.unix_s) for s, a in decoded if s is not None)
+
+    def _decode(self, kind: type[T], data: bytes) -> T | None:
+        try:
+            return from_json(kind, data)
+        except ConfigError:
+            self.malformed += 1
+            return None

@@ -1,0 +1,89 @@
+"""The robot's position in the mission frame, from the autopilot's local one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.frames import LocalTransform, MissionFrame
+from edge.core.guidance import MissionPosition, MissionSetpoint
+from edge.core.ports import Autopilot, Odometry
+from edge.core.vehicle import Position, Setpoint, Vector, VehicleState, Velocity
+
+# At 20 Hz, a dozen positions that did not come.
+MAX_POSITION_AGE_S = 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fixed:
+    """A transform, and the two origins that it holds for."""
+
+    frame: MissionFrame
+    local_origin_deg: tuple[float, float]
+    transform: LocalTransform
+
+
+class Navigation:
+    """Knows where the robot is (an OdometrySource). Every method may be called from any thread.
+
+    `frame` and `datum_m` are replaced whole by the control thread: where the mission frame lies,
+    and the mission z of the robot's takeoff point.
+    """
+
+    def __init__(self, autopilot: Autopilot, clock_s: Callable[[], float]) -> None:
+        """`clock_s` is the monotonic clock of the autopilot's times, s."""
+        self._autopilot = autopilot
+        self._clock_s = clock_s
+        self._fixed: _Fixed | None = None
+        self.frame: MissionFrame | None = None
+        self.datum_m: float | None = None
+
+    def odometry(self) -> Odometry | None:
+        """Position and velocity, z being the height above the takeoff point; 0 before takeoff."""
+        estimate = self.estimate(self._autopilot.state())
+        if estimate is None:
+            return None
+        x_m, y_m, z_m = estimate.position_m
+        height_m = 0.0 if self.datum_m is None else z_m - self.datum_m
+        return Odometry((x_m, y_m, height_m), estimate.velocity_m_s)
+
+    def estimate(self, vehicle: VehicleState) -> Odometry | None:
+        """The same with z up from the estimator's origin; None when unknown or too old."""
+        transform = self._transform(vehicle)
+        position_m, velocity_m_s = vehicle.position_local_m, vehicle.velocity_local_m_s
+        if transform is None or position_m is None or velocity_m_s is None:
+            return None
+        if not vehicle.position_ok or self._clock_s() - vehicle.position_at_s > MAX_POSITION_AGE_S:
+            return None
+        return Odometry(
+            _vector(transform.local_to_mission(np.array(position_m))),
+            _vector(transform.velocity_to_mission(np.array(velocity_m_s))),
+        )
+
+    def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
+        """The setpoint in the vehicle's local frame; None when there is no telling."""
+        transform = self._transform(vehicle)
+        if transform is None:
+            return None
+        if isinstance(setpoint, MissionPosition):
+            if self.datum_m is None:
+                return None
+            x_m, y_m, height_m = setpoint.position_m
+            place_m = np.array([x_m, y_m, height_m + self.datum_m])
+            return Position(_vector(transform.mission_to_local(place_m)))
+        return Velocity(_vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
+
+    def _transform(self, vehicle: VehicleState) -> LocalTransform | None:
+        frame, origin_deg, fixed = self.frame, vehicle.origin_deg, self._fixed
+        if frame is None or origin_deg is None:
+            return None
+        if fixed is None or fixed.frame is not frame or fixed.local_origin_deg != origin_deg:
+            fixed = _Fixed(frame, origin_deg, frame.relative_to(*origin_deg))
+            self._fixed = fixed
+        return fixed.transform
+
+
+def _vector(values: F64) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

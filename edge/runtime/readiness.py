@@ -1,0 +1,161 @@
+"""What keeps the robot from flying: gathers what preflight's checks ask for.
+
+Main thread only: what it asks of the vehicle takes up to a few seconds, and is asked before flight.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import structlog
+
+from edge.core.failsafe import PARAMETERS, explain, required
+from edge.core.failsafe import check as check_parameters
+from edge.core.frames import MissionFrame
+from edge.core.mission import Origin
+from edge.core.ports import Autopilot, AutopilotSetup, Odometry
+from edge.core.preflight import HeardStatus, PreflightInputs, failed_checks
+from edge.runtime.config import RobotConfig
+
+# Parameters may be changed by others meanwhile.
+_READ_AGAIN_S = 30.0
+_TRY_AGAIN_S = 3.0
+
+_log = structlog.get_logger(__name__)
+
+
+class Checks(NamedTuple):
+    """What preflight found at one time: one line for each check that failed."""
+
+    failed: tuple[str, ...]
+    at_s: float
+
+
+class Readiness:
+    """The checks of one robot before flight.
+
+    `explanations` say what PX4 would do when something fails; `changes` are the parameters that
+    were set.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        autopilot: Autopilot,
+        setup: AutopilotSetup,
+        *,
+        bundle_id: str,
+        world_id: str,
+        bundle_problem: str | None,
+    ) -> None:
+        self._config = config
+        self._autopilot = autopilot
+        self._setup = setup
+        self._bundle_id = bundle_id
+        self._world_id = world_id
+        self._bundle_problem = bundle_problem
+        self._requirements = required(
+            config.failsafe.rc, config.fence.ceiling_m, config.flight.command_timeout_s
+        )
+        self._parameter_problems: tuple[str, ...] | None = None
+        self._parameters_due_s = self._fence_due_s = -math.inf
+        self._fence_for: Origin | None = None
+        self.explanations: tuple[str, ...] = ()
+        self.changes: tuple[str, ...] = ()
+
+    def prepare(self, now_s: float, origin: Origin | None) -> None:
+        """Read, and set if the configuration says so, what the vehicle must be; only on the ground.
+
+        The fence goes to the vehicle when the mission's origin is known.
+        """
+        vehicle = self._autopilot.state()
+        if not vehicle.connected:
+            self._parameters_due_s, self._fence_for = -math.inf, None
+            return
+        if vehicle.armed is not False:
+            return
+        if now_s >= self._parameters_due_s:
+            self._parameters_due_s = now_s + (_READ_AGAIN_S if self._read() else _TRY_AGAIN_S)
+        if origin is not None and origin != self._fence_for and now_s >= self._fence_due_s:
+            self._fence_due_s = now_s + _TRY_AGAIN_S
+            self._upload_fence(origin)
+
+    def checks(
+        self,
+        now_s: float,
+        unix_now_s: float,
+        *,
+        origin: Origin | None,
+        odometry: Odometry | None,
+        peers: Sequence[HeardStatus],
+        duplicate: bool,
+        ground_age_s: float,
+        ground_clock_offset_s: float | None,
+    ) -> Checks:
+        """All checks, now. `ground_age_s` is infinite if the ground was never heard."""
+        config = self._config
+        inputs = PreflightInputs(
+            now_s=now_s,
+            unix_now_s=unix_now_s,
+            robot_id=config.robot_id,
+            duplicate_id=duplicate,
+            bundle_problem=self._bundle_problem,
+            bundle_id=self._bundle_id,
+            world_id=self._world_id,
+            system_id=config.autopilot.system_id,
+            vehicle=self._autopilot.state(),
+            failsafe_problems=self._parameter_problems,
+            fence=config.fence,
+            fence_uploaded=origin is not None and origin == self._fence_for,
+            origin=origin,
+            position_m=None if odometry is None else odometry.position_m,
+            slot_height_m=config.flight.slot_height_m,
+            landing_point_m=config.flight.landing_point_m,
+            min_separation_m=config.flight.min_separation_m,
+            neighbours=peers,
+            ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
+            ground_clock_offset_s=ground_clock_offset_s,
+        )
+        return Checks(failed_checks(inputs, config.preflight), now_s)
+
+    def _read(self) -> bool:
+        """Whether everything is as it must be."""
+        try:
+            values = self._setup.read_parameters(PARAMETERS)
+            if self._config.failsafe.parameters == "set" and self._set_wrong(values):
+                values = self._setup.read_parameters(PARAMETERS)
+        except OSError as error:
+            _log.warning("PX4 parameters not read or set", error=str(error))
+            self._parameter_problems = None
+            return False
+        self._parameter_problems = check_parameters(self._requirements, values)
+        self.explanations = explain(values)
+        return not self._parameter_problems
+
+    def _set_wrong(self, values: dict[str, int | float | None]) -> bool:
+        """Set what is wrong and can be set; whether there was any."""
+        wrong = [
+            (requirement, requirement.value_to_set)
+            for requirement in self._requirements
+            if values.get(requirement.name) is not None
+            and requirement.problem(values[requirement.name]) is not None
+            and requirement.value_to_set is not None
+        ]
+        for requirement, value in wrong:
+            self._setup.set_parameter(requirement.name, value)
+            change = f"{requirement.name} from {values[requirement.name]:g} to {value:g}"
+            self.changes = (*self.changes, change)
+            _log.warning("PX4 parameter set", change=change, why=requirement.why)
+        return bool(wrong)
+
+    def _upload_fence(self, origin: Origin) -> None:
+        try:
+            self._setup.upload_fence(self._fence_deg(origin.frame()))
+        except OSError as error:
+            _log.warning("fence upload failed", error=str(error))
+            return
+        self._fence_for = origin
+
+    def _fence_deg(self, frame: MissionFrame) -> list[tuple[float, float]]:
+        margin_m = self._config.failsafe.fence_margin_m
+        return [frame.to_global_deg(*vertex) for vertex in self._config.fence.grown_m(margin_m)]

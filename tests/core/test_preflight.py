@@ -1,0 +1,220 @@
+"""Preflight: a robot that is ready has no failed check, and each thing that is wrong is named."""
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+
+from edge.core.mission import FlightState, Origin, RobotStatus
+from edge.core.preflight import (
+    HeardStatus,
+    PreflightInputs,
+    PreflightLimits,
+    failed_checks,
+)
+from edge.core.safety import Fence
+from edge.core.schema import ConfigError, from_mapping
+from edge.core.vehicle import Gps, Mode, VehicleState
+
+UNIX_S = 1_790_000_000.0
+ORIGIN = Origin(47.4, 8.5, 90.0)
+LIMITS = PreflightLimits()
+VEHICLE = VehicleState(
+    connected=True,
+    system_id=1,
+    position_local_m=(1.0, 2.0, 0.0),
+    velocity_local_m_s=(0.0, 0.0, 0.0),
+    position_at_s=99.9,
+    position_ok=True,
+    heading_rad=1.0,
+    origin_deg=(47.4, 8.5),
+    mode=Mode.HOLD,
+    armed=False,
+    in_air=False,
+    heartbeat_at_s=99.0,
+    battery=0.9,
+    gps=Gps(3, 14, 0.8),
+    armable=True,
+)
+NEIGHBOUR = RobotStatus(
+    robot_id=2,
+    boot_nonce=5,
+    sequence=9,
+    uptime_s=60.0,
+    unix_time_s=UNIX_S,
+    state=FlightState.IDLE,
+    reason="",
+    ready=True,
+    failed_checks=(),
+    alarms=(),
+    obeyed_sequence=1,
+    operator="",
+    orders=(),
+    bundle_id="b",
+    world_id="w",
+    trial="",
+    origin=ORIGIN,
+    system_id=2,
+    slot_height_m=7.0,
+    landing_point_m=(12.0, 8.0),
+    position_m=(12.0, 8.0, 0.0),
+    velocity_m_s=(0.0, 0.0, 0.0),
+    heading_rad=1.0,
+    mode="hold",
+    armed=False,
+    battery=0.9,
+    satellites=14,
+    message_counts={},
+    neighbour_ages_s={},
+    loops={},
+)
+READY = PreflightInputs(
+    now_s=100.0,
+    unix_now_s=UNIX_S,
+    robot_id=1,
+    duplicate_id=False,
+    bundle_problem=None,
+    bundle_id="b",
+    world_id="w",
+    system_id=1,
+    vehicle=VEHICLE,
+    failsafe_problems=(),
+    fence=Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 3.0, 25.0),
+    fence_uploaded=True,
+    origin=ORIGIN,
+    position_m=(8.0, 8.0, 0.0),
+    slot_height_m=5.0,
+    landing_point_m=(8.0, 8.0),
+    min_separation_m=2.0,
+    neighbours=(HeardStatus(NEIGHBOUR, UNIX_S + 0.2),),
+    ground_age_s=0.4,
+    ground_clock_offset_s=None,
+)
+
+# What is wrong with the inputs, and the one line that says so.
+INPUTS: list[tuple[dict[str, Any], str]] = [
+    ({"bundle_problem": "cnn differs"}, "bundle is not verified (cnn differs): deploy it again"),
+    ({"unix_now_s": 1_500_000_000.0}, "clock is before 2026: set the time of this robot"),
+    ({"ground_age_s": None}, "ground was not heard: start"),
+    ({"ground_age_s": 3.1}, "ground was last heard 3.1 s ago: check the radio"),
+    ({"ground_clock_offset_s": -7.0}, "clock differs from the ground's by -7.0 s: set the time"),
+    ({"system_id": 2}, "autopilot has system id 1, configured is 2: check which vehicle this is"),
+    ({"failsafe_problems": None}, "autopilot's failsafe parameters were not read"),
+    ({"failsafe_problems": ("COM_OF_LOSS_T = 1",)}, "autopilot's COM_OF_LOSS_T = 1"),
+    ({"fence_uploaded": False}, "autopilot does not have the fence: wait for the upload"),
+    ({"origin": None}, "mission origin is not set: set it on the ground"),
+    ({"position_m": None}, "place in the fence is not known"),
+    ({"position_m": (1.0, 8.0, 0.0)}, "robot stands 1.0 m inside the fence, must be 2 m inside"),
+    ({"position_m": (-1.0, 8.0, 0.0)}, "robot stands 1.0 m outside it, must be 2 m inside"),
+    ({"position_m": (math.nan, 8.0, 0.0)}, "robot stands nan m outside it"),
+    ({"landing_point_m": (31.5, 8.0)}, "landing point lies 0.5 m inside the fence, must be 2 m"),
+    ({"slot_height_m": 2.0}, "slot height is 2 m, must be from the floor at 3 m to the ceiling"),
+    ({"slot_height_m": 26.0}, "slot height is 26 m"),
+    ({"duplicate_id": True}, "another program says that it is robot 1: stop it"),
+    ({"robot_id": 2}, "another program says that it is robot 2"),
+    ({"bundle_id": "c"}, "robot 2 has another bundle: deploy one to all"),
+    ({"world_id": "v"}, "robot 2 has another world: deploy one to all"),
+    ({"origin": Origin(47.4, 8.5, 91.0)}, "robot 2 has another mission origin"),
+    ({"slot_height_m": 6.0}, "robot 2 flies 1.0 m above or below, must be 2 m: change the slots"),
+    ({"landing_point_m": (12.0, 9.0)}, "robot 2 lands 1.0 m away, must be 2 m"),
+    (
+        {"neighbours": (HeardStatus(NEIGHBOUR, UNIX_S - 30.0),)},
+        "robot 2's clock differs by 30.0 s: set the time of both",
+    ),
+]
+VEHICLES: list[tuple[dict[str, Any], str]] = [
+    ({"connected": False}, "autopilot is not connected: check its power"),
+    ({"system_id": None}, "autopilot has system id not known, configured is 1"),
+    ({"other_system_ids": (4, 6)}, "other vehicles are on this link (system id 4, 6)"),
+    ({"armed": True}, "vehicle is armed: disarm it"),
+    ({"armed": None}, "vehicle is not known to be disarmed: disarm it"),
+    ({"position_local_m": None}, "position is not known: wait"),
+    ({"position_at_s": 99.0}, "position is 1.0 s old: check the link"),
+    ({"position_ok": False}, "position is not trusted by the autopilot: wait"),
+    ({"origin_deg": None}, "estimator's origin is not known: wait for a GPS fix"),
+    ({"heading_rad": None}, "heading is not known: check the compass"),
+    ({"gps": None}, "GPS is not heard: check the receiver"),
+    ({"gps": Gps(2, 14, 0.8)}, "GPS has no 3-D fix: wait"),
+    ({"gps": Gps(3, 5, 0.8)}, "GPS sees 5 satellites, must see 8: wait"),
+    ({"gps": Gps(3, 14, math.nan)}, "GPS precision (HDOP) is nan, must be at most 2"),
+    ({"battery": None}, "battery is not known: check the power module"),
+    ({"battery": 0.3}, "battery has 30 %, must have 50 %: charge or change it"),
+    ({"armable": False, "problems": ("no mag",)}, "autopilot would not arm (no mag): mend"),
+    ({"armable": None}, "autopilot would not arm (it does not say why)"),
+]
+
+
+def test_a_robot_that_is_ready_fails_no_check() -> None:
+    assert failed_checks(READY, LIMITS) == ()
+    alone = dataclasses.replace(READY, neighbours=())
+    assert failed_checks(alone, LIMITS) == ()
+
+
+@pytest.mark.parametrize(("change", "said"), INPUTS)
+def test_whatever_is_wrong_is_named_alone(change: dict[str, Any], said: str) -> None:
+    (failed,) = failed_checks(dataclasses.replace(READY, **change), LIMITS)
+    assert failed.startswith(said)
+
+
+@pytest.mark.parametrize(("change", "said"), VEHICLES)
+def test_whatever_is_wrong_with_the_vehicle_is_named_alone(
+    change: dict[str, Any], said: str
+) -> None:
+    vehicle = dataclasses.replace(VEHICLE, **change)
+    (failed,) = failed_checks(dataclasses.replace(READY, vehicle=vehicle), LIMITS)
+    assert failed.startswith(said)
+
+
+@pytest.mark.parametrize(("change", "said"), INPUTS)
+def test_everything_that_is_wrong_at_once_is_named(change: dict[str, Any], said: str) -> None:
+    for vehicle_change, vehicle_said in VEHICLES:
+        if vehicle_change.get("connected") is False or (
+            "system_id" in change and "system_id" in vehicle_change
+        ):
+            continue
+        vehicle = dataclasses.replace(VEHICLE, **vehicle_change)
+        failed = failed_checks(dataclasses.replace(READY, vehicle=vehicle, **change), LIMITS)
+        assert len(failed) == 2
+        for text in (said, vehicle_said):
+            assert any(line.startswith(text) for line in failed)
+
+
+def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
+    lost = dataclasses.replace(VEHICLE, connected=False, battery=0.1, armed=True)
+    (failed,) = failed_checks(dataclasses.replace(READY, vehicle=lost), LIMITS)
+    assert failed.startswith("autopilot is not connected")
+
+
+def test_a_neighbour_without_an_origin_has_not_ours() -> None:
+    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, origin=None), UNIX_S)
+    (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
+    assert failed.startswith("robot 2 has another mission origin")
+
+
+def test_slots_exactly_the_separation_apart_are_apart() -> None:
+    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, slot_height_m=5.1 + 2.1), UNIX_S)
+    inputs = dataclasses.replace(
+        READY, neighbours=(neighbour,), slot_height_m=5.1, min_separation_m=2.1
+    )
+    assert failed_checks(inputs, LIMITS) == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"min_battery": 0.0}, "min_battery = 0.0: must be above 0 and at most 1"),
+        ({"min_battery": 50.0}, "min_battery = 50.0"),
+        ({"min_satellites": 3}, "min_satellites = 3: must be at least 4"),
+        ({"max_hdop": math.inf}, "max_hdop = inf: must be finite and above 0"),
+        ({"max_position_age_s": 0.0}, "max_position_age_s = 0.0"),
+        ({"max_ground_age_s": math.nan}, "max_ground_age_s = nan"),
+        ({"max_clock_difference_s": -1.0}, "max_clock_difference_s = -1.0"),
+    ],
+)
+def test_limits_that_make_no_sense_are_refused_by_name(
+    change: dict[str, object], said: str
+) -> None:
+    assert from_mapping(PreflightLimits, {}, "robot.toml: preflight") == LIMITS
+    with pytest.raises(ConfigError, match=said):
+        from_mapping(PreflightLimits, change, "robot.toml: preflight")
