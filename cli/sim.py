@@ -1,7 +1,12 @@
-"""`lpac sim` and `lpac demo`: a swarm in this process."""
+"""`lpac sim` and `lpac demo`: a swarm in this process, or a whole fleet on this machine."""
 
 import gc
 import json
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -11,8 +16,11 @@ import typer
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+    from rich.table import Table
 
     from sim.experiment import Flight, Scenario
+    from sim.fleet import Fleet, FleetScenario
+    from sim.operator import Statuses
 
 DEFAULT_BUNDLE = Path(__file__).resolve().parents[1] / "policies" / "lpac_l2_k3_n10_512"
 
@@ -33,17 +41,35 @@ class Scale(StrEnum):
     MODEL = "model"
 
 
+class Vehicle(StrEnum):
+    """What the robots fly."""
+
+    POINT = "point"
+    MAVLINK = "mavlink"
+    PX4 = "px4"
+
+
 def sim(
     *,
+    context: typer.Context,
+    vehicle: Annotated[
+        Vehicle,
+        typer.Option(
+            help="point: points in simulated time, in this process; mavlink: one process per robot "
+            "in real time, each with a simulated PX4; px4: the same with real PX4s."
+        ),
+    ] = Vehicle.POINT,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
     controller: Annotated[Controller, typer.Option(help="Who flies.")] = Controller.LPAC,
-    robots: Annotated[int, typer.Option(help="Number of robots.")] = 10,
+    robots: Annotated[int, typer.Option("--robots", "-n", help="Number of robots.")] = 10,
     seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 0,
     world: Annotated[
         Path | None, typer.Option(help="CoverageControl world file (.env) instead of a random one.")
     ] = None,
     features: Annotated[int, typer.Option(help="Features of a random world.")] = 10,
-    duration: Annotated[float, typer.Option(help="Flight time, s.")] = 60.0,
+    duration: Annotated[
+        float, typer.Option(help="Flight time, s; with mavlink and px4 that of the mission.")
+    ] = 60.0,
     scale: Annotated[
         Scale, typer.Option(help="field: 16 units per m, velocity x 0.25; model: 1 and 1.")
     ] = Scale.FIELD,
@@ -52,14 +78,42 @@ def sim(
     max_message_age: Annotated[
         float, typer.Option(help="Older messages are not used, s; 0: each is used once.")
     ] = 0.8,
+    gps_bias: Annotated[
+        bool, typer.Option(help="mavlink: each vehicle takes itself to be 1 to 5 m elsewhere.")
+    ] = True,
+    px4: Annotated[
+        Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
+    ] = None,
+    script: Annotated[
+        bool,
+        typer.Option(help="mavlink, px4: take off, cover and land; else wait for `lpac ground`."),
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the flight, its world and a figure.")
+        Path | None, typer.Option(help="Folder for the flight, its world, figure and flight logs.")
     ] = None,
 ) -> None:
-    """Fly a swarm over an unknown world in simulated time and print how well it covers it."""
-    from edge.core.frames import ModelScale
+    """Fly a swarm over an unknown world and print how well it covers it."""
     from edge.core.world import parse_world
+
+    _require_options_of(context, vehicle)
+    world_features = parse_world(_text(world), str(world)) if world else None
+    if vehicle is not Vehicle.POINT:
+        from sim.fleet import FleetScenario
+
+        fleet_scenario = FleetScenario(
+            robots=robots,
+            seed=seed,
+            duration_s=duration,
+            features=world_features,
+            random_feature_count=features,
+            gps_bias=gps_bias,
+        )
+        if vehicle is Vehicle.PX4 and px4 is None:
+            raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+        _launch(fleet_scenario, bundle, px4, script, as_json, out)
+        return
+    from edge.core.frames import ModelScale
     from sim.experiment import FIELD_SCALE, Scenario
 
     scenario = Scenario(
@@ -67,7 +121,7 @@ def sim(
         robots=robots,
         seed=seed,
         duration_s=duration,
-        features=parse_world(_text(world), str(world)) if world else None,
+        features=world_features,
         random_feature_count=features,
         scale=FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0),
         loss=loss,
@@ -122,6 +176,132 @@ def demo(
     )
     typer.echo(f"coverage cost after 60 s over initial cost: {costs}")
     typer.echo(f"see {out / 'demo.png'}")
+
+
+_ONLY_FOR = {
+    "controller": (Vehicle.POINT,),
+    "scale": (Vehicle.POINT,),
+    "loss": (Vehicle.POINT,),
+    "delay": (Vehicle.POINT,),
+    "max_message_age": (Vehicle.POINT,),
+    "gps_bias": (Vehicle.MAVLINK,),
+    "px4": (Vehicle.PX4,),
+    "script": (Vehicle.MAVLINK, Vehicle.PX4),
+}
+
+
+def _require_options_of(context: typer.Context, vehicle: Vehicle) -> None:
+    """An option that would do nothing is a mistake."""
+    for name, vehicles in _ONLY_FOR.items():
+        source = context.get_parameter_source(name)
+        if vehicle not in vehicles and source is not None and source.name == "COMMANDLINE":
+            raise ValueError(
+                f"--{name.replace('_', '-')} does nothing with --vehicle {vehicle.value}"
+            )
+
+
+def _launch(
+    scenario: "FleetScenario",
+    bundle: Path,
+    px4: Path | None,
+    script: bool,
+    as_json: bool,
+    out: Path | None,
+) -> None:
+    """Run a fleet of processes; exit code 1 if its flight did not end as it should."""
+    from sim.fleet import Fleet
+
+    # Whoever stops this program means the fleet too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
+        fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
+        with fleet:
+            if not script:
+                _wait_for_ground(fleet, show)
+                return
+            from sim.fleet_flight import fly, summary_lines
+
+            flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
+    if out:
+        from sim.fleet_report import write_fleet_flight
+
+        write_fleet_flight(flight, out)
+    if as_json:
+        typer.echo(json.dumps(flight.summary(), indent=2))
+    else:
+        for line in summary_lines(flight):
+            typer.echo(line)
+        if out:
+            typer.echo(f"see {out / 'flight.png'}; the flight logs are in {out / 'robots'}")
+    if flight.problem or not flight.all_landed:
+        raise typer.Exit(1)
+
+
+def _wait_for_ground(fleet: "Fleet", show: Callable[[str, "Statuses"], None]) -> None:
+    typer.echo(
+        f"fleet {fleet.name}, robots 0 to {len(fleet.robots) - 1}; connect a ground to "
+        f"{', '.join(fleet.endpoints)}; Ctrl-C ends all"
+    )
+    try:
+        while True:
+            fleet.require_running()
+            show("no script", fleet.operator.statuses())
+            time.sleep(0.2)
+    except KeyboardInterrupt:
+        return
+
+
+@contextmanager
+def _live() -> Iterator[tuple[Callable[[str, "Statuses"], None], Callable[[str], None]]]:
+    """On stderr: a table of the robots, on a terminal only; and a way to say a line above it."""
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True, highlight=False)
+    began_s = time.monotonic()
+
+    def say(text: str) -> None:
+        console.print(f"{time.monotonic() - began_s:6.1f} s  {text}", markup=False)
+
+    if not console.is_terminal:
+        yield (lambda *_: None), say
+        return
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        shown_s = -1.0
+
+        def show(step: str, statuses: "Statuses") -> None:
+            nonlocal shown_s
+            now_s = time.monotonic() - began_s
+            if now_s - shown_s >= 0.5:
+                shown_s = now_s
+                live.update(_table(f"{now_s:.0f} s: {step}", statuses), refresh=True)
+
+        yield show, say
+
+
+def _table(title: str, statuses: "Statuses") -> "Table":
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading, style in (
+        ("robot", ""), ("state", "bold"), ("x", ""), ("y", ""), ("height", ""), ("m/s", ""),
+        ("hears", ""), ("battery", ""), ("", ""),
+    ):  # fmt: skip
+        table.add_column(heading, style=style, justify="left" if not heading else "right")
+    for robot, status in sorted(statuses.items()):
+        position_m = status.position_m or ()
+        speed_m_s = sum(v * v for v in (status.velocity_m_s or ())[:2]) ** 0.5
+        table.add_row(
+            str(robot),
+            status.state.value,
+            *(f"{metres:.1f}" for metres in position_m),
+            *("" for _ in range(3 - len(position_m))),
+            f"{speed_m_s:.1f}",
+            str(len(status.neighbour_ages_s)),
+            "" if status.battery is None else f"{100.0 * status.battery:.0f} %",
+            "; ".join((*status.alarms, *status.failed_checks)) or status.reason,
+        )
+    return table
 
 
 def _fly(scenarios: list[tuple[str, "Scenario"]], bundle_path: Path) -> list["Flight"]:

@@ -9,6 +9,7 @@ import fcntl
 import gc
 import hashlib
 import json
+import logging
 import math
 import os
 import secrets
@@ -24,6 +25,7 @@ from typing import NamedTuple
 
 import structlog
 
+from edge.adapters.deadman import Deadman
 from edge.adapters.flight_log import FlightLog, FlightMetadata
 from edge.adapters.idf_sensor import IdfSensor
 from edge.adapters.logs import configure_logging
@@ -117,12 +119,19 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         )
         parts.callback(recorder.close)
         configure_logging(recorder)
-        # 4. The vehicle.
+        # 4. The vehicle, and who holds it when this program hangs.
         autopilot = parts.enter_context(
             MavsdkAutopilot(config.autopilot.url, system_id=config.autopilot.system_id)
         )
+        deadman = parts.enter_context(
+            Deadman(
+                config.autopilot.port,
+                config.autopilot.system_id,
+                config.flight.command_timeout_s,
+            )
+        )
         # 5. The robot's own parts, and the radio that feeds them.
-        program = _Program(config, loaded, autopilot, recorder, boot_nonce)
+        program = _Program(config, loaded, autopilot, deadman, recorder, boot_nonce)
         link = parts.enter_context(program.open_link())
         # 6. The loops.
         gc.collect()
@@ -144,12 +153,14 @@ class _Program:
         config: RobotConfig,
         loaded: Loaded,
         autopilot: MavsdkAutopilot,
+        deadman: Deadman,
         recorder: FlightLog,
         boot_nonce: int,
     ) -> None:
         self._config = config
         self._loaded = loaded
         self._autopilot = autopilot
+        self._deadman = deadman
         self._recorder = recorder
         self._boot_nonce = boot_nonce
         self._started_s = time.monotonic()
@@ -224,7 +235,8 @@ class _Program:
     # Steps of the loops
 
     def _control_step(self) -> None:
-        self._control.tick(time.monotonic())
+        flying = self._control.tick(time.monotonic())
+        self._deadman.feed(flying=flying)
 
     def _perception_step(self) -> None:
         tick = self._pac.perceive(time.monotonic())
@@ -268,6 +280,7 @@ class _Program:
             odometry=self._navigation.odometry(),
             peers=peers,
             duplicate=self._link is not None and self._link.duplicate(),
+            watchdog_alive=self._deadman.alive(),
             ground_age_s=self._inbox.ground_age_s(now_s),
             ground_clock_offset_s=self._inbox.ground_clock_offset_s,
         )
@@ -333,6 +346,8 @@ class _Program:
         alarms = []
         if self._link is not None and self._link.duplicate():
             alarms.append(f"another program says that it is robot {self._config.robot_id}")
+        if not self._deadman.alive():
+            alarms.append("the watchdog has ended: only PX4 notices if this program hangs")
         if not self._recorder.recording:
             alarms.append("the flight log is not written")
         return tuple(alarms)
@@ -375,6 +390,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
     with ExitStack() as parts:
         parts.enter_context(_alone(f"robot {config.robot_id} of fleet {config.fleet}"))
         parts.enter_context(_alone(f"autopilot {config.autopilot.url}"))
+        structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
         autopilot = parts.enter_context(
             MavsdkAutopilot(config.autopilot.url, system_id=config.autopilot.system_id)
         )
@@ -397,6 +413,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
                 odometry=navigation.odometry(),
                 peers=inbox.peers(now_s),
                 duplicate=config.robot_id in link.present(),
+                watchdog_alive=True,  # There is none before the robot's program runs.
                 ground_age_s=ground_age_s,
                 ground_clock_offset_s=inbox.ground_clock_offset_s,
             )

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from threading import Condition, Lock, Thread
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -82,14 +83,13 @@ _REFUSALS = {1: "not now", 2: "denied", 3: "not supported", 4: "failed", 6: "can
 _LOOK_S = 0.2
 _RENEW_S = 1.0
 _STREAMS_S = 10.0
-_ORIGIN_RETRY_S = 0.05
 _PREARM_CHECKS_S = 10.0
 _REASON_S = 0.3
 _STALE_COMMAND_S = 1.0
 _PARAMETER_ROUNDS, _PARAMETER_ROUND_S = 3, 0.4
 
 
-class AutopilotError(Exception):
+class AutopilotError(OSError):
     """What the autopilot did not do, in one line."""
 
 
@@ -179,7 +179,7 @@ class MavsdkAutopilot:
 
     def __enter__(self) -> Self:
         """Raises AutopilotError if there can be no such connection."""
-        log_subscribe(_log_mavsdk)
+        _take_over_log()
         configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
         if self._wanted_system_id is not None:
             # A companion has its vehicle's system id.
@@ -385,9 +385,8 @@ class MavsdkAutopilot:
 
     def _on_telemetry(self, name: str) -> Callable[[dict[str, Any]], None]:
         def on_telemetry(fields: dict[str, Any]) -> None:
-            needed_origin = self._telemetry.needs_origin()
             self._telemetry.hear(name, fields, time.monotonic())
-            if name == "STATUSTEXT" or self._telemetry.needs_origin() is not needed_origin:
+            if name == "STATUSTEXT" or self._telemetry.needs_origin():
                 with self._wake:
                     self._next_s = 0.0
                     self._wake.notify_all()
@@ -453,8 +452,10 @@ class MavsdkAutopilot:
         if self._link is None or (action in _STARTS and not self.state().connected):
             return "no vehicle"
         command = _COMMANDS[action]
+        answer = None
         for _ in range(command.times):
-            answer = self._ask(command)
+            if not self._overridden:
+                answer = self._ask(command)
             if self._overridden or self._closing:
                 return "superseded"
             if answer is not None and action is not Action.KILL:
@@ -500,7 +501,6 @@ class MavsdkAutopilot:
             self._heard, self._next_streams_s = heard, now_s + _STREAMS_S
             self._ask_for_streams()
         if self._telemetry.needs_origin():
-            self._next_s = now_s + _ORIGIN_RETRY_S
             self._request(_GPS_GLOBAL_ORIGIN)
         if now_s >= self._next_renewal_s:
             self._next_renewal_s = now_s + _RENEW_S
@@ -543,6 +543,12 @@ class MavsdkAutopilot:
 
     def _request(self, message_id: int) -> None:
         self._send_command(_REQUEST_MESSAGE, message_id)
+
+
+@cache
+def _take_over_log() -> None:
+    """Once: another callback would free the one that MAVSDK's threads may be in."""
+    log_subscribe(_log_mavsdk)
 
 
 def _log_mavsdk(level: LogLevel, text: str, _file: str | None, _line: int) -> bool:

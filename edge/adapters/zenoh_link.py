@@ -4,10 +4,11 @@ Keys, below `lpac/<fleet>/`: `robot/<id>/message`, `robot/<id>/status`, `ground/
 `ground/order`, and for presence the liveliness tokens `robot/<id>/alive/<session>`, which vanish
 with the session that declared them: at once if the program ends, a second after it stops answering.
 
-What an operator must know of peer mode: gossip makes a mesh from one known peer, but a connection
-that only gossip made is not made again when it alone is lost. So let every robot's `connect` name
-all robots with smaller ids, and the ground's all robots: each pair then has one side that tries
-again for ever. Two sides that both try can end connected but deaf to each other.
+In peer mode gossip makes a mesh from one known peer, but what only gossip connected is not
+connected again when it alone is lost; scouting does it within some 8 s. So for flight let every
+robot's `connect` name all robots with smaller ids, and the ground's all robots: the configured side
+tries again for ever. Never name each other: two sides that connect at once after a cut may end up
+connected and yet deaf to each other.
 """
 
 import json
@@ -16,8 +17,7 @@ import re
 import secrets
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from threading import Lock
-from types import TracebackType
+from threading import Lock, Thread
 from typing import Literal, Self
 
 import structlog
@@ -31,13 +31,12 @@ _ROBOT_TOPICS = ("message", "status")
 _GROUND_TOPICS = ("state", "order")
 _ENDPOINT = re.compile(r"tcp/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
 _TOKEN = re.compile(r"robot/(\d+)/alive/(\w+)")
-_GROUND_RANK = MAX_ROBOT_ID + 1
+_CLOSE_TIMEOUT_S = 1.0
 
-# zenoh closes TCP sockets with a linger time of 10 s, and the close of a connection whose other end
-# is out of reach holds the receiving thread for as long. With zenoh's two threads, two lost
-# neighbours would make a robot deaf to all others. A thread is needed per neighbour lost within
-# 10 s; idle ones cost 20 kB each.
-_RUNTIME = "(rx: (worker_threads: 32))"
+# zenoh closes TCP sockets with a linger time of 10 s, which holds the closing thread for as long if
+# the other end is out of reach. With zenoh's few threads, two lost neighbours would make a robot
+# deaf to all others. Here each neighbour lost within 10 s may hold one; an idle one costs 10 kB.
+_RUNTIME = "(rx: (worker_threads: 32), net: (worker_threads: 32))"
 
 _ADVICE = {
     "Address already in use": "another program has this port; does this robot's already run?",
@@ -55,8 +54,8 @@ class LinkError(Exception):
 class ZenohLink:
     """A session on the radio: a robot's, or with `robot_id` None the ground's.
 
-    Every method may be called from any thread, and none but the constructor raises. Close it, or
-    use it as a context manager: the interpreter does not exit while it is open.
+    Every method may be called from any thread. Close it, or use it as a context manager: the
+    interpreter does not exit while it is open.
     """
 
     def __init__(
@@ -100,18 +99,13 @@ class ZenohLink:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exception_type: type[BaseException] | None,
-        exception: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def publish(self, topic: str, data: bytes) -> None:
-        """Send on one of the own topics: `message` and `status`, or the ground's `state`, `order`.
+        """Send on an own topic: a robot's `message` or `status`, the ground's `state` or `order`.
 
-        Dropped when the link is congested or closed.
+        Dropped when the link is congested or closed. Raises KeyError for any other topic.
         """
         try:
             self._publishers[topic].put(data)
@@ -120,14 +114,14 @@ class ZenohLink:
 
     def present(self) -> frozenset[int]:
         """The other robots whose programs are connected now."""
-        return frozenset(id_ for id_, _ in self._others() if id_ != self._robot_id)
+        return frozenset(id_ for id_ in self._others() if id_ != self._robot_id)
 
     def duplicate(self) -> bool:
         """Whether another session says that it is this robot.
 
         Up to a second after a restart that may be the own former session.
         """
-        return any(id_ == self._robot_id for id_, _ in self._others())
+        return self._robot_id in self._others()
 
     def duplicates(self) -> frozenset[int]:
         """The robot ids that more than one session claims, the own among them."""
@@ -148,8 +142,18 @@ class ZenohLink:
             return self._failures.total()
 
     def close(self) -> None:
-        """Leave the radio; again is no error."""
-        self._session.close()  # type: ignore[no-untyped-call]
+        """Leave the radio, within a second or so; again is no error."""
+        # A connection whose other end is out of reach holds it, too; the interpreter can exit
+        # though it is not done.
+        closing = Thread(target=self._close_session, daemon=True)
+        closing.start()
+        closing.join(_CLOSE_TIMEOUT_S)
+
+    def _close_session(self) -> None:
+        try:
+            self._session.close()  # type: ignore[no-untyped-call]
+        except zenoh.ZError as error:
+            self._failed("close", error)
 
     def _config(
         self, mode: str, listen: Sequence[str], connect: Sequence[str], scouting: bool
@@ -232,9 +236,10 @@ class ZenohLink:
             else:
                 self._tokens.discard(token)
 
-    def _others(self) -> list[tuple[int, str]]:
+    def _others(self) -> frozenset[int]:
+        """The robot ids that other sessions claim."""
         with self._lock:
-            return [token for token in self._tokens if token[1] != self._session_id]
+            return frozenset(id_ for id_, session in self._tokens if session != self._session_id)
 
 
 def _check(
@@ -263,7 +268,7 @@ def _session_id(robot_id: int | None) -> str:
 
     zenoh compares the bytes from the end of the text.
     """
-    rank = _GROUND_RANK if robot_id is None else robot_id
+    rank = MAX_ROBOT_ID + 1 if robot_id is None else robot_id
     return f"1{secrets.token_hex(12)}{rank.to_bytes(3, 'little').hex()}"
 
 

@@ -117,7 +117,7 @@ def required(
 
     `rc` "pilot": somebody holds a remote control and may take the vehicle at any time; "none":
     there is none, and PX4 must not wait for one. `ceiling_m` is the fence's. `command_timeout_s` is
-    the deadman's: how long PX4 goes on without a command.
+    the watchdog's, after which a robot that hangs holds; PX4 takes over later.
 
     Raises ValueError if one of them is out of its range.
     """
@@ -125,23 +125,24 @@ def required(
         raise ValueError(f"rc = {rc!r}: allowed are 'pilot', 'none'")
     if not 0.0 < ceiling_m < math.inf:
         raise ValueError(f"ceiling_m = {ceiling_m}: must be finite and above 0")
-    if not 0.2 < command_timeout_s <= 1.0:
+    if not 0.2 < command_timeout_s <= 0.7:
         raise ValueError(
-            f"command_timeout_s = {command_timeout_s}: must be above 0.2 and at most 1"
+            f"command_timeout_s = {command_timeout_s}: must be above 0.2 and at most 0.7"
         )
     return (
         Requirement(
             "COM_OF_LOSS_T",
-            float(command_timeout_s),
-            "s without a command until PX4 takes over from a program that died or hangs",
-            above=0.2,
-            up_to=command_timeout_s,
+            1.0,
+            "s without a command until PX4 takes over; the watchdog, which holds a robot that "
+            "hangs, comes first",
+            above=command_timeout_s + 0.2,
+            up_to=1.5,
         ),
         Requirement(
             "COM_OBL_RC_ACT",
             4,
-            "a robot whose program dies or hangs must stay where it is; robots that return meet",
-            values=(4, 5),
+            "a robot whose program died must land where it is; robots that return meet",
+            values=(4,),
             means=_OFFBOARD_LOSS,
         ),
         Requirement(
@@ -338,7 +339,7 @@ def explain(parameters: Parameters) -> tuple[str, ...]:
     """What this vehicle will do when something fails, from its own parameters, one line each."""
     look_up = _LookUp(parameters)
     return (
-        f"if this program dies or hangs, PX4 will: {_on_program_loss(look_up)}",
+        f"if this program dies, PX4 will: {_on_program_loss(look_up)}",
         f"if the remote control is lost, PX4 will: {_on_remote_control_loss(look_up)}",
         "if a ground station's heartbeats stop, PX4 will: "
         + look_up.delayed("NAV_DLL_ACT", _LINK_LOSS),
@@ -388,7 +389,7 @@ def _on_program_loss(look_up: _LookUp) -> str:
     if look_up.setting("COM_OBL_RC_ACT") in (0, 1, 2):
         nobody = look_up.action("NAV_RCL_ACT", _LINK_LOSS | {0: _NO_FAILSAFE})
         action += f"; without a remote control {nobody}"
-    text = f"{look_up.number('COM_OF_LOSS_T')} s after the last command {action}"
+    text = f"{action}, {look_up.number('COM_OF_LOSS_T')} s after the last command"
     return text if _STOP_MOTORS in text else f"{text}; it obeys again when commands come"
 
 

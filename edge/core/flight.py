@@ -29,12 +29,12 @@ from edge.core.vehicle import PILOTED, Action, Mode, Vector, VehicleState
 
 _S = FlightState
 
-# PX4 takes a setpoint stream for real only after a while, and wants one before offboard.
+# PX4 wants a setpoint stream before offboard, and earlier commands are carried out meanwhile.
 _STREAM_S = 0.5
 _ASK_AGAIN_S = 1.0
 _ARMING_TIMEOUT_S = 6.0
 _OFFBOARD_TIMEOUT_S = 4.0
-# After a lapse the first telemetry to come is what piled up meanwhile; PX4 tells its mode at 1 Hz.
+# What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
 _STALE_TELEMETRY_S = 2.0
 _AT_HEIGHT_M = 0.5
 _AT_SLOT_M = 1.0
@@ -101,20 +101,23 @@ class Flight:
     """What the machine remembers from tick to tick.
 
     `target_m` is what TAKEOFF and HOLD keep: x and y of the mission frame, and a height.
-    `mode_seen`: since the state was entered the autopilot was seen in the mode that it needs.
-    `lapsed`: the control loop was silent for too long, and no mode was seen since; then nothing is
-    sent before `silent_until_s`. `trial` is the mission that was started last.
+    `reached`: since the state was entered the vehicle was seen as the state needs it: in offboard,
+    in LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`.
+    After a lapse of the control loop nothing is sent before `silent_until_s`, which stays set until
+    the vehicle is in offboard again. `obeyed_expiry_s` is the last obeyed order's, `trial` the
+    mission that was started last.
     """
 
     state: FlightState = FlightState.INIT
     reason: str = "program started"
+    alarming: bool = False
     since_s: float = 0.0
     tick_at_s: float = -math.inf
     datum_m: float | None = None
     target_m: Vector | None = None
-    mode_seen: bool = False
-    lapsed: bool = False
+    reached: bool = False
     silent_until_s: float = -math.inf
+    rejoined_at_s: float = -math.inf
     asked_at_s: float = -math.inf
     armed_asked: bool = False
     landed_since_s: float | None = None
@@ -122,6 +125,7 @@ class Flight:
     land_by: Literal["ground", "return", "safety"] = "safety"
     killed: bool = False
     trial: str = ""
+    obeyed_expiry_s: float = -math.inf
     answers: tuple[OrderResult, ...] = ()
 
 
@@ -152,7 +156,10 @@ class FlightInputs:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """Who flies: what does not change during a flight."""
+    """Who flies: what does not change during a flight.
+
+    Raises ValueError if the fence leaves no way to the robot's height or to its landing point.
+    """
 
     robot_id: int
     boot_nonce: int
@@ -160,14 +167,32 @@ class Robot:
     fence: Fence
     limits: MotionLimits
 
+    def __post_init__(self) -> None:
+        fence, height_m = self.fence, self.parameters.slot_height_m
+        if not fence.floor_m <= height_m <= fence.ceiling_m:
+            raise ValueError(
+                f"slot = {self.parameters.slot} flies at {height_m:g} m: must be from floor_m = "
+                f"{fence.floor_m:g} to ceiling_m = {fence.ceiling_m:g}"
+            )
+        x_m, y_m = self.parameters.landing_point_m
+        if not fence.distance_m(x_m, y_m) >= fence.buffer_m:
+            raise ValueError(
+                f"landing_point_m = {[x_m, y_m]}: must be inside the fence, at least buffer_m = "
+                f"{fence.buffer_m:g} from its line"
+            )
+
 
 class Decision(NamedTuple):
-    """A tick's outcome; `new_trial`: the explored map and the mailbox are to be forgotten."""
+    """A tick's outcome; `new_trial`: the explored map and the mailbox are to be forgotten.
+
+    `taken` is the row of `TRANSITIONS` that led to the state, None if it stays.
+    """
 
     flight: Flight
     actions: tuple[Action, ...]
     alarms: tuple[str, ...]
     new_trial: bool
+    taken: "Transition | None"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,9 +217,13 @@ class _Tick:
         return self.inputs.vehicle.heartbeat_at_s > self.flight.since_s
 
     @property
+    def silent(self) -> bool:
+        return is_silent(self.flight, self.inputs.now_s)
+
+    @property
     def calm(self) -> Calm:
         ground = self.inputs.ground
-        if ground is None:
+        if ground is None or not self.ground_heard:
             return "none"
         asked = ground.calm_for(self.robot.robot_id)
         return "hold" if asked == "none" and not ground.enabled else asked
@@ -208,18 +237,21 @@ class _Tick:
         return height_m(self.flight, self.inputs.odometry)
 
     @property
-    def mode_counts(self) -> bool:
-        """Whether the reported mode tells that the autopilot left ours, and is no old news."""
-        flight = self.flight
-        return flight.mode_seen or (flight.lapsed and self.inputs.now_s >= flight.silent_until_s)
-
-    @property
     def lapse_s(self) -> float:
-        return self.inputs.now_s - self.flight.tick_at_s
+        """How long the control loop was silent; 0 if it was not, or has just begun."""
+        silence_s = self.inputs.now_s - self.flight.tick_at_s
+        allowed_s = self.robot.parameters.command_timeout_s
+        return silence_s if allowed_s < silence_s < math.inf else 0.0
 
     @property
-    def offboard_since_s(self) -> float:
+    def acts_from_s(self) -> float:
+        """From when on the state's setpoints and commands are sent."""
         return max(self.flight.since_s, self.flight.silent_until_s)
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the autopilot had its time to go to offboard."""
+        return self.inputs.now_s - self.acts_from_s > _OFFBOARD_TIMEOUT_S
 
 
 def height_m(flight: Flight, odometry: Odometry | None) -> float | None:
@@ -231,7 +263,10 @@ def height_m(flight: Flight, odometry: Odometry | None) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One row: from any of `sources` to `target` when `why` gives a reason; `when` is for people."""
+    """One row: from any of `sources` to `target` when `why` gives a reason; `when` is for people.
+
+    `alarm`: the operator must see the reason for as long as the target lasts.
+    """
 
     sources: tuple[FlightState, ...]
     target: FlightState
@@ -239,10 +274,11 @@ class Transition:
     why: Callable[[_Tick], str | None]
     actions: tuple[Action, ...] = ()
     land_by: Literal["ground", "return", "safety"] = "safety"
+    alarm: bool = False
 
 
-_STEERED = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
-_AIRBORNE = (*_STEERED, _S.LAND)
+STEERED = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
+_AIRBORNE = (*STEERED, _S.LAND)
 _ON_GROUND = (_S.INIT, _S.IDLE, _S.PREFLIGHT, _S.LANDED)
 
 
@@ -259,41 +295,56 @@ def _disarmed(t: _Tick) -> str | None:
 
 
 def _link_lost(t: _Tick) -> str | None:
-    return _if(not t.inputs.vehicle.connected, "the autopilot does not answer")
+    lost = not t.inputs.vehicle.connected and not t.silent
+    return _if(lost, "the autopilot does not answer")
+
+
+def _disarmed_again(t: _Tick) -> str | None:
+    return _disarmed(t) if t.heard_since_entry and not t.flight.killed else None
 
 
 def _armed_by_others(t: _Tick) -> str | None:
-    if not t.inputs.vehicle.armed:
+    if not t.inputs.vehicle.armed or t.flight.armed_asked:
         return None
-    first = t.flight.state is _S.INIT
-    return f"vehicle {'was already' if first else 'is'} armed, not by this program: only observing"
+    already = "was already" if t.flight.state is _S.INIT else "is"
+    return f"the vehicle {already} armed, without an order: only observing"
+
+
+def _armed_again(t: _Tick) -> str | None:
+    answers = t.inputs.vehicle.connected and t.heard_since_entry and not t.flight.killed
+    return _armed_by_others(t) if answers else None
 
 
 def _pilot(t: _Tick) -> str | None:
-    return _if(t.mode_counts and t.mode in PILOTED, f"a pilot flies it ({t.mode})")
+    # Right after a rejoin, the pilot's mode is the one that the operator wants to end.
+    ending = not t.flight.reached and (
+        t.inputs.now_s - t.flight.rejoined_at_s <= _OFFBOARD_TIMEOUT_S
+    )
+    return _if(t.mode in PILOTED and not ending, f"a pilot flies it ({t.mode})")
 
 
 def _left_offboard(t: _Tick) -> str | None:
-    left = t.flight.mode_seen and t.mode not in (Mode.OFFBOARD, Mode.LAND, None)
-    return _if(left, f"vehicle left offboard for {t.mode}")
+    left = t.flight.reached and t.mode not in (Mode.OFFBOARD, Mode.LAND)
+    return _if(left, f"the vehicle left offboard for {t.mode}")
 
 
 def _left_land(t: _Tick) -> str | None:
-    return _if(t.flight.mode_seen and t.mode is not Mode.LAND, f"vehicle left land for {t.mode}")
+    return _if(t.flight.reached and t.mode is not Mode.LAND, f"the vehicle left land for {t.mode}")
 
 
 def _lapse(t: _Tick) -> str | None:
-    silent = t.lapse_s > t.robot.parameters.command_timeout_s and t.flight.tick_at_s > -math.inf
-    return _if(silent, f"control was silent for {t.lapse_s:.1f} s")
+    return _if(t.lapse_s > 0.0, f"control was silent for {t.lapse_s:.1f} s")
 
 
 def _autopilot_lands(t: _Tick) -> str | None:
-    return _if(t.mode_counts and t.mode is Mode.LAND, "the autopilot lands by itself")
+    # Else it lands because it was told to, before this state.
+    lapsed = t.flight.silent_until_s > -math.inf and not t.silent
+    by_itself = t.flight.reached or t.overdue or lapsed
+    return _if(t.mode is Mode.LAND and by_itself, "the autopilot lands by itself")
 
 
 def _offboard_refused(t: _Tick) -> str | None:
-    waited_s = t.inputs.now_s - t.offboard_since_s
-    refused = not t.flight.mode_seen and waited_s > _OFFBOARD_TIMEOUT_S
+    refused = t.overdue and not t.flight.reached
     return _if(refused, f"offboard refused{_refusal(t, Action.OFFBOARD)}")
 
 
@@ -301,6 +352,10 @@ def _position_lost(t: _Tick) -> str | None:
     lost_s = t.inputs.now_s - max(t.flight.position_ok_at_s, t.flight.silent_until_s)
     timeout_s = t.robot.parameters.position_timeout_s
     return _if(t.inputs.odometry is None and lost_s >= timeout_s, "position lost")
+
+
+def _on_ground(t: _Tick) -> str | None:
+    return _if(t.inputs.vehicle.in_air is False and not t.silent, "it stands on the ground")
 
 
 def _battery_critical(t: _Tick) -> str | None:
@@ -329,7 +384,7 @@ def _ground_holds(t: _Tick) -> str | None:
 
 
 def _ground_holds_landing(t: _Tick) -> str | None:
-    return _if(t.calm == "hold" and t.flight.land_by != "safety", "ground commands hold")
+    return _ground_holds(t) if t.flight.land_by != "safety" and _may_climb(t) else None
 
 
 def _ground_returns(t: _Tick) -> str | None:
@@ -337,7 +392,12 @@ def _ground_returns(t: _Tick) -> str | None:
 
 
 def _ground_returns_landing(t: _Tick) -> str | None:
-    return _if(t.calm == "return" and t.flight.land_by == "ground", "ground commands return")
+    return _ground_returns(t) if t.flight.land_by == "ground" and _may_climb(t) else None
+
+
+def _may_climb(t: _Tick) -> bool:
+    """Nothing that the ground repeats may lift a vehicle that has landed."""
+    return t.inputs.vehicle.in_air is True and t.height_m is not None
 
 
 def _too_close(t: _Tick) -> str | None:
@@ -354,7 +414,12 @@ def _ground_lost(t: _Tick) -> str | None:
 def _ground_long_lost(t: _Tick) -> str | None:
     parameters = t.robot.parameters
     limit_s = parameters.ground_timeout_s + parameters.ground_lost_land_s
-    return _if(t.inputs.ground_age_s > limit_s, "ground lost for too long")
+    lost = t.inputs.ground_age_s > limit_s and not t.silent
+    return _if(lost, f"ground lost for {limit_s:g} s")
+
+
+def _battery_low_in_hold(t: _Tick) -> str | None:
+    return _battery_low(t) if t.calm == "none" and t.ground_heard else None
 
 
 def _policy_stale(t: _Tick) -> str | None:
@@ -373,16 +438,16 @@ def _enabled(t: _Tick) -> str | None:
     return _if(enabled and t.ground_heard, "enabled")
 
 
+def _enabled_at_rest(t: _Tick) -> str | None:
+    return _enabled(t) if t.age_s > _STALE_TELEMETRY_S else None
+
+
 def _not_enabled(t: _Tick) -> str | None:
     return _if(_enabled(t) is None, "not enabled" if t.ground_heard else "ground lost")
 
 
 def _may_fly_again(t: _Tick) -> str | None:
-    return _if(t.calm == "none" and _enabled(t) is not None, "enabled")
-
-
-def _rest(t: _Tick) -> str | None:
-    return _if(_enabled(t) is None and t.age_s > _ASK_AGAIN_S, "disarmed")
+    return _enabled(t) if t.calm == "none" else None
 
 
 def _takeoff(t: _Tick) -> str | None:
@@ -391,8 +456,11 @@ def _takeoff(t: _Tick) -> str | None:
 
 def _arming_called_off(t: _Tick) -> str | None:
     if not t.ground_heard:
-        return "ground lost"
-    return _if(t.calm != "none", f"ground commands {t.calm}")
+        return "ground lost while arming"
+    if t.calm != "none":
+        return f"ground commands {t.calm} while arming"
+    left = t.flight.reached and t.mode is not Mode.OFFBOARD
+    return _lapse(t) or _if(left, f"the vehicle left offboard for {t.mode} while arming")
 
 
 def _arming_failed(t: _Tick) -> str | None:
@@ -404,8 +472,8 @@ def _arming_failed(t: _Tick) -> str | None:
 
 
 def _armed(t: _Tick) -> str | None:
-    armed = t.flight.armed_asked and t.inputs.vehicle.armed and t.heard_since_entry
-    return _if(bool(armed) and t.inputs.odometry is not None, "armed")
+    armed = t.flight.armed_asked and t.inputs.vehicle.armed is True
+    return _if(armed and t.inputs.odometry is not None, "armed")
 
 
 def _lift_off_failed(t: _Tick) -> str | None:
@@ -419,8 +487,8 @@ def _lift_off_failed(t: _Tick) -> str | None:
 def _at_slot(t: _Tick) -> str | None:
     height = t.height_m
     wanted_m = t.robot.parameters.slot_height_m
-    there = t.inputs.vehicle.in_air and height is not None and height > wanted_m - _AT_HEIGHT_M
-    return _if(bool(there), f"at its height, {wanted_m:g} m")
+    there = height is not None and height > wanted_m - _AT_HEIGHT_M
+    return _if(there and t.inputs.vehicle.in_air is True, f"at its height, {wanted_m:g} m")
 
 
 def _start(t: _Tick) -> str | None:
@@ -449,107 +517,109 @@ def _refusal(t: _Tick, action: Action) -> str:
 
 
 TRANSITIONS: tuple[Transition, ...] = (
-    Transition(tuple(_S), _S.FAULT, "the operator orders kill", _killed, (Action.KILL,)),
+    Transition(tuple(_S), _S.FAULT, "the operator orders kill", _killed, alarm=True),
     # What the vehicle does, whoever made it.
     Transition((*_AIRBORNE, _S.PILOT), _S.LANDED, "the vehicle is disarmed", _disarmed),
-    Transition((_S.FAULT,), _S.INIT, "the vehicle is disarmed, and not killed",
-               lambda t: None if t.flight.killed or not t.heard_since_entry else _disarmed(t)),
-    Transition((_S.ARMING, *_AIRBORNE, _S.PILOT), _S.FAULT, "the autopilot does not answer",
-               _link_lost),
+    Transition((_S.FAULT,), _S.INIT, "the vehicle is disarmed, and was not killed",
+               _disarmed_again),
+    Transition((*_AIRBORNE, _S.PILOT), _S.FAULT, "the autopilot does not answer", _link_lost,
+               alarm=True),
     Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED), _S.INIT, "the autopilot does not answer",
                _link_lost),
-    Transition(_ON_GROUND, _S.PILOT, "the vehicle is armed, not by this program", _armed_by_others),
-    Transition((_S.FAULT,), _S.PILOT, "the autopilot answers again, armed",
-               lambda t: None if t.flight.killed or not t.inputs.vehicle.connected
-               or not t.heard_since_entry else _armed_by_others(t)),
+    Transition((_S.ARMING,), _S.INIT, "the autopilot does not answer", _link_lost,
+               (Action.DISARM,)),
+    Transition((*_ON_GROUND, _S.ARMING), _S.PILOT, "the vehicle is armed, not by this program",
+               _armed_by_others, alarm=True),
+    Transition((_S.FAULT,), _S.PILOT, "the autopilot answers again, armed, and was not killed",
+               _armed_again, alarm=True),
     # A pilot, and the autopilot's own failsafe.
-    Transition(_AIRBORNE, _S.PILOT, "the sticks fly the vehicle", _pilot),
-    Transition((_S.ARMING,), _S.IDLE, "the control loop was silent", _lapse, (Action.DISARM,)),
-    Transition(_STEERED, _S.HOLD, "the control loop was silent", _lapse),
-    Transition(_STEERED, _S.PILOT, "the vehicle left offboard", _left_offboard),
-    Transition((_S.LAND,), _S.PILOT, "the vehicle left land", _left_land),
-    Transition(_STEERED, _S.LAND, "the autopilot lands by itself", _autopilot_lands),
-    Transition((_S.TAKEOFF,), _S.LAND, "offboard is refused", _offboard_refused),
-    Transition((_S.HOLD, _S.RETURN), _S.PILOT, "offboard is refused", _offboard_refused),
+    Transition(_AIRBORNE, _S.PILOT, "a pilot's mode is on", _pilot, alarm=True),
+    Transition(STEERED, _S.HOLD, "the control loop was silent", _lapse, alarm=True),
+    Transition(STEERED, _S.PILOT, "the vehicle left offboard", _left_offboard, alarm=True),
+    Transition((_S.LAND,), _S.PILOT, "the vehicle left land", _left_land, alarm=True),
+    Transition(STEERED, _S.LAND, "the autopilot lands by itself", _autopilot_lands, alarm=True),
+    Transition((_S.HOLD, _S.RETURN), _S.PILOT, "offboard is refused", _offboard_refused,
+               alarm=True),
     # What cannot wait for anybody.
-    Transition(_STEERED, _S.LAND, "the position is lost", _position_lost),
-    Transition(_STEERED, _S.LAND, "the battery is critical", _battery_critical),
+    Transition(STEERED, _S.LAND, "the position is lost", _position_lost, alarm=True),
+    Transition(STEERED, _S.LAND, "the battery is critical", _battery_critical, alarm=True),
+    Transition((_S.HOLD, _S.RETURN), _S.LAND, "it stands on the ground", _on_ground),
     # The ground calms.
+    Transition((_S.ARMING,), _S.IDLE, "the ground commands hold, land or return, or is lost; the "
+               "control loop was silent; the vehicle left offboard",
+               _arming_called_off, (Action.DISARM,), alarm=True),
     Transition((_S.TAKEOFF,), _S.LAND, "the ground commands land or return",
-               _ground_ends_takeoff, land_by="ground"),
+               _ground_ends_takeoff, land_by="return"),
     Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "the ground commands land",
                _ground_lands, land_by="ground"),
     Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, "the ground commands hold",
                _ground_holds),
-    Transition((_S.LAND,), _S.HOLD, "the ground commands hold, and landing was no emergency",
-               _ground_holds_landing),
+    Transition((_S.LAND,), _S.HOLD, "the ground commands hold, it is in the air, and landing was "
+               "no emergency", _ground_holds_landing),
     Transition((_S.HOLD, _S.MISSION), _S.RETURN, "the ground commands return", _ground_returns),
-    Transition((_S.LAND,), _S.RETURN, "the ground commands return, and had commanded land",
-               _ground_returns_landing),
-    Transition((_S.ARMING,), _S.IDLE, "the ground commands hold, land or return, or is lost",
-               _arming_called_off, (Action.DISARM,)),
+    Transition((_S.LAND,), _S.RETURN, "the ground commands return, it is in the air, and the "
+               "ground had commanded land", _ground_returns_landing),
     # What the robot notices by itself.
-    Transition((_S.MISSION, _S.RETURN), _S.HOLD, "a neighbour is too close", _too_close),
-    Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", _ground_lost),
-    Transition((_S.HOLD,), _S.LAND, "the ground stays lost", _ground_long_lost),
-    Transition((_S.MISSION,), _S.RETURN, "the battery is low", _battery_low),
+    Transition((_S.MISSION,), _S.HOLD, "a neighbour is too close", _too_close, alarm=True),
+    Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", _ground_lost, alarm=True),
+    Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, "the ground stays lost", _ground_long_lost,
+               alarm=True),
+    Transition((_S.MISSION,), _S.RETURN, "the battery is low", _battery_low, alarm=True),
     Transition((_S.HOLD,), _S.RETURN, "the battery is low, and the ground commands nothing",
-               lambda t: _battery_low(t) if t.calm == "none" and t.ground_heard else None),
-    Transition((_S.MISSION,), _S.HOLD, "the policy has no fresh answer", _policy_stale),
+               _battery_low_in_hold, alarm=True),
+    Transition((_S.MISSION,), _S.HOLD, "the policy has no fresh answer", _policy_stale,
+               alarm=True),
     # The way of a flight.
     Transition((_S.INIT,), _S.IDLE, "autopilot, position and estimator origin are known", _found),
-    Transition((_S.IDLE,), _S.PREFLIGHT, "the ground enables, and has set an origin", _enabled),
+    Transition((_S.IDLE,), _S.PREFLIGHT, "the ground enables, and has set an origin",
+               _enabled_at_rest),
     Transition((_S.PREFLIGHT,), _S.IDLE, "the ground does not enable, or is lost", _not_enabled),
     Transition((_S.PREFLIGHT,), _S.ARMING, "the operator orders takeoff, and the robot is ready",
                _takeoff),
     Transition((_S.ARMING,), _S.TAKEOFF, "the vehicle is armed", _armed),
     Transition((_S.ARMING,), _S.IDLE, "offboard or arming is refused, or takes too long",
-               _arming_failed, (Action.DISARM,)),
+               _arming_failed, (Action.DISARM,), alarm=True),
     Transition((_S.TAKEOFF,), _S.HOLD, "at its height, and the autopilot says in the air",
                _at_slot),
-    Transition((_S.TAKEOFF,), _S.LAND, "it does not climb", _lift_off_failed),
+    Transition((_S.TAKEOFF,), _S.LAND, "it does not climb", _lift_off_failed, alarm=True),
     Transition((_S.HOLD,), _S.MISSION, "the operator orders start", _start),
     Transition((_S.RETURN,), _S.LAND, "at its landing point", _at_landing_point,
                land_by="return"),
     Transition((_S.PILOT,), _S.HOLD, "the operator orders rejoin", _rejoin),
     Transition((_S.LANDED,), _S.PREFLIGHT, "enabled, and the ground commands nothing",
                _may_fly_again),
-    Transition((_S.LANDED,), _S.IDLE, "the ground does not enable, or is lost", _rest),
 )  # fmt: skip
 
 
 def step(robot: Robot, flight: Flight, inputs: FlightInputs) -> Decision:
     """One control tick: at most one transition, and what to ask of the autopilot now."""
-    if inputs.odometry is not None:
-        flight = replace(flight, position_ok_at_s=inputs.now_s)
-    expected = Mode.LAND if flight.state is _S.LAND else Mode.OFFBOARD
-    if (
-        flight.state in _AIRBORNE
-        and inputs.vehicle.mode is expected
-        and not _silent(flight, inputs)
-    ):
-        flight = replace(flight, mode_seen=True, lapsed=False)
-    if flight.state is _S.PILOT and flight.datum_m is None:
-        flight = replace(flight, datum_m=_home_m(inputs))
-    accepted, flight = _answer(robot, flight, inputs)
-    tick = _Tick(robot, flight, inputs, accepted)
-    new_trial = False
+    flight = _look(_Tick(robot, flight, inputs, None))
+    order = _new_order(robot, flight, inputs)
+    tick = _Tick(robot, flight, inputs, None)
+    refusal = None if order is None else _order_problem(tick, order)
+    obeyed = order if refusal is None else None
+    row, reason = _first_row(replace(tick, accepted=None if obeyed is None else obeyed.kind))
+    if obeyed is not None and (row is None or row.why not in _BY_ORDER):
+        # Something graver came first.
+        obeyed, refusal = None, reason
     actions: tuple[Action, ...] = ()
-    row, reason = _first_row(tick)
     if row is not None:
-        if row.target is _S.MISSION and inputs.order is not None:
-            new_trial = inputs.order.trial != flight.trial
-            flight = replace(flight, trial=inputs.order.trial)
-        flight = _enter(row, reason, replace(tick, flight=flight))
-        actions = row.actions
-        tick = _Tick(robot, flight, inputs, None)
+        flight, actions = _enter(row, reason, tick), row.actions
+    if order is not None:
+        flight = _answer(flight, order, refusal)
+    new_trial = obeyed is not None and obeyed.kind == "start" and obeyed.trial != flight.trial
+    if obeyed is not None and new_trial:
+        flight = replace(flight, trial=obeyed.trial)
+    tick = _Tick(robot, flight, inputs, None)
     asked = _ask(tick)
-    if Action.ARM in asked:
-        flight = replace(flight, armed_asked=True)
-    if asked:
-        flight = replace(flight, asked_at_s=inputs.now_s)
-    flight = replace(flight, tick_at_s=inputs.now_s, landed_since_s=_landed_since_s(tick))
-    return Decision(flight, actions + asked, _alarms(tick), new_trial)
+    flight = replace(
+        flight,
+        tick_at_s=inputs.now_s,
+        target_m=_target_m(tick),
+        asked_at_s=inputs.now_s if asked else flight.asked_at_s,
+        armed_asked=flight.armed_asked or Action.ARM in asked,
+    )
+    return Decision(flight, actions + asked, _alarms(tick), new_trial, row)
 
 
 def is_silent(flight: Flight, now_s: float) -> bool:
@@ -557,8 +627,30 @@ def is_silent(flight: Flight, now_s: float) -> bool:
     return now_s < flight.silent_until_s
 
 
-def _silent(flight: Flight, inputs: FlightInputs) -> bool:
-    return is_silent(flight, inputs.now_s)
+def _look(t: _Tick) -> Flight:
+    """The memory, with what this tick's inputs add to it, before any transition."""
+    flight, inputs, now_s = t.flight, t.inputs, t.inputs.now_s
+    vehicle = inputs.vehicle
+    if t.lapse_s > 0.0:
+        flight = replace(flight, silent_until_s=now_s + _STALE_TELEMETRY_S)
+    if vehicle.heartbeat_at_s > t.acts_from_s + _STREAM_S and not is_silent(flight, now_s):
+        flight = replace(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
+    if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
+        flight = replace(flight, silent_until_s=-math.inf)
+    if inputs.odometry is not None:
+        flight = replace(flight, position_ok_at_s=now_s)
+    landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
+    down = flight.state is _S.LAND and vehicle.in_air is False
+    flight = replace(flight, landed_since_s=landed_since_s if down else None)
+    if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > _STALE_TELEMETRY_S:
+        flight = replace(flight, datum_m=_home_m(inputs))
+    return flight
+
+
+def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
+    if state is _S.FAULT:
+        return vehicle.armed is False
+    return vehicle.mode is (Mode.LAND if state is _S.LAND else Mode.OFFBOARD)
 
 
 def _first_row(tick: _Tick) -> tuple[Transition | None, str]:
@@ -573,18 +665,18 @@ def _first_row(tick: _Tick) -> tuple[Transition | None, str]:
 def _enter(row: Transition, reason: str, t: _Tick) -> Flight:
     """The memory with which the row's target begins."""
     flight, now_s = t.flight, t.inputs.now_s
-    lapsed = row.why is _lapse
-    stays_offboard = flight.state in _STEERED and row.target in _STEERED and not lapsed
+    from_offboard = flight.state in (_S.ARMING, *STEERED)
+    stays_offboard = from_offboard and row.target in STEERED and row.why is not _lapse
     return replace(
         flight,
         state=row.target,
         reason=reason,
+        alarming=row.alarm,
         since_s=now_s,
         datum_m=_datum_m(row.target, t),
-        target_m=_target_m(row.target, t),
-        mode_seen=stays_offboard and flight.mode_seen,
-        lapsed=lapsed or (stays_offboard and flight.lapsed),
-        silent_until_s=now_s + _STALE_TELEMETRY_S if lapsed else flight.silent_until_s,
+        target_m=flight.target_m if row.why is _at_slot else None,
+        reached=stays_offboard and flight.reached,
+        rejoined_at_s=now_s if row.why is _rejoin else flight.rejoined_at_s,
         asked_at_s=-math.inf,
         armed_asked=False,
         landed_since_s=None,
@@ -610,66 +702,66 @@ def _home_m(inputs: FlightInputs) -> float | None:
     return odometry.position_m[2] - above_home_m
 
 
-def _target_m(target: FlightState, t: _Tick) -> Vector | None:
-    odometry = t.inputs.odometry
-    if odometry is None or target not in (_S.TAKEOFF, _S.HOLD):
+def _target_m(t: _Tick) -> Vector | None:
+    """Above the takeoff point, or where the vehicle was when it could be told to stay there."""
+    odometry, height, state = t.inputs.odometry, t.height_m, t.flight.state
+    if state not in (_S.TAKEOFF, _S.HOLD):
         return None
-    x_m, y_m, z_m = odometry.position_m
-    if target is _S.TAKEOFF:
-        return x_m, y_m, t.robot.parameters.slot_height_m
-    datum_m = t.flight.datum_m
-    return None if datum_m is None else (x_m, y_m, z_m - datum_m)
+    if odometry is None or height is None or (t.flight.target_m is not None and not t.silent):
+        return t.flight.target_m
+    x_m, y_m, _ = odometry.position_m
+    return x_m, y_m, t.robot.parameters.slot_height_m if state is _S.TAKEOFF else height
 
 
 def _ask(t: _Tick) -> tuple[Action, ...]:
     """What the state needs from the autopilot, asked again until it is so; ARM is asked once."""
-    flight, vehicle, now_s = t.flight, t.inputs.vehicle, t.inputs.now_s
-    if flight.killed and vehicle.armed is not False:
-        return _again(t, Action.KILL)
-    if flight.state is _S.ARMING:
-        return _ask_to_arm(t)
+    flight, now_s = t.flight, t.inputs.now_s
+    streamed = now_s - t.acts_from_s >= _STREAM_S
     if flight.state is _S.LAND:
-        if t.mode is not Mode.LAND:
-            return _again(t, Action.LAND)
-        on_ground_s = now_s - (flight.landed_since_s or now_s)
-        return _again(t, Action.DISARM) if on_ground_s > _LANDED_DISARM_S else ()
-    if flight.state in _STEERED and not flight.mode_seen:
-        streamed = now_s - t.offboard_since_s >= _STREAM_S
-        return _again(t, Action.OFFBOARD) if streamed else ()
+        since_s = flight.landed_since_s
+        if since_s is not None and now_s - since_s > _LANDED_DISARM_S:
+            return _again(t, Action.DISARM)
+        return () if flight.reached else _again(t, Action.LAND)
+    if flight.state is _S.FAULT:
+        return _again(t, Action.KILL) if flight.killed and not flight.reached else ()
+    if flight.state is _S.ARMING and flight.reached:
+        return () if flight.armed_asked else (Action.ARM,)
+    if t.silent and flight.state in STEERED:
+        # Without setpoints it would land. Before a look, a pilot may have it.
+        flies_on = t.mode is Mode.OFFBOARD and t.heard_since_entry
+        return _again(t, Action.HOLD) if flies_on else ()
+    if flight.state in (_S.ARMING, *STEERED) and streamed and not flight.reached:
+        return _again(t, Action.OFFBOARD)
     return ()
 
 
-def _ask_to_arm(t: _Tick) -> tuple[Action, ...]:
-    if t.flight.armed_asked or t.age_s < _STREAM_S:
-        return ()
-    result = t.inputs.vehicle.result
-    ready = t.mode is Mode.OFFBOARD and t.heard_since_entry
-    if result is not None and result.action is Action.OFFBOARD and result.accepted:
-        ready = ready or result.at_s >= t.flight.since_s
-    return (Action.ARM,) if ready else _again(t, Action.OFFBOARD)
-
-
 def _again(t: _Tick, action: Action) -> tuple[Action, ...]:
-    return (action,) if t.inputs.now_s - t.flight.asked_at_s >= _ASK_AGAIN_S else ()
+    asked_at_s = t.flight.asked_at_s
+    if t.inputs.now_s - asked_at_s < _ASK_AGAIN_S:
+        return ()
+    # A mode is asked for again only after a look: a pilot may have taken the vehicle in between.
+    looked = t.inputs.vehicle.heartbeat_at_s > asked_at_s + _STREAM_S
+    return (action,) if looked or action in (Action.DISARM, Action.KILL) else ()
 
 
-def _landed_since_s(t: _Tick) -> float | None:
-    if t.flight.state is not _S.LAND or t.inputs.vehicle.in_air is not False:
-        return None
-    return t.flight.landed_since_s or t.inputs.now_s
+_BY_ORDER = (_killed, _takeoff, _start, _rejoin)
 
 
-def _answer(robot: Robot, flight: Flight, inputs: FlightInputs) -> tuple[OrderKind | None, Flight]:
-    """Accept or refuse the order, once: one that was answered is not looked at again."""
+def _new_order(robot: Robot, flight: Flight, inputs: FlightInputs) -> Order | None:
+    """The order, unless it is another robot's, or was answered before."""
     order = inputs.order
     if order is None or order.robot_id != robot.robot_id:
-        return None, flight
-    if any(answer.order_id == order.order_id for answer in flight.answers):
-        return None, flight
-    problem = _order_problem(_Tick(robot, flight, inputs, None), order)
-    answer = OrderResult(order.order_id, problem is None, problem or "")
-    flight = replace(flight, answers=(*flight.answers, answer)[-_ANSWERS_KEPT:])
-    return (order.kind if problem is None else None), flight
+        return None
+    return None if any(a.order_id == order.order_id for a in flight.answers) else order
+
+
+def _answer(flight: Flight, order: Order, refusal: str | None) -> Flight:
+    answer = OrderResult(order.order_id, refusal is None, refusal or "")
+    expiry_s = flight.obeyed_expiry_s
+    if refusal is None:
+        expiry_s = max(expiry_s, order.expires_at_uptime_s)
+    answers = (*flight.answers, answer)[-_ANSWERS_KEPT:]
+    return replace(flight, answers=answers, obeyed_expiry_s=expiry_s)
 
 
 def _order_problem(t: _Tick, order: Order) -> str | None:
@@ -685,6 +777,10 @@ def _order_problem(t: _Tick, order: Order) -> str | None:
     source = {"takeoff": _S.PREFLIGHT, "start": _S.HOLD, "rejoin": _S.PILOT}[order.kind]
     if state is not source:
         return f"{order.kind} is taken in {source} only, the robot is in {state}: {t.flight.reason}"
+    if order.expires_at_uptime_s <= t.flight.obeyed_expiry_s:
+        return "older than an order that was obeyed"
+    if t.silent:
+        return "the control loop was silent just before"
     if not t.ground_heard:
         return "the ground's state is not heard"
     if t.calm != "none":
@@ -719,7 +815,7 @@ def _not_in_place(t: _Tick) -> str | None:
 
 
 def _cannot_start(t: _Tick) -> str | None:
-    if not t.flight.mode_seen:
+    if not t.flight.reached:
         return "the autopilot is not in offboard yet"
     if t.inputs.policy_velocity_m_s is None:
         return "the policy has no fresh answer"
@@ -731,15 +827,8 @@ def _cannot_start(t: _Tick) -> str | None:
 
 def _alarms(t: _Tick) -> tuple[str, ...]:
     """What the operator must see, the gravest first."""
-    state = t.flight.state
-    alarms = []
-    if state in (_S.FAULT, _S.PILOT):
-        alarms.append(t.flight.reason)
-    if state in _AIRBORNE:
+    alarms = [t.flight.reason] if t.flight.alarming else []
+    if t.flight.state in (*_AIRBORNE, _S.PILOT):
         checks = (_position_lost, _too_close, _battery_low, _ground_lost)
         alarms += [text for check in checks if (text := check(t)) is not None]
-        if state in (_S.HOLD, _S.LAND) and not t.flight.reason.startswith(
-            ("ground commands", "at ")
-        ):
-            alarms.append(t.flight.reason)
     return tuple(dict.fromkeys(alarms))

@@ -2,7 +2,8 @@
 
 Heights are above the robot's own takeoff point. HOLD, TAKEOFF and RETURN are flown as positions a
 short way ahead of the estimate, which PX4 stops at much sooner than at a velocity of 0, and which
-never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity.
+never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity. Neighbours and
+the fence limit RETURN and MISSION.
 """
 
 from dataclasses import dataclass, field
@@ -11,9 +12,17 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
-from edge.core.flight import Flight, FlightInputs, Robot, height_m, is_silent
+from edge.core.flight import STEERED, Flight, FlightInputs, Robot, height_m, is_silent
 from edge.core.mission import FlightState
-from edge.core.safety import MotionLimits, brake, hold_height, keep_inside, limit_acceleration
+from edge.core.safety import (
+    MotionLimits,
+    approach_speed,
+    brake,
+    hold_height,
+    keep_inside,
+    leash,
+    limit_acceleration,
+)
 from edge.core.vehicle import Vector
 
 # PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P).
@@ -37,6 +46,8 @@ class MissionPosition(NamedTuple):
 
 MissionSetpoint = MissionVelocity | MissionPosition
 
+_STOP = MissionVelocity((0.0, 0.0, 0.0))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guidance:
@@ -53,47 +64,42 @@ def guide(
     guidance: Guidance,
     dt_s: float,
 ) -> tuple[MissionSetpoint | None, Guidance]:
-    """The setpoint of this tick, None when nothing is to be sent, and the memory for the next."""
+    """The setpoint of this tick, None when nothing is to be sent, and the memory for the next.
+
+    `flight` is what `flight.step` made of the same inputs; `dt_s` is the time since the last tick.
+    """
     state, limits = flight.state, robot.limits
-    if is_silent(flight, inputs.now_s):
-        return None, Guidance()
-    if state is FlightState.ARMING:
-        return MissionVelocity((0.0, 0.0, 0.0)), Guidance()
-    if state not in (
-        FlightState.TAKEOFF,
-        FlightState.HOLD,
-        FlightState.MISSION,
-        FlightState.RETURN,
-    ):
+    if state not in (FlightState.ARMING, *STEERED) or is_silent(flight, inputs.now_s):
         return None, Guidance()
     height = height_m(flight, inputs.odometry)
-    if inputs.odometry is None or height is None:
-        return MissionVelocity((0.0, 0.0, 0.0)), Guidance()
-    x_m, y_m, _ = inputs.odometry.position_m
-    position_m = np.array([x_m, y_m, height])
+    if state is FlightState.ARMING or inputs.odometry is None or height is None:
+        return _STOP, Guidance()
+    position_m = np.array([*inputs.odometry.position_m[:2], height])
+    if not np.isfinite(position_m).all():
+        return _STOP, Guidance()
     if state in (FlightState.TAKEOFF, FlightState.HOLD):
         return _towards(flight.target_m, position_m, limits), Guidance()
+    wanted_m_s = np.zeros(3)
     if state is FlightState.RETURN:
-        wanted_m_s = _homewards(robot, position_m, limits)
-    else:
-        wanted_m_s = np.zeros(3)
-        if inputs.policy_velocity_m_s is not None:
-            wanted_m_s[:2] = inputs.policy_velocity_m_s
-        wanted_m_s = limit_acceleration(
-            guidance.velocity_m_s, wanted_m_s, limits.max_acceleration_m_s2, dt_s
-        )
+        wanted_m_s[:2] = _homewards(robot, position_m)
+    elif inputs.policy_velocity_m_s is not None:
+        wanted_m_s[:2] = inputs.policy_velocity_m_s
+    wanted_m_s = limit_acceleration(
+        guidance.velocity_m_s, wanted_m_s, limits.max_acceleration_m_s2, dt_s
+    )
     wanted_m_s[2] = hold_height(height, robot.parameters.slot_height_m, limits.max_climb_m_s)
     velocity_m_s = np.array(inputs.odometry.velocity_m_s)
-    braked_m_s = brake(
+    inside_m_s, recovering = keep_inside(
+        robot.fence, position_m, velocity_m_s, wanted_m_s, limits, guidance.recovering
+    )
+    safe_m_s = brake(
         position_m,
         velocity_m_s,
-        wanted_m_s,
+        inside_m_s,
         inputs.neighbours,
         robot.parameters.min_separation_m,
         limits,
-    )
-    safe_m_s, recovering = keep_inside(
-        robot.fence, position_m, velocity_m_s, braked_m_s, limits, guidance.recovering
+        robot.fence,
     )
     remembered = Guidance(np.array([*safe_m_s[:2], 0.0]), recovering)
     if state is FlightState.RETURN:
@@ -104,26 +110,23 @@ def guide(
 def _towards(target_m: Vector | None, position_m: F64, limits: MotionLimits) -> MissionSetpoint:
     """A position on the way to the target: near in the plane, and a second's climb away."""
     if target_m is None:
-        return MissionVelocity((0.0, 0.0, 0.0))
-    offset_m = np.array(target_m) - position_m
-    distance_m = float(np.hypot(*offset_m[:2]))
-    if distance_m > _HOLD_LEASH_M:
-        offset_m[:2] *= _HOLD_LEASH_M / distance_m
-    climb_m = limits.max_climb_m_s * _AHEAD_S
-    offset_m[2] = min(max(offset_m[2], -climb_m), climb_m)
-    return MissionPosition(_vector(position_m + offset_m))
+        return _STOP
+    place_m = leash(np.array(target_m[:2]), position_m[:2], _HOLD_LEASH_M)
+    if place_m is None:
+        return _STOP
+    height = float(position_m[2])
+    climb_m = hold_height(height, target_m[2], limits.max_climb_m_s) * _AHEAD_S
+    return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
 
 
-def _homewards(robot: Robot, position_m: F64, limits: MotionLimits) -> F64:
-    """(3,), without climb: towards the landing point, once at the robot's own height."""
-    wanted_m_s = np.zeros(3)
-    if abs(position_m[2] - robot.parameters.slot_height_m) < _AT_OWN_HEIGHT_M:
-        offset_m = np.array(robot.parameters.landing_point_m) - position_m[:2]
-        distance_m = float(np.hypot(*offset_m))
-        wanted_m_s[:2] = offset_m * min(
-            1.0 / _AHEAD_S, limits.max_speed_m_s / max(distance_m, 1e-9)
-        )
-    return wanted_m_s
+def _homewards(robot: Robot, position_m: F64) -> F64:
+    """(2,): towards the landing point, once at the robot's own height."""
+    if abs(position_m[2] - robot.parameters.slot_height_m) >= _AT_OWN_HEIGHT_M:
+        return np.zeros(2)
+    offset_m = np.array(robot.parameters.landing_point_m) - position_m[:2]
+    distance_m = float(np.hypot(*offset_m))
+    speed_m_s = min(approach_speed(distance_m, robot.limits), robot.limits.max_speed_m_s)
+    return offset_m * (speed_m_s / max(distance_m, 1e-9))
 
 
 def _vector(values: F64) -> Vector:

@@ -3,8 +3,8 @@
 Mission frame: x right, y forward, z up, m, heights above the robot's own takeoff point. Positions
 and velocities are (3,) float64 unless said otherwise.
 
-What is commanded passes `limit_speed` and `limit_acceleration` first, then `brake`, and
-`keep_inside` last: nothing may soften a stop.
+What is commanded passes `limit_speed` and `limit_acceleration` first, then `keep_inside`, and
+`brake` last, which keeps to the fence too: nothing may soften a stop.
 
 Nothing here raises in flight. A number that is not finite, or beyond 1000 km, is no measurement:
 where one comes in, a velocity goes out as 0, and a point as None.
@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
+from edge.core.mailbox import Neighbour
 
 _ABSURD = 1e6
 _LARGEST_FENCE_M = 1e4
@@ -142,15 +143,6 @@ class MotionLimits:
             raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
 
 
-class MovingNeighbour(NamedTuple):
-    """Another robot: where it was `age_s` ago, and its velocity then; (3,) each."""
-
-    robot_id: int
-    position_m: Sequence[float] | F64
-    velocity_m_s: Sequence[float] | F64
-    age_s: float
-
-
 class Closest(NamedTuple):
     """The nearest other robot, and its 3-D distance, m."""
 
@@ -158,17 +150,17 @@ class Closest(NamedTuple):
     distance_m: float
 
 
-def nearest(
-    position_m: Sequence[float], neighbours: Iterable[MovingNeighbour]
-) -> Closest | None:
-    """Who is nearest by 3-D distance, each taken to have flown on as it did; None if nobody is."""
-    closest: Closest | None = None
-    for robot_id, seen_at_m, velocity_m_s, age_s in neighbours:
-        there_m = [p + v * age_s for p, v in zip(seen_at_m, velocity_m_s, strict=True)]
-        distance_m = math.dist(there_m, position_m)
-        if closest is None or distance_m < closest.distance_m:
-            closest = Closest(robot_id, distance_m)
-    return closest
+def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Closest | None:
+    """Who is nearest by 3-D distance, each taken to have flown on as it did; None if nobody is.
+
+    Neighbours of which something is not known are left out.
+    """
+    distances = [
+        Closest(neighbour.robot_id, math.dist(_extrapolated(neighbour), position_m))
+        for neighbour in neighbours
+        if _is_known(neighbour)
+    ]
+    return min(distances, key=lambda closest: closest.distance_m, default=None)
 
 
 def limit_speed(velocity: F64, max_speed: float) -> F64:
@@ -252,13 +244,7 @@ def keep_inside(
         speed_m_s = _RECOVERY_SHARE * limits.max_speed_m_s
         horizontal = inward * (speed_m_s / max(math.hypot(*inward), 1e-9))
     else:
-        outward_speeds = -(edges.inward @ velocity_m_s[:2])
-        caps = [
-            _speed_towards(slack_m, speed, limits)
-            for slack_m, speed in zip(
-                (distances_m - fence.buffer_m).tolist(), outward_speeds.tolist(), strict=True
-            )
-        ]
+        caps = _caps_at_edges(fence, position_m, velocity_m_s, limits)
         horizontal = _limit_towards(wanted_m_s[:2], -edges.inward, caps)
     climb_m_s = _keep_height(fence, position_m[2], velocity_m_s[2], wanted_m_s[2], limits)
     return np.array([*horizontal, climb_m_s]), recovering
@@ -268,52 +254,74 @@ def brake(
     position_m: F64,
     velocity_m_s: F64,
     wanted_m_s: F64,
-    neighbours: Iterable[MovingNeighbour],
+    neighbours: Sequence[Neighbour],
     min_separation_m: float,
     limits: MotionLimits,
-) -> tuple[F64, Closest | None]:
+    fence: Fence | None,
+) -> F64:
     """What may be flown of `wanted_m_s`, so that the robot stays `min_separation_m` from others.
 
     `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
     did. One that is `min_separation_m` or more above or below brakes nothing, since robots cross in
     their height slots. Towards another one the robot may close half the slack: that one does the
-    same. Away from it, it may always fly. Climbing is not limited.
+    same. Away from it, it may always fly. Climbing is not limited. Giving way to a neighbour leads
+    over no edge of `fence`; None where there is none to keep to.
 
-    Also returns who is nearest. What is not known of one neighbour stops the robot.
+    A neighbour of which something is not known stops the robot.
     """
     if not _plausible(position_m, velocity_m_s, wanted_m_s):
-        return np.zeros(3), None
-    closest: Closest | None = None
+        return np.zeros(3)
+    if not all(map(_is_known, neighbours)):
+        return np.zeros(3)
     directions: list[F64] = []
     caps: list[float] = []
-    known = True
-    for robot_id, seen_at_m, its_velocity_m_s, age_s in neighbours:
-        if not _plausible(seen_at_m, its_velocity_m_s, (age_s,)):
-            known = False
-            continue
-        offset_m = np.asarray(seen_at_m) + np.asarray(its_velocity_m_s) * age_s - position_m
-        distance_m = math.hypot(*offset_m)
-        if closest is None or distance_m < closest.distance_m:
-            closest = Closest(robot_id, distance_m)
+    for neighbour in neighbours:
+        offset_m = np.array(_extrapolated(neighbour)) - position_m
         up_m = float(offset_m[2])
         if abs(up_m) >= min_separation_m:
             continue
         apart_m = math.hypot(offset_m[0], offset_m[1])
         if apart_m == 0.0:
-            known = False  # Every way may be the wrong one.
-            continue
+            return np.zeros(3)  # Every way may be the wrong one.
         direction = offset_m[:2] / apart_m
         # Squares of far smaller numbers than a separation may vanish: never below 0.
         needed_m = math.sqrt(max(min_separation_m * min_separation_m - up_m * up_m, 0.0))
         speed = float(direction @ velocity_m_s[:2])
         directions.append(direction)
         caps.append(_speed_towards((apart_m - needed_m) / 2.0, speed, limits))
-    if not known:
-        return np.zeros(3), closest
-    if not directions:
-        return wanted_m_s, closest
-    horizontal = _limit_towards(wanted_m_s[:2], np.array(directions), caps)
-    return np.array([*horizontal, wanted_m_s[2]]), closest
+    towards = zip(directions, caps, strict=True)
+    if all(float(direction @ wanted_m_s[:2]) <= cap for direction, cap in towards):
+        return wanted_m_s
+    if fence is not None:
+        directions += list(-fence._edges().inward)
+        caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
+    horizontal = _limit_towards(wanted_m_s[:2], directions, caps)
+    return np.array([*horizontal, wanted_m_s[2]])
+
+
+def _extrapolated(neighbour: Neighbour) -> list[float]:
+    """Where it is now, (3,), if it has flown on as it did."""
+    return [
+        place_m + speed_m_s * neighbour.age_s
+        for place_m, speed_m_s in zip(neighbour.position_m, neighbour.velocity_m_s, strict=True)
+    ]
+
+
+def _is_known(neighbour: Neighbour) -> bool:
+    return _plausible(neighbour.position_m, neighbour.velocity_m_s, (neighbour.age_s,))
+
+
+def _caps_at_edges(
+    fence: Fence, position_m: F64, velocity_m_s: F64, limits: MotionLimits
+) -> list[float]:
+    """How fast to be told to fly outwards at each edge."""
+    edges = fence._edges()
+    slacks_m = edges.distances_m(position_m[:2]) - fence.buffer_m
+    outward_m_s = -(edges.inward @ velocity_m_s[:2])
+    return [
+        _speed_towards(slack_m, speed_m_s, limits)
+        for slack_m, speed_m_s in zip(slacks_m.tolist(), outward_m_s.tolist(), strict=True)
+    ]
 
 
 def _speed_towards(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
@@ -329,14 +337,15 @@ def _speed_towards(slack_m: float, speed_m_s: float, limits: MotionLimits) -> fl
     return min(approach_speed(slack_m, limits), max(slack_m - stopping_m, 0.0) / _SLACK_TIME_S)
 
 
-def _limit_towards(velocity: F64, directions: F64, caps: Sequence[float]) -> F64:
-    """`velocity` (2,) with at most `caps` (n,), 0 or more, along each of `directions` (n, 2)."""
+def _limit_towards(velocity: F64, directions: Iterable[F64], caps: Sequence[float]) -> F64:
+    """`velocity` (2,) with at most `caps`, 0 or more, along each of `directions` (2,)."""
     limited = velocity
-    for direction, cap in zip(directions, caps, strict=True):
+    pairs = list(zip(directions, caps, strict=True))
+    for direction, cap in pairs:
         limited = limited - direction * max(float(direction @ limited) - cap, 0.0)
     # Where directions oppose each other, mending one breaks another: the whole vector gives way.
     share = 1.0
-    for direction, cap in zip(directions, caps, strict=True):
+    for direction, cap in pairs:
         speed = float(direction @ limited)
         if speed > cap + _ROUNDING_M_S:
             share = min(share, cap / speed)

@@ -5,6 +5,7 @@ the key, the value and what is allowed.
 """
 
 import math
+import re
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,14 +22,21 @@ from edge.runtime.pac import PacParameters, PayloadType
 
 @dataclass(frozen=True, slots=True)
 class AutopilotConfig:
-    """Where PX4 is (`url` as MAVSDK has it, e.g. udpin://127.0.0.1:14551), and which one."""
+    """Where PX4's datagrams come in (`url`, e.g. udpin://127.0.0.1:14551), and which one it is."""
 
     url: str
     system_id: int
 
     def __post_init__(self) -> None:
+        if re.fullmatch(r"udpin://[^:/]+:\d{1,5}", self.url) is None:
+            raise ValueError(f"url = {self.url!r}: must be udpin://ADDRESS:PORT")
         if not 1 <= self.system_id <= 255:
             raise ValueError(f"system_id = {self.system_id}: must be from 1 to 255")
+
+    @property
+    def port(self) -> int:
+        """The UDP port of `url`."""
+        return int(self.url.rsplit(":", 1)[1])
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,8 +61,8 @@ class FlightControl:
         self.obeyed_sequence = -1
         self.operator = ""
 
-    def tick(self, now_s: float) -> None:
-        """One tick: reads the newest of everything, sends at most one setpoint."""
+    def tick(self, now_s: float) -> bool:
+        """One tick: reads the newest of everything, sends at most one setpoint; whether it did."""
         vehicle = self._autopilot.state()
         ground, ground_age_s = self._inbox.ground(now_s)
         if ground is not None:
@@ -103,6 +103,7 @@ class FlightControl:
             flight = decision.flight
             _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
         self._record(inputs, setpoint, sent, decision.actions)
+        return sent is not None
 
     def leave(self, on_stop: Action) -> Action | None:
         """The program ends: what it asks of the vehicle it was flying; None if it was not."""

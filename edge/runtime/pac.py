@@ -137,9 +137,12 @@ class Pac:
         self.frame_id = 0
 
     def forget(self) -> None:
-        """Start anew: no explored map, no messages, no action. From any thread."""
+        """Start anew: no explored map and no messages. From any thread.
+
+        The last action is left to the next tick of the policy, so that the robot need not stop.
+        """
         self._forget_map = True
-        self._features = self._action = None
+        self._features = None
         self.mailbox.clear()
 
     def receive(self, data: bytes, now_s: float, unix_now_s: float) -> Rejection | None:

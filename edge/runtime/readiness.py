@@ -89,6 +89,7 @@ class Readiness:
         odometry: Odometry | None,
         peers: Sequence[HeardStatus],
         duplicate: bool,
+        watchdog_alive: bool,
         ground_age_s: float,
         ground_clock_offset_s: float | None,
     ) -> Checks:
@@ -116,7 +117,10 @@ class Readiness:
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             ground_clock_offset_s=ground_clock_offset_s,
         )
-        return Checks(failed_checks(inputs, config.preflight), now_s)
+        failed = failed_checks(inputs, config.preflight)
+        if not watchdog_alive:
+            failed = (*failed, "watchdog has ended: start this robot's program again")
+        return Checks(failed, now_s)
 
     def _read(self) -> bool:
         """Whether everything is as it must be."""
@@ -129,7 +133,9 @@ class Readiness:
             self._parameter_problems = None
             return False
         self._parameter_problems = check_parameters(self._requirements, values)
-        self.explanations = explain(values)
+        timeout_s = self._config.flight.command_timeout_s
+        hang = f"if this program hangs, its watchdog lets PX4 hold, {timeout_s:g} s later"
+        self.explanations = (hang, *explain(values))
         return not self._parameter_problems
 
     def _set_wrong(self, values: dict[str, int | float | None]) -> bool:

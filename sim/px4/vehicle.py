@@ -410,9 +410,10 @@ class Px4Vehicle:
         if action is Action.STOP_MOTORS:
             self.disarm(force=True)
             return
-        # Time for a pilot to take over; without a position there is none.
+        # Time for a pilot to take over; a mode that lost what it needs is left at once.
         waiting = self.time_s - self._failsafe_since_s < self.parameters["COM_FAIL_ACT_T"]
-        if waiting and action in (Action.RETURN, Action.LAND) and self.position_valid:
+        delayed = cause not in ("offboard signal lost", "position lost")
+        if waiting and delayed and action in (Action.RETURN, Action.LAND):
             action = Action.HOLD
         mode = ACTION_MODES.get(action, self.intended_mode)
         # A landing or return that was asked for goes on under a milder failsafe.

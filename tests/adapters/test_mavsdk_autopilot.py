@@ -551,8 +551,12 @@ def test_a_program_that_stands_still_stops_the_vehicle() -> None:
             assert each.stdout.readline() == "flying\n"
         programs[0].send_signal(signal.SIGSTOP)
         programs[2].kill()
-        landing = lambda: all(vehicle.mode is Px4Mode.LAND for vehicle in vehicles)  # noqa: E731
-        assert server.wait_for(landing, 20.0)
+        have_waited = server.wait_for(
+            lambda: all(v.time_s > h[-1][0] + 2.0 for v, h in zip(vehicles, heard, strict=True)),
+            20.0,
+        )
+        assert have_waited
+        assert {vehicle.mode for vehicle in vehicles} == {Px4Mode.LAND}
     for vehicle, setpoints in zip(vehicles, heard, strict=True):
         last_s, last = setpoints[-1]
         assert last.velocity_m_s[0] == 1.0

@@ -32,7 +32,7 @@ def test_what_is_set_is_safe(rc: RemoteControl) -> None:
         "RETURN" in text or "STOP" in text or "NOT" in text for text in explain(safe(rc))
     )
     assert line("program dies", parameters).endswith(
-        "0.5 s after the last command land where it is; it obeys again when commands come"
+        "land where it is, 1 s after the last command; it obeys again when commands come"
     )
 
 
@@ -50,8 +50,9 @@ def test_what_is_required_can_be_set_and_is_read(rc: RemoteControl) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("COM_OF_LOSS_T", 1.0, "COM_OF_LOSS_T = 1; wanted is above 0.2 and up to 0.5"),
-        ("COM_OF_LOSS_T", 0.1, "COM_OF_LOSS_T = 0.1"),
+        ("COM_OF_LOSS_T", 0.5, "COM_OF_LOSS_T = 0.5; wanted is above 0.7 and up to 1.5"),
+        ("COM_OF_LOSS_T", 2.0, "COM_OF_LOSS_T = 2"),
+        ("COM_OBL_RC_ACT", 5, "COM_OBL_RC_ACT = 5 (hold where it is); wanted is 4"),
         ("COM_OBL_RC_ACT", 3, "COM_OBL_RC_ACT = 3 (RETURN to where it was armed"),
         ("COM_OBL_RC_ACT", 7, "COM_OBL_RC_ACT = 7 (STOP ITS MOTORS and fall)"),
         ("COM_FAIL_ACT_T", 25.0, "COM_FAIL_ACT_T = 25"),
@@ -101,8 +102,8 @@ def test_a_parameter_that_the_vehicle_does_not_have_is_a_problem_unless_it_is_ne
 
 
 def test_values_as_32_bit_floats_are_allowed() -> None:
-    requirements = required("pilot", 25.0, command_timeout_s=0.3)
-    parameters = {**safe("pilot"), "COM_OF_LOSS_T": 0.30000001192092896}
+    requirements = required("pilot", 25.0)
+    parameters = {**safe("pilot"), "BAT_CRIT_THR": 0.4000000059604645, "BAT_LOW_THR": 0.45}
     assert check(requirements, parameters) == ()
 
 

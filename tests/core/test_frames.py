@@ -226,6 +226,16 @@ def test_a_wrong_mission_frame_says_what_is_allowed(
     assert str(error.value) == said
 
 
+@settings(deadline=None)
+@given(number(-500.0, 500.0), number(-500.0, 500.0), number(0.0, 6.28))
+def test_a_place_of_the_mission_frame_is_found_on_the_earth(
+    x_m: float, y_m: float, heading_rad: float
+) -> None:
+    frame = MissionFrame(39.95, -75.16, heading_rad)
+    origin_m = frame.relative_to(*frame.to_global_deg(x_m, y_m)).local_origin_m
+    np.testing.assert_allclose(origin_m, (x_m, y_m, 0.0), atol=1e-6)
+
+
 def test_a_wrong_local_origin_says_what_is_allowed() -> None:
     with pytest.raises(
         ValueError, match=r"^local origin latitude = nan deg: must be in \[-90, 90\]$"

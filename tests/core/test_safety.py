@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
+from edge.core.mailbox import Neighbour
 from edge.core.safety import (
     Closest,
     Fence,
     MotionLimits,
-    MovingNeighbour,
     approach_speed,
     brake,
     hold_height,
@@ -21,6 +21,7 @@ from edge.core.safety import (
     leash,
     limit_acceleration,
     limit_speed,
+    nearest,
 )
 from edge.core.schema import ConfigError, from_mapping
 
@@ -308,83 +309,83 @@ def test_approach_speed_is_the_largest_that_the_distance_is_enough_for(
     assert needed_m == pytest.approx(max(distance_m, 0.0), abs=1e-9)
 
 
-def neighbour(robot_id: int, *position_m: float, **at: object) -> MovingNeighbour:
-    return MovingNeighbour(robot_id, position_m, **({"velocity_m_s": AT_REST, "age_s": 0.0} | at))  # type: ignore[arg-type]
+def neighbour(robot_id: int, *position_m: float, **at: object) -> Neighbour:
+    return Neighbour(robot_id, position_m, **({"velocity_m_s": AT_REST, "age_s": 0.0} | at))  # type: ignore[arg-type]
 
 
 def test_the_way_towards_a_neighbour_is_slowed_and_no_other() -> None:
     wanted = np.array([2.0, 1.0, 0.5])
-    command, closest = brake(AT_REST, AT_REST, wanted, [neighbour(7, 3.0, 0.0, 0.0)], 3.0, LIMITS)
+    command = brake(AT_REST, AT_REST, wanted, [neighbour(7, 3.0, 0.0, 0.0)], 3.0, LIMITS, None)
     np.testing.assert_allclose(command, [0.0, 1.0, 0.5], atol=1e-9)
-    assert closest == Closest(7, 3.0)
-    away, _ = brake(AT_REST, AT_REST, -wanted, [neighbour(7, 1.0, 0.0, 0.0)], 3.0, LIMITS)
+    away = brake(AT_REST, AT_REST, -wanted, [neighbour(7, 1.0, 0.0, 0.0)], 3.0, LIMITS, None)
     np.testing.assert_array_equal(away, -wanted)
 
 
 def test_robots_cross_in_their_height_slots() -> None:
     wanted = np.array([2.0, 0.0, 0.0])
     above = neighbour(2, 0.5, 0.0, 2.0)
-    command, closest = brake(AT_REST, AT_REST, wanted, [above], 2.0, LIMITS)
+    command = brake(AT_REST, AT_REST, wanted, [above], 2.0, LIMITS, None)
     np.testing.assert_array_equal(command, wanted)
-    assert closest is not None
-    assert closest.distance_m == pytest.approx(math.hypot(0.5, 2.0))
     # Nearer in height, it needs as much horizontally as is missing.
-    command, _ = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.3, 0.0, 1.5)], 2.0, LIMITS)
+    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.3, 0.0, 1.5)], 2.0, LIMITS, None)
     assert command[0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_nearest_neighbour_is_where_it_has_flown_to_since() -> None:
     near = neighbour(1, 5.0, 0.0, 0.0, velocity_m_s=(10.0, 0.0, 0.0), age_s=1.0)
     far = neighbour(2, 0.0, 12.0, 0.0, velocity_m_s=(0.0, -4.0, 0.0), age_s=0.5)
-    _, closest = brake(AT_REST, AT_REST, AT_REST, [near, far], 2.0, LIMITS)
-    assert closest == Closest(2, 10.0)
-    assert brake(AT_REST, AT_REST, AT_REST, [], 2.0, LIMITS)[1] is None
+    assert nearest((0.0, 0.0, 0.0), [near, far]) == Closest(2, 10.0)
+    assert nearest((0.0, 0.0, 0.0), []) is None
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.data())
-def test_robots_at_one_height_that_all_fly_to_one_point_keep_their_separation(
+def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
     data: st.DataObject,
 ) -> None:
     limits, separation_m = data.draw(motion_limits), data.draw(number(1.0, 4.0))
-    count = data.draw(st.integers(2, 4))
-    turn = data.draw(number(0.0, math.tau))
+    fence = Fence(((-16.0, -12.0), (16.0, -12.0), (0.0, 24.0)), 1.0, 3.0, 25.0)
+    corners = ((-11.0, -10.0), (11.0, -10.0), (0.0, 16.0), (0.0, 0.0))
+    starts = data.draw(st.permutations(corners))[: data.draw(st.integers(2, 4))]
+    goal = np.array(data.draw(st.tuples(number(-20.0, 20.0), number(-20.0, 30.0))))
     vehicles = [
-        Vehicle(
-            np.array(
-                [radius * math.cos(turn + k * 1.57), radius * math.sin(turn + k * 1.57), 10.0]
-            ),
-            limits.lag_s,
-            limits.max_acceleration_m_s2,
-        )
-        for k, radius in enumerate(
-            data.draw(st.lists(number(8.0, 20.0), min_size=count, max_size=count))
-        )
+        Vehicle(np.array([*xy, 10.0]), limits.lag_s, limits.max_acceleration_m_s2) for xy in starts
     ]
-    told = [AT_REST] * count
+    told = [AT_REST] * len(vehicles)
     for _ in range(200):
         heard = [
             neighbour(k, *vehicle.position_m, velocity_m_s=vehicle.velocity_m_s)
             for k, vehicle in enumerate(vehicles)
         ]
         for own, vehicle in enumerate(vehicles):
-            wanted = np.append(
-                limit_speed(-10.0 * vehicle.position_m[:2], limits.max_speed_m_s), 0.0
-            )
+            position_m, velocity_m_s = vehicle.position_m, vehicle.velocity_m_s
+            wanted = limit_speed(10.0 * (goal - position_m[:2]), limits.max_speed_m_s)
             told[own] = limit_acceleration(
-                told[own], wanted, limits.max_acceleration_m_s2, CONTROL_S
+                told[own], np.append(wanted, 0.0), limits.max_acceleration_m_s2, CONTROL_S
             )
-            command, closest = brake(
-                vehicle.position_m,
-                vehicle.velocity_m_s,
-                told[own],
-                [other for other in heard if other.robot_id != own],
-                separation_m,
-                limits,
+            inside, recovering = keep_inside(
+                fence, position_m, velocity_m_s, told[own], limits, False
             )
+            others = [other for other in heard if other.robot_id != own]
+            closest = nearest(position_m.tolist(), others)
+            command = brake(position_m, velocity_m_s, inside, others, separation_m, limits, fence)
             vehicle.fly(command, AT_REST)
+            assert not recovering
+            assert fence.distance_m(*vehicle.position_m[:2]) > 0.5 * fence.buffer_m
             assert closest is not None
             assert closest.distance_m > 0.9 * separation_m
+
+
+def test_giving_way_to_a_neighbour_leads_over_no_edge() -> None:
+    """Beside the fence, with a neighbour on the inner side ahead."""
+    at_the_buffer = np.array([2.0, 16.0, 10.0])
+    ahead = neighbour(3, 3.0, 17.5, 10.0)
+    wanted = np.array([0.0, 1.0, 0.0])
+    free = brake(at_the_buffer, AT_REST, wanted, [ahead], 2.0, LIMITS, None)
+    assert free[0] < -0.1
+    command = brake(at_the_buffer, AT_REST, wanted, [ahead], 2.0, LIMITS, FENCE)
+    assert command[0] > -1e-6
+    assert command @ (1.0, 1.5, 0.0) < 1e-6
 
 
 @given(vectors(10.0), vectors(10.0), number(0.1, 5.0), number(0.0, 1.0))
@@ -419,8 +420,9 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
     command, _ = keep_inside(FENCE, a, b, c, LIMITS, False)
     assert np.isfinite(command).all()
     assert usable or not command.any()
-    for other in (MovingNeighbour(1, AT_REST, AT_REST, d), MovingNeighbour(1, a, b, 0.1)):
-        command, closest = brake(a, b, c, [other], 2.0, LIMITS)
+    for other in (Neighbour(1, AT_REST, AT_REST, d), Neighbour(1, a, b, 0.1)):
+        command = brake(a, b, c, [other], 2.0, LIMITS, FENCE)
+        closest = nearest(AT_REST, [other])
         assert np.isfinite(command).all()
         assert usable or not command.any()
         assert closest is None or math.isfinite(closest.distance_m)
@@ -434,8 +436,7 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
 
 def test_an_unknown_neighbour_stops_the_robot_and_hides_no_other() -> None:
     lost = neighbour(1, math.nan, 0.0, 0.0)
-    command, closest = brake(
-        AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), [lost, neighbour(2, 9.0, 0, 0)], 2.0, LIMITS
-    )
+    others = [lost, neighbour(2, 9.0, 0.0, 0.0)]
+    command = brake(AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), others, 2.0, LIMITS, None)
     assert not command.any()
-    assert closest == Closest(2, 9.0)
+    assert nearest((0.0, 0.0, 0.0), others) == Closest(2, 9.0)

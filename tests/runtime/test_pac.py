@@ -248,14 +248,14 @@ def test_a_bundle_without_perception_drives_no_robot(shipped_bundle: Bundle) -> 
         make_robot(blind, World())
 
 
-def test_a_new_mission_forgets_map_messages_and_action(shipped_policy: Policy) -> None:
+def test_a_new_mission_forgets_map_and_messages(shipped_policy: Policy) -> None:
     flown, fresh = (make_robot(shipped_policy, World()) for _ in range(2))
     flown.receive(message(shipped_policy), 0.0, 0.0)
     flown.perceive(0.0)
     assert flown.infer(0.0, 0.0) is not None
     flown.forget()
-    assert flown.control(0.0) is None
     assert flown.mailbox.neighbours(0.0) == ()
+    assert flown.infer(0.1, 0.1) is None  # no features yet
     dark = World(seen=np.zeros((64, 64), np.float32))
     for robot in (flown, fresh):
         robot._sensor = dark

@@ -1,0 +1,402 @@
+"""A whole fleet on this machine: vehicles, one `lpac robot run` process each, and an operator."""
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.frames import LocalTransform
+from edge.core.mission import Origin
+from edge.core.safety import Fence
+from edge.core.world import Feature, format_world, random_features
+from edge.runtime.bundle import BundleError, load_bundle
+from sim.experiment import FIELD_SCALE
+from sim.fleet_vehicles import Autopilot, SimulatedVehicles, Vehicles, free_ports
+from sim.operator import Operator, Say
+from sim.px4.vehicle import Px4Vehicle
+from sim.px4.world import WorldOrigin
+from sim.px4_build import Px4Build
+
+MAX_ROBOTS = 20
+MIN_APART_M = 3.0
+STOP_WITHIN_S = 3.0
+
+# The field is the policy's world; its y axis does not point north, so that mistakes show.
+WORLD = WorldOrigin()
+ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
+
+_BASE_HEIGHT_M = 4.0
+_SLOT_SPACING_M = 2.0
+# Robots stop half a metre outside the field, with the fence 1.5 m further out.
+_FENCE_BEYOND_FIELD_M = 2.0
+_FENCE_BUFFER_M = 1.5
+_PAD_INSIDE_FIELD_M = 2.0
+_PAD_TRIALS = 20_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetScenario:
+    """A flight of a fleet; everything random in it but the timing follows from `seed`.
+
+    The world is that of a `sim.experiment.Scenario` with the same seed. Without `gps_bias` the
+    simulated vehicles' estimates are off by noise alone.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    robots: int = 10
+    seed: int = 0
+    duration_s: float = 60.0
+    features: tuple[Feature, ...] | None = None
+    random_feature_count: int = 10
+    gps_bias: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.robots <= MAX_ROBOTS:
+            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
+        if self.seed < 0:
+            raise ValueError(f"seed = {self.seed}: must be at least 0")
+        if not 0.0 < self.duration_s < math.inf:
+            raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
+        if self.random_feature_count < 0:
+            raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
+
+
+class Usage(NamedTuple):
+    """What a process took so far: processor time, s, and its greatest resident memory, MB."""
+
+    cpu_s: float
+    peak_memory_mb: float
+
+
+class RobotProcess:
+    """One `lpac robot run`; `folder` holds robot.toml, what it prints (robot.log), its flight log.
+
+    `running` tells whether it has not ended yet.
+    """
+
+    def __init__(self, robot_id: int, folder: Path) -> None:
+        self.robot_id = robot_id
+        self.folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        self._first_start_unix_s = math.inf
+
+    def start(self) -> None:
+        """Start the program, also again after it has ended."""
+        first = self._process is None
+        if first:
+            self._first_start_unix_s = time.time()
+        with (self.folder / "robot.log").open("wb" if first else "ab") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "cli.main", "robot", "run",
+                 "--config", str(self.folder / "robot.toml")],
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                # Ctrl-C is for the launcher alone, which lands the vehicles first.
+                process_group=0,
+            )  # fmt: skip
+
+    @property
+    def running(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        """Raises RuntimeError if the program was never started."""
+        if self._process is None:
+            raise RuntimeError(f"robot {self.robot_id} was not started")
+        return self._process.pid
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send a signal; nothing happens if the program has ended."""
+        if self._process is not None:
+            self._process.send_signal(number)
+
+    def wait(self, timeout_s: float) -> int | None:
+        """The exit code once the program has ended, None if it has not within the time."""
+        assert self._process is not None
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def usage(self) -> Usage:
+        """Nothing if the program has ended."""
+        return process_usage(self.pid) if self.running else Usage(0.0, 0.0)
+
+    def logs(self) -> list[Path]:
+        """The flight logs of these starts, the oldest first; the folder may have older ones."""
+        return sorted(
+            path
+            for path in (self.folder / "logs").rglob("*.mcap")
+            if path.stat().st_mtime >= self._first_start_unix_s
+        )
+
+    def last_words(self) -> str:
+        """The last line that the program printed."""
+        log = self.folder / "robot.log"
+        lines = log.read_text(errors="replace").split("\n") if log.exists() else []
+        return next((line for line in reversed(lines) if line.strip()), "it printed nothing")
+
+
+def process_usage(pid: int) -> Usage:
+    """What a process of this machine took so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    ticks = int(fields[11]) + int(fields[12])
+    status = Path(f"/proc/{pid}/status").read_text()
+    peak_kb = next(
+        (int(w[1]) for w in map(str.split, status.split("\n")) if w[:1] == ["VmHWM:"]), 0
+    )
+    return Usage(ticks / os.sysconf("SC_CLK_TCK"), peak_kb / 1024.0)
+
+
+class Fleet:
+    """Vehicles, robots and an operator: a context, in which all of them run.
+
+    `robots[i]` is robot i's process, `operator` speaks to all. `simulated` are the vehicles
+    themselves, for whoever wants to do something to them; None where they are real PX4.
+    `pads_m` (N, 2) is where they really stand, `landing_points_m` (N, 2) where they return to, both
+    in the mission frame. `endpoints` are the robots' zenoh addresses, `name` the fleet's.
+    """
+
+    def __init__(
+        self,
+        scenario: FleetScenario,
+        folder: Path,
+        bundle_path: Path,
+        *,
+        px4_build: Path | None = None,
+        say: Say = lambda _: None,
+    ) -> None:
+        """Prepare the fleet in `folder`: world, and a folder for each robot. Starts nothing.
+
+        With `px4_build` the vehicles are real PX4s of that build folder.
+
+        Raises ValueError if that one is no build, or there is no room for so many robots;
+        BundleError for a bundle that cannot be loaded, or has no perception.
+        """
+        self.bundle = load_bundle(bundle_path)
+        perception, training = self.bundle.manifest.perception, self.bundle.manifest.training
+        if perception is None:
+            raise BundleError(f"{bundle_path}: the bundle has no perception: it cannot fly")
+        self.scenario = scenario
+        self._bundle_path = bundle_path.resolve()
+        self.folder = folder.resolve()
+        self.field_m = perception.world_size / FIELD_SCALE.env_scale
+        self.max_speed_m_s = training.max_speed * FIELD_SCALE.velocity_scale
+        self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
+            WORLD.latitude_deg, WORLD.longitude_deg
+        )
+        self.fence = _fence(self.field_m, scenario.robots)
+        self.features = scenario.features
+        if self.features is None:
+            self.features = random_features(
+                # The first of the children that sim.experiment draws from.
+                np.random.default_rng(np.random.SeedSequence(scenario.seed).spawn(1)[0]),
+                scenario.random_feature_count,
+                perception.world_size,
+            )
+        self.vehicles: Vehicles
+        self.simulated: SimulatedVehicles | None = None
+        if px4_build is None:
+            self.pads_m, self.landing_points_m, drawn = self._draw_vehicles()
+            self.vehicles = self.simulated = SimulatedVehicles(drawn)
+        else:
+            self.pads_m = self.landing_points_m = self._draw_pads(np.zeros((scenario.robots, 2)))
+            self.vehicles = Px4Build(
+                px4_build, [self._to_world_m(pad_m) for pad_m in self.pads_m], WORLD,
+                self.folder / "px4",
+            )  # fmt: skip
+        with free_ports(scenario.robots, socket.SOCK_STREAM) as ports:
+            self.endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
+            self.name = f"sim-{ports[0]}"
+        self.robots = tuple(
+            RobotProcess(robot, self.folder / "robots" / str(robot))
+            for robot in range(scenario.robots)
+        )
+        self.operator = Operator(fleet=self.name, connect=self.endpoints, say=say)
+        self._say = say
+        self._stack = ExitStack()
+        self._write_files()
+
+    def __enter__(self) -> Self:
+        """Start everything. Raises OSError or LinkError if a port is taken."""
+        with ExitStack() as stack:
+            stack.enter_context(self.vehicles)
+            stack.enter_context(self.operator)
+            stack.callback(self._stop_robots)
+            for robot in self.robots:
+                robot.start()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stack.__exit__(kind, error, traceback)
+
+    def require_running(self) -> None:
+        """Raises RuntimeError with the last words of a robot's program that has ended."""
+        for robot in self.robots:
+            if not robot.running:
+                raise RuntimeError(
+                    f"the program of robot {robot.robot_id} has ended: {robot.last_words()}"
+                )
+
+    def true_positions_m(self) -> F64:
+        """Where simulated vehicles really are: the mission frame, (N, 3)."""
+        assert self.simulated is not None
+        with self.simulated.stepped:
+            world_m = [vehicle.position_m for vehicle in self.simulated.vehicles]
+        return np.array([self.to_mission.local_to_mission(place_m) for place_m in world_m])
+
+    def _stop_robots(self) -> None:
+        running = [robot for robot in self.robots if robot.running]
+        for robot in running:
+            robot.send_signal(signal.SIGTERM)
+            robot.send_signal(signal.SIGCONT)
+        until_s = time.monotonic() + STOP_WITHIN_S
+        for robot in running:
+            if robot.wait(max(0.0, until_s - time.monotonic())) is None:
+                self._say(f"robot {robot.robot_id} did not end within {STOP_WITHIN_S:g} s: killed")
+                robot.send_signal(signal.SIGKILL)
+                robot.wait(STOP_WITHIN_S)
+
+    # Where everything stands
+
+    def _draw_vehicles(self) -> tuple[F64, F64, list[Px4Vehicle]]:
+        """Pads, landing points, vehicles. A robot lands where it takes its own pad to be."""
+        robots = self.scenario.robots
+        seeds = np.random.SeedSequence([self.scenario.seed, robots]).generate_state(robots).tolist()
+        # Both places of a vehicle and its pad: a vehicle's bias is drawn before it has a place.
+        biases_m = np.zeros((robots, 2))
+        if self.scenario.gps_bias:
+            biases_m = np.array([self._horizontal(Px4Vehicle(seed=s).gps_bias_m) for s in seeds])
+        pads_m = self._draw_pads(biases_m)
+        headings_rad = np.random.default_rng(seeds).uniform(0.0, math.tau, robots).tolist()
+        vehicles = []
+        for seed, pad_m, heading_rad in zip(seeds, pads_m, headings_rad, strict=True):
+            north_m, east_m = self._to_world_m(pad_m)
+            vehicle = Px4Vehicle(
+                seed=seed, start_m=(north_m, east_m), heading_rad=heading_rad, origin=WORLD
+            )
+            if not self.scenario.gps_bias:
+                vehicle.gps_bias_m = np.zeros(3)
+            vehicles.append(vehicle)
+        return pads_m, pads_m + biases_m, vehicles
+
+    def _draw_pads(self, biases_m: F64) -> F64:
+        """Pads (N, 2) apart from each other, both in truth and as the robots see them."""
+        rng = np.random.default_rng([self.scenario.seed, 1])
+        lowest_m, highest_m = _PAD_INSIDE_FIELD_M, self.field_m - _PAD_INSIDE_FIELD_M
+        pads_m: list[F64] = []
+        seen_m: list[F64] = []
+        for _ in range(_PAD_TRIALS):
+            if len(pads_m) == len(biases_m):
+                return np.array(pads_m)
+            pad_m = rng.uniform(lowest_m, highest_m, 2)
+            pad_seen_m = pad_m + biases_m[len(pads_m)]
+            inside = (pad_seen_m > lowest_m).all() and (pad_seen_m < highest_m).all()
+            if inside and _apart(pad_m, pads_m) and _apart(pad_seen_m, seen_m):
+                pads_m.append(pad_m)
+                seen_m.append(pad_seen_m)
+        raise ValueError(
+            f"robots = {len(biases_m)}: there is no room for their pads on {self.field_m:g} x "
+            f"{self.field_m:g} m"
+        )
+
+    def _horizontal(self, vector_m: F64) -> F64:
+        """A vector (3,) of the world, along the mission axes: (2,)."""
+        turned: F64 = self.to_mission.velocity_to_mission(vector_m)[:2]
+        return turned
+
+    def _to_world_m(self, place_m: F64) -> tuple[float, float]:
+        """North and east, m, of a place (2,) of the mission frame."""
+        north_m, east_m, _ = self.to_mission.mission_to_local(np.array([*place_m, 0.0])).tolist()
+        return north_m, east_m
+
+    # What the robots read
+
+    def _write_files(self) -> None:
+        assert self.features is not None
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "world.env").write_text(format_world(self.features))
+        for robot, autopilot in zip(self.robots, self.vehicles.autopilots, strict=True):
+            robot.folder.mkdir(parents=True, exist_ok=True)
+            config = _toml(self._config(robot.robot_id, autopilot))
+            (robot.folder / "robot.toml").write_text(config)
+
+    def _config(self, robot: int, autopilot: Autopilot) -> dict[str, object]:
+        return {
+            "fleet": self.name,
+            "robot_id": robot,
+            "on_stop": "land",
+            "policy": {
+                "bundle": str(self._bundle_path),
+                "world": "../../world.env",
+                "env_scale": FIELD_SCALE.env_scale,
+                "velocity_scale": FIELD_SCALE.velocity_scale,
+            },
+            "autopilot": {"url": autopilot.url, "system_id": autopilot.system_id},
+            "link": {
+                "listen": [self.endpoints[robot]],
+                "connect": list(self.endpoints[:robot]),
+            },
+            "flight": {
+                "slot": robot,
+                "base_height_m": _BASE_HEIGHT_M,
+                "slot_spacing_m": _SLOT_SPACING_M,
+                "landing_point_m": [round(c, 3) for c in self.landing_points_m[robot].tolist()],
+            },
+            "fence": {
+                "vertices_m": [list(vertex) for vertex in self.fence.vertices_m],
+                "buffer_m": self.fence.buffer_m,
+                "floor_m": self.fence.floor_m,
+                "ceiling_m": self.fence.ceiling_m,
+            },
+            "limits": {
+                "max_speed_m_s": self.max_speed_m_s,
+                "max_climb_m_s": 2.0,
+                "max_acceleration_m_s2": 2.0,
+                "lag_s": 1.3,
+            },
+            "failsafe": {"rc": "none", "parameters": "set"},
+        }
+
+
+def _fence(field_m: float, robots: int) -> Fence:
+    low_m, high_m = -_FENCE_BEYOND_FIELD_M, field_m + _FENCE_BEYOND_FIELD_M
+    return Fence(
+        vertices_m=((low_m, low_m), (high_m, low_m), (high_m, high_m), (low_m, high_m)),
+        buffer_m=_FENCE_BUFFER_M,
+        floor_m=_BASE_HEIGHT_M / 2.0,
+        ceiling_m=_BASE_HEIGHT_M + robots * _SLOT_SPACING_M + 2.0,
+    )
+
+
+def _apart(place_m: F64, others_m: Sequence[F64]) -> bool:
+    return all(math.dist(place_m, other_m) >= MIN_APART_M for other_m in others_m)
+
+
+def _toml(config: Mapping[str, object]) -> str:
+    """TOML of plain values, and of tables of them; JSON's values are TOML's too."""
+    lines = [f"{k} = {json.dumps(v)}" for k, v in config.items() if not isinstance(v, dict)]
+    for name, table in config.items():
+        if isinstance(table, dict):
+            lines += ["", f"[{name}]", *(f"{k} = {json.dumps(v)}" for k, v in table.items())]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,1165 @@
+"""The state machine flies a scripted vehicle, tick by tick, with guidance in the loop.
+
+Every test with a `world` is a scenario: it runs once as it is, and again with telemetry that is up
+to a second late on top of coming once a second.
+"""
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from inspect import signature
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.core.flight import (
+    TRANSITIONS,
+    Decision,
+    Flight,
+    FlightInputs,
+    FlightParameters,
+    Robot,
+    Transition,
+    step,
+)
+from edge.core.guidance import Guidance, MissionPosition, MissionSetpoint, guide
+from edge.core.mission import Calm, FlightState, GroundState, Order, OrderKind, OrderResult, Origin
+from edge.core.ports import Odometry
+from edge.core.safety import Closest, Fence, MotionLimits
+from edge.core.vehicle import Action, ActionResult, Mode, VehicleState
+
+TICK_S = 0.1
+PERIOD_S = 1.0
+ZERO_M = 7.3  # The estimator's zero is not the pad.
+NOT_OURS = (
+    FlightState.INIT,
+    FlightState.IDLE,
+    FlightState.PREFLIGHT,
+    FlightState.LANDED,
+    FlightState.PILOT,
+    FlightState.FAULT,
+)
+AIRBORNE = (
+    FlightState.TAKEOFF,
+    FlightState.HOLD,
+    FlightState.MISSION,
+    FlightState.RETURN,
+    FlightState.LAND,
+)
+SAFETY_PAGE = Path(__file__).parents[2] / "docs" / "safety.md"
+
+FENCE = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 1.0, 30.0)
+ROBOT = Robot(
+    robot_id=3,
+    boot_nonce=77,
+    parameters=FlightParameters(slot=1, landing_point_m=(10.0, 12.0)),
+    fence=FENCE,
+    limits=MotionLimits(2.0, 1.5, 1.5, 1.3),
+)
+SLOT_M = ROBOT.parameters.slot_height_m
+
+
+class World:
+    """One robot's decisions, a crude PX4, and a ground; `heartbeats` come `latency_s` late."""
+
+    def __init__(self, phase_s: float = 0.35, latency_s: float = 0.1) -> None:
+        self.now_s = 100.0
+        self.latency_s = latency_s
+        self.next_beat_s = self.now_s + phase_s
+        # The vehicle, as it really is.
+        self.mode = self.intended = Mode.HOLD
+        self.armed = False
+        self.position_m = np.array([16.0, 14.0, 0.0])
+        self.velocity_m_s = np.zeros(3)
+        self.sticks_m_s = np.zeros(3)
+        self.landed_at_s: float | None = self.now_s
+        self.setpoint: MissionSetpoint | None = None
+        self.setpoint_at_s = -math.inf
+        self.commands: list[Action] = []
+        self.refuses: dict[Action, str] = {}
+        self.heavy = False
+        self.watchdog = True
+        # What is heard of it.
+        self.telemetry = True
+        self.position_known = True
+        self.battery = 0.9
+        self.beats: list[tuple[float, Mode, bool, bool]] = []
+        self.heard = VehicleState(origin_deg=(47.0, 8.0), position_ok=True, height_above_home_m=0)
+        # The rest of the inputs.
+        self.ground: GroundState | None = None
+        self.ground_on = True
+        self.ground_at_s = -math.inf
+        self.policy_m_s: np.ndarray | None = np.array([1.0, 0.0])
+        self.closest: Closest | None = None
+        self.busy: tuple[int, ...] = ()
+        self.failed_checks: tuple[str, ...] | None = ()
+        self.order: Order | None = None
+        self.orders = 0
+        # The program, and what it did.
+        self.restart()
+        self.taken: list[Transition] = []
+        self.actions: list[tuple[float, Action]] = []
+        self.takeoffs = 0
+
+    def restart(self) -> None:
+        """The robot's program starts anew."""
+        self.flight, self.guidance = Flight(), Guidance()
+        self.started_s = self.now_s
+
+    # Time
+
+    def tick(self) -> Decision:
+        self._pass(TICK_S)
+        return self._decide(self._hear())
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            self.tick()
+
+    def until(self, state: FlightState, within_s: float) -> None:
+        for _ in range(round(within_s / TICK_S)):
+            self.tick()
+            if self.flight.state is state:
+                return
+        raise AssertionError(f"{self.flight.state}, not {state}: {self.flight.reason}")
+
+    def stop(self, seconds: float) -> None:
+        """The process is stopped and continued: its first tick knows nothing new."""
+        before = self._hear()
+        for _ in range(round(seconds / TICK_S)):
+            self._pass(TICK_S)
+            if self.watchdog and self.mode is Mode.OFFBOARD and self._silence_s > 0.5:
+                self.mode = self.intended = Mode.HOLD
+        connected = self.now_s - before.heartbeat_at_s < 2.5
+        known, self.position_known = self.position_known, False
+        ground_on, self.ground_on = self.ground_on, False
+        self._decide(replace(before, connected=connected))
+        self.position_known, self.ground_on = known, ground_on
+
+    # The ground
+
+    def enable(self, calm: Calm = "none") -> None:
+        self.ground = GroundState(1, "op", Origin(47.0, 8.0, 0.0), enabled=True, calm=calm)
+
+    def new_order(self, kind: OrderKind, trial: str = "") -> Order:
+        self.orders += 1
+        expires_s = self.now_s - self.started_s + 9.0
+        return Order(f"o{self.orders}", ROBOT.robot_id, 77, kind, expires_s, "op", trial)
+
+    def give(self, order: Order) -> OrderResult:
+        self.order = order
+        self.tick()
+        self.order = None
+        return next(a for a in reversed(self.flight.answers) if a.order_id == order.order_id)
+
+    def obey(self, kind: OrderKind, trial: str = "") -> None:
+        answer = self.give(self.new_order(kind, trial))
+        assert answer.accepted, answer.reason
+
+    def refuse(self, kind: OrderKind) -> str:
+        answer = self.give(self.new_order(kind))
+        assert not answer.accepted
+        return answer.reason
+
+    # A flight's beginning
+
+    def ready(self) -> None:
+        self.enable()
+        self.until(FlightState.PREFLIGHT, 6.0)
+
+    def hover(self) -> None:
+        self.ready()
+        self.obey("takeoff")
+        self.until(FlightState.HOLD, 25.0)
+        self.run(3.0)
+
+    def fly(self) -> None:
+        self.hover()
+        self.obey("start", "first")
+        assert self.flight.state is FlightState.MISSION
+        self.run(1.0)
+
+    def pilot(self, *sticks_m_s: float) -> None:
+        self.mode = self.intended = Mode.POSITION
+        self.sticks_m_s = np.array(sticks_m_s or (0.0, 0.0, 0.0))
+
+    @property
+    def height_m(self) -> float:
+        return float(self.position_m[2])
+
+    @property
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm(self.velocity_m_s))
+
+    # The vehicle
+
+    @property
+    def _silence_s(self) -> float:
+        return self.now_s - self.setpoint_at_s
+
+    def _pass(self, dt_s: float) -> None:
+        self.now_s += dt_s
+        for action in self.commands:
+            text = self._carry_out(action)
+            result = ActionResult(action, not text, text, self.now_s)
+            self.heard = replace(self.heard, result=result)
+        self.commands = []
+        if self.armed and self.intended is Mode.OFFBOARD:
+            # PX4's failsafe, which ends when setpoints come again.
+            self.mode = Mode.OFFBOARD if self._silence_s <= 1.0 else Mode.LAND
+        self._move(dt_s)
+        if self.now_s >= self.next_beat_s:
+            beat = (self.next_beat_s, self.mode, self.armed, self.armed and self.height_m > 0.1)
+            self.next_beat_s += PERIOD_S
+            if self.telemetry:
+                self.beats.append(beat)
+        if self.ground_on and self.ground is not None:
+            self.ground_at_s = self.now_s
+
+    def _carry_out(self, action: Action) -> str:
+        if action in self.refuses:
+            return self.refuses[action]
+        if action is Action.OFFBOARD:
+            if self._silence_s > 0.5:
+                return "no setpoints"
+            self.mode = self.intended = Mode.OFFBOARD
+        elif action is Action.ARM:
+            assert self.mode is Mode.OFFBOARD
+            self.armed = True
+        elif action is Action.HOLD:
+            self.mode = self.intended = Mode.HOLD
+        elif action is Action.LAND:
+            self.mode = self.intended = Mode.LAND
+        elif action is Action.DISARM:
+            if self.height_m > 0.0:
+                return "not landed"
+            self.armed = False
+        elif action is Action.KILL:
+            self.armed, self.position_m[2] = False, 0.0
+        return ""
+
+    def _move(self, dt_s: float) -> None:
+        wanted_m_s = np.zeros(3)
+        if self.armed and self.mode is Mode.LAND:
+            wanted_m_s[2] = -0.7
+        elif self.armed and self.mode is Mode.POSITION:
+            wanted_m_s = self.sticks_m_s
+        elif self.armed and self.mode is Mode.OFFBOARD and self.setpoint is not None:
+            if isinstance(self.setpoint, MissionPosition):
+                wanted_m_s = 0.95 * (np.array(self.setpoint.position_m) - self.position_m)
+            else:
+                wanted_m_s = np.array(self.setpoint.velocity_m_s)
+        self.velocity_m_s = self.velocity_m_s + 0.4 * (wanted_m_s - self.velocity_m_s)
+        if self.heavy:
+            self.velocity_m_s[2] = min(self.velocity_m_s[2], 0.0)
+        self.position_m = self.position_m + self.velocity_m_s * dt_s
+        if self.height_m > 0.0:
+            self.landed_at_s = None
+            return
+        self.position_m[2] = 0.0
+        self.velocity_m_s = np.zeros(3)
+        self.landed_at_s = self.now_s if self.landed_at_s is None else self.landed_at_s
+        if self.mode is Mode.LAND and self.now_s - self.landed_at_s > 2.0:
+            self.armed = False
+
+    # The robot
+
+    def _hear(self) -> VehicleState:
+        while self.beats and self.beats[0][0] + self.latency_s <= self.now_s:
+            at_s, mode, armed, in_air = self.beats.pop(0)
+            self.heard = replace(
+                self.heard, mode=mode, armed=armed, in_air=in_air, heartbeat_at_s=at_s
+            )
+        silence_s = self.now_s - self.heard.heartbeat_at_s
+        return replace(
+            self.heard,
+            connected=silence_s < 2.5,
+            battery=self.battery,
+            position_ok=self.position_known,
+            height_above_home_m=self.height_m,
+        )
+
+    def _decide(self, vehicle: VehicleState) -> Decision:
+        odometry = None
+        if self.position_known:
+            x_m, y_m, height_m = self.position_m.tolist()
+            vx, vy, vz = self.velocity_m_s.tolist()
+            odometry = Odometry((x_m, y_m, height_m + ZERO_M), (vx, vy, vz))
+        inputs = FlightInputs(
+            now_s=self.now_s,
+            vehicle=vehicle,
+            odometry=odometry,
+            policy_velocity_m_s=self.policy_m_s,
+            neighbours=(),
+            closest=self.closest,
+            busy_neighbours=self.busy,
+            ground=self.ground,
+            ground_age_s=self.now_s - self.ground_at_s,
+            failed_checks=self.failed_checks,
+            order=self.order,
+            uptime_s=self.now_s - self.started_s,
+        )
+        before = self.flight
+        decision = step(ROBOT, before, inputs)
+        self.flight = decision.flight
+        setpoint, self.guidance = guide(ROBOT, self.flight, inputs, self.guidance, TICK_S)
+        self._check(before, decision, setpoint)
+        self.commands += decision.actions
+        self.actions += [(self.now_s, action) for action in decision.actions]
+        if decision.taken is not None:
+            self.taken.append(decision.taken)
+        if setpoint is not None:
+            self.setpoint, self.setpoint_at_s = setpoint, self.now_s
+        return decision
+
+    def _check(self, before: Flight, decision: Decision, setpoint: MissionSetpoint | None) -> None:
+        """What holds in every tick of every flight."""
+        state = decision.flight.state
+        allowed = set(Action)
+        if state in NOT_OURS:
+            assert setpoint is None
+            allowed = {Action.DISARM} if before.state is FlightState.ARMING else set()
+            if decision.flight.killed:
+                allowed.add(Action.KILL)
+        assert set(decision.actions) <= allowed
+        if setpoint is not None:
+            assert all(math.isfinite(value) for value in setpoint[0])
+        if state is FlightState.ARMING and before.state is not FlightState.ARMING:
+            assert before.state is FlightState.PREFLIGHT
+            assert self.order is not None
+            assert self.order.kind == "takeoff"
+            self.takeoffs += 1
+        if Action.ARM in decision.actions:
+            assert state is FlightState.ARMING
+        arms = sum(action is Action.ARM for _, action in self.actions)
+        assert arms + (Action.ARM in decision.actions) <= self.takeoffs
+
+    def asked(self, action: Action) -> int:
+        return sum(asked is action for _, asked in self.actions)
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+# A whole flight
+
+
+def test_takes_off_flies_returns_lands_and_flies_again(world: World) -> None:
+    world.ready()
+    for trial in ("first", "second"):
+        world.obey("takeoff")
+        world.until(FlightState.TAKEOFF, 8.0)
+        world.until(FlightState.HOLD, 15.0)
+        world.run(3.0)
+        assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
+        world.order = world.new_order("start", trial)
+        assert world.tick().new_trial
+        world.order = None
+        east_m = float(world.position_m[0])
+        world.run(3.0)
+        assert world.position_m[0] > east_m + 2.0
+        world.enable(calm="return")
+        world.until(FlightState.LAND, 30.0)
+        assert world.position_m[:2] == pytest.approx(ROBOT.parameters.landing_point_m, abs=0.6)
+        world.until(FlightState.LANDED, 20.0)
+        assert not world.armed
+        world.run(5.0)
+        assert world.flight.state is FlightState.LANDED
+        world.enable()
+        world.until(FlightState.PREFLIGHT, 1.0)
+    assert world.asked(Action.ARM) == 2
+
+
+def test_the_same_trial_goes_on_after_a_hold(world: World) -> None:
+    world.fly()
+    world.enable(calm="hold")
+    world.run(2.0)
+    assert world.flight.state is FlightState.HOLD
+    world.enable()
+    world.run(3.0)
+    assert world.flight.state is FlightState.HOLD  # Withdrawing it sets nothing in motion.
+    world.order = world.new_order("start", "first")
+    decision = world.tick()
+    assert decision.flight.state is FlightState.MISSION
+    assert not decision.new_trial
+
+
+# Nothing that repeats arms
+
+
+def test_repeated_ground_states_never_arm(world: World) -> None:
+    for calm in ("none", "hold", "return", "land", "none"):
+        world.enable(calm=calm)
+        world.run(5.0)
+    assert world.flight.state is FlightState.PREFLIGHT
+    assert world.actions == []
+
+
+def test_a_battery_swap_in_somebodys_hands_does_not_arm(world: World) -> None:
+    world.ready()
+    takeoff = world.new_order("takeoff")
+    world.restart()
+    world.heard = VehicleState(origin_deg=(47.0, 8.0))
+    world.until(FlightState.PREFLIGHT, 8.0)
+    answer = world.give(replace(takeoff, boot_nonce=76))
+    assert answer == OrderResult("o1", False, "meant for another start of this robot's program")
+    world.run(10.0)
+    assert world.actions == []
+
+
+def test_a_watchdog_restart_forgets_a_takeoff_that_it_was_told(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    world.run(0.2)
+    world.restart()
+    world.run(20.0)
+    assert world.flight.state is FlightState.PREFLIGHT
+    assert world.asked(Action.ARM) == 0
+
+
+def test_a_late_gps_fix_does_not_arm(world: World) -> None:
+    world.position_known = False
+    world.enable()
+    world.run(20.0)
+    assert world.flight.state is FlightState.INIT
+    assert "INIT" in world.refuse("takeoff").upper()
+    world.position_known = True
+    world.until(FlightState.PREFLIGHT, 5.0)
+    world.run(10.0)
+    assert world.actions == []
+
+
+def test_a_repeated_takeoff_order_arms_once(world: World) -> None:
+    world.ready()
+    order = world.new_order("takeoff")
+    for _ in range(60):
+        world.order = order
+        world.tick()
+    world.until(FlightState.HOLD, 20.0)
+    assert world.asked(Action.ARM) == 1
+
+
+def test_a_takeoff_order_counts_no_more_after_others_were_answered(world: World) -> None:
+    world.ready()
+    takeoff = world.new_order("takeoff")
+    assert world.give(takeoff).accepted
+    world.enable(calm="hold")
+    world.until(FlightState.IDLE, 1.0)
+    world.enable()
+    world.until(FlightState.PREFLIGHT, 3.0)
+    for _ in range(10):
+        world.refuse("rejoin")
+    assert world.give(takeoff).reason == "older than an order that was obeyed"
+    world.run(10.0)
+    assert world.asked(Action.ARM) == 0
+
+
+# Orders
+
+
+def test_orders_are_refused_with_the_reason(world: World) -> None:
+    world.enable()
+    world.failed_checks = None
+    world.until(FlightState.PREFLIGHT, 6.0)
+    assert world.refuse("takeoff") == "not ready: the checks are still running"
+    world.failed_checks = ("battery 40 %", "GPS: 2-D fix")
+    assert world.refuse("takeoff") == "not ready: battery 40 %; GPS: 2-D fix"
+    world.failed_checks = ()
+    assert world.refuse("start").startswith("start is taken in hold only, the robot is in preflight")
+    order = world.new_order("takeoff")
+    late = replace(order, expires_at_uptime_s=world.now_s - world.started_s)
+    assert world.give(late).reason == "expired"
+    for expires_s in (1e9, math.nan, math.inf):
+        far = replace(world.new_order("takeoff"), expires_at_uptime_s=expires_s)
+        assert world.give(far).reason.endswith("too long")
+    world.give(replace(world.new_order("takeoff"), boot_nonce=1))
+    assert "another start" in world.flight.answers[-1].reason
+    world.enable(calm="hold")
+    assert world.refuse("takeoff") == "the ground commands hold"
+    answers = world.flight.answers
+    world.order = replace(world.new_order("takeoff"), robot_id=4)
+    world.tick()
+    assert world.flight.answers == answers
+    assert world.actions == []
+
+
+def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: World) -> None:
+    world.hover()
+    world.busy = (4, 7)
+    assert world.refuse("start") == "robots still taking off: 4, 7"
+    world.busy = ()
+    world.policy_m_s = None
+    assert world.refuse("start") == "the policy has no fresh answer"
+    world.policy_m_s = np.zeros(2)
+    world.closest = Closest(4, 1.2)
+    assert world.refuse("start") == "only 1.2 m to robot 4"
+    world.closest = None
+    world.position_m[0] = 33.0
+    assert world.refuse("start").startswith("outside the fence")
+    world.position_m[0], world.position_m[2] = 16.0, SLOT_M - 2.0
+    assert "its height is 6 m" in world.refuse("start")
+    world.position_m[2] = SLOT_M
+    world.battery = 0.2
+    assert world.refuse("start") == "battery low: 20%"
+    assert world.flight.state is FlightState.RETURN
+
+
+# Arming
+
+
+def test_takeoff_waits_for_the_vehicle_and_stops_where_it_is_refused(world: World) -> None:
+    for action in (Action.OFFBOARD, Action.ARM):
+        world.ready()
+        world.refuses = {action: "not today"}
+        world.obey("takeoff")
+        world.until(FlightState.IDLE, 7.0)
+        assert f"{action} refused: not today" in world.flight.reason
+        assert world.actions[-1][1] is Action.DISARM
+    world.refuses = {}
+    world.ready()
+    world.telemetry = False
+    world.until(FlightState.INIT, 6.0)
+
+
+def test_arming_is_called_off(world: World) -> None:
+    world.ready()
+    for calm in ("hold", "return", "land"):
+        world.obey("takeoff")
+        world.run(0.4)
+        world.enable(calm=calm)
+        world.tick()
+        assert world.flight.state is FlightState.IDLE
+        world.ready()
+    world.ground_on = False
+    world.run(2.5)
+    world.obey("takeoff")
+    world.until(FlightState.IDLE, 1.0)
+    assert world.actions[-1][1] is Action.DISARM
+    world.ground_on = True
+    world.ready()
+    world.obey("takeoff")
+    world.stop(1.0)
+    assert world.flight.state is FlightState.IDLE
+    world.run(15.0)
+    assert not world.armed
+
+
+def test_a_vehicle_that_does_not_arm_is_left_alone(world: World) -> None:
+    world.ready()
+    world.position_known = False  # Armed, but where?
+    world.obey("takeoff")
+    world.until(FlightState.IDLE, 7.0)
+    assert world.flight.reason == "the autopilot does not arm"
+    world.run(3.0)
+    assert not world.armed
+
+
+def test_the_link_is_lost_while_arming(world: World) -> None:
+    world.ready()
+    world.telemetry = False
+    world.beats = []
+    world.refuses = {Action.OFFBOARD: ""}
+    world.obey("takeoff")
+    world.until(FlightState.INIT, 4.0)
+    assert world.actions[-1][1] is Action.DISARM
+
+
+def test_somebody_else_arms_meanwhile(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    world.armed, world.mode = True, Mode.POSITION
+    world.intended = Mode.POSITION
+    world.until(FlightState.PILOT, 3.0)
+    assert world.asked(Action.ARM) == 0
+
+
+def test_a_pilot_takes_it_while_arming(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    while not world.flight.reached:
+        world.tick()
+    world.pilot()
+    world.refuses = {Action.ARM: "wrong mode"}
+    world.until(FlightState.IDLE, 4.0)
+    world.run(3.0)
+    assert not world.armed
+    assert world.mode is Mode.POSITION
+
+
+# Takeoff
+
+
+def test_a_takeoff_that_does_not_climb_ends_after_15_s(world: World) -> None:
+    world.ready()
+    world.heavy = True
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 6.0)
+    began_s = world.now_s
+    world.until(FlightState.LAND, 16.0)
+    assert world.now_s - began_s == pytest.approx(15.0, abs=0.3)
+    assert world.flight.reason in world._decide(world._hear()).alarms
+    world.until(FlightState.LANDED, 8.0)
+    assert not world.armed
+
+
+def test_a_takeoff_on_hold_stays_where_it_is_in_the_air_or_on_the_ground(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    while world.height_m < 3.0:
+        world.tick()
+    world.run(2.5 - world.latency_s if world.latency_s < 0.5 else 0.0)
+    world.enable(calm="hold")
+    world.tick()
+    assert world.flight.state is FlightState.HOLD
+    world.enable(calm="land")
+    world.until(FlightState.LANDED, 20.0)
+    world.ready()
+    world.heavy = True
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 6.0)
+    world.enable(calm="hold")
+    world.until(FlightState.LAND, 3.0)
+    assert world.flight.reason == "it stands on the ground"
+    # Nothing that the ground repeats lifts it off again.
+    world.heavy = False
+    world.enable(calm="return")
+    world.until(FlightState.LANDED, 10.0)
+    assert world.height_m == 0.0
+
+
+def test_land_and_return_end_a_takeoff(world: World) -> None:
+    for calm in ("land", "return"):
+        world.ready()
+        world.obey("takeoff")
+        world.until(FlightState.TAKEOFF, 6.0)
+        world.run(1.0)
+        world.enable(calm=calm)
+        world.tick()
+        assert world.flight.state is FlightState.LAND
+        world.until(FlightState.LANDED, 15.0)
+
+
+# The ground calms
+
+
+def test_the_latest_of_hold_land_and_return_counts(world: World) -> None:
+    world.fly()
+    steps: tuple[tuple[Calm, FlightState], ...] = (
+        ("hold", FlightState.HOLD),
+        ("land", FlightState.LAND),
+        ("hold", FlightState.HOLD),
+        ("return", FlightState.RETURN),
+        ("hold", FlightState.HOLD),
+        ("land", FlightState.LAND),
+        ("return", FlightState.RETURN),
+        ("land", FlightState.LAND),
+    )
+    for calm, state in steps:
+        world.enable(calm=calm)
+        world.tick()
+        assert world.flight.state is state
+        world.run(0.9)
+        assert world.flight.state is state
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_changing_ones_mind_quickly_ends_in_what_was_said_last(world: World) -> None:
+    world.fly()
+    for calm, seconds in (("land", 0.4), ("hold", 0.8), ("land", 0.2), ("hold", 0.6)):
+        world.enable(calm=calm)
+        world.run(seconds)
+    world.run(5.0)
+    assert world.flight.state is FlightState.HOLD
+    assert world.mode is Mode.OFFBOARD
+    world.enable(calm="land")
+    world.run(0.2)
+    assert world.flight.state is FlightState.LAND
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_one_robot_alone_is_called_and_disabling_holds(world: World) -> None:
+    world.fly()
+    assert world.ground is not None
+    world.ground = replace(world.ground, robot_calm={"3": "hold"})
+    world.tick()
+    assert world.flight.state is FlightState.HOLD
+    world.enable()
+    world.obey("start", "first")
+    world.ground = replace(world.ground, enabled=False)
+    world.tick()
+    assert world.flight.state is FlightState.HOLD
+
+
+def test_after_touchdown_hold_and_return_do_not_lift_it(world: World) -> None:
+    for calm in ("hold", "return"):
+        world.hover()
+        world.enable(calm="land")
+        while world.height_m > 0.0:
+            world.tick()
+        world.run(0.2)
+        world.enable(calm=calm)
+        world.until(FlightState.LANDED, 12.0)
+        assert world.height_m < 0.5
+        world.enable()
+        world.until(FlightState.PREFLIGHT, 1.0)
+
+
+# Faults in flight
+
+
+def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
+    world.fly()
+    world.ground_on = False
+    lost_s = world.now_s
+    world.until(FlightState.HOLD, 4.0)
+    assert world.now_s - lost_s == pytest.approx(3.0, abs=0.2)
+    assert "ground lost" in world._decide(world._hear()).alarms
+    world.until(FlightState.LAND, 11.0)
+    assert world.now_s - lost_s == pytest.approx(13.0, abs=0.2)
+    world.ground_on = True
+    world.enable(calm="hold")
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_the_ground_comes_back_and_the_robot_waits(world: World) -> None:
+    world.fly()
+    world.enable(calm="return")
+    world.run(0.5)
+    world.ground_on = False
+    world.until(FlightState.HOLD, 4.0)
+    world.run(3.0)
+    assert world.flight.state is FlightState.HOLD
+    world.ground_on = True
+    world.enable()
+    world.run(5.0)
+    assert world.flight.state is FlightState.HOLD
+
+
+def test_battery_low_returns_and_critical_lands(world: World) -> None:
+    world.fly()
+    world.battery = 0.24
+    decision = world.tick()
+    assert world.flight.state is FlightState.RETURN
+    assert decision.alarms == ("battery low: 24%",)
+    world.enable(calm="hold")
+    world.run(1.0)
+    assert world.flight.state is FlightState.HOLD
+    world.enable()
+    world.run(0.2)
+    assert world.flight.state is FlightState.RETURN
+    world.battery = 0.1
+    world.tick()
+    assert world.flight.state is FlightState.LAND
+    world.enable(calm="hold")
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_position_lost_lands_after_a_second(world: World) -> None:
+    world.fly()
+    world.position_known = False
+    world.run(0.9)
+    assert world.flight.state is FlightState.MISSION
+    world.run(0.2)
+    assert world.flight.state is FlightState.LAND
+    assert "position lost" in world.tick().alarms
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
+    world.fly()
+    world.closest = Closest(9, 1.4)
+    decision = world.tick()
+    assert world.flight.state is FlightState.HOLD
+    assert decision.alarms == ("only 1.4 m to robot 9",)
+    # On its way home it brakes, but does not flicker between two states.
+    world.enable(calm="return")
+    world.run(1.0)
+    assert world.flight.state is FlightState.RETURN
+
+
+def test_a_stale_policy_holds(world: World) -> None:
+    world.fly()
+    world.policy_m_s = None
+    world.tick()
+    assert world.flight.state is FlightState.HOLD
+    assert world.flight.alarming
+    world.policy_m_s = np.ones(2)
+    world.run(2.0)
+    assert world.flight.state is FlightState.HOLD
+
+
+def test_the_autopilot_that_lands_is_left_to_land(world: World) -> None:
+    world.fly()
+    world.mode = world.intended = Mode.LAND
+    world.until(FlightState.LAND, 2.5)
+    world.enable(calm="hold")
+    world.until(FlightState.LANDED, 20.0)
+    assert world.asked(Action.OFFBOARD) == 1
+
+
+def test_a_vehicle_that_leaves_offboard_is_not_fought_for(world: World) -> None:
+    world.fly()
+    world.mode = world.intended = Mode.RETURN
+    world.until(FlightState.PILOT, 2.5)
+    world.run(10.0)
+    assert world.flight.state is FlightState.PILOT
+    assert world.mode is Mode.RETURN
+
+
+def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
+    world.fly()
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.run(3.0)
+    world.telemetry = True
+    world.until(FlightState.PILOT, 4.0)
+    world.run(3.0)
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.armed = False
+    world.telemetry = True
+    world.until(FlightState.IDLE, 5.0)
+
+
+def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
+    world.fly()
+    world.pilot()
+    world.until(FlightState.PILOT, 2.5)
+    world.refuses = {Action.OFFBOARD: "sticks"}
+    world.obey("rejoin")
+    world.run(3.5)
+    assert world.flight.state is FlightState.HOLD
+    world.until(FlightState.PILOT, 2.0)
+    world.mode = world.intended = Mode.HOLD
+    world.run(3.0)
+    world.obey("rejoin")
+    world.until(FlightState.PILOT, 6.0)
+    assert world.flight.reason == "offboard refused: sticks"
+
+
+# A lapse of the control loop
+
+
+def test_after_a_lapse_nothing_moves_until_the_operator_resumes(world: World) -> None:
+    world.fly()
+    assert world.speed_m_s > 0.5
+    world.stop(4.0)
+    assert world.flight.state is FlightState.HOLD
+    assert world.flight.alarming
+    at_m = world.position_m.copy()
+    sent_s = world.setpoint_at_s
+    world.run(1.8)
+    assert world.setpoint_at_s == sent_s  # Stale telemetry is worked off first.
+    for _ in range(100):
+        world.tick()
+        assert world.flight.state is FlightState.HOLD
+        assert world.speed_m_s < 0.2
+    assert world.position_m == pytest.approx(at_m, abs=0.1)
+    assert world.mode is Mode.OFFBOARD
+    world.obey("start", "first")
+    world.run(3.0)
+    assert world.speed_m_s > 0.5
+
+
+def test_just_after_a_lapse_no_order_is_taken(world: World) -> None:
+    world.fly()
+    world.stop(0.8)
+    assert world.refuse("start") == "the control loop was silent just before"
+
+
+def test_after_a_lapse_without_a_watchdog_the_autopilots_landing_goes_on(world: World) -> None:
+    world.fly()
+    world.watchdog = False
+    world.stop(4.0)
+    world.until(FlightState.LAND, 4.0)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_after_a_lapse_that_only_the_program_saw_the_vehicle_holds() -> None:
+    world = World()
+    world.fly()
+    world.watchdog = False
+    world.stop(0.6)
+    world.next_beat_s, world.latency_s = world.now_s + 0.2, 0.1
+    world.run(10.0)
+    assert world.asked(Action.HOLD) == 1
+    assert world.flight.state is FlightState.HOLD
+    assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
+
+
+def test_a_pilot_who_took_it_during_a_lapse_keeps_it(world: World) -> None:
+    world.fly()
+    world.pilot(0.0, 0.5, 0.0)
+    world.stop(3.0)
+    world.until(FlightState.PILOT, 2.5)
+    world.run(5.0)
+    assert world.mode is Mode.POSITION
+
+
+# A pilot
+
+
+def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> None:
+    world.fly()
+    world.pilot(1.0, 0.0, 0.0)
+    world.until(FlightState.PILOT, 2.5)
+    while world.position_m[0] < 33.0:
+        world.tick()
+    assert world.refuse("rejoin").startswith("outside the fence")
+    world.pilot(-1.0, 0.0, -0.3)
+    while world.position_m[0] > 25.0:
+        world.tick()
+    assert "its height is 6 m" in world.refuse("rejoin")
+    world.position_m[2] = SLOT_M
+    world.pilot()
+    world.obey("rejoin")
+    world.run(5.0)
+    assert world.flight.state is FlightState.HOLD
+    assert world.mode is Mode.OFFBOARD
+    world.obey("start", "first")
+    world.run(1.0)
+    assert world.flight.state is FlightState.MISSION
+
+
+def test_a_pilot_keeps_a_vehicle_that_was_told_to_land_or_to_stop_landing(world: World) -> None:
+    for calm in ("land", "hold"):
+        world.hover()
+        world.enable(calm="land")
+        world.run(0.1 if calm == "land" else 3.0)
+        world.enable(calm=calm)
+        world.run(0.9)
+        world.pilot()
+        world.until(FlightState.PILOT, 2.5)
+        world.run(4.0)
+        assert world.mode is Mode.POSITION
+        world.pilot(0.0, 0.0, -1.0)
+        while world.height_m > 0.0:
+            world.tick()
+        world.armed = False
+        world.until(FlightState.LANDED, 2.5)
+        world.enable()
+        world.until(FlightState.PREFLIGHT, 1.0)
+
+
+def test_a_landing_that_somebody_else_ends_is_his(world: World) -> None:
+    world.hover()
+    world.enable(calm="land")
+    world.run(3.0)
+    world.mode = world.intended = Mode.HOLD
+    world.until(FlightState.PILOT, 2.5)
+
+
+def test_a_program_that_starts_in_flight_only_observes_until_rejoin(world: World) -> None:
+    world.fly()
+    world.pilot()
+    world.run(2.5)
+    actions = list(world.actions)
+    world.restart()
+    world.until(FlightState.PILOT, 2.0)
+    assert "was already armed" in world.flight.reason
+    for calm in ("none", "hold", "land", "return", "none"):
+        world.enable(calm=calm)
+        world.run(2.0)
+    world.battery = 0.1
+    world.run(2.0)
+    world.battery = 0.9
+    assert world.flight.state is FlightState.PILOT
+    assert world.actions == actions
+    world.obey("rejoin")
+    world.until(FlightState.HOLD, 1.0)
+    world.run(4.0)
+    assert world.flight.state is FlightState.HOLD
+    assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
+
+
+def test_a_vehicle_armed_by_hand_is_only_observed(world: World) -> None:
+    world.ready()
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.until(FlightState.PILOT, 2.5)
+    assert world.refuse("rejoin") in ("position or height is not known", "the vehicle is not in the air")
+    world.armed = False
+    world.until(FlightState.LANDED, 2.5)
+    world.run(1.0)
+    assert world.actions == []
+
+
+def test_a_ground_that_goes_leaves_preflight(world: World) -> None:
+    world.ready()
+    world.ground_on = False
+    world.until(FlightState.IDLE, 4.0)
+    world.telemetry = False
+    world.until(FlightState.INIT, 4.0)
+
+
+# Kill
+
+
+@pytest.mark.parametrize("state", list(FlightState))
+def test_kill_is_taken_in_every_state(state: FlightState) -> None:
+    world = World()
+    world.hover()
+    world.flight = replace(world.flight, state=state, since_s=world.now_s, reached=True)
+    world.obey("kill")
+    assert world.flight.state is FlightState.FAULT
+    assert world.actions[-1][1] is Action.KILL
+    world.run(3.0)
+    assert not world.armed
+
+
+def test_a_killed_robot_stays_so_but_kills_nobody_who_arms_it_later(world: World) -> None:
+    world.fly()
+    world.refuses = {Action.KILL: "did not hear"}
+    world.obey("kill")
+    world.run(3.0)
+    assert world.asked(Action.KILL) >= 3
+    world.refuses = {}
+    world.run(4.0)
+    assert not world.armed
+    kills = world.asked(Action.KILL)
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.run(5.0)
+    assert world.asked(Action.KILL) == kills
+    assert world.flight.state is FlightState.FAULT
+
+
+# The table
+
+
+def scenarios() -> list[Callable[[World], None]]:
+    return [
+        test
+        for name, test in sorted(globals().items())
+        if name.startswith("test_") and list(signature(test).parameters) == ["world"]
+    ]
+
+
+def test_every_transition_is_taken_in_some_scenario() -> None:
+    taken: list[Transition] = []
+    for scenario in scenarios():
+        world = World()
+        scenario(world)
+        taken += world.taken
+    assert [row for row in TRANSITIONS if row not in taken] == []
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    scenario=st.sampled_from(scenarios()),
+    phase_s=st.floats(0.0, 1.0),
+    latency_s=st.floats(0.0, 1.0),
+)
+def test_late_telemetry_changes_no_outcome(
+    scenario: Callable[[World], None], phase_s: float, latency_s: float
+) -> None:
+    scenario(World(phase_s, latency_s))
+
+
+def test_the_page_for_people_has_the_same_table() -> None:
+    rows = [
+        line for line in SAFETY_PAGE.read_text().splitlines() if line.startswith("| ") and " -> " in line
+    ]
+    assert rows == table(), "docs/safety.md: put the rows of test_flight.table() there"
+
+
+def table() -> list[str]:
+    """The machine as rows of Markdown: | From -> To | When |."""
+    rows = []
+    for row in TRANSITIONS:
+        everywhere = set(row.sources) == set(FlightState)
+        sources = "any" if everywhere else ", ".join(state.name for state in row.sources)
+        rows.append(f"| {sources} -> {row.target.name} | {row.when} |")
+    return rows
+
+
+# Whatever comes
+
+
+finite = st.floats(-1e3, 1e3)
+ages_s = st.sampled_from([0.0, 0.2, 1.0, 4.0, 20.0, math.inf])
+
+
+@settings(max_examples=100, deadline=None)
+@given(seed=st.integers(0, 2**32), state=st.sampled_from([None, *AIRBORNE, FlightState.PILOT]))
+def test_whatever_comes_nothing_raises_or_arms_unasked(seed: int, state: FlightState | None) -> None:
+    """The checks are the world's own, in every tick."""
+    draw = random.Random(seed)
+    world = World(draw.random(), draw.random())
+    if state is not None:
+        world.flight = replace(world.flight, state=state, datum_m=ZERO_M, since_s=world.now_s)
+        world.armed = True
+    for _ in range(200):
+        for change in draw.choices(CHANGES, k=draw.choice((0, 0, 1, 3))):
+            change(world, draw)
+        if draw.random() < 0.01:
+            world.stop(draw.choice((0.6, 3.0, 15.0)))
+        world.tick()
+        world.order = None
+
+
+def _order(world: World, draw: random.Random) -> None:
+    kinds: tuple[OrderKind, ...] = ("takeoff", "start", "rejoin", "kill")
+    kind = draw.choices(kinds, weights=(6, 3, 3, 1))[0]
+    order = world.new_order(kind, draw.choice(("", "a")))
+    if draw.random() < 0.3:
+        order = replace(order, order_id=f"o{draw.randrange(5)}")
+    if draw.random() < 0.1:
+        order = replace(order, boot_nonce=draw.randrange(100))
+    if draw.random() < 0.1:
+        order = replace(order, expires_at_uptime_s=draw.choice((math.nan, -1.0, 1e9)))
+    world.order = order
+
+
+def _mode(world: World, draw: random.Random) -> None:
+    world.mode = world.intended = draw.choice(list(Mode))
+
+
+def _arm(world: World, draw: random.Random) -> None:
+    world.armed = draw.random() < 0.5
+
+
+def _ground(world: World, draw: random.Random) -> None:
+    calms: tuple[Calm, ...] = ("none", "none", "hold", "return", "land")
+    world.enable(draw.choice(calms))
+    world.ground_on = draw.random() < 0.8
+
+
+def _surroundings(world: World, draw: random.Random) -> None:
+    world.policy_m_s = draw.choice((None, np.array([draw.uniform(-3, 3), draw.uniform(-3, 3)])))
+    world.closest = draw.choice((None, None, Closest(4, draw.uniform(0.0, 3.0))))
+    world.busy = draw.choice(((), (), (5,)))
+    world.failed_checks = draw.choice(((), (), None, ("x",)))
+    world.battery = draw.choice((0.9, 0.9, 0.2, 0.1))
+
+
+def _vehicle(world: World, draw: random.Random) -> None:
+    world.position_known = draw.random() < 0.8
+    world.telemetry = draw.random() < 0.8
+    world.position_m = np.array([draw.uniform(-5, 40), draw.uniform(-5, 40), draw.uniform(0, 12)])
+    world.refuses = draw.choice(({}, {}, {Action.OFFBOARD: "no"}, {Action.ARM: "no"}))
+
+
+CHANGES = (_order, _order, _mode, _arm, _ground, _ground, _surroundings, _vehicle)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"slot": -1}, "slot = -1"),
+        ({"landing_point_m": (1.0,)}, "landing_point_m"),
+        ({"landing_point_m": (1.0, math.nan)}, "landing_point_m"),
+        ({"takeoff_timeout_s": 0.0}, "takeoff_timeout_s = 0.0"),
+        ({"min_separation_m": 2.0}, "min_separation_m = 2.0"),
+        ({"battery_critical": 0.3}, "battery_critical = 0.3"),
+        ({"slot": 20}, "slot = 20"),
+        ({"landing_point_m": (1.0, 12.0)}, "buffer_m = 2"),
+    ],
+)
+def test_parameters_that_cannot_be_flown_are_named(wrong: dict[str, object], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        replace(ROBOT, parameters=replace(ROBOT.parameters, **wrong))  # type: ignore[arg-type]
