@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from edge.core.perception import PerceptionParameters
-from edge.runtime.bundle import Training
 from edge.core.schema import ConfigError, from_mapping
+from edge.runtime.bundle import Training
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,7 +166,7 @@ def _draw_costs(axes: Axes, flight: FleetFlight) -> None:
             share = normalized(cost)
             label = f"{name}, {share[-1]:.2f} at the end"
             axes.plot(time_s, share, color=colour, ls=style, lw=1.2, label=label)
-            axes.legend(loc="upper left", frameon=False, fontsize=7, handlelength=2.4)
+            axes.legend(loc="upper right", frameon=False, fontsize=7, handlelength=2.4)
     axes.set(ylabel=r"cost $J\,/\,J_0$", ylim=(0.0, 1.05))
     _tidy(axes)
 

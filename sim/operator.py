@@ -262,6 +262,22 @@ _GROUNDED = (_S.INIT, _S.IDLE, _S.PREFLIGHT, _S.LANDED)
 _FLYING = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
 
 
+def waiting_to_land(statuses: Statuses, arrived: Collection[int]) -> set[int]:
+    """Who of those that `arrived` over their landing points must not land yet.
+
+    Landing leads through the heights of all lower robots: somebody still flies home there.
+    """
+    lowest_m = min(
+        (s.slot_height_m for r, s in statuses.items() if s.state in _FLYING and r not in arrived),
+        default=math.inf,
+    )
+    return {
+        robot
+        for robot, status in statuses.items()
+        if robot in arrived and status.state in _FLYING and status.slot_height_m > lowest_m
+    }
+
+
 class ScriptError(RuntimeError):
     """The flight did not go as the script has it; the text says what did not happen."""
 
@@ -342,6 +358,7 @@ class Script:
 
     def _go(self, step: Step, watch: Callable[[str], None]) -> None:
         began_s = self.began_s[step.name] = time.monotonic()
+        self._say(step.name)
         while True:
             step.act()
             watch(step.name)
@@ -426,10 +443,7 @@ class Script:
             self._operator.order("rejoin" if left_alone else "start", robot, self._trial)
 
     def _send_home(self) -> None:
-        """All fly home at their own heights; who is there waits until nobody flies below.
-
-        Landing leads through the heights of all lower robots.
-        """
+        """All fly home at their own heights; who is there waits until nobody flies below."""
         statuses = self._operator.statuses()
         self._over_landing_point |= {
             robot
@@ -437,20 +451,8 @@ class Script:
             if status.position_m is not None
             and math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
         }
-        under_way = [
-            status.slot_height_m
-            for robot, status in statuses.items()
-            if status.state in _FLYING and robot not in self._over_landing_point
-        ]
-        lowest_m = min(under_way, default=math.inf)
-        self._operator.calm_each(
-            "return",
-            {
-                robot: "hold"
-                for robot in self._over_landing_point & statuses.keys()
-                if statuses[robot].state in _FLYING and statuses[robot].slot_height_m > lowest_m
-            },
-        )
+        waiting = waiting_to_land(statuses, self._over_landing_point)
+        self._operator.calm_each("return", dict.fromkeys(waiting, "hold"))
 
     def _say_once(self, text: str) -> None:
         """Say a text unless it differs from one that was said by its numbers only."""

@@ -109,8 +109,9 @@ def decode(
     """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
 
     `bundle_id` is the 32 bytes of the own manifest's SHA-256, `frame_id` that of the own mission
-    frame (None: of any), `message_size` the number of floats that the own network takes. The payload is a read-only view of `data`, float32 or float16, not a
-    copy: `data` must not change afterwards.
+    frame (None takes messages of any), `message_size` the number of floats that the own network
+    takes. The payload is a read-only view of `data`, float32 or float16, not a copy: `data` must
+    not change afterwards.
     """
     view = memoryview(data).toreadonly()
     # Nothing behind the version can be read in a layout that is not this one.

@@ -102,6 +102,7 @@ class World:
         # The program, and what it did.
         self.restart()
         self.taken: list[Transition] = []
+        self.taken_s: list[float] = []
         self.actions: list[tuple[float, Action]] = []
         self.takeoffs = 0
 
@@ -187,6 +188,9 @@ class World:
         self.mode = self.intended = Mode.POSITION
         self.sticks_m_s = np.array(sticks_m_s or (0.0, 0.0, 0.0))
 
+    def state(self) -> FlightState:
+        return self.flight.state
+
     @property
     def height_m(self) -> float:
         return float(self.position_m[2])
@@ -228,7 +232,6 @@ class World:
                 return "no setpoints"
             self.mode = self.intended = Mode.OFFBOARD
         elif action is Action.ARM:
-            assert self.mode is Mode.OFFBOARD
             self.armed = True
         elif action is Action.HOLD:
             self.mode = self.intended = Mode.HOLD
@@ -312,6 +315,9 @@ class World:
         self.actions += [(self.now_s, action) for action in decision.actions]
         if decision.taken is not None:
             self.taken.append(decision.taken)
+            self.taken_s.append(self.now_s)
+            # No two rows may lead back and forth.
+            assert len(self.taken_s) < 6 or self.now_s - self.taken_s[-6] > 0.7
         if setpoint is not None:
             self.setpoint, self.setpoint_at_s = setpoint, self.now_s
         return decision
@@ -370,7 +376,7 @@ def test_takes_off_flies_returns_lands_and_flies_again(world: World) -> None:
         world.until(FlightState.LANDED, 20.0)
         assert not world.armed
         world.run(5.0)
-        assert world.flight.state is FlightState.LANDED
+        assert world.state() is FlightState.LANDED
         world.enable()
         world.until(FlightState.PREFLIGHT, 1.0)
     assert world.asked(Action.ARM) == 2
@@ -380,10 +386,10 @@ def test_the_same_trial_goes_on_after_a_hold(world: World) -> None:
     world.fly()
     world.enable(calm="hold")
     world.run(2.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     world.enable()
     world.run(3.0)
-    assert world.flight.state is FlightState.HOLD  # Withdrawing it sets nothing in motion.
+    assert world.state() is FlightState.HOLD  # Withdrawing it sets nothing in motion.
     world.order = world.new_order("start", "first")
     decision = world.tick()
     assert decision.flight.state is FlightState.MISSION
@@ -397,7 +403,7 @@ def test_repeated_ground_states_never_arm(world: World) -> None:
     for calm in ("none", "hold", "return", "land", "none"):
         world.enable(calm=calm)
         world.run(5.0)
-    assert world.flight.state is FlightState.PREFLIGHT
+    assert world.state() is FlightState.PREFLIGHT
     assert world.actions == []
 
 
@@ -419,7 +425,7 @@ def test_a_watchdog_restart_forgets_a_takeoff_that_it_was_told(world: World) -> 
     world.run(0.2)
     world.restart()
     world.run(20.0)
-    assert world.flight.state is FlightState.PREFLIGHT
+    assert world.state() is FlightState.PREFLIGHT
     assert world.asked(Action.ARM) == 0
 
 
@@ -427,7 +433,7 @@ def test_a_late_gps_fix_does_not_arm(world: World) -> None:
     world.position_known = False
     world.enable()
     world.run(20.0)
-    assert world.flight.state is FlightState.INIT
+    assert world.state() is FlightState.INIT
     assert "INIT" in world.refuse("takeoff").upper()
     world.position_known = True
     world.until(FlightState.PREFLIGHT, 5.0)
@@ -509,7 +515,7 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
     world.position_m[2] = SLOT_M
     world.battery = 0.2
     assert world.refuse("start") == "battery low: 20%"
-    assert world.flight.state is FlightState.RETURN
+    assert world.state() is FlightState.RETURN
 
 
 # Arming
@@ -536,7 +542,7 @@ def test_arming_is_called_off(world: World) -> None:
         world.run(0.4)
         world.enable(calm=calm)
         world.tick()
-        assert world.flight.state is FlightState.IDLE
+        assert world.state() is FlightState.IDLE
         world.ready()
     world.ground_on = False
     world.run(2.5)
@@ -547,7 +553,7 @@ def test_arming_is_called_off(world: World) -> None:
     world.ready()
     world.obey("takeoff")
     world.stop(1.0)
-    assert world.flight.state is FlightState.IDLE
+    assert world.state() is FlightState.IDLE
     world.run(15.0)
     assert not world.armed
 
@@ -618,7 +624,7 @@ def test_a_takeoff_on_hold_stays_where_it_is_in_the_air_or_on_the_ground(world: 
     world.run(2.5 - world.latency_s if world.latency_s < 0.5 else 0.0)
     world.enable(calm="hold")
     world.tick()
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     world.enable(calm="land")
     world.until(FlightState.LANDED, 20.0)
     world.ready()
@@ -636,14 +642,15 @@ def test_a_takeoff_on_hold_stays_where_it_is_in_the_air_or_on_the_ground(world: 
 
 
 def test_land_and_return_end_a_takeoff(world: World) -> None:
-    for calm in ("land", "return"):
+    calms: tuple[Calm, ...] = ("land", "return")
+    for calm in calms:
         world.ready()
         world.obey("takeoff")
         world.until(FlightState.TAKEOFF, 6.0)
         world.run(1.0)
         world.enable(calm=calm)
         world.tick()
-        assert world.flight.state is FlightState.LAND
+        assert world.state() is FlightState.LAND
         world.until(FlightState.LANDED, 15.0)
 
 
@@ -665,23 +672,29 @@ def test_the_latest_of_hold_land_and_return_counts(world: World) -> None:
     for calm, state in steps:
         world.enable(calm=calm)
         world.tick()
-        assert world.flight.state is state
+        assert world.state() is state
         world.run(0.9)
-        assert world.flight.state is state
+        assert world.state() is state
     world.until(FlightState.LANDED, 20.0)
 
 
 def test_changing_ones_mind_quickly_ends_in_what_was_said_last(world: World) -> None:
     world.fly()
-    for calm, seconds in (("land", 0.4), ("hold", 0.8), ("land", 0.2), ("hold", 0.6)):
+    said: tuple[tuple[Calm, float], ...] = (
+        ("land", 0.4),
+        ("hold", 0.8),
+        ("land", 0.2),
+        ("hold", 0.6),
+    )
+    for calm, seconds in said:
         world.enable(calm=calm)
         world.run(seconds)
     world.run(5.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert world.mode is Mode.OFFBOARD
     world.enable(calm="land")
     world.run(0.2)
-    assert world.flight.state is FlightState.LAND
+    assert world.state() is FlightState.LAND
     world.until(FlightState.LANDED, 20.0)
 
 
@@ -690,16 +703,17 @@ def test_one_robot_alone_is_called_and_disabling_holds(world: World) -> None:
     assert world.ground is not None
     world.ground = replace(world.ground, robot_calm={"3": "hold"})
     world.tick()
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     world.enable()
     world.obey("start", "first")
     world.ground = replace(world.ground, enabled=False)
     world.tick()
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
 
 
 def test_after_touchdown_hold_and_return_do_not_lift_it(world: World) -> None:
-    for calm in ("hold", "return"):
+    calms: tuple[Calm, ...] = ("hold", "return")
+    for calm in calms:
         world.hover()
         world.enable(calm="land")
         while world.height_m > 0.0:
@@ -736,28 +750,28 @@ def test_the_ground_comes_back_and_the_robot_waits(world: World) -> None:
     world.ground_on = False
     world.until(FlightState.HOLD, 4.0)
     world.run(3.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     world.ground_on = True
     world.enable()
     world.run(5.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
 
 
 def test_battery_low_returns_and_critical_lands(world: World) -> None:
     world.fly()
     world.battery = 0.24
     decision = world.tick()
-    assert world.flight.state is FlightState.RETURN
+    assert world.state() is FlightState.RETURN
     assert decision.alarms == ("battery low: 24%",)
     world.enable(calm="hold")
     world.run(1.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     world.enable()
     world.run(0.2)
-    assert world.flight.state is FlightState.RETURN
+    assert world.state() is FlightState.RETURN
     world.battery = 0.1
     world.tick()
-    assert world.flight.state is FlightState.LAND
+    assert world.state() is FlightState.LAND
     world.enable(calm="hold")
     world.until(FlightState.LANDED, 20.0)
 
@@ -766,9 +780,9 @@ def test_position_lost_lands_after_a_second(world: World) -> None:
     world.fly()
     world.position_known = False
     world.run(0.9)
-    assert world.flight.state is FlightState.MISSION
+    assert world.state() is FlightState.MISSION
     world.run(0.2)
-    assert world.flight.state is FlightState.LAND
+    assert world.state() is FlightState.LAND
     assert "position lost" in world.tick().alarms
     world.until(FlightState.LANDED, 20.0)
 
@@ -777,23 +791,23 @@ def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
     world.fly()
     world.closest = Closest(9, 1.4)
     decision = world.tick()
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert decision.alarms == ("only 1.4 m to robot 9",)
     # On its way home it brakes, but does not flicker between two states.
     world.enable(calm="return")
     world.run(1.0)
-    assert world.flight.state is FlightState.RETURN
+    assert world.state() is FlightState.RETURN
 
 
 def test_a_stale_policy_holds(world: World) -> None:
     world.fly()
     world.policy_m_s = None
     world.tick()
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert world.flight.alarming
     world.policy_m_s = np.ones(2)
     world.run(2.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
 
 
 def test_the_autopilot_that_lands_is_left_to_land(world: World) -> None:
@@ -810,7 +824,7 @@ def test_a_vehicle_that_leaves_offboard_is_not_fought_for(world: World) -> None:
     world.mode = world.intended = Mode.RETURN
     world.until(FlightState.PILOT, 2.5)
     world.run(10.0)
-    assert world.flight.state is FlightState.PILOT
+    assert world.state() is FlightState.PILOT
     assert world.mode is Mode.RETURN
 
 
@@ -836,7 +850,7 @@ def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
     world.refuses = {Action.OFFBOARD: "sticks"}
     world.obey("rejoin")
     world.run(3.5)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     world.until(FlightState.PILOT, 2.0)
     world.mode = world.intended = Mode.HOLD
     world.run(3.0)
@@ -852,7 +866,7 @@ def test_after_a_lapse_nothing_moves_until_the_operator_resumes(world: World) ->
     world.fly()
     assert world.speed_m_s > 0.5
     world.stop(4.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert world.flight.alarming
     at_m = world.position_m.copy()
     sent_s = world.setpoint_at_s
@@ -860,7 +874,7 @@ def test_after_a_lapse_nothing_moves_until_the_operator_resumes(world: World) ->
     assert world.setpoint_at_s == sent_s  # Stale telemetry is worked off first.
     for _ in range(100):
         world.tick()
-        assert world.flight.state is FlightState.HOLD
+        assert world.state() is FlightState.HOLD
         assert world.speed_m_s < 0.2
     assert world.position_m == pytest.approx(at_m, abs=0.1)
     assert world.mode is Mode.OFFBOARD
@@ -891,7 +905,7 @@ def test_after_a_lapse_that_only_the_program_saw_the_vehicle_holds() -> None:
     world.next_beat_s, world.latency_s = world.now_s + 0.2, 0.1
     world.run(10.0)
     assert world.asked(Action.HOLD) == 1
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
 
 
@@ -922,11 +936,11 @@ def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> N
     world.pilot()
     world.obey("rejoin")
     world.run(5.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert world.mode is Mode.OFFBOARD
     world.obey("start", "first")
     world.run(1.0)
-    assert world.flight.state is FlightState.MISSION
+    assert world.state() is FlightState.MISSION
 
 
 def test_a_pilot_keeps_a_vehicle_that_was_told_to_land_or_to_stop_landing(world: World) -> None:
@@ -971,12 +985,12 @@ def test_a_program_that_starts_in_flight_only_observes_until_rejoin(world: World
     world.battery = 0.1
     world.run(2.0)
     world.battery = 0.9
-    assert world.flight.state is FlightState.PILOT
+    assert world.state() is FlightState.PILOT
     assert world.actions == actions
     world.obey("rejoin")
     world.until(FlightState.HOLD, 1.0)
     world.run(4.0)
-    assert world.flight.state is FlightState.HOLD
+    assert world.state() is FlightState.HOLD
     assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
 
 
@@ -1011,7 +1025,7 @@ def test_kill_is_taken_in_every_state(state: FlightState) -> None:
     world.hover()
     world.flight = replace(world.flight, state=state, since_s=world.now_s, reached=True)
     world.obey("kill")
-    assert world.flight.state is FlightState.FAULT
+    assert world.state() is FlightState.FAULT
     assert world.actions[-1][1] is Action.KILL
     world.run(3.0)
     assert not world.armed
@@ -1030,7 +1044,7 @@ def test_a_killed_robot_stays_so_but_kills_nobody_who_arms_it_later(world: World
     world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
     world.run(5.0)
     assert world.asked(Action.KILL) == kills
-    assert world.flight.state is FlightState.FAULT
+    assert world.state() is FlightState.FAULT
 
 
 # The table
@@ -1091,29 +1105,28 @@ def table() -> list[str]:
 # Whatever comes
 
 
-@settings(max_examples=100, deadline=None)
-@given(seed=st.integers(0, 2**32), state=st.sampled_from([None, *AIRBORNE, FlightState.PILOT]))
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    begin=st.sampled_from([World.enable, World.ready, World.hover, World.fly]),
+)
 def test_whatever_comes_nothing_raises_or_arms_unasked(
-    seed: int, state: FlightState | None
+    seed: int, begin: Callable[[World], None]
 ) -> None:
     """The checks are the world's own, in every tick."""
     draw = random.Random(seed)
     world = World(draw.random(), draw.random())
-    if state is not None:
-        world.flight = replace(world.flight, state=state, datum_m=ZERO_M, since_s=world.now_s)
-        world.armed = True
-    for _ in range(200):
-        for change in draw.choices(CHANGES, k=draw.choice((0, 0, 1, 3))):
-            change(world, draw)
-        if draw.random() < 0.01:
-            world.stop(draw.choice((0.6, 3.0, 15.0)))
+    begin(world)
+    for _ in range(400):
+        if draw.random() < 0.1:
+            draw.choices(CHANGES, weights=(12, 1, 1, 6, 4, 3, 1, 1))[0](world, draw)
         world.tick()
         world.order = None
 
 
 def _order(world: World, draw: random.Random) -> None:
     kinds: tuple[OrderKind, ...] = ("takeoff", "start", "rejoin", "kill")
-    kind = draw.choices(kinds, weights=(6, 3, 3, 1))[0]
+    kind = draw.choices(kinds, weights=(30, 20, 10, 1))[0]
     order = world.new_order(kind, draw.choice(("", "a")))
     if draw.random() < 0.3:
         order = replace(order, order_id=f"o{draw.randrange(5)}")
@@ -1133,9 +1146,9 @@ def _arm(world: World, draw: random.Random) -> None:
 
 
 def _ground(world: World, draw: random.Random) -> None:
-    calms: tuple[Calm, ...] = ("none", "none", "hold", "return", "land")
+    calms: tuple[Calm, ...] = ("none", "none", "none", "hold", "return", "land")
     world.enable(draw.choice(calms))
-    world.ground_on = draw.random() < 0.8
+    world.ground_on = draw.random() < 0.9
 
 
 def _surroundings(world: World, draw: random.Random) -> None:
@@ -1148,12 +1161,20 @@ def _surroundings(world: World, draw: random.Random) -> None:
 
 def _vehicle(world: World, draw: random.Random) -> None:
     world.position_known = draw.random() < 0.8
-    world.telemetry = draw.random() < 0.8
-    world.position_m = np.array([draw.uniform(-5, 40), draw.uniform(-5, 40), draw.uniform(0, 12)])
+    world.telemetry = draw.random() < 0.9
     world.refuses = draw.choice(({}, {}, {Action.OFFBOARD: "no"}, {Action.ARM: "no"}))
 
 
-CHANGES = (_order, _order, _mode, _arm, _ground, _ground, _surroundings, _vehicle)
+def _place(world: World, draw: random.Random) -> None:
+    world.position_m = np.array([draw.uniform(-5, 40), draw.uniform(-5, 40), draw.uniform(0, 12)])
+
+
+def _stop(world: World, draw: random.Random) -> None:
+    world.watchdog = draw.random() < 0.5
+    world.stop(draw.choice((0.6, 3.0, 15.0)))
+
+
+CHANGES = (_order, _mode, _arm, _ground, _surroundings, _vehicle, _place, _stop)
 
 
 @pytest.mark.parametrize(

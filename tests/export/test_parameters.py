@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from edge.core.perception import PerceptionParameters
-from edge.runtime.bundle import Training
 from edge.core.schema import ConfigError
+from edge.runtime.bundle import Training
 from export.parameters import read_parameters
 
 ROOT = Path(__file__).parents[2]

@@ -135,7 +135,7 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(shipped_policy:
                 frame_id=0,
                 own_robot_id=9,
                 message_size=870,
-            )  # fmt: skip
+            )
         )
     # The last values of x_0 are the position, times 1/sqrt(degree).
     x = [m.payload[33] for m in own if isinstance(m, AggregatedMessage)]
@@ -199,9 +199,12 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: Policy) -> None:
     robot = make_robot(shipped_policy, World())
     good = message(shipped_policy)
     other = encode(
-        AggregatedMessage(3, 1, 1, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)),
-        bytes(32), "float32",
-    )  # fmt: skip
+        AggregatedMessage(
+            3, 1, 1, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)
+        ),
+        bytes(32),
+        "float32",
+    )
     cases = {
         Rejection.OWN: message(shipped_policy, robot_id=1),
         Rejection.OTHER_BUNDLE: other,

@@ -1,0 +1,253 @@
+"""Setpoints of each flight state, flown by a vehicle that follows them late."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.core import F64
+from edge.core.flight import Flight, FlightInputs, FlightParameters, Robot
+from edge.core.guidance import (
+    Guidance,
+    MissionPosition,
+    MissionSetpoint,
+    MissionVelocity,
+    guide,
+)
+from edge.core.mailbox import Neighbour
+from edge.core.mission import FlightState
+from edge.core.ports import Odometry
+from edge.core.safety import Fence, MotionLimits
+from edge.core.vehicle import Vector, VehicleState
+
+TICK_S = 0.1
+ZERO_M = -3.0  # The takeoff point, from the estimator's zero.
+ROBOT = Robot(
+    robot_id=3,
+    boot_nonce=77,
+    parameters=FlightParameters(slot=1, landing_point_m=(10.0, 12.0)),
+    fence=Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 1.0, 30.0),
+    limits=MotionLimits(2.0, 1.0, 1.5, 1.3),
+)
+SLOT_M = ROBOT.parameters.slot_height_m
+AT_SLOT: Vector = (16.0, 16.0, SLOT_M)
+STILL: Vector = (0.0, 0.0, 0.0)
+
+
+def flight(state: FlightState, target_m: Vector | None = None) -> Flight:
+    return Flight(state=state, datum_m=ZERO_M, target_m=target_m)
+
+
+def inputs(
+    position_m: Vector | None = AT_SLOT,
+    velocity_m_s: Vector = STILL,
+    policy_m_s: F64 | None = None,
+    neighbours: tuple[Neighbour, ...] = (),
+) -> FlightInputs:
+    odometry = None
+    if position_m is not None:
+        x_m, y_m, height_m = position_m
+        odometry = Odometry((x_m, y_m, height_m + ZERO_M), velocity_m_s)
+    return FlightInputs(
+        now_s=100.0,
+        vehicle=VehicleState(),
+        odometry=odometry,
+        policy_velocity_m_s=policy_m_s,
+        neighbours=neighbours,
+        closest=None,
+        busy_neighbours=(),
+        ground=None,
+        ground_age_s=0.0,
+        failed_checks=(),
+        order=None,
+        uptime_s=50.0,
+    )
+
+
+def setpoint(state: Flight, given: FlightInputs) -> MissionSetpoint | None:
+    return guide(ROBOT, state, given, Guidance(), TICK_S)[0]
+
+
+def position(state: Flight, given: FlightInputs) -> F64:
+    sent = setpoint(state, given)
+    assert isinstance(sent, MissionPosition)
+    return np.array(sent.position_m)
+
+
+class Vehicle:
+    """Answers a velocity with the lag of PX4's offboard mode, a position with 0.95 of it per s."""
+
+    def __init__(self, position_m: Vector) -> None:
+        self.position_m = np.array(position_m)
+        self.velocity_m_s = np.zeros(3)
+        self.path_m: list[F64] = []
+
+    def fly(
+        self,
+        state: Flight,
+        seconds: float,
+        policy_m_s: F64 | None = None,
+        neighbours: tuple[Neighbour, ...] = (),
+    ) -> None:
+        memory = Guidance()
+        for _ in range(round(seconds / TICK_S)):
+            x, y, z = self.position_m.tolist()
+            vx, vy, vz = self.velocity_m_s.tolist()
+            given = inputs((x, y, z), (vx, vy, vz), policy_m_s, neighbours)
+            sent, memory = guide(ROBOT, state, given, memory, TICK_S)
+            assert sent is not None
+            if isinstance(sent, MissionPosition):
+                wanted_m_s, lag_s = 0.95 * (np.array(sent.position_m) - self.position_m), 0.3
+            else:
+                wanted_m_s, lag_s = np.array(sent.velocity_m_s), ROBOT.limits.lag_s
+            self.velocity_m_s += (wanted_m_s - self.velocity_m_s) * (TICK_S / lag_s)
+            self.position_m = self.position_m + self.velocity_m_s * TICK_S
+            self.path_m.append(self.position_m)
+
+
+@pytest.mark.parametrize(
+    "state", sorted(set(FlightState) - {"arming", "takeoff", "hold", "mission", "return"})
+)
+def test_nothing_is_sent_where_the_robot_does_not_steer(state: FlightState) -> None:
+    assert setpoint(flight(state, AT_SLOT), inputs(policy_m_s=np.ones(2))) is None
+
+
+def test_nothing_is_sent_right_after_a_lapse() -> None:
+    silent = replace(flight(FlightState.HOLD, AT_SLOT), silent_until_s=100.5)
+    assert setpoint(silent, inputs()) is None
+
+
+@pytest.mark.parametrize("state", ["takeoff", "hold", "mission", "return"])
+@pytest.mark.parametrize("position_m", [None, (math.nan, 1.0, 2.0), (1.0, 1.0, math.inf)])
+def test_without_a_position_the_vehicle_is_told_to_stop(
+    state: str, position_m: Vector | None
+) -> None:
+    given = inputs(position_m, policy_m_s=np.ones(2))
+    sent = setpoint(flight(FlightState(state), AT_SLOT), given)
+    assert sent == MissionVelocity((0.0, 0.0, 0.0))
+
+
+def test_arming_streams_a_standstill() -> None:
+    sent = setpoint(flight(FlightState.ARMING), inputs((16.0, 16.0, 0.0)))
+    assert sent == MissionVelocity((0.0, 0.0, 0.0))
+
+
+def test_takeoff_climbs_straight_up_at_the_climb_rate_to_the_slot() -> None:
+    state = flight(FlightState.TAKEOFF, AT_SLOT)
+    vehicle = Vehicle((16.0, 16.0, 0.0))
+    vehicle.fly(state, 12.0)
+    path_m = np.array(vehicle.path_m)
+    assert path_m[:, :2] == pytest.approx(np.full((120, 2), 16.0))
+    assert np.diff(path_m[:, 2]).max() <= ROBOT.limits.max_climb_m_s * TICK_S
+    assert path_m[-1, 2] == pytest.approx(SLOT_M, abs=0.1)
+
+
+def test_hold_comes_back_slowly_when_the_estimate_jumps() -> None:
+    state = flight(FlightState.HOLD, AT_SLOT)
+    here_m = np.array([23.0, 16.0, SLOT_M + 4.0])
+    sent_m = position(state, inputs((23.0, 16.0, SLOT_M + 4.0)))
+    assert sent_m - here_m == pytest.approx([-0.5, 0.0, -1.0])
+    vehicle = Vehicle((23.0, 16.0, SLOT_M))
+    vehicle.fly(state, 30.0)
+    assert np.abs(np.diff(vehicle.path_m, axis=0)).max() < 0.6 * TICK_S
+    assert vehicle.position_m == pytest.approx(AT_SLOT, abs=0.1)
+
+
+def test_return_flies_level_only_at_its_own_height() -> None:
+    vehicle = Vehicle((28.0, 28.0, 1.5))
+    vehicle.fly(flight(FlightState.RETURN), 60.0)
+    path_m = np.array(vehicle.path_m)
+    away = np.hypot(*(path_m[:, :2] - 28.0).T) > 0.1
+    assert (path_m[away, 2] > SLOT_M - 1.05).all()
+    assert vehicle.position_m == pytest.approx([10.0, 12.0, SLOT_M], abs=0.2)
+    speeds = np.hypot(*(np.diff(path_m[:, :2], axis=0) / TICK_S).T)
+    assert speeds.max() <= ROBOT.limits.max_speed_m_s
+    # It arrives, it does not swing.
+    distances_m = np.hypot(*(path_m[:, :2] - (10.0, 12.0)).T)
+    assert np.diff(distances_m).max() < 0.01
+
+
+def test_mission_flies_the_policy_at_the_slot_height_and_speeds_up_smoothly() -> None:
+    state, wanted = flight(FlightState.MISSION), np.array([1.2, -0.9])
+    memory, speeds = Guidance(), []
+    for _ in range(20):
+        low = inputs((16.0, 16.0, SLOT_M - 0.4), policy_m_s=wanted)
+        sent, memory = guide(ROBOT, state, low, memory, TICK_S)
+        assert isinstance(sent, MissionVelocity)
+        assert sent.velocity_m_s[2] == pytest.approx(0.4)
+        speeds.append(math.hypot(*sent.velocity_m_s[:2]))
+    assert np.diff([0.0, *speeds]).max() <= ROBOT.limits.max_acceleration_m_s2 * TICK_S + 1e-9
+    assert speeds[-1] == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("state", [FlightState.MISSION, FlightState.RETURN])
+def test_the_fence_is_not_crossed_and_one_who_is_outside_comes_back(state: FlightState) -> None:
+    vehicle = Vehicle(AT_SLOT)
+    vehicle.fly(flight(FlightState.MISSION), 30.0, np.array([2.0, 0.3]))
+    assert max(place[0] for place in vehicle.path_m) <= 30.2
+    outside = Vehicle((36.0, 16.0, SLOT_M))
+    outside.fly(flight(state), 20.0, np.array([2.0, 0.0]))
+    assert ROBOT.fence.contains(outside.position_m)
+
+
+@pytest.mark.parametrize("state", [FlightState.MISSION, FlightState.RETURN])
+def test_a_neighbour_in_the_way_stops_and_one_in_another_slot_does_not(state: FlightState) -> None:
+    for above_m, passes in ((0.0, False), (2.0, True)):
+        there: Vector = (13.0, 14.0, SLOT_M + above_m)
+        vehicle = Vehicle(AT_SLOT)
+        neighbour = Neighbour(4, there, STILL, 0.1)
+        vehicle.fly(flight(state), 30.0, np.array([-0.75, -0.5]), (neighbour,))
+        nearest_m = min(math.dist(place, there) for place in vehicle.path_m)
+        level_m = min(math.dist(place[:2], there[:2]) for place in vehicle.path_m)
+        assert nearest_m >= ROBOT.parameters.min_separation_m
+        assert (level_m < 1.0) is passes
+
+
+coordinates = st.floats(-60.0, 60.0)
+speeds = st.floats(-8.0, 8.0)
+vectors = st.tuples(coordinates, coordinates, coordinates)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    state=st.sampled_from(["takeoff", "hold", "mission", "return"]),
+    here_m=vectors,
+    velocity_m_s=st.tuples(speeds, speeds, speeds),
+    target_m=st.none() | vectors,
+    direction_rad=st.none() | st.floats(-4.0, 4.0) | st.just(math.nan),
+    others=st.lists(st.tuples(vectors, st.tuples(speeds, speeds, speeds)), max_size=3),
+    recovering=st.booleans(),
+    dt_s=st.sampled_from([0.0, 0.1, 5.0]),
+)
+def test_what_is_sent_is_finite_near_and_within_the_limits(
+    state: str,
+    here_m: Vector,
+    velocity_m_s: Vector,
+    target_m: Vector | None,
+    direction_rad: float | None,
+    others: list[tuple[Vector, Vector]],
+    recovering: bool,
+    dt_s: float,
+) -> None:
+    policy_m_s = None
+    if direction_rad is not None:
+        policy_m_s = 2.0 * np.array([math.cos(direction_rad), math.sin(direction_rad)])
+    neighbours = tuple(Neighbour(9, *other, 0.3) for other in others)
+    sent, memory = guide(
+        ROBOT,
+        flight(FlightState(state), target_m),
+        inputs(here_m, velocity_m_s, policy_m_s, neighbours),
+        Guidance(np.array([1.0, 1.0, 0.0]), recovering),
+        dt_s,
+    )
+    assert sent is not None
+    assert np.isfinite(memory.velocity_m_s).all()
+    step_m = np.array(sent[0])
+    if isinstance(sent, MissionPosition):
+        step_m = step_m - here_m  # About what is flown in a second.
+    assert np.isfinite(step_m).all()
+    assert math.hypot(*step_m[:2]) <= ROBOT.limits.max_speed_m_s + 1e-9
+    assert abs(step_m[2]) <= ROBOT.limits.max_climb_m_s + 1e-9
