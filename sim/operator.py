@@ -341,6 +341,8 @@ class Script:
         try:
             for step in self.steps:
                 self._go(step, watch)
+            if not self._all_heard(self._operator.statuses()):
+                raise ScriptError(f"{self._who_is_not(lambda _: True)} fell silent")
         except BaseException:
             self.land(watch)
             raise

@@ -355,6 +355,7 @@ def _position_lost(t: _Tick) -> str | None:
 
 
 def _on_ground(t: _Tick) -> str | None:
+    # Nothing that the ground repeats may lift a vehicle off.
     return _if(t.inputs.vehicle.in_air is False and not t.silent, "it stands on the ground")
 
 
@@ -384,7 +385,7 @@ def _ground_holds(t: _Tick) -> str | None:
 
 
 def _ground_holds_landing(t: _Tick) -> str | None:
-    return _ground_holds(t) if t.flight.land_by != "safety" and _may_climb(t) else None
+    return _ground_holds(t) if t.flight.land_by != "safety" else None
 
 
 def _ground_returns(t: _Tick) -> str | None:
@@ -392,12 +393,7 @@ def _ground_returns(t: _Tick) -> str | None:
 
 
 def _ground_returns_landing(t: _Tick) -> str | None:
-    return _ground_returns(t) if t.flight.land_by == "ground" and _may_climb(t) else None
-
-
-def _may_climb(t: _Tick) -> bool:
-    """Nothing that the ground repeats may lift a vehicle that has landed."""
-    return t.inputs.vehicle.in_air is True and t.height_m is not None
+    return _ground_returns(t) if t.flight.land_by == "ground" else None
 
 
 def _too_close(t: _Tick) -> str | None:
@@ -439,6 +435,7 @@ def _enabled(t: _Tick) -> str | None:
 
 
 def _enabled_at_rest(t: _Tick) -> str | None:
+    # Until then the operator sees why arming failed, and telemetry that the vehicle is disarmed.
     return _enabled(t) if t.age_s > _STALE_TELEMETRY_S else None
 
 
@@ -554,11 +551,11 @@ TRANSITIONS: tuple[Transition, ...] = (
                _ground_lands, land_by="ground"),
     Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, "the ground commands hold",
                _ground_holds),
-    Transition((_S.LAND,), _S.HOLD, "the ground commands hold, it is in the air, and landing was "
-               "no emergency", _ground_holds_landing),
+    Transition((_S.LAND,), _S.HOLD, "the ground commands hold, and landing was no emergency",
+               _ground_holds_landing),
     Transition((_S.HOLD, _S.MISSION), _S.RETURN, "the ground commands return", _ground_returns),
-    Transition((_S.LAND,), _S.RETURN, "the ground commands return, it is in the air, and the "
-               "ground had commanded land", _ground_returns_landing),
+    Transition((_S.LAND,), _S.RETURN, "the ground commands return, and had commanded land",
+               _ground_returns_landing),
     # What the robot notices by itself.
     Transition((_S.MISSION,), _S.HOLD, "a neighbour is too close", _too_close, alarm=True),
     Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", _ground_lost, alarm=True),
@@ -571,7 +568,7 @@ TRANSITIONS: tuple[Transition, ...] = (
                alarm=True),
     # The way of a flight.
     Transition((_S.INIT,), _S.IDLE, "autopilot, position and estimator origin are known", _found),
-    Transition((_S.IDLE,), _S.PREFLIGHT, "the ground enables, and has set an origin",
+    Transition((_S.IDLE,), _S.PREFLIGHT, "the ground enables and has set an origin, after 2 s",
                _enabled_at_rest),
     Transition((_S.PREFLIGHT,), _S.IDLE, "the ground does not enable, or is lost", _not_enabled),
     Transition((_S.PREFLIGHT,), _S.ARMING, "the operator orders takeoff, and the robot is ready",

@@ -129,15 +129,17 @@ class World:
         raise AssertionError(f"{self.flight.state}, not {state}: {self.flight.reason}")
 
     def stop(self, seconds: float) -> None:
-        """The process is stopped and continued: its first tick knows nothing new."""
+        """The process is stopped and continued: its first ticks know nothing new."""
         before = self._hear()
+        known, self.position_known = self.position_known, False
+        ground_on, self.ground_on = self.ground_on, False
         for _ in range(round(seconds / TICK_S)):
             self._pass(TICK_S)
             if self.watchdog and self.mode is Mode.OFFBOARD and self._silence_s > 0.5:
                 self.mode = self.intended = Mode.HOLD
         connected = self.now_s - before.heartbeat_at_s < 2.5
-        known, self.position_known = self.position_known, False
-        ground_on, self.ground_on = self.ground_on, False
+        self._decide(replace(before, connected=connected))
+        self._pass(TICK_S)
         self._decide(replace(before, connected=connected))
         self.position_known, self.ground_on = known, ground_on
 
@@ -529,6 +531,9 @@ def test_takeoff_waits_for_the_vehicle_and_stops_where_it_is_refused(world: Worl
         world.until(FlightState.IDLE, 7.0)
         assert f"{action} refused: not today" in world.flight.reason
         assert world.actions[-1][1] is Action.DISARM
+        world.run(1.5)
+        assert world.state() is FlightState.IDLE
+        assert world.flight.alarming
     world.refuses = {}
     world.ready()
     world.telemetry = False
@@ -865,12 +870,14 @@ def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
 def test_after_a_lapse_nothing_moves_until_the_operator_resumes(world: World) -> None:
     world.fly()
     assert world.speed_m_s > 0.5
-    world.stop(4.0)
+    world.stop(20.0)
     assert world.state() is FlightState.HOLD
     assert world.flight.alarming
+    world.run(1.0)
+    world.position_m[0] += 0.4  # Where it stands then counts.
     at_m = world.position_m.copy()
     sent_s = world.setpoint_at_s
-    world.run(1.8)
+    world.run(0.7)
     assert world.setpoint_at_s == sent_s  # Stale telemetry is worked off first.
     for _ in range(100):
         world.tick()
@@ -902,7 +909,7 @@ def test_after_a_lapse_that_only_the_program_saw_the_vehicle_holds() -> None:
     world.fly()
     world.watchdog = False
     world.stop(0.6)
-    world.next_beat_s, world.latency_s = world.now_s + 0.2, 0.1
+    world.next_beat_s, world.latency_s = world.now_s + 0.05, 0.0
     world.run(10.0)
     assert world.asked(Action.HOLD) == 1
     assert world.state() is FlightState.HOLD

@@ -1,0 +1,220 @@
+"""A fleet of real robot programs on simulated vehicles, from takeoff to landing."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import pytest
+
+from edge.adapters.flight_log import read_metadata
+from edge.core.mission import FlightState
+from edge.core.world import parse_world
+from edge.runtime.bundle import Bundle
+from edge.runtime.config import load_config
+from sim.experiment import Scenario
+from sim.experiment import fly as fly_in_process
+from sim.fleet import MIN_APART_M, Fleet, FleetScenario
+from sim.operator import Operator
+from tests.cli.test_cli import error_line, lpac
+from tests.conftest import ROOT, SHIPPED
+
+# Worlds in which a change of the clocks' phases alone hardly moves the cost.
+SEEDS = (3, 4, 5, 7, 8)
+ROBOTS = 5
+MISSION_S = 20.0
+# The end of the mission that the cost is taken from: the robots keep moving about their places.
+LAST_S = 5
+DRONE_M = 0.3
+
+ORDER_OF_STATES = [
+    FlightState.PREFLIGHT, FlightState.ARMING, FlightState.TAKEOFF, FlightState.HOLD,
+    FlightState.MISSION, FlightState.RETURN, FlightState.LAND,
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[int, tuple[dict[str, Any], Path]]:
+    """A flight of five robots over each of five worlds, as many at once as there are cores."""
+
+    def fly(seed: int) -> tuple[dict[str, Any], Path]:
+        out = tmp_path_factory.mktemp("fleet") / str(seed)
+        result = lpac(
+            "sim", "--vehicle", "mavlink", "-n", ROBOTS, "--seed", seed, "--duration", MISSION_S,
+            "--json", "--out", out,
+        )  # fmt: skip
+        assert result.stdout, result.stderr
+        return json.loads(result.stdout), out
+
+    with ThreadPoolExecutor(min(len(SEEDS), os.cpu_count() or 1)) as at_once:
+        return dict(zip(SEEDS, at_once.map(fly, SEEDS), strict=True))
+
+
+Flights = dict[int, tuple[dict[str, Any], Path]]
+
+
+def test_all_robots_take_off_cover_and_land(flights: Flights) -> None:
+    for flight, _ in flights.values():
+        assert flight["problem"] is None and flight["all_landed"], flight
+        for robot in flight["fleet"]:
+            states = [change["state"] for change in robot["timeline"]]
+            positions = [states.index(state) for state in ORDER_OF_STATES if state in states]
+            assert positions == sorted(positions)
+            assert {FlightState.TAKEOFF, FlightState.MISSION, FlightState.LAND} <= {*states}
+            # A machine that is too busy for a moment makes a robot hold; then it goes on.
+            assert robot["mission_share"] > 0.5
+            assert robot["messages"]["accepted"] > 0
+
+
+def test_robots_never_touch_in_truth(flights: Flights) -> None:
+    assert min(flight["separation"]["distance_m"] for flight, _ in flights.values()) > DRONE_M
+
+
+def test_the_fence_is_never_crossed_by_the_estimate(flights: Flights) -> None:
+    for flight, _ in flights.values():
+        assert not flight["fence"]["crossed"] and flight["fence"]["margin_m"] > 0.0
+
+
+def test_a_fleet_covers_as_well_as_the_swarm_in_simulated_time(
+    flights: Flights, shipped_bundle: Bundle
+) -> None:
+    """The same worlds, scale, starts and duration; medians, since each flight has its own luck."""
+    flown, simulated = [], []
+    for flight, out in flights.values():
+        flown.append(np.mean(flight["cost_curve"]["normalized_cost"][-LAST_S - 1 :]))
+        scenario = Scenario(
+            robots=ROBOTS,
+            duration_s=MISSION_S,
+            features=parse_world((out / "world.env").read_text()),
+            starts_m=tuple((x, y) for x, y in flight["start_positions_m"]),
+        )
+        in_process = fly_in_process(scenario, shipped_bundle)
+        simulated.append(in_process.normalized_cost[-LAST_S - 1 :].mean())
+    assert np.median(flown) == pytest.approx(np.median(simulated), rel=0.1), (flown, simulated)
+
+
+def test_what_a_flight_leaves_behind(flights: Flights) -> None:
+    for flight, out in flights.values():
+        assert json.loads((out / "flight.json").read_text()) == flight
+        assert (out / "flight.png").stat().st_size > 0 and (out / "flight.pdf").exists()
+        for robot_id, robot in enumerate(flight["fleet"]):
+            assert load_config(out / "robots" / str(robot_id) / "robot.toml").robot_id == robot_id
+            assert robot["logs"]
+            for log in robot["logs"]:
+                assert read_metadata(out / log).robot_id == robot_id
+            assert 0.0 < robot["cpu_share"] < 1.0 and robot["peak_memory_mb"] > 0.0
+            assert set(robot["loops"]) == {"perception", "policy", "control"}
+            assert all(loop["failures"] == 0 for loop in robot["loops"].values())
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("robots", [1, 10])
+def test_where_a_fleet_stands(tmp_path: Path, seed: int, robots: int) -> None:
+    fleet = Fleet(FleetScenario(robots=robots, seed=seed), tmp_path, SHIPPED)
+    assert fleet.simulated is not None
+    for places_m in (fleet.pads_m, fleet.landing_points_m):
+        assert min(fleet.fence.distance_m(x, y) for x, y in places_m) > fleet.fence.buffer_m
+        away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
+        assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= MIN_APART_M
+    np.testing.assert_allclose(fleet.true_positions_m()[:, :2], fleet.pads_m, atol=1e-9)
+    errors_m = np.linalg.norm(fleet.landing_points_m - fleet.pads_m, axis=1)
+    assert np.all((errors_m >= 1.0) & (errors_m <= 5.0))
+
+
+def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
+    tmp_path: Path, shipped_bundle: Bundle
+) -> None:
+    fleet = Fleet(FleetScenario(robots=1, seed=11), tmp_path, SHIPPED)
+    swarm = fly_in_process(Scenario(robots=1, seed=11, duration_s=0.1), shipped_bundle)
+    assert fleet.features == swarm.features
+    assert parse_world((tmp_path / "world.env").read_text()) == swarm.features
+
+
+def test_a_killed_robot_program_falls_silent_and_can_be_started_again(tmp_path: Path) -> None:
+    with Fleet(FleetScenario(robots=2), tmp_path, SHIPPED) as fleet:
+        assert fleet.operator.wait_for(lambda statuses: len(statuses) == 2, 60.0)
+        before = fleet.operator.statuses()[1].boot_nonce
+        fleet.robots[1].send_signal(signal.SIGKILL)
+        assert fleet.robots[1].wait(10.0) == -signal.SIGKILL
+        assert fleet.operator.wait_for(lambda statuses: set(statuses) == {0}, 20.0)
+        with pytest.raises(RuntimeError, match="the program of robot 1 has ended"):
+            fleet.require_running()
+        fleet.robots[1].start()
+        assert fleet.operator.wait_for(
+            lambda statuses: 1 in statuses and statuses[1].boot_nonce != before, 60.0
+        )
+        # A stopped process is woken up to end.
+        fleet.robots[0].send_signal(signal.SIGSTOP)
+    assert [robot.wait(0.0) for robot in fleet.robots] == [0, 0]
+
+
+@contextmanager
+def launched(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """`lpac sim --vehicle mavlink` in the background."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cli.main", "sim", "--vehicle", "mavlink", *map(str, arguments)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "1000", "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    with process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+                process.wait(90.0)
+
+
+def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
+    assert stream is not None
+    lines = []
+    for line in stream:
+        lines.append(line)
+        match = re.search(pattern, line)
+        if match:
+            return match
+    raise AssertionError(f"{pattern!r} is not among {lines}")
+
+
+def test_ctrl_c_lands_all() -> None:
+    with launched("-n", 2, "--json") as process:
+        read_until(process.stderr, r" s  mission$")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=90.0)
+    assert process.returncode == 1
+    flight = json.loads(output)
+    assert flight["problem"] == "stopped by Ctrl-C" and flight["all_landed"]
+
+
+def test_without_the_script_another_ground_commands() -> None:
+    with launched("-n", 1, "--no-script") as process:
+        fleet, endpoint = read_until(process.stdout, r"fleet (\S+), .* ground to (\S+);").groups()
+        with Operator(fleet=fleet, connect=[endpoint]) as operator:
+            assert operator.wait_for(lambda statuses: 0 in statuses, 60.0)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(20.0) == 0
+            assert operator.wait_for(lambda statuses: not statuses, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["-n", "0"], "robots = 0: must be from 1 to 20"),
+        (["-n", "21"], "robots = 21: must be from 1 to 20"),
+        (["--duration", "0"], "duration = 0.0: must be positive and finite"),
+        (["--loss", "0.1"], "--loss does nothing with --vehicle mavlink"),
+        (["--controller", "lpac"], "--controller does nothing with --vehicle mavlink"),
+        (["--px4", "docs"], "--px4 does nothing with --vehicle mavlink"),
+        (["--bundle", "absent"], "absent: No such file or directory"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
+    assert text in error_line(lpac("sim", "--vehicle", "mavlink", *arguments))

@@ -1,0 +1,187 @@
+"""The scripted ground station, against robots that only talk."""
+
+import dataclasses
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.adapters.zenoh_link import ZenohLink
+from edge.core.mission import (
+    FlightState,
+    GroundState,
+    Order,
+    OrderResult,
+    Origin,
+    RobotStatus,
+    from_json,
+    to_json,
+)
+from sim.fleet_vehicles import free_ports
+from sim.operator import Operator, waiting_to_land
+
+ORIGIN = Origin(40.0, -75.0, 30.0)
+STATUS = RobotStatus(
+    robot_id=0, boot_nonce=7, sequence=0, uptime_s=100.0, unix_time_s=0.0, state=FlightState.HOLD,
+    reason="", ready=False, failed_checks=(), alarms=(), obeyed_sequence=0, operator="", orders=(),
+    bundle_id="", world_id="", trial="", origin=None, system_id=1, slot_height_m=4.0,
+    landing_point_m=(0.0, 0.0), position_m=(0.0, 0.0, 4.0), velocity_m_s=None, heading_rad=None,
+    mode=None, armed=True, battery=None, satellites=None, message_counts={}, neighbour_ages_s={},
+    loops={},
+)  # fmt: skip
+
+
+class Talker:
+    """A robot's radio: says what the test wants, and keeps what the ground says."""
+
+    def __init__(self, endpoint: str, robot: int) -> None:
+        self._changed = threading.Condition()
+        self.states: list[GroundState] = []
+        self.orders: list[Order] = []
+        self.status = dataclasses.replace(STATUS, robot_id=robot)
+        self.link = ZenohLink(
+            fleet="test", robot_id=robot, listen=(endpoint,),
+            subscriptions={"ground/state": self._on_state, "ground/order": self._on_order},
+        )  # fmt: skip
+
+    def say(self, **changes: object) -> None:
+        self.status = dataclasses.replace(self.status, **changes)  # type: ignore[arg-type]
+        self.link.publish("status", to_json(self.status))
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        with self._changed:
+            assert self._changed.wait_for(condition, 10.0), (self.states, self.orders)
+
+    def _on_state(self, _: str, data: bytes) -> None:
+        with self._changed:
+            self.states.append(from_json(GroundState, data))
+            self._changed.notify_all()
+
+    def _on_order(self, _: str, data: bytes) -> None:
+        with self._changed:
+            self.orders.append(from_json(Order, data))
+            self._changed.notify_all()
+
+
+@contextmanager
+def talking(robots: int = 1) -> Iterator[tuple[Operator, list[Talker]]]:
+    """An operator that hears the robots' first statuses."""
+    with free_ports(robots, socket.SOCK_STREAM) as ports:
+        endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
+    talkers = [Talker(endpoint, robot) for robot, endpoint in enumerate(endpoints)]
+    try:
+        with Operator(fleet="test", connect=endpoints) as operator:
+
+            def heard(statuses: object) -> bool:
+                for talker in talkers:
+                    talker.say()
+                return len(operator.statuses()) == robots
+
+            assert operator.wait_for(heard, 10.0)
+            yield operator, talkers
+    finally:
+        for talker in talkers:
+            talker.link.close()
+
+
+def test_an_order_is_repeated_until_it_is_answered() -> None:
+    with talking() as (operator, [robot]):
+        order_id = operator.order("start", 0, "trial")
+        robot.wait_for(lambda: len(robot.orders) >= 3)
+        assert len(set(robot.orders)) == 1
+        order = robot.orders[0]
+        assert (order.order_id, order.robot_id, order.boot_nonce) == (order_id, 0, 7)
+        assert (order.kind, order.trial, order.expires_at_uptime_s) == ("start", "trial", 110.0)
+        assert operator.ordered(0) and operator.result(order_id) is None
+        robot.say(orders=(OrderResult(order_id, True),))
+        assert operator.result(order_id, 10.0) == OrderResult(order_id, True)
+        assert not operator.ordered(0) and operator.refusals == []
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        ({"orders": (OrderResult("?", False, "not ready: no GPS"),)}, "not ready: no GPS"),
+        ({"uptime_s": 110.5}, "it was not answered"),
+        ({"boot_nonce": 8, "uptime_s": 3.0}, "it was not answered"),
+    ],
+    ids=["refused", "expired", "restarted"],
+)
+def test_what_becomes_of_an_order_that_is_not_taken(answer: dict[str, object], reason: str) -> None:
+    with talking() as (operator, [robot]):
+        order_id = operator.order("takeoff", 0)
+        if "orders" in answer:
+            answer = {"orders": (OrderResult(order_id, False, reason),)}
+        robot.say(**answer)
+        assert operator.result(order_id, 10.0) == OrderResult(order_id, False, reason)
+        assert operator.refusals == [f"robot 0 refuses takeoff: {reason}"]
+
+
+def test_nobody_orders_a_robot_that_is_not_heard() -> None:
+    with talking() as (operator, _):
+        result = operator.result(operator.order("takeoff", 5))
+        assert result is not None and result.reason == "the robot is not heard"
+
+
+def test_the_state_is_repeated_and_its_sequence_grows_with_each_change() -> None:
+    with talking() as (operator, [robot]):
+        assert robot.states == []  # a ground that wants nothing says nothing
+        operator.enable(ORIGIN)
+        robot.wait_for(lambda: len(robot.states) >= 2)
+        operator.enable(ORIGIN)
+        operator.calm("return", 3)
+        operator.calm("hold", 4)
+        robot.wait_for(lambda: bool(robot.states[-1].robot_calm.get("4")))
+        state = robot.states[-1]
+        assert state.enabled and state.origin == ORIGIN and state.unix_time_s is not None
+        assert [state.calm_for(robot) for robot in (0, 3, 4)] == ["none", "return", "hold"]
+        assert (robot.states[0].sequence, state.sequence) == (1, 3)
+        operator.calm("land")
+        robot.wait_for(lambda: robot.states[-1].calm_for(3) == "land")
+
+
+def test_a_silent_robot_is_no_longer_among_the_statuses() -> None:
+    with talking(2) as (operator, [_, other]):
+
+        def only_the_other(statuses: object) -> bool:
+            other.say()
+            return set(operator.statuses()) == {1}
+
+        assert operator.wait_for(only_the_other, 15.0)
+        assert len(operator.history(0)) >= 1
+        assert not operator.wait_for(lambda statuses: 0 in statuses, 0.1)
+
+
+robots_in_the_air = st.dictionaries(
+    st.integers(0, 9),
+    st.tuples(
+        st.sampled_from(
+            [FlightState.HOLD, FlightState.RETURN, FlightState.LAND, FlightState.LANDED]
+        ),
+        st.booleans(),
+    ),
+    min_size=1,
+)
+
+
+@given(robots_in_the_air)
+def test_nobody_lands_through_the_height_of_one_who_flies_home(
+    robots: dict[int, tuple[FlightState, bool]],
+) -> None:
+    statuses = {
+        robot: dataclasses.replace(STATUS, robot_id=robot, state=state, slot_height_m=4.0 + robot)
+        for robot, (state, _) in robots.items()
+    }
+    arrived = {robot for robot, (_, there) in robots.items() if there}
+    waiting = waiting_to_land(statuses, arrived)
+    flying = {r for r, (s, _) in robots.items() if s in (FlightState.HOLD, FlightState.RETURN)}
+    for robot in flying & arrived:
+        others_below = any(other < robot for other in flying - arrived)
+        assert (robot in waiting) == others_below
+    assert waiting <= flying & arrived
+    # Somebody can always go on.
+    assert not flying or flying - waiting
