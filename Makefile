@@ -5,7 +5,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo setup test lint bench export clean
+.PHONY: help demo fly setup test lint bench export clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -13,6 +13,9 @@ help: ## show this list
 
 demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
 	.venv/bin/lpac demo --out out/demo
+
+fly: .venv/sim ## ten robot programs fly simulated PX4s for two minutes: out/fly/flight.png
+	.venv/bin/lpac sim --vehicle mavlink --duration 50 --out out/fly
 
 setup: .venv/sim .venv/export ## install what a workstation needs: simulator, plots, torch, onnx
 

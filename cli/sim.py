@@ -299,7 +299,7 @@ def _table(title: str, statuses: "Statuses") -> "Table":
             f"{speed_m_s:.1f}",
             str(len(status.neighbour_ages_s)),
             "" if status.battery is None else f"{100.0 * status.battery:.0f} %",
-            "; ".join((*status.alarms, *status.failed_checks)) or status.reason,
+            "; ".join(status.alarms if status.armed else status.failed_checks) or status.reason,
         )
     return table
 

@@ -75,6 +75,10 @@ class FleetScenario:
             raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
 
 
+class FleetError(ValueError):
+    """A robot's program has ended; the text says which, and its last words."""
+
+
 class Usage(NamedTuple):
     """What a process took so far: processor time, s, and its greatest resident memory, MB."""
 
@@ -251,10 +255,10 @@ class Fleet:
         self._stack.__exit__(kind, error, traceback)
 
     def require_running(self) -> None:
-        """Raises RuntimeError with the last words of a robot's program that has ended."""
+        """Raises FleetError if the program of a robot has ended."""
         for robot in self.robots:
             if not robot.running:
-                raise RuntimeError(
+                raise FleetError(
                     f"the program of robot {robot.robot_id} has ended: {robot.last_words()}"
                 )
 

@@ -171,7 +171,7 @@ def fly(
 ) -> FleetFlight:
     """Fly the script with a fleet that runs; `watch` gets the step's name, some times a second.
 
-    Ctrl-C lands all. Raises RuntimeError if a robot's program ends before all are heard.
+    Ctrl-C lands all. Raises FleetError if a robot's program ends before all are heard.
     """
     scenario, operator = fleet.scenario, fleet.operator
     script = Script(

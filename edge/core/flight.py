@@ -723,6 +723,10 @@ def _ask(t: _Tick) -> tuple[Action, ...]:
         return _again(t, Action.KILL) if flight.killed and not flight.reached else ()
     if flight.state is _S.ARMING and flight.reached:
         return () if flight.armed_asked else (Action.ARM,)
+    if flight.state in _ON_GROUND and t.inputs.vehicle.armed is False:
+        # Where a flight leaves PX4, it would not arm again.
+        stuck = t.heard_since_entry and t.mode in (Mode.OFFBOARD, Mode.LAND, Mode.RETURN)
+        return _again(t, Action.HOLD) if stuck else ()
     if t.silent and flight.state in STEERED:
         # Without setpoints it would land. Before a look, a pilot may have it.
         flies_on = t.mode is Mode.OFFBOARD and t.heard_since_entry

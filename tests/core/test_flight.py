@@ -43,6 +43,7 @@ NOT_OURS = (
     FlightState.PILOT,
     FlightState.FAULT,
 )
+ON_GROUND = NOT_OURS[:4]
 AIRBORNE = (
     FlightState.TAKEOFF,
     FlightState.HOLD,
@@ -312,7 +313,7 @@ class World:
         decision = step(ROBOT, before, inputs)
         self.flight = decision.flight
         setpoint, self.guidance = guide(ROBOT, self.flight, inputs, self.guidance, TICK_S)
-        self._check(before, decision, setpoint)
+        self._check(before, vehicle, decision, setpoint)
         self.commands += decision.actions
         self.actions += [(self.now_s, action) for action in decision.actions]
         if decision.taken is not None:
@@ -324,7 +325,13 @@ class World:
             self.setpoint, self.setpoint_at_s = setpoint, self.now_s
         return decision
 
-    def _check(self, before: Flight, decision: Decision, setpoint: MissionSetpoint | None) -> None:
+    def _check(
+        self,
+        before: Flight,
+        vehicle: VehicleState,
+        decision: Decision,
+        setpoint: MissionSetpoint | None,
+    ) -> None:
         """What holds in every tick of every flight."""
         state = decision.flight.state
         allowed = set(Action)
@@ -333,6 +340,8 @@ class World:
             allowed = {Action.DISARM} if before.state is FlightState.ARMING else set()
             if decision.flight.killed:
                 allowed.add(Action.KILL)
+            if state in ON_GROUND and vehicle.armed is False:
+                allowed.add(Action.HOLD)
         assert set(decision.actions) <= allowed
         if setpoint is not None:
             assert all(math.isfinite(value) for value in setpoint[0])

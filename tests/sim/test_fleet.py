@@ -22,13 +22,14 @@ from edge.runtime.bundle import Bundle
 from edge.runtime.config import load_config
 from sim.experiment import Scenario
 from sim.experiment import fly as fly_in_process
-from sim.fleet import MIN_APART_M, Fleet, FleetScenario
+from sim.fleet import MIN_APART_M, Fleet, FleetError, FleetScenario
 from sim.operator import Operator
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
 
-# Worlds in which a change of the clocks' phases alone hardly moves the cost.
-SEEDS = (3, 4, 5, 7, 8)
+# Worlds in which the swarm's cost hangs little, by 10 % at most, on the clocks' phases, on the last
+# decimetres of the starts and on the vehicles' lag. In others luck decides.
+SEEDS = (0, 14, 18, 19, 23)
 ROBOTS = 5
 MISSION_S = 20.0
 # The end of the mission that the cost is taken from: the robots keep moving about their places.
@@ -145,7 +146,7 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(tmp_path: 
         fleet.robots[1].send_signal(signal.SIGKILL)
         assert fleet.robots[1].wait(10.0) == -signal.SIGKILL
         assert fleet.operator.wait_for(lambda statuses: set(statuses) == {0}, 20.0)
-        with pytest.raises(RuntimeError, match="the program of robot 1 has ended"):
+        with pytest.raises(FleetError, match="the program of robot 1 has ended"):
             fleet.require_running()
         fleet.robots[1].start()
         assert fleet.operator.wait_for(
