@@ -10,6 +10,8 @@ import typer
 
 app = typer.Typer(name="robot", help="Fly one robot, or check whether it could.")
 
+_END_WITHIN_S = 2.9
+
 ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configuration, TOML.")]
 
 
@@ -19,12 +21,20 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
 
     A vehicle that is flying then holds, or lands if the configuration says so.
     """
+    stop = threading.Event()
+
+    def on_signal(*_: object) -> None:
+        if not stop.is_set():
+            stop.set()
+            # Whatever hangs, the program ends; PX4 then lands a vehicle that it was flying.
+            signal.setitimer(signal.ITIMER_REAL, _END_WITHIN_S)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+
     from edge.robot import run as run_robot
     from edge.runtime.config import load_config
 
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
     run_robot(load_config(config), stop)
 
 

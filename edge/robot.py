@@ -1,24 +1,27 @@
 """One robot's program: everything is built and wired here, in numbered steps.
 
-Threads: the three loops (`perception`, `policy`, `control`), zenoh's and MAVSDK's own, whose
-callbacks only store, and the main thread, which keeps house: status, preflight checks, flight log.
+Threads: the three loops (`perception`, `policy`, `control`), `preflight`, which waits for the
+vehicle while it stands on the ground, zenoh's and MAVSDK's own, whose callbacks only store, and the
+main thread, which keeps house: status and flight log.
 """
 
+import ctypes
 import dataclasses
-import fcntl
+import errno
 import gc
 import hashlib
 import json
 import logging
 import math
-import os
 import secrets
+import socket
+import struct
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
@@ -31,11 +34,11 @@ from edge.adapters.idf_sensor import IdfSensor
 from edge.adapters.logs import configure_logging
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
 from edge.adapters.zenoh_link import ZenohLink
-from edge.core.flight import Robot
 from edge.core.mission import FlightState, RobotStatus, to_json
 from edge.core.vehicle import Action
+from edge.core.wire import Rejection, decode
 from edge.core.world import parse_world, rasterize
-from edge.runtime.bundle import Bundle, load_bundle
+from edge.runtime.bundle import load_bundle
 from edge.runtime.config import RobotConfig
 from edge.runtime.control import FlightControl
 from edge.runtime.inbox import Inbox
@@ -47,8 +50,12 @@ from edge.runtime.readiness import Readiness
 from edge.runtime.verify import verify
 
 _HOUSEKEEPING_S = 0.25
-_LEAVE_S = 1.2
+_PREFLIGHT_S = 0.25
+# On leaving: for the autopilot's answer, and for a loop that hangs.
+_ANSWER_S = 1.2
 _JOIN_S = 0.3
+# Whoever sent it: nobody has this robot id.
+_NOBODY = -1
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
 
@@ -61,11 +68,14 @@ class RobotError(ValueError):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Loaded:
-    """What a robot needs before any hardware: all of it is checked already."""
+    """What a robot needs before any hardware: all of it is checked already.
 
-    bundle: Bundle
-    bundle_problem: str | None
+    `bundle_problem` is why the bundle was not verified on this CPU, None if it was.
+    """
+
     policy: Policy
+    bundle_id: str
+    bundle_problem: str | None
     sensor: IdfSensor
     world_id: str
 
@@ -83,9 +93,9 @@ def load(config: RobotConfig) -> Loaded:
     text = Path(config.policy.world).read_text("utf-8-sig")
     importance = rasterize(parse_world(text, config.policy.world), perception.world_size)
     return Loaded(
-        bundle=bundle,
-        bundle_problem=problem,
         policy=Policy(bundle),
+        bundle_id=bundle.id,
+        bundle_problem=problem,
         sensor=IdfSensor(importance, perception.sensor_size),
         world_id=hashlib.sha256(text.encode()).hexdigest()[:12],
     )
@@ -98,25 +108,15 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
     """
     # 1. Policy and world, before anything that moves.
     loaded = load(config)
+    if stop.is_set():
+        return
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     boot_nonce = secrets.randbits(48)
     with ExitStack() as parts:
         # 2. One program per robot, and per vehicle, on this machine.
-        parts.enter_context(_alone(f"robot {config.robot_id} of fleet {config.fleet}"))
-        parts.enter_context(_alone(f"autopilot {config.autopilot.url}"))
+        _take_alone(config, parts)
         # 3. The flight log, so that it holds all that follows.
-        recorder = FlightLog(
-            Path(config.log.folder),
-            FlightMetadata(
-                robot_id=config.robot_id,
-                boot_nonce=boot_nonce,
-                bundle_id=loaded.bundle.id,
-                bundle_path=config.policy.bundle,
-                configuration=json.dumps(dataclasses.asdict(config)),
-                version=version("lpac-edge"),
-            ),
-            max_total_bytes=int(config.log.max_total_mb * 1e6),
-        )
+        recorder = _open_log(config, loaded, boot_nonce)
         parts.callback(recorder.close)
         configure_logging(recorder)
         # 4. The vehicle, and who holds it when this program hangs.
@@ -130,19 +130,71 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
                 config.flight.command_timeout_s,
             )
         )
-        # 5. The robot's own parts, and the radio that feeds them.
-        program = _Program(config, loaded, autopilot, deadman, recorder, boot_nonce)
-        link = parts.enter_context(program.open_link())
-        # 6. The loops.
+        # 5. What the robot knows: its place, its radio mail, its map and messages.
+        navigation = Navigation(autopilot, time.monotonic)
+        inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
+        pac = Pac(
+            robot_id=config.robot_id,
+            boot_epoch=time.time_ns() // 1_000_000,
+            policy=loaded.policy,
+            sensor=loaded.sensor,
+            odometry=navigation,
+            parameters=config.pac,
+        )
+        # 6. The radio that feeds it.
+        link = parts.enter_context(
+            _open_link(config, inbox, config.robot_id, partial(_receive, pac, loaded, recorder))
+        )
+        # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
+        program = _Program(
+            config, loaded, autopilot, deadman, recorder, navigation, inbox, pac, link, boot_nonce
+        )
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
-        program.start(link)
-        _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle.id[:12])
-        # 7. Keeping house until somebody stops the program.
+        ctypes.CDLL(None).malloc_trim(0)  # What verification took goes back to the system.
+        program.start()
+        parts.callback(program.leave)
+        _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])
+        # 8. Keeping house until somebody stops the program.
         while not stop.wait(_HOUSEKEEPING_S):
             program.keep_house()
-        # 8. A defined end: the vehicle holds or lands, then everything is closed.
-        program.leave()
+
+
+def _open_log(config: RobotConfig, loaded: Loaded, boot_nonce: int) -> FlightLog:
+    metadata = FlightMetadata(
+        robot_id=config.robot_id,
+        boot_nonce=boot_nonce,
+        bundle_id=loaded.bundle_id,
+        bundle_path=config.policy.bundle,
+        configuration=json.dumps(dataclasses.asdict(config)),
+        version=version("lpac-edge"),
+    )
+    max_total_bytes = int(config.log.max_total_mb * 1e6)
+    return FlightLog(Path(config.log.folder), metadata, max_total_bytes=max_total_bytes)
+
+
+def _receive(pac: Pac, loaded: Loaded, recorder: FlightLog, key: str, data: bytes) -> None:
+    """A neighbour's message, from the link's threads: to the mailbox, and what came to the log."""
+    unix_now_s = time.time()
+    rejection = pac.receive(data, time.monotonic(), unix_now_s)
+    message = decode(
+        data,
+        bundle_id=loaded.policy.bundle_id,
+        frame_id=None,
+        own_robot_id=_NOBODY,
+        message_size=loaded.policy.manifest.geometry.message_size,
+    )
+    header = None if isinstance(message, Rejection) else message
+    recorder.record(
+        "received",
+        unix_now_s,
+        {
+            "sender": int(key.split("/")[1]),
+            "sequence": header and header.sequence,
+            "age_s": header and unix_now_s - header.sent_at_s,
+            "rejection": rejection,
+        },
+    )
 
 
 class _Program:
@@ -155,6 +207,10 @@ class _Program:
         autopilot: MavsdkAutopilot,
         deadman: Deadman,
         recorder: FlightLog,
+        navigation: Navigation,
+        inbox: Inbox,
+        pac: Pac,
+        link: ZenohLink,
         boot_nonce: int,
     ) -> None:
         self._config = config
@@ -162,24 +218,18 @@ class _Program:
         self._autopilot = autopilot
         self._deadman = deadman
         self._recorder = recorder
+        self._navigation = navigation
+        self._inbox = inbox
+        self._pac = pac
+        self._link = link
         self._boot_nonce = boot_nonce
         self._started_s = time.monotonic()
-        self._navigation = Navigation(autopilot, time.monotonic)
-        self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
-        self._pac = Pac(
-            robot_id=config.robot_id,
-            boot_epoch=time.time_ns() // 1_000_000,
-            policy=loaded.policy,
-            sensor=loaded.sensor,
-            odometry=self._navigation,
-            parameters=config.pac,
-        )
         self._control = FlightControl(
-            robot=Robot(config.robot_id, boot_nonce, config.flight, config.fence, config.limits),
+            robot=config.robot(boot_nonce),
             autopilot=autopilot,
-            navigation=self._navigation,
-            pac=self._pac,
-            inbox=self._inbox,
+            navigation=navigation,
+            pac=pac,
+            inbox=inbox,
             recorder=recorder,
             unix_clock_s=time.time,
             started_s=self._started_s,
@@ -191,43 +241,47 @@ class _Program:
             Loop("perception", 1.0 / rates.perception_hz, self._perception_step),
             Loop("policy", 1.0 / rates.policy_hz, self._policy_step),
         )
+        # A vehicle that falls silent holds it up for many seconds.
+        self._preflight = Loop("preflight", _PREFLIGHT_S, self._preflight_step)
         self._sequence = 0
-        self._link: ZenohLink | None = None
 
-    def open_link(self) -> ZenohLink:
-        """The radio, with what it hears going into mailbox and inbox."""
-        return _open_link(self._config, self._inbox, self._config.robot_id, self._on_message)
-
-    def start(self, link: ZenohLink) -> None:
+    def start(self) -> None:
         """Start the loops; from now on the robot may send."""
-        self._link = link
-        for loop in self._loops:
+        for loop in (*self._loops, self._preflight):
             loop.start()
 
     def keep_house(self) -> None:
-        """Checks, status and flight log; a part that fails does not keep the others from theirs."""
-        for task in (self._check, self._tell, self._recorder.flush):
+        """Status and flight log; a part that fails does not keep the other from its own."""
+        for task in (self._tell, self._recorder.flush):
             try:
                 task()
             except Exception:
                 _log.exception("keeping house failed", task=task.__name__)
 
     def leave(self) -> None:
-        """Stop the loops and leave a vehicle that we flew in a defined state, in less than 2 s."""
-        for loop in self._loops:
-            if not loop.stop(_JOIN_S):
-                _log.error("loop hangs", loop=loop.name)
+        """Leave a vehicle that we flew in a defined state, and stop the loops, within 2.5 s."""
+        control, *others = self._loops
+        self._stop(control)
         action = self._control.leave(Action(self._config.on_stop))
         if action is not None:
             _log.warning("program ends in flight", vehicle=action)
-            self._autopilot.command(action)
-            self._await(action)
+            self._command(action)
+        for loop in (*others, self._preflight):
+            self._stop(loop)
 
-    def _await(self, action: Action) -> None:
+    def _stop(self, loop: Loop) -> None:
+        if not loop.stop(_JOIN_S):
+            _log.error("loop hangs", loop=loop.name)
+
+    def _command(self, action: Action) -> None:
         asked_s = time.monotonic()
-        while time.monotonic() - asked_s < _LEAVE_S:
+        self._autopilot.command(action)
+        while time.monotonic() - asked_s < _ANSWER_S:
             result = self._autopilot.state().result
             if result and result.action is action and result.at_s >= asked_s:
+                if result.accepted:
+                    # The watchdog would interrupt it.
+                    self._deadman.feed(flying=False)
                 return
             time.sleep(0.02)
         _log.error("the autopilot did not answer", action=action)
@@ -253,41 +307,34 @@ class _Program:
 
     def _policy_step(self) -> None:
         tick = self._pac.infer(time.monotonic(), time.time())
-        if tick is None or self._link is None:
+        if tick is None:
             return
         self._link.publish("message", tick.message)
         record = {field.name: getattr(tick, field.name) for field in dataclasses.fields(tick)}
         self._recorder.record("policy", time.time(), record)
 
-    # The link's threads
-
-    def _on_message(self, _: str, data: bytes) -> None:
-        rejection = self._pac.receive(data, time.monotonic(), time.time())
-        self._recorder.record("received", time.time(), {"bytes": len(data), "rejection": rejection})
-
-    # The main thread
-
-    def _check(self) -> None:
-        now_s = time.monotonic()
+    def _preflight_step(self) -> None:
         control = self._control
+        origin = control.origin
+        self._readiness.prepare(time.monotonic(), origin)
+        now_s = time.monotonic()
         peers = self._inbox.peers(now_s)
         control.peer_states = {peer.status.robot_id: peer.status.state for peer in peers}
-        self._readiness.prepare(now_s, control.origin)
         control.checks = self._readiness.checks(
             now_s,
             time.time(),
-            origin=control.origin,
+            origin=origin,
             odometry=self._navigation.odometry(),
             peers=peers,
-            duplicate=self._link is not None and self._link.duplicate(),
+            duplicate=self._link.duplicate(),
             watchdog_alive=self._deadman.alive(),
             ground_age_s=self._inbox.ground_age_s(now_s),
             ground_clock_offset_s=self._inbox.ground_clock_offset_s,
         )
 
+    # The main thread
+
     def _tell(self) -> None:
-        if self._link is None:
-            return
         now_s, unix_now_s = time.monotonic(), time.time()
         status = self._status(now_s, unix_now_s)
         self._link.publish("status", to_json(status))
@@ -304,10 +351,10 @@ class _Program:
 
     def _status(self, now_s: float, unix_now_s: float) -> RobotStatus:
         config, control, vehicle = self._config, self._control, self._autopilot.state()
-        flight, checks = control.flight, control.checks
+        flight, failed_checks = control.flight, control.failed_checks(now_s)
         odometry = self._navigation.odometry()
         self._sequence += 1
-        ready = flight.state is FlightState.PREFLIGHT and checks is not None and not checks.failed
+        ready = flight.state is FlightState.PREFLIGHT and failed_checks == ()
         neighbours = self._pac.mailbox.neighbours(now_s)
         return RobotStatus(
             robot_id=config.robot_id,
@@ -318,12 +365,12 @@ class _Program:
             state=flight.state,
             reason=flight.reason,
             ready=ready,
-            failed_checks=checks.failed if checks else ("checks are still running",),
+            failed_checks=("checks are still running",) if failed_checks is None else failed_checks,
             alarms=(*control.alarms, *self._alarms()),
             obeyed_sequence=control.obeyed_sequence,
             operator=control.operator,
             orders=flight.answers,
-            bundle_id=self._loaded.bundle.id,
+            bundle_id=self._loaded.bundle_id,
             world_id=self._loaded.world_id,
             trial=flight.trial,
             origin=control.origin,
@@ -344,7 +391,7 @@ class _Program:
 
     def _alarms(self) -> tuple[str, ...]:
         alarms = []
-        if self._link is not None and self._link.duplicate():
+        if self._link.duplicate():
             alarms.append(f"another program says that it is robot {self._config.robot_id}")
         if not self._deadman.alive():
             alarms.append("the watchdog has ended: only PX4 notices if this program hangs")
@@ -353,24 +400,39 @@ class _Program:
         return tuple(alarms)
 
 
-@contextmanager
-def _alone(what: str) -> Iterator[None]:
-    """Hold `what` for this process: another program on this machine must not fly it too."""
-    name = "".join(c if c.isalnum() else "-" for c in what)
-    path = Path(tempfile.gettempdir()) / f"lpac-{name}.lock"
-    with path.open("a+") as lock:
+def _take_alone(config: RobotConfig, parts: ExitStack) -> None:
+    """Hold robot and vehicle for this process: another on this machine must not fly them too.
+
+    Abstract socket names belong to the network as ports do, so containers see each other; they need
+    no file, and vanish with their process.
+    """
+    for what in (
+        f"robot {config.robot_id} of fleet {config.fleet}",
+        f"the autopilot's port {config.autopilot.port}",
+    ):
+        name = f"\0lpac {what}"
+        held = parts.enter_context(socket.socket(socket.AF_UNIX))
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            lock.seek(0)
+            held.bind(name)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
             raise RobotError(
-                f"{what} is in use by process {lock.read().strip() or 'unknown'} on this machine: "
-                "stop that one first"
+                f"{what} is in use by {_holder(name)} on this machine: stop that first"
             ) from None
-        lock.truncate(0)
-        lock.write(str(os.getpid()))
-        lock.flush()
-        yield
+        held.listen()
+
+
+def _holder(name: str) -> str:
+    with socket.socket(socket.AF_UNIX) as caller:
+        try:
+            caller.connect(name)
+        except OSError:
+            return "another process"
+        pid, _, _ = struct.unpack(
+            "3i", caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        )
+    return f"process {pid}" if pid else "another container"
 
 
 class CheckReport(NamedTuple):
@@ -388,8 +450,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
     """
     loaded = load(config)
     with ExitStack() as parts:
-        parts.enter_context(_alone(f"robot {config.robot_id} of fleet {config.fleet}"))
-        parts.enter_context(_alone(f"autopilot {config.autopilot.url}"))
+        _take_alone(config, parts)
         structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
         autopilot = parts.enter_context(
             MavsdkAutopilot(config.autopilot.url, system_id=config.autopilot.system_id)
@@ -427,7 +488,7 @@ def _readiness(config: RobotConfig, loaded: Loaded, autopilot: MavsdkAutopilot) 
         config,
         autopilot,
         autopilot,
-        bundle_id=loaded.bundle.id,
+        bundle_id=loaded.bundle_id,
         world_id=loaded.world_id,
         bundle_problem=loaded.bundle_problem,
     )

@@ -16,7 +16,7 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from edge.core import F64
 from edge.core.mission import FlightState
 from sim.fleet_flight import FleetFlight, RobotFlight, normalized
-from sim.report import _STYLE
+from sim.report import STYLE
 
 _DENSITY = LinearSegmentedColormap.from_list("density", ["#ffffff", "#d0d5db", "#8f99a5"])
 _INK, _FAINT = "#252525", "#bdbdbd"
@@ -43,14 +43,14 @@ def write_fleet_flight(flight: FleetFlight, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "flight.json").write_text(json.dumps(flight.summary(), indent=2) + "\n")
     figure = fleet_figure(flight)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         for suffix in (".png", ".pdf"):
             figure.savefig((folder / "flight").with_suffix(suffix))
 
 
 def fleet_figure(flight: FleetFlight) -> Figure:
     """Paths over the importance, beside states, heights and coverage cost over time."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.16, 4.3), layout="constrained")
         columns = figure.add_gridspec(1, 2, width_ratios=(1.08, 1.0))
         left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
@@ -94,8 +94,9 @@ def _draw_map(axes: Axes, flight: FleetFlight, colours: list[tuple[float, ...]])
                 np.interp(mission_s, robot.time_s, robot.position_m[:, axis]) for axis in (0, 1)
             ]
             axes.plot(*end_m, marker="o", ms=5, color=colour, mec=_INK, mew=0.5, zorder=5, ls="")
-    axes.plot(*flight.pads_m.T, ls="", marker="s", ms=4, mfc="none", mec=_INK, mew=0.6, zorder=4)
-    axes.plot(*flight.landing_points_m.T, ls="", marker="x", ms=3.5, color=_INK, mew=0.7, zorder=4)
+    for pad_m, point_m, colour in zip(flight.pads_m, flight.landing_points_m, colours, strict=True):
+        axes.plot(*pad_m, ls="", marker="s", ms=4.5, mfc="white", mec=colour, mew=1.0, zorder=4)
+        axes.plot(*point_m, ls="", marker="x", ms=4.5, color=colour, mew=1.1, zorder=4)
     corners_m = np.array(flight.fence.vertices_m)
     (x_low, y_low), (x_high, y_high) = corners_m.min(axis=0) - 1.0, corners_m.max(axis=0) + 1.0
     axes.set(

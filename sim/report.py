@@ -18,7 +18,7 @@ from sim.experiment import Flight
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of the flight's duration
 
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     "font.family": "serif",
     "font.serif": ["DejaVu Serif"],
     "mathtext.fontset": "dejavuserif",
@@ -72,7 +72,7 @@ def write_demo(flights: Mapping[str, Flight], folder: Path) -> None:
 
 def _figure(shown: Flight, flights: Mapping[str, Flight]) -> Figure:
     """Snapshots of one flight above the cost curves of all."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.16, 4.2), layout="constrained")
         rows = figure.add_gridspec(2, 1, height_ratios=(1.0, 0.95))
         above = figure.add_subfigure(rows[0])
@@ -153,6 +153,6 @@ def _draw_costs(axes: Axes, flights: Mapping[str, Flight]) -> None:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         for suffix in (".png", ".pdf"):
             figure.savefig(path.with_suffix(suffix))

@@ -47,7 +47,7 @@ _ADVICE = {
 _log = structlog.get_logger(__name__)
 
 
-class LinkError(Exception):
+class LinkError(OSError):
     """The link cannot be opened; the text says which endpoint or setting, and what to do."""
 
 

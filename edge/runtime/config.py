@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from edge.core.flight import FlightParameters
+from edge.core.failsafe import required
+from edge.core.flight import FlightParameters, Robot
 from edge.core.frames import ModelScale
 from edge.core.preflight import PreflightLimits
 from edge.core.safety import Fence, MotionLimits
@@ -30,6 +31,8 @@ class AutopilotConfig:
     def __post_init__(self) -> None:
         if re.fullmatch(r"udpin://[^:/]+:\d{1,5}", self.url) is None:
             raise ValueError(f"url = {self.url!r}: must be udpin://ADDRESS:PORT")
+        if not 1 <= self.port <= 65535:
+            raise ValueError(f"url = {self.url!r}: its port must be from 1 to 65535")
         if not 1 <= self.system_id <= 255:
             raise ValueError(f"system_id = {self.system_id}: must be from 1 to 255")
 
@@ -41,7 +44,10 @@ class AutopilotConfig:
 
 @dataclass(frozen=True, slots=True)
 class LinkConfig:
-    """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting."""
+    """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting.
+
+    A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
+    """
 
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[str, ...] = ()
@@ -51,6 +57,12 @@ class LinkConfig:
     def __post_init__(self) -> None:
         if not (self.listen or self.connect or self.scouting):
             raise ValueError("listen, connect and scouting: one of them must be set")
+        if self.mode == "client" and not (self.connect or self.scouting):
+            raise ValueError("mode = 'client': connect or scouting must be set")
+        for name in ("listen", "connect"):
+            for endpoint in getattr(self, name):
+                if re.fullmatch(r"tcp/\S+:\d{1,5}", endpoint) is None:
+                    raise ValueError(f"{name} = {endpoint!r}: must be tcp/ADDRESS:PORT")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +95,10 @@ class PolicyConfig:
 
     def __post_init__(self) -> None:
         ModelScale(self.env_scale, self.velocity_scale)
+        if not 0.0 <= self.max_message_age_s < math.inf:
+            raise ValueError(f"max_message_age_s = {self.max_message_age_s}: must be 0 or above")
+        if not 0.0 < self.max_input_age_s < math.inf:
+            raise ValueError(f"max_input_age_s = {self.max_input_age_s}: must be above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +126,8 @@ class LogConfig:
     max_total_mb: float = 2000.0
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.max_total_mb < math.inf:
-            raise ValueError(f"max_total_mb = {self.max_total_mb}: must be 1 or more")
+        if not 50.0 <= self.max_total_mb < math.inf:
+            raise ValueError(f"max_total_mb = {self.max_total_mb}: must be 50 or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +149,10 @@ class RobotConfig:
     on_stop: Literal["hold", "land"] = "hold"
 
     def __post_init__(self) -> None:
-        if not self.fleet or set(self.fleet) & set("/*$#? "):
-            raise ValueError(f"fleet = {self.fleet!r}: must be a name without / * $ # ? or spaces")
+        if re.fullmatch(r"[A-Za-z0-9_-]{1,32}", self.fleet) is None:
+            raise ValueError(
+                f"fleet = {self.fleet!r}: must be 1 to 32 letters, digits, '-' and '_'"
+            )
         if not 0 <= self.robot_id <= MAX_ROBOT_ID:
             raise ValueError(f"robot_id = {self.robot_id}: must be from 0 to {MAX_ROBOT_ID}")
         if self.flight.command_timeout_s * self.rates.control_hz < 2.0:
@@ -142,6 +160,13 @@ class RobotConfig:
                 f"flight: command_timeout_s = {self.flight.command_timeout_s}: must be at least "
                 f"two periods of rates: control_hz = {self.rates.control_hz}"
             )
+        # What only shows when the tables come together, before any of it is used.
+        self.robot(boot_nonce=0)
+        required(self.failsafe.rc, self.fence.ceiling_m, self.flight.command_timeout_s)
+
+    def robot(self, boot_nonce: int) -> Robot:
+        """Who flies, in this start of its program."""
+        return Robot(self.robot_id, boot_nonce, self.flight, self.fence, self.limits)
 
     @property
     def pac(self) -> PacParameters:

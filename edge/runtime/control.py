@@ -5,12 +5,13 @@ from dataclasses import asdict
 
 import structlog
 
-from edge.core.flight import Flight, FlightInputs, Robot, height_m, step
+from edge.core.flight import STEERED, Flight, FlightInputs, Robot, height_m, step
 from edge.core.guidance import Guidance, MissionSetpoint, guide
+from edge.core.mailbox import Neighbour
 from edge.core.mission import FlightState, Origin
-from edge.core.ports import Autopilot, Recorder
-from edge.core.safety import nearest
-from edge.core.vehicle import Action, Setpoint
+from edge.core.ports import Autopilot, Odometry, Recorder
+from edge.core.safety import Closest, nearest
+from edge.core.vehicle import Action, Mode, Setpoint
 from edge.runtime.inbox import Inbox
 from edge.runtime.navigation import Navigation
 from edge.runtime.pac import Pac
@@ -66,23 +67,23 @@ class FlightControl:
         vehicle = self._autopilot.state()
         ground, ground_age_s = self._inbox.ground(now_s)
         if ground is not None:
+            if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
+                self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
             self._take_origin(ground.origin, vehicle.armed)
         odometry = self._navigation.estimate(vehicle)
-        own = self._navigation.odometry()
         neighbours = self._pac.mailbox.neighbours(now_s)
-        policy_velocity_m_s = self._pac.control(now_s)
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
             odometry=odometry,
-            policy_velocity_m_s=policy_velocity_m_s,
+            policy_velocity_m_s=self._pac.control(now_s),
             neighbours=neighbours,
-            closest=None if own is None else nearest(own.position_m, neighbours),
+            closest=self._closest(odometry, neighbours),
             busy_neighbours=tuple(r for r, s in self.peer_states.items() if s in _BUSY),
             ground=ground,
             ground_age_s=ground_age_s,
-            failed_checks=self._failed_checks(now_s),
+            failed_checks=self.failed_checks(now_s),
             order=self._inbox.order(),
             uptime_s=now_s - self._started_s,
         )
@@ -105,15 +106,22 @@ class FlightControl:
         self._record(inputs, setpoint, sent, decision.actions)
         return sent is not None
 
+    def failed_checks(self, now_s: float) -> tuple[str, ...] | None:
+        """What keeps the robot on the ground; None if nobody looked lately. From any thread."""
+        checks = self.checks
+        if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
+            return None
+        return checks.failed if checks.origin == self.origin else None
+
     def leave(self, on_stop: Action) -> Action | None:
-        """The program ends: what it asks of the vehicle it was flying; None if it was not."""
-        state = self.flight.state
-        if state is FlightState.ARMING:
+        """What the program that ends asks of the vehicle it was flying; None if it was not.
+
+        Once the control loop has ended. Nothing is taken from a pilot, or from PX4's failsafe.
+        """
+        if self.flight.state is FlightState.ARMING:
             return Action.DISARM
-        flying = (
-            FlightState.TAKEOFF, FlightState.HOLD, FlightState.MISSION, FlightState.RETURN,
-        )  # fmt: skip
-        return on_stop if state in flying else None
+        obeys = self._autopilot.state().mode in (Mode.OFFBOARD, Mode.HOLD)
+        return on_stop if self.flight.state in STEERED and obeys else None
 
     def _take_origin(self, origin: Origin | None, armed: bool | None) -> None:
         """The mission frame stays where it is while the vehicle is armed."""
@@ -124,9 +132,14 @@ class FlightControl:
         self.origin, self._navigation.frame, self._pac.frame_id = origin, frame, frame.frame_id
         self._pac.forget()
 
-    def _failed_checks(self, now_s: float) -> tuple[str, ...] | None:
-        checks = self.checks
-        return checks.failed if checks and now_s - checks.at_s <= _MAX_CHECKS_AGE_S else None
+    def _closest(
+        self, odometry: Odometry | None, neighbours: tuple[Neighbour, ...]
+    ) -> Closest | None:
+        if odometry is None:
+            return None
+        # What the robot itself tells of its height.
+        height = height_m(self.flight, odometry) or 0.0
+        return nearest((*odometry.position_m[:2], height), neighbours)
 
     def _record(
         self,

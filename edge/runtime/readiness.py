@@ -1,6 +1,7 @@
 """What keeps the robot from flying: gathers what preflight's checks ask for.
 
-Main thread only: what it asks of the vehicle takes up to a few seconds, and is asked before flight.
+One thread only, and not the control loop's: a vehicle that falls silent while it is asked something
+holds up the caller for many seconds.
 """
 
 import math
@@ -25,10 +26,11 @@ _log = structlog.get_logger(__name__)
 
 
 class Checks(NamedTuple):
-    """What preflight found at one time: one line for each check that failed."""
+    """What preflight found at one time, for one mission origin: one line for each failed check."""
 
     failed: tuple[str, ...]
     at_s: float
+    origin: Origin | None
 
 
 class Readiness:
@@ -120,7 +122,7 @@ class Readiness:
         failed = failed_checks(inputs, config.preflight)
         if not watchdog_alive:
             failed = (*failed, "watchdog has ended: start this robot's program again")
-        return Checks(failed, now_s)
+        return Checks(failed, now_s, origin)
 
     def _read(self) -> bool:
         """Whether everything is as it must be."""

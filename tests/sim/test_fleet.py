@@ -46,8 +46,10 @@ ORDER_OF_STATES = [
 def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[int, tuple[dict[str, Any], Path]]:
     """A flight of five robots over each of five worlds, as many at once as there are cores."""
 
+    folder = tmp_path_factory.mktemp("fleet")
+
     def fly(seed: int) -> tuple[dict[str, Any], Path]:
-        out = tmp_path_factory.mktemp("fleet") / str(seed)
+        out = folder / str(seed)
         result = lpac(
             "sim", "--vehicle", "mavlink", "-n", ROBOTS, "--seed", seed, "--duration", MISSION_S,
             "--json", "--out", out,

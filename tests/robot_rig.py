@@ -1,0 +1,194 @@
+"""One robot's program as a real process, its vehicle, and the ground that commands it."""
+
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge.core.mission import FlightState, Origin, RobotStatus
+from edge.core.world import format_world, random_features
+from edge.runtime.config import RobotConfig, load_config
+from sim.fleet_vehicles import free_ports
+from sim.operator import Operator
+from sim.px4.link import Px4Link
+from sim.px4.server import Instance, Px4Server
+from sim.px4.vehicle import Px4Vehicle
+from sim.px4.world import WorldOrigin
+from tests.conftest import ROOT, SHIPPED
+
+SYSTEM_ID = 7
+# The mission's y axis does not point north, and the vehicle does not stand on its origin.
+ORIGIN = Origin(WorldOrigin().latitude_deg, WorldOrigin().longitude_deg, heading_deg=30.0)
+PAD_M = (12.0, 10.0)
+
+Changes = dict[str, dict[str, Any]]
+
+
+def new_vehicle(**parameters: float) -> Px4Vehicle:
+    """Ready at once, quick to take off, with failsafe parameters that no robot may fly with."""
+    transform = ORIGIN.frame().relative_to(ORIGIN.latitude_deg, ORIGIN.longitude_deg)
+    north_m, east_m, _ = transform.mission_to_local(np.array([*PAD_M, 0.0])).tolist()
+    vehicle = Px4Vehicle(seed=1, start_m=(north_m, east_m), ready_after_s=0.0)
+    vehicle.gps_bias_m = np.zeros(3)
+    vehicle.parameters |= {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0, **parameters}
+    vehicle.parameters |= {"MPC_LAND_SPEED": 1.5, "COM_DISARM_LAND": 0.5}
+    return vehicle
+
+
+def write_config(folder: Path, *, url: str, endpoint: str, changes: Changes | None = None) -> Path:
+    """robot.toml in `folder`, and its world; `changes` are further keys of its tables."""
+    world = random_features(np.random.default_rng(0), 10, 512)
+    (folder / "world.env").write_text(format_world(world))
+    tables: Changes = {
+        "policy": {"bundle": str(SHIPPED), "world": "world.env"},
+        "autopilot": {"url": url, "system_id": SYSTEM_ID},
+        "link": {"listen": [endpoint]},
+        "flight": {"slot": 0, "base_height_m": 3.0, "landing_point_m": list(PAD_M)},
+        "fence": {
+            "vertices_m": [[-2.0, -2.0], [34.0, -2.0], [34.0, 34.0], [-2.0, 34.0]],
+            "buffer_m": 1.5, "floor_m": 2.0, "ceiling_m": 20.0,
+        },
+        "limits": {
+            "max_speed_m_s": 1.25, "max_climb_m_s": 2.0, "max_acceleration_m_s2": 2.0, "lag_s": 1.3,
+        },
+        "failsafe": {"rc": "none", "parameters": "set"},
+    }  # fmt: skip
+    top = {"fleet": f"test-{endpoint.rpartition(':')[2]}", "robot_id": 3}
+    for name, keys in (changes or {}).items():
+        if name == "":
+            top |= keys
+        else:
+            tables[name] = tables.get(name, {}) | keys
+    lines = [f"{key} = {json.dumps(value)}" for key, value in top.items()]
+    for name, keys in tables.items():
+        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())]
+    path = folder / "robot.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+class Rig:
+    """A vehicle that runs, a ground that is heard, and the robot's configuration."""
+
+    def __init__(self, config_path: Path, server: Px4Server, links: Sequence[Px4Link]) -> None:
+        self.config_path = config_path
+        self.config: RobotConfig = load_config(config_path)
+        self.server = server
+        self.vehicle = links[0].vehicle
+        self.operator = Operator(
+            fleet=self.config.fleet, connect=self.config.link.listen, name="test"
+        )
+
+    @property
+    def status(self) -> RobotStatus:
+        """The robot's newest."""
+        return self.operator.statuses()[self.config.robot_id]
+
+    def wait(self, condition: Callable[[RobotStatus], object], timeout_s: float = 40.0) -> None:
+        """Until the robot says so."""
+        robot = self.config.robot_id
+        done = self.operator.wait_for(lambda s: robot in s and bool(condition(s[robot])), timeout_s)
+        assert done, self.operator.statuses().get(robot)
+
+    def wait_for_state(self, state: FlightState) -> None:
+        self.wait(lambda status: status.state is state)
+
+    def order(self, kind: Any, trial: str = "") -> None:
+        """Order it; it must be obeyed."""
+        result = self.operator.result(self.operator.order(kind, self.config.robot_id, trial), 15.0)
+        assert result is not None
+        assert result.accepted, result
+
+    def take_off(self) -> None:
+        self.operator.enable(ORIGIN)
+        self.wait(lambda status: status.ready)
+        self.order("takeoff")
+        self.wait_for_state(FlightState.HOLD)
+
+    def vehicle_is(
+        self, condition: Callable[[Px4Vehicle], object], timeout_s: float = 30.0
+    ) -> bool:
+        """Wait until the vehicle itself is so; whether it came to be."""
+        return self.server.wait_for(lambda: bool(condition(self.vehicle)), timeout_s)
+
+
+@contextmanager
+def rig(
+    folder: Path, vehicle: Px4Vehicle, *others: Px4Link, changes: Changes | None = None
+) -> Iterator[Rig]:
+    """A rig in `folder`; `others` speak on the same link as the vehicle."""
+    links = (Px4Link(vehicle, system_id=SYSTEM_ID), *others)
+    with free_ports(1 + len(links), socket.SOCK_DGRAM) as ports:
+        client_port, *listen_ports = ports
+    with free_ports(1, socket.SOCK_STREAM) as (port,):
+        endpoint = f"tcp/127.0.0.1:{port}"
+    path = write_config(
+        folder, url=f"udpin://127.0.0.1:{client_port}", endpoint=endpoint, changes=changes
+    )
+    instances = [
+        Instance(link, listen, client_port)
+        for link, listen in zip(links, listen_ports, strict=True)
+    ]
+    with Px4Server(instances) as server:
+        made = Rig(path, server, links)
+        with made.operator:
+            yield made
+
+
+class Program:
+    """`lpac robot run`, as a process."""
+
+    def __init__(self, config_path: Path) -> None:
+        self.log = config_path.with_suffix(".log")
+        with self.log.open("ab") as output:
+            self.process = subprocess.Popen(
+                command("run", "--config", str(config_path)), env=environment(),
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+            )  # fmt: skip
+
+    def end(self, number: int) -> tuple[int, float]:
+        """Send the signal; the exit code, and the seconds until then."""
+        asked_s = time.monotonic()
+        self.process.send_signal(number)
+        code = self.process.wait(20.0)
+        return code, time.monotonic() - asked_s
+
+
+@contextmanager
+def program(made: Rig) -> Iterator[Program]:
+    """The robot's program, which is killed in the end if it still runs."""
+    running = Program(made.config_path)
+    try:
+        yield running
+    finally:
+        running.process.kill()
+        running.process.wait()
+
+
+def lpac_robot(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """`lpac robot ...` until it ends."""
+    return subprocess.run(
+        command(*map(str, arguments)), env=environment(),
+        capture_output=True, text=True, timeout=60.0, check=False,
+    )  # fmt: skip
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "cli.main", "robot", *arguments]
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+
+
+def horizontal_speed_m_s(vehicle: Px4Vehicle) -> float:
+    return math.hypot(*vehicle.velocity_m_s[:2])

@@ -1,0 +1,158 @@
+"""What is asked of a vehicle before it flies: the real MAVSDK, and a simulated vehicle."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
+from edge.core.failsafe import PARAMETERS
+from edge.core.mission import Origin
+from edge.runtime.config import load_config
+from edge.runtime.readiness import Checks, Readiness
+from sim.px4.modes import Result
+from sim.px4.vehicle import Px4Vehicle
+from tests.robot_rig import ORIGIN, SYSTEM_ID, Rig, new_vehicle, rig, write_config
+
+
+@contextmanager
+def readiness(
+    folder: Path, vehicle: Px4Vehicle, parameters: str, **facts: Any
+) -> Iterator[tuple[Readiness, Rig]]:
+    changes = {"failsafe": {"rc": "none", "parameters": parameters}}
+    with rig(folder, vehicle, changes=changes) as made:
+        config = made.config
+        with MavsdkAutopilot(config.autopilot.url, system_id=SYSTEM_ID) as autopilot:
+            asked = Readiness(
+                config, autopilot, autopilot,
+                **{"bundle_id": "b", "world_id": "w", "bundle_problem": None} | facts,
+            )  # fmt: skip
+            deadline_s = time.monotonic() + 20.0
+            while not (autopilot.state().connected and autopilot.state().armable):
+                assert time.monotonic() < deadline_s, autopilot.state()
+                time.sleep(0.05)
+            yield asked, made
+
+
+def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> Checks:
+    now_s = time.monotonic()
+    known: dict[str, Any] = {
+        "origin": origin,
+        "odometry": None,
+        "peers": (),
+        "duplicate": False,
+        "watchdog_alive": True,
+        "ground_age_s": 0.1,
+        "ground_clock_offset_s": 0.0,
+    }
+    return asked.checks(now_s, time.time(), **known | facts)
+
+
+def about_parameters(checks: Checks) -> list[str]:
+    return [line for line in checks.failed if any(name in line for name in PARAMETERS)]
+
+
+def test_refuse_explains_and_changes_nothing(tmp_path: Path) -> None:
+    vehicle = new_vehicle(COM_OBL_RC_ACT=0, NAV_RCL_ACT=0)
+    with readiness(tmp_path, vehicle, "refuse") as (asked, _):
+        before = dict(vehicle.parameters)
+        assert any("parameters were not read" in line for line in checked(asked).failed)
+        asked.prepare(time.monotonic(), ORIGIN)
+        problems = about_parameters(checked(asked))
+        assert any("COM_OBL_RC_ACT = 0" in line and "must land" in line for line in problems)
+        assert any("if this program dies" in line for line in asked.explanations)
+        assert (
+            "if this program hangs, its watchdog lets PX4 hold, 0.5 s later" in asked.explanations
+        )
+        assert asked.changes == ()
+    assert vehicle.parameters == before
+
+
+def test_set_makes_them_right_but_for_what_is_to_be_set_by_hand(tmp_path: Path) -> None:
+    vehicle = new_vehicle(COM_OBL_RC_ACT=0, EKF2_HGT_REF=3)
+    with readiness(tmp_path, vehicle, "set") as (asked, _):
+        before = dict(vehicle.parameters)
+        asked.prepare(time.monotonic(), ORIGIN)
+        (problem,) = about_parameters(checked(asked))
+        assert "EKF2_HGT_REF = 3" in problem
+        assert "by hand" in problem
+        changed = {n: v for n, v in vehicle.parameters.items() if v != before[n]}
+        assert changed["COM_OBL_RC_ACT"] == 4
+        assert "COM_OBL_RC_ACT from 0 to 4" in asked.changes
+        assert len(asked.changes) == len(changed)
+        assert "EKF2_HGT_REF" not in changed
+
+
+def test_a_parameter_that_others_change_later_is_noticed(tmp_path: Path) -> None:
+    vehicle = new_vehicle()
+    with readiness(tmp_path, vehicle, "set") as (asked, _):
+        asked.prepare(time.monotonic(), ORIGIN)
+        assert about_parameters(checked(asked)) == []
+        vehicle.parameters["COM_OBL_RC_ACT"] = 3
+        asked.prepare(time.monotonic() + 5.0, ORIGIN)
+        assert vehicle.parameters["COM_OBL_RC_ACT"] == 3
+        asked.prepare(time.monotonic() + 31.0, ORIGIN)
+        assert vehicle.parameters["COM_OBL_RC_ACT"] == 4
+
+
+def test_the_fence_is_uploaded_with_its_margin_for_each_new_origin(tmp_path: Path) -> None:
+    vehicle = new_vehicle()
+    with readiness(tmp_path, vehicle, "set") as (asked, made):
+        asked.prepare(time.monotonic(), None)
+        assert len(vehicle.fence) == 0
+        for heading_deg in (30.0, 200.0):
+            origin = dataclasses.replace(ORIGIN, heading_deg=heading_deg)
+            assert any("does not have the fence" in line for line in checked(asked, origin).failed)
+            asked.prepare(time.monotonic() + heading_deg, origin)
+            assert not any("fence: wait" in line for line in checked(asked, origin).failed)
+            (polygon,) = vehicle.fence
+            transform = origin.frame().relative_to(origin.latitude_deg, origin.longitude_deg)
+            # Our fence ends at 34 m, PX4's 5 m further out.
+            for along_m, inside in ((38.9, True), (39.1, False), (-6.9, True), (-7.1, False)):
+                for place_m in ((along_m, 16.0), (16.0, along_m)):
+                    local_m = transform.mission_to_local(np.array([*place_m, 0.0]))
+                    assert polygon.contains(made.vehicle._world, *local_m[:2]) is inside, place_m
+
+
+def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
+    vehicle = new_vehicle()
+    with readiness(tmp_path, vehicle, "set") as (asked, made):
+        with made.server.stepped:
+            assert vehicle.arm() is Result.ACCEPTED
+        before = dict(vehicle.parameters)
+        deadline_s = time.monotonic() + 10.0
+        while asked._autopilot.state().armed is not True:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        asked.prepare(time.monotonic(), ORIGIN)
+        assert (vehicle.parameters, vehicle.fence) == (before, ())
+        assert any("vehicle is armed" in line for line in checked(asked).failed)
+
+
+@pytest.mark.parametrize(
+    ("facts", "line"),
+    [
+        ({"watchdog_alive": False}, "watchdog has ended"),
+        ({"duplicate": True}, "another program says that it is robot 3"),
+        ({"ground_age_s": float("inf")}, "ground was not heard"),
+        ({"ground_age_s": 9.0}, "ground was last heard 9.0 s ago"),
+        ({"ground_clock_offset_s": 5.0}, "clock differs from the ground's"),
+    ],
+)
+def test_what_the_program_knows_itself(tmp_path: Path, facts: dict[str, Any], line: str) -> None:
+    url, endpoint = "udpin://127.0.0.1:14551", "tcp/127.0.0.1:7447"
+    config = load_config(write_config(tmp_path, url=url, endpoint=endpoint))
+    asked = Readiness(
+        config, MavsdkAutopilot(config.autopilot.url), MavsdkAutopilot(config.autopilot.url),
+        bundle_id="b", world_id="w", bundle_problem="cnn.onnx does not fit",
+    )  # fmt: skip
+    checks = checked(asked, **facts)
+    assert checks.origin == ORIGIN
+    assert any(line in failed for failed in checks.failed)
+    assert not any(line in failed for failed in checked(asked).failed)
+    assert any("cnn.onnx does not fit" in failed for failed in checks.failed)

@@ -1,0 +1,237 @@
+"""A fleet in its mission, to which faults are done; and a robot program that can be made to fail.
+
+As a program, `python -m tests.sim.fault_rig FOLDER` is `lpac robot run` with FOLDER's robot.toml.
+For as long as FOLDER holds a file `fail-policy` its policy raises, with `fail-sensor` its sensor
+sees nothing. It also runs beside another program of the same robot id, as on another machine.
+"""
+
+import math
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.mission import FlightState, OrderKind, OrderResult, RobotStatus
+from sim.fleet import ORIGIN, Fleet, RobotProcess
+from sim.operator import Heard, Script
+from sim.px4.vehicle import Px4Vehicle, Truth
+from tests.conftest import ROOT
+
+_S = FlightState
+
+# A robot that this machine kept waiting, or that passes another which lands, rightly leaves the
+# mission too.
+_BY_ITSELF = re.compile(
+    r"control was silent|the policy has no fresh answer|left offboard for hold|only .* m to robot|"
+    r"mission started|taken back"
+)
+
+
+class FaultyRobot(RobotProcess):
+    """A robot program that fails when a test says so."""
+
+    def start(self) -> None:
+        """Start the program."""
+        with (self.folder / "robot.log").open("wb") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.sim.fault_rig", str(self.folder)],
+                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                process_group=0,
+            )  # fmt: skip
+
+    def fail(self, part: Literal["policy", "sensor"]) -> None:
+        """From now on that part fails."""
+        (self.folder / f"fail-{part}").touch()
+
+    def mend(self) -> None:
+        """Nothing fails any more."""
+        for path in self.folder.glob("fail-*"):
+            path.unlink()
+
+
+class FaultRig:
+    """A running fleet, and what tests do to it and ask of it; `flying` are the robots not lost yet.
+
+    Times are a vehicle's own, s. What the vehicle really did is `truth`.
+    """
+
+    def __init__(self, fleet: Fleet, robots: Sequence[int]) -> None:
+        assert fleet.simulated is not None
+        self.fleet = fleet
+        self.operator = fleet.operator
+        self.simulated = fleet.simulated
+        self.flying = set(robots)
+
+    # The operator's part
+
+    def script(self, name: str) -> None:
+        """Do one step of the script with the robots that fly."""
+        script = Script(
+            self.operator, robots=self.flying, origin=ORIGIN, mission_s=0.0, trial="faults"
+        )
+        step = next(step for step in script.steps if step.name == name)
+        script.began_s[name] = time.monotonic()
+        while not self.operator.wait_for(step.done, 0.2):
+            late = time.monotonic() - script.began_s[name] > 2.0 * step.at_most_s
+            assert not late, (name, self.told(), self.operator.refusals)
+            step.act()
+
+    def order(self, kind: OrderKind, robot: int) -> OrderResult:
+        """Order something, and wait for the answer."""
+        result = self.operator.result(self.operator.order(kind, robot, "faults"), 30.0)
+        assert result is not None, self.told()
+        return result
+
+    def told(self) -> dict[int, tuple[str, str, str | None, tuple[str, ...]]]:
+        """What the robots say of themselves, for whoever reads a failure."""
+        statuses = sorted(self.operator.statuses().items())
+        return {r: (s.state, s.reason, s.mode, s.failed_checks) for r, s in statuses}
+
+    def status(self, robot: int) -> RobotStatus:
+        """Its newest status."""
+        return self.operator.statuses()[robot]
+
+    def wait_state(self, robot: int, state: FlightState, timeout_s: float = 30.0) -> RobotStatus:
+        """Wait until the robot says that it is in this state; returns what it says."""
+        assert self.operator.wait_for(
+            lambda statuses: robot in statuses and statuses[robot].state is state, timeout_s
+        ), self.told()
+        return self.status(robot)
+
+    @contextmanager
+    def others_go_on(self, robot: int, *, lost: bool = False) -> Iterator[None]:
+        """Meanwhile the others fly their mission; afterwards all do, but a robot that is `lost`."""
+        self.script("start")
+        began_s = time.monotonic()
+        self.flying.remove(robot)
+        others = tuple(self.flying)
+        yield
+        self.script("start")
+        for other in others:
+            for _, status in self.heard(other, began_s):
+                goes_on = status.state is _S.MISSION or _BY_ITSELF.search(status.reason)
+                assert goes_on, (other, status.state, status.reason)
+        if not lost:
+            self.flying.add(robot)
+            self.script("start")
+
+    def heard(self, robot: int, since_s: float) -> list[Heard]:
+        """What a robot said since then (`time.monotonic()`)."""
+        return [heard for heard in self.operator.history(robot) if heard.at_s >= since_s]
+
+    # The vehicles' part
+
+    def vehicle(self, robot: int) -> Px4Vehicle:
+        """The robot's vehicle."""
+        return self.simulated.vehicles[robot]
+
+    def now_s(self, robot: int) -> float:
+        """The vehicle's time."""
+        with self.simulated.stepped:
+            return self.vehicle(robot).time_s
+
+    def change(self, robot: int, **fields: Any) -> float:
+        """Set fields of the vehicle; returns its time."""
+        with self.simulated.stepped:
+            for name, value in fields.items():
+                setattr(self.vehicle(robot), name, value)
+            return self.vehicle(robot).time_s
+
+    def wait_vehicle(
+        self, robot: int, holds: Callable[[Px4Vehicle], bool], timeout_s: float = 60.0
+    ) -> None:
+        """Wait until something holds of the vehicle."""
+        vehicle = self.vehicle(robot)
+        with self.simulated.stepped:
+            assert self.simulated.stepped.wait_for(lambda: holds(vehicle), timeout_s), (
+                robot, self.told(), vehicle.truth[-1],
+            )  # fmt: skip
+
+    def wait_time(self, robot: int, until_s: float) -> None:
+        """Wait for a time of the vehicle."""
+        self.wait_vehicle(robot, lambda vehicle: vehicle.time_s >= until_s)
+
+    def wait_moving(self, robot: int) -> None:
+        """Wait until the vehicle flies fast enough for a stop to be one."""
+        self.wait_vehicle(robot, lambda vehicle: speed_m_s(vehicle.velocity_m_s, 2) > 0.3)
+
+    def wait_down(self, robot: int) -> None:
+        """Wait until the vehicle stands on the ground, disarmed."""
+        self.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed, 90.0)
+
+    def last_setpoint_s(self, robot: int) -> float:
+        """When the last setpoint reached the vehicle."""
+        with self.simulated.stepped:
+            return self.vehicle(robot)._setpoint_at_s
+
+    def truth(self, robot: int, since_s: float) -> list[Truth]:
+        """What was really so since then; it is never nothing."""
+        with self.simulated.stepped:
+            truth = [entry for entry in self.vehicle(robot).truth if entry.time_s > since_s]
+        assert truth
+        return truth
+
+    def max_speed_m_s(self, robot: int, since_s: float, axes: int = 3) -> float:
+        """The greatest true speed since then; with 2 axes the horizontal one."""
+        return max(speed_m_s(entry.velocity_m_s, axes) for entry in self.truth(robot, since_s))
+
+    def estimate_m(self, robot: int) -> F64:
+        """Where the vehicle takes itself to be: the mission frame, (3,)."""
+        with self.simulated.stepped:
+            return self._to_mission_m(self.vehicle(robot).estimated_position_m)
+
+    def _to_mission_m(self, place_m: F64) -> F64:
+        return self.fleet.to_mission.local_to_mission(place_m)
+
+    def inside_m(self, robot: int) -> float:
+        """How far inside the fence the vehicle takes itself to be."""
+        x_m, y_m, _ = self.estimate_m(robot)
+        return self.fleet.fence.distance_m(x_m, y_m)
+
+    def outwards(self, robot: int) -> F64:
+        """(3,): north, east, down, of length 1, towards the nearest side of the fence."""
+        x_m, y_m, _ = self.estimate_m(robot)
+        low_m, high_m = np.array(self.fleet.fence.vertices_m)[[0, 2]]
+        away_m = np.array([x_m - low_m[0], high_m[0] - x_m, y_m - low_m[1], high_m[1] - y_m])
+        outwards = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0], [0, 1.0, 0]])[away_m.argmin()]
+        return self.fleet.to_mission.velocity_to_local(outwards)
+
+
+def speed_m_s(velocity_m_s: Sequence[float] | F64, axes: int) -> float:
+    """Of the first axes of a velocity."""
+    return math.hypot(*velocity_m_s[:axes])
+
+
+def _main(folder: Path) -> None:
+    import edge.robot
+    from cli.main import main
+    from edge.adapters.idf_sensor import IdfSensor
+    from edge.runtime.pac import Pac
+
+    infer, view = Pac.infer, IdfSensor.view
+
+    def infer_or_fail(pac: Pac, now_s: float, unix_now_s: float) -> Any:
+        if (folder / "fail-policy").exists():
+            raise RuntimeError("the policy was made to fail")
+        return infer(pac, now_s, unix_now_s)
+
+    def view_or_nothing(sensor: IdfSensor, position: F64) -> Any:
+        return None if (folder / "fail-sensor").exists() else view(sensor, position)
+
+    Pac.infer, IdfSensor.view = infer_or_fail, view_or_nothing  # type: ignore[method-assign]
+    edge.robot._take_alone = lambda *_: None
+    sys.argv = ["lpac", "robot", "run", "--config", str(folder / "robot.toml")]
+    main()
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]))
+
+
