@@ -1,8 +1,8 @@
 """One robot's program: everything is built and wired here, in numbered steps.
 
-Threads: the three loops (`perception`, `policy`, `control`), `preflight`, which waits for the
-vehicle while it stands on the ground, zenoh's and MAVSDK's own, whose callbacks only store, and the
-main thread, which keeps house: status and flight log.
+Threads: the three loops (`perception`, `policy`, `control`); `status`, and `preflight`, which waits
+for the vehicle while that stands on the ground; zenoh's and MAVSDK's own, whose callbacks only
+store; and the main thread, which waits for the disk.
 """
 
 import ctypes
@@ -49,8 +49,8 @@ from edge.runtime.policy import Policy
 from edge.runtime.readiness import Readiness
 from edge.runtime.verify import verify
 
-_HOUSEKEEPING_S = 0.25
-_PREFLIGHT_S = 0.25
+# Of preflight checks, status, and writing the flight log.
+_PERIOD_S = 0.25
 # On leaving: for the autopilot's answer, and for a loop that hangs.
 _ANSWER_S = 1.2
 _JOIN_S = 0.3
@@ -155,9 +155,9 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         program.start()
         parts.callback(program.leave)
         _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])
-        # 8. Keeping house until somebody stops the program.
-        while not stop.wait(_HOUSEKEEPING_S):
-            program.keep_house()
+        # 8. The log goes to the disk until somebody stops the program.
+        while not stop.wait(_PERIOD_S):
+            recorder.flush()
 
 
 def _open_log(config: RobotConfig, loaded: Loaded, boot_nonce: int) -> FlightLog:
@@ -241,32 +241,27 @@ class _Program:
             Loop("perception", 1.0 / rates.perception_hz, self._perception_step),
             Loop("policy", 1.0 / rates.policy_hz, self._policy_step),
         )
-        # A vehicle that falls silent holds it up for many seconds.
-        self._preflight = Loop("preflight", _PREFLIGHT_S, self._preflight_step)
+        # A vehicle that falls silent holds up the first for many seconds.
+        self._chores = (
+            Loop("preflight", _PERIOD_S, self._preflight_step),
+            Loop("status", _PERIOD_S, self._status_step),
+        )
         self._sequence = 0
 
     def start(self) -> None:
         """Start the loops; from now on the robot may send."""
-        for loop in (*self._loops, self._preflight):
+        for loop in (*self._loops, *self._chores):
             loop.start()
 
-    def keep_house(self) -> None:
-        """Status and flight log; a part that fails does not keep the other from its own."""
-        for task in (self._tell, self._recorder.flush):
-            try:
-                task()
-            except Exception:
-                _log.exception("keeping house failed", task=task.__name__)
-
     def leave(self) -> None:
-        """Leave a vehicle that we flew in a defined state, and stop the loops, within 2.5 s."""
+        """Leave a vehicle that we flew in a defined state, and stop the loops."""
         control, *others = self._loops
         self._stop(control)
         action = self._control.leave(Action(self._config.on_stop))
         if action is not None:
             _log.warning("program ends in flight", vehicle=action)
             self._command(action)
-        for loop in (*others, self._preflight):
+        for loop in (*others, *self._chores):
             self._stop(loop)
 
     def _stop(self, loop: Loop) -> None:
@@ -332,9 +327,7 @@ class _Program:
             ground_clock_offset_s=self._inbox.ground_clock_offset_s,
         )
 
-    # The main thread
-
-    def _tell(self) -> None:
+    def _status_step(self) -> None:
         now_s, unix_now_s = time.monotonic(), time.time()
         status = self._status(now_s, unix_now_s)
         self._link.publish("status", to_json(status))
@@ -480,7 +473,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             )
             if not checks.failed or now_s > until_s:
                 return CheckReport(readiness.explanations, readiness.changes, checks.failed)
-            time.sleep(_HOUSEKEEPING_S)
+            time.sleep(_PERIOD_S)
 
 
 def _readiness(config: RobotConfig, loaded: Loaded, autopilot: MavsdkAutopilot) -> Readiness:

@@ -3,10 +3,10 @@
 import json
 import math
 import os
+import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,6 +83,7 @@ class Rig:
         self.config_path = config_path
         self.config: RobotConfig = load_config(config_path)
         self.server = server
+        self.link = links[0]
         self.vehicle = links[0].vehicle
         self.operator = Operator(
             fleet=self.config.fleet, connect=self.config.link.listen, name="test"
@@ -145,28 +146,29 @@ def rig(
 
 
 class Program:
-    """`lpac robot run`, as a process."""
+    """A robot's program, as a process; it prints to `log`, or to a descriptor."""
 
-    def __init__(self, config_path: Path) -> None:
+    def __init__(self, config_path: Path, arguments: Sequence[str], output: int | None) -> None:
         self.log = config_path.with_suffix(".log")
-        with self.log.open("ab") as output:
+        with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                command("run", "--config", str(config_path)), env=environment(),
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                arguments, env=environment(),
+                stdin=subprocess.DEVNULL, stdout=output or log, stderr=subprocess.STDOUT,
             )  # fmt: skip
 
-    def end(self, number: int) -> tuple[int, float]:
-        """Send the signal; the exit code, and the seconds until then."""
-        asked_s = time.monotonic()
+    def end(self, number: signal.Signals) -> int:
+        """Send the signal; the exit code."""
         self.process.send_signal(number)
-        code = self.process.wait(20.0)
-        return code, time.monotonic() - asked_s
+        return self.process.wait(20.0)
 
 
 @contextmanager
-def program(made: Rig) -> Iterator[Program]:
-    """The robot's program, which is killed in the end if it still runs."""
-    running = Program(made.config_path)
+def program(
+    made: Rig, arguments: Sequence[str] = (), output: int | None = None
+) -> Iterator[Program]:
+    """`lpac robot run`, or another command line; it is killed in the end if it still runs."""
+    default = command("run", "--config", str(made.config_path))
+    running = Program(made.config_path, arguments or default, output)
     try:
         yield running
     finally:

@@ -304,6 +304,9 @@ class Px4Vehicle:
     def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
         """Sticks alone take the vehicle only where COM_RC_OVERRIDE allows it."""
         self._sticks_m_s = np.array([*velocity_m_s] or [0.0] * 3)
+        if self.mode in PILOTED:
+            # It stays where the sticks are let go, not where they were let go before.
+            self._hold_m = None
         bit = 2 if self.mode is Mode.OFFBOARD else 1
         override = int(self.parameters["COM_RC_OVERRIDE"]) & bit
         if self.mode not in PILOTED and override and self.rc_connected and self._sticks_m_s.any():

@@ -104,13 +104,13 @@ def test_the_fence_is_uploaded_with_its_margin_for_each_new_origin(tmp_path: Pat
     vehicle = new_vehicle()
     with readiness(tmp_path, vehicle, "set") as (asked, made):
         asked.prepare(time.monotonic(), None)
-        assert len(vehicle.fence) == 0
+        assert not made.vehicle.fence
         for heading_deg in (30.0, 200.0):
             origin = dataclasses.replace(ORIGIN, heading_deg=heading_deg)
             assert any("does not have the fence" in line for line in checked(asked, origin).failed)
             asked.prepare(time.monotonic() + heading_deg, origin)
             assert not any("fence: wait" in line for line in checked(asked, origin).failed)
-            (polygon,) = vehicle.fence
+            (polygon,) = made.vehicle.fence
             transform = origin.frame().relative_to(origin.latitude_deg, origin.longitude_deg)
             # Our fence ends at 34 m, PX4's 5 m further out.
             for along_m, inside in ((38.9, True), (39.1, False), (-6.9, True), (-7.1, False)):

@@ -6,6 +6,7 @@ sees nothing. It also runs beside another program of the same robot id, as on an
 """
 
 import math
+import os
 import re
 import subprocess
 import sys
@@ -14,23 +15,30 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 
-from edge.core import F64
-from edge.core.mission import FlightState, OrderKind, OrderResult, RobotStatus
+from cli.robot import run
+from edge.adapters.idf_sensor import IdfSensor
+from edge.core import F32, F64
+from edge.core.mission import Calm, FlightState, OrderKind, OrderResult, RobotStatus
+from edge.runtime.pac import Pac, PolicyTick
 from sim.fleet import ORIGIN, Fleet, RobotProcess
-from sim.operator import Heard, Script
+from sim.operator import Heard, Script, Statuses
+from sim.px4.server import STEP_S
 from sim.px4.vehicle import Px4Vehicle, Truth
 from tests.conftest import ROOT
 
 _S = FlightState
 
+PILOT_M_S = 3.0
+GUST_M_S2 = 1.5
 # A robot that this machine kept waiting, or that passes another which lands, rightly leaves the
 # mission too.
 _BY_ITSELF = re.compile(
     r"control was silent|the policy has no fresh answer|left offboard for hold|only .* m to robot|"
-    r"mission started|taken back"
+    r"taken back"
 )
 
 
@@ -42,7 +50,7 @@ class FaultyRobot(RobotProcess):
         with (self.folder / "robot.log").open("wb") as output:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "tests.sim.fault_rig", str(self.folder)],
-                cwd=ROOT, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                cwd=ROOT, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
                 process_group=0,
             )  # fmt: skip
 
@@ -105,6 +113,34 @@ class FaultRig:
         ), self.told()
         return self.status(robot)
 
+    def bring_to(self, robot: int, state: FlightState) -> None:
+        """Bring a robot that flies the mission to another state by the ground's word."""
+        if state is _S.MISSION:
+            return
+        calm: Calm = "hold" if state is _S.HOLD else "return"
+        self.operator.calm(calm, robot)
+        began_s = self.now_s(robot)
+        self.wait_state(robot, state)
+        if state is _S.HOLD:
+            # At rest, and free to start again.
+            self.wait_time(robot, began_s + 2.5)
+            self.operator.calm("none", robot)
+
+    def is_heard(self, robot: int) -> bool:
+        """Whether all others that fly have fresh messages of the robot, soon."""
+        return self.operator.wait_for(
+            lambda statuses: all(str(robot) in s.neighbour_ages_s for s in self._flying(statuses)),
+            10.0,
+        )
+
+    def is_forgotten(self, robot: int) -> bool:
+        """Whether no other that flies has a fresh message of the robot."""
+        statuses = self._flying(self.operator.statuses())
+        return not any(str(robot) in status.neighbour_ages_s for status in statuses)
+
+    def _flying(self, statuses: Statuses) -> list[RobotStatus]:
+        return [statuses[other] for other in self.flying]
+
     @contextmanager
     def others_go_on(self, robot: int, *, lost: bool = False) -> Iterator[None]:
         """Meanwhile the others fly their mission; afterwards all do, but a robot that is `lost`."""
@@ -162,9 +198,13 @@ class FaultRig:
         """Wait until the vehicle flies fast enough for a stop to be one."""
         self.wait_vehicle(robot, lambda vehicle: speed_m_s(vehicle.velocity_m_s, 2) > 0.3)
 
-    def wait_down(self, robot: int) -> None:
-        """Wait until the vehicle stands on the ground, disarmed."""
+    def wait_landed(self, robot: int) -> None:
+        """Wait until the vehicle stands on the ground, disarmed, and its robot says so."""
         self.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed, 90.0)
+        # LANDED lasts no longer than a tick if the ground lets the robot fly again.
+        assert self.operator.wait_for(
+            lambda statuses: statuses[robot].state in (_S.LANDED, _S.PREFLIGHT), 30.0
+        ), self.told()
 
     def last_setpoint_s(self, robot: int) -> float:
         """When the last setpoint reached the vehicle."""
@@ -196,12 +236,42 @@ class FaultRig:
         return self.fleet.fence.distance_m(x_m, y_m)
 
     def outwards(self, robot: int) -> F64:
-        """(3,): north, east, down, of length 1, towards the nearest side of the fence."""
+        """(3,), mission frame, of length 1: towards the nearest side of the fence."""
         x_m, y_m, _ = self.estimate_m(robot)
         low_m, high_m = np.array(self.fleet.fence.vertices_m)[[0, 2]]
         away_m = np.array([x_m - low_m[0], high_m[0] - x_m, y_m - low_m[1], high_m[1] - y_m])
-        outwards = np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0], [0, 1.0, 0]])[away_m.argmin()]
-        return self.fleet.to_mission.velocity_to_local(outwards)
+        sides = np.array([(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
+        outwards: F64 = sides[away_m.argmin()]
+        return outwards
+
+    def fly_by_hand(self, robot: int, place_m: F64) -> None:
+        """A pilot flies it to where its estimate is `place_m` (3,), mission frame, and stops."""
+        goal_m = self.fleet.to_mission.mission_to_local(place_m)
+
+        def is_there(vehicle: Px4Vehicle) -> bool:
+            offset_m = goal_m - vehicle.estimated_position_m
+            away_m = speed_m_s(offset_m, 3)
+            vehicle.move_sticks((offset_m * min(1.0, PILOT_M_S / max(away_m, 1e-9))).tolist())
+            return away_m < 0.2
+
+        with self.simulated.stepped:
+            self.vehicle(robot).pilot()
+        self.wait_vehicle(robot, is_there)
+        with self.simulated.stepped:
+            self.vehicle(robot).move_sticks(())
+
+    def push_over_the_fence(self, robot: int) -> None:
+        """A gust carries it over the line; then the wind blows on as it is."""
+        outwards = self.fleet.to_mission.velocity_to_local(self.outwards(robot))
+
+        def is_over_the_line(vehicle: Px4Vehicle) -> bool:
+            vehicle.wind_m_s = vehicle.wind_m_s + outwards * GUST_M_S2 * STEP_S
+            x_m, y_m, _ = self._to_mission_m(vehicle.estimated_position_m)
+            return self.fleet.fence.distance_m(x_m, y_m) < -0.3
+
+        self.wait_vehicle(robot, is_over_the_line)
+        with self.simulated.stepped:
+            self.vehicle(robot).wind_m_s = self.vehicle(robot)._compensated_wind.copy()
 
 
 def speed_m_s(velocity_m_s: Sequence[float] | F64, axes: int) -> float:
@@ -209,29 +279,23 @@ def speed_m_s(velocity_m_s: Sequence[float] | F64, axes: int) -> float:
     return math.hypot(*velocity_m_s[:axes])
 
 
-def _main(folder: Path) -> None:
-    import edge.robot
-    from cli.main import main
-    from edge.adapters.idf_sensor import IdfSensor
-    from edge.runtime.pac import Pac
+def _run(folder: Path) -> None:
+    class FailingPac(Pac):
+        def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
+            if (folder / "fail-policy").exists():
+                raise RuntimeError("the policy was made to fail")
+            return super().infer(now_s, unix_now_s)
 
-    infer, view = Pac.infer, IdfSensor.view
+    class FailingSensor(IdfSensor):
+        def view(self, position: F64) -> F32:
+            nothing = np.zeros((0, 0), np.float32)
+            return nothing if (folder / "fail-sensor").exists() else super().view(position)
 
-    def infer_or_fail(pac: Pac, now_s: float, unix_now_s: float) -> Any:
-        if (folder / "fail-policy").exists():
-            raise RuntimeError("the policy was made to fail")
-        return infer(pac, now_s, unix_now_s)
-
-    def view_or_nothing(sensor: IdfSensor, position: F64) -> Any:
-        return None if (folder / "fail-sensor").exists() else view(sensor, position)
-
-    Pac.infer, IdfSensor.view = infer_or_fail, view_or_nothing  # type: ignore[method-assign]
-    edge.robot._take_alone = lambda *_: None
-    sys.argv = ["lpac", "robot", "run", "--config", str(folder / "robot.toml")]
-    main()
+    with patch.multiple(
+        "edge.robot", Pac=FailingPac, IdfSensor=FailingSensor, _take_alone=lambda *_: None
+    ):
+        run(folder / "robot.toml")
 
 
 if __name__ == "__main__":
-    _main(Path(sys.argv[1]))
-
-
+    _run(Path(sys.argv[1]))

@@ -276,6 +276,18 @@ def test_a_pilot_takes_over_and_the_client_gets_the_vehicle_back() -> None:
     assert vehicle.mode is Mode.OFFBOARD
 
 
+def test_a_vehicle_stays_where_the_sticks_were_let_go_last() -> None:
+    vehicle = hovering(rc=True)
+    for north_m_s in (2.0, -2.0):
+        vehicle.pilot(Mode.POSCTL, (north_m_s, 0.0, 0.0))
+        run(vehicle, 5.0)
+        vehicle.move_sticks(())
+        let_go_m = vehicle.position_m.copy()
+        run(vehicle, 5.0)
+        assert speed_m_s(vehicle) < 0.2
+        assert np.linalg.norm(vehicle.position_m - let_go_m) < 1.5
+
+
 @pytest.mark.parametrize(("override", "mode"), [(1, Mode.OFFBOARD), (2, Mode.POSCTL)])
 def test_sticks_alone_leave_offboard_only_where_a_parameter_allows_it(
     override: int, mode: Mode

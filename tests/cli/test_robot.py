@@ -1,0 +1,137 @@
+"""`lpac robot` as a user types it: the checks, and every way in which it cannot start."""
+
+import json
+import os
+import socket
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from sim.px4.link import Px4Link
+from tests.robot_rig import ORIGIN, SYSTEM_ID, Changes, lpac_robot, new_vehicle, rig, write_config
+
+
+def failures(result: subprocess.CompletedProcess[str]) -> list[str]:
+    """What did not pass, of a check that said no."""
+    assert result.returncode == 1
+    failed = [
+        line.removeprefix("FAILED  ")
+        for line in result.stdout.splitlines()
+        if line.startswith("FAILED  ")
+    ]
+    assert failed
+    plural = "s" if len(failed) > 1 else ""
+    assert result.stderr == f"lpac: not ready to fly: {len(failed)} check{plural} failed\n"
+    return failed
+
+
+def test_check_explains_unsafe_failsafes_and_refuses_them(tmp_path: Path) -> None:
+    vehicle = new_vehicle(COM_OBL_RC_ACT=0, NAV_RCL_ACT=0)
+    changes: Changes = {"failsafe": {"parameters": "refuse"}}
+    with rig(tmp_path, vehicle, changes=changes) as made:
+        made.operator.enable(ORIGIN)
+        before = dict(vehicle.parameters)
+        result = lpac_robot("check", "--config", made.config_path, "--wait", 4)
+        assert vehicle.parameters == before
+    failed = failures(result)
+    assert any("COM_OBL_RC_ACT = 0" in line and "must land" in line for line in failed)
+    (dies,) = (line for line in result.stdout.splitlines() if "if this program dies" in line)
+    assert "land" not in dies
+    # Only the parameters are wrong.
+    assert all(line.startswith("autopilot's ") for line in failed), failed
+
+
+def test_check_passes_a_good_vehicle_and_says_what_it_set(tmp_path: Path) -> None:
+    vehicle = new_vehicle()
+    with rig(tmp_path, vehicle) as made:
+        made.operator.enable(ORIGIN)
+        result = lpac_robot("check", "--config", made.config_path, "--wait", 20)
+        assert (result.returncode, result.stderr) == (0, "")
+        lines = result.stdout.splitlines()
+        assert lines[-1] == "ready to fly"
+        assert "set: COM_OBL_RC_ACT from 0 to 4" in lines
+        assert any("if this program dies" in line and "land" in line for line in lines)
+
+        again = lpac_robot("check", "--config", made.config_path, "--wait", 20, "--json")
+        assert (again.returncode, again.stderr) == (0, "ready to fly\n")
+        report = json.loads(again.stdout)
+        assert (report["failed"], report["changes"]) == ([], [])
+        assert report["explanations"]
+    assert not any(truth.armed for truth in vehicle.truth)
+
+
+def test_check_without_a_ground_or_on_a_wrong_vehicle(tmp_path: Path) -> None:
+    with rig(tmp_path, new_vehicle(), changes={"autopilot": {"system_id": 9}}) as made:
+        failed = failures(lpac_robot("check", "--config", made.config_path, "--wait", 3))
+    assert any(line.startswith("ground was not heard") for line in failed)
+    assert any(line.startswith("autopilot ") for line in failed)
+
+
+def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
+    other = Px4Link(new_vehicle(), system_id=SYSTEM_ID + 1)
+    with rig(tmp_path, new_vehicle(), other) as made:
+        made.operator.enable(ORIGIN)
+        failed = failures(lpac_robot("check", "--config", made.config_path, "--wait", 4))
+    assert failed == [
+        f"other vehicles are on this link (system id {SYSTEM_ID + 1}): give each its own port"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"policy": {"bundle": "nothing"}}, "nothing"),
+        ({"policy": {"world": "nothing.env"}}, "nothing.env"),
+        ({"policy": {"world": "broken.env"}}, "broken.env: record 1 (CircularBND)"),
+        ({"flight": {"slot": 99}}, "slot = 99 flies at 201 m"),
+        ({"link": {"listen": ["tcp/192.0.2.1:1"]}}, "this machine has no such address"),
+        ({"link": {"listen": ["TAKEN"]}}, "another program has this port"),
+    ],
+)
+def test_what_keeps_it_from_starting_is_one_line(
+    tmp_path: Path, changes: Changes, error: str
+) -> None:
+    (tmp_path / "broken.env").write_text("CircularBND 1 2")
+    with socket.socket() as taken, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        free.bind(("127.0.0.1", 0))
+        url, endpoint = (
+            f"{kind}://127.0.0.1:{each.getsockname()[1]}"
+            for kind, each in (("udpin", free), ("tcp", taken))
+        )
+        endpoint = endpoint.replace("://", "/")
+        free.close()
+        if "link" in changes:
+            listen = [e.replace("TAKEN", endpoint) for e in changes["link"]["listen"]]
+            changes = {"link": {"listen": listen}}
+        path = write_config(tmp_path, url=url, endpoint=endpoint, changes=changes)
+        result = lpac_robot("run", "--config", path)
+    assert result.returncode == 1
+    # What it did until then is in JSON.
+    *log, line = result.stderr.splitlines()
+    assert all(json.loads(entry) for entry in log)
+    assert line.startswith("lpac: ")
+    assert error in line
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_vehicle_that_another_program_has(tmp_path: Path, command: str) -> None:
+    path = write_config(tmp_path, url="udpin://127.0.0.1:14999", endpoint="tcp/127.0.0.1:1")
+    with socket.socket(socket.AF_UNIX) as held:
+        held.bind("\0lpac the autopilot's port 14999")
+        held.listen()
+        result = lpac_robot(command, "--config", path)
+    assert result.returncode == 1
+    assert result.stderr == (
+        f"lpac: the autopilot's port 14999 is in use by process {os.getpid()} on this machine: "
+        "stop that first\n"
+    )
+
+
+def test_a_configuration_that_is_not_there() -> None:
+    for command in ("run", "check"):
+        result = lpac_robot(command, "--config", "none.toml")
+        assert result.returncode == 1
+        assert result.stderr == "lpac: none.toml: cannot be read: No such file or directory\n"

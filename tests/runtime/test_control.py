@@ -1,0 +1,321 @@
+"""One robot's control ticks in simulated time: no thread, no socket, a simulated vehicle."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.adapters.idf_sensor import IdfSensor
+from edge.core import F32
+from edge.core.mission import (
+    FlightState,
+    GroundState,
+    Order,
+    OrderKind,
+    OrderResult,
+    Origin,
+    to_json,
+)
+from edge.core.vehicle import Action, ActionResult, Mode, Setpoint, Vector, VehicleState, Velocity
+from edge.core.world import random_features, rasterize
+from edge.runtime.config import load_config
+from edge.runtime.control import FlightControl
+from edge.runtime.inbox import Inbox
+from edge.runtime.navigation import Navigation
+from edge.runtime.pac import Pac
+from edge.runtime.policy import Policy
+from edge.runtime.readiness import Checks
+from sim.px4.modes import Mode as Px4Mode
+from sim.px4.modes import Result
+from sim.px4.vehicle import Px4Vehicle
+from sim.px4.vehicle import Setpoint as Px4Setpoint
+from tests.robot_rig import ORIGIN, new_vehicle, write_config
+
+ELSEWHERE = dataclasses.replace(ORIGIN, heading_deg=120.0)
+MODES = {
+    Px4Mode.OFFBOARD: Mode.OFFBOARD,
+    Px4Mode.HOLD: Mode.HOLD,
+    Px4Mode.LAND: Mode.LAND,
+    Px4Mode.POSCTL: Mode.POSITION,
+}
+NOT_SET = np.full(3, np.nan)
+
+
+class DirectAutopilot:
+    """An `Autopilot` port that calls the simulated vehicle."""
+
+    def __init__(self, vehicle: Px4Vehicle) -> None:
+        self.vehicle = vehicle
+        self.commands: list[Action] = []
+        self.result: ActionResult | None = None
+
+    def state(self) -> VehicleState:
+        vehicle = self.vehicle
+        return VehicleState(
+            connected=True,
+            system_id=7,
+            position_local_m=vector(vehicle.local_position_m),
+            velocity_local_m_s=vector(vehicle.velocity_m_s),
+            position_at_s=vehicle.time_s,
+            position_ok=vehicle.position_valid,
+            heading_rad=vehicle.heading_rad,
+            origin_deg=vehicle.global_origin[:2],
+            height_above_home_m=0.0,
+            mode=MODES[vehicle.mode],
+            armed=vehicle.armed,
+            in_air=not vehicle.landed,
+            heartbeat_at_s=vehicle.time_s,
+            battery=vehicle.battery_remaining,
+            result=self.result,
+        )
+
+    def send(self, setpoint: Setpoint) -> Setpoint | None:
+        commanded = np.array(setpoint[0])
+        is_velocity = isinstance(setpoint, Velocity)
+        self.vehicle.offboard(
+            Px4Setpoint(
+                NOT_SET if is_velocity else commanded, commanded if is_velocity else NOT_SET
+            )
+        )
+        return setpoint
+
+    def command(self, action: Action) -> None:
+        self.commands.append(action)
+        match action:
+            case Action.ARM:
+                result = self.vehicle.arm()
+            case Action.DISARM | Action.KILL:
+                result = self.vehicle.disarm(force=action is Action.KILL)
+            case _:
+                result = self.vehicle.set_mode(Px4Mode[action.name])
+        self.result = ActionResult(action, result is Result.ACCEPTED, "", self.vehicle.time_s)
+
+
+class Flown:
+    """A robot whose ground, policy and vehicle a test steps through time."""
+
+    def __init__(self, folder: Path, policy: Policy) -> None:
+        path = write_config(folder, url="udpin://127.0.0.1:1", endpoint="tcp/127.0.0.1:1")
+        config = load_config(path)
+        self.vehicle = new_vehicle(COM_OBL_RC_ACT=4)
+        self.autopilot = DirectAutopilot(self.vehicle)
+        self.records: list[tuple[str, Mapping[str, object]]] = []
+        self.navigation = Navigation(self.autopilot, lambda: self.now_s)
+        self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
+        world = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
+        self.pac = Pac(
+            robot_id=config.robot_id, boot_epoch=1, policy=policy, sensor=IdfSensor(world, 64),
+            odometry=self.navigation, parameters=config.pac,
+        )  # fmt: skip
+        self.control = FlightControl(
+            robot=config.robot(boot_nonce=11),
+            autopilot=self.autopilot,
+            navigation=self.navigation,
+            pac=self.pac,
+            inbox=self.inbox,
+            recorder=self,
+            unix_clock_s=lambda: self.now_s,
+            started_s=0.0,
+        )
+        self.ground = GroundState(sequence=1, operator="test", origin=ORIGIN, enabled=True)
+        self.failed_checks: tuple[str, ...] = ()
+        self.sent = False
+        self.images: F32 | None = None
+        self._orders = 0
+
+    @property
+    def now_s(self) -> float:
+        return self.vehicle.time_s
+
+    @property
+    def state(self) -> FlightState:
+        return self.control.flight.state
+
+    def record(self, topic: str, _: float, message: Mapping[str, object]) -> None:
+        self.records.append((topic, message))
+
+    def say(self, **changes: Any) -> None:
+        self.ground = dataclasses.replace(self.ground, sequence=self.ground.sequence + 1, **changes)
+
+    def tick(self) -> None:
+        """One tenth of a second of everything."""
+        self.inbox.put_ground(to_json(self.ground), self.now_s, self.now_s)
+        self.look()
+        perceived = self.pac.perceive(self.now_s)
+        self.images = None if perceived is None else perceived.images.copy()
+        self.pac.infer(self.now_s, self.now_s)
+        self.sent = self.control.tick(self.now_s)
+        for _ in range(5):
+            self.vehicle.step(0.02)
+
+    def look(self) -> None:
+        """Preflight's part."""
+        self.control.checks = Checks(self.failed_checks, self.now_s, self.control.origin)
+
+    def until(self, *states: FlightState) -> None:
+        for _ in range(400):
+            if self.state in states:
+                return
+            self.tick()
+        raise AssertionError(self.control.flight)
+
+    def order(self, kind: OrderKind, trial: str = "") -> OrderResult:
+        self._orders += 1
+        order = Order(
+            order_id=str(self._orders), robot_id=3, boot_nonce=11, kind=kind,
+            expires_at_uptime_s=self.now_s + 9.0, operator="test", trial=trial,
+        )  # fmt: skip
+        self.inbox.put_order(to_json(order))
+        self.tick()
+        return self.control.flight.answers[-1]
+
+    def take_off(self) -> None:
+        self.until(FlightState.PREFLIGHT)
+        assert self.order("takeoff").accepted
+        self.until(FlightState.HOLD)
+
+    def explore(self, trial: str) -> None:
+        assert self.order("start", trial).accepted
+        for _ in range(60):
+            self.tick()
+        assert self.state is FlightState.MISSION
+
+    def explored(self) -> int:
+        """How much of its surroundings the robot knows, in pixels of its local map."""
+        assert self.images is not None
+        return int((self.images[0, 0] > 0.0).sum())
+
+
+def vector(values: Any) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+@pytest.fixture
+def flown(tmp_path: Path, shipped_policy: Policy) -> Flown:
+    return Flown(tmp_path, shipped_policy)
+
+
+def test_it_flies_what_it_is_told_and_lands(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    assert not flown.sent
+    flown.take_off()
+    assert flown.sent
+    assert abs(-flown.vehicle.position_m[2] - 3.0) < 0.8
+    flown.explore("a")
+    assert np.linalg.norm(flown.vehicle.velocity_m_s[:2]) > 0.2
+    flown.say(calm="hold")
+    flown.until(FlightState.HOLD)
+    flown.say(calm="return")
+    flown.until(FlightState.LANDED)
+    assert not flown.sent
+    assert not flown.vehicle.armed
+    assert flown.autopilot.commands.count(Action.ARM) == 1
+    flown.say(calm="none")
+    flown.take_off()
+    topics = [topic for topic, _ in flown.records]
+    assert topics.count("control") == round(flown.now_s / 0.1)
+    assert topics.count("ground") == flown.ground.sequence
+    answers = [message["answer"] for topic, message in flown.records if topic == "order"]
+    assert answers == [OrderResult(str(number), True) for number in (1, 2, 3)]
+
+
+def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
+    flown.take_off()
+    flown.explore("a")
+    explored = flown.explored()
+    for trial, forgets in (("a", False), ("b", True)):
+        flown.say(calm="hold")
+        flown.until(FlightState.HOLD)
+        flown.say(calm="none")
+        flown.tick()
+        assert flown.order("start", trial).accepted
+        flown.tick()
+        assert (flown.explored() < 0.9 * explored) is forgets
+        assert flown.control.flight.trial == trial
+
+
+def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
+    def place() -> Origin | None:
+        assert flown.navigation.frame is not None
+        assert flown.control.origin is not None
+        assert flown.navigation.frame.frame_id == flown.control.origin.frame().frame_id
+        assert flown.pac.frame_id == flown.navigation.frame.frame_id
+        return flown.control.origin
+
+    flown.take_off()
+    flown.say(origin=ELSEWHERE)
+    flown.tick()
+    assert place() == ORIGIN
+    flown.say(calm="land")
+    flown.until(FlightState.LANDED)
+    flown.tick()
+    assert place() == ELSEWHERE
+
+
+def test_a_program_that_starts_in_flight_takes_the_origin_it_hears(flown: Flown) -> None:
+    flown.vehicle.arm(force=True)
+    flown.until(FlightState.PILOT)
+    flown.tick()
+    assert flown.control.origin == ORIGIN
+    assert not flown.sent
+    assert flown.autopilot.commands == []
+
+
+def test_checks_count_for_their_origin_and_not_for_long(
+    flown: Flown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown.failed_checks = ("GPS is not heard",)
+    flown.until(FlightState.PREFLIGHT)
+    assert flown.order("takeoff").reason == "not ready: GPS is not heard"
+    flown.failed_checks = ()
+    flown.tick()
+    monkeypatch.setattr(flown, "look", lambda: None)
+    # Preflight is slow: what it found was for the origin before.
+    flown.say(origin=ELSEWHERE)
+    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    flown.say(origin=ORIGIN)
+    flown.tick()
+    assert flown.control.failed_checks(flown.now_s) == ()
+    for _ in range(51):
+        flown.tick()
+    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    assert Action.ARM not in flown.autopilot.commands
+
+
+def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
+    flown.take_off()
+    flown.control.peer_states = {5: FlightState.TAKEOFF, 6: FlightState.HOLD}
+    assert flown.order("start", "a").reason == "robots still taking off: 5"
+    flown.control.peer_states = {5: FlightState.HOLD}
+    assert flown.order("start", "a").accepted
+
+
+@pytest.mark.parametrize("on_stop", [Action.HOLD, Action.LAND])
+def test_what_it_leaves_behind(flown: Flown, on_stop: Action) -> None:
+    leave = flown.control.leave
+    assert leave(on_stop) is None
+    flown.until(FlightState.PREFLIGHT)
+    assert leave(on_stop) is None
+    assert flown.order("takeoff").accepted
+    assert flown.state is FlightState.ARMING
+    assert leave(on_stop) is Action.DISARM
+    flown.until(FlightState.TAKEOFF)
+    assert leave(on_stop) is on_stop
+    flown.until(FlightState.HOLD)
+    assert leave(on_stop) is on_stop
+    flown.explore("a")
+    assert leave(on_stop) is on_stop
+    # The watchdog was first.
+    flown.vehicle.set_mode(Px4Mode.HOLD)
+    assert leave(on_stop) is on_stop
+    # PX4 lands by itself, or a pilot came, and no tick has seen it yet.
+    flown.vehicle.set_mode(Px4Mode.LAND)
+    assert leave(on_stop) is None
+    flown.vehicle.pilot()
+    assert leave(on_stop) is None
+    flown.until(FlightState.PILOT)
+    assert leave(on_stop) is None

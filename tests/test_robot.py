@@ -1,0 +1,256 @@
+"""The robot's program as a process: `lpac robot run`, a simulated vehicle, and a ground."""
+
+import os
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import onnx
+
+from edge.adapters.flight_log import read as read_log
+from edge.adapters.zenoh_link import ZenohLink
+from edge.core.failsafe import PARAMETERS
+from edge.core.mission import FlightState
+from edge.runtime.bundle import Bundle, make_bundle, write_bundle
+from sim.px4.modes import Mode
+from tests.robot_rig import (
+    ORIGIN,
+    Changes,
+    Program,
+    Rig,
+    horizontal_speed_m_s,
+    lpac_robot,
+    new_vehicle,
+    program,
+    rig,
+)
+from tests.runtime.test_bundle import scaled, with_files
+
+PARAM_REQUEST_READ = 20  # MAVLink's message id
+# An exit code of 0 says that the program ended by itself: after 2.9 s its own timer would kill it.
+
+
+def test_a_day_of_one_robot(tmp_path: Path) -> None:
+    """It flies, lands, flies again, is ended in flight, started in flight, and taken back."""
+    vehicle = new_vehicle()
+    with rig(tmp_path, vehicle) as made:
+        with program(made) as first:
+            made.take_off()
+            second = lpac_robot("run", "--config", made.config_path)
+            assert second.returncode == 1
+            (line,) = second.stderr.splitlines()
+            assert line == (
+                f"lpac: robot 3 of fleet {made.config.fleet} is in use by process "
+                f"{first.process.pid} on this machine: stop that first"
+            )
+            fly_a_mission(made, "a")
+            made.operator.calm("land")
+            made.wait_for_state(FlightState.LANDED)
+            assert not vehicle.armed
+
+            made.operator.calm("none")
+            made.take_off()
+            fly_a_mission(made, "b")
+            assert first.end(signal.SIGTERM) == 0
+        assert made.vehicle_is(lambda v: v.mode is Mode.HOLD and horizontal_speed_m_s(v) < 0.2)
+        assert vehicle.armed
+
+        with program(made) as again:
+            made.wait(lambda status: status.state is FlightState.PILOT and status.uptime_s > 3.0)
+            assert vehicle.mode is Mode.HOLD
+            assert any("already armed" in alarm for alarm in made.status.alarms)
+            made.order("rejoin")
+            made.wait_for_state(FlightState.HOLD)
+            assert made.vehicle_is(lambda v: v.mode is Mode.OFFBOARD)
+            made.operator.calm("land")
+            made.wait_for_state(FlightState.LANDED)
+            assert again.end(signal.SIGINT) == 0
+    look_into_the_logs(tmp_path / "logs")
+    assert "Traceback" not in first.log.read_text()
+
+
+def fly_a_mission(made: Rig, trial: str) -> None:
+    made.order("start", trial)
+    made.wait(lambda status: status.trial == trial and status.state is FlightState.MISSION)
+    assert made.vehicle_is(lambda v: horizontal_speed_m_s(v) > 0.3)
+    assert all(loop.failures == 0 for loop in made.status.loops.values())
+    assert made.status.message_counts["accepted"] == 0
+    made.operator.calm("hold")
+    made.wait_for_state(FlightState.HOLD)
+    made.operator.calm("none")
+    made.order("start", trial)
+    made.wait_for_state(FlightState.MISSION)
+
+
+def look_into_the_logs(folder: Path) -> None:
+    """Everything that happened is in there, of all starts."""
+    topics: Counter[str] = Counter()
+    states: list[str] = []
+    for path in sorted(folder.glob("*.mcap")):
+        for topic, _, message in read_log(path):
+            topics[topic] += 1
+            if topic == "control":
+                states.append(message["state"])
+    assert {"perception", "policy", "control", "status", "vehicle", "order", "ground"} <= set(
+        topics
+    )
+    assert {"/pose", "/log"} <= set(topics)
+    seen = [
+        state for state, before in zip(states, [None, *states], strict=False) if state != before
+    ]
+    assert seen[:6] == ["init", "idle", "preflight", "arming", "takeoff", "hold"]
+    assert seen[-5:] == ["init", "pilot", "hold", "land", "landed"]
+
+
+def test_it_can_be_ended_at_any_time_of_its_start(tmp_path: Path) -> None:
+    with rig(tmp_path, new_vehicle()) as made:
+        for moment in ("handles signals", "robot runs", "flight state"):
+            with program(made) as starting:
+                wait_until(partial(reached, starting, moment))
+                for number in (signal.SIGTERM, signal.SIGINT):
+                    starting.process.send_signal(number)
+                assert starting.process.wait(20.0) == 0, moment
+            starting.log.unlink()
+
+
+def reached(starting: Program, moment: str) -> bool:
+    if moment != "handles signals":
+        return f'"event": "{moment}"' in starting.log.read_text()
+    status = Path(f"/proc/{starting.process.pid}/status").read_text()
+    (caught,) = (line.split()[1] for line in status.splitlines() if line.startswith("SigCgt"))
+    return bool(int(caught, 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def test_a_vehicle_that_does_not_answer_holds_up_neither_status_nor_end(tmp_path: Path) -> None:
+    with rig(tmp_path, new_vehicle()) as made:
+        receive, asked = made.link.receive, Counter[int]()
+
+        def deaf_while_it_is_read(datagram: bytes) -> None:
+            asked[datagram[7]] += 1
+            # Each parameter is asked for twice.
+            if asked[PARAM_REQUEST_READ] <= len(PARAMETERS) + 5:
+                receive(datagram)
+
+        made.link.receive = deaf_while_it_is_read  # type: ignore[method-assign]
+        with program(made) as running:
+            made.operator.enable(ORIGIN)
+            wait_until(lambda: asked[PARAM_REQUEST_READ] > len(PARAMETERS) + 5)
+            made.wait(lambda status: status.failed_checks == ("checks are still running",))
+            assert running.end(signal.SIGTERM) == 0
+
+
+HANGING = """
+import pathlib, sys, time
+from edge.runtime.control import FlightControl
+tick = FlightControl.tick
+def hang(self, now_s):
+    while pathlib.Path(sys.argv[-1]).with_name("hang").exists():
+        time.sleep(0.1)
+    return tick(self, now_s)
+FlightControl.tick = hang
+import cli.main
+cli.main.main()
+"""
+
+
+def test_a_control_loop_that_hangs_in_flight_lets_the_vehicle_hold_and_the_program_end(
+    tmp_path: Path,
+) -> None:
+    vehicle = new_vehicle()
+    with rig(tmp_path, vehicle) as made:
+        command = [sys.executable, "-c", HANGING, "robot", "run", "--config", str(made.config_path)]
+        with program(made, command) as hanging:
+            made.take_off()
+            fly_a_mission(made, "a")
+            (tmp_path / "hang").touch()
+            assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+            assert hanging.end(signal.SIGTERM) == 0
+        assert vehicle.armed
+        assert vehicle.mode is Mode.HOLD
+
+
+def test_ended_in_flight_it_lands_if_configured_to(tmp_path: Path) -> None:
+    vehicle = new_vehicle()
+    with rig(tmp_path, vehicle, changes={"": {"on_stop": "land"}}) as made:
+        with program(made) as flying:
+            made.take_off()
+            assert flying.end(signal.SIGTERM) == 0
+        assert vehicle.mode is Mode.LAND
+        ended_s = vehicle.time_s
+        assert made.vehicle_is(lambda v: not v.armed)
+        # The watchdog has not interrupted it.
+        assert Mode.HOLD not in {truth.mode for truth in vehicle.truth if truth.time_s > ended_s}
+
+
+def test_a_robot_with_an_altered_policy_says_so_and_does_not_arm(
+    tmp_path: Path, shipped_bundle: Bundle
+) -> None:
+    graph = scaled(shipped_bundle.files["action.onnx"], first_weight(shipped_bundle), slice(None))
+    files = with_files(shipped_bundle, action__onnx=graph)
+    write_bundle(make_bundle(shipped_bundle.manifest, files), tmp_path / "altered")
+    vehicle = new_vehicle()
+    changes = {"policy": {"bundle": "altered"}}
+    with rig(tmp_path, vehicle, changes=changes) as made, program(made):
+        made.operator.enable(ORIGIN)
+        made.wait_for_state(FlightState.PREFLIGHT)
+        # All else is well by then.
+        made.wait(lambda status: len(status.failed_checks) == 1)
+        result = made.operator.result(made.operator.order("takeoff", 3), 15.0)
+        assert result is not None
+        assert not result.accepted
+        assert "action.onnx, swarm of the bundle do not compute" in result.reason
+        assert not made.status.ready
+    assert not any(truth.armed for truth in vehicle.truth)
+
+
+def first_weight(bundle: Bundle) -> str:
+    return str(onnx.load_from_string(bundle.files["action.onnx"]).graph.initializer[0].name)
+
+
+def test_without_a_vehicle_and_a_log_it_runs_and_says_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    changes: Changes = {"autopilot": {"system_id": 9}, "log": {"folder": "file"}}
+    with rig(tmp_path, new_vehicle(), changes=changes) as made, program(made) as running:
+        made.operator.enable(ORIGIN)
+        made.wait(lambda status: status.failed_checks and status.uptime_s > 3.0)
+        status = made.status
+        assert status.state is FlightState.INIT
+        assert any(line.startswith("autopilot ") for line in status.failed_checks)
+        assert "the flight log is not written" in status.alarms
+        assert running.end(signal.SIGTERM) == 0
+
+
+def test_it_flies_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
+    with rig(tmp_path, new_vehicle()) as made:
+        reader, writer = os.pipe()
+        with program(made, output=writer) as running:
+            os.close(writer)
+            os.close(reader)
+            made.take_off()
+            assert all(loop.failures == 0 for loop in made.status.loops.values())
+            assert running.end(signal.SIGTERM) == 0
+
+
+def test_two_programs_that_say_they_are_one_robot_see_each_other(tmp_path: Path) -> None:
+    """Not on one machine, which refuses the second: here it calls its fleet's link by itself."""
+    with rig(tmp_path, new_vehicle()) as made, program(made):
+        made.operator.enable(ORIGIN)
+        made.wait(lambda status: status.ready)
+        with ZenohLink(
+            fleet=made.config.fleet, robot_id=3, listen=("tcp/127.0.0.1:0",),
+            connect=made.config.link.listen,
+        ):  # fmt: skip
+            alarm = "another program says that it is robot 3"
+            made.wait(lambda status: alarm in status.alarms and not status.ready)
+        made.wait(lambda status: status.ready and not status.alarms)
