@@ -58,6 +58,9 @@ _JOIN_S = 0.3
 _NOBODY = -1
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
+_M_ARENA_MAX = -8  # of mallopt(3)
+# The control loop notices its own lapse first, and keeps the vehicle.
+_WATCHDOG_GRACE = 1.1
 
 _log = structlog.get_logger(__name__)
 
@@ -91,7 +94,13 @@ def load(config: RobotConfig) -> Loaded:
     if failed:
         problem = f"{', '.join(failed)} of the bundle do not compute torch's golden outputs here"
     text = Path(config.policy.world).read_text("utf-8-sig")
-    importance = rasterize(parse_world(text, config.policy.world), perception.world_size)
+    training = bundle.manifest.training
+    importance = rasterize(
+        parse_world(text, config.policy.world),
+        perception.world_size,
+        training.idf_truncation,
+        training.idf_norm,
+    )
     return Loaded(
         policy=Policy(bundle),
         bundle_id=bundle.id,
@@ -107,6 +116,8 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
     Raises ValueError or OSError, in one line, for what keeps the program from starting.
     """
     # 1. Policy and world, before anything that moves.
+    libc = ctypes.CDLL(None)
+    libc.mallopt(_M_ARENA_MAX, 1)  # Else each of 80 threads may get a heap of its own.
     loaded = load(config)
     if stop.is_set():
         return
@@ -127,7 +138,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             Deadman(
                 config.autopilot.port,
                 config.autopilot.system_id,
-                config.flight.command_timeout_s,
+                config.flight.command_timeout_s * _WATCHDOG_GRACE,
             )
         )
         # 5. What the robot knows: its place, its radio mail, its map and messages.
@@ -151,7 +162,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         )
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
-        ctypes.CDLL(None).malloc_trim(0)  # What verification took goes back to the system.
+        libc.malloc_trim(0)  # What verification took goes back to the system.
         program.start()
         parts.callback(program.leave)
         _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])

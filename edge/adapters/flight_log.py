@@ -12,7 +12,6 @@ that they tell the order where the clock does not.
 | `control` | a tick of the control loop: state, position, setpoint, and what was sent of it |
 | `status`, `ground`, `vehicle` | `RobotStatus`, `GroundState`, `VehicleState` |
 | `order` | `Order`, and the answer to it |
-| `loops` | `LoopStatus` of each loop |
 | `/pose` | `position_m` (3,) and `yaw_rad` (from x to y, or None) in the mission frame |
 | `/log` | `level` (debug, info, warning, error, critical), `message`, `name` |
 
@@ -46,7 +45,7 @@ from mcap.records import Channel, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from edge.core.mission import GroundState, LoopStatus, Order, OrderResult, RobotStatus
+from edge.core.mission import GroundState, Order, OrderResult, RobotStatus
 from edge.core.vehicle import VehicleState
 
 _METADATA = "lpac"
@@ -506,7 +505,6 @@ def _topic(name: str, schema: _Schema) -> _Topic:
     return _Topic(f"lpac.{name}", json.dumps(schema).encode())
 
 
-_LOOP = _schema(LoopStatus)
 _TOPICS = {
     "perception": _topic(
         "Perception", _object(images=_ARRAY, position_feature=_ARRAY, features=_ARRAY)
@@ -549,7 +547,6 @@ _TOPICS = {
     ),
     "ground": _topic("Ground", _schema(GroundState)),
     "vehicle": _topic("Vehicle", _schema(VehicleState)),
-    "loops": _topic("Loops", _object(perception=_LOOP, policy=_LOOP, control=_LOOP)),
     "/pose": _Topic(
         "foxglove.PoseInFrame",
         json.dumps(

@@ -9,7 +9,6 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from threading import Condition, Lock, Thread
@@ -272,15 +271,18 @@ class MavsdkAutopilot:
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
         """PX4's values; None where it has no such parameter. Called from one thread at a time.
 
-        Raises AutopilotError if the vehicle is not there.
+        Raises AutopilotError if the vehicle is not there, or falls silent meanwhile.
         """
         types = self._types_of(names)
         parameters = Param(self._required_link().system)
         values: dict[str, int | float | None] = dict.fromkeys(names)
         for name, kind in types.items():
             read = parameters.get_param_float if kind == _REAL32 else parameters.get_param_int
-            with suppress(MavsdkError):
+            try:
                 values[name] = read(name)
+            except MavsdkError as error:
+                # It was there a moment ago; each further one would be waited for as well.
+                raise AutopilotError(f"parameter {name}: {_reason(error)}") from error
         return values
 
     def set_parameter(self, name: str, value: int | float) -> None:

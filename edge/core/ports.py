@@ -61,7 +61,7 @@ class Autopilot(Protocol):
 class AutopilotSetup(Protocol):
     """What is done with a vehicle before a flight. Each method waits for it, and may raise OSError.
 
-    Called from the main thread alone.
+    Called from one thread alone, preflight's.
     """
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:

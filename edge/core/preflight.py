@@ -115,7 +115,13 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
     vehicle = inputs.vehicle
     if not vehicle.connected:
         # Whatever was heard before says nothing about now.
-        yield "autopilot is not connected: check its power and the connection's address"
+        others = ", ".join(map(str, vehicle.other_system_ids))
+        yield (
+            f"autopilot with system id {inputs.system_id} is not connected, but system id {others} "
+            "is: set MAV_SYS_ID or the config"
+            if others
+            else "autopilot is not connected: check its power and the connection's address"
+        )
         return
     if vehicle.system_id != inputs.system_id:
         yield (

@@ -79,7 +79,7 @@ class Inbox:
         return None
 
     def peers(self, now_s: float) -> tuple[HeardStatus, ...]:
-        """The fresh statuses of the other robots. Main thread."""
+        """The fresh statuses of the other robots. Preflight's thread."""
         with self._lock:
             self._statuses = {
                 key: arrived

@@ -141,7 +141,6 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
         "order": {**dataclasses.asdict(order), "answer": OrderResult("a", True)},
         "ground": {"sequence": 1},
         "vehicle": dataclasses.asdict(state),
-        "loops": {"control": {"ticks": 3}},
         "/pose": {"position_m": (1.0, 2.0, 3.0), "yaw_rad": math.pi / 2},
         "/log": {"level": "warning", "message": "hello", "name": "robot"},
     }

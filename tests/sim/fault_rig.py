@@ -22,7 +22,7 @@ import numpy as np
 from cli.robot import run
 from edge.adapters.idf_sensor import IdfSensor
 from edge.core import F32, F64
-from edge.core.mission import Calm, FlightState, OrderKind, OrderResult, RobotStatus
+from edge.core.mission import FlightState, OrderKind, OrderResult, RobotStatus
 from edge.runtime.pac import Pac, PolicyTick
 from sim.fleet import ORIGIN, Fleet, RobotProcess
 from sim.operator import Heard, Script, Statuses
@@ -50,9 +50,13 @@ class FaultyRobot(RobotProcess):
         with (self.folder / "robot.log").open("wb") as output:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "tests.sim.fault_rig", str(self.folder)],
-                cwd=ROOT, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                cwd=ROOT,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
                 process_group=0,
-            )  # fmt: skip
+            )
 
     def fail(self, part: Literal["policy", "sensor"]) -> None:
         """From now on that part fails."""
@@ -88,7 +92,7 @@ class FaultRig:
         script.began_s[name] = time.monotonic()
         while not self.operator.wait_for(step.done, 0.2):
             late = time.monotonic() - script.began_s[name] > 2.0 * step.at_most_s
-            assert not late, (name, self.told(), self.operator.refusals)
+            assert not late, (name, self.told(), self.operator.refusals[-5:])
             step.act()
 
     def order(self, kind: OrderKind, robot: int) -> OrderResult:
@@ -112,19 +116,6 @@ class FaultRig:
             lambda statuses: robot in statuses and statuses[robot].state is state, timeout_s
         ), self.told()
         return self.status(robot)
-
-    def bring_to(self, robot: int, state: FlightState) -> None:
-        """Bring a robot that flies the mission to another state by the ground's word."""
-        if state is _S.MISSION:
-            return
-        calm: Calm = "hold" if state is _S.HOLD else "return"
-        self.operator.calm(calm, robot)
-        began_s = self.now_s(robot)
-        self.wait_state(robot, state)
-        if state is _S.HOLD:
-            # At rest, and free to start again.
-            self.wait_time(robot, began_s + 2.5)
-            self.operator.calm("none", robot)
 
     def is_heard(self, robot: int) -> bool:
         """Whether all others that fly have fresh messages of the robot, soon."""
