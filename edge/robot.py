@@ -58,7 +58,6 @@ _JOIN_S = 0.3
 _NOBODY = -1
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
-_M_ARENA_MAX = -8  # of mallopt(3)
 # The control loop notices its own lapse first, and keeps the vehicle.
 _WATCHDOG_GRACE = 1.1
 
@@ -116,8 +115,6 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
     Raises ValueError or OSError, in one line, for what keeps the program from starting.
     """
     # 1. Policy and world, before anything that moves.
-    libc = ctypes.CDLL(None)
-    libc.mallopt(_M_ARENA_MAX, 1)  # Else each of 80 threads may get a heap of its own.
     loaded = load(config)
     if stop.is_set():
         return
@@ -162,7 +159,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         )
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
-        libc.malloc_trim(0)  # What verification took goes back to the system.
+        ctypes.CDLL(None).malloc_trim(0)  # What verification took goes back to the system.
         program.start()
         parts.callback(program.leave)
         _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])

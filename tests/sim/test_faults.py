@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from edge.core.mission import FlightState
+from edge.core.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus, to_json
 from edge.core.wire import Rejection, decode, encode
 from sim.fleet import ORIGIN, Fleet, FleetScenario
 from sim.operator import Statuses
@@ -105,29 +105,46 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
     operator.enable(ORIGIN)
     text = f"another program says that it is robot {STOPPED}"
 
-    def both_say_so(_: Statuses) -> bool:
+    def two() -> tuple[RobotStatus, ...]:
         told = {heard.status.boot_nonce: heard.status for heard in operator.history(STOPPED)}
+        return tuple(told.values())
+
+    def both_say_so(_: Statuses) -> bool:
+        told = two()
         return len(told) == 2 and all(
             status.state is _S.PREFLIGHT
             and text in status.alarms
             and any(check.startswith(text) for check in status.failed_checks)
-            for status in told.values()
+            for status in told
         )
 
     assert operator.wait_for(both_say_so, 60.0), grounded.told()
+    with rogue(grounded.fleet) as session:
 
-    def both_refuse(_: Statuses) -> bool:
-        # Each of them also answers orders that are meant for the other.
-        assert not grounded.order("takeoff", STOPPED).accepted
-        refused = {
-            heard.status.boot_nonce
-            for heard in operator.history(STOPPED)
-            for answer in heard.status.orders
-            if text in answer.reason
-        }
-        return len(refused) == 2
+        def both_refuse(_: Statuses) -> bool:
+            told = two()
+            for status in told:
+                # For each program of the two; the operator takes them for one.
+                order = Order(
+                    order_id=f"for {status.boot_nonce}",
+                    robot_id=STOPPED,
+                    boot_nonce=status.boot_nonce,
+                    kind="takeoff",
+                    expires_at_uptime_s=status.uptime_s + ORDER_LIFETIME_S / 2.0,
+                    operator="test",
+                )
+                session.put(f"lpac/{grounded.fleet.name}/ground/order", to_json(order))
+            return all(
+                any(
+                    answer.order_id == f"for {status.boot_nonce}"
+                    and not answer.accepted
+                    and text in answer.reason
+                    for answer in status.orders
+                )
+                for status in told
+            )
 
-    assert operator.wait_for(both_refuse, 60.0), grounded.told()
+        assert operator.wait_for(both_refuse, 30.0), grounded.told()
     for robot in (STOPPED, TWIN):
         assert not any(entry.armed for entry in grounded.truth(robot, 0.0))
 
