@@ -58,8 +58,6 @@ _JOIN_S = 0.3
 _NOBODY = -1
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
-# The control loop notices its own lapse first, and keeps the vehicle.
-_WATCHDOG_GRACE = 1.1
 
 _log = structlog.get_logger(__name__)
 
@@ -135,7 +133,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             Deadman(
                 config.autopilot.port,
                 config.autopilot.system_id,
-                config.flight.command_timeout_s * _WATCHDOG_GRACE,
+                config.flight.command_timeout_s,
             )
         )
         # 5. What the robot knows: its place, its radio mail, its map and messages.

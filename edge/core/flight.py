@@ -36,6 +36,7 @@ _ARMING_TIMEOUT_S = 6.0
 _OFFBOARD_TIMEOUT_S = 4.0
 # What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
 _STALE_TELEMETRY_S = 2.0
+_LAPSE_SHARE = 0.9
 _AT_HEIGHT_M = 0.5
 _AT_SLOT_M = 1.0
 _AT_LANDING_POINT_M = 0.5
@@ -240,7 +241,8 @@ class _Tick:
     def lapse_s(self) -> float:
         """How long the control loop was silent; 0 if it was not, or has just begun."""
         silence_s = self.inputs.now_s - self.flight.tick_at_s
-        allowed_s = self.robot.parameters.command_timeout_s
+        # A little before the watchdog does, so that what it does is never taken for a pilot's.
+        allowed_s = _LAPSE_SHARE * self.robot.parameters.command_timeout_s
         return silence_s if allowed_s < silence_s < math.inf else 0.0
 
     @property
@@ -403,6 +405,12 @@ def _too_close(t: _Tick) -> str | None:
     return f"only {closest.distance_m:.1f} m to robot {closest.robot_id}"
 
 
+def _outside(t: _Tick) -> str | None:
+    odometry = t.inputs.odometry
+    outside = odometry and t.robot.fence.distance_m(*odometry.position_m[:2]) < 0.0
+    return _if(bool(outside), "outside the fence")
+
+
 def _ground_lost(t: _Tick) -> str | None:
     return _if(not t.ground_heard, "ground lost")
 
@@ -540,7 +548,8 @@ TRANSITIONS: tuple[Transition, ...] = (
     # What cannot wait for anybody.
     Transition(STEERED, _S.LAND, "the position is lost", _position_lost, alarm=True),
     Transition(STEERED, _S.LAND, "the battery is critical", _battery_critical, alarm=True),
-    Transition((_S.HOLD, _S.RETURN), _S.LAND, "it stands on the ground", _on_ground),
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "it stands on the ground", _on_ground,
+               alarm=True),
     # The ground calms.
     Transition((_S.ARMING,), _S.IDLE, "the ground commands hold, land or return, or is lost; the "
                "control loop was silent; the vehicle left offboard",
@@ -706,7 +715,8 @@ def _target_m(t: _Tick) -> Vector | None:
         return None
     if odometry is None or height is None or (t.flight.target_m is not None and not t.silent):
         return t.flight.target_m
-    x_m, y_m, _ = odometry.position_m
+    fence = t.robot.fence
+    x_m, y_m = fence.moved_inside_m(*odometry.position_m[:2], fence.buffer_m / 2.0)
     return x_m, y_m, t.robot.parameters.slot_height_m if state is _S.TAKEOFF else height
 
 
@@ -830,6 +840,6 @@ def _alarms(t: _Tick) -> tuple[str, ...]:
     """What the operator must see, the gravest first."""
     alarms = [t.flight.reason] if t.flight.alarming else []
     if t.flight.state in (*_AIRBORNE, _S.PILOT):
-        checks = (_position_lost, _too_close, _battery_low, _ground_lost)
+        checks = (_position_lost, _too_close, _outside, _battery_low, _ground_lost)
         alarms += [text for check in checks if (text := check(t)) is not None]
     return tuple(dict.fromkeys(alarms))

@@ -6,6 +6,7 @@ never lets the vehicle dash when the estimate jumps. MISSION is flown as a veloc
 the fence limit RETURN and MISSION.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ from edge.core.safety import (
     MotionLimits,
     approach_speed,
     brake,
+    clear_height_m,
     hold_height,
     keep_inside,
     leash,
@@ -78,7 +80,12 @@ def guide(
     if not np.isfinite(position_m).all():
         return _STOP, Guidance()
     if state in (FlightState.TAKEOFF, FlightState.HOLD):
-        return _towards(flight.target_m, position_m, limits), Guidance()
+        highest_m = math.inf
+        if state is FlightState.TAKEOFF:
+            separation_m = robot.parameters.min_separation_m
+            clear_m = clear_height_m(position_m, inputs.neighbours, separation_m)
+            highest_m = max(height, clear_m)
+        return _towards(flight.target_m, highest_m, position_m, limits), Guidance()
     wanted_m_s = np.zeros(3)
     if state is FlightState.RETURN:
         wanted_m_s[:2] = _homewards(robot, position_m)
@@ -107,7 +114,9 @@ def guide(
     return MissionVelocity(_vector(safe_m_s)), remembered
 
 
-def _towards(target_m: Vector | None, position_m: F64, limits: MotionLimits) -> MissionSetpoint:
+def _towards(
+    target_m: Vector | None, highest_m: float, position_m: F64, limits: MotionLimits
+) -> MissionSetpoint:
     """A position on the way to the target: near in the plane, and a second's climb away."""
     if target_m is None:
         return _STOP
@@ -115,7 +124,8 @@ def _towards(target_m: Vector | None, position_m: F64, limits: MotionLimits) -> 
     if place_m is None:
         return _STOP
     height = float(position_m[2])
-    climb_m = hold_height(height, target_m[2], limits.max_climb_m_s) * _AHEAD_S
+    wanted_m = min(target_m[2], highest_m)
+    climb_m = hold_height(height, wanted_m, limits.max_climb_m_s) * _AHEAD_S
     return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
 
 

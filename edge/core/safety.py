@@ -85,6 +85,19 @@ class Fence:
         """
         return float(self._edges().distances_m(np.array([x_m, y_m])).min())
 
+    def moved_inside_m(self, x_m: float, y_m: float, depth_m: float) -> tuple[float, float]:
+        """The place itself, or one near it that is at least about `depth_m` inside every line."""
+        edges = self._edges()
+        place = np.array([x_m, y_m])
+        # In a corner, mending one line's shortfall may make another's: a few rounds settle it.
+        for _ in range(10):
+            missing_m = np.maximum(depth_m - edges.distances_m(place), 0.0)
+            if not missing_m.any():
+                break
+            for inward, distance_m in zip(edges.inward, edges.offsets_m, strict=True):
+                place = place + inward * max(depth_m - float(inward @ place - distance_m), 0.0)
+        return float(place[0]), float(place[1])
+
     def grown_m(self, margin_m: float) -> tuple[tuple[float, float], ...]:
         """Corners (x, y) of the polygon whose every line lies `margin_m` further out."""
         after = self._edges().inward
@@ -161,6 +174,22 @@ def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Clo
         if _is_known(neighbour)
     ]
     return min(distances, key=lambda closest: closest.distance_m, default=None)
+
+
+def clear_height_m(
+    position_m: F64, neighbours: Iterable[Neighbour], min_separation_m: float
+) -> float:
+    """How high a robot may climb from here, m: `min_separation_m` below whoever is above it.
+
+    Infinite if nobody is. Who is less than twice that distance away in the plane counts as above.
+    """
+    heights_m = [math.inf]
+    for neighbour in filter(_is_known, neighbours):
+        x_m, y_m, height_m = _extrapolated(neighbour)
+        apart_m = math.hypot(x_m - position_m[0], y_m - position_m[1])
+        if apart_m < 2.0 * min_separation_m and height_m > position_m[2]:
+            heights_m.append(height_m - min_separation_m)
+    return min(heights_m)
 
 
 def limit_speed(velocity: F64, max_speed: float) -> F64:
