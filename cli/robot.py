@@ -17,7 +17,7 @@ ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configur
 
 @app.command()
 def run(config: ConfigPath = Path("robot.toml")) -> None:
-    """Fly this robot, under the ground's commands, until SIGTERM, Ctrl-C or the terminal's end.
+    """Fly this robot, under the ground's commands, until SIGTERM or Ctrl-C.
 
     A vehicle that is flying then holds, or lands if the configuration says so.
     """
@@ -29,8 +29,10 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
             # Whatever hangs, the program ends; PX4 then lands a vehicle that it was flying.
             signal.setitimer(signal.ITIMER_REAL, _END_WITHIN_S)
 
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
+    # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
     from edge.robot import run as run_robot
     from edge.runtime.config import load_config

@@ -1,8 +1,8 @@
 """One robot's program: everything is built and wired here, in numbered steps.
 
-Threads: the three loops (`perception`, `policy`, `control`); `status`, and `preflight`, which waits
-for the vehicle while that stands on the ground; zenoh's and MAVSDK's own, whose callbacks only
-store; and the main thread, which waits for the disk.
+Threads: the three loops (`perception`, `policy`, `control`); `status`; `log`, which waits for the
+disk; `preflight`, which waits for the vehicle while that stands on the ground; zenoh's and MAVSDK's
+own, whose callbacks only store; and the main thread, which waits for signals.
 """
 
 import ctypes
@@ -161,9 +161,8 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         program.start()
         parts.callback(program.leave)
         _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])
-        # 8. The log goes to the disk until somebody stops the program.
-        while not stop.wait(_PERIOD_S):
-            recorder.flush()
+        # 8. Until somebody stops the program.
+        stop.wait()
 
 
 def _open_log(config: RobotConfig, loaded: Loaded, boot_nonce: int) -> FlightLog:
@@ -251,6 +250,7 @@ class _Program:
         self._chores = (
             Loop("preflight", _PERIOD_S, self._preflight_step),
             Loop("status", _PERIOD_S, self._status_step),
+            Loop("log", _PERIOD_S, self._recorder.flush),
         )
         self._sequence = 0
 
@@ -276,13 +276,12 @@ class _Program:
 
     def _command(self, action: Action) -> None:
         asked_s = time.monotonic()
+        # Or the watchdog would interrupt it. If it does not arrive, PX4 lands the vehicle.
+        self._deadman.feed(flying=False)
         self._autopilot.command(action)
         while time.monotonic() - asked_s < _ANSWER_S:
             result = self._autopilot.state().result
             if result and result.action is action and result.at_s >= asked_s:
-                if result.accepted:
-                    # The watchdog would interrupt it.
-                    self._deadman.feed(flying=False)
                 return
             time.sleep(0.02)
         _log.error("the autopilot did not answer", action=action)
@@ -320,13 +319,14 @@ class _Program:
         self._readiness.prepare(time.monotonic(), origin)
         now_s = time.monotonic()
         peers = self._inbox.peers(now_s)
-        control.peer_states = {peer.status.robot_id: peer.status.state for peer in peers}
+        control.peers = peers
         control.checks = self._readiness.checks(
             now_s,
             time.time(),
             origin=origin,
             odometry=self._navigation.odometry(),
             peers=peers,
+            not_understood=self._inbox.not_understood,
             duplicate=self._link.duplicate(),
             watchdog_alive=self._deadman.alive(),
             ground_age_s=self._inbox.ground_age_s(now_s),
@@ -472,6 +472,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
                 origin=origin,
                 odometry=navigation.odometry(),
                 peers=inbox.peers(now_s),
+                not_understood=inbox.not_understood,
                 duplicate=config.robot_id in link.present(),
                 watchdog_alive=True,  # There is none before the robot's program runs.
                 ground_age_s=ground_age_s,

@@ -116,7 +116,7 @@ def _watch(pipe: int, udp: socket.socket, system_id: int, timeout_s: float) -> N
             flying = fed[-1:] == _FLYING
         elif flying and not readable and peer is not None:
             _hold(udp, peer, system_id)
-            print(f"lpac: control loop silent for {timeout_s} s: hold", file=sys.stderr, flush=True)
+            _say(f"control loop silent for {timeout_s} s: hold")
             flying = False
 
 
@@ -134,8 +134,14 @@ def _hold(udp: socket.socket, peer: tuple[str, int], system_id: int) -> None:
         try:
             udp.sendto(_hold_command(sequence, system_id), peer)
         except OSError as error:
-            print(f"lpac: hold not sent: {error}", file=sys.stderr, flush=True)
+            _say(f"hold not sent: {error}")
         time.sleep(_APART_S)
+
+
+def _say(text: str) -> None:
+    # Nobody may be left to read it.
+    with suppress(OSError):
+        print(f"lpac: {text}", file=sys.stderr, flush=True)
 
 
 def _hold_command(sequence: int, system_id: int) -> bytes:

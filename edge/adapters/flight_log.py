@@ -80,7 +80,7 @@ class FlightMetadata:
 class FlightLog:
     """Writes what a robot records; implements `Recorder`.
 
-    `record` may be called from any thread, everything else from the main thread alone. After an
+    `record` may be called from any thread, everything else from one thread at a time. After an
     error of the file system it records nothing more and says so once; nothing raises in flight.
     """
 

@@ -41,26 +41,6 @@ _RATES_HZ = {
     49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
     245: 5.0,  # EXTENDED_SYS_STATE
 }
-# Streams that PX4 has on by default for a companion, and nobody here listens to.
-_UNUSED = (
-    30,  # ATTITUDE
-    31,  # ATTITUDE_QUATERNION
-    36,  # SERVO_OUTPUT_RAW
-    62,  # NAV_CONTROLLER_OUTPUT
-    65,  # RC_CHANNELS
-    74,  # VFR_HUD
-    83,  # ATTITUDE_TARGET
-    85,  # POSITION_TARGET_LOCAL_NED
-    87,  # POSITION_TARGET_GLOBAL_INT
-    105,  # HIGHRES_IMU
-    141,  # ALTITUDE
-    147,  # BATTERY_STATUS
-    230,  # ESTIMATOR_STATUS
-    241,  # VIBRATION
-    242,  # HOME_POSITION
-    331,  # ODOMETRY
-    340,  # UTM_GLOBAL_POSITION
-)
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
 
 _AUTOPILOT = 1  # component id
@@ -540,8 +520,6 @@ class MavsdkAutopilot:
     def _ask_for_streams(self) -> None:
         for message_id, rate_hz in _RATES_HZ.items():
             self._send_command(_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
-        for message_id in _UNUSED:
-            self._send_command(_SET_MESSAGE_INTERVAL, message_id, -1.0)
 
     def _request(self, message_id: int) -> None:
         self._send_command(_REQUEST_MESSAGE, message_id)

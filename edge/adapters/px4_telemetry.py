@@ -26,7 +26,7 @@ _TEXT_KEPT_S = 15.0
 _JUMP_M, _JUMP_M_S = 1.0, 1.0
 _ORIGIN_ANSWER_S = 0.5
 
-_SENSOR_GPS, _PREARM_CHECK = 1 << 5, 1 << 28
+_SENSOR_GPS, _SENSOR_RC, _PREARM_CHECK = 1 << 5, 1 << 16, 1 << 28
 _SAFETY_ARMED = 1 << 7
 _AUTOPILOT_INVALID = 8
 _WARNING = 4
@@ -151,6 +151,7 @@ class Px4Telemetry:
         self._change(
             armable=bool(healthy & _PREARM_CHECK) if present & _PREARM_CHECK else None,
             battery=percent / 100.0 if percent >= 0 else None,
+            remote_control=bool(present & healthy & _SENSOR_RC),
         )
 
     def _on_gps_raw_int(self, fields: Fields, _: float) -> None:

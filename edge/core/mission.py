@@ -16,6 +16,7 @@ from typing import Literal, TypeVar
 
 from edge.core.frames import MissionFrame
 from edge.core.schema import ConfigError, from_mapping
+from edge.core.vehicle import Vector
 
 ORDER_LIFETIME_S = 10.0
 
@@ -156,8 +157,8 @@ class RobotStatus:
     system_id: int | None
     slot_height_m: float
     landing_point_m: tuple[float, ...]
-    position_m: tuple[float, ...] | None
-    velocity_m_s: tuple[float, ...] | None
+    position_m: Vector | None
+    velocity_m_s: Vector | None
     heading_rad: float | None
     mode: str | None
     armed: bool | None
@@ -166,6 +167,12 @@ class RobotStatus:
     message_counts: dict[str, int]
     neighbour_ages_s: dict[str, float]
     loops: dict[str, LoopStatus]
+
+    def __post_init__(self) -> None:
+        for name, size in (("position_m", 3), ("velocity_m_s", 3), ("landing_point_m", 2)):
+            value = getattr(self, name)
+            if value is not None and len(value) != size:
+                raise ValueError(f"{name} = {list(value)}: must be {size} numbers")
 
 
 def to_json(message: GroundState | Order | RobotStatus) -> bytes:

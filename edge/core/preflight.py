@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from edge.core.failsafe import RemoteControl
 from edge.core.mission import Origin, RobotStatus
 from edge.core.safety import Fence
 from edge.core.vehicle import Gps, VehicleState
@@ -46,9 +47,10 @@ class PreflightLimits:
 
 
 class HeardStatus(NamedTuple):
-    """Another robot's status, and what this robot's wall clock said when it came."""
+    """Another robot's status, and when it came: this robot's monotonic and wall clock, s."""
 
     status: RobotStatus
+    heard_at_s: float
     heard_at_unix_s: float
 
 
@@ -60,8 +62,9 @@ class PreflightInputs:
     `system_id` is the configured one. `position_m` (3,) and `landing_point_m` (2,) are in the
     mission frame; the slot's height is above the takeoff point. `failsafe_problems` come from
     `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
-    robots that were heard lately. `ground_age_s` is how long ago the ground was heard, None if
-    never; `ground_clock_offset_s` is its wall clock minus this one, None if it is not known.
+    robots that were heard lately, `not_understood` those who said what cannot be read.
+    `ground_age_s` is how long ago the ground was heard, None if never; `ground_clock_offset_s` is
+    its wall clock minus this one, None if it is not known.
     """
 
     now_s: float
@@ -82,6 +85,8 @@ class PreflightInputs:
     landing_point_m: Sequence[float]
     min_separation_m: float
     neighbours: Sequence[HeardStatus]
+    not_understood: Sequence[str]
+    rc: RemoteControl
     ground_age_s: float | None
     ground_clock_offset_s: float | None
 
@@ -131,6 +136,8 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
     if vehicle.other_system_ids:
         others = ", ".join(map(str, vehicle.other_system_ids))
         yield f"other vehicles are on this link (system id {others}): give each its own port"
+    if inputs.rc == "pilot" and not vehicle.remote_control:
+        yield "remote control is not heard, and the config has a pilot: switch it on"
     if vehicle.armed is not False:
         state = "armed" if vehicle.armed else "not known to be disarmed"
         yield f"vehicle is {state}: disarm it"
@@ -217,8 +224,12 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
     others = [heard for heard in inputs.neighbours if heard.status.robot_id != inputs.robot_id]
     if inputs.duplicate_id or len(others) < len(inputs.neighbours):
         yield f"another program says that it is robot {inputs.robot_id}: stop it, or change its id"
-    for status, heard_at_unix_s in others:
+    for robot in inputs.not_understood:
+        yield f"{robot} runs another version of this program: deploy one to all"
+    for status, _, heard_at_unix_s in others:
         other = f"robot {status.robot_id}"
+        if status.system_id is not None and status.system_id == inputs.system_id:
+            yield f"{other}'s vehicle has the same system id {status.system_id}: set MAV_SYS_ID"
         if status.bundle_id != inputs.bundle_id:
             yield f"{other} has another bundle: deploy one to all"
         if status.world_id != inputs.world_id:

@@ -89,8 +89,8 @@ class Fence:
         """The place itself, or one near it that is at least about `depth_m` inside every line."""
         edges = self._edges()
         place = np.array([x_m, y_m])
-        # In a corner, mending one line's shortfall may make another's: a few rounds settle it.
-        for _ in range(10):
+        # In a corner, mending one line's shortfall makes another's: in rounds it converges.
+        for _ in range(100):
             missing_m = np.maximum(depth_m - edges.distances_m(place), 0.0)
             if not missing_m.any():
                 break

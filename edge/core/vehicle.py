@@ -65,10 +65,12 @@ class VehicleState:
     """Everything that was heard of the vehicle, the newest of each; None is not heard yet.
 
     `position_local_m` and `velocity_local_m_s` were received together, at `position_at_s`;
-    `mode`, `armed` come with the autopilot's heartbeat, once a second, last at `heartbeat_at_s`.
+    `mode`, `armed` come with the autopilot's heartbeat, 1 to 5 times a second, last at
+    `heartbeat_at_s`.
     `origin_deg` is the estimator's origin: latitude and longitude. `height_above_home_m` is above
     where the vehicle was armed, up positive. `battery` is the remaining share, 0 to 1. `problems`
-    are the autopilot's reasons why it would not arm, in its own words.
+    are the autopilot's reasons why it would not arm, in its own words. `remote_control` tells
+    whether it hears one.
     `result` is the outcome of the last command that ended.
     """
 
@@ -90,6 +92,7 @@ class VehicleState:
     gps: Gps | None = None
     armable: bool | None = None
     problems: tuple[str, ...] = ()
+    remote_control: bool | None = None
     result: ActionResult | None = None
 
 

@@ -1,6 +1,6 @@
 """One control tick of a robot: what it knows -> flight state -> setpoint and commands."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
 
 import structlog
@@ -10,6 +10,7 @@ from edge.core.guidance import Guidance, MissionSetpoint, guide
 from edge.core.mailbox import Neighbour
 from edge.core.mission import FlightState, Origin
 from edge.core.ports import Autopilot, Odometry, Recorder
+from edge.core.preflight import HeardStatus
 from edge.core.safety import Closest, nearest
 from edge.core.vehicle import Action, Mode, Setpoint
 from edge.runtime.inbox import Inbox
@@ -19,6 +20,8 @@ from edge.runtime.readiness import Checks
 
 _log = structlog.get_logger(__name__)
 
+# The statuses' period is a quarter of a second.
+_MAX_STATUS_AGE_S = 1.5
 # Checks that are older say nothing about now.
 _MAX_CHECKS_AGE_S = 5.0
 _GROUNDED = (FlightState.INIT, FlightState.IDLE, FlightState.PREFLIGHT, FlightState.LANDED)
@@ -28,7 +31,7 @@ _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
 class FlightControl:
     """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
 
-    Another thread sets `checks`, and `peer_states` (robot id -> what it says of its state), whole.
+    Another thread sets `checks`, and `peers` (what the other robots say of themselves), whole.
     `obeyed_sequence` and `operator` are the last ground state's; `origin` is the mission's.
     """
 
@@ -57,7 +60,7 @@ class FlightControl:
         self.flight = Flight()
         self.alarms: tuple[str, ...] = ()
         self.checks: Checks | None = None
-        self.peer_states: Mapping[int, FlightState] = {}
+        self.peers: tuple[HeardStatus, ...] = ()
         self.origin: Origin | None = None
         self.obeyed_sequence = -1
         self.operator = ""
@@ -72,7 +75,7 @@ class FlightControl:
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
             self._take_origin(ground.origin, vehicle.armed)
         odometry = self._navigation.estimate(vehicle)
-        neighbours = self._pac.mailbox.neighbours(now_s)
+        neighbours = self._neighbours(now_s)
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
@@ -80,7 +83,9 @@ class FlightControl:
             policy_velocity_m_s=self._pac.control(now_s),
             neighbours=neighbours,
             closest=self._closest(odometry, neighbours),
-            busy_neighbours=tuple(r for r, s in self.peer_states.items() if s in _BUSY),
+            busy_neighbours=tuple(
+                peer.status.robot_id for peer in self.peers if peer.status.state in _BUSY
+            ),
             ground=ground,
             ground_age_s=ground_age_s,
             failed_checks=self.failed_checks(now_s),
@@ -132,6 +137,25 @@ class FlightControl:
         self.origin, self._navigation.frame, self._pac.frame_id = origin, frame, frame.frame_id
         self._pac.forget()
 
+    def _neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
+        """Whom to keep away from: also robots that are silent since their policy or sensor failed.
+
+        They still tell their place in their status, if not as often.
+        """
+        heard = self._pac.mailbox.neighbours(now_s)
+        known = {self._robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
+        told = []
+        for status, heard_at_s, _ in self.peers:
+            age_s = now_s - heard_at_s
+            comparable = status.origin == self.origin and age_s <= _MAX_STATUS_AGE_S
+            if status.robot_id in known or not comparable:
+                continue
+            if status.position_m is not None and status.velocity_m_s is not None:
+                told.append(
+                    Neighbour(status.robot_id, status.position_m, status.velocity_m_s, age_s)
+                )
+        return (*heard, *told)
+
     def _closest(
         self, odometry: Odometry | None, neighbours: tuple[Neighbour, ...]
     ) -> Closest | None:
@@ -167,7 +191,7 @@ class FlightControl:
             },
         )
         if inputs.order is not None:
-            answer = self.flight.answers[-1] if self.flight.answers else None
-            self._recorder.record(
-                "order", self._unix_clock_s(), {**asdict(inputs.order), "answer": answer}
-            )
+            order_id = inputs.order.order_id
+            given = (answer for answer in self.flight.answers if answer.order_id == order_id)
+            record = {**asdict(inputs.order), "answer": next(given, None)}
+            self._recorder.record("order", self._unix_clock_s(), record)

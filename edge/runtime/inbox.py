@@ -39,6 +39,8 @@ class Inbox:
         self._ground_at_s = -math.inf
         # The ground's wall clock minus this one, None while it is not known.
         self.ground_clock_offset_s: float | None = None
+        # Whose statuses could not be read when `peers` was asked last.
+        self.not_understood: tuple[str, ...] = ()
         self.malformed = 0
 
     def put_ground(self, data: bytes, now_s: float, unix_now_s: float) -> None:
@@ -86,9 +88,16 @@ class Inbox:
                 for key, arrived in sorted(self._statuses.items())
                 if now_s - arrived.at_s <= _STATUS_LIFETIME_S
             }
-            arrivals = tuple(self._statuses.values())
-        decoded = ((self._decode(RobotStatus, arrived.data), arrived) for arrived in arrivals)
-        return tuple(HeardStatus(s, a.unix_s) for s, a in decoded if s is not None)
+            arrivals = dict(self._statuses)
+        decoded = {key: self._decode(RobotStatus, a.data) for key, a in arrivals.items()}
+        self.not_understood = tuple(
+            f"robot {key.split('/')[1]}" for key, status in decoded.items() if status is None
+        )
+        return tuple(
+            HeardStatus(status, arrivals[key].at_s, arrivals[key].unix_s)
+            for key, status in decoded.items()
+            if status is not None
+        )
 
     def _decode(self, kind: type[T], data: bytes) -> T | None:
         try:

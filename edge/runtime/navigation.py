@@ -40,9 +40,13 @@ class Navigation:
         self.datum_m: float | None = None
 
     def odometry(self) -> Odometry | None:
-        """Position and velocity, z being the height above the takeoff point; 0 before takeoff."""
-        estimate = self.estimate(self._autopilot.state())
-        if estimate is None:
+        """Position and velocity, z being the height above the takeoff point; 0 before takeoff.
+
+        None, too, for an armed vehicle whose takeoff point is not known.
+        """
+        vehicle = self._autopilot.state()
+        estimate = self.estimate(vehicle)
+        if estimate is None or (self.datum_m is None and vehicle.armed):
             return None
         x_m, y_m, z_m = estimate.position_m
         height_m = 0.0 if self.datum_m is None else z_m - self.datum_m

@@ -19,7 +19,7 @@ from edge.core.preflight import HeardStatus, PreflightInputs, failed_checks
 from edge.runtime.config import RobotConfig
 
 # Parameters may be changed by others meanwhile.
-_READ_AGAIN_S = 30.0
+_READ_AGAIN_S = 5.0
 _TRY_AGAIN_S = 3.0
 
 _log = structlog.get_logger(__name__)
@@ -74,7 +74,8 @@ class Readiness:
         if not vehicle.connected:
             self._parameters_due_s, self._fence_for = -math.inf, None
             return
-        if vehicle.armed is not False:
+        # Nothing is set while it is not sure which vehicle answers.
+        if vehicle.armed is not False or vehicle.other_system_ids:
             return
         if now_s >= self._parameters_due_s:
             self._parameters_due_s = now_s + (_READ_AGAIN_S if self._read() else _TRY_AGAIN_S)
@@ -90,6 +91,7 @@ class Readiness:
         origin: Origin | None,
         odometry: Odometry | None,
         peers: Sequence[HeardStatus],
+        not_understood: Sequence[str],
         duplicate: bool,
         watchdog_alive: bool,
         ground_age_s: float,
@@ -116,6 +118,8 @@ class Readiness:
             landing_point_m=config.flight.landing_point_m,
             min_separation_m=config.flight.min_separation_m,
             neighbours=peers,
+            not_understood=not_understood,
+            rc=config.failsafe.rc,
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             ground_clock_offset_s=ground_clock_offset_s,
         )

@@ -743,6 +743,26 @@ def test_after_touchdown_hold_and_return_do_not_lift_it(world: World) -> None:
 # Faults in flight
 
 
+def test_a_robot_that_was_knocked_down_in_its_mission_lands(world: World) -> None:
+    world.fly()
+    world.heavy = True
+    while world.height_m > 0.0:
+        world.position_m[2] = max(world.position_m[2] - 0.5, 0.0)
+        world.tick()
+    world.until(FlightState.LAND, 3.0)
+    assert world.flight.alarming
+
+
+def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:
+    world.fly()
+    world.position_m[:2] = (33.0, 16.0)
+    world.enable(calm="hold")
+    world.until(FlightState.HOLD, 1.0)
+    assert "outside the fence" in world._decide(world._hear()).alarms
+    world.run(20.0)
+    assert world.position_m[:2] == pytest.approx((31.0, 16.0), abs=0.2)
+
+
 def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
     world.fly()
     world.ground_on = False

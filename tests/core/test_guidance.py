@@ -251,3 +251,20 @@ def test_what_is_sent_is_finite_near_and_within_the_limits(
     assert np.isfinite(step_m).all()
     assert math.hypot(*step_m[:2]) <= ROBOT.limits.max_speed_m_s + 1e-9
     assert abs(step_m[2]) <= ROBOT.limits.max_climb_m_s + 1e-9
+
+
+def test_takeoff_stops_below_a_robot_that_hovers_above_and_goes_on_when_it_is_gone() -> None:
+    state = flight(FlightState.TAKEOFF, AT_SLOT)
+    x_m, y_m, _ = AT_SLOT
+    separation_m = ROBOT.parameters.min_separation_m
+    above = Neighbour(7, (x_m + 0.5, y_m, 4.0), STILL, 0.1)
+    vehicle = Vehicle((x_m, y_m, 0.0))
+    vehicle.fly(state, 20.0, neighbours=(above,))
+    assert max(place_m[2] for place_m in vehicle.path_m) <= 4.0 - separation_m + 0.05
+    vehicle.fly(state, 20.0)
+    assert vehicle.position_m[2] == pytest.approx(SLOT_M, abs=0.1)
+    # One that hovers beside the way, or below, stops nobody.
+    for place_m in ((x_m + 2.0 * separation_m, y_m, 4.0), (x_m, y_m, 0.5)):
+        elsewhere = Neighbour(7, place_m, STILL, 0.1)
+        sent_m = position(state, inputs((x_m, y_m, 3.0), neighbours=(elsewhere,)))
+        assert sent_m[2] > 3.9

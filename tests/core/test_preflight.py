@@ -87,7 +87,9 @@ READY = PreflightInputs(
     slot_height_m=5.0,
     landing_point_m=(8.0, 8.0),
     min_separation_m=2.0,
-    neighbours=(HeardStatus(NEIGHBOUR, UNIX_S + 0.2),),
+    neighbours=(HeardStatus(NEIGHBOUR, 99.8, UNIX_S + 0.2),),
+    not_understood=(),
+    rc="none",
     ground_age_s=0.4,
     ground_clock_offset_s=None,
 )
@@ -99,7 +101,9 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
     ({"ground_age_s": None}, "ground was not heard: start"),
     ({"ground_age_s": 3.1}, "ground was last heard 3.1 s ago: check the radio"),
     ({"ground_clock_offset_s": -7.0}, "clock differs from the ground's by -7.0 s: set the time"),
-    ({"system_id": 2}, "autopilot has system id 1, configured is 2: check which vehicle this is"),
+    ({"system_id": 9}, "autopilot has system id 1, configured is 9: check which vehicle this is"),
+    ({"rc": "pilot"}, "remote control is not heard, and the config has a pilot: switch it on"),
+    ({"not_understood": ("robot 4",)}, "robot 4 runs another version of this program"),
     ({"failsafe_problems": None}, "autopilot's failsafe parameters were not read"),
     ({"failsafe_problems": ("COM_OF_LOSS_T = 1",)}, "autopilot's COM_OF_LOSS_T = 1"),
     ({"fence_uploaded": False}, "autopilot does not have the fence: wait for the upload"),
@@ -119,7 +123,7 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
     ({"slot_height_m": 6.0}, "robot 2 flies 1.0 m above or below, must be 2 m: change the slots"),
     ({"landing_point_m": (12.0, 9.0)}, "robot 2 lands 1.0 m away, must be 2 m"),
     (
-        {"neighbours": (HeardStatus(NEIGHBOUR, UNIX_S - 30.0),)},
+        {"neighbours": (HeardStatus(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
         "robot 2's clock differs by 30.0 s: set the time of both",
     ),
 ]
@@ -187,13 +191,13 @@ def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
 
 
 def test_a_neighbour_without_an_origin_has_not_ours() -> None:
-    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, origin=None), UNIX_S)
+    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, origin=None), 99.8, UNIX_S)
     (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
     assert failed.startswith("robot 2 has another mission origin")
 
 
 def test_slots_exactly_the_separation_apart_are_apart() -> None:
-    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, slot_height_m=5.1 + 2.1), UNIX_S)
+    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, slot_height_m=5.1 + 2.1), 99.8, UNIX_S)
     inputs = dataclasses.replace(
         READY, neighbours=(neighbour,), slot_height_m=5.1, min_separation_m=2.1
     )

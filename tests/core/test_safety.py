@@ -16,6 +16,7 @@ from edge.core.safety import (
     MotionLimits,
     approach_speed,
     brake,
+    clear_height_m,
     hold_height,
     keep_inside,
     leash,
@@ -440,3 +441,24 @@ def test_an_unknown_neighbour_stops_the_robot_and_hides_no_other() -> None:
     command = brake(AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), others, 2.0, LIMITS, None)
     assert not command.any()
     assert nearest((0.0, 0.0, 0.0), others) == Closest(2, 9.0)
+
+
+@settings(deadline=None)
+@given(fences(), number(-60.0, 60.0), number(-60.0, 60.0))
+def test_a_place_is_moved_inside_only_if_it_is_not(fence: Fence, x_m: float, y_m: float) -> None:
+    depth_m = fence.buffer_m / 2.0
+    moved = fence.moved_inside_m(x_m, y_m, depth_m)
+    if fence.distance_m(x_m, y_m) >= depth_m:
+        assert moved == (x_m, y_m)
+    assert fence.distance_m(*moved) > 0.0
+
+
+def test_who_is_above_keeps_a_robot_below() -> None:
+    def height_m(*others: Neighbour) -> float:
+        return clear_height_m(np.array([0.0, 0.0, 2.0]), others, 1.5)
+
+    assert height_m() == math.inf
+    assert height_m(neighbour(1, 1.0, 0.0, 6.0), neighbour(2, 0.0, 2.9, 5.0)) == 3.5
+    assert height_m(neighbour(1, 3.1, 0.0, 6.0), neighbour(2, 0.0, 0.0, 1.0)) == math.inf
+    falling = neighbour(1, 0.0, 0.0, 6.0, velocity_m_s=(0.0, 0.0, -2.0), age_s=0.5)
+    assert height_m(falling) == 3.5

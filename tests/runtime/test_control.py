@@ -17,8 +17,10 @@ from edge.core.mission import (
     OrderKind,
     OrderResult,
     Origin,
+    RobotStatus,
     to_json,
 )
+from edge.core.preflight import HeardStatus
 from edge.core.vehicle import Action, ActionResult, Mode, Setpoint, Vector, VehicleState, Velocity
 from edge.core.world import random_features, rasterize
 from edge.runtime.config import load_config
@@ -32,6 +34,7 @@ from sim.px4.modes import Mode as Px4Mode
 from sim.px4.modes import Result
 from sim.px4.vehicle import Px4Vehicle
 from sim.px4.vehicle import Setpoint as Px4Setpoint
+from tests.core.test_preflight import NEIGHBOUR
 from tests.robot_rig import ORIGIN, new_vehicle, write_config
 
 ELSEWHERE = dataclasses.replace(ORIGIN, heading_deg=120.0)
@@ -188,6 +191,22 @@ class Flown:
         assert self.images is not None
         return int((self.images[0, 0] > 0.0).sum())
 
+    def peers(self, *statuses: RobotStatus, age_s: float = 0.1) -> None:
+        """What other robots said of themselves."""
+        at_s = self.now_s - age_s
+        self.control.peers = tuple(HeardStatus(status, at_s, at_s) for status in statuses)
+
+    def odometry(self) -> Vector:
+        odometry = self.navigation.odometry()
+        assert odometry is not None
+        return odometry.position_m
+
+
+def peer(robot_id: int, state: FlightState, position_m: Vector = (100.0, 0.0, 9.0)) -> RobotStatus:
+    return dataclasses.replace(
+        NEIGHBOUR, robot_id=robot_id, state=state, position_m=position_m, origin=ORIGIN
+    )
+
 
 def vector(values: Any) -> Vector:
     x, y, z = values.tolist()
@@ -288,9 +307,19 @@ def test_checks_count_for_their_origin_and_not_for_long(
 
 def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
     flown.take_off()
-    flown.control.peer_states = {5: FlightState.TAKEOFF, 6: FlightState.HOLD}
+    flown.peers(peer(5, FlightState.TAKEOFF), peer(6, FlightState.HOLD))
     assert flown.order("start", "a").reason == "robots still taking off: 5"
-    flown.control.peer_states = {5: FlightState.HOLD}
+    flown.peers(peer(5, FlightState.HOLD))
+    assert flown.order("start", "a").accepted
+
+
+def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_status(flown: Flown) -> None:
+    flown.take_off()
+    x_m, y_m, height_m = flown.odometry()
+    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))
+    assert flown.order("start", "a").reason == "only 1.0 m to robot 5"
+    # What it said two seconds ago tells nothing, nor does a place in another frame.
+    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)), age_s=2.0)
     assert flown.order("start", "a").accepted
 
 

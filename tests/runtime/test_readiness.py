@@ -45,6 +45,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "origin": origin,
         "odometry": None,
         "peers": (),
+        "not_understood": (),
         "duplicate": False,
         "watchdog_alive": True,
         "ground_age_s": 0.1,
@@ -94,7 +95,7 @@ def test_a_parameter_that_others_change_later_is_noticed(tmp_path: Path) -> None
         asked.prepare(time.monotonic(), ORIGIN)
         assert about_parameters(checked(asked)) == []
         vehicle.parameters["COM_OBL_RC_ACT"] = 3
-        asked.prepare(time.monotonic() + 5.0, ORIGIN)
+        asked.prepare(time.monotonic() + 3.0, ORIGIN)
         assert vehicle.parameters["COM_OBL_RC_ACT"] == 3
         asked.prepare(time.monotonic() + 31.0, ORIGIN)
         assert vehicle.parameters["COM_OBL_RC_ACT"] == 4
