@@ -46,7 +46,10 @@ def check(
     wait: Annotated[float, typer.Option(help="How long the robot may take to be ready, s.")] = 15.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Say what PX4 would do when something fails, and what still keeps the robot from flying."""
+    """Say what PX4 would do when something fails, and what still keeps the robot from flying.
+
+    With parameters = "set" in the configuration, unsafe PX4 parameters are set.
+    """
     from edge.robot import check as check_robot
     from edge.runtime.config import load_config
 

@@ -163,7 +163,7 @@ def process_usage(pid: int) -> Usage:
     peak_kb = next(
         (int(w[1]) for w in map(str.split, status.split("\n")) if w[:1] == ["VmHWM:"]), 0
     )
-    return Usage(ticks / os.sysconf("SC_CLK_TCK"), peak_kb / 1024.0)
+    return Usage(ticks / os.sysconf("SC_CLK_TCK"), peak_kb * 1024 / 1e6)
 
 
 class Fleet:
