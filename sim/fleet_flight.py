@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from edge.core import F32, F64
 from edge.core.coverage import coverage_cost
-from edge.core.mission import FlightState, RobotStatus
+from edge.core.mission import AIRBORNE, ON_GROUND, FlightState, RobotStatus
 from edge.core.safety import Fence
 from edge.core.world import rasterize
 from sim.experiment import FIELD_SCALE
@@ -24,10 +24,6 @@ COST_PERIOD_S = 1.0
 SEPARATION_PERIOD_S = 0.04
 
 _LOOPS = ("perception", "policy", "control")
-
-_S = FlightState
-_IN_AIR = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN, _S.LAND)
-_DOWN = (_S.INIT, _S.IDLE, _S.PREFLIGHT, _S.LANDED)
 
 
 class StateChange(NamedTuple):
@@ -108,7 +104,7 @@ class FleetFlight:
         """Whether every robot says that it is down and disarmed, and is, as far as is known."""
         return all(
             robot.changes
-            and robot.changes[-1].state in _DOWN
+            and robot.changes[-1].state in ON_GROUND
             and not robot.truth.airborne[-1:].any()
             for robot in self.robots
         )
@@ -299,7 +295,7 @@ def _robot_flight(
     return RobotFlight(
         time_s=np.array([heard.at_s - start_s for heard in placed]),
         position_m=np.array([heard.status.position_m for heard in placed]).reshape(-1, 3),
-        in_air=np.array([heard.status.state in _IN_AIR for heard in placed], np.bool_),
+        in_air=np.array([heard.status.state in AIRBORNE for heard in placed], np.bool_),
         changes=tuple(changes),
         mission_share=_mission_share(changes, *mission_s),
         **rest,
@@ -314,7 +310,7 @@ def _mission_share(changes: list[StateChange], begin_s: float, end_s: float) -> 
     flown_s = (
         max(0.0, min(until_s, end_s) - max(change.time_s, begin_s))
         for change, until_s in zip(changes, ends_s, strict=True)
-        if change.state is _S.MISSION
+        if change.state is FlightState.MISSION
     )
     return sum(flown_s) / (end_s - begin_s)
 
@@ -329,7 +325,7 @@ def _place_at(time_s: F64, position_m: F64, at_s: float) -> tuple[float, float]:
 
 def _costs(importance: F32, robots: tuple[RobotFlight, ...], at_s: float) -> tuple[float, float]:
     """The cost for where the robots in the air take themselves to be, and for where they are."""
-    flying = [robot for robot in robots if robot.state_at(at_s) in _IN_AIR]
+    flying = [robot for robot in robots if robot.state_at(at_s) in AIRBORNE]
     return (
         _cost(importance, [_place_at(r.time_s, r.position_m, at_s) for r in flying]),
         _cost(importance, [_place_at(r.truth.time_s, r.truth.position_m, at_s) for r in flying]),

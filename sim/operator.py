@@ -18,7 +18,9 @@ from typing import NamedTuple, Self
 
 from edge.adapters.zenoh_link import ZenohLink
 from edge.core.mission import (
+    ON_GROUND,
     ORDER_LIFETIME_S,
+    STEERED,
     Calm,
     FlightState,
     GroundState,
@@ -258,8 +260,6 @@ _START_AGAIN_S = 3.0
 _SETTLE_S = 1.0
 _EXPLAIN_AFTER_S = 8.0
 _OVER_LANDING_POINT_M = 1.5
-_GROUNDED = (_S.INIT, _S.IDLE, _S.PREFLIGHT, _S.LANDED)
-_FLYING = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
 
 
 def waiting_to_land(statuses: Statuses, arrived: Collection[int]) -> set[int]:
@@ -268,13 +268,13 @@ def waiting_to_land(statuses: Statuses, arrived: Collection[int]) -> set[int]:
     Landing leads through the heights of all lower robots: somebody still flies home there.
     """
     lowest_m = min(
-        (s.slot_height_m for r, s in statuses.items() if s.state in _FLYING and r not in arrived),
+        (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
         default=math.inf,
     )
     return {
         robot
         for robot, status in statuses.items()
-        if robot in arrived and status.state in _FLYING and status.slot_height_m > lowest_m
+        if robot in arrived and status.state in STEERED and status.slot_height_m > lowest_m
     }
 
 
@@ -402,7 +402,7 @@ class Script:
 
     def _all_down(self, statuses: Statuses) -> bool:
         """A robot that is not heard any more cannot be waited for."""
-        return all(s.state in _GROUNDED and not s.armed for s in statuses.values())
+        return all(s.state in ON_GROUND and not s.armed for s in statuses.values())
 
     # What is done in a step
 

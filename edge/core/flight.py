@@ -15,7 +15,10 @@ from typing import Literal, NamedTuple
 from edge.core import F64
 from edge.core.mailbox import Neighbour
 from edge.core.mission import (
+    AIRBORNE,
+    ON_GROUND,
     ORDER_LIFETIME_S,
+    STEERED,
     Calm,
     FlightState,
     GroundState,
@@ -279,11 +282,6 @@ class Transition:
     alarm: bool = False
 
 
-STEERED = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
-_AIRBORNE = (*STEERED, _S.LAND)
-_ON_GROUND = (_S.INIT, _S.IDLE, _S.PREFLIGHT, _S.LANDED)
-
-
 def _if(condition: bool, reason: str) -> str | None:
     return reason if condition else None
 
@@ -524,21 +522,21 @@ def _refusal(t: _Tick, action: Action) -> str:
 TRANSITIONS: tuple[Transition, ...] = (
     Transition(tuple(_S), _S.FAULT, "the operator orders kill", _killed, alarm=True),
     # What the vehicle does, whoever made it.
-    Transition((*_AIRBORNE, _S.PILOT), _S.LANDED, "the vehicle is disarmed", _disarmed),
+    Transition((*AIRBORNE, _S.PILOT), _S.LANDED, "the vehicle is disarmed", _disarmed),
     Transition((_S.FAULT,), _S.INIT, "the vehicle is disarmed, and was not killed",
                _disarmed_again),
-    Transition((*_AIRBORNE, _S.PILOT), _S.FAULT, "the autopilot does not answer", _link_lost,
+    Transition((*AIRBORNE, _S.PILOT), _S.FAULT, "the autopilot does not answer", _link_lost,
                alarm=True),
     Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED), _S.INIT, "the autopilot does not answer",
                _link_lost),
     Transition((_S.ARMING,), _S.INIT, "the autopilot does not answer", _link_lost,
                (Action.DISARM,)),
-    Transition((*_ON_GROUND, _S.ARMING), _S.PILOT, "the vehicle is armed, not by this program",
+    Transition((*ON_GROUND, _S.ARMING), _S.PILOT, "the vehicle is armed, not by this program",
                _armed_by_others, alarm=True),
     Transition((_S.FAULT,), _S.PILOT, "the autopilot answers again, armed, and was not killed",
                _armed_again, alarm=True),
     # A pilot, and the autopilot's own failsafe.
-    Transition(_AIRBORNE, _S.PILOT, "a pilot's mode is on", _pilot, alarm=True),
+    Transition(AIRBORNE, _S.PILOT, "a pilot's mode is on", _pilot, alarm=True),
     Transition(STEERED, _S.HOLD, "the control loop was silent", _lapse, alarm=True),
     Transition(STEERED, _S.PILOT, "the vehicle left offboard", _left_offboard, alarm=True),
     Transition((_S.LAND,), _S.PILOT, "the vehicle left land", _left_land, alarm=True),
@@ -733,7 +731,7 @@ def _ask(t: _Tick) -> tuple[Action, ...]:
         return _again(t, Action.KILL) if flight.killed and not flight.reached else ()
     if flight.state is _S.ARMING and flight.reached:
         return () if flight.armed_asked else (Action.ARM,)
-    if flight.state in _ON_GROUND and t.inputs.vehicle.armed is False:
+    if flight.state in ON_GROUND and t.inputs.vehicle.armed is False:
         # Where a flight leaves PX4, it would not arm again.
         stuck = t.heard_since_entry and t.mode in (Mode.OFFBOARD, Mode.LAND, Mode.RETURN)
         return _again(t, Action.HOLD) if stuck else ()
@@ -839,7 +837,7 @@ def _cannot_start(t: _Tick) -> str | None:
 def _alarms(t: _Tick) -> tuple[str, ...]:
     """What the operator must see, the gravest first."""
     alarms = [t.flight.reason] if t.flight.alarming else []
-    if t.flight.state in (*_AIRBORNE, _S.PILOT):
+    if t.flight.state in (*AIRBORNE, _S.PILOT):
         checks = (_position_lost, _too_close, _outside, _battery_low, _ground_lost)
         alarms += [text for check in checks if (text := check(t)) is not None]
     return tuple(dict.fromkeys(alarms))

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
-from edge.core.flight import STEERED, Flight, FlightInputs, Robot, height_m, is_silent
-from edge.core.mission import FlightState
+from edge.core.flight import Flight, FlightInputs, Robot, height_m, is_silent
+from edge.core.mission import STEERED, FlightState
 from edge.core.safety import (
     MotionLimits,
     approach_speed,

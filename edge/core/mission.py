@@ -40,6 +40,12 @@ class FlightState(StrEnum):
     FAULT = "fault"
 
 
+# Disarmed, as far as the robot knows.
+ON_GROUND = (FlightState.INIT, FlightState.IDLE, FlightState.PREFLIGHT, FlightState.LANDED)
+# The robot flies its vehicle by setpoints.
+STEERED = (FlightState.TAKEOFF, FlightState.HOLD, FlightState.MISSION, FlightState.RETURN)
+AIRBORNE = (*STEERED, FlightState.LAND)
+
 Calm = Literal["none", "hold", "return", "land"]
 OrderKind = Literal["takeoff", "start", "rejoin", "kill"]
 

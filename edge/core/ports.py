@@ -74,19 +74,6 @@ class AutopilotSetup(Protocol):
         """Replace PX4's fence by one polygon to stay in: latitude and longitude."""
 
 
-class PeerLink(Protocol):
-    """The radio: one's own message to the neighbours, and who is there."""
-
-    def publish(self, topic: str, data: bytes) -> None:
-        """Send on `lpac/<fleet>/robot/<own id>/<topic>`; dropped when the link is congested."""
-
-    def present(self) -> frozenset[int]:
-        """The other robots whose programs are connected now."""
-
-    def duplicate(self) -> bool:
-        """Whether another program says that it is this robot."""
-
-
 class Recorder(Protocol):
     """The flight log."""
 

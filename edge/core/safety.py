@@ -106,11 +106,6 @@ class Fence:
         corners = np.array(self.vertices_m) - margin_m * outward
         return tuple((float(x_m), float(y_m)) for x_m, y_m in corners)
 
-    def contains(self, position_m: Sequence[float] | F64) -> bool:
-        """Whether a position (3,) is inside, heights included; False where it is not finite."""
-        x_m, y_m, z_m = position_m
-        return self.distance_m(x_m, y_m) >= 0.0 and self.floor_m <= z_m <= self.ceiling_m
-
     def _edges(self) -> "_Edges":
         corners = np.array(self.vertices_m)
         along = np.roll(corners, -1, axis=0) - corners

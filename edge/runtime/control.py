@@ -5,10 +5,10 @@ from dataclasses import asdict
 
 import structlog
 
-from edge.core.flight import STEERED, Flight, FlightInputs, Robot, height_m, step
+from edge.core.flight import Flight, FlightInputs, Robot, height_m, step
 from edge.core.guidance import Guidance, MissionSetpoint, guide
 from edge.core.mailbox import Neighbour
-from edge.core.mission import FlightState, Origin
+from edge.core.mission import ON_GROUND, STEERED, FlightState, Origin
 from edge.core.ports import Autopilot, Odometry, Recorder
 from edge.core.preflight import HeardStatus
 from edge.core.safety import Closest, nearest
@@ -24,7 +24,6 @@ _log = structlog.get_logger(__name__)
 _MAX_STATUS_AGE_S = 1.5
 # Checks that are older say nothing about now.
 _MAX_CHECKS_AGE_S = 5.0
-_GROUNDED = (FlightState.INIT, FlightState.IDLE, FlightState.PREFLIGHT, FlightState.LANDED)
 _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
 
 
@@ -130,7 +129,7 @@ class FlightControl:
 
     def _take_origin(self, origin: Origin | None, armed: bool | None) -> None:
         """The mission frame stays where it is while the vehicle is armed."""
-        grounded = armed is False and self.flight.state in _GROUNDED
+        grounded = armed is False and self.flight.state in ON_GROUND
         if origin is None or origin == self.origin or not (grounded or self.origin is None):
             return
         frame = origin.frame()

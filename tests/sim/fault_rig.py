@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+import edge.robot
 from cli.robot import run
 from edge.adapters.idf_sensor import IdfSensor
 from edge.core import F32, F64
@@ -283,7 +284,7 @@ def _run(folder: Path) -> None:
             return nothing if (folder / "fail-sensor").exists() else super().view(position)
 
     with patch.multiple(
-        "edge.robot", Pac=FailingPac, IdfSensor=FailingSensor, _take_alone=lambda *_: None
+        edge.robot, Pac=FailingPac, IdfSensor=FailingSensor, _take_alone=lambda *_: None
     ):
         run(folder / "robot.toml")
 

@@ -47,6 +47,7 @@ def grounded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     change_config(fleet, STOPPED, 'rc = "none"', 'rc = "pilot"')
     with fleet:
         rig = FaultRig(fleet, range(TWIN))
+        rig.change(STOPPED, rc_connected=True)
         rig.script("assemble")
         yield rig
 
