@@ -13,6 +13,7 @@ from edge.core.vehicle import Position, Setpoint, Vector, VehicleState, Velocity
 
 # At 20 Hz, a dozen positions that did not come.
 MAX_POSITION_AGE_S = 0.6
+_PLACE_POSITION_AGE_S = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,13 +67,19 @@ class Navigation:
         )
 
     def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
-        """The setpoint in the vehicle's local frame; None when there is no telling."""
+        """The setpoint in the vehicle's local frame; None when there is no telling.
+
+        A place becomes a standstill while the position does not come: the estimator's origin may
+        have jumped, and the same numbers be another place.
+        """
         transform = self._transform(vehicle)
         if transform is None:
             return None
         if isinstance(setpoint, MissionPosition):
             if self.datum_m is None:
                 return None
+            if self._clock_s() - vehicle.position_at_s > _PLACE_POSITION_AGE_S:
+                return Velocity((0.0, 0.0, 0.0))
             x_m, y_m, height_m = setpoint.position_m
             place_m = np.array([x_m, y_m, height_m + self.datum_m])
             return Position(_vector(transform.mission_to_local(place_m)))

@@ -1132,7 +1132,7 @@ MEND = "its table of transitions must be what test_flight.table() returns, row b
 def table() -> list[str]:
     """The machine as rows of Markdown, in the order of `TRANSITIONS`.
 
-    | From | To | When | The operator reads, for example |, the last from the scenarios, with numbers as "…".
+    From, to, when, and what the operator reads: that is from the scenarios, with numbers as "…".
     """
     rows = []
     reasons = reasons_by_row()

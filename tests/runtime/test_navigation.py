@@ -87,6 +87,13 @@ def test_a_position_without_takeoff_height_is_not_flown() -> None:
     assert navigation().to_local(MissionPosition((1.0, 2.0, 3.0)), VEHICLE) is None
 
 
+def test_a_place_is_not_flown_to_while_positions_are_missing() -> None:
+    made = navigation(now_s=100.3)
+    made.datum_m = 0.0
+    there = MissionPosition((1.0, 2.0, 3.0))
+    assert made.to_local(there, VEHICLE) == Velocity((0.0, 0.0, 0.0))
+
+
 place = st.tuples(*[st.floats(-100.0, 100.0)] * 3)
 
 
