@@ -162,7 +162,8 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         parts.callback(program.leave)
         _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])
         # 8. Until somebody stops the program.
-        stop.wait()
+        while not stop.wait(_PERIOD_S):
+            pass  # A signal that another thread took is seen only here.
 
 
 def _open_log(config: RobotConfig, loaded: Loaded, boot_nonce: int) -> FlightLog:

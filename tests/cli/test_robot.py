@@ -69,13 +69,19 @@ def test_check_without_a_ground_or_on_a_wrong_vehicle(tmp_path: Path) -> None:
 
 
 def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
-    other = Px4Link(new_vehicle(), system_id=SYSTEM_ID + 1)
-    with rig(tmp_path, new_vehicle(), other) as made:
+    """And sets nothing, on neither."""
+    vehicles = new_vehicle(), new_vehicle()
+    before = dict(vehicles[0].parameters)
+    with rig(tmp_path, vehicles[0], Px4Link(vehicles[1], system_id=SYSTEM_ID + 1)) as made:
         made.operator.enable(ORIGIN)
         failed = failures(lpac_robot("check", "--config", made.config_path, "--wait", 4))
     assert failed == [
-        f"other vehicles are on this link (system id {SYSTEM_ID + 1}): give each its own port"
+        f"other vehicles are on this link (system id {SYSTEM_ID + 1}): give each its own port",
+        "autopilot's failsafe parameters were not read: wait, or check the link",
+        "autopilot does not have the fence: wait for the upload, or check the link",
     ]
+    for vehicle in vehicles:
+        assert {**vehicle.parameters, "MAV_SYS_ID": 1} == {**before, "MAV_SYS_ID": 1}
 
 
 @pytest.mark.parametrize(
