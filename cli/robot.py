@@ -2,6 +2,7 @@
 
 import json
 import signal
+import sys
 import threading
 from pathlib import Path
 from typing import Annotated
@@ -34,6 +35,8 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
     # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
+    # structlog would load it to draw tracebacks: 5 MB that no robot has a use for.
+    sys.modules["rich"] = None  # type: ignore[assignment]
     from edge.robot import run as run_robot
     from edge.runtime.config import load_config
 

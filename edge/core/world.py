@@ -109,7 +109,7 @@ def format_world(features: tuple[Feature, ...]) -> str:
 
 
 def random_features(
-    rng: np.random.Generator,
+    rng: "np.random.Generator",  # as text: to load it costs a robot 7 MB
     count: int,
     world_size: int,
     sigma: tuple[float, float] = (40.0, 60.0),
