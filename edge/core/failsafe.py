@@ -218,6 +218,22 @@ def required(
             up_to=0.3,
         ),
         Requirement(
+            "COM_POS_LOW_ACT",
+            2,
+            "what PX4 does in hold when its position gets poor; returning robots would meet",
+            values=(2, 1, 0, 5),
+            means=_FENCE,
+            may_be_absent=True,
+        ),
+        Requirement(
+            "COM_WIND_MAX_ACT",
+            0,
+            "what PX4 does in a strong wind; returning robots would meet",
+            values=(0, 1, 2, 5),
+            means=_FENCE,
+            may_be_absent=True,
+        ),
+        Requirement(
             "COM_FLTT_LOW_ACT",
             1,
             "robots that return because the battery would just last meet",

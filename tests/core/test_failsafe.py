@@ -95,7 +95,10 @@ def test_a_pilot_must_be_able_to_take_over_and_nobody_must_not() -> None:
 def test_a_parameter_that_the_vehicle_does_not_have_is_a_problem_unless_it_is_newer() -> None:
     requirements = required("pilot", 25.0)
     problems = check(requirements, {})
-    optional = {"COM_FLTT_LOW_ACT", "COM_FLT_TIME_MAX", "COM_ARM_ON_BOOT"}
+    optional = {
+        "COM_POS_LOW_ACT", "COM_WIND_MAX_ACT", "COM_FLTT_LOW_ACT", "COM_FLT_TIME_MAX",
+        "COM_ARM_ON_BOOT",
+    }  # fmt: skip
     assert {text.split(" ")[0] for text in problems} == set(PARAMETERS) - optional
     assert all("is not known" in text for text in problems)
     assert any("NOT KNOWN" in text for text in explain({}))
