@@ -5,7 +5,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup test lint bench export clean
+.PHONY: help demo fly setup test lint bench export image lock clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -32,6 +32,21 @@ bench: .venv/test ## measure against torch: a table, and out/bench/*.json
 
 export: .venv/export ## rebuild the shipped policy's bundle from its checkpoint
 	.venv/bin/lpac export $(POLICY).pt --params $(POLICY).toml -o $(POLICY)
+
+ARCH ?= arm64
+image: | .venv/bin/pip ## the robot's image for ARM (or ARCH=amd64), and its size: out/image
+	@deploy/docker/image.sh $(ARCH)
+	@$(RUN) fleet.image out/image/$(ARCH)
+
+LOCK := .venv/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes \
+	--python-platform aarch64-manylinux_2_28 --only-binary :all: --upgrade \
+	--custom-compile-command 'make lock'
+
+lock: | .venv/bin/pip ## pin the image's packages to the newest versions, with their hashes
+	.venv/bin/pip install --quiet --disable-pip-version-check uv
+	$(LOCK) pyproject.toml --output-file deploy/docker/requirements.lock
+	echo 'hatchling>=1.27' | $(LOCK) - --output-file deploy/docker/build.lock
+	.venv/bin/python deploy/docker/lock_debian.py
 
 clean: ## remove .venv and everything made
 	rm -rf .venv out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,12 +1,13 @@
-"""`lpac bundle`: look at a bundle, or prove that this machine computes what torch computed."""
+"""`lpac bundle`: look at a bundle, prove that this machine computes what torch did, measure it."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-app = typer.Typer(name="bundle", help="Look at a policy bundle, or verify it on this machine.")
+app = typer.Typer(name="bundle", help="Look at a policy bundle; verify or time it on this machine.")
 
 BundlePath = Annotated[
     Path, typer.Argument(metavar="BUNDLE", help="A bundle's directory or .zip archive.")
@@ -81,4 +82,41 @@ def verify(path: BundlePath, as_json: AsJson = False) -> None:
     if failed:
         raise ValueError(
             f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of torch's golden outputs"
+        )
+
+
+@app.command()
+def benchmark(
+    path: BundlePath,
+    neighbours: Annotated[int, typer.Option(help="How many send to the robot.")] = 10,
+    seconds: Annotated[float, typer.Option(help="How long to measure, s.")] = 3.0,
+    as_json: AsJson = False,
+) -> None:
+    """Time the steps of a robot on this machine; fails if one takes over half of its period."""
+    from edge.runtime.benchmark import MOST_OF_PERIOD
+    from edge.runtime.benchmark import benchmark as measure
+    from edge.runtime.bundle import load_bundle
+
+    bundle = load_bundle(path)
+    result = measure(bundle, neighbours, seconds)
+    if as_json:
+        steps = {
+            step.step: {**dataclasses.asdict(step), "share": step.share} for step in result.steps
+        }
+        typer.echo(
+            json.dumps({**dataclasses.asdict(result), "id": bundle.id, "steps": steps}, indent=2)
+        )
+    else:
+        typer.echo(f"{bundle.manifest.name} on {result.architecture}, {neighbours} neighbours, ms:")
+        for step in result.steps:
+            typer.echo(
+                f"{step.step:12} p50 {step.p50_ms:.2f}  p99 {step.p99_ms:.2f}  "
+                f"max {step.max_ms:.2f}  p99 is {step.share:.1%} of {step.period_ms:.0f} ms"
+            )
+    slow = [step for step in result.steps if not step.fits]
+    if slow:
+        times = ", ".join(f"{s.step} {s.p99_ms:.0f} of {s.period_ms:.0f} ms" for s in slow)
+        raise ValueError(
+            f"{path}: too slow on this machine: {times} (p99), and at most {MOST_OF_PERIOD:.0%} "
+            "may be taken: end what else runs, or fly a smaller policy"
         )

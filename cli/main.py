@@ -5,14 +5,15 @@ import sys
 
 import typer
 
-from cli import bundle, export, replay, robot, sim
+# field and field_setup add their commands to fleet's.
+from cli import bundle, export, field, field_setup, fleet, hosts, log, replay, robot, sim  # noqa: F401
 
 # One process is one robot, or a simulation on one core: BLAS threads would only disturb the loops.
 # numpy reads this when it is first imported, and no sub-command has imported it yet.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # What the robot's install leaves out.
-_WORKSTATION = {"torch", "onnx", "matplotlib", "rich", "export", "sim"}
+_WORKSTATION = {"torch", "onnx", "matplotlib", "rich", "tomlkit", "export", "sim", "fleet"}
 
 app = typer.Typer(
     name="lpac",
@@ -24,9 +25,12 @@ app = typer.Typer(
 app.command()(export.export)
 app.command()(sim.sim)
 app.command()(sim.demo)
+app.command()(hosts.hosts)
 app.command()(replay.replay)
 app.add_typer(bundle.app)
 app.add_typer(robot.app)
+app.add_typer(log.app)
+app.add_typer(fleet.app)
 
 
 def main() -> None:

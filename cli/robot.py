@@ -4,6 +4,7 @@ import json
 import signal
 import sys
 import threading
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,14 @@ import typer
 app = typer.Typer(name="robot", help="Fly one robot, or check whether it could.")
 
 _END_WITHIN_S = 2.9
+
+
+class Rc(StrEnum):
+    """Who may take the vehicle by remote control."""
+
+    PILOT = "pilot"
+    NONE = "none"
+
 
 ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configuration, TOML.")]
 
@@ -70,3 +79,52 @@ def check(
         count = len(report.failed)
         raise ValueError(f"not ready to fly: {count} check{'s' if count > 1 else ''} failed")
     typer.echo("ready to fly", err=as_json)
+
+
+@app.command()
+def setup(
+    *,
+    system_id: Annotated[int, typer.Option(min=1, max=255, help="The MAV_SYS_ID it is to have.")],
+    rc: Annotated[Rc, typer.Option(help="Whether somebody holds a remote control.")],
+    ceiling: Annotated[float, typer.Option(help="The fence's, above the pad, m.")],
+    url: Annotated[
+        str, typer.Option(help="Where PX4's MAVLink comes in.")
+    ] = "udpin://127.0.0.1:14551",
+    command_timeout: Annotated[
+        float, typer.Option(help="After so long a hung program lets its vehicle hold, s.")
+    ] = 0.5,
+    wait: Annotated[float, typer.Option(help="How long to listen for the vehicle, s.")] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Set a vehicle's system id and failsafe parameters, once, also those that need a reboot.
+
+    It must be the only vehicle there, and disarmed. No configuration is needed.
+    """
+    import logging
+
+    import structlog
+
+    from edge.adapters.alone import Alone
+    from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
+    from edge.core.failsafe import required
+    from edge.runtime.config import AutopilotConfig
+    from edge.runtime.setup import set_up
+
+    requirements = required(rc.value, ceiling, command_timeout)
+    port = AutopilotConfig(url, system_id).port
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    with Alone(f"the autopilot's port {port}"), MavsdkAutopilot(url) as autopilot:
+        report = set_up(autopilot, autopilot, requirements, system_id, wait)
+    if as_json:
+        typer.echo(json.dumps(report._asdict(), indent=2))
+    else:
+        for line in report.changes:
+            typer.echo(f"set: {line}")
+        for line in report.problems:
+            typer.echo(f"FAILED  {line}")
+    if report.problems:
+        raise ValueError("the vehicle is not safe to fly as it is")
+    if report.needs_reboot:
+        typer.echo("restart the autopilot: only then all of it counts", err=as_json)
+    elif not report.changes:
+        typer.echo("all was so already", err=as_json)

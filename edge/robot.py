@@ -2,7 +2,8 @@
 
 Threads: the three loops (`perception`, `policy`, `control`); `status`; `log`, which waits for the
 disk; `preflight`, which waits for the vehicle while that stands on the ground; zenoh's and MAVSDK's
-own, whose callbacks only store; and the main thread, which waits for signals.
+own, whose callbacks only store; and the main thread, which waits for signals, tells systemd that
+the control loop lives, and does nothing that could hang.
 """
 
 import ctypes
@@ -33,6 +34,7 @@ from edge.adapters.flight_log import FlightLog, FlightMetadata
 from edge.adapters.idf_sensor import IdfSensor
 from edge.adapters.logs import configure_logging
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
+from edge.adapters.service_manager import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.adapters.zenoh_link import ZenohLink
 from edge.core.mission import FlightState, RobotStatus, to_json
 from edge.core.vehicle import Action
@@ -49,8 +51,10 @@ from edge.runtime.policy import Policy
 from edge.runtime.readiness import Readiness
 from edge.runtime.verify import verify
 
-# Of preflight checks, status, and writing the flight log.
+# Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
+# A control loop without a tick for longer hangs: the vehicle was told to hold before that.
+_CONTROL_FRESH_S = 1.0
 # On leaving: for the autopilot's answer, and for a loop that hangs.
 _ANSWER_S = 1.2
 _JOIN_S = 0.3
@@ -119,6 +123,8 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     boot_nonce = secrets.randbits(48)
     with ExitStack() as parts:
+        service_manager = ServiceManager()
+        parts.callback(service_manager.close)
         # 2. One program per robot, and per vehicle, on this machine.
         _take_alone(config, parts)
         # 3. The flight log, so that it holds all that follows.
@@ -160,10 +166,11 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         ctypes.CDLL(None).malloc_trim(0)  # What verification took goes back to the system.
         program.start()
         parts.callback(program.leave)
+        parts.callback(service_manager.tell, STOPPING)
         _log.info("robot runs", robot=config.robot_id, bundle=loaded.bundle_id[:12])
         # 8. Until somebody stops the program.
-        while not stop.wait(_PERIOD_S):
-            pass  # A signal that another thread took is seen only here.
+        while not stop.wait(_PERIOD_S):  # A signal that another thread took is seen only here.
+            service_manager.tell(*program.news())
 
 
 def _open_log(config: RobotConfig, loaded: Loaded, boot_nonce: int) -> FlightLog:
@@ -254,11 +261,23 @@ class _Program:
             Loop("log", _PERIOD_S, self._recorder.flush),
         )
         self._sequence = 0
+        self._status_text: str | None = None
 
     def start(self) -> None:
         """Start the loops; from now on the robot may send."""
         for loop in (*self._loops, *self._chores):
             loop.start()
+
+    def news(self) -> list[str]:
+        """What systemd is to know now. Waits for nothing."""
+        news = [] if self._status_text is None else [self._status_text]
+        ages_s = [loop.age_s() for loop in self._loops]
+        if None not in ages_s:
+            news.append(READY)
+        control_s = ages_s[0]
+        if control_s is not None and control_s < _CONTROL_FRESH_S:
+            news.append(ALIVE)
+        return news
 
     def leave(self) -> None:
         """Leave a vehicle that we flew in a defined state, and stop the loops."""
@@ -338,7 +357,15 @@ class _Program:
         now_s, unix_now_s = time.monotonic(), time.time()
         status = self._status(now_s, unix_now_s)
         self._link.publish("status", to_json(status))
-        for topic, value in (("status", status), ("vehicle", self._autopilot.state())):
+        vehicle = self._autopilot.state()
+        self._status_text = status_text(
+            status,
+            monotonic_s=now_s,
+            autopilot=vehicle.connected,
+            ages_s={loop.name: loop.age_s() for loop in self._loops},
+            peers=self._link.peers(),
+        )
+        for topic, value in (("status", status), ("vehicle", vehicle)):
             fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
             self._recorder.record(topic, unix_now_s, fields)
         if status.position_m is not None:

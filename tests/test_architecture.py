@@ -35,6 +35,7 @@ ONLY_IN = {
     "pymavlink": {"sim/"},
     "typer": {"cli/"},
     "rich": {"cli/"},
+    "tomlkit": {"fleet/"},
 }
 # The core has no clock, thread, file or socket (the mailbox has a lock, for its callers' threads).
 IMPURE = {

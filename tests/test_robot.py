@@ -1,15 +1,18 @@
 """The robot's program as a process: `lpac robot run`, a simulated vehicle, and a ground."""
 
+import json
 import os
 import signal
+import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
 import onnx
+import pytest
 
 from edge.adapters.flight_log import read as read_log
 from edge.adapters.zenoh_link import ZenohLink
@@ -164,20 +167,74 @@ cli.main.main()
 """
 
 
+@pytest.fixture
+def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """Where a robot's program that is started now tells its news."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(20.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield listening
+
+
+def news(systemd: socket.socket, condition: Callable[[list[str]], object]) -> list[str]:
+    """The first assignments that are so."""
+    while not condition(assignments := systemd.recv(4096).decode().split("\n")):
+        pass
+    return assignments
+
+
 def test_a_control_loop_that_hangs_in_flight_lets_the_vehicle_hold_and_the_program_end(
-    tmp_path: Path,
+    tmp_path: Path, systemd: socket.socket
 ) -> None:
     vehicle = new_vehicle()
     with rig(tmp_path, vehicle) as made:
         command = [sys.executable, "-c", HANGING, "robot", "run", "--config", str(made.config_path)]
         with program(made, command) as hanging:
+            status, *others = news(systemd, lambda told: "READY=1" in told)
+            assert others == ["READY=1", "WATCHDOG=1"]
+            described = json.loads(status.removeprefix("STATUS="))
+            assert described["robot_id"] == 3 and described["link"]
+            assert all(loop["ticks"] > 0 for loop in described["loops"].values())
+
             made.take_off()
             fly_a_mission(made, "a")
             (tmp_path / "hang").touch()
             assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+            status, *others = news(systemd, lambda told: "WATCHDOG=1" not in told)
+            assert others == ["READY=1"]
+            assert json.loads(status.removeprefix("STATUS="))["armed"]
             assert hanging.end(signal.SIGTERM) == 0
+            news(systemd, lambda told: told == ["STOPPING=1"])
         assert vehicle.armed
         assert vehicle.mode is Mode.HOLD
+
+
+def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_hold(
+    tmp_path: Path,
+) -> None:
+    vehicle = new_vehicle()
+    with rig(tmp_path, vehicle) as made:
+        with program(made) as hanging:
+            made.take_off()
+            hanging.process.send_signal(signal.SIGSTOP)
+            assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+            # As systemd does it.
+            for number in (signal.SIGABRT, signal.SIGCONT):
+                hanging.process.send_signal(number)
+            assert hanging.process.wait(20.0) == -signal.SIGABRT
+        former = made.status.boot_nonce
+        with program(made):
+            made.wait(
+                lambda status: (
+                    status.boot_nonce != former
+                    and status.state is FlightState.PILOT
+                    and status.uptime_s > 2.0
+                )
+            )
+            assert vehicle.armed
+            assert vehicle.mode is Mode.HOLD
+            assert horizontal_speed_m_s(vehicle) < 0.2
 
 
 def test_ended_in_flight_it_lands_if_configured_to(tmp_path: Path) -> None:

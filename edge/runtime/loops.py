@@ -32,6 +32,7 @@ class Loop:
         # Written by the loop's thread alone.
         self._ticks = self._overruns = self._failures = 0
         self._latenesses_s: deque[float] = deque(maxlen=math.ceil(_LATENESSES_KEPT_S / period_s))
+        self._succeeded_s: float | None = None
 
     def start(self) -> None:
         """Begin; the first tick is now."""
@@ -55,6 +56,11 @@ class Loop:
             lateness_max_ms=latenesses_ms[-1],
         )
 
+    def age_s(self) -> float | None:
+        """Since the last tick that succeeded, s; None before the first. Called from any thread."""
+        succeeded_s = self._succeeded_s
+        return None if succeeded_s is None else time.monotonic() - succeeded_s
+
     def _run(self) -> None:
         deadline_s = time.monotonic()
         while not self._stop.is_set():
@@ -72,6 +78,7 @@ class Loop:
         self._ticks += 1
         try:
             self._step()
+            self._succeeded_s = time.monotonic()
         except Exception:
             self._failures += 1
             # The first of a row says all; a log that fills the disk helps nobody.

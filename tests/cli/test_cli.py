@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -67,6 +68,31 @@ def test_bundle_verify_after_one_flipped_byte(tmp_path: Path) -> None:
     assert line.endswith("gnn_2.onnx does not have the hash that manifest.json states")
 
 
+def test_bundle_benchmark_times_the_steps_of_a_flight() -> None:
+    result = lpac("bundle", "benchmark", SHIPPED, "--seconds", 0.2, "--neighbours", 3, "--json")
+    # A busy machine may be too slow, which it says.
+    assert result.returncode == 0 or "too slow on this machine" in error_line(result)
+    report = json.loads(result.stdout)
+    assert report["id"] == (SHIPPED / "bundle.id").read_text().strip()
+    assert report["architecture"] == platform.machine() and report["neighbours"] == 3
+    periods_ms = {name: step["period_ms"] for name, step in report["steps"].items()}
+    assert periods_ms == {"perceive": 200.0, "infer": 400.0}
+    for step in report["steps"].values():
+        assert 0.0 < step["p50_ms"] <= step["p99_ms"] <= step["max_ms"]
+    assert "p99 is" in lpac("bundle", "benchmark", SHIPPED, "--seconds", 0.2).stdout
+
+
+def test_a_machine_that_is_too_slow_is_told_in_one_line() -> None:
+    code = (
+        "import sys, edge.runtime.benchmark as b; b.MOST_OF_PERIOD = 0.0; sys.argv = ['lpac', "
+        f"'bundle', 'benchmark', '{SHIPPED}', '--seconds', '0.1']; import cli.main as m; m.main()"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert "too slow on this machine: perceive " in error_line(result)
+
+
 def test_sim_json_is_the_same_twice() -> None:
     runs = [lpac("sim", "--seed", 7, "--duration", 5, "--json") for _ in range(2)]
     assert runs[0].returncode == 0, runs[0].stderr
@@ -105,6 +131,7 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--bundle", "absent"], "absent: No such file or directory"),
         (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),
         (["bundle", "info", "tests"], "manifest.json is missing"),
+        (["bundle", "benchmark", str(SHIPPED), "--neighbours", "-1"], "must be from 0 to 1000"),
         (["export", "absent.pt", "--params", f"{SHIPPED}.toml", "-o", "x"], "absent.pt"),
         (["export", "README.md", "--params", f"{SHIPPED}.toml", "-o", "x"], "README.md"),
         (["export", f"{SHIPPED}.pt", "--params", "absent.toml", "-o", "x"], "absent.toml"),

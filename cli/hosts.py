@@ -1,0 +1,62 @@
+"""`lpac hosts`: robot computers on this machine, to try `lpac fleet` on."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cli.sim import DEFAULT_BUNDLE
+
+_FORGET_EVERY_S = 60.0
+
+
+def hosts(
+    *,
+    count: Annotated[int, typer.Option("--hosts", "-n", help="How many, spares and all.")] = 3,
+    spares: Annotated[int, typer.Option(help="How many of them have no slot.")] = 0,
+    image: Annotated[Path, typer.Option(help="What `make image ARCH=amd64` made.")] = Path(
+        "out/image/amd64"
+    ),
+    bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
+    out: Annotated[Path, typer.Option(help="Folder for fleet.toml, SSH's files and logs.")] = Path(
+        "out/fleet-demo"
+    ),
+) -> None:
+    """Run robot computers (Ubuntu 18.04, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
+    from sim.hosts import RobotHosts
+
+    # Whoever stops this program means the hosts too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with RobotHosts(
+            count, out, image=image, bundle=bundle, spares=spares, say=typer.echo
+        ) as running:
+            _give_to_user(out)
+            fleet = f"--fleet {running.fleet_toml}"
+            typer.echo(f"fleet {running.fleet}; Ctrl-C ends all; in another terminal:")
+            for line in (
+                f"lpac fleet status {fleet}",
+                f"lpac fleet deploy {fleet}",
+                f"lpac fleet start {fleet}",
+                f"lpac fleet stop {fleet}",
+                f"ssh -F {running.ssh_config} {running[0].name}",
+            ):
+                typer.echo(f"  {line}")
+            while True:
+                time.sleep(_FORGET_EVERY_S)
+                for host in running:
+                    with host.stepped:
+                        host.vehicle.truth.clear()
+    except KeyboardInterrupt:
+        typer.echo("ended")
+
+
+def _give_to_user(folder: Path) -> None:
+    """With sudo: SSH refuses keys of others."""
+    user, group = os.environ.get("SUDO_UID"), os.environ.get("SUDO_GID")
+    if user and group:
+        for path in (folder, *folder.iterdir()):
+            os.chown(path, int(user), int(group))

@@ -1,0 +1,1 @@
+"""The fleet from the workstation: releases, deployment over SSH, start and stop."""

@@ -1,0 +1,278 @@
+"""Making a computer a robot of the fleet: each step is done, or was so already.
+
+The first step logs in as a person does, since only that person can: OpenSSH itself asks for the
+password, and whether the host key is the right one.
+"""
+
+import socket
+import subprocess
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from edge.core.schema import ConfigError
+from fleet.config import FleetConfig, RobotHost, add_robot, load_fleet
+from fleet.deploy import deploy, operator
+from fleet.release import load_common, make_release
+from fleet.session import FleetError, RemoteError, UnreachableError, connect, explain, ssh_command
+
+# As ssh-copy-id does it; the key comes on standard input.
+_INSTALL_KEYS = """exec sh -c '
+cd && umask 077 && mkdir -p .ssh && touch .ssh/authorized_keys || exit 1
+file=.ssh/authorized_keys
+[ -z "$(tail -c 1 $file)" ] || echo >> $file
+while read -r key; do grep -qxF "$key" $file || echo "$key" >> $file; done
+'"""
+_LOGIN_S = 30.0
+
+
+class Step(NamedTuple):
+    """One step of enrolling: what came of it, and what there is to say about it."""
+
+    name: str
+    outcome: Literal["done", "was so already", "left to do"]
+    notes: tuple[str, ...] = ()
+
+
+OnStep = Callable[[Step], None]
+Say = Callable[[str], None]
+
+
+async def enroll(
+    path: Path,
+    name: str,
+    host: str,
+    *,
+    user: str,
+    port: int | None,
+    robot_id: int,
+    rename: bool,
+    on_step: OnStep,
+    say: Say,
+) -> None:
+    """Enroll the computer at `host` in the fleet of the file; a robot that is new is a spare.
+
+    `on_step` hears of every step, `say` what is being done. `rename` lets a robot that is enrolled
+    as another one become this one. Raises ConfigError or FleetError at the first step that fails.
+    """
+    config = load_fleet(path)
+    robot = _robot(config, name, host, user, port, robot_id)
+    on_step(_key(config, robot))
+    async with connect(config, robot, say) as session:
+        found = (await session.call("overview", directory=config.directory))["identity"]
+        await session.call("lock", directory=config.directory, who=operator())
+        wanted = {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id}
+        if found not in (None, wanted) and not rename:
+            # The same word as the robot's, but before the file is changed.
+            await session.call("set_identity", **wanted, rename=False)
+        was_there = name in config.robots
+        if not was_there:
+            add_robot(
+                path, name, host, robot_id, user=user, port=port,
+                address=robot.address if robot.address != host else None,
+            )  # fmt: skip
+            config = load_fleet(path)
+            robot = config.robots[name]
+        on_step(Step(path.name, *_done(not was_there)))
+        identity = await session.call("set_identity", **wanted, rename=rename)
+        was = (f"it was {identity['former']}",) if identity["former"] else ()
+        on_step(Step("robot id", *_done(identity["changed"], was)))
+        on_step(_vision_hub_step(
+            await session.call("set_vision_hub", mavlink_port=robot.mavlink_port)
+        ))  # fmt: skip
+        on_step(_predecessors_step(
+            await session.call(
+                "retire", predecessors=list(config.predecessors), mavlink_port=robot.mavlink_port
+            )
+        ))  # fmt: skip
+    step = await _release(config, robot, say)
+    on_step(step)
+    if step.outcome == "left to do":
+        on_step(Step("PX4", "left to do", ("the release sets it up: enroll again after that",)))
+        return
+    async with connect(config, robot, say) as session:
+        await session.call("lock", directory=config.directory, who=operator())
+        try:
+            report = await session.call(
+                "set_up_px4", directory=config.directory, url=robot.mavlink_url,
+                mavlink_port=robot.mavlink_port, system_id=robot.system_id,
+                rc=_value(config, robot, "failsafe", "rc"),
+                ceiling_m=_value(config, robot, "fence", "ceiling_m"),
+                command_timeout_s=_value(config, robot, "flight", "command_timeout_s", 0.5),
+            )  # fmt: skip
+        except RemoteError as error:
+            on_step(Step("PX4", "left to do", (f"{error}; then enroll again",)))
+            return
+        on_step(_px4_step(report))
+
+
+def _robot(
+    config: FleetConfig, name: str, host: str, user: str, port: int | None, robot_id: int
+) -> RobotHost:
+    """The robot of the file, or one that it does not have yet."""
+    known = config.robots.get(name)
+    if known is not None:
+        if (known.host, known.robot_id) != (host, robot_id):
+            raise ConfigError(
+                f"{config.path}: robots.{name}: has host = {known.host!r} and robot_id = "
+                f"{known.robot_id}: change it in the file, or enroll it with these"
+            )
+        return known
+    robot = RobotHost(
+        name=name, host=host, user=user, port=port, address=host, robot_id=robot_id, zenoh_port=0,
+        system_id=robot_id, mavlink_url="", cpus=(), overrides={},
+    )  # fmt: skip
+    (named,) = _ssh_options(config, robot)["hostname"]
+    try:
+        return replace(robot, address=socket.gethostbyname(named))
+    except OSError:
+        raise UnreachableError(f"{host}: its host name is not known") from None
+
+
+# The key
+
+
+def _key(config: FleetConfig, robot: RobotHost) -> Step:
+    """Let this operator's keys in, with a person's login if need be."""
+    problem = _login_problem(config, robot)
+    if problem is None:
+        return Step("key", "was so already")
+    keys = _public_keys(config, robot)
+    if not keys:
+        raise FleetError("there is no key of yours to install: make one with ssh-keygen")
+    command = [
+        "BatchMode=no" if part == "BatchMode=yes" else part for part in ssh_command(config, robot)
+    ]
+    done = subprocess.run([*command, _INSTALL_KEYS], input=keys.encode(), check=False)
+    if done.returncode != 0:
+        raise UnreachableError(f"{robot.host} did not let you in: see above")
+    problem = _login_problem(config, robot)
+    if problem is not None:
+        raise UnreachableError(
+            f"your key is installed, and still: {problem}; a key with a passphrase needs ssh-add"
+        )
+    return Step("key", "done")
+
+
+def _login_problem(config: FleetConfig, robot: RobotHost) -> str | None:
+    """Why a login without a question is not possible where a person's may be; None if it is.
+
+    Raises UnreachableError where a person's is not either.
+    """
+    try:
+        done = subprocess.run(
+            [*ssh_command(config, robot), "true"], stdin=subprocess.DEVNULL, capture_output=True,
+            text=True, timeout=_LOGIN_S + config.ssh.connect_timeout_s, check=False,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        raise UnreachableError(f"{robot.host}: it does not answer") from None
+    if done.returncode == 0:
+        return None
+    problem = explain(done.stderr, robot.host)
+    a_person_may = "Permission denied" in done.stderr or (
+        "Host key verification failed" in done.stderr
+        and "IDENTIFICATION HAS CHANGED" not in done.stderr
+    )
+    if not a_person_may:
+        raise UnreachableError(f"{robot.host}: {problem}")
+    return problem
+
+
+def _public_keys(config: FleetConfig, robot: RobotHost) -> str:
+    """What authorized_keys is to hold: the agent's keys, and those that ssh would use here."""
+    lines = []
+    options = _ssh_options(config, robot)
+    if options.get("identitiesonly") != ["yes"]:
+        agent = subprocess.run(["ssh-add", "-L"], capture_output=True, text=True, check=False)
+        if agent.returncode == 0:
+            lines += agent.stdout.splitlines()
+    for file in options.get("identityfile", []):
+        public = Path(file + ".pub").expanduser()
+        if public.exists():
+            lines += public.read_text().splitlines()
+    return "".join(f"{line}\n" for line in dict.fromkeys(lines) if line.strip())
+
+
+def _ssh_options(config: FleetConfig, robot: RobotHost) -> dict[str, list[str]]:
+    """What OpenSSH's configuration says of this host."""
+    *command, host = ssh_command(config, robot)
+    done = subprocess.run([*command, "-G", host], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise FleetError(explain(done.stderr, robot.host))
+    options: dict[str, list[str]] = {}
+    for line in done.stdout.splitlines():
+        key, _, value = line.partition(" ")
+        options.setdefault(key, []).append(value)
+    return options
+
+
+# The other steps
+
+
+async def _release(config: FleetConfig, robot: RobotHost, say: Say) -> Step:
+    """A release without a slot's configuration, unless there is any: nothing is started by it."""
+    async with connect(config, robot, say) as session:
+        if (await session.call("overview", directory=config.directory))["current"] is not None:
+            return Step("release", "was so already")
+    try:
+        common = load_common(config)
+    except (ValueError, OSError) as error:
+        return Step("release", "left to do", (str(error),))
+    config = replace(config, slots=())
+    with tempfile.TemporaryDirectory(prefix="lpac-enroll-") as folder:
+        release = make_release(config, robot, common, Path(folder))
+
+        def report(step: str, share: float | None) -> None:
+            say(step if share is None else f"{step} {100.0 * share:.0f} %")
+
+        await deploy(config, robot, release, report)
+    return Step("release", "done", ("as a spare's: nothing was started",))
+
+
+def _vision_hub_step(result: Mapping[str, Any]) -> Step:
+    if not result["there"]:
+        return Step(
+            "vision-hub", "was so already",
+            ("not a VOXL2: see that PX4's MAVLink comes to this computer",),
+        )  # fmt: skip
+    notes = tuple(result["changed"])
+    if notes and not result["restarted"]:
+        notes = (*notes, "voxl-vision-hub does not run: see `systemctl status voxl-vision-hub`")
+    return Step("vision-hub", *_done(bool(result["changed"]), notes))
+
+
+def _predecessors_step(result: Mapping[str, Any]) -> Step:
+    notes = (*(f"stopped {what}" for what in result["stopped"]), *result["suspects"])
+    return Step("predecessors", *_done(bool(result["stopped"]), notes))
+
+
+def _px4_step(report: Mapping[str, Any]) -> Step:
+    notes = tuple(report["changes"])
+    if report["restarted"]:
+        notes = (*notes, f"PX4 was restarted, and answers as system {report['system_id']}")
+    if report["needs_reboot"]:
+        notes = (*notes, "some of it counts after a restart only: switch the vehicle off and on")
+    notes = (*notes, *report["problems"])
+    if report["problems"] or report["needs_reboot"]:
+        return Step("PX4", "left to do", notes)
+    return Step("PX4", *_done(bool(report["changes"]) or report["restarted"], notes))
+
+
+def _done(
+    changed: bool, notes: tuple[str, ...] = ()
+) -> tuple[Literal["done", "was so already"], tuple[str, ...]]:
+    return "done" if changed else "was so already", notes
+
+
+def _value(
+    config: FleetConfig, robot: RobotHost, table: str, key: str, default: object = None
+) -> object:
+    """What robot.toml would have there."""
+    for values in (robot.overrides, config.shared):
+        if key in values.get(table, {}):
+            return values[table][key]
+    if default is None:
+        raise ConfigError(f"{config.path}: robot.{table}.{key} is missing")
+    return default

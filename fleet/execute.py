@@ -1,0 +1,66 @@
+"""A command on a robot, by its shell; its output comes line by line while it runs."""
+
+import asyncio
+import shlex
+from collections.abc import Callable
+from contextlib import suppress
+
+from fleet.config import FleetConfig, RobotHost
+from fleet.session import UnreachableError, explain, ssh_command
+
+# Of a line of output.
+_MOST_BYTES = 1 << 22
+# What ssh itself ends with if there is no conversation with the robot.
+_SSH_FAILED = 255
+
+OnLine = Callable[[str], None]
+
+
+async def execute(
+    config: FleetConfig,
+    robot: RobotHost,
+    command: str,
+    on_output: OnLine,
+    on_error: OnLine,
+) -> int:
+    """Run `command` in the login shell; its exit code. Each line of stdout and stderr is handed on.
+
+    Raises UnreachableError, ValueError for a line that is endless.
+    """
+    process = await asyncio.create_subprocess_exec(
+        *ssh_command(config, robot), command,
+        stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE, limit=_MOST_BYTES, process_group=0,
+    )  # fmt: skip
+    assert process.stdout is not None and process.stderr is not None
+    complaints: list[str] = []
+
+    def on_complaint(line: str) -> None:
+        complaints.append(line)
+        on_error(line)
+
+    try:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(_read(process.stdout, on_output))
+            group.create_task(_read(process.stderr, on_complaint))
+        exit_code = await process.wait()
+    except* ValueError:
+        raise ValueError(f"a line of its output is longer than {_MOST_BYTES} bytes") from None
+    finally:
+        with suppress(ProcessLookupError):
+            process.kill()
+        await process.wait()
+    if exit_code == _SSH_FAILED:
+        raise UnreachableError(explain("\n".join(complaints), robot.host))
+    return exit_code
+
+
+def as_root(command: list[str]) -> str:
+    """The shell's text that runs `command` as root, whoever logs in."""
+    text = shlex.join(command)
+    return f'if [ "$(id -u)" = 0 ]; then exec {text}; else exec sudo -n {text}; fi'
+
+
+async def _read(stream: asyncio.StreamReader, on_line: OnLine) -> None:
+    while line := await stream.readline():
+        on_line(line.decode(errors="replace").rstrip("\r\n"))

@@ -1,0 +1,79 @@
+"""The robots' journals: what the program, and systemd about it, wrote and when."""
+
+import json
+from collections.abc import Sequence
+from datetime import datetime
+from typing import NamedTuple
+
+
+class Entry(NamedTuple):
+    """One entry of a robot's journal, at the robot's time."""
+
+    unix_time_s: float
+    text: str
+
+
+def journal_command(lines: int, *, follow: bool) -> list[str]:
+    """The robot's command that prints the unit's last entries, and with `follow` those to come."""
+    return [
+        "journalctl", "--quiet", "--no-pager", "--all", "--unit", "lpac-robot.service",
+        "--lines", str(lines), "--output", "json", *(["--follow"] if follow else []),
+    ]  # fmt: skip
+
+
+def parse_entry(line: str) -> Entry:
+    """The entry in a line of journalctl's JSON. Raises ValueError if it is none."""
+    try:
+        fields = json.loads(line)
+        text = fields.get("MESSAGE") or ""
+        if isinstance(text, list):  # it is no UTF-8, or too long
+            text = bytes(text).decode(errors="replace")
+        return Entry(int(fields["__REALTIME_TIMESTAMP"]) / 1e6, str(text))
+    except (KeyError, TypeError, AttributeError, ValueError):
+        raise ValueError(f"journalctl printed {line[:80]!r}") from None
+
+
+def readable(entry: Entry) -> str:
+    """The time here, and the text; of a structured line `level event key=value`."""
+    time_of_day = datetime.fromtimestamp(entry.unix_time_s).strftime("%H:%M:%S")
+    return f"{time_of_day} {_readable_text(entry.text)}"
+
+
+def last_words(lines: Sequence[str]) -> str | None:
+    """The last line with which the program said what is wrong; else the last one; None if none."""
+    for line in reversed(lines):
+        if line.startswith("lpac: ") or _level(line) in ("error", "critical"):
+            return _readable_text(line)
+    return _readable_text(lines[-1]) if lines else None
+
+
+def _readable_text(text: str) -> str:
+    event = _structured(text)
+    if event is None:
+        return text
+    event.pop("timestamp", None)
+    words = [str(event.pop("level", "")), str(event.pop("event", ""))]
+    exception = event.pop("exception", None)
+    words += [f"{key}={_value(value)}" for key, value in event.items()]
+    line = " ".join(word for word in words if word)
+    return line if exception is None else f"{line}\n{exception}"
+
+
+def _value(value: object) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return json.dumps(text) if " " in text and isinstance(value, str) else text
+
+
+def _level(text: str) -> str | None:
+    event = _structured(text)
+    return None if event is None else str(event.get("level"))
+
+
+def _structured(text: str) -> dict[str, object] | None:
+    if not text.startswith("{"):
+        return None
+    try:
+        event = json.loads(text)
+    except ValueError:
+        return None
+    return event if isinstance(event, dict) and "event" in event else None

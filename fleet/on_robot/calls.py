@@ -1,0 +1,95 @@
+"""The robot's end of a session: calls come in as JSON lines, progress and results go out.
+
+A call that has begun is carried out though the laptop has gone: what it does to the robot is then
+whole. A session ends when its input ends, or is silent: then locks that it held are free again.
+"""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import traceback
+from typing import Any, Callable, Dict, List, Optional
+
+# The laptop says something every few seconds.
+SILENCE_S = 20.0
+
+Call = Callable[..., Dict[str, Any]]
+_CALLS = {}  # type: Dict[str, Call]
+
+
+class Refused(Exception):
+    """What was asked cannot or must not be done; one line says why, and what to do."""
+
+
+def call(function: Call) -> Call:
+    """Let the laptop call this function, with arguments and a result that JSON can hold."""
+    _CALLS[function.__name__] = function
+    return function
+
+
+def say(text: str) -> None:
+    """Tell whoever waits for the present call how far it is."""
+    _send({"progress": text})
+
+
+def run(
+    command: List[str], timeout_s: float = 10.0, stdin: Optional[str] = None
+) -> "subprocess.CompletedProcess[str]":
+    """Run a program of the robot and wait for it; its output comes back whatever its exit code.
+
+    Raises Refused if the program is not there, or does not end in time.
+    """
+    try:
+        return subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL if stdin is None else None,
+            input=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+            timeout=timeout_s,
+            check=False,
+        )
+    except FileNotFoundError:
+        raise Refused("the program %s is missing on the robot" % command[0]) from None
+    except subprocess.TimeoutExpired:
+        raise Refused("%s did not end within %g s" % (" ".join(command[:3]), timeout_s)) from None
+
+
+def serve() -> None:
+    """Answer calls from standard input until it ends or is silent."""
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    buffer = b""
+    while select.select([0], [], [], SILENCE_S)[0]:
+        data = os.read(0, 1 << 16)
+        if not data:
+            return
+        *lines, buffer = (buffer + data).split(b"\n")
+        for line in lines:
+            if line:
+                _answer(json.loads(line.decode()))
+
+
+def _answer(request: Dict[str, Any]) -> None:
+    function = _CALLS[request["call"]]
+    try:
+        _send({"result": function(**request["arguments"])})
+    except (Refused, OSError) as error:
+        _send({"error": " ".join(str(error).split())})
+    except Exception as error:
+        # A mistake of ours: the one who reads it needs the place.
+        where = traceback.extract_tb(sys.exc_info()[2])[-1]
+        _send({"error": "%s: %s (%s:%s)" % (type(error).__name__, error, where[0], where[1])})
+
+
+def _send(message: Dict[str, Any]) -> None:
+    data = (json.dumps(message) + "\n").encode()
+    try:
+        while data:
+            data = data[os.write(1, data) :]
+    except OSError:
+        pass  # Nobody is there any more; the call goes on.

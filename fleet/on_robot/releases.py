@@ -1,0 +1,381 @@
+"""Releases on the robot: taking them in, proving them, switching between them.
+
+`current` is what runs, `last-good` what a rollback goes back to. Both are symlinks that are
+replaced in one step, and `pending` says that a switch is not confirmed yet: whoever comes next
+confirms it or takes it back. All but `overview` need the lock.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import shutil
+import stat
+import time
+from typing import Any, Dict, List, Optional
+
+from fleet.on_robot import service
+from fleet.on_robot.calls import Refused, call, run, say
+
+_MARGIN_BYTES = 100000000
+_KEPT = 3
+_VERIFY_S = 300.0
+_HEALTHY_S = 40.0
+
+_lock = []  # type: List[int]
+
+
+@call
+def overview(directory: str) -> Dict[str, Any]:
+    """What is on the robot: its identity, releases, versions, unit, disk and clock."""
+    current = _linked(directory, "current")
+    versions = _versions(directory, current)
+    if versions is not None:
+        versions.pop("packages", None)
+    return {
+        "identity": identity(),
+        "machine": os.uname().machine,
+        "sudo": os.environ.get("SUDO_UID") is not None,
+        "current": current,
+        "last_good": _linked(directory, "last-good"),
+        "pending": _pending(directory),
+        "releases": _releases(directory),
+        "versions": versions,
+        "service": service.service(),
+        "unix_time_s": time.time(),
+    }
+
+
+def identity() -> Optional[Dict[str, Any]]:
+    """Who the robot was enrolled as, None if it was not."""
+    try:
+        with open("/etc/lpac/robot.json") as file:
+            found = json.load(file)
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+@call
+def lock(directory: str, who: str) -> Dict[str, Any]:
+    """Hold the robot for this session alone. Raises Refused that says who has it."""
+    os.makedirs(os.path.join(directory, "releases"), exist_ok=True)
+    descriptor = os.open(os.path.join(directory, "lock"), os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        holder = os.pread(descriptor, 200, 0).decode(errors="replace")
+        os.close(descriptor)
+        raise Refused("%s is changing this robot: wait, then try again" % holder) from None
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, who.encode()[:200], 0)
+    _lock.append(descriptor)
+    return {"recovered": _recover(directory)}
+
+
+def require_lock() -> None:
+    """Raises RuntimeError if this session does not hold the robot."""
+    if not _lock:
+        raise RuntimeError("lock was not called")
+
+
+@call
+def prepare(
+    directory: str, release: str, size_bytes: int, image: str, mavlink_port: int
+) -> Dict[str, Any]:
+    """Make room for a release; what is already here of it need not travel.
+
+    Returns whether it is here whole (`complete`), the folder to fill (`incoming`), and folders of
+    releases that may hold equal files (`like`). Raises Refused if the vehicle is armed, or the disk
+    has no room.
+    """
+    require_lock()
+    service.refuse_in_flight(mavlink_port, "deploying")
+    incoming = os.path.join(directory, "incoming")
+    target = os.path.join(incoming, release)
+    with contextlib.suppress(FileNotFoundError):
+        for name in os.listdir(incoming):
+            if name != release:
+                _remove(os.path.join(incoming, name))
+    path = os.path.join(directory, "releases", release)
+    current = _linked(directory, "current")
+    answer = {"complete": os.path.isdir(path), "incoming": target}
+    # rsync takes at most 20 such folders.
+    likely = [current] if current else []
+    likely += [name for name in _releases(directory) if name != current]
+    answer["like"] = [os.path.join(directory, "releases", name) for name in likely[:_KEPT]]
+    if not answer["complete"]:
+        os.makedirs(target, exist_ok=True)
+        here = (_versions(directory, name) or {} for name in likely)
+        needed = 0 if any(versions.get("image") == image for versions in here) else size_bytes
+        needed = max(0, needed - _size(target)) + _MARGIN_BYTES
+        free = shutil.disk_usage(directory).free
+        if free < needed:
+            raise Refused(
+                "the disk has %d MB free, and the release needs %d MB: remove old logs "
+                "(`lpac fleet pull`, then `lpac fleet exec`)" % (free // 1e6, needed // 1e6)
+            )
+    return answer
+
+
+@call
+def discard(directory: str, release: str) -> Dict[str, Any]:
+    """Remove what has come of a release that will not be completed, so that the disk is free."""
+    require_lock()
+    _remove(os.path.join(directory, "incoming", release))
+    return {}
+
+
+@call
+def accept(directory: str, release: str) -> Dict[str, Any]:
+    """Check every file that has come against the manifest, and take the release in whole."""
+    require_lock()
+    incoming = os.path.join(directory, "incoming", release)
+    _check(incoming, release)
+    os.sync()
+    os.makedirs(os.path.join(directory, "releases"), exist_ok=True)
+    os.rename(incoming, os.path.join(directory, "releases", release))
+    _sync_folder(os.path.join(directory, "releases"))
+    return {}
+
+
+@call
+def prove(directory: str, release: str) -> Dict[str, Any]:
+    """Run the release's own verification of its policy, and its benchmark, on this CPU.
+
+    Raises Refused that says what it does not compute, or that it is too slow.
+    """
+    require_lock()
+    path = os.path.join(directory, "releases", release)
+    reports = {}
+    for command, options in (("verify", []), ("benchmark", ["--seconds", "1.5"])):
+        say(command)
+        lpac = ["/usr/bin/lpac", "bundle", command, "/release/bundle", "--json"]
+        done = run_inside(path, [*lpac, *options])
+        if done.returncode != 0:
+            lines = [line for line in done.stderr.split("\n") if line.strip()]
+            reason = lines[-1] if lines else "exit code %d" % done.returncode
+            raise Refused("bundle %s on the robot: %s" % (command, reason))
+        reports[command] = json.loads(done.stdout)
+    return reports
+
+
+@call
+def switch(directory: str, release: str, mavlink_port: int) -> Dict[str, Any]:
+    """Run this release from now on, if its program turns out well; else the former one again.
+
+    A release without robot.toml, a spare's, becomes current and nothing is started. Raises Refused
+    if the vehicle is armed, or if the new release did not run well, with the reason.
+    """
+    require_lock()
+    service.refuse_in_flight(mavlink_port, "switching")
+    _prune(directory, {release})
+    former = _linked(directory, "current")
+    service.write_whole(
+        os.path.join(directory, "pending"),
+        json.dumps({"release": release, "former": former}).encode(),
+    )
+    problem = _activate(directory, release)
+    if problem is not None:
+        _take_back(directory, former)
+        back = "runs %s again" % former if former else "nothing runs: it was its first release"
+        raise Refused("%s does not run well (%s); the robot %s" % (release, problem, back))
+    _confirm(directory, former)
+    _prune(directory, set())
+    return overview(directory)
+
+
+@call
+def rollback(directory: str, mavlink_port: int) -> Dict[str, Any]:
+    """Run the last good release again."""
+    require_lock()
+    service.refuse_in_flight(mavlink_port, "rolling back")
+    current, last_good = _linked(directory, "current"), _linked(directory, "last-good")
+    if last_good is None or last_good == current:
+        raise Refused("there is no earlier release to go back to")
+    problem = _activate(directory, last_good)
+    if problem is not None:
+        raise Refused("%s does not run well either: %s" % (last_good, problem))
+    return overview(directory)
+
+
+def _activate(directory: str, release: str) -> Optional[str]:
+    """Switch and restart; why the program does not run well then, None if it does."""
+    path = os.path.join(directory, "releases", release)
+    _link(directory, "current", release)
+    try:
+        service.install_unit(directory, path)
+        if not os.path.exists(os.path.join(path, "robot.toml")):
+            service.halt()
+            return None
+        service.run_now()
+        say("health")
+        return service.unhealthy(_HEALTHY_S)
+    except Refused as error:
+        return str(error)
+
+
+def _take_back(directory: str, former: Optional[str]) -> None:
+    say("rollback")
+    if former is None:
+        service.halt()
+        os.unlink(os.path.join(directory, "current"))
+    else:
+        problem = _activate(directory, former)
+        if problem is not None:
+            raise Refused("it was taken back to %s, which does not run: %s" % (former, problem))
+    os.unlink(os.path.join(directory, "pending"))
+
+
+def _confirm(directory: str, former: Optional[str]) -> None:
+    if former is not None and former != _linked(directory, "current"):
+        _link(directory, "last-good", former)
+    os.unlink(os.path.join(directory, "pending"))
+
+
+def _recover(directory: str) -> Optional[str]:
+    """Finish a switch that a loss of power, or of its operator, left open; what was done."""
+    pending = _pending(directory)
+    if pending is None:
+        return None
+    release, former = pending["release"], pending["former"]
+    if _linked(directory, "current") != release:
+        os.unlink(os.path.join(directory, "pending"))
+        return None
+    problem = service.unhealthy(_HEALTHY_S) if _starts(directory, release) else None
+    if problem is None:
+        _confirm(directory, former)
+        return "an interrupted switch to %s is now confirmed" % release
+    _take_back(directory, former)
+    return "an interrupted switch to %s was taken back: %s" % (release, problem)
+
+
+def _starts(directory: str, release: str) -> bool:
+    return os.path.exists(os.path.join(directory, "releases", release, "robot.toml"))
+
+
+def _check(folder: str, release: str) -> None:
+    """Raises Refused if a file is not what the release's manifest says, or there are others."""
+    with open(os.path.join(folder, "manifest.json"), "rb") as file:
+        data = file.read()
+    if hashlib.sha256(data).hexdigest()[:16] != release:
+        raise Refused("the manifest that came is not the release's: deploy again")
+    wanted = json.loads(data.decode())["files"]
+    found = set()
+    for parent, folders, files in os.walk(folder):
+        for name in folders + files:
+            path = os.path.join(parent, name)
+            relative = os.path.relpath(path, folder)
+            if relative == "manifest.json" or (os.path.isdir(path) and not os.path.islink(path)):
+                continue
+            found.add(relative)
+            if wanted.get(relative) != _entry(path):
+                raise Refused("%s has not come whole: deploy again" % relative)
+    if len(found) != len(wanted):
+        missing = sorted(set(wanted) - found)[0]
+        raise Refused("%s has not come: deploy again" % missing)
+
+
+def _entry(path: str) -> List[str]:
+    """A file's mode and sha256, or a symlink's target, as the manifest has them."""
+    info = os.lstat(path)
+    if stat.S_ISLNK(info.st_mode):
+        return ["link", os.readlink(path)]
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        for block in iter(lambda: file.read(1 << 20), b""):
+            digest.update(block)
+    return [oct(stat.S_IMODE(info.st_mode)), digest.hexdigest()]
+
+
+def run_inside(release: str, command: List[str]) -> Any:
+    """Run a program in the release's file system, as nobody, with nothing of the robot's.
+
+    As the unit does it, but before anything is switched.
+    """
+    script = (
+        'set -e; cd "$1/root"; shift; mount --bind .. release; mount -t proc proc proc; '
+        "mount --rbind /sys sys; mount --rbind /dev dev; mount -t tmpfs tmpfs tmp; "
+        'exec nice -n 5 chroot --userspec=65534:65534 . "$@"'
+    )
+    return run(["unshare", "--mount", "sh", "-c", script, "sh", release, *command], _VERIFY_S)
+
+
+def _prune(directory: str, besides: Any) -> None:
+    """Remove the oldest releases; never the current and the last good one."""
+    keep = {_linked(directory, "current"), _linked(directory, "last-good")} | besides
+    spare = [name for name in _releases(directory) if name not in keep]
+    for name in spare[max(0, _KEPT - len(keep)) :]:
+        _remove(os.path.join(directory, "releases", name))
+
+
+def _releases(directory: str) -> List[str]:
+    """The releases that are here whole, the newest first."""
+    folder = os.path.join(directory, "releases")
+    with contextlib.suppress(FileNotFoundError):
+        names = os.listdir(folder)
+        return sorted(names, key=lambda n: -os.lstat(os.path.join(folder, n)).st_ctime)
+    return []
+
+
+def _versions(directory: str, release: Optional[str]) -> Optional[Dict[str, Any]]:
+    if release is None:
+        return None
+    try:
+        with open(os.path.join(directory, "releases", release, "versions.json")) as file:
+            versions = json.load(file)
+    except (OSError, ValueError):
+        return None
+    return versions if isinstance(versions, dict) else None
+
+
+def _pending(directory: str) -> Optional[Dict[str, Any]]:
+    try:
+        with open(os.path.join(directory, "pending")) as file:
+            return dict(json.load(file))
+    except (OSError, ValueError):
+        return None
+
+
+def _linked(directory: str, name: str) -> Optional[str]:
+    try:
+        return os.path.basename(os.readlink(os.path.join(directory, name)))
+    except OSError:
+        return None
+
+
+def _link(directory: str, name: str, release: str) -> None:
+    part = os.path.join(directory, name + ".part")
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(part)
+    os.symlink(os.path.join("releases", release), part)
+    os.replace(part, os.path.join(directory, name))
+    _sync_folder(directory)
+
+
+def _sync_folder(path: str) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _remove(path: str) -> None:
+    """Remove a release: first its name, so that no half of one is ever taken for whole."""
+    parent, name = os.path.split(path)
+    gone = os.path.join(os.path.dirname(parent), "incoming", name + ".gone")
+    with contextlib.suppress(FileNotFoundError):
+        os.makedirs(os.path.dirname(gone), exist_ok=True)
+        os.rename(path, gone)
+        shutil.rmtree(gone)
+
+
+def _size(path: str) -> int:
+    total = 0
+    for parent, _, files in os.walk(path):
+        for name in files:
+            with contextlib.suppress(OSError):
+                total += os.lstat(os.path.join(parent, name)).st_size
+    return total

@@ -1,0 +1,310 @@
+"""The robot's unit under systemd: what it says, whether it is well, starting and stopping it."""
+
+import contextlib
+import json
+import os
+import socket
+import struct
+import time
+from typing import Any, Dict, List, Optional
+
+from fleet.on_robot.calls import Refused, call, run, say
+
+UNIT = "lpac-robot.service"
+UNIT_PATH = "/etc/systemd/system/" + UNIT
+DROP_IN_PATH = UNIT_PATH + ".d/lpac-robot.conf"
+
+# The program says how it is four times a second.
+_STATUS_FRESH_S = 2.0
+# For so long it must be well without a restart.
+_STEADY_S = 3.0
+# PX4 sends heartbeats at 1 Hz.
+_HEARTBEAT_WAIT_S = 2.5
+
+_PROPERTIES = (
+    "LoadState,ActiveState,SubState,Result,NRestarts,StatusText,MainPID,UnitFileState,"
+    "ActiveEnterTimestampMonotonic"
+)
+
+
+@call
+def service() -> Dict[str, Any]:
+    """What systemd knows of the unit, and the program's own last words (`status`, None if none).
+
+    `fresh` tells whether the program is running and said so within the last seconds.
+    """
+    shown = run(["systemctl", "show", UNIT, "--no-pager", "-p", _PROPERTIES])
+    if shown.returncode != 0:
+        raise Refused("systemctl show: %s" % shown.stderr.strip())
+    lines = shown.stdout.split("\n")
+    values = dict(line.split("=", 1) for line in lines if "=" in line)
+    status = _parsed(values.get("StatusText", ""))
+    now_s = time.monotonic()
+    age_s = None if status is None else now_s - float(status["monotonic_s"])
+    active = values.get("ActiveState") == "active"
+    started_s = int(values.get("ActiveEnterTimestampMonotonic") or 0) / 1e6
+    return {
+        "active": values.get("ActiveState", "unknown"),
+        "result": values.get("Result", ""),
+        "restarts": int(values.get("NRestarts") or 0),
+        "enabled": values.get("UnitFileState") == "enabled",
+        "installed": values.get("LoadState") == "loaded",
+        "uptime_s": now_s - started_s if active else None,
+        "status": status,
+        "status_age_s": age_s,
+        "fresh": active and age_s is not None and -1.0 < age_s < _STATUS_FRESH_S,
+    }
+
+
+def refuse_in_flight(mavlink_port: int, doing: str) -> None:
+    """Raises Refused if the vehicle is armed, as far as anybody on the robot can tell."""
+    if armed(mavlink_port):
+        raise Refused("the vehicle is armed: %s is refused until it is disarmed" % doing)
+
+
+def armed(mavlink_port: int) -> bool:
+    """Whether the vehicle's motors may turn, by the robot's program or else by the vehicle itself.
+
+    A program that runs but has fallen silent may have an armed vehicle: its last word counts.
+    """
+    state = service()
+    if state["active"] in ("active", "reloading", "deactivating"):
+        status = state["status"] or {}
+        if status.get("armed") is not None:
+            return bool(status["armed"])
+        if state["fresh"]:
+            return False  # It has not heard of a vehicle.
+    heartbeat = hear_heartbeat(mavlink_port)
+    return heartbeat is not None and bool(heartbeat["armed"])
+
+
+def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dict[str, Any]]:
+    """The first heartbeat of an autopilot that comes to the UDP port of this host.
+
+    None if none comes, or somebody else listens there.
+    """
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as udp:
+        try:
+            udp.bind(("127.0.0.1", port))
+        except OSError:
+            return None
+        until_s = time.monotonic() + wait_s
+        while True:
+            left_s = until_s - time.monotonic()
+            if left_s <= 0.0:
+                return None
+            udp.settimeout(left_s)
+            try:
+                data = udp.recv(65535)
+            except socket.timeout:
+                return None
+            heartbeat = _heartbeat(data)
+            if heartbeat is not None:
+                return heartbeat
+
+
+def _heartbeat(data: bytes) -> Optional[Dict[str, Any]]:
+    """An autopilot's HEARTBEAT among the MAVLink messages of a datagram, None if there is none."""
+    while len(data) >= 12:
+        if data[0] == 0xFD:  # MAVLink 2
+            size, header = data[1], 10
+            system, component = data[5], data[6]
+            message = data[7] | data[8] << 8 | data[9] << 16
+            total = header + size + 2 + (13 if data[2] & 1 else 0)
+        elif data[0] == 0xFE:  # MAVLink 1
+            size, header = data[1], 6
+            system, component, message = data[3], data[4], data[5]
+            total = header + size + 2
+        else:
+            return None
+        if len(data) < total:
+            return None
+        if message == 0 and component == 1:
+            # Trailing zeros are left out of a MAVLink 2 payload.
+            payload = data[header : header + size].ljust(9, b"\0")
+            _, _, autopilot, base_mode, _, _ = struct.unpack("<IBBBBB", payload[:9])
+            return {
+                "system_id": system,
+                "autopilot": autopilot,
+                "armed": bool(base_mode & 0x80),
+            }
+        data = data[total:]
+    return None
+
+
+@call
+def start(directory: str) -> Dict[str, Any]:
+    """Start the unit now and at every boot, and wait until the program is well."""
+    if not os.path.exists(os.path.join(directory, "current", "robot.toml")):
+        raise Refused("there is no release for a slot on this robot: deploy first")
+    _systemctl("reset-failed", UNIT)
+    _systemctl("enable", UNIT)
+    _systemctl("start", UNIT, timeout_s=60.0)
+    problem = unhealthy(20.0)
+    if problem is not None:
+        raise Refused("it does not run well: %s" % problem)
+    return service()
+
+
+@call
+def stop(mavlink_port: int, in_flight: bool, disable: bool) -> Dict[str, Any]:
+    """Stop the unit; a vehicle in flight holds or lands then, as its `on_stop` says.
+
+    Refused while the vehicle is armed unless `in_flight` insists. With `disable` it does not start
+    at the next boot either.
+    """
+    if not in_flight:
+        refuse_in_flight(mavlink_port, "stopping")
+    if service()["installed"]:
+        _systemctl("stop", UNIT, timeout_s=30.0)
+        if disable:
+            _systemctl("disable", UNIT)
+    return service()
+
+
+@call
+def restart(directory: str, mavlink_port: int, in_flight: bool) -> Dict[str, Any]:
+    """Stop and start the unit."""
+    stop(mavlink_port, in_flight, disable=False)
+    return start(directory)
+
+
+@call
+def journal(lines: int) -> Dict[str, Any]:
+    """The unit's last lines in the journal, the oldest first."""
+    return {"lines": last_words(lines)}
+
+
+def last_words(lines: int) -> List[str]:
+    """What the program, and systemd about it, wrote last."""
+    shown = run(["journalctl", "-u", UNIT, "-n", str(lines), "-o", "cat", "--no-pager"])
+    return [line for line in shown.stdout.split("\n") if line.strip()]
+
+
+def unhealthy(deadline_s: float) -> Optional[str]:
+    """Why the program does not run well, None once it has done so for a few seconds.
+
+    Well means: systemd has it active without a restart, all its loops tick without new failures,
+    and it has joined the radio link. Vehicle, GPS and battery are preflight's matter.
+    """
+    until_s = time.monotonic() + deadline_s
+    first = None  # type: Optional[Dict[str, Any]]
+    first_s = 0.0
+    restarts = service()["restarts"]
+    while True:
+        now = service()
+        problem = _problem(now)
+        if problem is None and (first is None or _restarted(first, now)):
+            first, first_s = now, time.monotonic()
+        if problem is None and first is not None:
+            problem = _loop_problem(first["status"]["loops"], now["status"]["loops"])
+            if problem is None and time.monotonic() - first_s >= _STEADY_S:
+                return None
+        hopeless = now["active"] == "failed" or now["restarts"] >= restarts + 2
+        if hopeless or time.monotonic() > until_s:
+            return "%s; %s" % (problem or "it runs for too short a time", _reason())
+        time.sleep(0.25)
+
+
+def _problem(now: Dict[str, Any]) -> Optional[str]:
+    if now["active"] != "active":
+        return "the unit is %s (%s)" % (now["active"], now["result"])
+    if not now["fresh"]:
+        return "the program says nothing"
+    if not now["status"]["link"]:
+        return "the radio link is not open"
+    return None
+
+
+def _restarted(first: Dict[str, Any], now: Dict[str, Any]) -> bool:
+    return bool(now["status"]["boot_nonce"] != first["status"]["boot_nonce"])
+
+
+def _loop_problem(before: Dict[str, Any], now: Dict[str, Any]) -> Optional[str]:
+    for name in sorted(now):
+        if now[name]["failures"] > before[name]["failures"]:
+            return "its %s loop fails" % name
+        if now[name]["ticks"] <= before[name]["ticks"]:
+            return "its %s loop does not tick" % name
+    return None
+
+
+def _reason() -> str:
+    """The program's last line that says why, from the journal."""
+    for line in reversed(last_words(20)):
+        if line.startswith("lpac: "):
+            return "it says: %s" % line
+        if line.startswith("{"):
+            try:
+                event = json.loads(line)
+            except ValueError:
+                continue
+            if event.get("level") in ("error", "critical"):
+                return "it says: %s" % event.get("event")
+    return "see `lpac fleet logs`"
+
+
+def install_unit(directory: str, release: str) -> None:
+    """Make the release's unit file, and its drop-in if it has one, systemd's."""
+    # The unit mounts the image over it.
+    os.makedirs(os.path.join(directory, "sandbox"), mode=0o755, exist_ok=True)
+    changed = _copy(os.path.join(release, UNIT), UNIT_PATH)
+    drop_in = os.path.join(release, "lpac-robot.conf")
+    if os.path.exists(drop_in):
+        os.makedirs(os.path.dirname(DROP_IN_PATH), exist_ok=True)
+        changed = _copy(drop_in, DROP_IN_PATH) or changed
+    elif os.path.exists(DROP_IN_PATH):
+        os.unlink(DROP_IN_PATH)
+        changed = True
+    if changed:
+        _systemctl("daemon-reload")
+
+
+def run_now() -> None:
+    """Restart the unit, whatever came of it before, and start it at every boot."""
+    say("restart")
+    run(["systemctl", "reset-failed", UNIT])
+    _systemctl("enable", UNIT)
+    # A program that cannot start shows in its health, with the reason.
+    run(["systemctl", "restart", UNIT], timeout_s=90.0)
+
+
+def halt() -> None:
+    """Stop the unit, now and at boot, if it is there."""
+    run(["systemctl", "disable", "--now", UNIT], timeout_s=30.0)
+
+
+def _copy(source: str, target: str) -> bool:
+    with open(source, "rb") as file:
+        data = file.read()
+    if os.path.exists(target):
+        with open(target, "rb") as file:
+            if file.read() == data:
+                return False
+    write_whole(target, data)
+    return True
+
+
+def write_whole(path: str, data: bytes) -> None:
+    """Write a file that, whenever the power goes, is the old one or the new one."""
+    part = path + ".part"
+    with open(part, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
+
+
+def _systemctl(*arguments: str, timeout_s: float = 20.0) -> None:
+    done = run(["systemctl", *arguments], timeout_s=timeout_s)
+    if done.returncode != 0 and arguments[0] != "reset-failed":
+        reason = " ".join(done.stderr.split()) or "exit code %d" % done.returncode
+        raise Refused("systemctl %s: %s; %s" % (" ".join(arguments), reason, _reason()))
+
+
+def _parsed(text: str) -> Optional[Dict[str, Any]]:
+    try:
+        status = json.loads(text)
+    except ValueError:
+        return None
+    return status if isinstance(status, dict) and "monotonic_s" in status else None

@@ -1,0 +1,36 @@
+"""The same for many robots at once: none waits for another, and every one has an outcome."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Generic, NamedTuple, TypeVar
+
+from fleet.config import RobotHost
+from fleet.session import FleetError
+
+T = TypeVar("T")
+
+
+class Outcome(NamedTuple, Generic[T]):
+    """What came of it for one robot: a value, or why there is none."""
+
+    robot: RobotHost
+    value: T | None
+    problem: str | None
+
+
+async def for_each(
+    robots: Sequence[RobotHost],
+    task: Callable[[RobotHost], Awaitable[T]],
+    on_outcome: Callable[[Outcome[T]], None] = lambda _: None,
+) -> list[Outcome[T]]:
+    """Do `task` with all robots side by side; the outcomes in the robots' order."""
+
+    async def one(robot: RobotHost) -> Outcome[T]:
+        try:
+            outcome = Outcome(robot, await task(robot), None)
+        except (FleetError, ValueError, OSError) as error:
+            outcome = Outcome[T](robot, None, " ".join(str(error).split()))
+        on_outcome(outcome)
+        return outcome
+
+    return list(await asyncio.gather(*(one(robot) for robot in robots)))

@@ -1,0 +1,113 @@
+"""Fetching what robots recorded of a trial: resumable, and checked against their checksums."""
+
+import asyncio
+import contextlib
+import hashlib
+from pathlib import Path
+from typing import NamedTuple
+
+from fleet.config import FleetConfig, RobotHost
+from fleet.deploy import Report, check_identity
+from fleet.session import RemoteError, UnreachableError, connect, rsync
+
+SUMS = "SHA256SUMS"
+
+
+class Pulled(NamedTuple):
+    """What was fetched to `folder`, how much of it travelled, and a word about it."""
+
+    folder: str
+    files: int
+    size_bytes: int
+    sent_bytes: int
+    summary: str
+
+
+async def pull(
+    config: FleetConfig, robot: RobotHost, trial: str | None, out: Path, report: Report
+) -> Pulled:
+    """Fetch flight logs, PX4's logs and parameters, journal, configuration and versions.
+
+    To `out`/TRIAL/ROBOT; without a trial, whatever is newer than what is there, to `out`/all/ROBOT.
+    `SHA256SUMS` there is what the robot said, and `sha256sum -c` understands it. Raises FleetError,
+    also if the robot has nothing of the trial.
+    """
+    folder = out.resolve() / ("all" if trial is None else trial.replace("/", "_")) / robot.name
+    report("connect", None)
+    async with connect(config, robot, lambda step: report(step, None)) as session:
+        found = await session.call("overview", directory=config.directory)
+        check_identity(found["identity"], config, robot)
+        collected = await session.call(
+            "collect", directory=config.directory, mavlink_port=robot.mavlink_port, trial=trial,
+            since_s=0.0 if trial is not None else _newest_s(folder),
+        )  # fmt: skip
+        if collected["folder"] is None:
+            return _nothing(config, robot, trial, folder, collected)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            sent_bytes = await rsync(
+                config, robot, [f":{collected['folder']}/"], f"{folder}/",
+                options=["--copy-links", "--partial"], sudo=found["sudo"],
+                on_share=lambda share: report("fetch", share),
+            )  # fmt: skip
+        finally:
+            # A robot out of reach removes it later by itself; the transfer's problem is to be told.
+            with contextlib.suppress(UnreachableError):
+                await session.call("fetched", folder=collected["folder"])
+    report("check", None)
+    sums: dict[str, str] = collected["files"]
+    await asyncio.to_thread(_check, folder, sums)
+    _write_sums(folder, sums)
+    size_bytes = sum((folder / name).stat().st_size for name in sums)
+    summary = "whole" if sent_bytes else "was here already"
+    return Pulled(str(folder), len(sums), size_bytes, sent_bytes, summary)
+
+
+def _nothing(
+    config: FleetConfig,
+    robot: RobotHost,
+    trial: str | None,
+    folder: Path,
+    collected: dict[str, object],
+) -> Pulled:
+    """Raises RemoteError unless that is as it should be."""
+    if trial is None:
+        return Pulled(str(folder), 0, 0, 0, "nothing new")
+    if not collected["has_logs"] and config.slot_of(robot.name) is None:
+        return Pulled(str(folder), 0, 0, 0, "a spare that never flew")
+    trials = collected["trials"]
+    assert isinstance(trials, list)
+    flown = f"it has {', '.join(map(repr, trials[-5:]))}" if trials else "it has none at all"
+    raise RemoteError(f"it has nothing of trial {trial!r}; {flown}")
+
+
+def _newest_s(folder: Path) -> float:
+    """When the newest of the logs that came whole was written to, Unix time; 0 without any.
+
+    Those of a pull that broke off do not count.
+    """
+    logs = [folder / name for name in _read_sums(folder) if name.endswith((".mcap", ".ulg"))]
+    return max((log.stat().st_mtime for log in logs if log.exists()), default=0.0)
+
+
+def _check(folder: Path, sums: dict[str, str]) -> None:
+    """Raises RemoteError if a file here is not what the robot has."""
+    for name, wanted in sums.items():
+        with (folder / name).open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != wanted:
+                raise RemoteError(f"{name} did not come whole: pull again")
+
+
+def _read_sums(folder: Path) -> dict[str, str]:
+    """File -> sha256 of what came in earlier pulls."""
+    path = folder / SUMS
+    if not path.exists():
+        return {}
+    lines = (line.partition("  ") for line in path.read_text().splitlines())
+    return {name: digest for digest, _, name in lines}
+
+
+def _write_sums(folder: Path, sums: dict[str, str]) -> None:
+    known = _read_sums(folder) | sums
+    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(known.items()))
+    (folder / SUMS).write_text(text)

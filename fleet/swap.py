@@ -1,0 +1,86 @@
+"""A spare takes a failed robot's slot: its pad, height and landing point."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from edge.core.schema import ConfigError
+from fleet.config import FleetConfig, RobotHost, assign, load_fleet
+from fleet.deploy import Deployed, Report, check_identity, deploy, operator
+from fleet.release import load_common, make_release
+from fleet.session import RemoteError, UnreachableError, connect
+
+OnStep = Callable[[str], None]
+
+
+class Swapped(NamedTuple):
+    """The slot's number in the file, counted from 0, and what runs on the spare now.
+
+    `silent` is why the failed robot could not be stopped, None if it was.
+    """
+
+    slot: int
+    deployed: Deployed
+    silent: str | None
+
+
+async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
+    """Let `spare` fly instead of `failed`; a repeat finishes what was interrupted.
+
+    The spare is looked at before anything is changed, and the failed robot is stopped before the
+    spare gets its place. Raises ConfigError, or FleetError if the failed robot is armed or the
+    spare cannot have the release; ValueError or OSError if there is no release.
+    """
+    config = load_fleet(path)
+    index = _slot(config, failed, spare)
+    common = load_common(config)
+    report(f"look at {spare}", None)
+    async with connect(config, config.robots[spare]) as session:
+        found = await session.call("overview", directory=config.directory)
+        check_identity(found["identity"], config, config.robots[spare])
+    report(f"stop {failed}", None)
+    silent = await _stop(config, config.robots[failed])
+    report(path.name, None)
+    assign(path, index, spare)
+    config = load_fleet(path)
+    robot = config.robots[spare]
+    with tempfile.TemporaryDirectory(prefix="lpac-swap-") as folder:
+        release = make_release(config, robot, common, Path(folder))
+        deployed = await deploy(config, robot, release, report)
+    return Swapped(index, deployed, silent)
+
+
+def _slot(config: FleetConfig, failed: str, spare: str) -> int:
+    """The slot that changes hands, or did so in an earlier try. Raises ConfigError."""
+    for name in (failed, spare):
+        if name not in config.robots:
+            known = ", ".join(config.robots)
+            raise ConfigError(f"{config.path}: robots: {name!r} is unknown; known are {known}")
+    slots = {slot.robot: index for index, slot in enumerate(config.slots)}
+    if failed in slots and spare in slots:
+        raise ConfigError(f"{config.path}: {spare} is no spare: it has slots[{slots[spare]}]")
+    if failed not in slots and spare not in slots:
+        raise ConfigError(f"{config.path}: {failed} has no slot that {spare} could take")
+    return slots[failed if failed in slots else spare]
+
+
+async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
+    """Stop the robot's program, now and at boot; why it was not found, None if it was.
+
+    Raises RemoteError if it refuses, since it flies.
+    """
+    try:
+        async with connect(config, robot) as session:
+            found = await session.call("overview", directory=config.directory)
+            try:
+                check_identity(found["identity"], config, robot)
+            except RemoteError as error:
+                return str(error)
+            await session.call("lock", directory=config.directory, who=operator())
+            await session.call(
+                "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=True
+            )
+    except UnreachableError as error:
+        return str(error)
+    return None

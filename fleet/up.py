@@ -1,0 +1,125 @@
+"""The start of a day in the field: robots that answer, clocks set, programs that run."""
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from fleet.config import FleetConfig, RobotHost
+from fleet.deploy import Report, check_identity, operator
+from fleet.doctor import (
+    GOOD_CLOCK_OFFSET_S,
+    Check,
+    Diagnosis,
+    Examination,
+    diagnose,
+    measure_clock,
+)
+from fleet.operations import Outcome
+from fleet.session import RemoteError, Session, UnreachableError, connect
+
+_ASK_AGAIN_S = 1.0
+
+
+class Arrival(NamedTuple):
+    """What was done on a robot to bring it up, and what could not be, in words."""
+
+    done: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+class Decision(NamedTuple):
+    """Whether a robot may fly, as far as that shows on the ground; and what speaks against it."""
+
+    robot: str
+    go: bool
+    reasons: tuple[str, ...]
+
+
+async def bring_up(
+    config: FleetConfig,
+    robot: RobotHost,
+    until_s: float,
+    report: Report,
+    unix_time_s: Callable[[], float] = time.time,
+) -> Arrival:
+    """Wait for the robot, set its clock, finish an interrupted switch, start its program.
+
+    It is waited for until `until_s` of the monotonic clock. A program that was stopped on purpose
+    is not started. Raises FleetError if it does not come, or another robot answers.
+    """
+    while True:
+        try:
+            report("connect", None)
+            async with connect(config, robot, lambda step: report(step, None)) as session:
+                found = await session.call("overview", directory=config.directory)
+                check_identity(found["identity"], config, robot)
+                return await _bring_up(config, robot, session, unix_time_s)
+        except UnreachableError as error:
+            # A robot that is starting refuses connections, and breaks them off.
+            if time.monotonic() + _ASK_AGAIN_S > until_s:
+                raise
+            report(f"waits: {error}", None)
+            await asyncio.sleep(_ASK_AGAIN_S)
+
+
+async def _bring_up(
+    config: FleetConfig,
+    robot: RobotHost,
+    session: Session,
+    unix_time_s: Callable[[], float],
+) -> Arrival:
+    done: list[str] = []
+    problems: list[str] = []
+
+    async def step(function: str, **arguments: object) -> dict[str, Any]:
+        try:
+            return await session.call(function, **arguments)
+        except RemoteError as error:
+            problems.append(str(error))
+            return {}
+
+    # Taking it finishes an interrupted switch.
+    locked = await step("lock", directory=config.directory, who=operator())
+    if locked.get("recovered"):
+        done.append(locked["recovered"])
+    clock = await measure_clock(session, unix_time_s)
+    if abs(clock.offset_s) > GOOD_CLOCK_OFFSET_S + clock.uncertainty_s:
+        port = robot.mavlink_port
+        if await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
+            done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
+    service = await session.call("service")
+    flies = config.slot_of(robot.name) is not None
+    idle = flies and locked and service["enabled"] and service["active"] != "active"
+    if idle and await step("start", directory=config.directory):
+        done.append("its program was started")
+    return Arrival(tuple(done), tuple(problems))
+
+
+def board(
+    config: FleetConfig,
+    arrivals: Sequence[Outcome[Arrival]],
+    examinations: Sequence[Outcome[Examination]],
+) -> list[Diagnosis]:
+    """All robots' checks: the doctor's, and what kept them from coming up."""
+    examined = {diagnosis.robot: diagnosis for diagnosis in diagnose(config, examinations)}
+    diagnoses = []
+    for outcome in arrivals:
+        name = outcome.robot.name
+        if outcome.value is None:
+            checks = (Check("up", "FAILED", outcome.problem or ""),)
+            diagnoses.append(Diagnosis(name, checks))
+            continue
+        problems = "; ".join(outcome.value.problems)
+        done = "; ".join(outcome.value.done) or "nothing was to be done"
+        came = Check("up", "FAILED", problems) if problems else Check("up", "ok", done)
+        diagnoses.append(Diagnosis(name, (came, *examined[name].checks)))
+    return diagnoses
+
+
+def decide(diagnosis: Diagnosis) -> Decision:
+    """Go or no-go: no-go for whatever failed."""
+    failed = diagnosis.failed()
+    return Decision(
+        diagnosis.robot, not failed, tuple(f"{check.name}: {check.found}" for check in failed)
+    )

@@ -1,0 +1,380 @@
+"""Deploying to real robot computers: whole and proven, or nothing has changed."""
+
+import asyncio
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from onnx import numpy_helper
+
+from edge.runtime.bundle import BUNDLE_ID, MANIFEST, make_bundle
+from fleet.config import FleetConfig, load_fleet
+from fleet.config import RobotHost as Robot
+from fleet.deploy import Deployed, Report, deploy, rollback
+from fleet.operations import Outcome, for_each
+from fleet.release import Common, Release, load_common, make_release
+from fleet.session import FleetError, RemoteError, UnreachableError, connect
+from sim.hosts import RobotHost, RobotHosts
+
+ROOT = Path(__file__).parents[2]
+
+
+def silent(_: str, __: float | None) -> None:
+    """Nobody watches."""
+
+
+class Laptop:
+    """What an operator has: fleet.toml as it is now, and the releases made from it."""
+
+    def __init__(self, hosts: RobotHosts, folder: Path) -> None:
+        self.hosts = hosts
+        self.config: FleetConfig = load_fleet(hosts.fleet_toml)
+        self.common: Common = load_common(self.config)
+        self._folder = folder
+
+    def robot(self, index: int) -> Robot:
+        return self.config.robots[self.hosts[index].name]
+
+    def release(self, index: int, common: Common | None = None) -> Release:
+        folder = self._folder / f"release-{len(list(self._folder.iterdir()))}"
+        folder.mkdir()
+        return make_release(self.config, self.robot(index), common or self.common, folder)
+
+    def deploy(
+        self, index: int, release: Release | None = None, report: Report = silent
+    ) -> Deployed:
+        release = release or self.release(index)
+        return asyncio.run(deploy(self.config, self.robot(index), release, report))
+
+    def deploy_all(self, releases: dict[str, Release]) -> list[Outcome[Deployed]]:
+        """Side by side, by the robots' names."""
+        robots = [self.config.robots[name] for name in releases]
+        return asyncio.run(
+            for_each(robots, lambda r: deploy(self.config, r, releases[r.name], silent))
+        )
+
+    def call(self, index: int, function: str, **arguments: object) -> dict[str, Any]:
+        async def one() -> dict[str, Any]:
+            async with connect(self.config, self.robot(index)) as session:
+                return await session.call(function, **arguments)
+
+        return asyncio.run(one())
+
+    def overview(self, index: int) -> dict[str, Any]:
+        return self.call(index, "overview", directory=self.config.directory)
+
+    def changed(self) -> Common:
+        """The same with another world file: a release that differs in one file, and versions."""
+        world = self.common.world + b"CircularBND 100 100 20 %.9f\n" % time.monotonic()
+        return self.common._replace(world=world)
+
+
+@pytest.fixture(scope="module")
+def laptop(hosts: RobotHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+    """Three robots that run a first release."""
+    laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
+    releases = {}
+    for index in range(3):
+        enrolled(laptop, index)
+        releases[hosts[index].name] = laptop.release(index)
+    outcomes = laptop.deploy_all(releases)
+    assert all(outcome.value for outcome in outcomes), outcomes
+    return laptop
+
+
+def boot_nonce(overview: dict[str, Any]) -> int:
+    assert overview["service"]["fresh"], overview
+    nonce: int = overview["service"]["status"]["boot_nonce"]
+    return nonce
+
+
+def await_true(holds: Callable[[], bool], within_s: float = 60.0) -> None:
+    until_s = time.monotonic() + within_s
+    while not holds():
+        assert time.monotonic() < until_s, "it did not come true"
+        time.sleep(0.05)
+
+
+def test_a_second_deploy_sends_nothing_and_disturbs_nothing(laptop: Laptop) -> None:
+    before = [boot_nonce(laptop.overview(index)) for index in range(3)]
+    for index in range(3):
+        done = laptop.deploy(index)
+        assert (done.summary, done.sent_bytes) == ("unchanged", 0)
+    assert [boot_nonce(laptop.overview(index)) for index in range(3)] == before
+
+
+def test_a_changed_file_travels_alone_and_rollback_brings_the_former_back(laptop: Laptop) -> None:
+    former = laptop.overview(0)["current"]
+    release = laptop.release(0, laptop.changed())
+    done = laptop.deploy(0, release)
+    assert done.release == release.id != former
+    # The world, the lock of versions, and the manifest of 2,000 files.
+    assert done.sent_bytes < 0.01 * release.size_bytes
+    now = laptop.overview(0)
+    assert (now["current"], now["last_good"], now["pending"]) == (release.id, former, None)
+    assert now["service"]["enabled"]
+    assert asyncio.run(rollback(laptop.config, laptop.robot(0), silent)) == former
+    assert laptop.overview(0)["current"] == former
+    with pytest.raises(RemoteError, match="no earlier release"):
+        asyncio.run(rollback(laptop.config, laptop.robot(0), silent))
+
+
+def test_a_robot_that_is_off_does_not_hold_up_the_others(laptop: Laptop) -> None:
+    common = laptop.changed()
+    releases = {laptop.robot(i).name: laptop.release(i, common) for i in range(3)}
+
+    laptop.hosts[1].power_off()
+    try:
+        first, off, third = laptop.deploy_all(releases)
+    finally:
+        laptop.hosts[1].power_on()
+    assert first.value and third.value
+    assert off.problem == "it does not answer: it is off, or out of reach"
+    assert laptop.deploy(1, releases["r2"]).summary == "runs"
+
+
+@pytest.mark.parametrize("mishap", ["cut", "power", "full"])
+def test_a_transfer_that_breaks_off_leaves_what_runs_and_a_repeat_finishes(
+    laptop: Laptop, mishap: str
+) -> None:
+    host = laptop.hosts[2]
+    host.reset()
+    enrolled(laptop, 2)
+    release = laptop.release(2)
+    seen: list[float] = []
+
+    def at_a_third(step: str, share: float | None) -> None:
+        if step == "image" and share is not None and share >= 0.3 and not seen:
+            seen.append(share)
+            {"cut": host.cut, "power": host.power_off, "full": host.fill_disk}[mishap]()
+
+    with pytest.raises(FleetError) as error:
+        laptop.deploy(2, release, at_a_third)
+    assert seen
+    if mishap == "full":
+        assert "its disk is full" in str(error.value)
+        host.free_disk()
+    else:
+        assert isinstance(error.value, UnreachableError)
+        {"cut": host.heal, "power": host.power_on}[mishap]()
+    assert laptop.overview(2)["current"] is None
+
+    def free_again() -> bool:
+        try:
+            laptop.call(2, "lock", directory=laptop.config.directory, who="the next one")
+        except RemoteError as error:
+            assert "is changing this robot" in str(error)
+            return False
+        return True
+
+    await_true(free_again)
+    assert laptop.deploy(2, release).summary == "runs"
+
+
+def test_a_killed_laptop_program_leaves_the_robot_whole_and_free(
+    laptop: Laptop, tmp_path: Path
+) -> None:
+    host = laptop.hosts[2]
+    host.reset()
+    enrolled(laptop, 2)
+    program = subprocess.Popen(
+        [sys.executable, "-m", "cli.main", "fleet", "deploy", "--robots", host.name,
+         "--fleet", str(laptop.hosts.fleet_toml)],
+        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    incoming = host.root / "opt" / "lpac" / "incoming"
+    await_true(lambda: any(incoming.glob("*/root/usr/lib/*/*")))
+    program.send_signal(signal.SIGKILL)
+    program.wait()
+    assert laptop.overview(2)["current"] is None
+    await_true(lambda: not holders(laptop, 2))
+    assert laptop.deploy(2).summary == "runs"
+
+
+def holders(laptop: Laptop, index: int) -> bool:
+    """Whether somebody has the robot's lock."""
+    try:
+        laptop.call(index, "lock", directory=laptop.config.directory, who="the next one")
+    except RemoteError:
+        return True
+    return False
+
+
+def enrolled(laptop: Laptop, index: int) -> None:
+    robot = laptop.robot(index)
+    identity = {"fleet": laptop.config.fleet, "robot": robot.name, "robot_id": robot.robot_id}
+    laptop.hosts[index].run(
+        f"mkdir -p /etc/lpac && echo '{json.dumps(identity)}' > /etc/lpac/robot.json"
+    )
+
+
+def test_a_full_disk_is_found_before_anything_travels(laptop: Laptop) -> None:
+    host = laptop.hosts[0]
+    before = laptop.overview(0)
+    host.fill_disk()
+    try:
+        with pytest.raises(RemoteError, match=r"the disk has \d+ MB free.*needs \d+ MB"):
+            laptop.deploy(0, laptop.release(0, laptop.changed()))
+        after = laptop.overview(0)
+    finally:
+        host.free_disk()
+    assert after["current"] == before["current"]
+    assert boot_nonce(after) == boot_nonce(before)
+
+
+def test_a_policy_that_does_not_compute_what_torch_computed_is_not_run(laptop: Laptop) -> None:
+    bundle = laptop.common.bundle
+    model = onnx.load_from_string(bundle.files["gnn_1.onnx"])
+    taps = next(tensor for tensor in model.graph.initializer if tensor.name == "taps")
+    taps.CopyFrom(numpy_helper.from_array(1.01 * numpy_helper.to_array(taps), "taps"))
+    files = {n: c for n, c in bundle.files.items() if n not in (MANIFEST, BUNDLE_ID)}
+    broken = make_bundle(bundle.manifest, files | {"gnn_1.onnx": model.SerializeToString()})
+    before = laptop.overview(0)
+    with pytest.raises(RemoteError, match=r"bundle verify on the robot: .*gnn_1\.onnx"):
+        laptop.deploy(0, laptop.release(0, laptop.common._replace(bundle=broken)))
+    after = laptop.overview(0)
+    assert (after["current"], after["pending"]) == (before["current"], None)
+    assert boot_nonce(after) == boot_nonce(before)
+
+
+def test_a_release_that_does_not_run_well_is_taken_back(laptop: Laptop) -> None:
+    before = laptop.overview(0)
+    # Not for a program that is not root's.
+    robot = replace(laptop.robot(0), zenoh_port=22)
+    config = replace(laptop.config, robots={**laptop.config.robots, robot.name: robot})
+    folder = laptop.release(0).folder.with_name("taken-port")
+    folder.mkdir()
+    release = make_release(config, robot, laptop.common, folder)
+    with pytest.raises(RemoteError) as error:
+        asyncio.run(deploy(config, robot, release, silent))
+    assert re.search(
+        rf"{release.id} does not run well .*zenoh.*:22.*the robot runs {before['current']} again",
+        str(error.value),
+    ), error.value
+    after = laptop.overview(0)
+    assert (after["current"], after["pending"]) == (before["current"], None)
+    assert after["last_good"] == before["last_good"]
+    assert after["service"]["fresh"]
+
+
+def test_the_robot_finishes_a_switch_without_the_laptop(laptop: Laptop) -> None:
+    host = laptop.hosts[0]
+    release = laptop.release(0, laptop.changed())
+
+    def cut_at_the_switch(step: str, _: float | None) -> None:
+        if step == "health":
+            host.cut()
+
+    with pytest.raises(UnreachableError):
+        laptop.deploy(0, release, cut_at_the_switch)
+    host.heal()
+    await_true(lambda: not holders(laptop, 0))
+    after = laptop.overview(0)
+    assert (after["current"], after["pending"]) == (release.id, None)
+    assert after["service"]["fresh"]
+
+
+def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop) -> None:
+    host = laptop.hosts[0]
+    former = laptop.overview(0)["current"]
+    release = laptop.release(0, laptop.changed())
+
+    def lose_power_at_the_switch(step: str, _: float | None) -> None:
+        if step == "health":
+            host.power_off()
+
+    with pytest.raises(UnreachableError):
+        laptop.deploy(0, release, lose_power_at_the_switch)
+    host.power_on()
+    pending = laptop.overview(0)["pending"]
+    assert pending == {"release": release.id, "former": former}
+    assert laptop.deploy(0, release).summary == "unchanged"
+    after = laptop.overview(0)
+    assert (after["current"], after["last_good"], after["pending"]) == (release.id, former, None)
+
+
+@pytest.mark.parametrize("program", ["runs", "stopped"])
+def test_an_armed_robot_refuses(laptop: Laptop, program: str) -> None:
+    host, robot = laptop.hosts[1], laptop.robot(1)
+    laptop.call(1, "start", directory=laptop.config.directory)
+    if program == "stopped":
+        laptop.call(1, "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=False)
+    before = laptop.overview(1)
+    arm(host, True)
+    try:
+        if program == "runs":
+            await_true(lambda: laptop.overview(1)["service"]["status"]["armed"] is True)
+        with pytest.raises(RemoteError, match="the vehicle is armed: deploying is refused"):
+            laptop.deploy(1, laptop.release(1, laptop.changed()))
+        with pytest.raises(RemoteError, match="the vehicle is armed: stopping is refused"):
+            laptop.call(1, "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=False)
+        after = laptop.overview(1)
+        assert after["current"] == before["current"]
+        if program == "runs":
+            assert boot_nonce(after) == boot_nonce(before)
+            laptop.call(1, "stop", mavlink_port=robot.mavlink_port, in_flight=True, disable=False)
+            assert laptop.overview(1)["service"]["active"] == "inactive"
+    finally:
+        arm(host, False)
+    laptop.call(1, "start", directory=laptop.config.directory)
+
+
+def arm(host: RobotHost, armed: bool) -> None:
+    with host.stepped:
+        host.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0  # never by itself
+        if armed:
+            host.vehicle.arm(force=True)
+        else:
+            host.vehicle.disarm(force=True)
+
+
+def test_of_two_operators_the_second_waits(laptop: Laptop) -> None:
+    async def both() -> None:
+        async with connect(laptop.config, laptop.robot(0)) as session:
+            await session.call("lock", directory=laptop.config.directory, who="alice@field")
+            with pytest.raises(RemoteError, match="alice@field is changing this robot"):
+                await deploy(laptop.config, laptop.robot(0), laptop.release(0), silent)
+
+    asyncio.run(both())
+    assert laptop.deploy(0).summary in ("unchanged", "runs")
+
+
+def test_a_robot_with_another_host_key_gets_nothing(laptop: Laptop) -> None:
+    known = laptop.hosts.known_hosts
+    right = known.read_text()
+    first, second = right.splitlines()[:2]
+    known.write_text(f"{first.split(' ', 1)[0]} {second.split(' ', 1)[1]}\n")
+    try:
+        with pytest.raises(UnreachableError, match="its host key is not the known one"):
+            laptop.deploy(0)
+        known.write_text("")
+        with pytest.raises(UnreachableError, match="its host key is not known"):
+            laptop.deploy(0)
+    finally:
+        known.write_text(right)
+
+
+def test_another_robot_at_the_address_gets_nothing(laptop: Laptop) -> None:
+    stranger = replace(laptop.robot(0), host=laptop.robot(1).host)
+    config = replace(laptop.config, robots={**laptop.config.robots, stranger.name: stranger})
+    with pytest.raises(RemoteError, match="answers r2"):
+        asyncio.run(deploy(config, stranger, laptop.release(0), silent))
+
+
+def test_old_releases_are_pruned(laptop: Laptop) -> None:
+    for _ in range(3):
+        laptop.deploy(0, laptop.release(0, laptop.changed()))
+    now = laptop.overview(0)
+    assert len(now["releases"]) == 3
+    assert {now["current"], now["last_good"]} <= set(now["releases"])
+    assert np.isfinite(now["unix_time_s"])

@@ -1,0 +1,521 @@
+"""What keeps robots from flying is found and named with its fix: on real robot computers, and from
+facts that those here cannot have."""
+
+import asyncio
+import contextlib
+import copy
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import cli.field  # noqa: F401 registers its commands
+from cli.fleet import app
+from fleet.config import FleetConfig, RobotHost, load_fleet
+from fleet.deploy import deploy
+from fleet.doctor import (
+    Check,
+    ClockOffset,
+    Diagnosis,
+    Examination,
+    diagnose,
+    examine,
+    judge,
+)
+from fleet.laptop import examine_laptop, iptables_blocks, nft_blocks, rsync_version
+from fleet.operations import Outcome, for_each
+from fleet.release import load_common, make_release
+from fleet.up import bring_up, decide
+from sim.hosts import RobotHost as Host
+from sim.hosts import RobotHosts
+
+ROOT = Path(__file__).parents[2]
+
+
+def silent(_: str, __: float | None) -> None:
+    """Nobody watches."""
+
+
+# On robot computers
+
+
+@pytest.fixture(scope="module")
+def enrolled(hosts: RobotHosts) -> Iterator[RobotHosts]:
+    """With new disks, and their identity; nothing else is done to them."""
+    for host in hosts:
+        host.reset()
+        identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
+        (host.root / "etc/lpac").mkdir()
+        (host.root / "etc/lpac/robot.json").write_text(json.dumps(identity))
+    yield hosts
+    for host in hosts:
+        host.reset()
+
+
+@contextlib.contextmanager
+def deaf(one: Host, other: Host) -> Iterator[None]:
+    """Nothing passes from one to the other, though both have the network."""
+    script = 'ip -n "$1" route "$2" blackhole "$3"/32'
+    one._rack.sh(script, one.name, "add", other.address)
+    try:
+        yield
+    finally:
+        one._rack.sh(script, one.name, "delete", other.address)
+
+
+def run_doctor(
+    hosts: RobotHosts, robots: str = "r1,r2,r3", **clock: Any
+) -> dict[str, dict[str, Check]]:
+    config = load_fleet(hosts.fleet_toml)
+    chosen = [config.robots[name] for name in robots.split(",")]
+
+    async def one(robot: RobotHost) -> Examination:
+        others = [other for other in chosen if other is not robot]
+        return await examine(config, robot, others, silent, **clock)
+
+    outcomes: list[Outcome[Examination]] = asyncio.run(for_each(chosen, one))
+    return {
+        diagnosis.robot: {check.name: check for check in diagnosis.checks}
+        for diagnosis in diagnose(config, outcomes)
+    }
+
+
+def test_a_stock_robot_is_told_what_it_lacks(enrolled: RobotHosts) -> None:
+    for checks in run_doctor(enrolled).values():
+        verdicts = {check.name: check.verdict for check in checks.values()}
+        assert {name for name, verdict in verdicts.items() if verdict == "FAILED"} == {
+            "release",
+            "vision-hub",
+        }
+        assert 'offboard_mode is "figure_eight"' in checks["vision-hub"].found
+        assert checks["vision-hub"].fix.startswith("lpac fleet enroll r")
+        assert checks["release"].fix.startswith("lpac fleet deploy --robots r")
+        for name in ("enrolled", "system", "clock", "memory", "radio", "mavlink", "commanders"):
+            assert verdicts[name] == "ok", checks[name]
+
+
+def test_a_full_disk_and_a_cut_radio_link(enrolled: RobotHosts) -> None:
+    r1, r2, r3, _ = enrolled
+    r1.fill_disk()
+    try:
+        with deaf(r2, r3):
+            found = run_doctor(enrolled)
+    finally:
+        r1.free_disk()
+    assert found["r1"]["disk"].verdict == "FAILED"
+    assert found["r2"]["disk"].verdict != "FAILED"
+    assert found["r1"]["radio"].verdict == "ok"
+    assert found["r2"]["radio"].verdict == "FAILED"
+    assert found["r2"]["radio"].found == "no answer from r3"
+
+
+def test_a_robot_that_is_off_is_its_own_fault_alone(enrolled: RobotHosts) -> None:
+    enrolled[1].cut()
+    try:
+        found = run_doctor(enrolled)
+    finally:
+        enrolled[1].heal()
+    assert list(found["r2"]) == ["reach"]
+    assert found["r2"]["reach"].verdict == "FAILED"
+    assert "off, or out of reach" in found["r2"]["reach"].found
+    assert found["r1"]["radio"].verdict == found["r3"]["radio"].verdict == "ok"
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "verdict"), [(3600.0, "FAILED"), (-0.3, "warning"), (0.0, "ok")]
+)
+def test_a_wrong_clock(enrolled: RobotHosts, ahead_s: float, verdict: str) -> None:
+    # The robots' clock is this machine's: it is the laptop's that is wrong.
+    checks = run_doctor(enrolled, "r1", unix_time_s=lambda: time.time() - ahead_s)["r1"]
+    assert checks["clock"].verdict == verdict
+    assert checks["clock"].fix == ("" if verdict == "ok" else "lpac fleet up")
+
+
+def test_another_vehicle_and_one_that_is_silent(enrolled: RobotHosts) -> None:
+    text = enrolled.fleet_toml.read_text()
+    changed = text.replace("robot_id = 1\n", "robot_id = 1\nsystem_id = 99\n")
+    changed = changed.replace(
+        "robot_id = 2\n", 'robot_id = 2\nmavlink_url = "udpin://127.0.0.1:14999"\n'
+    )
+    enrolled.fleet_toml.write_text(changed)
+    try:
+        found = run_doctor(enrolled, "r1,r2")
+    finally:
+        enrolled.fleet_toml.write_text(text)
+    assert "system id 1, configured is 99" in found["r1"]["mavlink"].found
+    assert "no heartbeat of PX4 at UDP port 14999" in found["r2"]["mavlink"].found
+    assert "14551, configured is 14999" in found["r2"]["vision-hub"].found
+
+
+def test_doctor_prints_a_board_and_fails(enrolled: RobotHosts) -> None:
+    asked = ["doctor", "--fleet", str(enrolled.fleet_toml), "--robots", "r1,r3"]
+    shown = CliRunner().invoke(app, asked, env={"COLUMNS": "200"})
+    assert str(shown.exception) == "4 checks failed, on r1, r3"
+    assert "vision-hub FAILED FAILED" in " ".join(shown.stdout.split())
+    assert "→ lpac fleet deploy --robots r1" in shown.stdout
+    asked.append("--json")
+    robots = json.loads(CliRunner().invoke(app, asked).stdout)["robots"]
+    assert list(robots) == ["r1", "r3"]
+    assert not robots["r1"]["ok"]
+    assert {"name": "radio", "verdict": "ok"}.items() <= robots["r1"]["checks"][9].items()
+
+
+def test_ping_has_every_way(enrolled: RobotHosts) -> None:
+    asked = ["ping", "--fleet", str(enrolled.fleet_toml), "--json"]
+    shown = CliRunner().invoke(app, asked)
+    assert shown.exit_code == 0
+    robots = json.loads(shown.stdout)["robots"]
+    for name, found in robots.items():
+        assert found["laptop_ms"] > 0.0
+        assert set(found["others"]) == set(robots) - {name}
+        assert all(way["loss"] == 0.0 for way in found["others"].values())
+    with deaf(enrolled[0], enrolled[2]):
+        shown = CliRunner().invoke(app, asked[:-1])
+    assert str(shown.exception) == "no answer: r1 → r3, r3 → r1"
+    assert "lost" in shown.stdout
+
+
+def test_up_says_no_go_with_the_reasons(enrolled: RobotHosts) -> None:
+    enrolled[2].cut()
+    try:
+        asked = ["up", "--fleet", str(enrolled.fleet_toml), "--timeout", "3", "--json"]
+        shown = CliRunner().invoke(app, asked)
+    finally:
+        enrolled[2].heal()
+    assert str(shown.exception) == "NO-GO: r1, r2, r3"
+    robots = json.loads(shown.stdout)["robots"]
+    # The spare is not waited for.
+    assert list(robots) == ["r1", "r2", "r3"]
+    assert "release: there is none" in robots["r1"]["reasons"]
+    assert robots["r3"]["reasons"] == ["up: it does not answer: it is off, or out of reach"]
+
+
+def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: RobotHosts) -> None:
+    config = load_fleet(enrolled.fleet_toml)
+    robot = config.robots["r1"]
+    waits: list[str] = []
+
+    def report(step: str, _: float | None) -> None:
+        if step.startswith("waits"):
+            waits.append(step)
+            enrolled[0].heal()
+
+    enrolled[0].cut()
+    arrival = asyncio.run(bring_up(config, robot, time.monotonic() + 60.0, report))
+    assert waits
+    assert arrival == ((), ())
+
+
+def test_a_clock_that_cannot_be_set_is_no_go(enrolled: RobotHosts) -> None:
+    """A container may not set the clock of the machine that it runs on."""
+    config = load_fleet(enrolled.fleet_toml)
+    arrival = asyncio.run(
+        bring_up(config, config.robots["r1"], time.monotonic(), silent, lambda: time.time() + 100.0)
+    )
+    assert len(arrival.problems) == 1
+    assert arrival.problems[0].startswith("its clock cannot be set")
+
+
+def test_up_starts_what_was_switched_off_and_says_go(enrolled: RobotHosts, tmp_path: Path) -> None:
+    host = enrolled[0]
+    config = load_fleet(enrolled.fleet_toml)
+    robot = config.robots[host.name]
+    release = make_release(config, robot, load_common(config), tmp_path)
+    asyncio.run(deploy(config, robot, release, silent))
+    hub = host.root / "etc/modalai/voxl-vision-hub.conf"
+    hub.write_text(hub.read_text().replace("figure_eight", "off"))
+    asked = ["--fleet", str(enrolled.fleet_toml), "--robots", host.name, "--json"]
+
+    # The program is stopped, but meant to run: as after a start that failed.
+    host.run("systemctl stop lpac-robot")
+    checks = run_doctor(enrolled, host.name)[host.name]
+    assert checks["program"].found == "it is inactive (success)"
+    # Its release has looked at PX4's parameters, and set them.
+    assert checks["failsafe"].verdict == checks["preflight"].verdict == "ok"
+
+    shown = CliRunner().invoke(app, ["up", *asked])
+    found = json.loads(shown.stdout)["robots"][host.name]
+    assert shown.exit_code == 0, found["reasons"]
+    assert found["go"]
+    assert found["checks"][0]["found"] == "its program was started"
+
+    # One that was stopped on purpose stays so.
+    host.run("systemctl disable --now lpac-robot")
+    assert asyncio.run(bring_up(config, robot, time.monotonic(), silent)) == ((), ())
+    assert host.run("systemctl is-active lpac-robot || true") == "inactive\n"
+
+
+def test_no_clock_is_set_under_an_armed_vehicle(enrolled: RobotHosts) -> None:
+    config = load_fleet(enrolled.fleet_toml)
+    host = enrolled[1]
+    with host.stepped:
+        host.vehicle.arm(force=True)
+    try:
+        arrival = asyncio.run(
+            bring_up(
+                config, config.robots["r2"], time.monotonic(), silent, lambda: time.time() + 100.0
+            )
+        )
+    finally:
+        with host.stepped:
+            host.vehicle.disarm(force=True)
+    assert arrival.problems == (
+        "the vehicle is armed: setting the clock is refused until it is disarmed",
+    )
+
+
+# From facts
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> FleetConfig:
+    """The example's three robots and a spare."""
+    text = (ROOT / "docs" / "fleet.toml").read_text()
+    path = tmp_path / "fleet.toml"
+    path.write_text(text.replace("# predecessors = []", 'predecessors = ["old_ros"]'))
+    return load_fleet(path)
+
+
+PING = {"loss": 0.0, "mean_ms": 3.0, "max_ms": 9.0}
+
+
+def well(config: FleetConfig, name: str) -> Examination:
+    """A robot that may fly."""
+    robot = config.robots[name]
+    status = {
+        "state": "idle", "autopilot": True, "system_id": robot.system_id, "peers": 2,
+        "failed_checks": [
+            "ground was not heard: start `lpac ground`, check the radio and the fleet's name",
+            "mission origin is not set: set it on the ground",
+            "place in the fence is not known: it needs the position and the mission origin",
+            "autopilot does not have the fence: wait for the upload, or check the link",
+        ],
+    }  # fmt: skip
+    runs = {"there": True, "active": True, "enabled": True}
+    idle = {"there": False, "active": False, "enabled": False}
+    facts = {
+        "identity": {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id},
+        "current": "0123456789abcdef", "pending": None,
+        "versions": {"image": "i1", "bundle": "b1", "world": "w1"},
+        "service": {
+            "active": "active", "result": "success", "fresh": True, "enabled": True,
+            "restarts": 0, "status": status,
+        },
+        "heartbeat": None, "kernel": "4.19.125", "systemd": 237, "python": "3.6.9",
+        "rsync": True, "sdk": "1.4.1", "px4": "1.14.0-2.0.94",
+        "disks": [{"path": "/opt", "free_bytes": 20e9, "total_bytes": 60e9}],
+        "memory": {"total_bytes": 8e9, "available_bytes": 6e9},
+        "cpus": 8, "load": 1.5, "hottest_c": 61.0, "synchronized": False,
+        "wifi": [{
+            "name": "wlan0", "connected": True, "network": "field", "signal_dbm": -52.0,
+            "rate_mbit_s": 200.0, "frequency_mhz": 5180.0, "power_save": False,
+        }],
+        "vision_hub": {
+            "en_localhost_mavlink_udp": True, "localhost_udp_port_number": None,
+            "offboard_mode": "off",
+        },
+        "units": {
+            "voxl-px4": {**runs}, "voxl-mavlink-server": {**runs}, "voxl-vision-hub": {**runs},
+            "voxl-microdds-agent": {**idle}, "old_ros": {**idle},
+        },
+        "containers": [],
+    }  # fmt: skip
+    pings = {other: PING for other in ("r1", "r2", "r3") if other != name}
+    return Examination(facts, ClockOffset(0.001, 0.01), "its program says so itself", pings)
+
+
+def judged(config: FleetConfig, change: Any = lambda _: None) -> dict[str, Check]:
+    """The checks of r1, with its facts changed."""
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    facts: dict[str, Any] = copy.deepcopy(dict(fleet["r1"].facts))
+    change(facts)
+    fleet["r1"] = fleet["r1"]._replace(facts=facts)
+    return {check.name: check for check in judge(config, config.robots["r1"], fleet)}
+
+
+def put(path: str, value: object) -> Any:
+    def change(facts: dict[str, Any]) -> None:
+        *parents, last = path.split(".")
+        for parent in parents:
+            facts = facts[parent]
+        facts[last] = value
+
+    return change
+
+
+def test_a_robot_that_is_well_may_fly(config: FleetConfig) -> None:
+    checks = judged(config)
+    assert {check.verdict for check in checks.values()} == {"ok"}
+    assert decide(Diagnosis("r1", tuple(checks.values()))) == ("r1", True, ())
+
+
+def container(**about: object) -> list[dict[str, object]]:
+    plain = {"name": "box", "image": "busybox", "running": True, "restarts": "no",
+             "host_network": False, "devices": False}  # fmt: skip
+    return [plain | about]
+
+
+@pytest.mark.parametrize(
+    ("change", "check", "verdict", "found"),
+    [
+        (put("identity", None), "enrolled", "FAILED", "never enrolled"),
+        (put("identity.robot", "r2"), "enrolled", "FAILED", "answers r2 of fleet demo"),
+        (put("pending", {"release": "a"}), "release", "FAILED", "interrupted"),
+        (put("versions.bundle", "b2"), "release", "FAILED", "that of r2, r3"),
+        (put("service.active", "failed"), "program", "FAILED", "it is failed"),
+        (put("service.fresh", False), "program", "FAILED", "says nothing"),
+        (put("service.restarts", 2), "program", "warning", "restarted 2 times"),
+        (put("service.enabled", False), "program", "warning", "battery swap"),
+        (put("service.status.peers", 1), "program", "warning", "1 of the 2"),
+        (put("systemd", 229), "system", "FAILED", "systemd 229"),
+        (put("python", "3.5.2"), "system", "FAILED", "Python 3.5.2"),
+        (put("kernel", "4.9.1"), "system", "warning", "4.9.1"),
+        (put("rsync", False), "system", "FAILED", "rsync is missing"),
+        (put("hottest_c", 80.0), "processor", "warning", "80 °C"),
+        (put("hottest_c", 91.0), "processor", "FAILED", "91 °C"),
+        (put("memory.available_bytes", 1e8), "memory", "FAILED", "100 of 8000 MB"),
+        (put("wifi", []), "wifi", "skipped", "no wireless interface"),
+        (put("px4", "1.12.3-0.1"), "px4", "FAILED", "older than 1.14"),
+        (put("units.voxl-px4.active", False), "px4", "FAILED", "voxl-px4 does not run"),
+        (put("vision_hub", None), "vision-hub", "skipped", "no voxl-vision-hub"),
+        (put("vision_hub", {"problem": "it is no JSON"}), "vision-hub", "FAILED", "no JSON"),
+        (put("vision_hub.en_localhost_mavlink_udp", False), "vision-hub", "FAILED", "not true"),
+        (
+            put("units.voxl-microdds-agent.active", True),
+            "commanders", "FAILED", "voxl-microdds-agent runs",
+        ),
+        (put("units.old_ros.enabled", True), "commanders", "FAILED", "starts at the next boot"),
+        (put("containers", None), "containers", "warning", "does not answer"),
+        (put("containers", container()), "containers", "ok", "1 run"),
+        (put("containers", container(host_network=True)), "containers", "FAILED", "box (host"),
+        (put("containers", container(devices=True)), "containers", "FAILED", "access to devices"),
+        (put("containers", container(image="me/ros:1")), "containers", "FAILED", "image me/ros"),
+        (
+            put("containers", container(name="old_ros", running=False, restarts="always")),
+            "containers", "FAILED", "(a predecessor) comes back by itself",
+        ),
+        (
+            put("containers", container(name="old_ros", running=False)),
+            "containers", "ok", "0 run",
+        ),
+        (
+            put("service.status.failed_checks", ["autopilot's COM_OBL_RC_ACT = 0; wanted is 4"]),
+            "failsafe", "FAILED", "COM_OBL_RC_ACT = 0",
+        ),
+        (
+            put("service.status.failed_checks", ["checks are still running"]),
+            "failsafe", "warning", "not read",
+        ),
+        (
+            put("service.status.failed_checks", ["GPS has no 3-D fix: wait, or move to open sky"]),
+            "preflight", "warning", "3-D fix",
+        ),
+        (
+            put("service.status.failed_checks", ["battery has 40 %, must have 50 %: charge it"]),
+            "preflight", "FAILED", "battery has 40 %",
+        ),
+        (
+            put("service.status.failed_checks", ["GPS is poor: wait"] * 8),
+            "failsafe", "warning", "there may be more",
+        ),
+    ],
+)  # fmt: skip
+def test_each_fault_is_named_with_its_fix(
+    config: FleetConfig, change: Any, check: str, verdict: str, found: str
+) -> None:
+    one = judged(config, change)[check]
+    assert one.verdict == verdict
+    assert found in one.found
+    assert bool(one.fix) == (verdict in ("FAILED", "warning"))
+
+
+@pytest.mark.parametrize(
+    ("about", "found"),
+    [({"power_save": True}, "power save on"), ({"signal_dbm": -80.0}, "-80 dBm, 200 Mbit/s: weak"),
+     ({"connected": False}, "wlan0 is not connected")],
+)  # fmt: skip
+def test_a_poor_radio(config: FleetConfig, about: dict[str, object], found: str) -> None:
+    wifi = [well(config, "r1").facts["wifi"][0] | about]
+    check = judged(config, put("wifi", wifi))["wifi"]
+    assert check.verdict == "warning"
+    assert found in check.found
+
+
+def test_what_a_stopped_robots_release_says_counts(config: FleetConfig) -> None:
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    facts: dict[str, Any] = copy.deepcopy(dict(fleet["r1"].facts))
+    facts["service"] |= {"active": "inactive", "fresh": False, "status": None}
+    facts["heartbeat"] = {"system_id": 1, "autopilot": 12, "armed": False}
+    vehicle = {"explanations": [], "changes": [], "failed": [
+        "ground was not heard: start it",
+        "autopilot's EKF2_HGT_REF = 3 (vision); wanted is 1 (GPS)",
+        "heading is not known: check the compass",
+    ]}  # fmt: skip
+    fleet["r1"] = fleet["r1"]._replace(facts=facts, vehicle=vehicle)
+    checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
+    assert checks["mavlink"].verdict == "ok"
+    assert checks["failsafe"].verdict == "FAILED"
+    assert "EKF2_HGT_REF = 3" in checks["failsafe"].found
+    assert checks["preflight"].verdict == "warning"
+    assert checks["preflight"].found == "heading is not known: check the compass"
+
+
+# The laptop
+
+
+def test_the_laptop_is_looked_at_and_named(config: FleetConfig) -> None:
+    checks = examine_laptop(config)
+    assert [check.name for check in checks] == ["tools", "keys", "sleep", "clock", "firewall"]
+    assert checks[0].verdict == "ok"
+
+
+def test_rsync_version() -> None:
+    assert rsync_version("rsync  version 3.1.2  protocol version 31\n") == (3, 1)
+    assert rsync_version("rsync  version v3.4.1  protocol version 32\n") == (3, 4)
+    assert rsync_version("openrsync: protocol version 29\n") is None
+
+
+UFW = """-P INPUT DROP
+-P FORWARD DROP
+-P OUTPUT ACCEPT
+-N ufw-user-input
+-A INPUT -i lo -j ACCEPT
+-A INPUT -m conntrack --ctstate RELATED,ESTABLISHED -j ACCEPT
+-A INPUT -j ufw-user-input
+-A ufw-user-input -p tcp -m tcp --dport 22 -j ACCEPT
+"""
+
+
+def test_iptables_rules() -> None:
+    assert iptables_blocks(UFW, [7447]) == ["input"]
+    opened = UFW + "-A ufw-user-input -p tcp -m multiport --dports 80,7000:7999 -j ACCEPT\n"
+    assert iptables_blocks(opened, [7447]) == []
+    assert iptables_blocks("-P INPUT ACCEPT\n-P OUTPUT ACCEPT\n", [7447]) == []
+    assert iptables_blocks(
+        "-P OUTPUT ACCEPT\n-A OUTPUT -p tcp --dport 7447 -j REJECT\n", [7447]
+    ) == ["output"]
+
+
+def test_nft_rules() -> None:
+    place = {"family": "inet", "table": "filter"}
+    base = place | {"name": "input", "hook": "input", "policy": "drop"}
+
+    def rule(*expressions: dict[str, Any]) -> dict[str, Any]:
+        return {"rule": place | {"chain": "input", "expr": list(expressions)}}
+
+    def to_port(right: Any) -> dict[str, Any]:
+        left = {"payload": {"protocol": "tcp", "field": "dport"}}
+        return {"match": {"op": "==", "left": left, "right": right}}
+
+    established = {"match": {"op": "in", "left": {"ct": {"key": "state"}}, "right": "established"}}
+    accept = {"accept": None}
+    closed = [{"chain": base}, rule(established, accept), rule(to_port(22), accept)]
+    assert nft_blocks({"nftables": closed}, [7447]) == ["input"]
+    for right in (7447, {"set": [22, 7447]}, {"set": [{"range": [7000, 8000]}]}):
+        opened = [*closed, rule(to_port(right), accept)]
+        assert nft_blocks({"nftables": opened}, [7447]) == []
+    assert nft_blocks({"nftables": []}, [7447]) == []

@@ -1,0 +1,146 @@
+"""What runs on the robot, as far as it needs no robot: releases in a folder, heartbeats."""
+
+import ast
+import hashlib
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common
+
+from fleet.on_robot import releases, service
+from fleet.on_robot.calls import Refused
+from fleet.release import _entry
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "fleet" / "on_robot").glob("*.py")), ids=lambda path: path.name
+)
+def test_the_robots_python_3_6_can_read_it(path: Path) -> None:
+    ast.parse(path.read_text(), feature_version=(3, 6))
+
+
+def make(folder: Path, files: dict[str, str]) -> str:
+    """A folder with a manifest; the release's id."""
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    (folder / "link").symlink_to("somewhere")
+    entries = {
+        str(path.relative_to(folder)): _entry(path, path.lstat())
+        for path in folder.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+    data = json.dumps({"files": entries}).encode()
+    (folder / "manifest.json").write_bytes(data)
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def test_a_release_is_taken_in_only_if_every_file_is_what_the_manifest_says(
+    tmp_path: Path,
+) -> None:
+    release = make(tmp_path, {"root/usr/bin/lpac": "run", "robot.toml": "a = 1"})
+    releases._check(str(tmp_path), release)
+
+    def refused(match: str) -> None:
+        with pytest.raises(Refused, match=match):
+            releases._check(str(tmp_path), release)
+
+    (tmp_path / "robot.toml").write_text("a = 2")
+    refused("robot.toml has not come whole")
+    (tmp_path / "robot.toml").write_text("a = 1")
+    (tmp_path / "robot.toml").chmod(0o777)
+    refused("robot.toml has not come whole")
+    (tmp_path / "robot.toml").unlink()
+    refused("robot.toml has not come")
+    (tmp_path / "robot.toml").write_text("a = 1")
+    (tmp_path / "robot.toml").chmod(0o644)
+    (tmp_path / "more").write_text("")
+    refused("more has not come whole")
+    (tmp_path / "more").unlink()
+    (tmp_path / "link").unlink()
+    (tmp_path / "link").symlink_to("elsewhere")
+    refused("link has not come whole")
+    (tmp_path / "manifest.json").write_text("{}")
+    refused("the manifest that came is not the release's")
+
+
+@given(
+    count=st.integers(1, 7),
+    current=st.integers(0, 6),
+    last_good=st.integers(0, 6),
+    new=st.integers(0, 6),
+)
+def test_pruning_never_removes_what_runs_nor_what_a_rollback_needs(
+    tmp_path_factory: pytest.TempPathFactory, count: int, current: int, last_good: int, new: int
+) -> None:
+    folder = tmp_path_factory.mktemp("robot")
+    for i in range(count):
+        (folder / "releases" / f"r{i}" / "root").mkdir(parents=True)
+    kept = {f"r{i % count}" for i in (current, last_good, new)}
+    releases._link(str(folder), "current", f"r{current % count}")
+    releases._link(str(folder), "last-good", f"r{last_good % count}")
+    releases._prune(str(folder), {f"r{new % count}"})
+    left = {path.name for path in (folder / "releases").iterdir()}
+    assert kept <= left
+    assert len(left) == min(count, max(3, len(kept)))
+
+
+@pytest.fixture
+def datagrams() -> Iterator[tuple[int, socket.socket]]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", 0))
+        port = udp.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        yield port, sender
+
+
+@pytest.mark.parametrize("armed", [False, True])
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_autopilots_heartbeat_tells_whether_it_is_armed(
+    datagrams: tuple[int, socket.socket], *, armed: bool, version: int
+) -> None:
+    port, sender = datagrams
+    mavlink = common.MAVLink(None, srcSystem=11, srcComponent=1)
+    camera = common.MAVLink(None, srcSystem=11, srcComponent=100)
+    messages = (
+        camera.heartbeat_encode(30, 8, 128, 0, 4).pack(camera, force_mavlink1=version == 1)
+        + mavlink.attitude_encode(1, 0, 0, 0, 0, 0, 0).pack(mavlink, force_mavlink1=version == 1)
+        + mavlink.heartbeat_encode(2, 12, 128 if armed else 0, 0, 0).pack(
+            mavlink, force_mavlink1=version == 1
+        )
+    )
+    stop = threading.Event()
+
+    def send() -> None:
+        while not stop.wait(0.05):
+            sender.sendto(b"no MAVLink", ("127.0.0.1", port))
+            sender.sendto(messages, ("127.0.0.1", port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        heard = service.hear_heartbeat(port)
+    finally:
+        stop.set()
+        thread.join()
+    assert heard == {"system_id": 11, "autopilot": 12, "armed": armed}
+
+
+@given(st.binary(max_size=300))
+def test_no_datagram_breaks_the_listener(data: bytes) -> None:
+    service._heartbeat(data)
+    service._heartbeat(b"\xfd" + data)
+    service._heartbeat(b"\xfe" + data)
+
+
+def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
+    assert service.hear_heartbeat(datagrams[0], wait_s=0.2) is None

@@ -1,0 +1,127 @@
+"""`lpac fleet swap` between real robot computers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fleet.config import assign, load_fleet
+from sim.hosts import RobotHost, RobotHosts
+from tests.fleet.field import lpac_fleet, name_robot
+
+
+@pytest.fixture(scope="module")
+def deployed(hosts: RobotHosts) -> Iterator[RobotHosts]:
+    """r3 flies, r4 is a spare; both have the release."""
+    for host in hosts[2:]:
+        host.reset()
+        name_robot(hosts, host)
+    done = lpac_fleet(hosts.fleet_toml, "deploy", "--robots", "r3,r4")
+    assert done.returncode == 0, done.stderr
+    yield hosts
+    for host in hosts[2:]:
+        host.reset()
+
+
+@pytest.fixture
+def fleet_file(deployed: RobotHosts, tmp_path: Path) -> Path:
+    """As it was at first, in a folder of its own."""
+    for name in ("ssh_config", "world.env"):
+        (tmp_path / name).symlink_to(deployed.folder / name)
+    path = tmp_path / "fleet.toml"
+    path.write_text(deployed.fleet_toml.read_text())
+    return path
+
+
+def runs(host: RobotHost) -> tuple[str, str]:
+    """Whether the program runs, and whether it starts at boot."""
+    return tuple(  # type: ignore[return-value]
+        host.run(f"systemctl {ask} lpac-robot || true").strip()
+        for ask in ("is-active", "is-enabled")
+    )
+
+
+def test_nothing_is_touched_where_there_is_nothing_to_swap(
+    hosts: RobotHosts, fleet_file: Path
+) -> None:
+    for failed, spare, why in (
+        ("r3", "r2", "r2 is no spare: it has slots[1]"),
+        ("r4", "r4", "r4 has no slot that r4 could take"),
+        ("r9", "r4", "'r9' is unknown; known are"),
+    ):
+        done = lpac_fleet(fleet_file, "swap", failed, spare)
+        assert done.returncode == 1
+        assert why in done.stderr
+    hosts[3].cut()
+    try:
+        done = lpac_fleet(fleet_file, "swap", "r3", "r4")
+        assert done.returncode == 1
+        assert "it does not answer" in done.stderr
+    finally:
+        hosts[3].heal()
+    assert runs(hosts[2]) == ("active", "enabled")
+    assert fleet_file.read_text() == hosts.fleet_toml.read_text()
+
+
+def test_a_spare_flies_instead_of_a_robot_that_answers(hosts: RobotHosts, fleet_file: Path) -> None:
+    r3, r4 = hosts[2], hosts[3]
+    before = load_fleet(fleet_file).slots[2]
+    with r3.stepped:
+        r3.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0
+        r3.vehicle.arm(force=True)
+    # It counts what the program itself says.
+    text = fleet_file.read_text()
+    r3.run(
+        "for i in $(seq 100); do systemctl show -p StatusText lpac-robot | "
+        "grep -q '\"armed\":true' && exit 0; sleep 0.1; done; exit 1"
+    )
+    done = lpac_fleet(fleet_file, "swap", "r3", "r4")
+    assert done.returncode == 1
+    assert "the vehicle is armed: stopping is refused" in done.stderr
+    assert fleet_file.read_text() == text
+    assert runs(r3) == ("active", "enabled")
+    with r3.stepped:
+        r3.vehicle.disarm(force=True)
+    r3.run(
+        "for i in $(seq 100); do systemctl show -p StatusText lpac-robot | "
+        "grep -q '\"armed\":false' && exit 0; sleep 0.1; done; exit 1"
+    )
+
+    done = lpac_fleet(fleet_file, "swap", "r3", "r4")
+    assert done.returncode == 0, done.stderr
+    assert runs(r3) == ("inactive", "disabled")
+    assert runs(r4) == ("active", "enabled")
+    config = load_fleet(fleet_file)
+    slot = config.slot_of("r4")
+    assert slot is not None
+    assert config.slot_of("r3") is None
+    assert (slot.height, slot.pad_m, slot.landing_point_m) == (
+        before.height, before.pad_m, before.landing_point_m,
+    )  # fmt: skip
+    toml = (r4.root / "opt/lpac/current/robot.toml").read_text()
+    assert f"landing_point_m = {list(before.landing_point_m)}" in toml
+    assert "(0.0 MB sent)" in done.stdout or "(0.1 MB sent)" in done.stdout
+    assert "no other robot needs a deploy" in done.stdout
+
+    done = lpac_fleet(fleet_file, "swap", "r3", "r4")
+    assert done.returncode == 0, done.stderr
+    assert runs(r4) == ("active", "enabled")
+
+    # The robot is repaired.
+    done = lpac_fleet(fleet_file, "swap", "r4", "r3")
+    assert done.returncode == 0, done.stderr
+    assert (runs(r3), runs(r4)) == (("active", "enabled"), ("inactive", "disabled"))
+
+
+def test_an_interrupted_swap_for_a_robot_that_is_off_is_finished(
+    hosts: RobotHosts, fleet_file: Path
+) -> None:
+    r3, r4 = hosts[2], hosts[3]
+    r3.power_off()
+    # Broken off after the file was changed.
+    assign(fleet_file, 2, "r4")
+    done = lpac_fleet(fleet_file, "swap", "r3", "r4")
+    assert done.returncode == 0, done.stderr
+    assert "r3     was not stopped: it does not answer: it is off, or out of reach" in done.stdout
+    assert "both fail their checks and do not take off" in done.stdout
+    assert runs(r4) == ("active", "enabled")
