@@ -87,7 +87,9 @@ def _print_board(diagnoses: "Sequence[Diagnosis]") -> None:
 def _verdict(verdict: str | None) -> "Text":
     if verdict is None:
         return styled("", FAINT)
-    return styled("-" if verdict == "skipped" else verdict, _STYLES[verdict])
+    # Ten robots are to fit into a terminal.
+    short = {"skipped": "-", "warning": "warn"}.get(verdict, verdict)
+    return styled(short, _STYLES[verdict])
 
 
 def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:

@@ -156,10 +156,9 @@ def _slot(config: "FleetConfig", robot: str) -> int | None:
 
 
 def _failed(service: Mapping[str, Any]) -> bool:
-    """It is dead, or waits for its next start after it died."""
-    return service["active"] == "failed" or (
-        service["active"] == "activating" and service["result"] not in ("", "success")
-    )
+    """It is dead, or starts again after it died."""
+    died = service["result"] not in ("", "success") or service["restarts"] > 0
+    return service["active"] == "failed" or (service["active"] == "activating" and died)
 
 
 def _parts(versions: Mapping[str, Any] | None) -> str | None:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
-from fleet.deploy import Report, check_identity
+from fleet.deploy import Report, check_identity, operator
 from fleet.operations import Outcome
-from fleet.session import FleetError, Session, connect
+from fleet.session import FleetError, RemoteError, Session, connect
 
 Verdict = Literal["ok", "skipped", "warning", "FAILED"]
 Facts = Mapping[str, Any]
@@ -152,10 +152,8 @@ async def ping_others(session: Session, others: Sequence[RobotHost]) -> Mapping[
         return await session.call(
             "ping", addresses={other.name: other.address for other in others}, count=_PINGS
         )
-    except FleetError as error:
-        if "missing" in str(error):
-            return str(error)
-        raise
+    except RemoteError as error:
+        return str(error)
 
 
 async def _check_vehicle(
@@ -167,14 +165,17 @@ async def _check_vehicle(
     if facts["current"] is None:
         return "it has no release"
     if facts["service"]["active"] not in ("inactive", "failed"):
-        return "its program says so itself"
+        return "its program runs"
+    if facts["pending"] is not None:
+        return "a switch of releases was interrupted"
     if facts["heartbeat"] is None:
         return "PX4 does not answer"
     if facts["heartbeat"]["armed"]:
         return "the vehicle is armed"
     try:
+        await session.call("lock", directory=config.directory, who=operator())
         return await session.call("vehicle_check", directory=config.directory)
-    except FleetError as error:
+    except RemoteError as error:
         return str(error)
 
 
@@ -475,7 +476,8 @@ def _vision_hub(config: FleetConfig, robot: RobotHost, found: Facts | None) -> C
     faults = []
     mode, port = found["offboard_mode"], found["localhost_udp_port_number"]
     if mode != "off":
-        faults.append(f'offboard_mode is "{mode}": it would fly that itself in offboard mode')
+        stands = "not set" if mode is None else f'"{mode}"'
+        faults.append(f"offboard_mode is {stands}: it flies by itself in offboard mode")
     if found["en_localhost_mavlink_udp"] is not True:
         faults.append("en_localhost_mavlink_udp is not true: PX4 cannot be reached")
     if port not in (None, robot.mavlink_port):

@@ -6,7 +6,8 @@ import platform
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from fleet.config import FleetConfig
@@ -61,8 +62,7 @@ def _keys(config: FleetConfig) -> Check:
     host = robot.host if robot else "robot"
     options = ["-F", config.ssh.config] if config.ssh.config else []
     files = re.findall(r"^identityfile (.+)$", _output("ssh", *options, "-G", host), re.MULTILINE)
-    there = [os.path.expanduser(file) for file in files]  # noqa: PTH111 as ssh writes it
-    there = [file for file in there if os.path.exists(file)]  # noqa: PTH110
+    there = [str(path) for path in map(_expanded, files) if path.exists()]
     if not there:
         return Check("keys", "FAILED", "no agent, no key file", "ssh-keygen -t ed25519")
     free = [file for file in there if _run("ssh-keygen", "-y", "-P", "", "-f", file)[0] == 0]
@@ -70,6 +70,10 @@ def _keys(config: FleetConfig) -> Check:
         return Check("keys", "FAILED", f"{there[0]} has a passphrase, and no agent knows it",
                      f"eval $(ssh-agent); ssh-add {there[0]}")  # fmt: skip
     return Check("keys", "ok", f"{free[0]}, no agent")
+
+
+def _expanded(file: str) -> Path:
+    return Path(file).expanduser()
 
 
 def _sleep() -> Check:
@@ -129,17 +133,16 @@ def _firewall(ports: Sequence[int]) -> Check:
             found = "one is active; only root sees its rules: run this with sudo"
             return Check(name, "warning", found, fix)
         return Check(name, "skipped", "only root sees the rules: run this with sudo")
-    rules = _output("nft", "--json", "list", "ruleset") if shutil.which("nft") else ""
-    try:
-        blocked = nft_blocks(json.loads(rules), ports) if rules else None
-    except ValueError:
-        blocked = None
-    if blocked is None and shutil.which("iptables"):
-        blocked = iptables_blocks(_output("iptables", "-S"), ports)
-    if blocked is None:
-        return Check(name, "skipped", "neither nft nor iptables is here")
+    # Either is empty where the program is not here, or an old one.
+    ruleset, rules = _output("nft", "--json", "list", "ruleset"), _output("iptables", "-S")
+    if not ruleset and not rules:
+        return Check(name, "skipped", "neither nft nor iptables tells its rules")
+    blocked = nft_blocks(json.loads(ruleset), ports) if ruleset else []
+    blocked += iptables_blocks(rules, ports)
     if blocked:
-        return Check(name, "FAILED", f"it blocks {' and '.join(blocked)} of TCP port {many}", fix)
+        return Check(
+            name, "FAILED", f"it blocks {' and '.join(sorted({*blocked}))} of TCP port {many}", fix
+        )
     return Check(name, "ok", f"nothing that blocks TCP port {many} was found")
 
 
@@ -191,17 +194,40 @@ def nft_blocks(ruleset: dict[str, Any], ports: Sequence[int]) -> list[str]:
     """Which of "input" and "output" base chains of `nft --json list ruleset` block TCP ports.
 
     A chain that drops by default counts as blocking unless one of its rules, or one of a chain that
-    it jumps to, names the port or accepts everything.
+    it jumps to, names the port or accepts everything. Tables with rules that only iptables can tell
+    are left to `iptables_blocks`.
     """
     entries = ruleset.get("nftables", [])
     chains = [entry["chain"] for entry in entries if "chain" in entry]
-    rules = [entry["rule"] for entry in entries if "rule" in entry]
+    sets = {
+        f"@{entry['set']['name']}": entry["set"].get("elem", [])
+        for entry in entries
+        if "set" in entry
+    }
+    rules = [_with_sets(entry["rule"], sets) for entry in entries if "rule" in entry]
+    foreign = {_table(rule) for rule in rules if any("xt" in each for each in rule["expr"])}
     blocked = []
     for hook in ("input", "output"):
-        bases = [chain for chain in chains if chain.get("hook") == hook]
+        bases = [c for c in chains if c.get("hook") == hook and _table(c) not in foreign]
         if any(not _nft_accepts(chain, rules, port) for chain in bases for port in ports):
             blocked.append(hook)
     return blocked
+
+
+def _table(part: Mapping[str, Any]) -> tuple[str, str]:
+    return str(part["family"]), str(part["table"])
+
+
+def _with_sets(rule: dict[str, Any], sets: Mapping[str, list[Any]]) -> dict[str, Any]:
+    """The rule with the elements of the sets that it names."""
+    expressions = []
+    for each in rule["expr"]:
+        match = each.get("match")
+        named = match is not None and isinstance(match["right"], str) and match["right"] in sets
+        expressions.append(
+            {"match": match | {"right": {"set": sets[match["right"]]}}} if named else each
+        )
+    return rule | {"expr": expressions}
 
 
 def _nft_accepts(chain: dict[str, Any], rules: Sequence[dict[str, Any]], port: int) -> bool:
@@ -213,12 +239,9 @@ def _nft_verdict(
     family: str, table: str, name: str, rules: Sequence[dict[str, Any]], port: int
 ) -> str | None:
     for rule in rules:
-        if (rule["family"], rule["table"], rule["chain"]) != (family, table, name):
+        if (*_table(rule), rule["chain"]) != (family, table, name):
             continue
         matches = [each["match"] for each in rule["expr"] if "match" in each]
-        # What iptables' own modules ask is not told here.
-        if any("xt" in each for each in rule["expr"]):
-            continue
         if not all(_nft_matches(match, port) for match in matches):
             continue
         for each in rule["expr"]:

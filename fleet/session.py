@@ -17,7 +17,7 @@ from fleet.config import FleetConfig, RobotHost
 
 Say = Callable[[str], None]
 
-_PING_S = 5.0
+_PING_S = 3.0
 # Of one call: the longest is the policy's verification on a slow CPU.
 _CALL_S = 400.0
 # In the order in which they are loaded.
@@ -202,7 +202,7 @@ async def rsync(
     shell = shlex.join(ssh_command(config, robot)[:-1])
     host = f"[{robot.host}]" if ":" in robot.host else robot.host
     paths = [host + path if path.startswith(":") else path for path in (*sources, target)]
-    command = ["rsync", "-rlpt", "--checksum", "--timeout=15",
+    command = ["rsync", "-rlpt", "--checksum", "--timeout=10",
                "--no-inc-recursive", "--info=progress2,stats2",
                "--no-human-readable", "-e", shell, *options]  # fmt: skip
     if sudo:

@@ -23,9 +23,9 @@ WHEELS_LOCK = HERE / "requirements.lock"
 BUILD_LOCK = HERE / "build.lock"
 # Where BuildKit and buildah put the Dockerfile's secret.
 CERTIFICATES = Path("/run/secrets/certificates")
-# Debian's architecture -> the wheels' (manylinux 2.28: glibc of the tree is 2.36).
+# Debian's architecture -> the wheels', and the glibcs of theirs that the tree's (2.36) serves.
 MACHINES = {"arm64": "aarch64", "amd64": "x86_64"}
-MANYLINUX = ("2_28", "2_27", "2_26", "2_24", "2_17", "2014")
+MANYLINUX = ("_2_28", "_2_27", "_2_26", "_2_24", "_2_17", "2014")
 # The tree has one date: two builds are equal, byte by byte.
 EPOCH_S = 0
 
@@ -161,8 +161,7 @@ def read_debian_lock(path: Path, architecture: str) -> dict[str, tuple[str, str]
 
 def _target(architecture: str) -> list[str]:
     machine = MACHINES[architecture]
-    platforms = [f"--platform=manylinux_{glibc}_{machine}" for glibc in MANYLINUX[:-1]]
-    platforms.append(f"--platform=manylinux2014_{machine}")
+    platforms = [f"--platform=manylinux{glibc}_{machine}" for glibc in MANYLINUX]
     return [*platforms, "--python-version=3.11", "--implementation=cp", "--abi=cp311",
             "--abi=abi3", "--abi=none"]  # fmt: skip
 

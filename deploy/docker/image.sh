@@ -54,8 +54,8 @@ with_buildah() {
     fi
     # Older buildahs do not know the Dockerfile's BUILDPLATFORM.
     arguments+=(--build-arg "BUILDPLATFORM=linux/$(buildah info --format '{{.host.arch}}')")
-    buildah build "${arguments[@]}" --isolation chroot --network host --layers --pull=never --timestamp 0 \
-        --ignorefile deploy/docker/Dockerfile.dockerignore --tag "$name" \
+    buildah build "${arguments[@]}" --isolation chroot --network host --layers --pull=never \
+        --timestamp 0 --ignorefile deploy/docker/Dockerfile.dockerignore --tag "$name" \
         --output "type=local,dest=$made/root" .
     buildah push --quiet "$name" "docker-archive:$made/image.tar:$name"
 }

@@ -14,7 +14,7 @@ import traceback
 from typing import Any, Callable, Dict, List, Optional
 
 # The laptop says something every few seconds.
-SILENCE_S = 20.0
+SILENCE_S = 12.0
 
 Call = Callable[..., Dict[str, Any]]
 _CALLS = {}  # type: Dict[str, Call]
@@ -78,8 +78,11 @@ def _answer(request: Dict[str, Any]) -> None:
     function = _CALLS[request["call"]]
     try:
         _send({"result": function(**request["arguments"])})
-    except (Refused, OSError) as error:
+    except Refused as error:
         _send({"error": " ".join(str(error).split())})
+    except OSError as error:
+        where = "%s: " % error.filename if error.filename else ""
+        _send({"error": where + (error.strerror or str(error))})
     except Exception as error:
         # A mistake of ours: the one who reads it needs the place.
         where = traceback.extract_tb(sys.exc_info()[2])[-1]

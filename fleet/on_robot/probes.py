@@ -106,7 +106,9 @@ def vehicle_check(directory: str) -> Dict[str, Any]:
     """What the release itself, while it does not run, says of the vehicle: `lpac robot check`.
 
     With `parameters = "set"` in its configuration it sets PX4's parameters, as it would when run.
+    Needs the lock, so that nobody starts the program meanwhile.
     """
+    releases.require_lock()
     say("reads PX4's parameters")
     if service.service()["active"] not in ("inactive", "failed"):
         raise Refused("its program runs")

@@ -1,5 +1,6 @@
 """The image as `make image` builds it: once for all tests, and only if something in it changed."""
 
+import functools
 import os
 import shutil
 import subprocess
@@ -22,6 +23,7 @@ def build_image() -> BuildImage:
     if missing:
         pytest.skip(f"needs: sudo apt install {' '.join(missing)}")
 
+    @functools.cache
     def build(architecture: str) -> Path:
         command = ["deploy/docker/image.sh", architecture]
         subprocess.run(command, cwd=ROOT, check=True)

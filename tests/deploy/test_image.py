@@ -15,6 +15,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from bench import release
 from fleet.image import measure, package_of, table
 from tests.conftest import ROOT, SHIPPED
 from tests.deploy.conftest import BuildImage, inside
@@ -114,6 +115,15 @@ def test_its_size_is_told(tree: Path) -> None:
     assert {"onnxruntime", "numpy", "zenoh", "mavsdk", "Python"} <= set(text.split())
     with pytest.raises(ValueError, match="run `make image`"):
         measure(tree)
+
+
+def test_the_bench_sets_it_beside_torch(build_image: BuildImage, tmp_path: Path) -> None:
+    report = release.measure(build_image("arm64").parent)
+    size, torch_mb = measure(build_image("arm64").parent), report.figures["torch_wheel_mb"]
+    assert report.figures["compressed_mb"] > size.compressed_bytes / 1e6
+    assert torch_mb is None or len(report.targets) == 1
+    (note,) = release.measure(tmp_path).notes
+    assert "run `make image`" in note
 
 
 def test_packages_are_told_by_their_paths() -> None:

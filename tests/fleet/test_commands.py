@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -143,10 +144,12 @@ def test_a_robot_in_flight_refuses_unless_somebody_insists(
 ) -> None:
     host = operator.hosts[1]
     with host.stepped:
-        host.vehicle.armed = True
+        host.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0  # never by itself
+        host.vehicle.arm(force=True)
     try:
+        until_s = time.monotonic() + 60.0
         while operator.json("status")["r2"]["service"]["status"]["armed"] is not True:
-            pass
+            assert time.monotonic() < until_s
         robots = operator.json(command, "--robots", "r1,r2", exit_code=1)
         assert robots["r1"]["problem"] is None
         assert robots["r2"]["problem"].startswith("the vehicle is armed")
@@ -154,7 +157,7 @@ def test_a_robot_in_flight_refuses_unless_somebody_insists(
         assert operator(command, "--robots", "r2", "--in-flight").returncode == 0
     finally:
         with host.stepped:
-            host.vehicle.armed = False
+            host.vehicle.disarm(force=True)
     assert operator.services()["r2"] == {"stop": "inactive", "restart": "active"}[command]
     operator.json("start")
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnx
 import pytest
 from onnx import numpy_helper
@@ -24,7 +23,8 @@ from fleet.deploy import Deployed, Report, deploy, rollback
 from fleet.operations import Outcome, for_each
 from fleet.release import Common, Release, load_common, make_release
 from fleet.session import FleetError, RemoteError, UnreachableError, connect
-from sim.hosts import RobotHost, RobotHosts
+from sim.host import RobotHost
+from sim.hosts import RobotHosts
 
 ROOT = Path(__file__).parents[2]
 
@@ -301,6 +301,7 @@ def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop)
     assert laptop.deploy(0, release).summary == "unchanged"
     after = laptop.overview(0)
     assert (after["current"], after["last_good"], after["pending"]) == (release.id, former, None)
+    assert len(after["releases"]) <= 3  # of the seven and more that it has had
 
 
 @pytest.mark.parametrize("program", ["runs", "stopped"])
@@ -369,12 +370,3 @@ def test_another_robot_at_the_address_gets_nothing(laptop: Laptop) -> None:
     config = replace(laptop.config, robots={**laptop.config.robots, stranger.name: stranger})
     with pytest.raises(RemoteError, match="answers r2"):
         asyncio.run(deploy(config, stranger, laptop.release(0), silent))
-
-
-def test_old_releases_are_pruned(laptop: Laptop) -> None:
-    for _ in range(3):
-        laptop.deploy(0, laptop.release(0, laptop.changed()))
-    now = laptop.overview(0)
-    assert len(now["releases"]) == 3
-    assert {now["current"], now["last_good"]} <= set(now["releases"])
-    assert np.isfinite(now["unix_time_s"])

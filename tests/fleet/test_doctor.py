@@ -518,4 +518,8 @@ def test_nft_rules() -> None:
     for right in (7447, {"set": [22, 7447]}, {"set": [{"range": [7000, 8000]}]}):
         opened = [*closed, rule(to_port(right), accept)]
         assert nft_blocks({"nftables": opened}, [7447]) == []
+    named = {"set": place | {"name": "open", "elem": [22, {"range": [7440, 7450]}]}}
+    opened = [named, *closed, rule(to_port("@open"), accept)]
+    assert nft_blocks({"nftables": opened}, [7447]) == []
+    assert nft_blocks({"nftables": opened}, [7451]) == ["input"]
     assert nft_blocks({"nftables": []}, [7447]) == []

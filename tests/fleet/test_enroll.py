@@ -16,6 +16,7 @@ PASSWORD = "voxl-password"
 STEPS = (
     "key", "enroll.toml", "robot id", "vision-hub", "predecessors", "release", "PX4",
 )  # fmt: skip
+SO_ALREADY, LEFT = "was so already", "left to do"
 
 # A container engine as far as enrolling uses it: two containers that run; what it is told is kept.
 DOCKER = """\
@@ -104,9 +105,8 @@ def outcomes(text: str) -> dict[str, str]:
     }
 
 
-def test_from_a_password_to_a_robot_of_the_fleet(
-    hosts: RobotHosts, new: RobotHost, fleet_file: Path, tmp_path: Path, person: dict[str, str]
-) -> None:
+def as_a_lab_left_it(new: RobotHost) -> None:
+    """A password, and three programs that may command the vehicle."""
     (new.root / "root/.ssh/authorized_keys").write_text("ssh-ed25519 AAAA another's")
     new.run(f"echo 'root:{PASSWORD}' | chpasswd; echo PermitRootLogin yes >> /etc/ssh/sshd_config")
     new.run("systemctl restart ssh")
@@ -116,6 +116,25 @@ def test_from_a_password_to_a_robot_of_the_fleet(
     new.run(
         "systemctl enable --now old-stack voxl-microdds-agent; systemctl start voxl-mpa-to-ros2"
     )
+
+
+def assert_alone(new: RobotHost, said: str) -> None:
+    """The predecessors do not run any more; what else runs was told."""
+    containers = json.loads((new.root / "var/lib/docker.json").read_text())
+    old, camera = containers["old_stack"], containers["camera"]
+    assert (old["State"]["Running"], old["HostConfig"]["RestartPolicy"]["Name"]) == (False, "no")
+    assert camera["State"]["Running"]
+    assert "container camera (lab/ros2) runs in this host's network" in said
+    assert "unit voxl-mpa-to-ros2 runs" in said
+    for unit in ("old-stack", "voxl-microdds-agent"):
+        state = f"systemctl is-active {unit}; systemctl is-enabled {unit}; true"
+        assert new.run(state).split() == ["inactive", "disabled"]
+
+
+def test_from_a_password_to_a_robot_of_the_fleet(
+    hosts: RobotHosts, new: RobotHost, fleet_file: Path, tmp_path: Path, person: dict[str, str]
+) -> None:
+    as_a_lab_left_it(new)
     comment = "/* made by voxl-configure: 'offboard_mode': // \"x\" */\n"
     hub = new.root / "etc/modalai/voxl-vision-hub.conf"
     original = comment + hub.read_text()
@@ -123,10 +142,21 @@ def test_from_a_password_to_a_robot_of_the_fleet(
     with new.stepped:
         new.vehicle.parameters |= {"EKF2_HGT_REF": 3, "COM_OBL_RC_ACT": 0}
     before = fleet_file.read_text()
+    image = str(load_fleet(fleet_file).image)
+    fleet_file.write_text(before.replace(image, f"{image}-none"))
 
     done = lpac_fleet(fleet_file, "enroll", "r4", new.address, environment=person)
+    assert done.returncode == 1
+    assert done.stderr.endswith("lpac: r4 is not ready: left to do: release, PX4\n")
+    assert "no image is there" in done.stdout
+    first = outcomes(done.stdout)
+    assert first == {**dict.fromkeys(STEPS, "done"), "release": LEFT, "PX4": LEFT}
+    stopped = done.stdout
+    fleet_file.write_text(fleet_file.read_text().replace(f"{image}-none", image))
+    done = lpac_fleet(fleet_file, "enroll", "r4", new.address)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert outcomes(done.stdout) == dict.fromkeys(STEPS, "done")
+    second = outcomes(done.stdout)
+    assert second == {**dict.fromkeys(STEPS, SO_ALREADY), "release": "done", "PX4": "done"}
 
     asked = (tmp_path / "asked").read_text()
     assert asked.count("continue connecting") == asked.count("password") == 1
@@ -145,15 +175,7 @@ def test_from_a_password_to_a_robot_of_the_fleet(
         "offboard_mode": "off",
     }  # fmt: skip
     assert (hub.parent / "voxl-vision-hub.conf.before-lpac").read_text() == original
-    containers = json.loads((new.root / "var/lib/docker.json").read_text())
-    old, camera = containers["old_stack"], containers["camera"]
-    assert (old["State"]["Running"], old["HostConfig"]["RestartPolicy"]["Name"]) == (False, "no")
-    assert camera["State"]["Running"]
-    assert "container camera (lab/ros2) runs in this host's network" in done.stdout
-    assert "unit voxl-mpa-to-ros2 runs" in done.stdout
-    for unit in ("old-stack", "voxl-microdds-agent"):
-        state = f"systemctl is-active {unit}; systemctl is-enabled {unit}; true"
-        assert new.run(state).split() == ["inactive", "disabled"]
+    assert_alone(new, stopped)
     assert new.vehicle.parameters["EKF2_HGT_REF"] == 1
     assert new.vehicle.parameters["COM_OBL_RC_ACT"] == 4
     assert "PX4 was restarted, and answers as system 4" in done.stdout
@@ -162,25 +184,17 @@ def test_from_a_password_to_a_robot_of_the_fleet(
     written = fleet_file.read_text(), hub.stat().st_mtime_ns
     done = lpac_fleet(fleet_file, "enroll", "r4", new.address)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert outcomes(done.stdout) == dict.fromkeys(STEPS, "was so already")
+    assert outcomes(done.stdout) == dict.fromkeys(STEPS, SO_ALREADY)
     assert (fleet_file.read_text(), hub.stat().st_mtime_ns) == written
 
-
-def test_what_cannot_be_done_is_said_and_a_repeat_does_it(
-    hosts: RobotHosts, new: RobotHost, fleet_file: Path, person: dict[str, str]
-) -> None:
-    (new.root / "etc/modalai/voxl-vision-hub.conf").unlink()
-    image = load_fleet(fleet_file).image
-    fleet_file.write_text(fleet_file.read_text().replace(str(image), str(image / "none")))
-    done = lpac_fleet(fleet_file, "enroll", "r4", new.address, environment=person)
-    assert done.returncode == 1
-    assert done.stderr.endswith("lpac: r4 is not ready: left to do: release, PX4\n")
-    assert "no image is there: run `make image`" in done.stdout
-    assert "not a VOXL2" in done.stdout
-    fleet_file.write_text(fleet_file.read_text().replace(str(image / "none"), str(image)))
+    # Another kind of computer, on a desk without its vehicle.
+    hub.unlink()
+    new.stop_vehicle()
     done = lpac_fleet(fleet_file, "enroll", "r4", new.address)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert outcomes(done.stdout)["release"] == outcomes(done.stdout)["PX4"] == "done"
+    assert done.returncode == 1
+    assert "not a VOXL2" in done.stdout
+    assert "no autopilot was heard within 10 s" in done.stdout
+    assert outcomes(done.stdout) == {**dict.fromkeys(STEPS, SO_ALREADY), "PX4": LEFT}
 
 
 def test_a_robot_is_not_renamed_nor_touched_in_flight_nor_let_in_unseen(

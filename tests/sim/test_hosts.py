@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from sim.host import new_key
 from sim.host_base import SUITE, NoHostsError, base_tree
 from sim.host_rack import children
-from sim.hosts import RobotHosts, new_key
+from sim.hosts import RobotHosts
 from tests.conftest import ROOT, SHIPPED
 
 CAP_SYS_TIME = 25
