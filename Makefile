@@ -5,11 +5,11 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup test lint bench export image lock clean
+.PHONY: help demo fly setup test lint bench export image lock deploy start stop status fleet-demo clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
 demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
 	.venv/bin/lpac demo --out out/demo
@@ -17,7 +17,7 @@ demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torc
 fly: .venv/sim ## ten robot programs fly simulated PX4s for two minutes: out/fly/flight.png
 	.venv/bin/lpac sim --vehicle mavlink --duration 50 --out out/fly
 
-setup: .venv/sim .venv/export ## install what a workstation needs: simulator, plots, torch, onnx
+setup: .venv/sim .venv/export .venv/fleet ## install what a workstation needs: simulator, plots, torch, onnx, deployment
 
 test: lint ## style, types, and every test
 	.venv/bin/pytest
@@ -47,6 +47,18 @@ lock: | .venv/bin/pip ## pin the image's packages to the newest versions, with t
 	$(LOCK) pyproject.toml --output-file deploy/docker/requirements.lock
 	echo 'hatchling>=1.27' | $(LOCK) - --output-file deploy/docker/build.lock
 	.venv/bin/python deploy/docker/lock_debian.py
+
+FLEET ?= fleet.toml
+deploy: .venv/fleet ## image, policy and configuration to the robots of FLEET=fleet.toml, proven there
+start: .venv/fleet ## start the robots' programs
+stop: .venv/fleet ## stop the robots' programs; a robot in flight refuses
+status: .venv/fleet ## what each robot has, and how it is
+deploy start stop status:
+	@.venv/bin/lpac fleet $@ --fleet $(FLEET)
+
+fleet-demo: .venv/sim .venv/fleet ## three robot computers on this machine to try it on, until Ctrl-C (root)
+	@mkdir -p out
+	$(if $(filter-out 0,$(shell id -u)),sudo) .venv/bin/lpac hosts -n 3 --out out/fleet-demo
 
 clean: ## remove .venv and everything made
 	rm -rf .venv out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

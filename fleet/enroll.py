@@ -32,7 +32,7 @@ class Step(NamedTuple):
     """One step of enrolling: what came of it, and what there is to say about it."""
 
     name: str
-    outcome: Literal["done", "was so already", "left to do"]
+    outcome: Literal["done", "was so already", "skipped", "left to do"]
     notes: tuple[str, ...] = ()
 
 
@@ -233,10 +233,8 @@ async def _release(config: FleetConfig, robot: RobotHost, say: Say) -> Step:
 
 def _vision_hub_step(result: Mapping[str, Any]) -> Step:
     if not result["there"]:
-        return Step(
-            "vision-hub", "was so already",
-            ("not a VOXL2: see that PX4's MAVLink comes to this computer",),
-        )  # fmt: skip
+        note = "not a VOXL2: see that PX4's MAVLink comes to this computer"
+        return Step("vision-hub", "skipped", (note,))
     notes = tuple(result["changed"])
     if notes and not result["restarted"]:
         notes = (*notes, "voxl-vision-hub does not run: see `systemctl status voxl-vision-hub`")

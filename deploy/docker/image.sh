@@ -19,7 +19,8 @@ folder=out/image/$arch
 inputs=$({
     echo "$base"
     find deploy/docker edge cli pyproject.toml README.md LICENSE -type f \
-        -not -path '*/__pycache__/*' -not -name lock_debian.py -print0 | sort -z | xargs -0 sha256sum
+        -not -path '*/__pycache__/*' -not -name lock_debian.py -print0 |
+        sort -z | xargs -0 sha256sum
 } | sha256sum)
 if [[ -f $archive && $(cat "$folder/inputs" 2>/dev/null) == "$inputs" ]]; then
     exit 0
@@ -44,7 +45,7 @@ with_buildah() {
         # No registry here: the same base from Debian's own packages.
         if ! command -v mmdebstrap >/dev/null; then
             tail -n 1 "$made/pull.log" >&2
-            echo "image: $base cannot be pulled; without a registry: sudo apt install mmdebstrap" >&2
+            echo "image: $base cannot be pulled; to make one: sudo apt install mmdebstrap" >&2
             exit 1
         fi
         mmdebstrap --quiet --variant=minbase --include=ca-certificates bookworm "$made/base.tar"
@@ -54,9 +55,9 @@ with_buildah() {
     fi
     # Older buildahs do not know the Dockerfile's BUILDPLATFORM.
     arguments+=(--build-arg "BUILDPLATFORM=linux/$(buildah info --format '{{.host.arch}}')")
-    buildah build "${arguments[@]}" --isolation chroot --network host --layers --pull=never \
-        --timestamp 0 --ignorefile deploy/docker/Dockerfile.dockerignore --tag "$name" \
-        --output "type=local,dest=$made/root" .
+    buildah build "${arguments[@]}" --isolation chroot --network host --layers --force-rm \
+        --pull=never --timestamp 0 --ignorefile deploy/docker/Dockerfile.dockerignore \
+        --tag "$name" --output "type=local,dest=$made/root" .
     buildah push --quiet "$name" "docker-archive:$made/image.tar:$name"
 }
 

@@ -206,7 +206,7 @@ def _activate(directory: str, release: str) -> Optional[str]:
     _link(directory, "current", release)
     try:
         service.install_unit(directory, path)
-        if not os.path.exists(os.path.join(path, "robot.toml")):
+        if not _starts(directory, release):
             service.halt()
             return None
         service.run_now()
@@ -229,8 +229,9 @@ def _take_back(directory: str, former: Optional[str]) -> None:
 
 
 def _confirm(directory: str, former: Optional[str]) -> None:
-    if former is not None and former != _linked(directory, "current"):
-        _link(directory, "last-good", former)
+    # A spare's release never ran: there is nothing in it to go back to.
+    if former not in (None, _linked(directory, "current")) and _starts(directory, str(former)):
+        _link(directory, "last-good", str(former))
     os.unlink(os.path.join(directory, "pending"))
 
 

@@ -32,7 +32,7 @@ def test_all_that_decides_about_safety_is_set_and_then_was_so_already(tmp_path: 
         assert report == {
             "system_id": SYSTEM_ID, "changes": [], "problems": [], "needs_reboot": True,
         }  # fmt: skip
-        setup(url, SYSTEM_ID)
+        made.vehicle.parameters["MAV_SYS_ID"] = SYSTEM_ID
         assert setup(url, SYSTEM_ID)[:2] == (0, "all was so already\n")
 
 

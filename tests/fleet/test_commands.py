@@ -176,7 +176,8 @@ def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -
     silent = "it does not answer: it is off, or out of reach"
     assert notes.split(maxsplit=1) == ["r3", silent + "\n"]
     assert deployed.stderr.splitlines()[-1] == "lpac: deployed on 1 of 2 robots; failed: r3"
-    assert ran.stderr.splitlines() == [
+    # ssh's own complaint comes first.
+    assert ran.stderr.splitlines()[1:] == [
         f"r3  {silent}", "lpac: succeeded on 1 of 2 robots; failed: r3",
     ]  # fmt: skip
 
@@ -205,10 +206,10 @@ def test_rollback_needs_a_release_to_go_back_to(operator: Operator) -> None:
 
 def test_logs_are_in_the_order_of_time(operator: Operator) -> None:
     operator.json("restart")
-    result = operator("logs", "-n", "5")
+    result = operator("logs", "-n", "20")
     assert result.returncode == 0, result.stderr
     lines = [line.split() for line in result.stdout.splitlines()]
-    assert {line[0] for line in lines} == {"r1", "r2", "r3", "r4"}
+    assert {line[0] for line in lines} == {"r1", "r2", "r3"}  # r4 never ran
     assert any(line[2:5] == ["info", "robot", "runs"] for line in lines)
     entries = [
         json.loads(line) for line in operator("logs", "-n", "5", "--json").stdout.splitlines()
