@@ -225,8 +225,10 @@ class _Progress:
         from rich.text import Text
 
         table = _new_table(narrow=False, heading=False)
-        # Of one width all the time, whatever the present steps are.
-        for width in (None, None, _STEP_WIDTH, _BAR_WIDTH, None):
+        names = max(len(row.name) for row in self.rows.values())
+        hosts = max(len(row.host) for row in self.rows.values())
+        # Of one width all the time, whatever the present steps are; outcomes have the rest.
+        for width in (names, hosts, _STEP_WIDTH, _BAR_WIDTH, None):
             table.add_column(no_wrap=True, min_width=width)
         for row in self.rows.values():
             bar: Text | ProgressBar = Text("")

@@ -8,15 +8,12 @@ the control loop lives, and does nothing that could hang.
 
 import ctypes
 import dataclasses
-import errno
 import gc
 import hashlib
 import json
 import logging
 import math
 import secrets
-import socket
-import struct
 import sys
 import threading
 import time
@@ -29,6 +26,7 @@ from typing import NamedTuple
 
 import structlog
 
+from edge.adapters.alone import Alone
 from edge.adapters.deadman import Deadman
 from edge.adapters.flight_log import FlightLog, FlightMetadata
 from edge.adapters.idf_sensor import IdfSensor
@@ -428,38 +426,9 @@ class _Program:
 
 
 def _take_alone(config: RobotConfig, parts: ExitStack) -> None:
-    """Hold robot and vehicle for this process: another on this machine must not fly them too.
-
-    Abstract socket names belong to the network as ports do, so containers see each other; they need
-    no file, and vanish with their process.
-    """
-    for what in (
-        f"robot {config.robot_id} of fleet {config.fleet}",
-        f"the autopilot's port {config.autopilot.port}",
-    ):
-        name = f"\0lpac {what}"
-        held = parts.enter_context(socket.socket(socket.AF_UNIX))
-        try:
-            held.bind(name)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
-            raise RobotError(
-                f"{what} is in use by {_holder(name)} on this machine: stop that first"
-            ) from None
-        held.listen()
-
-
-def _holder(name: str) -> str:
-    with socket.socket(socket.AF_UNIX) as caller:
-        try:
-            caller.connect(name)
-        except OSError:
-            return "another process"
-        pid, _, _ = struct.unpack(
-            "3i", caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
-        )
-    return f"process {pid}" if pid else "another container"
+    """Hold robot and vehicle for this process: another on this machine must not fly them too."""
+    parts.enter_context(Alone(f"robot {config.robot_id} of fleet {config.fleet}"))
+    parts.enter_context(Alone(f"the autopilot's port {config.autopilot.port}"))
 
 
 class CheckReport(NamedTuple):

@@ -88,7 +88,8 @@ def explain(text: str, host: str) -> str:
         if re.search(pattern, text):
             return advice.replace("HOST", host)
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "the connection ended without a word"
+    # Of a connection that has gone silent ssh does not say more.
+    return lines[-1] if lines else "it does not answer any more: it is off, or out of reach"
 
 
 class Session:

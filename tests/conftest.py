@@ -1,5 +1,11 @@
-"""What many tests share: the shipped policy."""
+"""What many tests share: the shipped policy, and the robot's image."""
 
+import functools
+import os
+import platform
+import shutil
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,6 +16,8 @@ from edge.runtime.policy import Policy
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
 
+BuildImage = Callable[[str], Path]
+
 
 @pytest.fixture(scope="session")
 def shipped_bundle() -> Bundle:
@@ -19,3 +27,28 @@ def shipped_bundle() -> Bundle:
 @pytest.fixture(scope="session")
 def shipped_policy(shipped_bundle: Bundle) -> Policy:
     return Policy(shipped_bundle)
+
+
+@pytest.fixture(scope="session")
+def build_image() -> BuildImage:
+    """Builds the image for an architecture, if something in it changed; returns its tree."""
+    if os.geteuid() != 0:
+        pytest.skip("needs root: the image is built and entered with chroot")
+    missing = [tool for tool in ("buildah", "mmdebstrap") if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"needs: sudo apt install {' '.join(missing)}")
+
+    @functools.cache
+    def build(architecture: str) -> Path:
+        subprocess.run([ROOT / "deploy" / "docker" / "image.sh", architecture], check=True)
+        return ROOT / "out" / "image" / architecture / "root"
+
+    return build
+
+
+@pytest.fixture(scope="session")
+def amd64_image(build_image: BuildImage) -> Path:
+    """The folder of the image for robot hosts on this machine."""
+    if platform.machine() != "x86_64":
+        pytest.skip("robot hosts are x86-64")
+    return build_image("amd64").parent

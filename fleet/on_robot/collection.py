@@ -108,7 +108,7 @@ def fetched(folder: str) -> Dict[str, Any]:
 
 def _trials(directory: str) -> Dict[str, Dict[str, Interval]]:
     """Which trials each flight log holds, and when: the release reads its own logs."""
-    current = releases._linked(directory, "current")
+    current = releases.linked(directory, "current")
     if current is None:
         raise Refused("no release is on the robot that could read its flight logs: deploy first")
     script = (

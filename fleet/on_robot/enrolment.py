@@ -81,7 +81,7 @@ def retire(predecessors: List[str], mavlink_port: int) -> Dict[str, Any]:
     Nothing is deleted. Returns what was `stopped`, which predecessors were so already or are not
     there (`idle`), and what runs that may send setpoints too (`suspects`), with what to do.
     """
-    containers = probes._containers()
+    containers = probes.known_containers()
     if containers is None:
         raise Refused("docker does not answer: look at `systemctl status docker` on the robot")
     by_name = {container["name"]: container for container in containers}
@@ -165,7 +165,7 @@ def _setup(
     ceiling_m: float,
     command_timeout_s: float,
 ) -> Dict[str, Any]:
-    release = os.path.join(directory, "releases", str(releases._linked(directory, "current")))
+    release = os.path.join(directory, "releases", str(releases.linked(directory, "current")))
     command = [
         "/usr/bin/lpac", "robot", "setup", "--json", "--url", url, "--system-id", str(system_id),
         "--rc", rc, "--ceiling", repr(ceiling_m), "--command-timeout", repr(command_timeout_s),
@@ -191,7 +191,7 @@ def _await_px4(mavlink_port: int, system_id: int) -> Optional[int]:
 
 def _unit(name: str) -> Dict[str, Any]:
     """Whether a unit is there, runs, and starts at boot."""
-    for unit in probes.units(probes._units([name])).values():
+    for unit in probes.known_units(probes.known_units([name])).values():
         return unit
     return {"there": False, "active": False, "enabled": False}
 

@@ -83,8 +83,8 @@ def facts(directory: str, mavlink_port: int, names: List[str]) -> Dict[str, Any]
         synchronized=synchronized(_output(["timedatectl", "status", "--no-pager"])),
         wifi=_wifi(),
         vision_hub=_vision_hub(),
-        units=units(_units(names)),
-        containers=_containers(),
+        units=units(known_units(names)),
+        containers=known_containers(),
     )
     return found
 
@@ -284,7 +284,7 @@ def without_comments(text: str) -> str:
     return re.sub(pattern, lambda match: match.group(1) or " ", text, flags=re.DOTALL)
 
 
-def _units(names: List[str]) -> str:
+def known_units(names: List[str]) -> str:
     properties = "Id,LoadState,ActiveState,UnitFileState"
     services = [name if "." in name else name + ".service" for name in names]
     return _output(["systemctl", "show", "--no-pager", "-p", properties, *services])
@@ -305,7 +305,7 @@ def units(text: str) -> Dict[str, Dict[str, Any]]:
     return found
 
 
-def _containers() -> Optional[List[Dict[str, Any]]]:
+def known_containers() -> Optional[List[Dict[str, Any]]]:
     """The containers of a container engine, empty where there is none; None if it is silent."""
     if shutil.which("docker") is None:
         return []

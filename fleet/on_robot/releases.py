@@ -29,7 +29,7 @@ _lock = []  # type: List[int]
 @call
 def overview(directory: str) -> Dict[str, Any]:
     """What is on the robot: its identity, releases, versions, unit, disk and clock."""
-    current = _linked(directory, "current")
+    current = linked(directory, "current")
     versions = _versions(directory, current)
     if versions is not None:
         versions.pop("packages", None)
@@ -38,7 +38,7 @@ def overview(directory: str) -> Dict[str, Any]:
         "machine": os.uname().machine,
         "sudo": os.environ.get("SUDO_UID") is not None,
         "current": current,
-        "last_good": _linked(directory, "last-good"),
+        "last_good": linked(directory, "last-good"),
         "pending": _pending(directory),
         "releases": _releases(directory),
         "versions": versions,
@@ -99,7 +99,7 @@ def prepare(
             if name != release:
                 _remove(os.path.join(incoming, name))
     path = os.path.join(directory, "releases", release)
-    current = _linked(directory, "current")
+    current = linked(directory, "current")
     answer = {"complete": os.path.isdir(path), "incoming": target}
     # rsync takes at most 20 such folders.
     likely = [current] if current else []
@@ -171,7 +171,7 @@ def switch(directory: str, release: str, mavlink_port: int) -> Dict[str, Any]:
     require_lock()
     service.refuse_in_flight(mavlink_port, "switching")
     _prune(directory, {release})
-    former = _linked(directory, "current")
+    former = linked(directory, "current")
     service.write_whole(
         os.path.join(directory, "pending"),
         json.dumps({"release": release, "former": former}).encode(),
@@ -191,7 +191,7 @@ def rollback(directory: str, mavlink_port: int) -> Dict[str, Any]:
     """Run the last good release again."""
     require_lock()
     service.refuse_in_flight(mavlink_port, "rolling back")
-    current, last_good = _linked(directory, "current"), _linked(directory, "last-good")
+    current, last_good = linked(directory, "current"), linked(directory, "last-good")
     if last_good is None or last_good == current:
         raise Refused("there is no earlier release to go back to")
     problem = _activate(directory, last_good)
@@ -230,7 +230,7 @@ def _take_back(directory: str, former: Optional[str]) -> None:
 
 def _confirm(directory: str, former: Optional[str]) -> None:
     # A spare's release never ran: there is nothing in it to go back to.
-    if former not in (None, _linked(directory, "current")) and _starts(directory, str(former)):
+    if former not in (None, linked(directory, "current")) and _starts(directory, str(former)):
         _link(directory, "last-good", str(former))
     os.unlink(os.path.join(directory, "pending"))
 
@@ -241,7 +241,7 @@ def _recover(directory: str) -> Optional[str]:
     if pending is None:
         return None
     release, former = pending["release"], pending["former"]
-    if _linked(directory, "current") != release:
+    if linked(directory, "current") != release:
         os.unlink(os.path.join(directory, "pending"))
         return None
     problem = service.unhealthy(_HEALTHY_S) if _starts(directory, release) else None
@@ -305,7 +305,7 @@ def run_inside(release: str, command: List[str]) -> Any:
 
 def _prune(directory: str, besides: Any) -> None:
     """Remove the oldest releases; never the current and the last good one."""
-    keep = {_linked(directory, "current"), _linked(directory, "last-good")} | besides
+    keep = {linked(directory, "current"), linked(directory, "last-good")} | besides
     spare = [name for name in _releases(directory) if name not in keep]
     for name in spare[max(0, _KEPT - len(keep)) :]:
         _remove(os.path.join(directory, "releases", name))
@@ -339,7 +339,7 @@ def _pending(directory: str) -> Optional[Dict[str, Any]]:
         return None
 
 
-def _linked(directory: str, name: str) -> Optional[str]:
+def linked(directory: str, name: str) -> Optional[str]:
     try:
         return os.path.basename(os.readlink(os.path.join(directory, name)))
     except OSError:

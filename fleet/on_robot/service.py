@@ -20,6 +20,7 @@ _STATUS_FRESH_S = 2.0
 _STEADY_S = 3.0
 # PX4 sends heartbeats at 1 Hz.
 _HEARTBEAT_WAIT_S = 2.5
+_IP = 0x0800
 
 _PROPERTIES = (
     "LoadState,ActiveState,SubState,Result,NRestarts,StatusText,MainPID,UnitFileState,"
@@ -72,35 +73,39 @@ def armed(mavlink_port: int) -> bool:
         status = state["status"] or {}
         if status.get("armed") is not None:
             return bool(status["armed"])
-        if state["fresh"]:
-            return False  # It has not heard of a vehicle.
     heartbeat = hear_heartbeat(mavlink_port)
     return heartbeat is not None and bool(heartbeat["armed"])
 
 
 def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dict[str, Any]]:
-    """The first heartbeat of an autopilot that comes to the UDP port of this host.
+    """The first heartbeat of an autopilot that comes to the UDP port of this host, None if none.
 
-    None if none comes, or somebody else listens there.
+    It listens beside whoever has the port, of which that one notices nothing.
     """
-    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as udp:
-        try:
-            udp.bind(("127.0.0.1", port))
-        except OSError:
-            return None
+    kind = socket.SOCK_DGRAM  # IP packets, without the frames around them
+    with contextlib.closing(socket.socket(socket.AF_PACKET, kind, socket.htons(_IP))) as packets:
         until_s = time.monotonic() + wait_s
         while True:
             left_s = until_s - time.monotonic()
             if left_s <= 0.0:
                 return None
-            udp.settimeout(left_s)
+            packets.settimeout(left_s)
             try:
-                data = udp.recv(65535)
+                packet = packets.recv(65535)
             except socket.timeout:
                 return None
-            heartbeat = _heartbeat(data)
+            heartbeat = _heartbeat(_datagram(packet, port))
             if heartbeat is not None:
                 return heartbeat
+
+
+def _datagram(packet: bytes, port: int) -> bytes:
+    """What an IPv4 packet carries to a UDP port; nothing if it is another packet."""
+    header = 4 * (packet[0] & 0x0F) if packet else 0
+    if len(packet) < header + 8 or packet[9] != socket.IPPROTO_UDP:
+        return b""
+    _, destination = struct.unpack_from("!HH", packet, header)
+    return packet[header + 8 :] if destination == port else b""
 
 
 def _heartbeat(data: bytes) -> Optional[Dict[str, Any]]:

@@ -16,8 +16,8 @@ from edge.adapters.flight_log import read as read_log
 from edge.core.mission import FlightState
 from edge.runtime.policy import Policy
 from edge.runtime.replay import replay
-from tests.conftest import ROOT, SHIPPED
-from tests.deploy.conftest import BuildImage, inside
+from tests.conftest import ROOT, SHIPPED, BuildImage
+from tests.deploy.entering import inside
 from tests.robot_rig import Changes, Rig, new_vehicle, program, rig
 
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")

@@ -17,8 +17,8 @@ from packaging.utils import canonicalize_name
 
 from bench import release
 from fleet.image import measure, package_of, table
-from tests.conftest import ROOT, SHIPPED
-from tests.deploy.conftest import BuildImage, inside
+from tests.conftest import ROOT, SHIPPED, BuildImage
+from tests.deploy.entering import inside
 
 DOCKER = ROOT / "deploy" / "docker"
 ARCHITECTURES = ("amd64", "arm64")

@@ -2,16 +2,17 @@
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
 from sim.host_base import NoHostsError
 from sim.hosts import RobotHosts
-from tests.conftest import ROOT, SHIPPED
+from tests.conftest import SHIPPED
 
 
 @pytest.fixture(scope="package")
-def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
+def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
     """r1, r2 and r3 with a slot each, r4 without; as the test before left them."""
     with ExitStack() as stack:
         try:
@@ -19,7 +20,7 @@ def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
                 RobotHosts(
                     4,
                     tmp_path_factory.mktemp("hosts"),
-                    image=ROOT / "out" / "image" / "amd64",
+                    image=amd64_image,
                     bundle=SHIPPED,
                     spares=1,
                 )

@@ -23,7 +23,6 @@ from sim.px4.modes import Mode
 from tests.conftest import ROOT, SHIPPED
 
 UNIT = ROOT / "systemd" / "lpac-robot.service"
-IMAGE = ROOT / "out" / "image" / "amd64"
 # Of systemd 252's scale, 10 the worst. What keeps it from less is what the robot is for, network,
 # and keys that a VOXL2's systemd does not know.
 EXPOSURE = 2.0
@@ -65,25 +64,24 @@ def test_the_unit_may_do_little() -> None:
 
 
 @pytest.fixture(scope="module")
-def hosts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
+def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
     """One robot's computer, with a release and the unit, which does not run."""
-    if not (IMAGE / "root").exists():
-        pytest.skip("needs the image: make image ARCH=amd64")
     with ExitStack() as stack:
         try:
             running = stack.enter_context(
-                RobotHosts(1, tmp_path_factory.mktemp("hosts"), image=IMAGE, bundle=SHIPPED)
+                RobotHosts(1, tmp_path_factory.mktemp("hosts"), image=amd64_image, bundle=SHIPPED)
             )
         except NoHostsError as reason:
             pytest.skip(str(reason))
         config = load_fleet(running.fleet_toml)
         (host,) = running
         release = host.root / config.directory.lstrip("/") / "releases/a"
-        shutil.copytree(IMAGE / "root", release / "root", symlinks=True)
+        shutil.copytree(amd64_image / "root", release / "root", symlinks=True)
         shutil.copytree(SHIPPED, release / "bundle")
         shutil.copy(config.world, release / "world.env")
         (release / "robot.toml").write_text(config.robot_toml(host.name))
         (release.parents[1] / "current").symlink_to("releases/a")
+        (release.parents[1] / "sandbox").mkdir()
         shutil.copy(UNIT, host.root / "etc/systemd/system")
         host.run("systemctl daemon-reload")
         yield running
@@ -247,3 +245,11 @@ def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_say
     assert "Start request repeated too quickly" in journal
     assert "lpac: /release/robot.toml: fleet = 3" in journal
     assert "Traceback" not in journal
+
+
+def test_nothing_was_added_to_the_release(host: RobotHost, amd64_image: Path) -> None:
+    def names(tree: Path) -> set[Path]:
+        return {path.relative_to(tree) for path in tree.rglob("*")}
+
+    release = host.root / "data/lpac/releases/a"  # where the test before has moved it
+    assert names(release / "root") == names(amd64_image / "root")
