@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from fleet.config import FleetConfig, RobotHost
-    from fleet.deploy import Report
     from fleet.doctor import Diagnosis, Examination, Round
+    from fleet.hold import Report
     from fleet.operations import Outcome
     from fleet.up import Arrival, Decision
 

@@ -1,7 +1,6 @@
 """`lpac fleet enroll`, `swap` and `pull`: a robot comes, one is replaced, a trial is taken home."""
 
 import asyncio
-import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from fleet.config import RobotHost
-    from fleet.deploy import Report
+    from fleet.hold import Report
     from fleet.pull import Pulled
 
 _STEP_WIDTH = 14
@@ -32,12 +31,18 @@ _STEP_WIDTH = 14
 @app.command()
 def enroll(
     name: Annotated[str, typer.Argument(help="The robot's name in the fleet, such as r11.")],
-    host: Annotated[str, typer.Argument(help="Its address, or its name in ssh's configuration.")],
+    host: Annotated[
+        str | None,
+        typer.Argument(
+            help="Its address, or its name in ssh's configuration; not needed if the file has it."
+        ),
+    ] = None,
     fleet: Fleet = DEFAULT_FLEET,
     user: Annotated[str, typer.Option(help="Who logs in; root, or who may use sudo.")] = "root",
     port: Annotated[int | None, typer.Option(help="Its ssh port, if not ssh's own.")] = None,
     robot_id: Annotated[
-        int | None, typer.Option(help="Its id in the fleet; the number in its name, if not given.")
+        int | None,
+        typer.Option(help="Its id in the fleet; of a new robot the number in its name otherwise."),
     ] = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Also if it is enrolled as another robot.")
@@ -51,11 +56,6 @@ def enroll(
     from fleet.enroll import Step
     from fleet.enroll import enroll as enroll_robot
 
-    number = re.search(r"\d+", name)
-    if robot_id is None:
-        if number is None:
-            raise ValueError(f"{name}: has no number in it: give --robot-id")
-        robot_id = int(number[0])
     left: list[str] = []
 
     def on_step(step: Step) -> None:

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
     from cli.fleet_status import State
     from fleet.config import FleetConfig, RobotHost
-    from fleet.deploy import Deployed, Report
+    from fleet.deploy import Deployed
+    from fleet.hold import Report
     from fleet.operations import Outcome
 
 T = TypeVar("T")
@@ -206,18 +207,13 @@ def _control(
     arguments: Callable[["RobotHost"], dict[str, Any]],
 ) -> list["Outcome[_Controlled]"]:
     """Call a function that changes the unit on all robots, and holds them for that."""
-    from fleet.deploy import check_identity, operator
-    from fleet.session import connect
+    from fleet.hold import hold
 
     async def one(robot: "RobotHost", report: "Report") -> _Controlled:
-        report("connect", None)
-        async with connect(config, robot, lambda step: report(step, None)) as session:
-            found = await session.call("overview", directory=config.directory)
-            check_identity(found["identity"], config, robot)
-            locked = await session.call("lock", directory=config.directory, who=operator())
+        async with hold(config, robot, report) as held:
             report(function, None)
-            service = await session.call(function, **arguments(robot))
-            return _Controlled(found["current"], service, locked["recovered"])
+            service = await held.session.call(function, **arguments(robot))
+            return _Controlled(held.found["current"], service, held.recovered)
 
     return run_for_each(robots, one)
 

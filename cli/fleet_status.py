@@ -42,7 +42,7 @@ class State(NamedTuple):
 
 async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
     """Ask the robot; nothing of it is held or changed. Raises FleetError."""
-    from fleet.deploy import check_identity
+    from fleet.hold import check_identity
     from fleet.logs import last_words
     from fleet.session import connect
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from fleet.config import FleetConfig, RobotHost
-    from fleet.deploy import Report
+    from fleet.hold import Report
     from fleet.operations import Outcome
 
 T = TypeVar("T")

@@ -1,16 +1,11 @@
 """A release's way to a robot: travel, be checked whole, prove itself, switch; or change nothing."""
 
-import getpass
-import socket
-from collections.abc import Callable
 from typing import NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
+from fleet.hold import Held, Report, hold
 from fleet.release import Release
-from fleet.session import FleetError, RemoteError, Session, connect, rsync
-
-# The step, and the share of it that is done where that is known.
-Report = Callable[[str, float | None], None]
+from fleet.session import FleetError, RemoteError, rsync
 
 # Of folders; files keep theirs, which the manifest has.
 _MODES = "--chmod=Du=rwx,Dgo=rx"
@@ -26,27 +21,6 @@ class Deployed(NamedTuple):
     infer_p99_ms: float | None
 
 
-def operator() -> str:
-    """Who changes robots from here, for whoever else tries to."""
-    return f"{getpass.getuser()}@{socket.gethostname()}"
-
-
-def check_identity(
-    identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
-) -> None:
-    """Raises RemoteError if another robot answers at this one's address."""
-    if identity is None:
-        raise RemoteError(
-            f"it is not enrolled: run `lpac fleet enroll {robot.name} {robot.host}` once"
-        )
-    wanted = {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}
-    if {key: identity.get(key) for key in wanted} != wanted:
-        raise RemoteError(
-            f"at {robot.host} answers {identity.get('robot')} of fleet {identity.get('fleet')} "
-            f"(id {identity.get('robot_id')}): mend the host in {config.path.name}, or enroll it"
-        )
-
-
 async def deploy(
     config: FleetConfig, robot: RobotHost, release: Release, report: Report
 ) -> Deployed:
@@ -54,33 +28,18 @@ async def deploy(
 
     Raises FleetError that says what went wrong; the robot then has what it had before.
     """
-    report("connect", None)
-    async with connect(config, robot, lambda step: report(step, None)) as session:
-        before = await session.call("overview", directory=config.directory)
-        check_identity(before["identity"], config, robot)
+    async with hold(config, robot, report) as held:
+        before, session = held.found, held.session
         if before["machine"] != release.image.machine:
             raise RemoteError(
                 f"it is {before['machine']}, and the image is for {release.image.machine}: "
                 f"make image ARCH={'arm64' if before['machine'] == 'aarch64' else 'amd64'}"
             )
-        await session.call("lock", directory=config.directory, who=operator())
-        before = await session.call("overview", directory=config.directory)
         spare = config.slot_of(robot.name) is None
         runs = spare or before["service"]["fresh"]
         if before["current"] == release.id and before["pending"] is None and runs:
-            return Deployed(release.id, "unchanged", 0, None, None)
-        place = await session.call(
-            "prepare", directory=config.directory, release=release.id, image=release.image.id,
-            size_bytes=release.size_bytes, mavlink_port=robot.mavlink_port,
-        )  # fmt: skip
-        sent_bytes = 0
-        if not place["complete"]:
-            sent_bytes = await _transfer(
-                config, robot, release, session, place["incoming"], place["like"],
-                sudo=before["sudo"], report=report,
-            )  # fmt: skip
-            report("check", None)
-            await session.call("accept", directory=config.directory, release=release.id)
+            return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
+        sent_bytes = await _bring(config, robot, release, held, report)
         proof = await session.call("prove", directory=config.directory, release=release.id)
         report("switch", None)
         after = await session.call(
@@ -97,44 +56,43 @@ async def deploy(
         )
 
 
-async def _transfer(
-    config: FleetConfig,
-    robot: RobotHost,
-    release: Release,
-    session: Session,
-    incoming: str,
-    like: list[str],
-    *,
-    sudo: bool,
-    report: Report,
+async def _bring(
+    config: FleetConfig, robot: RobotHost, release: Release, held: Held, report: Report
 ) -> int:
+    """Have the release whole on the robot; how many bytes of content travelled."""
+    session = held.session
+    place = await session.call(
+        "prepare", directory=config.directory, release=release.id, image=release.image.id,
+        size_bytes=release.size_bytes, mavlink_port=robot.mavlink_port,
+    )  # fmt: skip
+    if place["complete"]:
+        return 0
+    target, like = f":{place['incoming']}", place["like"]
     options = ["--delete", "--partial", _MODES]
     try:
-        sent = await rsync(
-            config, robot, [f"{release.image.folder}/"], f":{incoming}/root/",
+        sent_bytes = await rsync(
+            config, robot, [f"{release.image.folder}/"], f"{target}/root/",
             options=[*options, *(f"--link-dest={folder}/root" for folder in like)],
-            sudo=sudo, on_share=lambda share: report("image", share),
+            sudo=held.found["sudo"], on_share=lambda share: report("image", share),
         )  # fmt: skip
-        sent += await rsync(
-            config, robot, [f"{release.folder}/"], f":{incoming}/",
+        sent_bytes += await rsync(
+            config, robot, [f"{release.folder}/"], f"{target}/",
             options=[*options, "--exclude=/root", *(f"--link-dest={folder}" for folder in like)],
-            sudo=sudo, on_share=lambda share: report("policy", share),
+            sudo=held.found["sudo"], on_share=lambda share: report("policy", share),
         )  # fmt: skip
     except FleetError as error:
         if "disk is full" in str(error):
             await session.call("discard", directory=config.directory, release=release.id)
         raise
-    return sent
+    report("check", None)
+    await session.call("accept", directory=config.directory, release=release.id)
+    return sent_bytes
 
 
 async def rollback(config: FleetConfig, robot: RobotHost, report: Report) -> str:
     """Run the last good release again; its id. Raises FleetError."""
-    report("connect", None)
-    async with connect(config, robot, lambda step: report(step, None)) as session:
-        found = await session.call("overview", directory=config.directory)
-        check_identity(found["identity"], config, robot)
-        await session.call("lock", directory=config.directory, who=operator())
-        after = await session.call(
+    async with hold(config, robot, report) as held:
+        after = await held.session.call(
             "rollback", directory=config.directory, mavlink_port=robot.mavlink_port
         )
         return str(after["current"])

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
-from fleet.deploy import Report, check_identity, operator
+from fleet.hold import Report, check_identity, lock
 from fleet.operations import Outcome
 from fleet.session import FleetError, RemoteError, Session, connect
 
@@ -173,7 +173,7 @@ async def _check_vehicle(
     if facts["heartbeat"]["armed"]:
         return "the vehicle is armed"
     try:
-        await session.call("lock", directory=config.directory, who=operator())
+        await lock(session, config, robot)
         return await session.call("vehicle_check", directory=config.directory)
     except RemoteError as error:
         return str(error)

@@ -4,6 +4,7 @@ The first step logs in as a person does, since only that person can: OpenSSH its
 password, and whether the host key is the right one.
 """
 
+import re
 import socket
 import subprocess
 import tempfile
@@ -14,7 +15,8 @@ from typing import Any, Literal, NamedTuple
 
 from edge.core.schema import ConfigError
 from fleet.config import FleetConfig, RobotHost, add_robot, load_fleet
-from fleet.deploy import deploy, operator
+from fleet.deploy import deploy
+from fleet.hold import lock
 from fleet.release import load_common, make_release
 from fleet.session import FleetError, RemoteError, UnreachableError, connect, explain, ssh_command
 
@@ -36,6 +38,8 @@ class Step(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
+_VOXL2_URL = "udpin://127.0.0.1:14551"
+
 OnStep = Callable[[Step], None]
 Say = Callable[[str], None]
 
@@ -43,16 +47,19 @@ Say = Callable[[str], None]
 async def enroll(
     path: Path,
     name: str,
-    host: str,
+    host: str | None,
     *,
     user: str,
     port: int | None,
-    robot_id: int,
+    robot_id: int | None,
     rename: bool,
     on_step: OnStep,
     say: Say,
 ) -> None:
     """Enroll the computer at `host` in the fleet of the file; a robot that is new is a spare.
+
+    Of a robot that the file has, `host` and `robot_id` follow from it. A new robot without a
+    `robot_id` has the number in its name.
 
     `on_step` hears of every step, `say` what is being done. `rename` lets a robot that is enrolled
     as another one become this one. Raises ConfigError or FleetError at the first step that fails.
@@ -62,7 +69,7 @@ async def enroll(
     on_step(_key(config, robot))
     async with connect(config, robot, say) as session:
         found = (await session.call("overview", directory=config.directory))["identity"]
-        await session.call("lock", directory=config.directory, who=operator())
+        await lock(session, config, robot)
         wanted = {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id}
         if found not in (None, wanted) and not rename:
             # The same word as the robot's, but before the file is changed.
@@ -70,8 +77,8 @@ async def enroll(
         was_there = name in config.robots
         if not was_there:
             add_robot(
-                path, name, host, robot_id, user=user, port=port,
-                address=robot.address if robot.address != host else None,
+                path, name, robot.host, robot.robot_id, user=user, port=port,
+                address=robot.address if robot.address != robot.host else None,
             )  # fmt: skip
             config = load_fleet(path)
             robot = config.robots[name]
@@ -93,7 +100,7 @@ async def enroll(
         on_step(Step("PX4", "left to do", ("the release sets it up: enroll again after that",)))
         return
     async with connect(config, robot, say) as session:
-        await session.call("lock", directory=config.directory, who=operator())
+        await lock(session, config, robot)
         try:
             report = await session.call(
                 "set_up_px4", directory=config.directory, url=robot.mavlink_url,
@@ -109,20 +116,34 @@ async def enroll(
 
 
 def _robot(
-    config: FleetConfig, name: str, host: str, user: str, port: int | None, robot_id: int
+    config: FleetConfig,
+    name: str,
+    host: str | None,
+    user: str,
+    port: int | None,
+    robot_id: int | None,
 ) -> RobotHost:
     """The robot of the file, or one that it does not have yet."""
     known = config.robots.get(name)
     if known is not None:
-        if (known.host, known.robot_id) != (host, robot_id):
+        if host not in (None, known.host) or robot_id not in (None, known.robot_id):
             raise ConfigError(
                 f"{config.path}: robots.{name}: has host = {known.host!r} and robot_id = "
                 f"{known.robot_id}: change it in the file, or enroll it with these"
             )
         return known
+    if host is None:
+        raise ConfigError(f"{config.path}: robots.{name}: is not there: give its address")
+    if robot_id is None:
+        number = re.search(r"\d+", name)
+        if number is None:
+            raise ConfigError(f"{config.path}: robots.{name}: no number in it: give --robot-id")
+        robot_id = int(number[0])
+    # A file without it is refused when the robot is added.
+    url = config.shared.get("autopilot", {}).get("url", _VOXL2_URL)
     robot = RobotHost(
         name=name, host=host, user=user, port=port, address=host, robot_id=robot_id, zenoh_port=0,
-        system_id=robot_id, mavlink_url="", cpus=(), overrides={},
+        system_id=robot_id, mavlink_url=url, cpus=(), overrides={},
     )  # fmt: skip
     (named,) = _ssh_options(config, robot)["hostname"]
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
-from fleet.deploy import Report, check_identity
+from fleet.hold import Report, check_identity
 from fleet.session import RemoteError, UnreachableError, connect, rsync
 
 SUMS = "SHA256SUMS"

@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from edge.core.schema import ConfigError
 from fleet.config import FleetConfig, RobotHost, assign, load_fleet
-from fleet.deploy import Deployed, Report, check_identity, deploy, operator
+from fleet.deploy import Deployed, deploy
+from fleet.hold import Report, check_identity, lock
 from fleet.release import load_common, make_release
 from fleet.session import RemoteError, UnreachableError, connect
 
@@ -77,7 +78,7 @@ async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
                 check_identity(found["identity"], config, robot)
             except RemoteError as error:
                 return str(error)
-            await session.call("lock", directory=config.directory, who=operator())
+            await lock(session, config, robot)
             await session.call(
                 "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=True
             )

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
-from fleet.deploy import Report, check_identity, operator
 from fleet.doctor import (
     GOOD_CLOCK_OFFSET_S,
     Check,
@@ -15,6 +14,7 @@ from fleet.doctor import (
     diagnose,
     measure_clock,
 )
+from fleet.hold import Report, check_identity, lock
 from fleet.operations import Outcome
 from fleet.session import RemoteError, Session, UnreachableError, connect
 
@@ -79,10 +79,14 @@ async def _bring_up(
             problems.append(str(error))
             return {}
 
-    # Taking it finishes an interrupted switch.
-    locked = await step("lock", directory=config.directory, who=operator())
-    if locked.get("recovered"):
-        done.append(locked["recovered"])
+    locked = False
+    try:
+        recovered = await lock(session, config, robot)
+        locked = True
+        if recovered is not None:
+            done.append(recovered)
+    except RemoteError as error:
+        problems.append(str(error))
     clock = await measure_clock(session, unix_time_s)
     if abs(clock.offset_s) > GOOD_CLOCK_OFFSET_S + clock.uncertainty_s:
         port = robot.mavlink_port

@@ -85,8 +85,8 @@ def _answer(request: Dict[str, Any]) -> None:
         _send({"error": where + (error.strerror or str(error))})
     except Exception as error:
         # A mistake of ours: the one who reads it needs the place.
-        where = traceback.extract_tb(sys.exc_info()[2])[-1]
-        _send({"error": "%s: %s (%s:%s)" % (type(error).__name__, error, where[0], where[1])})
+        place = traceback.extract_tb(sys.exc_info()[2])[-1]
+        _send({"error": "%s: %s (%s:%s)" % (type(error).__name__, error, place[0], place[1])})
 
 
 def _send(message: Dict[str, Any]) -> None:

@@ -191,7 +191,7 @@ def _await_px4(mavlink_port: int, system_id: int) -> Optional[int]:
 
 def _unit(name: str) -> Dict[str, Any]:
     """Whether a unit is there, runs, and starts at boot."""
-    for unit in probes.known_units(probes.known_units([name])).values():
+    for unit in probes.units(probes.known_units([name])).values():
         return unit
     return {"there": False, "active": False, "enabled": False}
 

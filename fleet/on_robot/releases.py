@@ -58,8 +58,11 @@ def identity() -> Optional[Dict[str, Any]]:
 
 
 @call
-def lock(directory: str, who: str) -> Dict[str, Any]:
-    """Hold the robot for this session alone. Raises Refused that says who has it."""
+def lock(directory: str, who: str, mavlink_port: int) -> Dict[str, Any]:
+    """Hold the robot for this session alone, and finish a switch that was interrupted.
+
+    Returns what came of that (`recovered`). Raises Refused that says who has the robot.
+    """
     os.makedirs(os.path.join(directory, "releases"), exist_ok=True)
     descriptor = os.open(os.path.join(directory, "lock"), os.O_RDWR | os.O_CREAT, 0o600)
     try:
@@ -71,7 +74,7 @@ def lock(directory: str, who: str) -> Dict[str, Any]:
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, who.encode()[:200], 0)
     _lock.append(descriptor)
-    return {"recovered": _recover(directory)}
+    return {"recovered": _recover(directory, mavlink_port)}
 
 
 def require_lock() -> None:
@@ -149,7 +152,7 @@ def prove(directory: str, release: str) -> Dict[str, Any]:
     require_lock()
     path = os.path.join(directory, "releases", release)
     reports = {}
-    for command, options in (("verify", []), ("benchmark", ["--seconds", "1.5"])):
+    for command, options in (("verify", []), ("benchmark", ["--seconds", "1"])):
         say(command)
         lpac = ["/usr/bin/lpac", "bundle", command, "/release/bundle", "--json"]
         done = run_inside(path, [*lpac, *options])
@@ -212,7 +215,7 @@ def _activate(directory: str, release: str) -> Optional[str]:
         service.run_now()
         say("health")
         return service.unhealthy(_HEALTHY_S)
-    except Refused as error:
+    except (Refused, OSError) as error:
         return str(error)
 
 
@@ -220,7 +223,8 @@ def _take_back(directory: str, former: Optional[str]) -> None:
     say("rollback")
     if former is None:
         service.halt()
-        os.unlink(os.path.join(directory, "current"))
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(os.path.join(directory, "current"))
     else:
         problem = _activate(directory, former)
         if problem is not None:
@@ -235,8 +239,8 @@ def _confirm(directory: str, former: Optional[str]) -> None:
     os.unlink(os.path.join(directory, "pending"))
 
 
-def _recover(directory: str) -> Optional[str]:
-    """Finish a switch that a loss of power, or of its operator, left open; what was done."""
+def _recover(directory: str, mavlink_port: int) -> Optional[str]:
+    """Finish a switch that a loss of power, or of its operator, left open; what came of it."""
     pending = _pending(directory)
     if pending is None:
         return None
@@ -244,10 +248,13 @@ def _recover(directory: str) -> Optional[str]:
     if linked(directory, "current") != release:
         os.unlink(os.path.join(directory, "pending"))
         return None
-    problem = service.unhealthy(_HEALTHY_S) if _starts(directory, release) else None
+    if service.armed(mavlink_port):
+        return "a switch to %s was interrupted; nothing is restarted in flight" % release
+    say("finish an interrupted switch")
+    problem = _activate(directory, release)
     if problem is None:
         _confirm(directory, former)
-        return "an interrupted switch to %s is now confirmed" % release
+        return "an interrupted switch to %s was finished" % release
     _take_back(directory, former)
     return "an interrupted switch to %s was taken back: %s" % (release, problem)
 

@@ -17,7 +17,7 @@ DROP_IN_PATH = UNIT_PATH + ".d/lpac-robot.conf"
 # The program says how it is four times a second.
 _STATUS_FRESH_S = 2.0
 # For so long it must be well without a restart.
-_STEADY_S = 3.0
+_STEADY_S = 2.0
 # PX4 sends heartbeats at 1 Hz.
 _HEARTBEAT_WAIT_S = 2.5
 _IP = 0x0800

@@ -19,7 +19,8 @@ from onnx import numpy_helper
 from edge.runtime.bundle import BUNDLE_ID, MANIFEST, make_bundle
 from fleet.config import FleetConfig, load_fleet
 from fleet.config import RobotHost as Robot
-from fleet.deploy import Deployed, Report, deploy, rollback
+from fleet.deploy import Deployed, deploy, rollback
+from fleet.hold import Report
 from fleet.operations import Outcome, for_each
 from fleet.release import Common, Release, load_common, make_release
 from fleet.session import FleetError, RemoteError, UnreachableError, connect
@@ -169,15 +170,7 @@ def test_a_transfer_that_breaks_off_leaves_what_runs_and_a_repeat_finishes(
         {"cut": host.heal, "power": host.power_on}[mishap]()
     assert laptop.overview(2)["current"] is None
 
-    def free_again() -> bool:
-        try:
-            laptop.call(2, "lock", directory=laptop.config.directory, who="the next one")
-        except RemoteError as error:
-            assert "is changing this robot" in str(error)
-            return False
-        return True
-
-    await_true(free_again)
+    await_true(lambda: not holders(laptop, 2))
     assert laptop.deploy(2, release).summary == "runs"
 
 
@@ -201,10 +194,17 @@ def test_a_killed_laptop_program_leaves_the_robot_whole_and_free(
     assert laptop.deploy(2).summary == "runs"
 
 
+def take_lock(laptop: Laptop, index: int) -> None:
+    port = laptop.robot(index).mavlink_port
+    laptop.call(
+        index, "lock", directory=laptop.config.directory, who="the next one", mavlink_port=port
+    )
+
+
 def holders(laptop: Laptop, index: int) -> bool:
     """Whether somebody has the robot's lock."""
     try:
-        laptop.call(index, "lock", directory=laptop.config.directory, who="the next one")
+        take_lock(laptop, index)
     except RemoteError:
         return True
     return False
@@ -298,7 +298,7 @@ def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop)
     host.power_on()
     pending = laptop.overview(0)["pending"]
     assert pending == {"release": release.id, "former": former}
-    assert laptop.deploy(0, release).summary == "unchanged"
+    assert laptop.deploy(0, release).summary.endswith(f"switch to {release.id} was finished")
     after = laptop.overview(0)
     assert (after["current"], after["last_good"], after["pending"]) == (release.id, former, None)
     assert len(after["releases"]) <= 3  # of the seven and more that it has had
@@ -342,7 +342,9 @@ def arm(host: RobotHost, armed: bool) -> None:
 def test_of_two_operators_the_second_waits(laptop: Laptop) -> None:
     async def both() -> None:
         async with connect(laptop.config, laptop.robot(0)) as session:
-            await session.call("lock", directory=laptop.config.directory, who="alice@field")
+            await session.call(
+                "lock", directory=laptop.config.directory, who="alice@field", mavlink_port=14551
+            )
             with pytest.raises(RemoteError, match="alice@field is changing this robot"):
                 await deploy(laptop.config, laptop.robot(0), laptop.release(0), silent)
 
