@@ -77,9 +77,7 @@ def ssh_command(config: FleetConfig, robot: RobotHost) -> list[str]:
         command += ["-F", config.ssh.config]
     if robot.port is not None:
         command += ["-p", str(robot.port)]
-    if robot.user is not None:
-        command += ["-l", robot.user]
-    return [*command, robot.host]
+    return [*command, "-l", robot.user, robot.host]
 
 
 def explain(text: str, host: str) -> str:
@@ -160,9 +158,7 @@ async def connect(
     folder = Path(__file__).parent / "on_robot"
     sources = [("fleet", ""), ("fleet.on_robot", "")]
     sources += [
-        (f"fleet.on_robot.{name}", (folder / f"{name}.py").read_text("utf-8"))
-        for name in _MODULES
-        if (folder / f"{name}.py").exists()
+        (f"fleet.on_robot.{name}", (folder / f"{name}.py").read_text("utf-8")) for name in _MODULES
     ]
     payload = json.dumps(sources).encode()
     # Python 3.6 would take the robot's texts for ASCII.

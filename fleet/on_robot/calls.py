@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import traceback
-from typing import Any, Callable, Dict, List, Optional
+from typing import Any, Callable, Dict, List
 
 # The laptop says something every few seconds.
 SILENCE_S = 12.0
@@ -35,9 +35,7 @@ def say(text: str) -> None:
     _send({"progress": text})
 
 
-def run(
-    command: List[str], timeout_s: float = 10.0, stdin: Optional[str] = None
-) -> "subprocess.CompletedProcess[str]":
+def run(command: List[str], timeout_s: float = 10.0) -> "subprocess.CompletedProcess[str]":
     """Run a program of the robot and wait for it; its output comes back whatever its exit code.
 
     Raises Refused if the program is not there, or does not end in time.
@@ -45,8 +43,7 @@ def run(
     try:
         return subprocess.run(
             command,
-            stdin=subprocess.DEVNULL if stdin is None else None,
-            input=stdin,
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             encoding="utf-8",
@@ -58,6 +55,30 @@ def run(
         raise Refused("the program %s is missing on the robot" % command[0]) from None
     except subprocess.TimeoutExpired:
         raise Refused("%s did not end within %g s" % (" ".join(command[:3]), timeout_s)) from None
+
+
+def reason(done: "subprocess.CompletedProcess[str]") -> str:
+    """The last line with which a program complained, else its exit code."""
+    lines = [line for line in done.stderr.split("\n") if line.strip()]
+    return lines[-1].strip() if lines else "exit code %d" % done.returncode
+
+
+def must(command: List[str], timeout_s: float = 60.0) -> str:
+    """What a program of the robot prints. Raises Refused unless it returns 0."""
+    done = run(command, timeout_s)
+    if done.returncode != 0:
+        raise Refused("%s: %s" % (" ".join(command), reason(done)))
+    return done.stdout
+
+
+def write_whole(path: str, data: bytes) -> None:
+    """Write a file that, whenever the power goes, is the old one or the new one."""
+    part = path + ".part"
+    with open(part, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
 
 
 def serve() -> None:

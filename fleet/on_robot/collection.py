@@ -6,7 +6,6 @@ still grow are, so that what travels is what the checksums are of.
 
 import contextlib
 import glob
-import hashlib
 import json
 import os
 import shutil
@@ -16,7 +15,7 @@ import time
 from typing import Any, Dict, Iterator, List, Optional, Tuple
 
 from fleet.on_robot import releases, service
-from fleet.on_robot.calls import Refused, call, run, say
+from fleet.on_robot.calls import Refused, call, reason, say
 
 _STATE = "/var/lib/private/lpac"
 _LOGS = _STATE + "/logs"
@@ -30,7 +29,6 @@ _GROWS_S = 60.0
 _MARGIN_S = 30.0
 # A laptop that has gone fetches nothing any more.
 _FORGOTTEN_S = 3600.0
-_TRIALS_S = 300.0
 
 Interval = Tuple[float, float]
 
@@ -88,7 +86,7 @@ def collect(
         _journal(os.path.join(folder, journal), interval)
         say("checksums")
         answer["files"] = {
-            os.path.relpath(path, folder): _sha256(path) for path in sorted(_files(folder))
+            os.path.relpath(path, folder): releases.sha256(path) for path in sorted(_files(folder))
         }
     except BaseException:
         shutil.rmtree(folder)
@@ -111,16 +109,11 @@ def _trials(directory: str) -> Dict[str, Dict[str, Interval]]:
     current = releases.linked(directory, "current")
     if current is None:
         raise Refused("no release is on the robot that could read its flight logs: deploy first")
-    script = (
-        'set -e; cd "$1"; mount --bind "$2" var/lib; mount -o remount,bind,ro var/lib; '
-        "mount -t proc proc proc; mount --rbind /dev dev; mount -t tmpfs tmpfs tmp; shift 2; "
-        'exec nice -n 5 chroot . "$@"'
-    )
-    root = os.path.join(directory, "releases", current, "root")
+    release = os.path.join(directory, "releases", current)
     command = ["/usr/bin/lpac", "log", "trials", "/var/lib/logs", "--json"]
-    done = run(["unshare", "--mount", "sh", "-c", script, "sh", root, _STATE, *command], _TRIALS_S)
+    done = releases.run_inside(release, command, state=_STATE)
     if done.returncode != 0:
-        raise Refused("its flight logs cannot be read: %s" % " ".join(done.stderr.split())[-200:])
+        raise Refused("its flight logs cannot be read: %s" % reason(done))
     return dict(json.loads(done.stdout))
 
 
@@ -161,14 +154,6 @@ def _files(folder: str) -> Iterator[str]:
     for parent, _, names in os.walk(folder):
         for name in names:
             yield os.path.join(parent, name)
-
-
-def _sha256(path: str) -> str:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        for block in iter(lambda: file.read(1 << 20), b""):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _forget() -> None:

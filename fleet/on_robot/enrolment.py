@@ -7,7 +7,7 @@ import time
 from typing import Any, Dict, List, Optional
 
 from fleet.on_robot import probes, releases, service
-from fleet.on_robot.calls import Refused, call, run, say
+from fleet.on_robot.calls import Refused, call, must, reason, say, write_whole
 
 _IDENTITY = "/etc/lpac/robot.json"
 # Bridges PX4 to DDS: through it a predecessor's program commands the vehicle.
@@ -35,7 +35,7 @@ def set_identity(fleet: str, robot: str, robot_id: int, rename: bool) -> Dict[st
         if not rename:
             raise Refused("it is enrolled as %s: if it is to be %s, add --yes" % (former, robot))
     os.makedirs(os.path.dirname(_IDENTITY), mode=0o755, exist_ok=True)
-    service.write_whole(_IDENTITY, (json.dumps(wanted) + "\n").encode())
+    write_whole(_IDENTITY, (json.dumps(wanted) + "\n").encode())
     return {"changed": True, "former": former}
 
 
@@ -68,9 +68,9 @@ def set_vision_hub(mavlink_port: int) -> Dict[str, Any]:
         service.refuse_in_flight(mavlink_port, "changing voxl-vision-hub")
         if not os.path.exists(path + ".before-lpac"):
             shutil.copy2(path, path + ".before-lpac")
-        service.write_whole(path, (json.dumps(values, indent=4) + "\n").encode())
+        write_whole(path, (json.dumps(values, indent=4) + "\n").encode())
         if is_active:
-            _systemctl("restart", _VISION_HUB)
+            must(["systemctl", "restart", _VISION_HUB])
     return {"there": True, "changed": changes, "restarted": bool(changes) and is_active}
 
 
@@ -78,31 +78,27 @@ def set_vision_hub(mavlink_port: int) -> Dict[str, Any]:
 def retire(predecessors: List[str], mavlink_port: int) -> Dict[str, Any]:
     """Stop containers and units that must not command the vehicle any more, also at boot.
 
-    Nothing is deleted. Returns what was `stopped`, which predecessors were so already or are not
-    there (`idle`), and what runs that may send setpoints too (`suspects`), with what to do.
+    Nothing is deleted. Returns what was `stopped`, and what runs that may send setpoints too
+    (`suspects`), with what to do.
     """
     containers = probes.known_containers()
     if containers is None:
         raise Refused("docker does not answer: look at `systemctl status docker` on the robot")
     by_name = {container["name"]: container for container in containers}
-    stopped, idle = [], []
+    stopped = []
     for name in [*predecessors, _DDS_AGENT]:
-        done = []
         container, unit = by_name.get(name), _unit(name)
         if container and (container["running"] or container["restarts"] != "no"):
             service.refuse_in_flight(mavlink_port, "stopping %s" % name)
             say("stops %s" % name)
-            _docker("update", "--restart=no", name)
-            _docker("stop", name)
-            done.append("container %s" % name)
+            must(["docker", "update", "--restart=no", name])
+            must(["docker", "stop", name])
+            stopped.append("container %s" % name)
         if unit["active"] or unit["enabled"]:
             service.refuse_in_flight(mavlink_port, "stopping %s" % name)
             say("stops %s" % name)
-            _systemctl("disable", "--now", name)
-            done.append("unit %s" % name)
-        stopped += done
-        if not done and name in predecessors:
-            idle.append(name)
+            must(["systemctl", "disable", "--now", name])
+            stopped.append("unit %s" % name)
     suspects = [
         "container %s (%s) runs in this host's network: if it commands the vehicle, add it to "
         "predecessors" % (container["name"], container["image"])
@@ -115,7 +111,7 @@ def retire(predecessors: List[str], mavlink_port: int) -> Dict[str, Any]:
         for name in _BRIDGES
         if name not in predecessors and _unit(name)["active"]
     ]
-    return {"stopped": stopped, "idle": idle, "suspects": suspects}
+    return {"stopped": stopped, "suspects": suspects}
 
 
 @call
@@ -147,7 +143,7 @@ def set_up_px4(
             say("restarts PX4")
             time.sleep(_PARAMETERS_SAVED_S)
             service.refuse_in_flight(mavlink_port, "restarting PX4")
-            _systemctl("restart", _PX4)
+            must(["systemctl", "restart", _PX4])
             report["system_id"] = _await_px4(mavlink_port, system_id)
             report["restarted"] = True
             report["needs_reboot"] = report["system_id"] != system_id
@@ -174,9 +170,7 @@ def _setup(
     try:
         return dict(json.loads(done.stdout))
     except ValueError:
-        lines = [line for line in done.stderr.split("\n") if line.strip()]
-        reason = lines[-1] if lines else "exit code %d" % done.returncode
-        raise Refused(reason.replace("lpac: ", "", 1)) from None
+        raise Refused(reason(done).replace("lpac: ", "", 1)) from None
 
 
 def _await_px4(mavlink_port: int, system_id: int) -> Optional[int]:
@@ -194,18 +188,3 @@ def _unit(name: str) -> Dict[str, Any]:
     for unit in probes.units(probes.known_units([name])).values():
         return unit
     return {"there": False, "active": False, "enabled": False}
-
-
-def _systemctl(*arguments: str) -> None:
-    _do(["systemctl", *arguments])
-
-
-def _docker(*arguments: str) -> None:
-    _do(["docker", *arguments])
-
-
-def _do(command: List[str]) -> None:
-    done = run(command, timeout_s=60.0)
-    if done.returncode != 0:
-        reason = " ".join(done.stderr.split()) or "exit code %d" % done.returncode
-        raise Refused("%s: %s" % (" ".join(command), reason))

@@ -14,7 +14,7 @@ import time
 from typing import Any, Dict, List, Optional
 
 from fleet.on_robot import releases, service
-from fleet.on_robot.calls import Refused, call, run, say
+from fleet.on_robot.calls import Refused, call, reason, run, say
 
 VISION_HUB = "/etc/modalai/voxl-vision-hub.conf"
 
@@ -120,8 +120,7 @@ def vehicle_check(directory: str) -> Dict[str, Any]:
     try:
         report = json.loads(done.stdout)
     except ValueError:
-        lines = [line for line in done.stderr.split("\n") if line.strip()]
-        raise Refused(lines[-1] if lines else "exit code %d" % done.returncode) from None
+        raise Refused(reason(done)) from None
     return dict(report)
 
 

@@ -2,7 +2,7 @@
 
 `current` is what runs, `last-good` what a rollback goes back to. Both are symlinks that are
 replaced in one step, and `pending` says that a switch is not confirmed yet: whoever comes next
-confirms it or takes it back. All but `overview` need the lock.
+confirms it or takes it back. What changes releases needs the lock.
 """
 
 import contextlib
@@ -13,10 +13,10 @@ import os
 import shutil
 import stat
 import time
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, List, Optional, Set
 
 from fleet.on_robot import service
-from fleet.on_robot.calls import Refused, call, run, say
+from fleet.on_robot.calls import Refused, call, reason, run, say, write_whole
 
 _MARGIN_BYTES = 100000000
 _KEPT = 3
@@ -137,7 +137,6 @@ def accept(directory: str, release: str) -> Dict[str, Any]:
     incoming = os.path.join(directory, "incoming", release)
     _check(incoming, release)
     os.sync()
-    os.makedirs(os.path.join(directory, "releases"), exist_ok=True)
     os.rename(incoming, os.path.join(directory, "releases", release))
     _sync_folder(os.path.join(directory, "releases"))
     return {}
@@ -157,9 +156,7 @@ def prove(directory: str, release: str) -> Dict[str, Any]:
         lpac = ["/usr/bin/lpac", "bundle", command, "/release/bundle", "--json"]
         done = run_inside(path, [*lpac, *options])
         if done.returncode != 0:
-            lines = [line for line in done.stderr.split("\n") if line.strip()]
-            reason = lines[-1] if lines else "exit code %d" % done.returncode
-            raise Refused("bundle %s on the robot: %s" % (command, reason))
+            raise Refused("bundle %s on the robot: %s" % (command, reason(done)))
         reports[command] = json.loads(done.stdout)
     return reports
 
@@ -175,7 +172,7 @@ def switch(directory: str, release: str, mavlink_port: int) -> Dict[str, Any]:
     service.refuse_in_flight(mavlink_port, "switching")
     _prune(directory, {release})
     former = linked(directory, "current")
-    service.write_whole(
+    write_whole(
         os.path.join(directory, "pending"),
         json.dumps({"release": release, "former": former}).encode(),
     )
@@ -290,27 +287,36 @@ def _entry(path: str) -> List[str]:
     info = os.lstat(path)
     if stat.S_ISLNK(info.st_mode):
         return ["link", os.readlink(path)]
+    return [oct(stat.S_IMODE(info.st_mode)), sha256(path)]
+
+
+def sha256(path: str) -> str:
+    """Of a file's content, in hexadecimal."""
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         for block in iter(lambda: file.read(1 << 20), b""):
             digest.update(block)
-    return [oct(stat.S_IMODE(info.st_mode)), digest.hexdigest()]
+    return digest.hexdigest()
 
 
-def run_inside(release: str, command: List[str]) -> Any:
-    """Run a program in the release's file system, as nobody, with nothing of the robot's.
+def run_inside(release: str, command: List[str], state: str = "") -> Any:
+    """Run a program in the release's file system, as the unit does, but before any switch.
 
-    As the unit does it, but before anything is switched.
+    It runs as nobody; with `state`, a folder that it sees at /var/lib and may only read, as root.
     """
     script = (
-        'set -e; cd "$1/root"; shift; mount --bind .. release; mount -t proc proc proc; '
-        "mount --rbind /sys sys; mount --rbind /dev dev; mount -t tmpfs tmpfs tmp; "
-        'exec nice -n 5 chroot --userspec=65534:65534 . "$@"'
+        'set -e; cd "$1/root"; state=$2; shift 2; mount --bind .. release; '
+        "user=--userspec=65534:65534; "
+        'if [ "$state" ]; then user=--userspec=0:0; '
+        'mount --bind "$state" var/lib; mount -o remount,bind,ro var/lib; fi; '
+        "mount -t proc proc proc; mount --rbind /sys sys; mount --rbind /dev dev; "
+        'mount -t tmpfs tmpfs tmp; exec nice -n 5 chroot "$user" . "$@"'
     )
-    return run(["unshare", "--mount", "sh", "-c", script, "sh", release, *command], _VERIFY_S)
+    inside = ["unshare", "--mount", "sh", "-c", script, "sh", release, state]
+    return run([*inside, *command], _VERIFY_S)
 
 
-def _prune(directory: str, besides: Any) -> None:
+def _prune(directory: str, besides: Set[str]) -> None:
     """Remove the oldest releases; never the current and the last good one."""
     keep = {linked(directory, "current"), linked(directory, "last-good")} | besides
     spare = [name for name in _releases(directory) if name not in keep]
@@ -347,6 +353,7 @@ def _pending(directory: str) -> Optional[Dict[str, Any]]:
 
 
 def linked(directory: str, name: str) -> Optional[str]:
+    """The release that a symlink names, None if there is none."""
     try:
         return os.path.basename(os.readlink(os.path.join(directory, name)))
     except OSError:

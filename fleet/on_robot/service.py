@@ -8,7 +8,7 @@ import struct
 import time
 from typing import Any, Dict, List, Optional
 
-from fleet.on_robot.calls import Refused, call, run, say
+from fleet.on_robot.calls import Refused, call, must, run, say, write_whole
 
 UNIT = "lpac-robot.service"
 UNIT_PATH = "/etc/systemd/system/" + UNIT
@@ -34,10 +34,7 @@ def service() -> Dict[str, Any]:
 
     `fresh` tells whether the program is running and said so within the last seconds.
     """
-    shown = run(["systemctl", "show", UNIT, "--no-pager", "-p", _PROPERTIES])
-    if shown.returncode != 0:
-        raise Refused("systemctl show: %s" % shown.stderr.strip())
-    lines = shown.stdout.split("\n")
+    lines = must(["systemctl", "show", UNIT, "--no-pager", "-p", _PROPERTIES]).split("\n")
     values = dict(line.split("=", 1) for line in lines if "=" in line)
     status = _parsed(values.get("StatusText", ""))
     now_s = time.monotonic()
@@ -52,7 +49,6 @@ def service() -> Dict[str, Any]:
         "installed": values.get("LoadState") == "loaded",
         "uptime_s": now_s - started_s if active else None,
         "status": status,
-        "status_age_s": age_s,
         "fresh": active and age_s is not None and -1.0 < age_s < _STATUS_FRESH_S,
     }
 
@@ -142,9 +138,10 @@ def start(directory: str) -> Dict[str, Any]:
     """Start the unit now and at every boot, and wait until the program is well."""
     if not os.path.exists(os.path.join(directory, "current", "robot.toml")):
         raise Refused("there is no release for a slot on this robot: deploy first")
-    _systemctl("reset-failed", UNIT)
-    _systemctl("enable", UNIT)
-    _systemctl("start", UNIT, timeout_s=60.0)
+    run(["systemctl", "reset-failed", UNIT])
+    must(["systemctl", "enable", UNIT])
+    # A program that cannot start shows in its health, with the reason.
+    run(["systemctl", "start", UNIT], timeout_s=90.0)
     problem = unhealthy(20.0)
     if problem is not None:
         raise Refused("it does not run well: %s" % problem)
@@ -161,9 +158,9 @@ def stop(mavlink_port: int, in_flight: bool, disable: bool) -> Dict[str, Any]:
     if not in_flight:
         refuse_in_flight(mavlink_port, "stopping")
     if service()["installed"]:
-        _systemctl("stop", UNIT, timeout_s=30.0)
+        must(["systemctl", "stop", UNIT])
         if disable:
-            _systemctl("disable", UNIT)
+            must(["systemctl", "disable", UNIT])
     return service()
 
 
@@ -262,21 +259,21 @@ def install_unit(directory: str, release: str) -> None:
         os.unlink(DROP_IN_PATH)
         changed = True
     if changed:
-        _systemctl("daemon-reload")
+        must(["systemctl", "daemon-reload"])
 
 
 def run_now() -> None:
     """Restart the unit, whatever came of it before, and start it at every boot."""
     say("restart")
     run(["systemctl", "reset-failed", UNIT])
-    _systemctl("enable", UNIT)
-    # A program that cannot start shows in its health, with the reason.
+    must(["systemctl", "enable", UNIT])
+    # As above.
     run(["systemctl", "restart", UNIT], timeout_s=90.0)
 
 
 def halt() -> None:
     """Stop the unit, now and at boot, if it is there."""
-    run(["systemctl", "disable", "--now", UNIT], timeout_s=30.0)
+    run(["systemctl", "disable", "--now", UNIT])
 
 
 def _copy(source: str, target: str) -> bool:
@@ -288,23 +285,6 @@ def _copy(source: str, target: str) -> bool:
                 return False
     write_whole(target, data)
     return True
-
-
-def write_whole(path: str, data: bytes) -> None:
-    """Write a file that, whenever the power goes, is the old one or the new one."""
-    part = path + ".part"
-    with open(part, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
-
-
-def _systemctl(*arguments: str, timeout_s: float = 20.0) -> None:
-    done = run(["systemctl", *arguments], timeout_s=timeout_s)
-    if done.returncode != 0 and arguments[0] != "reset-failed":
-        reason = " ".join(done.stderr.split()) or "exit code %d" % done.returncode
-        raise Refused("systemctl %s: %s; %s" % (" ".join(arguments), reason, _reason()))
 
 
 def _parsed(text: str) -> Optional[Dict[str, Any]]:

@@ -9,6 +9,7 @@ import pytest
 from sim.host_base import NoHostsError
 from sim.hosts import RobotHosts
 from tests.conftest import SHIPPED
+from tests.fleet.field import lpac_fleet, name_robot
 
 
 @pytest.fixture(scope="package")
@@ -30,9 +31,12 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         yield running
 
 
-@pytest.fixture
-def fresh_hosts(hosts: RobotHosts) -> RobotHosts:
-    """The same with new disks, just booted: half a second each."""
-    for host in hosts:
+@pytest.fixture(scope="package")
+def deployed(hosts: RobotHosts) -> RobotHosts:
+    """With new disks r1 and r3, which fly, and r4, a spare; they have the release. Not r2."""
+    for host in (hosts[0], *hosts[2:]):
         host.reset()
+        name_robot(hosts, host)
+    done = lpac_fleet(hosts.fleet_toml, "deploy", "--robots", "r1,r3,r4")
+    assert done.returncode == 0, done.stderr
     return hosts

@@ -1,29 +1,79 @@
-"""What the tests of the field's commands share: the `lpac fleet` command, and enrolled robots."""
+"""What the tests of the fleet share: the `lpac fleet` command, and what is done to robots."""
 
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from sim.hosts import RobotHost, RobotHosts
 from tests.conftest import ROOT
 
+SILENT = "it does not answer: it is off, or out of reach"
+
+
+def _typed(fleet: Path, command: str, options: tuple[object, ...]) -> list[str]:
+    words = (command, "--fleet", fleet, *options)
+    return [sys.executable, "-m", "cli.main", "fleet", *map(str, words)]
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+
 
 def lpac_fleet(
-    fleet: Path, *arguments: object, environment: Mapping[str, str] | None = None
+    fleet: Path, command: str, *options: object, environment: Mapping[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """`lpac fleet ... --fleet FLEET` until it ends, where nobody can be asked."""
+    """`lpac fleet COMMAND --fleet FLEET ...` until it ends, where nobody can be asked."""
     return subprocess.run(
-        [sys.executable, "-m", "cli.main", "fleet", *map(str, arguments), "--fleet", str(fleet)],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200", **(environment or {})},
+        _typed(fleet, command, options), env={**_environment(), **(environment or {})},
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120.0, check=False,
         start_new_session=True,
     )  # fmt: skip
+
+
+@contextmanager
+def running_lpac_fleet(
+    fleet: Path, command: str, *options: object
+) -> Iterator[subprocess.Popen[str]]:
+    """The same while it runs; it is killed at the end."""
+    with subprocess.Popen(
+        _typed(fleet, command, options), env=_environment(),
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def unwatched(_: str, __: float | None) -> None:
+    """A report that nobody reads."""
 
 
 def name_robot(hosts: RobotHosts, host: RobotHost) -> None:
     """Give the host its identity, as `enroll` does."""
     identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
     host.run(f"mkdir -p /etc/lpac; echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
+
+
+@contextmanager
+def armed(host: RobotHost) -> Iterator[None]:
+    """Its vehicle is armed meanwhile, and does not disarm by itself."""
+    with host.stepped:
+        host.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0
+        host.vehicle.arm(force=True)
+    try:
+        yield
+    finally:
+        with host.stepped:
+            host.vehicle.disarm(force=True)
+
+
+def await_said(host: RobotHost, text: str) -> None:
+    """Until the robot's program says so of itself."""
+    host.run(
+        f"until systemctl show -p StatusText lpac-robot | grep -q '{text}'; do sleep 0.1; done"
+    )

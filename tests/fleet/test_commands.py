@@ -2,20 +2,23 @@
 
 import json
 import os
+import select
 import signal
 import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from sim.host_rack import children
 from sim.hosts import RobotHosts
-from tests.cli.test_cli import lpac
-from tests.conftest import ROOT
+from tests.fleet.field import (
+    SILENT,
+    armed,
+    await_said,
+    lpac_fleet,
+    name_robot,
+    running_lpac_fleet,
+)
 
 
 class Operator:
@@ -26,7 +29,7 @@ class Operator:
         self.fleet_toml = hosts.fleet_toml
 
     def __call__(self, command: str, *options: str) -> subprocess.CompletedProcess[str]:
-        return lpac("fleet", command, "--fleet", self.fleet_toml, *options)
+        return lpac_fleet(self.fleet_toml, command, *options)
 
     def json(self, command: str, *options: str, exit_code: int = 0) -> dict[str, Any]:
         """What the command says of each robot."""
@@ -37,34 +40,13 @@ class Operator:
         robots: dict[str, Any] = answer["robots"]
         return robots
 
-    def services(self) -> dict[str, str]:
-        """How the unit is on each robot."""
-        return {name: of["service"]["active"] for name, of in self.json("status").items()}
-
-    @contextmanager
-    def typing(
-        self, command: str, *options: str, fleet_toml: Path | None = None
-    ) -> Iterator[subprocess.Popen[str]]:
-        """A command that runs meanwhile."""
-        with subprocess.Popen(
-            [sys.executable, "-m", "cli.main", "fleet", command, *options,
-             "--fleet", str(fleet_toml or self.fleet_toml)],
-            cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"},
-        ) as process:  # fmt: skip
-            try:
-                yield process
-            finally:
-                process.kill()
-
 
 @pytest.fixture(scope="module")
 def operator(hosts: RobotHosts) -> Operator:
     """Of three robots that run a release, and a spare that has one."""
     operator = Operator(hosts)
     for host in hosts:
-        identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
-        host.run(f"mkdir -p /etc/lpac && echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
+        name_robot(hosts, host)
     robots = operator.json("deploy")
     assert {name: robot["problem"] for name, robot in robots.items()} == dict.fromkeys(
         ("r1", "r2", "r3", "r4")
@@ -73,24 +55,13 @@ def operator(hosts: RobotHosts) -> Operator:
     return operator
 
 
-def test_deploy_again_says_that_nothing_changed(operator: Operator) -> None:
-    result = operator("deploy")
-    assert result.returncode == 0, result.stderr
-    status = operator.json("status")
-    rows = [line.split() for line in result.stdout.splitlines()[1:]]
-    assert [(row[0], row[1], row[2], row[-1]) for row in rows] == [
-        (name, status[name]["current"], "0.0", "unchanged") for name in ("r1", "r2", "r3", "r4")
-    ]
-
-
 def test_status_tells_of_release_program_vehicle_and_clock(operator: Operator) -> None:
-    operator.json("restart")
     robots = operator.json("status")
     assert [robots[name]["slot"] for name in robots] == [0, 1, 2, None]
     for name, robot in robots.items():
         assert robot["problem"] is robot["last_words"] is robot["pending"] is None
         assert robot["identity"]["robot"] == name
-        assert abs(robot["clock_offset_s"]) < 60.0  # the same clock; but CI may be slow
+        assert isinstance(robot["clock_offset_s"], float)
     assert robots["r1"]["service"]["status"]["armed"] is False
     table, notes = operator("status").stdout.split("\n\n")
     r1, *_, r4 = (line.split() for line in table.splitlines()[2:])
@@ -121,48 +92,41 @@ def test_a_program_that_cannot_start_and_a_host_that_is_another(operator: Operat
     operator.json("start")
 
 
-def test_stop_start_and_restart(operator: Operator) -> None:
-    robots = operator.json("stop")
-    assert {name: of["service"]["active"] for name, of in robots.items()} == dict.fromkeys(
-        ("r1", "r2", "r3", "r4"), "inactive"
-    )
-    assert operator.hosts[0].run("systemctl is-enabled lpac-robot || true").strip() == "disabled"
+def test_a_robot_in_flight_refuses_unless_somebody_insists(operator: Operator) -> None:
+    r1, r2, _, _ = operator.hosts
+    before = operator.json("status")["r2"]["service"]["status"]["boot_nonce"]
+    with armed(r2):
+        await_said(r2, '"armed":true')
+        robots = operator.json("stop", "--robots", "r1,r2", exit_code=1)
+        assert robots["r1"]["problem"] is None
+        assert robots["r1"]["service"]["active"] == "inactive"
+        assert robots["r2"]["problem"].startswith("the vehicle is armed: stopping is refused")
+        (robot,) = operator.json("restart", "--robots", "r2", exit_code=1).values()
+        assert robot["problem"].startswith("the vehicle is armed")
+        service = operator.json("status")["r2"]["service"]
+        assert (service["active"], service["status"]["boot_nonce"]) == ("active", before)
+
+        (robot,) = operator.json("restart", "--robots", "r2", "--in-flight").values()
+        assert robot["service"]["active"] == "active"
+        assert robot["service"]["status"]["boot_nonce"] != before
+        (robot,) = operator.json("stop", "--robots", "r2", "--in-flight").values()
+        assert robot["service"]["active"] == "inactive"
+    assert r1.run("systemctl is-enabled lpac-robot || true").strip() == "disabled"
+
     started = operator("start")
-    assert started.returncode == 0
+    assert started.returncode == 0, started.stderr
     assert "left out, since a spare is not started: r4" in started.stderr
     assert [line.split()[0] for line in started.stdout.splitlines()] == ["robot", "r1", "r2", "r3"]
-    before = operator.json("status")
-    assert before["r1"]["service"]["enabled"] and before["r4"]["service"]["active"] == "inactive"
-    after = operator.json("restart", "--robots", "r1")
-    nonces = [of["r1"]["service"]["status"]["boot_nonce"] for of in (before, after)]
-    assert nonces[0] != nonces[1]
-
-
-@pytest.mark.parametrize("command", ["stop", "restart"])
-def test_a_robot_in_flight_refuses_unless_somebody_insists(
-    operator: Operator, command: str
-) -> None:
-    host = operator.hosts[1]
-    with host.stepped:
-        host.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0  # never by itself
-        host.vehicle.arm(force=True)
-    try:
-        until_s = time.monotonic() + 60.0
-        while operator.json("status")["r2"]["service"]["status"]["armed"] is not True:
-            assert time.monotonic() < until_s
-        robots = operator.json(command, "--robots", "r1,r2", exit_code=1)
-        assert robots["r1"]["problem"] is None
-        assert robots["r2"]["problem"].startswith("the vehicle is armed")
-        assert operator.services()["r2"] == "active"
-        assert operator(command, "--robots", "r2", "--in-flight").returncode == 0
-    finally:
-        with host.stepped:
-            host.vehicle.disarm(force=True)
-    assert operator.services()["r2"] == {"stop": "inactive", "restart": "active"}[command]
-    operator.json("start")
+    robots = operator.json("status")
+    assert robots["r1"]["service"]["enabled"]
+    assert [of["service"]["active"] for of in robots.values()] == [*["active"] * 3, "inactive"]
 
 
 def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -> None:
+    world = operator.hosts.folder / "world.env"
+    text = world.read_text()
+    before = operator.json("status", "--robots", "r1")["r1"]["current"]
+    world.write_text(text + text.splitlines()[-1] + "\n")
     operator.hosts[2].power_off()
     try:
         deployed = operator("deploy", "--robots", "r1,r3")
@@ -170,43 +134,31 @@ def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -
         ran = operator("exec", "--robots", "r1,r3", "true")
     finally:
         operator.hosts[2].power_on()
+        world.write_text(text)
     assert deployed.returncode == ran.returncode == 1
     table, notes = deployed.stdout.split("\n\n")
-    assert [line.split()[-1] for line in table.splitlines()] == ["result", "unchanged", "failed"]
-    silent = "it does not answer: it is off, or out of reach"
-    assert notes.split(maxsplit=1) == ["r3", silent + "\n"]
+    of_r1, of_r3 = (line.split() for line in table.splitlines()[1:])
+    assert of_r1[1] != before and of_r1[-1] == "runs"
+    assert float(of_r1[3]) > 0.0 and float(of_r1[4]) > 0.0  # its policy's ticks there, ms
+    assert of_r3[-1] == "failed"
+    assert notes.split(maxsplit=1) == ["r3", SILENT + "\n"]
     assert deployed.stderr.splitlines()[-1] == "lpac: deployed on 1 of 2 robots; failed: r3"
     # ssh's own complaint comes first.
     assert ran.stderr.splitlines()[1:] == [
-        f"r3  {silent}", "lpac: succeeded on 1 of 2 robots; failed: r3",
+        f"r3  {SILENT}", "lpac: succeeded on 1 of 2 robots; failed: r3",
     ]  # fmt: skip
 
-
-def test_rollback_needs_a_release_to_go_back_to(operator: Operator) -> None:
-    world = operator.hosts.folder / "world.env"
-    text = world.read_text()
-    before = operator.json("status", "--robots", "r1")["r1"]["current"]
-    world.write_text(text + text.splitlines()[-1] + "\n")
-    try:
-        deployed = operator.json("deploy", "--robots", "r1")["r1"]
-    finally:
-        world.write_text(text)
-    assert deployed["release"] != before and deployed["summary"] == "runs"
-    assert deployed["perceive_p99_ms"] > 0 and deployed["infer_p99_ms"] > 0
     assert "* image" in operator("status").stdout  # r1 has another world than the others
     assert operator.json("rollback", "--robots", "r1") == {
         "r1": {"host": operator.hosts[0].address, "problem": None, "release": before}
     }
-    again = operator.json("rollback", "--robots", "r1", exit_code=1)["r1"]
-    assert "no earlier release" in again["problem"]
 
 
 # Plain ssh
 
 
 def test_logs_are_in_the_order_of_time(operator: Operator) -> None:
-    operator.json("restart")
-    result = operator("logs", "-n", "20")
+    result = operator("logs", "-n", "200")
     assert result.returncode == 0, result.stderr
     lines = [line.split() for line in result.stdout.splitlines()]
     assert {line[0] for line in lines} == {"r1", "r2", "r3"}  # r4 never ran
@@ -220,7 +172,8 @@ def test_logs_are_in_the_order_of_time(operator: Operator) -> None:
 
 
 def test_logs_follow_until_ctrl_c(operator: Operator) -> None:
-    with operator.typing("logs", "-f", "-n", "1", "--robots", "r1,r2") as following:
+    asked = (operator.fleet_toml, "logs", "-f", "-n", "1", "--robots", "r1,r2")
+    with running_lpac_fleet(*asked) as following:
         assert following.stdout is not None
         waiting = {"r1", "r2"}
         while waiting:
@@ -260,15 +213,19 @@ def test_ctrl_c_ends_with_a_summary_of_who_has_what(operator: Operator) -> None:
     # Its kernel takes the connection, and then nobody says anything.
     hung.run("pkill -STOP -x sshd")
     try:
-        with operator.typing("deploy", fleet_toml=patient) as deploying:
+        with running_lpac_fleet(patient, "deploy") as deploying:
             assert deploying.stderr is not None
             waiting = {"r1", "r3", "r4"}
             while waiting:
                 _, _, name, text = deploying.stderr.readline().split(maxsplit=3)
                 if text == "done\n":
                     waiting.remove(name)
+            (ssh,) = map(os.pidfd_open, children(deploying.pid))
             deploying.send_signal(signal.SIGINT)
             output, _ = deploying.communicate()
+        # What it began it has ended.
+        assert select.select([ssh], [], [], 10.0)[0]
+        os.close(ssh)
     finally:
         hung.run("pkill -CONT -x sshd")
     assert deploying.returncode == 1

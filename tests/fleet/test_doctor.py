@@ -11,10 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-import cli.field  # noqa: F401 registers its commands
-from cli.fleet import app
 from fleet.config import FleetConfig, RobotHost, load_fleet
 from fleet.deploy import deploy
 from fleet.doctor import (
@@ -26,34 +23,26 @@ from fleet.doctor import (
     examine,
     judge,
 )
-from fleet.laptop import examine_laptop, iptables_blocks, nft_blocks, rsync_version
+from fleet.laptop import iptables_blocks, nft_blocks, rsync_version
 from fleet.operations import Outcome, for_each
 from fleet.release import load_common, make_release
 from fleet.up import bring_up, decide
 from sim.hosts import RobotHost as Host
 from sim.hosts import RobotHosts
-
-ROOT = Path(__file__).parents[2]
-
-
-def silent(_: str, __: float | None) -> None:
-    """Nobody watches."""
-
+from tests.conftest import ROOT
+from tests.fleet.field import SILENT, armed, lpac_fleet, name_robot, unwatched
 
 # On robot computers
 
 
 @pytest.fixture(scope="module")
-def enrolled(hosts: RobotHosts) -> Iterator[RobotHosts]:
-    """With new disks, and their identity; nothing else is done to them."""
-    for host in hosts:
+def enrolled(hosts: RobotHosts) -> RobotHosts:
+    """With their identity; r1, r2 and r3 with new disks, and nothing else is done to them."""
+    for host in hosts[:3]:
         host.reset()
-        identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
-        (host.root / "etc/lpac").mkdir()
-        (host.root / "etc/lpac/robot.json").write_text(json.dumps(identity))
-    yield hosts
     for host in hosts:
-        host.reset()
+        name_robot(hosts, host)
+    return hosts
 
 
 @contextlib.contextmanager
@@ -75,7 +64,7 @@ def run_doctor(
 
     async def one(robot: RobotHost) -> Examination:
         others = [other for other in chosen if other is not robot]
-        return await examine(config, robot, others, silent, **clock)
+        return await examine(config, robot, others, unwatched, **clock)
 
     outcomes: list[Outcome[Examination]] = asyncio.run(for_each(chosen, one))
     return {
@@ -94,48 +83,31 @@ def test_a_stock_robot_is_told_what_it_lacks(enrolled: RobotHosts) -> None:
         assert 'offboard_mode is "figure_eight"' in checks["vision-hub"].found
         assert checks["vision-hub"].fix.startswith("lpac fleet enroll r")
         assert checks["release"].fix.startswith("lpac fleet deploy --robots r")
-        for name in ("enrolled", "system", "clock", "memory", "radio", "mavlink", "commanders"):
+        for name in ("enrolled", "system", "clock", "mavlink", "commanders"):
             assert verdicts[name] == "ok", checks[name]
 
 
-def test_a_full_disk_and_a_cut_radio_link(enrolled: RobotHosts) -> None:
-    r1, r2, r3, _ = enrolled
+def test_each_robot_has_its_own_faults_alone(enrolled: RobotHosts) -> None:
+    """A full disk, no radio link between two, and one that is off."""
+    r1, r2, r3, r4 = enrolled
     r1.fill_disk()
+    r4.cut()
     try:
         with deaf(r2, r3):
-            found = run_doctor(enrolled)
+            found = run_doctor(enrolled, "r1,r2,r3,r4")
     finally:
         r1.free_disk()
+        r4.heal()
     assert found["r1"]["disk"].verdict == "FAILED"
     assert found["r2"]["disk"].verdict != "FAILED"
-    assert found["r1"]["radio"].verdict == "ok"
+    assert found["r1"]["radio"].verdict != "FAILED"
     assert found["r2"]["radio"].verdict == "FAILED"
     assert found["r2"]["radio"].found == "no answer from r3"
+    (reach,) = found["r4"].values()
+    assert (reach.name, reach.verdict, reach.found) == ("reach", "FAILED", SILENT)
 
 
-def test_a_robot_that_is_off_is_its_own_fault_alone(enrolled: RobotHosts) -> None:
-    enrolled[1].cut()
-    try:
-        found = run_doctor(enrolled)
-    finally:
-        enrolled[1].heal()
-    assert list(found["r2"]) == ["reach"]
-    assert found["r2"]["reach"].verdict == "FAILED"
-    assert "off, or out of reach" in found["r2"]["reach"].found
-    assert found["r1"]["radio"].verdict == found["r3"]["radio"].verdict == "ok"
-
-
-@pytest.mark.parametrize(
-    ("ahead_s", "verdict"), [(3600.0, "FAILED"), (-0.3, "warning"), (0.0, "ok")]
-)
-def test_a_wrong_clock(enrolled: RobotHosts, ahead_s: float, verdict: str) -> None:
-    # The robots' clock is this machine's: it is the laptop's that is wrong.
-    checks = run_doctor(enrolled, "r1", unix_time_s=lambda: time.time() - ahead_s)["r1"]
-    assert checks["clock"].verdict == verdict
-    assert checks["clock"].fix == ("" if verdict == "ok" else "lpac fleet up")
-
-
-def test_another_vehicle_and_one_that_is_silent(enrolled: RobotHosts) -> None:
+def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: RobotHosts) -> None:
     text = enrolled.fleet_toml.read_text()
     changed = text.replace("robot_id = 1\n", "robot_id = 1\nsystem_id = 99\n")
     changed = changed.replace(
@@ -143,55 +115,58 @@ def test_another_vehicle_and_one_that_is_silent(enrolled: RobotHosts) -> None:
     )
     enrolled.fleet_toml.write_text(changed)
     try:
-        found = run_doctor(enrolled, "r1,r2")
+        # The robots' clock is this machine's: it is the laptop's that is wrong.
+        found = run_doctor(enrolled, "r1,r2", unix_time_s=lambda: time.time() - 3600.0)
     finally:
         enrolled.fleet_toml.write_text(text)
+    assert found["r1"]["clock"].verdict == "FAILED"
     assert "system id 1, configured is 99" in found["r1"]["mavlink"].found
     assert "no heartbeat of PX4 at UDP port 14999" in found["r2"]["mavlink"].found
     assert "14551, configured is 14999" in found["r2"]["vision-hub"].found
 
 
 def test_doctor_prints_a_board_and_fails(enrolled: RobotHosts) -> None:
-    asked = ["doctor", "--fleet", str(enrolled.fleet_toml), "--robots", "r1,r3"]
-    shown = CliRunner().invoke(app, asked, env={"COLUMNS": "200"})
-    assert str(shown.exception) == "4 checks failed, on r1, r3"
+    asked = (enrolled.fleet_toml, "doctor", "--robots", "r1,r3")
+    shown = lpac_fleet(*asked)
+    assert shown.returncode == 1
+    assert shown.stderr.splitlines()[-1] == "lpac: 4 checks failed, on r1, r3"
     assert "vision-hub FAILED FAILED" in " ".join(shown.stdout.split())
     assert "→ lpac fleet deploy --robots r1" in shown.stdout
-    asked.append("--json")
-    robots = json.loads(CliRunner().invoke(app, asked).stdout)["robots"]
+    robots = json.loads(lpac_fleet(*asked, "--json").stdout)["robots"]
     assert list(robots) == ["r1", "r3"]
     assert not robots["r1"]["ok"]
-    assert {"name": "radio", "verdict": "ok"}.items() <= robots["r1"]["checks"][9].items()
+    (hub,) = [check for check in robots["r1"]["checks"] if check["name"] == "vision-hub"]
+    assert (hub["verdict"], hub["fix"]) == ("FAILED", "lpac fleet enroll r1")
 
 
 def test_ping_has_every_way(enrolled: RobotHosts) -> None:
-    asked = ["ping", "--fleet", str(enrolled.fleet_toml), "--json"]
-    shown = CliRunner().invoke(app, asked)
-    assert shown.exit_code == 0
+    shown = lpac_fleet(enrolled.fleet_toml, "ping", "--json")
+    assert shown.returncode == 0, shown.stderr
     robots = json.loads(shown.stdout)["robots"]
     for name, found in robots.items():
         assert found["laptop_ms"] > 0.0
         assert set(found["others"]) == set(robots) - {name}
-        assert all(way["loss"] == 0.0 for way in found["others"].values())
+        assert all(way["loss"] < 1.0 for way in found["others"].values())
     with deaf(enrolled[0], enrolled[2]):
-        shown = CliRunner().invoke(app, asked[:-1])
-    assert str(shown.exception) == "no answer: r1 → r3, r3 → r1"
+        shown = lpac_fleet(enrolled.fleet_toml, "ping")
+    assert shown.returncode == 1
+    assert shown.stderr.splitlines()[-1] == "lpac: no answer: r1 → r3, r3 → r1"
     assert "lost" in shown.stdout
 
 
 def test_up_says_no_go_with_the_reasons(enrolled: RobotHosts) -> None:
     enrolled[2].cut()
     try:
-        asked = ["up", "--fleet", str(enrolled.fleet_toml), "--timeout", "3", "--json"]
-        shown = CliRunner().invoke(app, asked)
+        shown = lpac_fleet(enrolled.fleet_toml, "up", "--timeout", "3", "--json")
     finally:
         enrolled[2].heal()
-    assert str(shown.exception) == "NO-GO: r1, r2, r3"
+    assert shown.returncode == 1
+    assert shown.stderr.splitlines()[-1] == "lpac: NO-GO: r1, r2, r3"
     robots = json.loads(shown.stdout)["robots"]
     # The spare is not waited for.
     assert list(robots) == ["r1", "r2", "r3"]
     assert "release: there is none" in robots["r1"]["reasons"]
-    assert robots["r3"]["reasons"] == ["up: it does not answer: it is off, or out of reach"]
+    assert robots["r3"]["reasons"] == [f"up: {SILENT}"]
 
 
 def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: RobotHosts) -> None:
@@ -214,7 +189,9 @@ def test_a_clock_that_cannot_be_set_is_no_go(enrolled: RobotHosts) -> None:
     """A container may not set the clock of the machine that it runs on."""
     config = load_fleet(enrolled.fleet_toml)
     arrival = asyncio.run(
-        bring_up(config, config.robots["r1"], time.monotonic(), silent, lambda: time.time() + 100.0)
+        bring_up(
+            config, config.robots["r1"], time.monotonic(), unwatched, lambda: time.time() + 100.0
+        )
     )
     assert len(arrival.problems) == 1
     assert arrival.problems[0].startswith("its clock cannot be set")
@@ -225,10 +202,9 @@ def test_up_starts_what_was_switched_off_and_says_go(enrolled: RobotHosts, tmp_p
     config = load_fleet(enrolled.fleet_toml)
     robot = config.robots[host.name]
     release = make_release(config, robot, load_common(config), tmp_path)
-    asyncio.run(deploy(config, robot, release, silent))
+    asyncio.run(deploy(config, robot, release, unwatched))
     hub = host.root / "etc/modalai/voxl-vision-hub.conf"
     hub.write_text(hub.read_text().replace("figure_eight", "off"))
-    asked = ["--fleet", str(enrolled.fleet_toml), "--robots", host.name, "--json"]
 
     # The program is stopped, but meant to run: as after a start that failed.
     host.run("systemctl stop lpac-robot")
@@ -237,32 +213,27 @@ def test_up_starts_what_was_switched_off_and_says_go(enrolled: RobotHosts, tmp_p
     # Its release has looked at PX4's parameters, and set them.
     assert checks["failsafe"].verdict == checks["preflight"].verdict == "ok"
 
-    shown = CliRunner().invoke(app, ["up", *asked])
+    shown = lpac_fleet(enrolled.fleet_toml, "up", "--robots", host.name, "--json")
     found = json.loads(shown.stdout)["robots"][host.name]
-    assert shown.exit_code == 0, found["reasons"]
+    assert shown.returncode == 0, found["reasons"]
     assert found["go"]
     assert found["checks"][0]["found"] == "its program was started"
 
     # One that was stopped on purpose stays so.
     host.run("systemctl disable --now lpac-robot")
-    assert asyncio.run(bring_up(config, robot, time.monotonic(), silent)) == ((), ())
+    assert asyncio.run(bring_up(config, robot, time.monotonic(), unwatched)) == ((), ())
     assert host.run("systemctl is-active lpac-robot || true") == "inactive\n"
 
 
 def test_no_clock_is_set_under_an_armed_vehicle(enrolled: RobotHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
-    host = enrolled[1]
-    with host.stepped:
-        host.vehicle.arm(force=True)
-    try:
+    with armed(enrolled[1]):
         arrival = asyncio.run(
             bring_up(
-                config, config.robots["r2"], time.monotonic(), silent, lambda: time.time() + 100.0
+                config, config.robots["r2"], time.monotonic(), unwatched,
+                lambda: time.time() + 100.0,
             )
-        )
-    finally:
-        with host.stepped:
-            host.vehicle.disarm(force=True)
+        )  # fmt: skip
     assert arrival.problems == (
         "the vehicle is armed: setting the clock is refused until it is disarmed",
     )
@@ -351,6 +322,17 @@ def test_a_robot_that_is_well_may_fly(config: FleetConfig) -> None:
     checks = judged(config)
     assert {check.verdict for check in checks.values()} == {"ok"}
     assert decide(Diagnosis("r1", tuple(checks.values()))) == ("r1", True, ())
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "verdict"), [(3600.0, "FAILED"), (-0.3, "warning"), (0.0, "ok")]
+)
+def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str) -> None:
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    fleet["r1"] = fleet["r1"]._replace(clock=ClockOffset(ahead_s, 0.01))
+    checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
+    assert checks["clock"].verdict == verdict
+    assert checks["clock"].fix == ("" if verdict == "ok" else "lpac fleet up")
 
 
 def container(**about: object) -> list[dict[str, object]]:
@@ -467,10 +449,19 @@ def test_what_a_stopped_robots_release_says_counts(config: FleetConfig) -> None:
 # The laptop
 
 
-def test_the_laptop_is_looked_at_and_named(config: FleetConfig) -> None:
-    checks = examine_laptop(config)
-    assert [check.name for check in checks] == ["tools", "keys", "sleep", "clock", "firewall"]
-    assert checks[0].verdict == "ok"
+def test_the_laptop_is_looked_at_and_what_it_lacks_is_named(
+    config: FleetConfig, tmp_path: Path
+) -> None:
+    def look(**environment: str) -> dict[str, dict[str, str]]:
+        asked = (config.path, "doctor", "--laptop", "--json")
+        shown = lpac_fleet(*asked, environment=environment)
+        return {c["name"]: c for c in json.loads(shown.stdout)["robots"]["laptop"]["checks"]}
+
+    checks = look()
+    assert list(checks) == ["tools", "keys", "sleep", "clock", "firewall"]
+    assert checks["tools"]["verdict"] == "ok"
+    tools = look(PATH=str(tmp_path))["tools"]
+    assert (tools["verdict"], tools["found"]) == ("FAILED", "ssh, ssh-keygen, rsync is missing")
 
 
 def test_rsync_version() -> None:

@@ -3,14 +3,13 @@
 import json
 import subprocess
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from fleet.config import load_fleet
 from sim.hosts import RobotHost, RobotHosts
-from tests.fleet.field import lpac_fleet
+from tests.fleet.field import armed, lpac_fleet
 
 PASSWORD = "voxl-password"
 STEPS = (
@@ -47,12 +46,11 @@ UNIT = "[Service]\nExecStart=/bin/sleep infinity\n[Install]\nWantedBy=multi-user
 
 
 @pytest.fixture
-def new(hosts: RobotHosts) -> Iterator[RobotHost]:
+def new(hosts: RobotHosts) -> RobotHost:
     """r4 as it came: only a password lets in, and the fleet of `fleet_file` does not know it."""
     host = hosts[3]
     host.reset()
-    yield host
-    host.reset()
+    return host
 
 
 @pytest.fixture
@@ -215,10 +213,8 @@ def test_a_robot_is_not_renamed_nor_touched_in_flight_nor_let_in_unseen(
     assert done.returncode == 1
     assert "it is enrolled as r9 of fleet other (id 9): if it is to be r4, add --yes" in done.stderr
     assert fleet_file.read_text() == before
-    with new.stepped:
-        new.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0
-        new.vehicle.arm(force=True)
-    done = lpac_fleet(fleet_file, "enroll", "r4", new.address, "--yes")
+    with armed(new):
+        done = lpac_fleet(fleet_file, "enroll", "r4", new.address, "--yes")
     assert done.returncode == 1
     assert outcomes(done.stdout)["robot id"] == "done"
     assert "it was r9 of fleet other (id 9)" in done.stdout

@@ -4,7 +4,6 @@ import asyncio
 import json
 import os
 import subprocess
-import threading
 import time
 from pathlib import Path
 
@@ -12,10 +11,11 @@ import pytest
 
 from edge.adapters.flight_log import FlightLog, FlightMetadata, read
 from fleet.config import load_fleet
+from fleet.hold import Report
 from fleet.pull import Pulled, pull
 from fleet.session import FleetError
 from sim.hosts import RobotHost, RobotHosts
-from tests.fleet.field import lpac_fleet, name_robot
+from tests.fleet.field import armed, lpac_fleet, unwatched
 
 LOGS = "var/lib/private/lpac/logs"
 # In the past, so that no file is taken for one that still grows.
@@ -43,27 +43,24 @@ def write_ulog(host: RobotHost, session: str, ended_s: float, data: bytes) -> No
 
 
 @pytest.fixture(scope="module")
-def flown(hosts: RobotHosts) -> RobotHosts:
-    """r1 has flown the trials A and B; r4, a spare, nothing. Both have a release."""
-    for host in (hosts[0], hosts[3]):
-        host.reset()
-        name_robot(hosts, host)
-    deployed = lpac_fleet(hosts.fleet_toml, "deploy", "--robots", "r1,r4")
-    assert deployed.returncode == 0, deployed.stderr
-    r1 = hosts[0]
+def flown(deployed: RobotHosts) -> RobotHosts:
+    """r1 has flown the trials A and B; r4, a spare, nothing."""
+    r1 = deployed[0]
     r1.run("systemctl stop lpac-robot; rm -f /var/lib/private/lpac/logs/*")
     write_logs(r1.root / LOGS, 1, [("A", FIRST_S), ("B", FIRST_S + 100.0)])
     write_ulog(r1, "sess001", FIRST_S - 500.0, b"before")
     write_ulog(r1, "sess002", FIRST_S + 12.0, b"of A")
     write_ulog(r1, "sess003", FIRST_S + 112.0, b"of B")
     (r1.root / "data/px4/param/parameters").write_bytes(b"EKF2_HGT_REF")
-    return hosts
+    return deployed
 
 
-def fetch(hosts: RobotHosts, index: int, trial: str | None, out: Path) -> Pulled:
+def fetch(
+    hosts: RobotHosts, index: int, trial: str | None, out: Path, report: Report = unwatched
+) -> Pulled:
     config = load_fleet(hosts.fleet_toml)
     robot = config.robots[hosts[index].name]
-    return asyncio.run(pull(config, robot, trial, out, lambda *_: None))
+    return asyncio.run(pull(config, robot, trial, out, report))
 
 
 def names(folder: Path) -> set[str]:
@@ -130,18 +127,13 @@ def test_a_cut_in_the_middle_is_made_up_for(flown: RobotHosts, tmp_path: Path) -
     write_ulog(host, "sess009", FIRST_S + 11.0, big)
     folder = tmp_path / "A/r1/px4/sess009"
 
-    def cut() -> None:
-        """While rsync writes to its own file there."""
-        while not any(path.stat().st_size for path in folder.glob(".log100.ulg.*")):
-            time.sleep(0.001)
-        host.cut()
+    def cut_in_the_middle(step: str, share: float | None) -> None:
+        if step == "fetch" and share is not None and 0.1 < share < 0.9:
+            host.cut()
 
-    cutter = threading.Thread(target=cut, daemon=True)
-    cutter.start()
     try:
         with pytest.raises(FleetError, match="it does not answer"):
-            fetch(flown, 0, "A", tmp_path)
-        cutter.join()
+            fetch(flown, 0, "A", tmp_path, cut_in_the_middle)
         host.heal()
         done = fetch(flown, 0, "A", tmp_path)
         assert 0 < done.sent_bytes < BIG_BYTES
@@ -170,11 +162,8 @@ def test_a_log_that_grows_comes_as_far_as_it_is(flown: RobotHosts, tmp_path: Pat
 
 def test_a_robot_in_flight_is_left_alone(flown: RobotHosts, tmp_path: Path) -> None:
     host = flown[0]
-    with host.stepped:
-        host.vehicle.arm(force=True)
-    try:
-        with pytest.raises(FleetError, match="the vehicle is armed: pulling is refused"):
-            fetch(flown, 0, "A", tmp_path)
-    finally:
-        with host.stepped:
-            host.vehicle.disarm(force=True)
+    with (
+        armed(host),
+        pytest.raises(FleetError, match="the vehicle is armed: pulling is refused"),
+    ):
+        fetch(flown, 0, "A", tmp_path)

@@ -189,7 +189,7 @@ def test_fleet_toml_describes_the_hosts(hosts: RobotHosts) -> None:
     assert all((hosts.folder / p).exists() for p in (fleet["ssh"]["config"], fleet["world"]))
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_hosts_go_when_their_program_does(
     hosts: RobotHosts, tmp_path: Path, number: signal.Signals
 ) -> None:
