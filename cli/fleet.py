@@ -276,9 +276,9 @@ def logs(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")] = False,
 ) -> None:
     """Show what the robots' programs, and systemd about them, have written, by time."""
-    from fleet.execute import as_root, execute
+    from fleet.execute import execute
     from fleet.logs import Entry, journal_command, parse_entry, readable
-    from fleet.session import RemoteError
+    from fleet.session import RemoteError, as_root
 
     config, chosen = open_fleet(fleet, robots)
     label = _labels(chosen)
@@ -300,7 +300,7 @@ def logs(
                 entries.append((entry, robot.name))
 
         complaints: list[str] = []
-        command = as_root(journal_command(lines, follow=follow))
+        command = as_root(shlex.join(journal_command(lines, follow=follow)))
         if await execute(config, robot, command, on_output, complaints.append) != 0:
             raise RemoteError(complaints[-1] if complaints else "journalctl failed")
 

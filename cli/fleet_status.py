@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
 # Characters of an id that tell it from others.
 SHORT = 8
-# Of a journal, to find out why a program has failed.
-_LAST_LINES = 20
 # A clock that is off by more is noted: what robots log cannot be put in order.
 _CLOCK_WITHIN_S = 0.5
 
@@ -42,18 +40,13 @@ class State(NamedTuple):
 
 async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
     """Ask the robot; nothing of it is held or changed. Raises FleetError."""
-    from fleet.hold import check_identity
-    from fleet.logs import last_words
-    from fleet.session import connect
+    from fleet.hold import visit
 
-    async with connect(config, robot) as session:
-        overview = await session.call("overview", directory=config.directory)
+    async with visit(config, robot) as (session, overview):
         clock_offset_s = overview["unix_time_s"] - time.time()
-        check_identity(overview["identity"], config, robot)
         words = None
         if _failed(overview["service"]):
-            journal = await session.call("journal", lines=_LAST_LINES)
-            words = last_words(journal["lines"])
+            words = (await session.call("last_words"))["text"]
     return State(overview, _slot(config, robot.name), clock_offset_s, words)
 
 

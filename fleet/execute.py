@@ -1,7 +1,6 @@
 """A command on a robot, by its shell; its output comes line by line while it runs."""
 
 import asyncio
-import shlex
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -53,12 +52,6 @@ async def execute(
     if exit_code == _SSH_FAILED:
         raise UnreachableError(explain("\n".join(complaints), robot.host))
     return exit_code
-
-
-def as_root(command: list[str]) -> str:
-    """The shell's text that runs `command` as root, whoever logs in."""
-    text = shlex.join(command)
-    return f'if [ "$(id -u)" = 0 ]; then exec {text}; else exec sudo -n {text}; fi'
 
 
 async def _read(stream: asyncio.StreamReader, on_line: OnLine) -> None:

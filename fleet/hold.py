@@ -13,12 +13,31 @@ from fleet.session import RemoteError, Session, connect
 Report = Callable[[str, float | None], None]
 
 
+class Visit(NamedTuple):
+    """A session with the right robot, and what was on it."""
+
+    session: Session
+    found: dict[str, Any]
+
+
 class Held(NamedTuple):
     """A session that has the robot's lock, what was on the robot, and what `lock` mended there."""
 
     session: Session
     found: dict[str, Any]
     recovered: str | None
+
+
+@contextlib.asynccontextmanager
+async def visit(
+    config: FleetConfig, robot: RobotHost, report: Report = lambda *_: None
+) -> AsyncIterator[Visit]:
+    """Look at the robot without holding it. Raises FleetError if another one answers, or none."""
+    report("connect", None)
+    async with connect(config, robot, lambda step: report(step, None)) as session:
+        found = await session.call("overview", directory=config.directory)
+        check_identity(found["identity"], config, robot)
+        yield Visit(session, found)
 
 
 @contextlib.asynccontextmanager
@@ -29,14 +48,13 @@ async def hold(
 
     Raises FleetError if it does not answer, another robot does, or somebody else holds it.
     """
-    report("connect", None)
-    async with connect(config, robot, lambda step: report(step, None)) as session:
-        found = await session.call("overview", directory=config.directory)
-        check_identity(found["identity"], config, robot)
+    async with visit(config, robot, report) as (session, found):
         recovered = await lock(session, config, robot)
-        if recovered is not None:
-            found = await session.call("overview", directory=config.directory)
-        yield Held(session, found, recovered)
+        if recovered is None:
+            yield Held(session, found, None)
+        else:
+            mended = await session.call("overview", directory=config.directory)
+            yield Held(session, mended, recovered)
 
 
 async def lock(session: Session, config: FleetConfig, robot: RobotHost) -> str | None:

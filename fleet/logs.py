@@ -1,7 +1,6 @@
 """The robots' journals: what the program, and systemd about it, wrote and when."""
 
 import json
-from collections.abc import Sequence
 from datetime import datetime
 from typing import NamedTuple
 
@@ -39,14 +38,6 @@ def readable(entry: Entry) -> str:
     return f"{time_of_day} {_readable_text(entry.text)}"
 
 
-def last_words(lines: Sequence[str]) -> str | None:
-    """The last line with which the program said what is wrong; else the last one; None if none."""
-    for line in reversed(lines):
-        if line.startswith("lpac: ") or _level(line) in ("error", "critical"):
-            return _readable_text(line)
-    return _readable_text(lines[-1]) if lines else None
-
-
 def _readable_text(text: str) -> str:
     event = _structured(text)
     if event is None:
@@ -62,11 +53,6 @@ def _readable_text(text: str) -> str:
 def _value(value: object) -> str:
     text = value if isinstance(value, str) else json.dumps(value)
     return json.dumps(text) if " " in text and isinstance(value, str) else text
-
-
-def _level(text: str) -> str | None:
-    event = _structured(text)
-    return None if event is None else str(event.get("level"))
 
 
 def _structured(text: str) -> dict[str, object] | None:

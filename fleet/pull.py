@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
-from fleet.hold import Report, check_identity
-from fleet.session import RemoteError, UnreachableError, connect, rsync
+from fleet.hold import Report, visit
+from fleet.session import RemoteError, UnreachableError, rsync
 
 SUMS = "SHA256SUMS"
 
@@ -33,10 +33,7 @@ async def pull(
     also if the robot has nothing of the trial.
     """
     folder = out.resolve() / ("all" if trial is None else trial.replace("/", "_")) / robot.name
-    report("connect", None)
-    async with connect(config, robot, lambda step: report(step, None)) as session:
-        found = await session.call("overview", directory=config.directory)
-        check_identity(found["identity"], config, robot)
+    async with visit(config, robot, report) as (session, found):
         collected = await session.call(
             "collect", directory=config.directory, mavlink_port=robot.mavlink_port, trial=trial,
             since_s=0.0 if trial is not None else _newest_s(folder),

@@ -80,6 +80,12 @@ def ssh_command(config: FleetConfig, robot: RobotHost) -> list[str]:
     return [*command, "-l", robot.user, robot.host]
 
 
+def as_root(command: str) -> str:
+    """What the login shell is to run `command` as root: releases, units, journals are root's."""
+    text = f'if [ "$(id -u)" = 0 ]; then exec {command}; else exec sudo -n {command}; fi'
+    return f"exec sh -c {shlex.quote(text)}"
+
+
 def explain(text: str, host: str) -> str:
     """What ssh's or rsync's last words mean, in one line."""
     for pattern, advice in _ADVICE:
@@ -163,10 +169,8 @@ async def connect(
     payload = json.dumps(sources).encode()
     # Python 3.6 would take the robot's texts for ASCII.
     python = f"env LC_ALL=C.UTF-8 python3 -u -c {shlex.quote(_BOOTSTRAP.format(size=len(payload)))}"
-    # Releases, units and other programs' files are root's.
-    remote = f'if [ "$(id -u)" = 0 ]; then exec {python}; else exec sudo -n {python}; fi'
     process = await asyncio.create_subprocess_exec(
-        *ssh_command(config, robot), f"exec sh -c {shlex.quote(remote)}",
+        *ssh_command(config, robot), as_root(python),
         stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE, limit=1 << 24,
         # Ctrl-C is for the laptop's program, which ends the sessions in order.

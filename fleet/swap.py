@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edge.core.schema import ConfigError
-from fleet.config import FleetConfig, RobotHost, assign, load_fleet
+from fleet.config import FleetConfig, RobotHost, assign, load_fleet, select
 from fleet.deploy import Deployed, deploy
-from fleet.hold import Report, check_identity, lock
+from fleet.hold import Report, check_identity, lock, visit
 from fleet.release import load_common, make_release
 from fleet.session import RemoteError, UnreachableError, connect
 
@@ -37,9 +37,8 @@ async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
     index = _slot(config, failed, spare)
     common = load_common(config)
     report(f"look at {spare}", None)
-    async with connect(config, config.robots[spare]) as session:
-        found = await session.call("overview", directory=config.directory)
-        check_identity(found["identity"], config, config.robots[spare])
+    async with visit(config, config.robots[spare]):
+        pass
     report(f"stop {failed}", None)
     silent = await _stop(config, config.robots[failed])
     report(path.name, None)
@@ -54,10 +53,7 @@ async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
 
 def _slot(config: FleetConfig, failed: str, spare: str) -> int:
     """The slot that changes hands, or did so in an earlier try. Raises ConfigError."""
-    for name in (failed, spare):
-        if name not in config.robots:
-            known = ", ".join(config.robots)
-            raise ConfigError(f"{config.path}: robots: {name!r} is unknown; known are {known}")
+    select(config, f"{failed},{spare}")
     slots = {slot.robot: index for index, slot in enumerate(config.slots)}
     if failed in slots and spare in slots:
         raise ConfigError(f"{config.path}: {spare} is no spare: it has slots[{slots[spare]}]")

@@ -14,9 +14,9 @@ from fleet.doctor import (
     diagnose,
     measure_clock,
 )
-from fleet.hold import Report, check_identity, lock
+from fleet.hold import Report, lock, visit
 from fleet.operations import Outcome
-from fleet.session import RemoteError, Session, UnreachableError, connect
+from fleet.session import RemoteError, Session, UnreachableError
 
 _ASK_AGAIN_S = 1.0
 
@@ -50,10 +50,7 @@ async def bring_up(
     """
     while True:
         try:
-            report("connect", None)
-            async with connect(config, robot, lambda step: report(step, None)) as session:
-                found = await session.call("overview", directory=config.directory)
-                check_identity(found["identity"], config, robot)
+            async with visit(config, robot, report) as (session, _):
                 return await _bring_up(config, robot, session, unix_time_s)
         except UnreachableError as error:
             # A robot that is starting refuses connections, and breaks them off.

@@ -6,7 +6,7 @@ import os
 import socket
 import struct
 import time
-from typing import Any, Dict, List, Optional
+from typing import Any, Dict, Optional
 
 from fleet.on_robot.calls import Refused, call, must, run, say, write_whole
 
@@ -172,15 +172,9 @@ def restart(directory: str, mavlink_port: int, in_flight: bool) -> Dict[str, Any
 
 
 @call
-def journal(lines: int) -> Dict[str, Any]:
-    """The unit's last lines in the journal, the oldest first."""
-    return {"lines": last_words(lines)}
-
-
-def last_words(lines: int) -> List[str]:
-    """What the program, and systemd about it, wrote last."""
-    shown = run(["journalctl", "-u", UNIT, "-n", str(lines), "-o", "cat", "--no-pager"])
-    return [line for line in shown.stdout.split("\n") if line.strip()]
+def last_words() -> Dict[str, Any]:
+    """`text`: what the program last said of why it does not run."""
+    return {"text": _reason()}
 
 
 def unhealthy(deadline_s: float) -> Optional[str]:
@@ -232,8 +226,9 @@ def _loop_problem(before: Dict[str, Any], now: Dict[str, Any]) -> Optional[str]:
 
 
 def _reason() -> str:
-    """The program's last line that says why, from the journal."""
-    for line in reversed(last_words(20)):
+    """The program's last line that says why it does not run, from the journal."""
+    shown = run(["journalctl", "-u", UNIT, "-n", "20", "-o", "cat", "--no-pager"])
+    for line in reversed(shown.stdout.split("\n")):
         if line.startswith("lpac: "):
             return "it says: %s" % line
         if line.startswith("{"):

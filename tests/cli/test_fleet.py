@@ -11,7 +11,7 @@ import pytest
 
 from cli.fleet_status import State, print_status
 from fleet.config import FleetConfig, load_fleet
-from fleet.logs import Entry, last_words, parse_entry, readable
+from fleet.logs import Entry, parse_entry, readable
 from fleet.operations import Outcome
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
@@ -148,13 +148,6 @@ def test_an_exception_keeps_its_lines() -> None:
 def test_what_is_no_journal_is_said() -> None:
     with pytest.raises(ValueError, match="journalctl printed 'bash: nonsense'"):
         parse_entry("bash: nonsense")
-
-
-def test_last_words_are_the_programs() -> None:
-    said = "lpac: /release/world.env: no such file"
-    assert last_words(["before", said, "lpac-robot.service: Failed with result."]) == said
-    assert last_words(["before", "after"]) == "after"
-    assert last_words([]) is None
 
 
 # The table
