@@ -37,6 +37,8 @@ ARCH ?= arm64
 image: | .venv/bin/pip ## the robot's image for ARM (or ARCH=amd64), and its size: out/image
 	@deploy/docker/image.sh $(ARCH)
 	@$(RUN) fleet.image out/image/$(ARCH)
+	@! command -v systemd-analyze > /dev/null || \
+		systemd-analyze security --offline=yes systemd/lpac-robot.service | tail -n 1
 
 LOCK := .venv/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes \
 	--python-platform aarch64-manylinux_2_28 --only-binary :all: --upgrade \

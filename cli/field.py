@@ -134,7 +134,7 @@ def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
 def up(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
-    timeout: Annotated[float, typer.Option(help="How long robots are waited for, s.")] = 60.0,
+    timeout: Annotated[float, typer.Option(help="How long robots are waited for, s.")] = 40.0,
     as_json: AsJson = False,
 ) -> None:
     """Wait for the robots, set their clocks, start their programs, look at all: go or no-go.

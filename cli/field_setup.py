@@ -97,6 +97,12 @@ def swap(
     _say("")
     slot = load_fleet(fleet).slots[swapped.slot]
     deployed = swapped.deployed
+    if not swapped.changed:
+        typer.secho(
+            f"{spare:6} had the slot already; the other way round it is `lpac fleet swap {spare} "
+            f"{failed}`",
+            fg="yellow",
+        )
     if swapped.silent is None:
         typer.echo(f"{failed:6} stopped; it does not start at boot either")
     else:

@@ -66,7 +66,7 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
     parts = {name: _parts(state.overview["versions"]) for name, state in states.items()}
     most = _most_common(text for text in parts.values() if text is not None)
     odd = {name: text for name, text in parts.items() if text not in (None, most)}
-    silent = ["", styled("no answer", BAD), *[""] * (len(_HEADINGS) - 4)]
+    silent = ["", styled("see below", BAD), *[""] * (len(_HEADINGS) - 4)]
     rows = []
     for robot, state, _ in outcomes:
         slot = _slot(config, robot.name)

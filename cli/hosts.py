@@ -28,8 +28,14 @@ def hosts(
     """Run robot computers (Ubuntu 18.04, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
     from sim.hosts import RobotHosts
 
-    # Whoever stops this program means the hosts too.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    def end(*_: object) -> None:
+        # Once: leaving must not be broken off, or hosts would stay.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
     try:
         with RobotHosts(
             count, out, image=image, bundle=bundle, spares=spares, say=typer.echo

@@ -127,9 +127,13 @@ class Session:
                         return result
         except TimeoutError:
             raise UnreachableError(f"it has not answered within {_CALL_S:g} s") from None
-        except (ConnectionError, ValueError):
+        except ConnectionError:
             pass  # The complaints tell why.
-        raise UnreachableError(explain(await self._complaints, self.robot.host))
+        except ValueError:
+            raise RemoteError(
+                f"its login shell prints {line[:60]!r}: let ~/.bashrc be silent for ssh"
+            ) from None
+        raise UnreachableError(explain(await self._all_complaints(), self.robot.host))
 
     async def close(self) -> None:
         """End the conversation; locks that it held are free then."""
@@ -141,7 +145,7 @@ class Session:
         except TimeoutError:
             self._process.kill()
             await self._process.wait()
-        await self._complaints
+        await self._all_complaints()
 
     async def _ping(self) -> None:
         """A robot that hears nothing for long takes the laptop for gone."""
@@ -150,6 +154,12 @@ class Session:
                 await asyncio.sleep(_PING_S)
                 self._write.write(b"\n")
                 await self._write.drain()
+
+    async def _all_complaints(self) -> str:
+        # A helper that ssh's configuration starts may hold the pipe open after ssh has ended.
+        with contextlib.suppress(TimeoutError):
+            return await asyncio.wait_for(self._complaints, 2.0)
+        return ""
 
     async def _last_words(self) -> str:
         assert self._process.stderr is not None

@@ -1,27 +1,26 @@
 """A spare takes a failed robot's slot: its pad, height and landing point."""
 
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from edge.core.schema import ConfigError
 from fleet.config import FleetConfig, RobotHost, assign, load_fleet, select
 from fleet.deploy import Deployed, deploy
-from fleet.hold import Report, check_identity, lock, visit
+from fleet.hold import Report, check_identity, visit
 from fleet.release import load_common, make_release
 from fleet.session import RemoteError, UnreachableError, connect
-
-OnStep = Callable[[str], None]
 
 
 class Swapped(NamedTuple):
     """The slot's number in the file, counted from 0, and what runs on the spare now.
 
-    `silent` is why the failed robot could not be stopped, None if it was.
+    `changed` tells whether the slot was the failed robot's until now. `silent` is why that one
+    could not be stopped, None if it was.
     """
 
     slot: int
+    changed: bool
     deployed: Deployed
     silent: str | None
 
@@ -35,6 +34,7 @@ async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
     """
     config = load_fleet(path)
     index = _slot(config, failed, spare)
+    changed = config.slots[index].robot == failed
     common = load_common(config)
     report(f"look at {spare}", None)
     async with visit(config, config.robots[spare]):
@@ -48,7 +48,7 @@ async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
     with tempfile.TemporaryDirectory(prefix="lpac-swap-") as folder:
         release = make_release(config, robot, common, Path(folder))
         deployed = await deploy(config, robot, release, report)
-    return Swapped(index, deployed, silent)
+    return Swapped(index, changed, deployed, silent)
 
 
 def _slot(config: FleetConfig, failed: str, spare: str) -> int:
@@ -74,7 +74,7 @@ async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
                 check_identity(found["identity"], config, robot)
             except RemoteError as error:
                 return str(error)
-            await lock(session, config, robot)
+            # Without the lock: on a robot that is broken it may not be had.
             await session.call(
                 "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=True
             )

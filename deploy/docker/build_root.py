@@ -90,7 +90,10 @@ def fetch(architecture: str, folder: Path) -> None:
     debian.mkdir(parents=True)
     names = [f"{name}:{architecture}={version}" for name, (version, _) in locked.items()]
     # apt checks the archive's signature; the lock says that it is what we tried.
-    _run("apt-get", "download", "--option=APT::Sandbox::User=root", *names, cwd=debian)
+    try:
+        _run("apt-get", "download", "--option=APT::Sandbox::User=root", *names, cwd=debian)
+    except BuildError as error:
+        raise BuildError(f"{error}; if the archive has newer versions: run `make lock`") from None
     for name, (version, sha256) in locked.items():
         (path,) = debian.glob(f"{name}_*.deb")
         if _sha256(path) != sha256:

@@ -59,7 +59,10 @@ def set_vision_hub(mavlink_port: int) -> Dict[str, Any]:
     if not isinstance(values, dict):
         raise Refused("%s is no JSON object: mend it, or remove it and reinstall" % path)
     changes = []
-    for key, value in (("en_localhost_mavlink_udp", True), ("offboard_mode", "off")):
+    wanted = [("en_localhost_mavlink_udp", True), ("offboard_mode", "off")]
+    if "localhost_udp_port_number" in values:
+        wanted.append(("localhost_udp_port_number", mavlink_port))
+    for key, value in wanted:
         if values.get(key) != value:
             changes.append("%s from %s to %s" % (key, *map(json.dumps, (values.get(key), value))))
             values[key] = value

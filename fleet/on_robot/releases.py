@@ -20,7 +20,9 @@ from fleet.on_robot.calls import Refused, call, reason, run, say, write_whole
 
 _MARGIN_BYTES = 100000000
 _KEPT = 3
-_VERIFY_S = 300.0
+_VERIFY_S = 150.0
+# The robot's, whatever folder its releases are in; it can be taken when no disk can be written.
+_LOCK = "/run/lpac-fleet.lock"
 _HEALTHY_S = 40.0
 
 _lock = []  # type: List[int]
@@ -63,8 +65,7 @@ def lock(directory: str, who: str, mavlink_port: int) -> Dict[str, Any]:
 
     Returns what came of that (`recovered`). Raises Refused that says who has the robot.
     """
-    os.makedirs(os.path.join(directory, "releases"), exist_ok=True)
-    descriptor = os.open(os.path.join(directory, "lock"), os.O_RDWR | os.O_CREAT, 0o600)
+    descriptor = os.open(_LOCK, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -89,9 +90,9 @@ def prepare(
 ) -> Dict[str, Any]:
     """Make room for a release; what is already here of it need not travel.
 
-    Returns whether it is here whole (`complete`), the folder to fill (`incoming`), and folders of
-    releases that may hold equal files (`like`). Raises Refused if the vehicle is armed, or the disk
-    has no room.
+    A release that is here, but damaged, is mended. Returns whether it is here whole (`complete`),
+    the folder to fill (`incoming`), and folders of releases that may hold equal files (`like`).
+    Raises Refused if the vehicle is armed, or the disk has no room.
     """
     require_lock()
     service.refuse_in_flight(mavlink_port, "deploying")
@@ -101,9 +102,8 @@ def prepare(
         for name in os.listdir(incoming):
             if name != release:
                 _remove(os.path.join(incoming, name))
-    path = os.path.join(directory, "releases", release)
     current = linked(directory, "current")
-    answer = {"complete": os.path.isdir(path), "incoming": target}
+    answer = {"complete": _is_whole(directory, release, target), "incoming": target}
     # rsync takes at most 20 such folders.
     likely = [current] if current else []
     likely += [name for name in _releases(directory) if name != current]
@@ -120,6 +120,22 @@ def prepare(
                 "(`lpac fleet pull`, then `lpac fleet exec`)" % (free // 1e6, needed // 1e6)
             )
     return answer
+
+
+def _is_whole(directory: str, release: str, incoming: str) -> bool:
+    """Whether the release is here and as it was made; a damaged one is incoming again."""
+    path = os.path.join(directory, "releases", release)
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    if not os.path.isdir(path):
+        return False
+    try:
+        _check(path, release)
+    except (Refused, OSError, ValueError):
+        os.makedirs(os.path.dirname(incoming), exist_ok=True)
+        _remove(incoming)
+        os.rename(path, incoming)
+        return False
+    return True
 
 
 @call
@@ -169,35 +185,43 @@ def switch(directory: str, release: str, mavlink_port: int) -> Dict[str, Any]:
     if the vehicle is armed, or if the new release did not run well, with the reason.
     """
     require_lock()
-    service.refuse_in_flight(mavlink_port, "switching")
     _prune(directory, {release})
-    former = linked(directory, "current")
-    write_whole(
-        os.path.join(directory, "pending"),
-        json.dumps({"release": release, "former": former}).encode(),
-    )
-    problem = _activate(directory, release)
-    if problem is not None:
-        _take_back(directory, former)
-        back = "runs %s again" % former if former else "nothing runs: it was its first release"
-        raise Refused("%s does not run well (%s); the robot %s" % (release, problem, back))
-    _confirm(directory, former)
+    service.refuse_in_flight(mavlink_port, "switching")
+    former, last_good = linked(directory, "current"), linked(directory, "last-good")
+    if not _starts(directory, release):
+        last_good = None  # Where a spare once flew, another robot may fly now.
+    elif former not in (None, release) and _starts(directory, str(former)):
+        last_good = former
+    _change(directory, release, last_good, mavlink_port)
     _prune(directory, set())
     return overview(directory)
 
 
 @call
 def rollback(directory: str, mavlink_port: int) -> Dict[str, Any]:
-    """Run the last good release again."""
+    """Run the last good release again; if it does not run well, the present one."""
     require_lock()
     service.refuse_in_flight(mavlink_port, "rolling back")
     current, last_good = linked(directory, "current"), linked(directory, "last-good")
-    if last_good is None or last_good == current:
+    if last_good in (None, current) or not _starts(directory, str(last_good)):
         raise Refused("there is no earlier release to go back to")
-    problem = _activate(directory, last_good)
-    if problem is not None:
-        raise Refused("%s does not run well either: %s" % (last_good, problem))
+    _change(directory, str(last_good), last_good, mavlink_port)
     return overview(directory)
+
+
+def _change(directory: str, release: str, last_good: Optional[str], mavlink_port: int) -> None:
+    """Let `release` run, with `last_good` to go back to; or the former one, and raise Refused."""
+    pending = {
+        "release": release,
+        "former": linked(directory, "current"),
+        "last_good": last_good,
+    }
+    write_whole(os.path.join(directory, "pending"), json.dumps(pending).encode())
+    problem = _activate(directory, release)
+    if problem is not None:
+        back = _take_back(directory, pending["former"], mavlink_port)
+        raise Refused("%s does not run well (%s); %s" % (release, problem, back))
+    _settle(directory, last_good)
 
 
 def _activate(directory: str, release: str) -> Optional[str]:
@@ -209,51 +233,68 @@ def _activate(directory: str, release: str) -> Optional[str]:
         if not _starts(directory, release):
             service.halt()
             return None
-        service.run_now()
-        say("health")
-        return service.unhealthy(_HEALTHY_S)
+        return service.run_now(_HEALTHY_S)
     except (Refused, OSError) as error:
         return str(error)
 
 
-def _take_back(directory: str, former: Optional[str]) -> None:
+def _take_back(directory: str, former: Optional[str], mavlink_port: int) -> str:
+    """Run the former release again; what came of it. The change is settled by that."""
+    if service.armed(mavlink_port):
+        return "the vehicle is armed by now: nothing is restarted in flight"
     say("rollback")
     if former is None:
         service.halt()
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(os.path.join(directory, "current"))
+        _unlink(directory, "current")
+        back = "nothing runs: it was the robot's first release"
     else:
         problem = _activate(directory, former)
+        back = "the robot runs %s again" % former
         if problem is not None:
-            raise Refused("it was taken back to %s, which does not run: %s" % (former, problem))
-    os.unlink(os.path.join(directory, "pending"))
+            back = "%s, to which it was taken back, does not run well either: %s" % (
+                former,
+                problem,
+            )
+    _settle(directory, linked(directory, "last-good"))
+    return back
 
 
-def _confirm(directory: str, former: Optional[str]) -> None:
-    # A spare's release never ran: there is nothing in it to go back to.
-    if former not in (None, linked(directory, "current")) and _starts(directory, str(former)):
-        _link(directory, "last-good", str(former))
-    os.unlink(os.path.join(directory, "pending"))
+def _settle(directory: str, last_good: Optional[str]) -> None:
+    """The change is over: nothing of it is pending any more."""
+    if last_good is None:
+        _unlink(directory, "last-good")
+    elif last_good != linked(directory, "last-good"):
+        _link(directory, "last-good", last_good)
+    # Unit and links may lie on several file systems.
+    os.sync()
+    _unlink(directory, "pending")
 
 
 def _recover(directory: str, mavlink_port: int) -> Optional[str]:
-    """Finish a switch that a loss of power, or of its operator, left open; what came of it."""
-    pending = _pending(directory)
+    """Finish a change that a loss of power, or of its operator, left open; what came of it.
+
+    Never fails, or nothing could be done to the robot any more.
+    """
+    pending, current = _pending(directory), linked(directory, "current")
     if pending is None:
         return None
     release, former = pending["release"], pending["former"]
-    if linked(directory, "current") != release:
-        os.unlink(os.path.join(directory, "pending"))
-        return None
     if service.armed(mavlink_port):
         return "a switch to %s was interrupted; nothing is restarted in flight" % release
+    last_good = linked(directory, "last-good")
+    if current is None:
+        _settle(directory, last_good)
+        return None
     say("finish an interrupted switch")
-    problem = _activate(directory, release)
+    problem = _activate(directory, current)
     if problem is None:
-        _confirm(directory, former)
-        return "an interrupted switch to %s was finished" % release
-    _take_back(directory, former)
-    return "an interrupted switch to %s was taken back: %s" % (release, problem)
+        _settle(directory, pending["last_good"] if current == release else last_good)
+        return "an interrupted switch was finished: the robot runs %s" % current
+    if current == release and former != release:
+        problem = "%s; %s" % (problem, _take_back(directory, former, mavlink_port))
+    else:
+        _settle(directory, last_good)
+    return "an interrupted switch was finished: %s does not run well (%s)" % (current, problem)
 
 
 def _starts(directory: str, release: str) -> bool:
@@ -367,6 +408,11 @@ def _link(directory: str, name: str, release: str) -> None:
     os.symlink(os.path.join("releases", release), part)
     os.replace(part, os.path.join(directory, name))
     _sync_folder(directory)
+
+
+def _unlink(directory: str, name: str) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(os.path.join(directory, name))
 
 
 def _sync_folder(path: str) -> None:

@@ -23,7 +23,7 @@ _HEARTBEAT_WAIT_S = 2.5
 _IP = 0x0800
 
 _PROPERTIES = (
-    "LoadState,ActiveState,SubState,Result,NRestarts,StatusText,MainPID,UnitFileState,"
+    "LoadState,ActiveState,Result,NRestarts,StatusText,InvocationID,UnitFileState,"
     "ActiveEnterTimestampMonotonic"
 )
 
@@ -46,7 +46,8 @@ def service() -> Dict[str, Any]:
         "result": values.get("Result", ""),
         "restarts": int(values.get("NRestarts") or 0),
         "enabled": values.get("UnitFileState") == "enabled",
-        "installed": values.get("LoadState") == "loaded",
+        "installed": values.get("LoadState") not in (None, "", "not-found"),
+        "invocation": values.get("InvocationID", ""),
         "uptime_s": now_s - started_s if active else None,
         "status": status,
         "fresh": active and age_s is not None and -1.0 < age_s < _STATUS_FRESH_S,
@@ -177,13 +178,13 @@ def last_words() -> Dict[str, Any]:
     return {"text": _reason()}
 
 
-def unhealthy(deadline_s: float) -> Optional[str]:
+def unhealthy(within_s: float) -> Optional[str]:
     """Why the program does not run well, None once it has done so for a few seconds.
 
     Well means: systemd has it active without a restart, all its loops tick without new failures,
     and it has joined the radio link. Vehicle, GPS and battery are preflight's matter.
     """
-    until_s = time.monotonic() + deadline_s
+    until_s = time.monotonic() + within_s
     first = None  # type: Optional[Dict[str, Any]]
     first_s = 0.0
     restarts = service()["restarts"]
@@ -257,13 +258,18 @@ def install_unit(directory: str, release: str) -> None:
         must(["systemctl", "daemon-reload"])
 
 
-def run_now() -> None:
-    """Restart the unit, whatever came of it before, and start it at every boot."""
+def run_now(within_s: float) -> Optional[str]:
+    """Restart the unit, also at every boot; why the program does not run well then."""
     say("restart")
     run(["systemctl", "reset-failed", UNIT])
     must(["systemctl", "enable", UNIT])
-    # As above.
+    former = service()["invocation"]
+    # A program that cannot start shows in its health, with the reason.
     run(["systemctl", "restart", UNIT], timeout_s=90.0)
+    if former and service()["invocation"] == former:
+        return "it was not restarted: see `systemctl status lpac-robot` on the robot"
+    say("health")
+    return unhealthy(within_s)
 
 
 def halt() -> None:

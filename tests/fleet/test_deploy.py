@@ -7,88 +7,28 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import onnx
 import pytest
 from onnx import numpy_helper
 
 from edge.runtime.bundle import BUNDLE_ID, MANIFEST, make_bundle
-from fleet.config import FleetConfig, load_fleet
-from fleet.config import RobotHost as Robot
-from fleet.deploy import Deployed, deploy, rollback
-from fleet.hold import Report
-from fleet.operations import Outcome, for_each
-from fleet.release import Common, Release, load_common, make_release
+from fleet.deploy import deploy
+from fleet.release import make_release
 from fleet.session import FleetError, RemoteError, UnreachableError, connect
 from sim.hosts import RobotHost, RobotHosts
 from tests.fleet.field import armed, await_said, name_robot, running_lpac_fleet, unwatched
-
-
-class Laptop:
-    """What an operator has: fleet.toml as it is now, and the releases made from it."""
-
-    def __init__(self, hosts: RobotHosts, folder: Path) -> None:
-        self.hosts = hosts
-        self.config: FleetConfig = load_fleet(hosts.fleet_toml)
-        self.common: Common = load_common(self.config)
-        self._folder = folder
-
-    def robot(self, index: int) -> Robot:
-        return self.config.robots[self.hosts[index].name]
-
-    def release(self, index: int, common: Common | None = None) -> Release:
-        folder = self._folder / f"release-{len(list(self._folder.iterdir()))}"
-        folder.mkdir()
-        return make_release(self.config, self.robot(index), common or self.common, folder)
-
-    def deploy(
-        self, index: int, release: Release | None = None, report: Report = unwatched
-    ) -> Deployed:
-        release = release or self.release(index)
-        return asyncio.run(deploy(self.config, self.robot(index), release, report))
-
-    def deploy_all(self, releases: dict[str, Release]) -> list[Outcome[Deployed]]:
-        """Side by side, by the robots' names."""
-        robots = [self.config.robots[name] for name in releases]
-        return asyncio.run(
-            for_each(robots, lambda r: deploy(self.config, r, releases[r.name], unwatched))
-        )
-
-    def call(self, index: int, function: str, **arguments: object) -> dict[str, Any]:
-        async def one() -> dict[str, Any]:
-            async with connect(self.config, self.robot(index)) as session:
-                return await session.call(function, **arguments)
-
-        return asyncio.run(one())
-
-    def overview(self, index: int) -> dict[str, Any]:
-        return self.call(index, "overview", directory=self.config.directory)
-
-    def changed(self) -> Common:
-        """The same with another world file: a release that differs in one file, and versions."""
-        world = self.common.world + b"CircularBND 100 100 20 %.9f\n" % time.monotonic()
-        return self.common._replace(world=world)
+from tests.fleet.laptop import Laptop, boot_nonce
 
 
 @pytest.fixture(scope="module")
 def laptop(hosts: RobotHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
-    """Three robots that run a first release."""
+    """r1 and r2 run a first release; r3 is there, whatever it has."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
-    releases = {}
-    for index in range(3):
+    for index in range(2):
         name_robot(hosts, hosts[index])
-        releases[hosts[index].name] = laptop.release(index)
-    outcomes = laptop.deploy_all(releases)
-    assert all(outcome.value for outcome in outcomes), outcomes
+        laptop.deploy(index)
     return laptop
-
-
-def boot_nonce(overview: dict[str, Any]) -> int:
-    assert overview["service"]["fresh"], overview
-    nonce: int = overview["service"]["status"]["boot_nonce"]
-    return nonce
 
 
 def await_true(holds: Callable[[], bool], within_s: float = 60.0) -> None:
@@ -100,7 +40,7 @@ def await_true(holds: Callable[[], bool], within_s: float = 60.0) -> None:
 
 def await_free(host: RobotHost) -> None:
     """Until nobody holds the robot. To ask mends nothing, as the robot's own `lock` does."""
-    host.run("flock --shared /opt/lpac/lock true")
+    host.run("flock --shared /run/lpac-fleet.lock true")
 
 
 def test_a_second_deploy_sends_nothing_and_disturbs_nothing(laptop: Laptop) -> None:
@@ -120,10 +60,10 @@ def test_a_changed_file_travels_alone_and_rollback_brings_the_former_back(laptop
     now = laptop.overview(0)
     assert (now["current"], now["last_good"], now["pending"]) == (release.id, former, None)
     assert now["service"]["enabled"]
-    assert asyncio.run(rollback(laptop.config, laptop.robot(0), unwatched)) == former
+    assert laptop.roll_back(0) == former
     assert laptop.overview(0)["current"] == former
     with pytest.raises(RemoteError, match="no earlier release"):
-        asyncio.run(rollback(laptop.config, laptop.robot(0), unwatched))
+        laptop.roll_back(0)
 
 
 @pytest.mark.parametrize("mishap", ["cut", "full"])
@@ -249,8 +189,8 @@ def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop)
         laptop.deploy(0, release, lose_power_at_the_switch)
     host.power_on()
     pending = laptop.overview(0)["pending"]
-    assert pending == {"release": release.id, "former": former}
-    assert laptop.deploy(0, release).summary.endswith(f"switch to {release.id} was finished")
+    assert (pending["release"], pending["former"]) == (release.id, former)
+    assert laptop.deploy(0, release).summary.endswith(f"finished: the robot runs {release.id}")
     after = laptop.overview(0)
     assert (after["current"], after["last_good"], after["pending"]) == (release.id, former, None)
     assert len(after["releases"]) <= 3  # of the seven and more that it has had

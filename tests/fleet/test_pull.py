@@ -5,13 +5,13 @@ import json
 import os
 import subprocess
 import time
+from collections.abc import Coroutine
 from pathlib import Path
 
 import pytest
 
 from edge.adapters.flight_log import FlightLog, FlightMetadata, read
 from fleet.config import load_fleet
-from fleet.hold import Report
 from fleet.pull import Pulled, pull
 from fleet.session import FleetError
 from sim.hosts import RobotHost, RobotHosts
@@ -55,12 +55,14 @@ def flown(deployed: RobotHosts) -> RobotHosts:
     return deployed
 
 
-def fetch(
-    hosts: RobotHosts, index: int, trial: str | None, out: Path, report: Report = unwatched
-) -> Pulled:
+def pulled(hosts: RobotHosts, trial: str | None, out: Path) -> Coroutine[None, None, Pulled]:
+    """What is to be awaited: r1's part."""
     config = load_fleet(hosts.fleet_toml)
-    robot = config.robots[hosts[index].name]
-    return asyncio.run(pull(config, robot, trial, out, report))
+    return pull(config, config.robots["r1"], trial, out, unwatched)
+
+
+def fetch(hosts: RobotHosts, trial: str | None, out: Path) -> Pulled:
+    return asyncio.run(pulled(hosts, trial, out))
 
 
 def names(folder: Path) -> set[str]:
@@ -81,11 +83,11 @@ def test_what_belongs_to_the_trial_comes_whole_and_only_once(
     statuses = list(read(folder / "logs/robot-1-0001.mcap"))
     assert [message["trial"] for _, _, message in statuses] == ["", *["A"] * 11]
     subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
-    again = fetch(flown, 0, "A", tmp_path)
+    again = fetch(flown, "A", tmp_path)
     assert (again.sent_bytes, again.files, again.summary) == (0, 6, "was here already")
     # What was damaged here is mended from there.
     (folder / "px4/sess002/log100.ulg").write_bytes(b"ofXA")
-    assert fetch(flown, 0, "A", tmp_path).sent_bytes > 0
+    assert fetch(flown, "A", tmp_path).sent_bytes > 0
     assert (folder / "px4/sess002/log100.ulg").read_bytes() == b"of A"
     assert flown[0].run("ls /var/tmp") == ""
 
@@ -102,7 +104,7 @@ def test_a_robot_without_the_trial_says_so(flown: RobotHosts, tmp_path: Path) ->
 
 def test_without_a_trial_comes_what_is_new(flown: RobotHosts, tmp_path: Path) -> None:
     host, folder = flown[0], tmp_path / "all" / "r1"
-    first = fetch(flown, 0, None, tmp_path)
+    first = fetch(flown, None, tmp_path)
     assert first.sent_bytes > 0
     assert {"logs/robot-1-0001.mcap", "logs/robot-1-0002.mcap", "px4/sess001/log100.ulg"} < names(
         folder
@@ -124,25 +126,28 @@ def test_without_a_trial_comes_what_is_new(flown: RobotHosts, tmp_path: Path) ->
 def test_a_cut_in_the_middle_is_made_up_for(flown: RobotHosts, tmp_path: Path) -> None:
     host = flown[0]
     big = os.urandom(BIG_BYTES)
-    # The share that is done is told after each file: when the first has come, the second travels.
-    write_ulog(host, "sess008", FIRST_S + 11.0, os.urandom(BIG_BYTES // 20))
     write_ulog(host, "sess009", FIRST_S + 11.0, big)
+    folder = tmp_path / "A/r1/px4/sess009"
 
-    def cut_in_the_middle(step: str, share: float | None) -> None:
-        if step == "fetch" and share:
-            assert share < 0.9
-            host.cut()
+    async def cut_in_the_middle() -> None:
+        fetching = asyncio.create_task(pulled(flown, "A", tmp_path))
+        # rsync's own file, as long as it is not whole.
+        while not any(path.stat().st_size for path in folder.glob(".log100.ulg.*")):
+            assert not fetching.done()
+            await asyncio.sleep(0.005)
+        host.cut()
+        await fetching
 
     try:
         with pytest.raises(FleetError, match="it does not answer"):
-            fetch(flown, 0, "A", tmp_path, cut_in_the_middle)
+            asyncio.run(cut_in_the_middle())
         host.heal()
-        done = fetch(flown, 0, "A", tmp_path)
+        done = fetch(flown, "A", tmp_path)
         assert 0 < done.sent_bytes < BIG_BYTES
-        assert (tmp_path / "A/r1/px4/sess009/log100.ulg").read_bytes() == big
+        assert (folder / "log100.ulg").read_bytes() == big
     finally:
         host.heal()
-        host.run("rm -r /data/px4/log/sess008 /data/px4/log/sess009")
+        host.run("rm -r /data/px4/log/sess009")
 
 
 def test_a_log_that_grows_comes_as_far_as_it_is(flown: RobotHosts, tmp_path: Path) -> None:
@@ -150,10 +155,11 @@ def test_a_log_that_grows_comes_as_far_as_it_is(flown: RobotHosts, tmp_path: Pat
     host.run("systemctl start lpac-robot")
     log = host.root / LOGS / "robot-1-0003.mcap"
     try:
+        began_bytes = log.stat().st_size
         host.run(
-            "until [ $(stat -c %s /" + LOGS + "/robot-1-0003.mcap) -gt 30000 ]; do sleep 0.1; done"
+            f"until [ $(stat -c %s /{LOGS}/{log.name}) -gt {began_bytes} ]; do sleep 0.1; done"
         )
-        done = fetch(flown, 0, None, tmp_path)
+        done = fetch(flown, None, tmp_path)
         folder = Path(done.folder)
         assert next(read(folder / "logs" / log.name))
         subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
@@ -168,4 +174,4 @@ def test_a_robot_in_flight_is_left_alone(flown: RobotHosts, tmp_path: Path) -> N
         armed(host),
         pytest.raises(FleetError, match="the vehicle is armed: pulling is refused"),
     ):
-        fetch(flown, 0, "A", tmp_path)
+        fetch(flown, "A", tmp_path)
