@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fleet import doctor
 from fleet.on_robot import probes, service
+from tests.conftest import ROOT
 
 NAMES = st.from_regex(r"[a-z][a-z0-9-]{0,14}", fullmatch=True)
 ANYTHING = st.text(max_size=200)
@@ -201,3 +203,14 @@ def test_a_clock_is_set_by_its_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "armed", lambda _: False)
     assert probes.set_clock(offset_s=-20.0, mavlink_port=1)["hardware_clock"] is False
     assert set_to == [1020.0]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [*doctor._GROUND, *doctor._NO_AUTOPILOT, doctor._FAILSAFE, doctor._NOT_READ, doctor._RUNNING,
+     doctor._WOULD_NOT_ARM],
+)  # fmt: skip
+def test_doctor_sorts_the_programs_checks_by_words_that_it_says(words: str) -> None:
+    """Reworded there alone, a fault would pass for something that only takes a while."""
+    said = [ROOT / "edge" / name for name in ("core/preflight.py", "robot.py")]
+    assert any(words in path.read_text() for path in said)
