@@ -27,8 +27,10 @@ if [[ -f $archive && $(cat "$folder/inputs" 2>/dev/null) == "$inputs" ]]; then
 fi
 
 arguments=(--platform "linux/$arch" --build-arg "BASE=$base" --file deploy/docker/Dockerfile)
-if [[ -n ${SSL_CERT_FILE:-} ]]; then
-    arguments+=(--secret "id=certificates,src=$SSL_CERT_FILE")
+# Whom this machine trusts, the build does too: a proxy may stand between it and PyPI.
+certificates=${SSL_CERT_FILE:-/etc/ssl/certs/ca-certificates.crt}
+if [[ -f $certificates ]]; then
+    arguments+=(--secret "id=certificates,src=$certificates")
 fi
 
 with_docker() {

@@ -79,7 +79,7 @@ def test_each_robot_that_does_not_answer_is_named_with_the_reason(nobody: Path) 
     assert error_line(result) == "lpac: reached 0 of 3 robots; failed: r1, r2, r3"
     rows, notes = result.stdout.split("\n\n")
     assert [line.split() for line in rows.splitlines()[2:]] == [
-        ["r1", "0", "no", "answer"], ["r2", "1", "no", "answer"], ["r3", "spare", "no", "answer"],
+        ["r1", "0", "see", "below"], ["r2", "1", "see", "below"], ["r3", "spare", "see", "below"],
     ]  # fmt: skip
     assert [line.split(maxsplit=1) for line in notes.splitlines()] == [
         [name, "nothing listens on its ssh port"] for name in ("r1", "r2", "r3")
@@ -206,7 +206,7 @@ def test_ten_robots_fit_the_terminal(
         "r10", "9", "01234567", "up", "13", "min", "preflight", "no", "100", "%", "14", "9", "1",
         "+0.0",
     ]  # fmt: skip
-    assert rows[10] == ["r11", "spare", "no", "answer"]
+    assert rows[10] == ["r11", "spare", "see", "below"]
     assert [line.split(maxsplit=1) for line in notes] == [
         ["r11", "it does not answer [or so]"],
         ["all", "image 11111111, bundle 22222222, world 33333333"],

@@ -162,8 +162,8 @@ class Builder:
     """The Dockerfile's build stage as a container, after it built the tree in /root_fs."""
 
     def __init__(self) -> None:
-        certificates = os.environ.get("SSL_CERT_FILE")
-        secret = ["--secret", f"id=certificates,src={certificates}"] if certificates else []
+        certificates = os.environ.get("SSL_CERT_FILE", "/etc/ssl/certs/ca-certificates.crt")
+        secret = ["--secret", f"id=certificates,src={certificates}"]
         host = buildah("info", "--format", "{{.host.arch}}")
         # As image.sh calls it: all comes from its cache.
         image = buildah(
@@ -175,7 +175,7 @@ class Builder:
         )  # fmt: skip
         self.container = buildah("from", "--pull-never", image.splitlines()[-1])
         self.files = Path(buildah("mount", self.container))
-        self.volume = [f"--volume={certificates}:{certificates}:ro"] if certificates else []
+        self.volume = [f"--volume={certificates}:/run/secrets/certificates:ro"]
 
     def build_root(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = ["buildah", "run", "--isolation=chroot", "--network=host", *self.volume,
