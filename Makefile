@@ -50,7 +50,7 @@ lock: | .venv/bin/pip ## pin the image's packages to the newest versions, with t
 	echo 'hatchling>=1.27' | $(LOCK) - --output-file deploy/docker/build.lock
 	.venv/bin/python deploy/docker/lock_debian.py
 
-FLEET ?= fleet.toml
+FLEET ?= $(or $(LPAC_FLEET),fleet.toml)
 deploy: .venv/fleet ## image, policy and configuration to the robots of FLEET=fleet.toml, proven there
 start: .venv/fleet ## start the robots' programs
 stop: .venv/fleet ## stop the robots' programs; a robot in flight refuses
