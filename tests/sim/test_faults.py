@@ -367,13 +367,15 @@ def test_the_battery_is_critical(rig: FaultRig) -> None:
 def test_the_battery_is_low(rig: FaultRig) -> None:
     robot = LOW
     with rig.others_go_on(robot, lost=True):
+        assert rig.status(robot).state is _S.MISSION
         heard_s = time.monotonic()
         rig.change(robot, battery_remaining=0.245)
         status = rig.wait_state(robot, _S.RETURN)
         assert status.reason == status.alarms[0] and "battery low" in status.reason
         rig.wait_landed(robot)
         states = dict.fromkeys(heard.status.state for heard in rig.heard(robot, heard_s))
-        assert [*states][:3] == [_S.MISSION, _S.RETURN, _S.LAND]
+        # Whether it still says "mission" once is a matter of the instant.
+        assert [state for state in states if state is not _S.MISSION][:2] == [_S.RETURN, _S.LAND]
         landed_m = rig.fleet.true_positions_m()[robot]
         assert math.dist(landed_m[:2], rig.fleet.pads_m[robot]) < 1.5
 
