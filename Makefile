@@ -17,7 +17,7 @@ demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torc
 fly: .venv/sim ## ten robot programs fly simulated PX4s for two minutes: out/fly/flight.png
 	.venv/bin/lpac sim --vehicle mavlink --duration 50 --out out/fly
 
-setup: .venv/sim .venv/export .venv/fleet ## install what a workstation needs: simulator, plots, torch, onnx, deployment
+setup: .venv/sim .venv/export .venv/fleet .venv/ground ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control
 
 test: lint ## style, types, and every test
 	.venv/bin/pytest

@@ -6,14 +6,34 @@ import sys
 import typer
 
 # field and field_setup add their commands to fleet's.
-from cli import bundle, export, field, field_setup, fleet, hosts, log, replay, robot, sim  # noqa: F401
+from cli import (  # noqa: F401
+    bundle,
+    export,
+    field,
+    field_setup,
+    fleet,
+    ground,
+    hosts,
+    live_map,
+    log,
+    mission,
+    replay,
+    report,
+    robot,
+    sim,
+    site,
+    watch,
+)
 
 # One process is one robot, or a simulation on one core: BLAS threads would only disturb the loops.
 # numpy reads this when it is first imported, and no sub-command has imported it yet.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # What the robot's install leaves out.
-_WORKSTATION = {"torch", "onnx", "matplotlib", "rich", "tomlkit", "export", "sim", "fleet"}
+_WORKSTATION = {
+    "torch", "onnx", "matplotlib", "rich", "tomlkit", "textual", "aiohttp", "export", "sim",
+    "ground", "fleet",
+}  # fmt: skip
 
 app = typer.Typer(
     name="lpac",
@@ -31,6 +51,13 @@ app.add_typer(bundle.app)
 app.add_typer(robot.app)
 app.add_typer(log.app)
 app.add_typer(fleet.app)
+app.command()(ground.ground)
+app.add_typer(mission.app)
+app.add_typer(site.app)
+app.command()(watch.watch)
+app.command("map")(live_map.live_map)
+app.command()(report.record)
+app.command()(report.report)
 
 
 def main() -> None:

@@ -28,13 +28,15 @@ ONLY_IN = {
     "onnxruntime": {"edge/runtime/policy.py"},
     "torch": {"export/"},
     "onnx": {"export/"},
-    "matplotlib": {"sim/"},
+    "matplotlib": {"sim/", "ground/"},
     "mavsdk": {"edge/adapters/"},
     "zenoh": {"edge/adapters/"},
     "mcap": {"edge/adapters/"},
     "pymavlink": {"sim/"},
     "typer": {"cli/"},
-    "rich": {"cli/"},
+    "rich": {"cli/", "ground/watch"},
+    "textual": {"ground/watch"},
+    "aiohttp": {"ground/live_map"},
     "tomlkit": {"fleet/"},
 }
 # The core has no clock, thread, file or socket (the mailbox has a lock, for its callers' threads).
@@ -103,4 +105,6 @@ print(sorted({name.split(".")[0] for name in sys.modules}))
     )
     loaded = set(ast.literal_eval(result.stdout.splitlines()[-1]))
     assert "onnxruntime" in loaded
-    assert loaded.isdisjoint({"torch", "torch_geometric", "onnx", "matplotlib", "export", "sim"})
+    assert loaded.isdisjoint(
+        {"torch", "torch_geometric", "onnx", "matplotlib", "export", "sim", "ground"}
+    )

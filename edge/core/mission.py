@@ -4,22 +4,30 @@ Two kinds of message go to the robots. `GroundState` is published again and agai
 depends on one packet; what it says can only stop or calm a robot. An `Order` happens once: it names
 the robot and its boot nonce, and expires. Nothing that repeats can arm a vehicle.
 
-Keys, below `lpac/<fleet>/`: `ground/state`, `ground/order`, `robot/<id>/status`.
+Keys, below `lpac/<fleet>/`: `ground/state`, `ground/order`, `ground/world` (a CoverageControl world
+file's text), `robot/<id>/status`, and `robot/<id>/explored` (see `explored_to_bytes`).
 """
 
 import dataclasses
+import hashlib
 import json
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
 from edge.core.frames import MissionFrame
+from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.vehicle import Vector
 
 ORDER_LIFETIME_S = 10.0
+EXPLORED_CELLS = 64
 
+Bools = npt.NDArray[np.bool_]
 T = TypeVar("T")
 
 
@@ -47,7 +55,7 @@ STEERED = (FlightState.TAKEOFF, FlightState.HOLD, FlightState.MISSION, FlightSta
 AIRBORNE = (*STEERED, FlightState.LAND)
 
 Calm = Literal["none", "hold", "return", "land"]
-OrderKind = Literal["takeoff", "start", "rejoin", "kill"]
+OrderKind = Literal["takeoff", "start", "pilot", "rejoin", "reset", "disarm", "kill"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,22 +80,50 @@ class Origin:
 
 
 @dataclass(frozen=True, slots=True)
+class Place:
+    """A robot's place in the flight: its height's `slot`, and where it lands, (x, y), m."""
+
+    slot: int
+    landing_point_m: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.slot < 0:
+            raise ValueError(f"slot = {self.slot}: must be 0 or above")
+        if len(self.landing_point_m) != 2 or not all(map(math.isfinite, self.landing_point_m)):
+            raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
+
+
+@dataclass(frozen=True, slots=True)
 class GroundState:
     """What the ground wants for as long as it says so; `sequence` grows with every change.
 
+    `operator` is who commands; of two states with one sequence the greater operator's counts.
     `enabled` lets robots run their preflight checks. `calm` asks the fleet to hold, to return to
-    the landing points, or to land; `robot_calm` (robot id as text) overrides it for one robot.
-    Withdrawing it sets nothing in motion. `origin` is taken up on the ground only. `unix_time_s` is
-    the ground's clock when it said so.
+    the landing points, or to land; `calm_by` is who asked, if it was not `operator`.
+    `robot_enabled` and `robot_calm` (robot id as text) override them for one robot. Withdrawing a
+    calm sets nothing in motion. `origin`, `fence` (None: the robot's configured one), `places` (by
+    robot id; who is not in it keeps its configured one) and `world_id` (None: whatever the robot
+    has) are taken up on the ground only. `trial` is the mission's name. `unix_time_s` is the
+    ground's clock when it said so.
     """
 
     sequence: int
     operator: str
     origin: Origin | None = None
     enabled: bool = False
+    robot_enabled: dict[str, bool] = field(default_factory=dict)
     calm: Calm = "none"
+    calm_by: str = ""
     robot_calm: dict[str, Calm] = field(default_factory=dict)
+    fence: Fence | None = None
+    places: dict[str, Place] = field(default_factory=dict)
+    world_id: str | None = None
+    trial: str = ""
     unix_time_s: float | None = None
+
+    def enabled_for(self, robot_id: int) -> bool:
+        """Whether one robot may run its checks and fly."""
+        return self.robot_enabled.get(str(robot_id), self.enabled)
 
     def calm_for(self, robot_id: int) -> Calm:
         """What is asked of one robot."""
@@ -100,8 +136,11 @@ class Order:
 
     It is for the start of the program whose `boot_nonce` it names, and expires at
     `expires_at_uptime_s` of the robot's own uptime, `ORDER_LIFETIME_S` after the status that the
-    ground saw: clocks need not agree. `trial` names the mission of a start: a name that the robot
-    has not flown last resets its explored map and its mailbox.
+    ground saw: clocks need not agree. `trial` names the mission of a start or a reset: a name that
+    the robot has not flown last resets its explored map and its mailbox.
+
+    `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
+    motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone.
     """
 
     order_id: str
@@ -140,7 +179,11 @@ class RobotStatus:
 
     `ready` means that a takeoff order would be taken; else `failed_checks` says why not. Positions
     are in the mission frame, heights above the robot's own takeoff point, m. `obeyed_sequence` is
-    the last ground state's that it obeyed. `alarms` are for the operator, the gravest first.
+    the last ground state's that it obeyed. `alarms` are for the operator, the gravest first;
+    `not_taken` says what of the ground's state the robot does not take up now, and why.
+    `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
+    for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
+    `neighbour_messages` counts each neighbour's messages since the start.
     """
 
     robot_id: int
@@ -173,12 +216,43 @@ class RobotStatus:
     message_counts: dict[str, int]
     neighbour_ages_s: dict[str, float]
     loops: dict[str, LoopStatus]
+    fence: Fence | None = None
+    not_taken: tuple[str, ...] = ()
+    in_air: bool | None = None
+    global_deg: tuple[float, ...] | None = None
+    hdop: float | None = None
+    policy_velocity_m_s: tuple[float, ...] | None = None
+    feature_age_s: float | None = None
+    neighbour_messages: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, size in (("position_m", 3), ("velocity_m_s", 3), ("landing_point_m", 2)):
+        for name, size in (
+            ("position_m", 3), ("velocity_m_s", 3), ("landing_point_m", 2), ("global_deg", 2),
+            ("policy_velocity_m_s", 2),
+        ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and len(value) != size:
                 raise ValueError(f"{name} = {list(value)}: must be {size} numbers")
+
+
+def world_id(text: str) -> str:
+    """What a world file is called: the first 12 hexadecimal digits of its sha256."""
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def explored_to_bytes(explored: Bools) -> bytes:
+    """(64, 64) over the policy's world, indexed [x, y]: True where the robot has seen the cell."""
+    if explored.shape != (EXPLORED_CELLS, EXPLORED_CELLS):
+        raise ValueError(f"explored has shape {explored.shape}")
+    return np.packbits(explored).tobytes()
+
+
+def explored_from_bytes(data: bytes) -> Bools:
+    """The inverse of `explored_to_bytes`. Raises ValueError if the size is wrong."""
+    if len(data) != EXPLORED_CELLS**2 // 8:
+        raise ValueError(f"explored has {len(data)} bytes: must be {EXPLORED_CELLS**2 // 8}")
+    bits = np.unpackbits(np.frombuffer(data, np.uint8)).astype(np.bool_)
+    return bits.reshape(EXPLORED_CELLS, EXPLORED_CELLS)
 
 
 def to_json(message: GroundState | Order | RobotStatus) -> bytes:

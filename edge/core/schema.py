@@ -1,6 +1,7 @@
 """Nested mappings (TOML, JSON) into frozen dataclasses; each mistake is a line naming the key."""
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Mapping
@@ -25,7 +26,7 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
     """
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where}: expected a table, got {mapping!r}")
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)  # type: ignore[arg-type]
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for key in mapping:
         if key not in fields:
@@ -42,6 +43,12 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
         raise
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
+
+
+@functools.cache
+def _hints(cls: type[Any]) -> dict[str, Any]:
+    """They are slow to look up, and statuses are decoded a hundred times a second."""
+    return typing.get_type_hints(cls)
 
 
 def _value(hint: Any, value: object, where: str) -> Any:
