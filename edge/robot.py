@@ -9,7 +9,6 @@ the control loop lives, and does nothing that could hang.
 import ctypes
 import dataclasses
 import gc
-import hashlib
 import json
 import logging
 import math
@@ -34,23 +33,24 @@ from edge.adapters.logs import configure_logging
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
 from edge.adapters.service_manager import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.adapters.zenoh_link import ZenohLink
-from edge.core.mission import FlightState, RobotStatus, to_json
+from edge.core.mission import FlightState, RobotStatus, explored_to_bytes, to_json, world_id
 from edge.core.vehicle import Action
 from edge.core.wire import Rejection, decode
 from edge.core.world import parse_world, rasterize
-from edge.runtime.bundle import load_bundle
+from edge.runtime.bundle import Manifest, load_bundle
 from edge.runtime.config import RobotConfig
-from edge.runtime.control import FlightControl
+from edge.runtime.control import FlightControl, GroundWorld
 from edge.runtime.inbox import Inbox
 from edge.runtime.loops import Loop
 from edge.runtime.navigation import Navigation
 from edge.runtime.pac import Pac
 from edge.runtime.policy import Policy
-from edge.runtime.readiness import Readiness
+from edge.runtime.readiness import Assignment, Readiness
 from edge.runtime.verify import verify
 
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
+_EXPLORED_PERIOD_S = 1.0
 # A control loop without a tick for longer hangs: the vehicle was told to hold before that.
 _CONTROL_FRESH_S = 1.0
 # On leaving: for the autopilot's answer, and for a loop that hangs.
@@ -85,28 +85,30 @@ class Loaded:
 def load(config: RobotConfig) -> Loaded:
     """Load and verify policy and world. Raises ValueError or OSError that says what is wrong."""
     bundle = load_bundle(Path(config.policy.bundle))
-    perception = bundle.manifest.perception
-    if perception is None:
+    if bundle.manifest.perception is None:
         raise RobotError(f"{config.policy.bundle}: the bundle has no perception: it cannot fly")
     failed = [check.name for check in verify(bundle) if not check.passed]
     problem = None
     if failed:
         problem = f"{', '.join(failed)} of the bundle do not compute torch's golden outputs here"
     text = Path(config.policy.world).read_text("utf-8-sig")
-    training = bundle.manifest.training
-    importance = rasterize(
-        parse_world(text, config.policy.world),
-        perception.world_size,
-        training.idf_truncation,
-        training.idf_norm,
-    )
     return Loaded(
         policy=Policy(bundle),
         bundle_id=bundle.id,
         bundle_problem=problem,
-        sensor=IdfSensor(importance, perception.sensor_size),
-        world_id=hashlib.sha256(text.encode()).hexdigest()[:12],
+        sensor=_sensor(text, config.policy.world, bundle.manifest),
+        world_id=world_id(text),
     )
+
+
+def _sensor(text: str, source: str, manifest: Manifest) -> IdfSensor:
+    """A sensor over a world file's text. Raises ValueError, one line with `source`."""
+    perception, training = manifest.perception, manifest.training
+    assert perception is not None  # Without it no robot is loaded.
+    features = parse_world(text, source)
+    truncation, norm = training.idf_truncation, training.idf_norm
+    importance = rasterize(features, perception.world_size, truncation, norm)
+    return IdfSensor(importance, perception.sensor_size)
 
 
 def run(config: RobotConfig, stop: threading.Event) -> None:
@@ -237,6 +239,7 @@ class _Program:
         self._started_s = time.monotonic()
         self._control = FlightControl(
             robot=config.robot(boot_nonce),
+            world_id=loaded.world_id,
             autopilot=autopilot,
             navigation=navigation,
             pac=pac,
@@ -259,6 +262,7 @@ class _Program:
             Loop("log", _PERIOD_S, self._recorder.flush),
         )
         self._sequence = 0
+        self._explored_due_s = -math.inf
         self._status_text: str | None = None
 
     def start(self) -> None:
@@ -311,7 +315,11 @@ class _Program:
         self._deadman.feed(flying=flying)
 
     def _perception_step(self) -> None:
-        tick = self._pac.perceive(time.monotonic())
+        now_s = time.monotonic()
+        tick = self._pac.perceive(now_s)
+        if now_s >= self._explored_due_s:
+            self._explored_due_s = now_s + _EXPLORED_PERIOD_S
+            self._link.publish("explored", explored_to_bytes(self._pac.explored()))
         if tick is not None:
             self._recorder.record(
                 "perception",
@@ -333,15 +341,16 @@ class _Program:
 
     def _preflight_step(self) -> None:
         control = self._control
-        origin = control.origin
-        self._readiness.prepare(time.monotonic(), origin)
+        self._look_for_world()
+        assignment = control.assignment
+        self._readiness.prepare(time.monotonic(), assignment)
         now_s = time.monotonic()
         peers = self._inbox.peers(now_s)
         control.peers = peers
         control.checks = self._readiness.checks(
             now_s,
             time.time(),
-            origin=origin,
+            assignment=assignment,
             odometry=self._navigation.odometry(),
             peers=peers,
             not_understood=self._inbox.not_understood,
@@ -350,6 +359,21 @@ class _Program:
             ground_age_s=self._inbox.ground_age_s(now_s),
             ground_clock_offset_s=self._inbox.ground_clock_offset_s,
         )
+
+    def _look_for_world(self) -> None:
+        """Make a sensor of the world that the ground wants, once that has come."""
+        wanted, data = self._control.wanted_world_id, self._inbox.world
+        if wanted is None or data is None:
+            return
+        text = data.decode("utf-8", "replace")
+        if world_id(text) != wanted:
+            return
+        try:
+            sensor = _sensor(text, f"world {wanted}", self._loaded.policy.manifest)
+        except ValueError as error:
+            self._control.world = GroundWorld(wanted, None, str(error))
+        else:
+            self._control.world = GroundWorld(wanted, sensor, "")
 
     def _status_step(self) -> None:
         now_s, unix_now_s = time.monotonic(), time.time()
@@ -375,14 +399,17 @@ class _Program:
             self._recorder.record("/pose", unix_now_s, pose)
 
     def _status(self, now_s: float, unix_now_s: float) -> RobotStatus:
-        config, control, vehicle = self._config, self._control, self._autopilot.state()
+        control, vehicle, gps = self._control, self._autopilot.state(), self._autopilot.state().gps
+        origin, robot, world = control.assignment
         flight, failed_checks = control.flight, control.failed_checks(now_s)
         odometry = self._navigation.odometry()
         self._sequence += 1
         ready = flight.state is FlightState.PREFLIGHT and failed_checks == ()
         neighbours = self._pac.mailbox.neighbours(now_s)
+        policy_velocity_m_s = self._pac.control(now_s)
+        ground_age_s = self._inbox.ground_age_s(now_s)
         return RobotStatus(
-            robot_id=config.robot_id,
+            robot_id=robot.robot_id,
             boot_nonce=self._boot_nonce,
             sequence=self._sequence,
             uptime_s=now_s - self._started_s,
@@ -396,22 +423,33 @@ class _Program:
             operator=control.operator,
             orders=flight.answers,
             bundle_id=self._loaded.bundle_id,
-            world_id=self._loaded.world_id,
+            world_id=world,
             trial=flight.trial,
-            origin=control.origin,
+            origin=origin,
             system_id=vehicle.system_id,
-            slot_height_m=config.flight.slot_height_m,
-            landing_point_m=config.flight.landing_point_m,
+            slot_height_m=robot.parameters.slot_height_m,
+            landing_point_m=robot.parameters.landing_point_m,
             position_m=odometry and odometry.position_m,
             velocity_m_s=odometry and odometry.velocity_m_s,
             heading_rad=vehicle.heading_rad,
             mode=vehicle.mode,
             armed=vehicle.armed,
             battery=vehicle.battery,
-            satellites=None if vehicle.gps is None else vehicle.gps.satellites,
+            satellites=None if gps is None else gps.satellites,
             message_counts=self._pac.mailbox.counts(),
             neighbour_ages_s={str(n.robot_id): round(n.age_s, 3) for n in neighbours},
             loops={loop.name: loop.status() for loop in self._loops},
+            fence=robot.fence,
+            not_taken=control.not_taken,
+            in_air=vehicle.in_air,
+            global_deg=self._navigation.global_deg(vehicle),
+            hdop=gps.hdop if gps is not None and math.isfinite(gps.hdop) else None,
+            policy_velocity_m_s=(
+                None if policy_velocity_m_s is None else tuple(policy_velocity_m_s.tolist())
+            ),
+            feature_age_s=self._pac.feature_age_s(now_s),
+            neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
+            ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
         )
 
     def _alarms(self) -> tuple[str, ...]:
@@ -462,11 +500,18 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             ground, ground_age_s = inbox.ground(now_s)
             origin = None if ground is None else ground.origin
             navigation.frame = None if origin is None else origin.frame()
-            readiness.prepare(now_s, origin)
+            robot, unfit = config.robot(boot_nonce=0), ""
+            if ground is not None:
+                try:
+                    robot = robot.assigned(ground)
+                except ValueError as error:
+                    unfit = str(error)
+            assignment = Assignment(origin, robot, loaded.world_id)
+            readiness.prepare(now_s, assignment)
             checks = readiness.checks(
                 now_s,
                 time.time(),
-                origin=origin,
+                assignment=assignment,
                 odometry=navigation.odometry(),
                 peers=inbox.peers(now_s),
                 not_understood=inbox.not_understood,
@@ -475,8 +520,9 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
                 ground_age_s=ground_age_s,
                 ground_clock_offset_s=inbox.ground_clock_offset_s,
             )
-            if not checks.failed or now_s > until_s:
-                return CheckReport(readiness.explanations, readiness.changes, checks.failed)
+            failed = (*checks.failed, unfit) if unfit else checks.failed
+            if not failed or now_s > until_s:
+                return CheckReport(readiness.explanations, readiness.changes, failed)
             time.sleep(_PERIOD_S)
 
 
@@ -486,7 +532,6 @@ def _readiness(config: RobotConfig, loaded: Loaded, autopilot: MavsdkAutopilot) 
         autopilot,
         autopilot,
         bundle_id=loaded.bundle_id,
-        world_id=loaded.world_id,
         bundle_problem=loaded.bundle_problem,
     )
 
@@ -504,6 +549,7 @@ def _open_link(
         ),
         "ground/state": lambda _, data: inbox.put_ground(data, time.monotonic(), time.time()),
         "ground/order": lambda _, data: inbox.put_order(data),
+        "ground/world": lambda _, data: inbox.put_world(data),
     }
     if on_message is not None:
         subscriptions["robot/*/message"] = on_message

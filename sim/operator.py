@@ -28,14 +28,18 @@ from edge.core.mission import (
     OrderKind,
     OrderResult,
     Origin,
+    Place,
     RobotStatus,
     from_json,
     to_json,
+    world_id,
 )
+from edge.core.safety import Fence
 from edge.core.schema import ConfigError
 from edge.core.vehicle import PILOTED
 
 PERIOD_S = 0.2
+WORLD_PERIOD_S = 1.0
 STATUS_LIFETIME_S = 2.0
 
 Statuses = Mapping[int, RobotStatus]
@@ -77,6 +81,8 @@ class Operator:
         self._arrived: queue.SimpleQueue[tuple[float, bytes] | None] = queue.SimpleQueue()
         self._heard: dict[int, list[Heard]] = {}
         self._state: GroundState | None = None
+        self._world = b""
+        self._world_at_s = -math.inf
         self._open: dict[str, Order] = {}
         self._results: dict[str, OrderResult] = {}
         self._link: ZenohLink | None = None
@@ -138,6 +144,25 @@ class Operator:
     def enable(self, origin: Origin) -> None:
         """Set the mission's origin, and let the robots run their checks."""
         self._change(origin=origin, enabled=True)
+
+    def assign(
+        self,
+        *,
+        fence: Fence | None = None,
+        places: Mapping[int, Place] | None = None,
+        world: str | None = None,
+    ) -> None:
+        """What the next flights are to fly by; without it, what the robots are configured for.
+
+        `places` are by robot id, `world` is a world file's text.
+        """
+        with self._changed:
+            self._world = (world or "").encode()
+        self._change(
+            fence=fence,
+            places={str(robot): place for robot, place in (places or {}).items()},
+            world_id=None if world is None else world_id(world),
+        )
 
     def disable(self) -> None:
         """Nothing is to fly: robots in the air hold."""
@@ -243,11 +268,15 @@ class Operator:
     def _publish(self) -> None:
         assert self._link is not None
         with self._changed:
-            state, orders = self._state, tuple(self._open.values())
+            state, world, orders = self._state, self._world, tuple(self._open.values())
         if self.silent:
             return
         if state is not None:
             self._link.publish("state", to_json(replace(state, unix_time_s=time.time())))
+            lacking = any(s.world_id != state.world_id for s in self.statuses().values())
+            if world and lacking and time.monotonic() - self._world_at_s >= WORLD_PERIOD_S:
+                self._world_at_s = time.monotonic()
+                self._link.publish("world", world)
         for order in orders:
             self._link.publish("order", to_json(order))
 

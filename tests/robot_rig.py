@@ -105,9 +105,14 @@ class Rig:
 
     def order(self, kind: Any, trial: str = "") -> None:
         """Order it; it must be obeyed."""
+        assert self.refusal(kind, trial) == ""
+
+    def refusal(self, kind: Any, trial: str = "") -> str:
+        """Why an order is refused; "" if it is obeyed."""
         result = self.operator.result(self.operator.order(kind, self.config.robot_id, trial), 15.0)
         assert result is not None
-        assert result.accepted, result
+        assert result.accepted is not bool(result.reason)
+        return result.reason
 
     def take_off(self) -> None:
         self.operator.enable(ORIGIN)

@@ -8,17 +8,22 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import onnx
 import pytest
 
 from edge.adapters.flight_log import read as read_log
 from edge.adapters.zenoh_link import ZenohLink
 from edge.core.failsafe import PARAMETERS
-from edge.core.mission import FlightState
+from edge.core.mission import FlightState, Place, explored_from_bytes, world_id
+from edge.core.safety import Fence
+from edge.core.world import format_world, random_features
 from edge.runtime.bundle import Bundle, make_bundle, write_bundle
+from sim.operator import Operator
 from sim.px4.modes import Mode
 from tests.robot_rig import (
     ORIGIN,
@@ -87,6 +92,124 @@ def fly_a_mission(made: Rig, trial: str) -> None:
     made.operator.calm("none")
     made.order("start", trial)
     made.wait_for_state(FlightState.MISSION)
+
+
+FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
+PLACE = Place(slot=1, landing_point_m=(14.0, 12.0))
+WORLD = format_world(random_features(np.random.default_rng(1), 10, 512))
+# One look of the sensor, 64 of the world's 512 cells wide, on a raster of 64 x 64.
+ONE_LOOK = 64
+
+
+def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_path: Path) -> None:
+    vehicle = new_vehicle(GF_MAX_VER_DIST=25)
+    explored: list[int] = []
+    with rig(tmp_path, vehicle) as made, program(made), listening(made, explored):
+        made.operator.enable(ORIGIN)
+        made.wait(lambda status: status.ready)
+        tells_where_it_stands(made)
+        obeys_only_who_commands(made)
+        refuses_what_does_not_fit(made)
+
+        made.operator.assign(fence=FENCE, places={3: PLACE}, world=WORLD)
+        made.wait(lambda status: status.world_id == world_id(WORLD) and status.ready)
+        assert made.status.fence == FENCE
+        assert (made.status.slot_height_m, made.status.landing_point_m) == (5.0, (14.0, 12.0))
+        assert made.status.not_taken == ()
+        # It was below the new ceiling.
+        assert vehicle.parameters["GF_MAX_VER_DIST"] == 0
+        made.take_off()
+        assert made.vehicle_is(lambda v: abs(-v.position_m[2] - 5.0) < 1.0)
+        keeps_what_it_has_in_flight(made)
+
+        made.order("start", "a")
+        wait_until(lambda: explored[-1] > 1.3 * ONE_LOOK)
+        assert made.refusal("disarm") == "in the air: land it first"
+        made.order("pilot")
+        assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+        assert (made.status.state, made.status.reason) == (FlightState.PILOT, "given to a pilot")
+        made.order("rejoin")
+        made.wait_for_state(FlightState.HOLD)
+        made.operator.calm("land")
+        made.wait_for_state(FlightState.LANDED)
+        assert explored[-1] > 1.3 * ONE_LOOK
+        made.order("reset", "b")
+        made.wait(lambda status: status.trial == "b")
+        wait_until(lambda: explored[-1] <= 1.3 * ONE_LOOK)
+
+        # Without a word of the ground's, the configured fence and place count again.
+        made.operator.assign()
+        made.wait(lambda status: (status.fence, status.slot_height_m) == (made.config.fence, 3.0))
+        assert made.status.world_id == world_id(WORLD)
+        assert made.refusal("disarm") == "is not armed"
+        with made.server.stepped:
+            vehicle.arm(force=True)
+        made.wait_for_state(FlightState.PILOT)
+        made.order("disarm")
+        assert made.vehicle_is(lambda v: not v.armed)
+    told = [m["message"] for path in (tmp_path / "logs").glob("*.mcap")
+            for _, _, m in read_log(path, "/log")]  # fmt: skip
+    assert any("taken up" in text and world_id(WORLD) in text for text in told)
+
+
+def tells_where_it_stands(made: Rig) -> None:
+    status = made.status
+    assert (status.fence, status.not_taken, status.in_air) == (made.config.fence, (), False)
+    assert status.global_deg is not None
+    assert status.position_m is not None
+    place_m = ORIGIN.frame().relative_to(*status.global_deg).local_origin_m
+    assert place_m[:2] == pytest.approx(status.position_m[:2], abs=1.5)
+    assert status.hdop is not None
+    assert status.policy_velocity_m_s is not None
+    assert status.feature_age_s is not None
+    assert status.neighbour_messages == {}
+    assert status.ground_age_s is not None and status.ground_age_s < 3.0
+
+
+def obeys_only_who_commands(made: Rig) -> None:
+    fleet, connect = made.config.fleet, made.config.link.listen
+    with Operator(fleet=fleet, connect=connect, name="eve") as eve:
+        assert eve.wait_for(lambda statuses: 3 in statuses, 20.0)
+        answer = eve.result(eve.order("takeoff", 3), 15.0)
+        assert answer is not None
+        assert answer.reason == "test commands, not eve"
+
+
+def refuses_what_does_not_fit(made: Rig) -> None:
+    """It stays on the ground, as it was."""
+    before = made.status
+    outside = Place(slot=1, landing_point_m=(50.0, 12.0))
+    made.operator.assign(fence=FENCE, places={3: outside}, world="Nonsense 1 2")
+    made.wait(lambda status: "record 1 (Nonsense)" in " ".join(status.not_taken))
+    reason = made.refusal("takeoff")
+    assert "the ground's fence or place does not fit: landing_point_m = [50.0, 12.0]" in reason
+    assert "the ground's world cannot be used: world " in reason
+    assert (made.status.fence, made.status.world_id) == (before.fence, before.world_id)
+
+
+def keeps_what_it_has_in_flight(made: Rig) -> None:
+    # No world is any world.
+    kept = ("in flight: keeps its fence", "in flight: keeps its place")
+    made.operator.assign()
+    made.wait(lambda status: status.not_taken == kept)
+    assert made.status.fence == FENCE
+    assert made.refusal("start", "a") == "; ".join(kept)
+    made.operator.assign(fence=FENCE, places={3: PLACE}, world=WORLD)
+    made.wait(lambda status: status.not_taken == ())
+
+
+@contextmanager
+def listening(made: Rig, explored: list[int]) -> Iterator[None]:
+    """Meanwhile it is kept how many cells the robot says it has seen."""
+
+    def count(_: str, data: bytes) -> None:
+        explored.append(int(explored_from_bytes(data).sum()))
+
+    with ZenohLink(
+        fleet=made.config.fleet, listen=("tcp/127.0.0.1:0",), connect=made.config.link.listen,
+        subscriptions={"robot/3/explored": count},
+    ):  # fmt: skip
+        yield
 
 
 def look_into_the_logs(folder: Path) -> None:

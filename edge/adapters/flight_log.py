@@ -1,8 +1,9 @@
 """The flight log: MCAP files that Foxglove opens and `lpac replay` runs again.
 
-A segment is a file `robot-<id>-<number>.mcap`: a metadata record `lpac` that says who flew what,
-then zstd chunks of JSON messages. The numbers go on from one start of the robot to the next, so
-that they tell the order where the clock does not.
+A segment is a file `<name>-<number>.mcap`: a metadata record `lpac` that says who flew what, then
+zstd chunks of JSON messages. The numbers go on from one start to the next, so that they tell the
+order where the clock does not. A robot's are called `robot-<id>`, and have these topics (the ground
+has its own, see `ground.record`):
 
 | topic | holds |
 | --- | --- |
@@ -36,7 +37,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 import structlog
@@ -61,9 +62,20 @@ class FlightLogError(ValueError):
     """The file is no flight log; the text says why."""
 
 
+class LogMetadata(Protocol):
+    """Who writes: a dataclass, whose fields stand as text at the start of every segment."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    @property
+    def log_name(self) -> str:
+        """What the segments are called before their numbers."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class FlightMetadata:
-    """Who flew what; written at the start of every segment.
+    """Who flew what.
 
     `bundle_id` is in hexadecimal, `bundle_path` is where the robot found it, and `configuration` is
     the robot's configuration as JSON text.
@@ -76,9 +88,31 @@ class FlightMetadata:
     configuration: str
     version: str
 
+    @property
+    def log_name(self) -> str:
+        """What a robot's segments are called."""
+        return f"robot-{self.robot_id}"
+
+
+class Topic(NamedTuple):
+    """How the messages of a topic are described (`schema`, a JSON schema), and converted to it.
+
+    `convert` gets the time, ns, and the message.
+    """
+
+    schema_name: str
+    schema: bytes
+    convert: Callable[[int, Mapping[str, Any]], Mapping[str, object]]
+
+
+def topic(name: str, kind: type, /, **more: Any) -> Topic:
+    """A topic whose messages have the fields of the dataclass `kind`, and `more` (name -> type)."""
+    hints = {**typing.get_type_hints(kind), **more}
+    return _topic(name, _fields_schema(hints))
+
 
 class FlightLog:
-    """Writes what a robot records; implements `Recorder`.
+    """Writes what a robot, or the ground, records; implements `Recorder`.
 
     `record` may be called from any thread, everything else from one thread at a time. After an
     error of the file system it records nothing more and says so once; nothing raises in flight.
@@ -87,20 +121,21 @@ class FlightLog:
     def __init__(
         self,
         directory: Path,
-        metadata: FlightMetadata,
+        metadata: LogMetadata,
+        topics: Mapping[str, Topic] | None = None,
         *,
         max_segment_bytes: int = 2**25,
         max_total_bytes: int = 2**30,
         max_queued_messages: int = 2000,
         sync_period_s: float = 1.0,
     ) -> None:
-        """Start a segment in `directory`, which is made if need be.
+        """Start a segment in `directory`, which is made if need be. No `topics` are a robot's.
 
         A killed process and a power loss cost what was recorded in the last `sync_period_s`: a
         battery swap is a power loss, and the kernel alone would write up to half a minute late.
         Shorter periods compress worse.
 
-        No segment grows beyond `max_segment_bytes`, and the oldest ones of this robot are deleted
+        No segment grows beyond `max_segment_bytes`, and the oldest ones of this name are deleted
         so that all of them, of earlier starts too, stay within `max_total_bytes`.
 
         Raises ValueError if a limit is impossible. If nothing can be written there, `recording` is
@@ -120,6 +155,7 @@ class FlightLog:
             raise ValueError(f"max_queued_messages = {max_queued_messages}: must be at least 1")
         self._directory = directory
         self._metadata = metadata
+        self._topics = _ROBOT_TOPICS if topics is None else topics
         self._max_segment_bytes = max_segment_bytes
         self._max_total_bytes = max_total_bytes
         self._lock = Lock()
@@ -187,7 +223,7 @@ class FlightLog:
         if self._segment is None:
             return
         try:
-            encoded = _encode(topic, unix_time_s, message)
+            encoded = _encode(topic, self._topics[topic], unix_time_s, message)
         except Exception as error:  # whatever it is, the others are worth keeping
             self._refuse(topic, repr(error))
             return
@@ -212,7 +248,8 @@ class FlightLog:
             self._dropped_reported = self._dropped
 
     def _begin_segment(self) -> None:
-        segments = _segments(self._directory, self._metadata.robot_id)
+        name = self._metadata.log_name
+        segments = _segments(self._directory, name)
         number = max(segments, default=0) + 1
         sizes = {path: path.stat().st_size for _, path in sorted(segments.items())}
         for path, size in list(sizes.items()):
@@ -221,8 +258,8 @@ class FlightLog:
             path.unlink(missing_ok=True)
             del sizes[path]
             _log.info("flight log deleted its oldest segment", path=str(path), bytes=size)
-        path = self._directory / f"robot-{self._metadata.robot_id}-{number:04}.mcap"
-        self._segment = _Segment(path, self._max_segment_bytes)
+        path = self._directory / f"{name}-{number:04}.mcap"
+        self._segment = _Segment(path, self._max_segment_bytes, self._topics)
         self._segment.begin(self._metadata)
 
     @contextlib.contextmanager
@@ -254,11 +291,11 @@ def read_metadata(path: Path) -> FlightMetadata:
     raise FlightLogError(f"{path}: was not written by a robot, or broke off before it began")
 
 
-def read(path: Path, only_topic: str | None = None) -> Iterator[tuple[str, float, dict[str, Any]]]:
+def read(path: Path, *only: str) -> Iterator[tuple[str, float, dict[str, Any]]]:
     """(topic, Unix time in s, message) of one segment in the order of writing.
 
-    With `only_topic` all others are passed over, three times as fast. A segment that breaks off,
-    since the robot was killed or lost its power, is read up to there.
+    With topics in `only` all others are passed over, three times as fast. A segment that breaks
+    off, since the robot was killed or lost its power, is read up to there.
     Arrays are numpy's again, bit by bit, and bytes are bytes.
 
     Raises FlightLogError if it is no MCAP file, OSError if it cannot be read.
@@ -267,7 +304,7 @@ def read(path: Path, only_topic: str | None = None) -> Iterator[tuple[str, float
     for record in _records(path):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
-        elif isinstance(record, Message) and only_topic in (None, topics[record.channel_id]):
+        elif isinstance(record, Message) and (not only or topics[record.channel_id] in only):
             message = json.loads(record.data, object_hook=_revive)
             yield topics[record.channel_id], record.log_time / 10**9, message
 
@@ -300,24 +337,25 @@ class _Encoded(NamedTuple):
 class _Segment:
     """One file. Raises what the file system raises."""
 
-    def __init__(self, path: Path, max_bytes: int) -> None:
+    def __init__(self, path: Path, max_bytes: int, topics: Mapping[str, Topic]) -> None:
         self._file = path.open("xb")
         self._max_bytes = max_bytes
+        self._topics = topics
         # The chunks are closed by `sync` alone.
         self._writer = Writer(self._file, max_bytes, CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
         # Of the chunk that is not closed, the first of which has the schemas; and of what `close`
         # writes, which repeats them.
-        self._pending_bytes = _schemas_bytes()
-        self._summary_bytes = _schemas_bytes() + _CHUNK_OVERHEAD_BYTES
+        self._pending_bytes = sum(len(topic.schema) + 128 for topic in topics.values())
+        self._summary_bytes = self._pending_bytes + _CHUNK_OVERHEAD_BYTES
         self._pending_messages = 0
 
-    def begin(self, metadata: FlightMetadata) -> None:
+    def begin(self, metadata: LogMetadata) -> None:
         """Write what comes before the first message."""
         self._writer.start()
         texts = {key: str(value) for key, value in dataclasses.asdict(metadata).items()}
         self._writer.add_metadata(_METADATA, texts)
-        for name, topic in _TOPICS.items():
+        for name, topic in self._topics.items():
             schema = self._writer.register_schema(topic.schema_name, "jsonschema", topic.schema)
             self._channels[name] = self._writer.register_channel(name, "json", schema)
         self.sync()
@@ -354,24 +392,24 @@ class _Segment:
             self._file.close()
 
 
-def _segments(directory: Path, robot_id: int) -> dict[int, Path]:
-    """The segments of that robot by their numbers."""
+def _segments(directory: Path, name: str) -> dict[int, Path]:
+    """The segments of that name by their numbers."""
     matches = (
-        (re.fullmatch(rf"robot-{robot_id}-(\d+)\.mcap", path.name), path)
+        (re.fullmatch(rf"{re.escape(name)}-(\d+)\.mcap", path.name), path)
         for path in directory.iterdir()
     )
     return {int(match[1]): path for match, path in matches if match}
 
 
-def _encode(topic: str, unix_time_s: float, message: Mapping[str, object]) -> _Encoded:
-    """Raises KeyError for an unknown topic, TypeError and ValueError for what JSON cannot hold."""
+def _encode(name: str, topic: Topic, unix_time_s: float, message: Mapping[str, object]) -> _Encoded:
+    """Raises TypeError and ValueError for what JSON cannot hold."""
     whole_s = math.floor(unix_time_s)
     # Times 10**9 as a whole, a float would lose its last digits.
     time_ns = whole_s * 10**9 + round((unix_time_s - whole_s) * 1e9)
     if not 0 <= time_ns < 2**63:
         raise ValueError(f"unix_time_s = {unix_time_s}")
-    converted = _TOPICS[topic].convert(time_ns, message)
-    return _Encoded(topic, time_ns, json.dumps(_plain(converted), separators=(",", ":")).encode())
+    converted = topic.convert(time_ns, message)
+    return _Encoded(name, time_ns, json.dumps(_plain(converted), separators=(",", ":")).encode())
 
 
 def _plain(value: object) -> object:
@@ -452,14 +490,25 @@ def _schema(hint: Any) -> _Schema:
     if origin is tuple:
         return _list(_schema(arguments[0]))
     if origin is dict:
-        return _object()
+        return {**_object(), "additionalProperties": _schema(arguments[1])}
     if origin is Literal or issubclass(hint, StrEnum):
         return _STRING
     by_type = {float: _NUMBER, int: _INTEGER, str: _STRING, bool: _BOOLEAN}
     if hint in by_type:
         return by_type[hint]
-    fields = typing.get_type_hints(hint)
-    return _object(**{name: _schema(field) for name, field in fields.items()})
+    return _fields_schema(typing.get_type_hints(hint))
+
+
+def _fields_schema(hints: Mapping[str, Any]) -> _Schema:
+    """Without lists of lists, which make Foxglove refuse a topic; it shows them all the same."""
+    schemas = {name: _schema(hint) for name, hint in hints.items()}
+    return _object(
+        **{
+            name: schema
+            for name, schema in schemas.items()
+            if schema["type"] != "array" or schema["items"]["type"] != "array"
+        }
+    )
 
 
 def _as_it_is(_: int, message: Mapping[str, object]) -> Mapping[str, object]:
@@ -496,17 +545,11 @@ def _foxglove_time(time_ns: int) -> dict[str, int]:
     return dict(zip(("sec", "nsec"), divmod(time_ns, 10**9), strict=True))
 
 
-class _Topic(NamedTuple):
-    schema_name: str
-    schema: bytes
-    convert: Callable[[int, Mapping[str, Any]], Mapping[str, object]] = _as_it_is
+def _topic(name: str, schema: _Schema) -> Topic:
+    return Topic(f"lpac.{name}", json.dumps(schema).encode(), _as_it_is)
 
 
-def _topic(name: str, schema: _Schema) -> _Topic:
-    return _Topic(f"lpac.{name}", json.dumps(schema).encode())
-
-
-_TOPICS = {
+_ROBOT_TOPICS = {
     "perception": _topic(
         "Perception", _object(images=_ARRAY, position_feature=_ARRAY, features=_ARRAY)
     ),
@@ -541,14 +584,11 @@ _TOPICS = {
             closest_m=_NUMBER,
         ),
     ),
-    "status": _topic("Status", _schema(RobotStatus)),
-    "order": _topic(
-        "Order",
-        _object(**_schema(Order)["properties"], answer=_schema(OrderResult)),
-    ),
-    "ground": _topic("Ground", _schema(GroundState)),
-    "vehicle": _topic("Vehicle", _schema(VehicleState)),
-    "/pose": _Topic(
+    "status": topic("Status", RobotStatus),
+    "order": topic("Order", Order, answer=OrderResult),
+    "ground": topic("Ground", GroundState),
+    "vehicle": topic("Vehicle", VehicleState),
+    "/pose": Topic(
         "foxglove.PoseInFrame",
         json.dumps(
             _object(
@@ -559,7 +599,7 @@ _TOPICS = {
         ).encode(),
         _foxglove_pose,
     ),
-    "/log": _Topic(
+    "/log": Topic(
         "foxglove.Log",
         json.dumps(
             _object(
@@ -574,8 +614,3 @@ _TOPICS = {
         _foxglove_log,
     ),
 }
-
-
-def _schemas_bytes() -> int:
-    """What all schemas and channels take in a file, at most."""
-    return sum(len(topic.schema) + 128 for topic in _TOPICS.values())

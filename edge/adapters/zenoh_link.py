@@ -1,8 +1,9 @@
 """The radio of the robots and the ground, over zenoh.
 
-Keys, below `lpac/<fleet>/`: `robot/<id>/message`, `robot/<id>/status`, `ground/state`,
-`ground/order`, and for presence the liveliness tokens `robot/<id>/alive/<session>`, which vanish
-with the session that declared them: at once if the program ends, a second after it stops answering.
+Keys, below `lpac/<fleet>/`: `robot/<id>/message`, `robot/<id>/status`, `robot/<id>/explored`,
+`ground/state`, `ground/order`, `ground/world`, and for presence the liveliness tokens
+`robot/<id>/alive/<session>`, which vanish with the session that declared them: at once if the
+program ends, a second after it stops answering.
 
 In peer mode gossip makes a mesh from one known peer, but what only gossip connected is not
 connected again when it alone is lost; scouting does it within some 8 s. So for flight let every
@@ -27,8 +28,12 @@ from edge.core.wire import MAX_ROBOT_ID
 
 ReceiveCallback = Callable[[str, bytes], None]
 
-_ROBOT_TOPICS = ("message", "status")
-_GROUND_TOPICS = ("state", "order")
+_ROBOT_TOPICS = ("message", "status", "explored")
+_GROUND_TOPICS = ("state", "order", "world")
+# Large, or of no hurry: between its fragments goes whatever else is to be sent.
+_PATIENT_TOPICS = ("explored", "world")
+# Of 64 kB each: a world that does not fit in there at once is dropped.
+_PATIENT_BATCHES = 8
 _ENDPOINT = re.compile(r"tcp/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
 _TOKEN = re.compile(r"robot/(\d+)/alive/(\w+)")
 _CLOSE_TIMEOUT_S = 1.0
@@ -103,7 +108,8 @@ class ZenohLink:
         self.close()
 
     def publish(self, topic: str, data: bytes) -> None:
-        """Send on an own topic: a robot's `message` or `status`, the ground's `state` or `order`.
+        """Send on an own topic: a robot's `message`, `status` or `explored`, the ground's `state`,
+        `order` or `world` (up to some 400 kB).
 
         Dropped when the link is congested or closed. Raises KeyError for any other topic.
         """
@@ -176,6 +182,7 @@ class ZenohLink:
             "scouting/gossip": once,
             # How soon a lost neighbour is noticed.
             "transport/link/tx/lease": 1000,
+            "transport/link/tx/queue/size/background": _PATIENT_BATCHES,
             # 200 MB among ten robots, for no gain.
             "transport/shared_memory/enabled": False,
         }.items():
@@ -202,7 +209,11 @@ class ZenohLink:
                 # The newest counts, at once: nothing queues up.
                 congestion_control=zenoh.CongestionControl.DROP,
                 express=True,
-                priority=zenoh.Priority.REAL_TIME,
+                priority=(
+                    zenoh.Priority.BACKGROUND
+                    if topic in _PATIENT_TOPICS
+                    else zenoh.Priority.REAL_TIME
+                ),
                 reliability=zenoh.Reliability.RELIABLE,
             )
             for topic in (_GROUND_TOPICS if self._robot_id is None else _ROBOT_TOPICS)

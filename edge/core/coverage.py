@@ -173,15 +173,18 @@ def _centroid(moments: F64, size: tuple[int, ...], positions: F64, robot: int) -
     centroid: F64
     if moments[0] >= _EMPTY_MASS:
         centroid = moments[1:3] / moments[0]
-    elif len(corners := _cell_corners(size, positions, robot)):
+    elif len(corners := cell_corners(size, positions, robot)):
         centroid = corners.mean(axis=0)
     else:
         centroid = np.clip(positions[robot], 0.0, size)
     return centroid
 
 
-def _cell_corners(size: tuple[int, ...], positions: F64, robot: int) -> F64:
-    """(n, 2): corners of the robot's Voronoi cell in [0, size[0]] x [0, size[1]]; n may be 0."""
+def cell_corners(size: tuple[float, ...], positions: F64, robot: int) -> F64:
+    """(n, 2): corners of the robot's Voronoi cell in [0, size[0]] x [0, size[1]]; n may be 0.
+
+    `positions` is (N, 2), `robot` one of their indices. Robots at one point share their cell.
+    """
     position = positions[robot]
     corners = np.array([(0.0, 0.0), (size[0], 0.0), size, (0.0, size[1])])
     offsets = positions - position

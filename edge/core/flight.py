@@ -25,6 +25,7 @@ from edge.core.mission import (
     Order,
     OrderKind,
     OrderResult,
+    Place,
 )
 from edge.core.ports import Odometry
 from edge.core.safety import Closest, Fence, MotionLimits
@@ -141,7 +142,8 @@ class FlightInputs:
     autopilot's position is old, or there is no mission origin. `policy_velocity_m_s` (2,) is None
     when the policy has no fresh answer. `closest` is the nearest neighbour. `busy_neighbours` say
     of themselves that they arm or take off. `failed_checks` are preflight's; None before the first.
-    `order` is new in this tick.
+    `not_taken` is what of the ground's state the robot does not fly by, in words. `order` is new in
+    this tick.
     """
 
     now_s: float
@@ -154,6 +156,7 @@ class FlightInputs:
     ground: GroundState | None
     ground_age_s: float
     failed_checks: tuple[str, ...] | None
+    not_taken: tuple[str, ...]
     order: Order | None
     uptime_s: float
 
@@ -184,6 +187,27 @@ class Robot:
                 f"landing_point_m = {[x_m, y_m]}: must be inside the fence, at least buffer_m = "
                 f"{fence.buffer_m:g} from its line"
             )
+
+    @property
+    def place(self) -> Place:
+        """Its place in the flight."""
+        return Place(self.parameters.slot, self.parameters.landing_point_m)
+
+    def told(self, ground: GroundState) -> tuple[Fence, Place]:
+        """Fence and place that the ground gives it, or else its own."""
+        fence = self.fence if ground.fence is None else ground.fence
+        return fence, ground.places.get(str(self.robot_id), self.place)
+
+    def assigned(self, ground: GroundState) -> "Robot":
+        """The same with those. Raises ValueError, which the operator reads, if they do not fit."""
+        fence, place = self.told(ground)
+        try:
+            parameters = replace(
+                self.parameters, slot=place.slot, landing_point_m=place.landing_point_m
+            )
+            return replace(self, fence=fence, parameters=parameters)
+        except ValueError as error:
+            raise ValueError(f"the ground's fence or place does not fit: {error}") from None
 
 
 class Decision(NamedTuple):
@@ -230,7 +254,8 @@ class _Tick:
         if ground is None or not self.ground_heard:
             return "none"
         asked = ground.calm_for(self.robot.robot_id)
-        return "hold" if asked == "none" and not ground.enabled else asked
+        enabled = ground.enabled_for(self.robot.robot_id)
+        return "hold" if asked == "none" and not enabled else asked
 
     @property
     def ground_heard(self) -> bool:
@@ -436,8 +461,9 @@ def _found(t: _Tick) -> str | None:
 
 def _enabled(t: _Tick) -> str | None:
     ground = t.inputs.ground
-    enabled = ground is not None and ground.enabled and ground.origin is not None
-    return _if(enabled and t.ground_heard, "enabled")
+    if ground is None or ground.origin is None or not t.ground_heard:
+        return None
+    return _if(ground.enabled_for(t.robot.robot_id), "enabled")
 
 
 def _enabled_at_rest(t: _Tick) -> str | None:
@@ -498,6 +524,14 @@ def _start(t: _Tick) -> str | None:
     return _if(t.accepted == "start", "mission started")
 
 
+def _given_away(t: _Tick) -> str | None:
+    return _if(t.accepted == "pilot", "given to a pilot")
+
+
+def _disarm(t: _Tick) -> str | None:
+    return _if(t.accepted == "disarm", "disarm ordered")
+
+
 def _rejoin(t: _Tick) -> str | None:
     return _if(t.accepted == "rejoin", "taken back by the operator")
 
@@ -521,6 +555,8 @@ def _refusal(t: _Tick, action: Action) -> str:
 
 TRANSITIONS: tuple[Transition, ...] = (
     Transition(tuple(_S), _S.FAULT, "the operator orders kill", _killed, alarm=True),
+    Transition((_S.ARMING, *AIRBORNE, _S.PILOT), _S.PILOT,
+               "the operator orders disarm, on the ground", _disarm, (Action.DISARM,)),
     # What the vehicle does, whoever made it.
     Transition((*AIRBORNE, _S.PILOT), _S.LANDED, "the vehicle is disarmed", _disarmed),
     Transition((_S.FAULT,), _S.INIT, "the vehicle is disarmed, and was not killed",
@@ -548,6 +584,9 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(STEERED, _S.LAND, "the battery is critical", _battery_critical, alarm=True),
     Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "it stands on the ground", _on_ground,
                alarm=True),
+    # The operator gives it away.
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.PILOT, "the operator orders pilot",
+               _given_away, (Action.HOLD,), alarm=True),
     # The ground calms.
     Transition((_S.ARMING,), _S.IDLE, "the ground commands hold, land or return, or is lost; the "
                "control loop was silent; the vehicle left offboard",
@@ -603,7 +642,8 @@ def step(robot: Robot, flight: Flight, inputs: FlightInputs) -> Decision:
     refusal = None if order is None else _order_problem(tick, order)
     obeyed = order if refusal is None else None
     row, reason = _first_row(replace(tick, accepted=None if obeyed is None else obeyed.kind))
-    if obeyed is not None and (row is None or row.why not in _BY_ORDER):
+    overruled = row is not None and row.why not in _BY_ORDER
+    if obeyed is not None and obeyed.kind != "reset" and overruled:
         # Something graver came first.
         obeyed, refusal = None, reason
     actions: tuple[Action, ...] = ()
@@ -611,8 +651,9 @@ def step(robot: Robot, flight: Flight, inputs: FlightInputs) -> Decision:
         flight, actions = _enter(row, reason, tick), row.actions
     if order is not None:
         flight = _answer(flight, order, refusal)
-    new_trial = obeyed is not None and obeyed.kind == "start" and obeyed.trial != flight.trial
-    if obeyed is not None and new_trial:
+    new_trial = False
+    if obeyed is not None and obeyed.kind in ("start", "reset"):
+        new_trial = obeyed.kind == "reset" or obeyed.trial != flight.trial
         flight = replace(flight, trial=obeyed.trial)
     tick = _Tick(robot, flight, inputs, None)
     asked = _ask(tick)
@@ -753,7 +794,16 @@ def _again(t: _Tick, action: Action) -> tuple[Action, ...]:
     return (action,) if looked or action in (Action.DISARM, Action.KILL) else ()
 
 
-_BY_ORDER = (_killed, _takeoff, _start, _rejoin)
+_BY_ORDER = (_killed, _disarm, _given_away, _takeoff, _start, _rejoin)
+# Where each order is taken; PILOT among pilot's, since there it is so already.
+_TAKEN_IN: dict[OrderKind, tuple[FlightState, ...]] = {
+    "takeoff": (_S.PREFLIGHT,),
+    "start": (_S.HOLD,),
+    "pilot": (_S.HOLD, _S.MISSION, _S.RETURN, _S.PILOT),
+    "rejoin": (_S.PILOT,),
+    "reset": tuple(s for s in _S if s not in (_S.ARMING, _S.TAKEOFF, _S.MISSION)),
+    "disarm": (_S.ARMING, *AIRBORNE, _S.PILOT),
+}
 
 
 def _new_order(robot: Robot, flight: Flight, inputs: FlightInputs) -> Order | None:
@@ -780,23 +830,41 @@ def _order_problem(t: _Tick, order: Order) -> str | None:
     left_s = order.expires_at_uptime_s - t.inputs.uptime_s
     if not 0.0 <= left_s <= ORDER_LIFETIME_S:
         return "expired" if left_s < 0.0 else f"would be valid for {left_s:.0f} s: too long"
-    state = t.flight.state
     if order.kind == "kill":
         return None
-    source = {"takeoff": _S.PREFLIGHT, "start": _S.HOLD, "rejoin": _S.PILOT}[order.kind]
-    if state is not source:
-        return f"{order.kind} is taken in {source} only, the robot is in {state}: {t.flight.reason}"
+    ground = t.inputs.ground
+    if ground is not None and order.operator != ground.operator:
+        return f"{ground.operator} commands, not {order.operator}"
+    if order.kind == "disarm" and (problem := _cannot_disarm(t)):
+        return problem
+    state, sources = t.flight.state, _TAKEN_IN[order.kind]
+    if state not in sources:
+        alone = f"taken in {sources[0]} only, the robot is" if len(sources) == 1 else "not taken"
+        return f"{order.kind} is {alone} in {state}: {t.flight.reason}"
     if order.expires_at_uptime_s <= t.flight.obeyed_expiry_s:
         return "older than an order that was obeyed"
     if t.silent:
         return "the control loop was silent just before"
     if not t.ground_heard:
         return "the ground's state is not heard"
+    if order.kind in ("pilot", "reset", "disarm"):
+        return None
     if t.calm != "none":
         return f"the ground commands {t.calm}"
     if order.kind == "takeoff":
         return _not_ready(t)
     return _not_in_place(t) or (_cannot_start(t) if order.kind == "start" else None)
+
+
+def _cannot_disarm(t: _Tick) -> str | None:
+    vehicle = t.inputs.vehicle
+    arming = t.flight.state is _S.ARMING  # It may be armed before that is heard.
+    if vehicle.armed is False and not arming:
+        return "is not armed"
+    if vehicle.in_air:
+        return "in the air: land it first"
+    known = arming or (vehicle.armed and vehicle.in_air is False)
+    return None if known else "not known to be armed, and on the ground"
 
 
 def _not_ready(t: _Tick) -> str | None:
@@ -828,6 +896,8 @@ def _cannot_start(t: _Tick) -> str | None:
         return "the autopilot is not in offboard yet"
     if t.inputs.policy_velocity_m_s is None:
         return "the policy has no fresh answer"
+    if t.inputs.not_taken:
+        return "; ".join(t.inputs.not_taken)
     if t.inputs.busy_neighbours:
         busy = ", ".join(map(str, t.inputs.busy_neighbours))
         return f"robots still taking off: {busy}"

@@ -72,6 +72,7 @@ class Mailbox:
         self._handed_out: dict[int, _Received] = {}  # the paper's rule only
         # Outlives the messages: a late duplicate must not pass for news.
         self._heard: dict[int, _Heard] = {}
+        self._accepted: Counter[int] = Counter()
         self._counts: Counter[str] = Counter(
             dict.fromkeys(["accepted", *(reason.value for reason in Rejection)], 0)
         )
@@ -100,6 +101,7 @@ class Mailbox:
                     message.boot_epoch, message.sequence, now_s, shortest_s
                 )
                 self._received[sender] = _Received(message, born_s)
+                self._accepted[sender] += 1
             self._counts[rejection or "accepted"] += 1
         return rejection
 
@@ -136,6 +138,11 @@ class Mailbox:
         """How many messages were accepted, and how many rejected for each reason, so far."""
         with self._lock:
             return dict(self._counts)
+
+    def accepted(self) -> dict[int, int]:
+        """How many messages of each neighbour were accepted so far, by robot id."""
+        with self._lock:
+            return dict(self._accepted)
 
     def clear(self) -> None:
         """Forget the messages, for a new mission; not the counts, nor what was the newest."""

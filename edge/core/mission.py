@@ -136,8 +136,8 @@ class Order:
 
     It is for the start of the program whose `boot_nonce` it names, and expires at
     `expires_at_uptime_s` of the robot's own uptime, `ORDER_LIFETIME_S` after the status that the
-    ground saw: clocks need not agree. `trial` names the mission of a start or a reset: a name that
-    the robot has not flown last resets its explored map and its mailbox.
+    ground saw: clocks need not agree. `trial` names the mission of a start or a reset: a start of
+    another mission than the last, and each reset, has the explored map and the mailbox forgotten.
 
     `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
     motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone.
@@ -183,7 +183,8 @@ class RobotStatus:
     `not_taken` says what of the ground's state the robot does not take up now, and why.
     `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
     for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
-    `neighbour_messages` counts each neighbour's messages since the start.
+    `neighbour_messages` counts each neighbour's messages since the start. `ground_age_s` is how
+    long ago the state that it obeys was heard, None if never.
     """
 
     robot_id: int
@@ -224,6 +225,7 @@ class RobotStatus:
     policy_velocity_m_s: tuple[float, ...] | None = None
     feature_age_s: float | None = None
     neighbour_messages: dict[str, int] = field(default_factory=dict)
+    ground_age_s: float | None = None
 
     def __post_init__(self) -> None:
         for name, size in (

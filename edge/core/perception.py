@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F32, F64
+from edge.core.mission import EXPLORED_CELLS, Bools
 
 # The images by number of channels, in the order in which CoverageControl stacks them.
 MAP_CHANNELS = {
@@ -215,10 +216,23 @@ class Perception:
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
         self._resize = Resize(parameters.local_map_size, image_size)
         self._images = np.empty((1, channels, image_size, image_size), np.float32)
+        # For people: which cells of the coarse raster over the world it has seen.
+        self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
 
     def observe(self, position: F64, view: F32) -> None:
-        """Write the sensor's view (sensor_size, sensor_size) around `position` into the map."""
-        self._map.insert(view, window_corner(position, view.shape[0]))
+        """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
+
+        Those cells of `explored` count as seen whose centre was.
+        """
+        size = view.shape[0]
+        corner = window_corner(position, size)
+        self._map.insert(view, corner)
+        scale = EXPLORED_CELLS / self._parameters.world_size
+        x, y = (
+            slice(max(math.ceil(low * scale - 0.5), 0), max(math.ceil(high * scale - 0.5), 0))
+            for low, high in ((start, start + size) for start in corner)
+        )
+        self.explored[x, y] = True
 
     def images(self, position: F64, neighbours: F64) -> F32:
         """The policy's images, (1, channels, image_size, image_size), valid until the next call.

@@ -211,12 +211,13 @@ def _place(inputs: PreflightInputs) -> Iterator[str]:
     if not depth_m >= fence.buffer_m:
         yield (
             f"landing point lies {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
-            "change it in the config"
+            "change it in the config, or on the ground"
         )
     if not fence.floor_m <= inputs.slot_height_m <= fence.ceiling_m:
         yield (
             f"slot height is {inputs.slot_height_m:g} m, must be from the floor at "
-            f"{fence.floor_m:g} m to the ceiling at {fence.ceiling_m:g} m: change it in the config"
+            f"{fence.floor_m:g} m to the ceiling at {fence.ceiling_m:g} m: "
+            "change it in the config, or on the ground"
         )
 
 
@@ -233,20 +234,20 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
         if status.bundle_id != inputs.bundle_id:
             yield f"{other} has another bundle: deploy one to all"
         if status.world_id != inputs.world_id:
-            yield f"{other} has another world: deploy one to all"
+            yield f"{other} has another world: set one on the ground, or deploy it to all"
         if inputs.origin is not None and status.origin != inputs.origin:
             yield f"{other} has another mission origin: set it again on the ground"
         apart_m = abs(status.slot_height_m - inputs.slot_height_m)
         if not apart_m >= inputs.min_separation_m - _ROUNDING_M:
             yield (
                 f"{other} flies {apart_m:.1f} m above or below, must be "
-                f"{inputs.min_separation_m:g} m: change the slots in the config"
+                f"{inputs.min_separation_m:g} m: change the slots in the config, or on the ground"
             )
         apart_m = math.dist(status.landing_point_m, inputs.landing_point_m)
         if not apart_m >= inputs.min_separation_m - _ROUNDING_M:
             yield (
                 f"{other} lands {apart_m:.1f} m away, must be {inputs.min_separation_m:g} m: "
-                "change the landing points in the config"
+                "change the landing points in the config, or on the ground"
             )
         offset_s = status.unix_time_s - heard_at_unix_s
         if not abs(offset_s) <= limits.max_clock_difference_s:

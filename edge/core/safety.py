@@ -233,7 +233,7 @@ def leash(target_m: F64, position_m: F64, length_m: float) -> F64 | None:
 
 def approach_speed(distance_m: float, limits: MotionLimits) -> float:
     """The largest speed v that `distance_m` is enough to stop from: v lag + v^2 / 2a; 0 if none."""
-    if not 0.0 < distance_m < math.inf:
+    if not 0.0 < distance_m < _ABSURD:
         return 0.0
     lag_s, acceleration = limits.lag_s, limits.max_acceleration_m_s2
     return 2.0 * distance_m / (lag_s + math.sqrt(lag_s * lag_s + 2.0 * distance_m / acceleration))

@@ -2,21 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import NamedTuple
 
 import structlog
 
 from edge.core.flight import Flight, FlightInputs, Robot, height_m, step
 from edge.core.guidance import Guidance, MissionSetpoint, guide
 from edge.core.mailbox import Neighbour
-from edge.core.mission import ON_GROUND, STEERED, FlightState, Origin
-from edge.core.ports import Autopilot, Odometry, Recorder
+from edge.core.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
+from edge.core.ports import Autopilot, Odometry, Recorder, Sensor
 from edge.core.preflight import HeardStatus
 from edge.core.safety import Closest, nearest
 from edge.core.vehicle import Action, Mode, Setpoint
 from edge.runtime.inbox import Inbox
 from edge.runtime.navigation import Navigation
 from edge.runtime.pac import Pac
-from edge.runtime.readiness import Checks
+from edge.runtime.readiness import Assignment, Checks
 
 _log = structlog.get_logger(__name__)
 
@@ -27,17 +28,27 @@ _MAX_CHECKS_AGE_S = 5.0
 _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
 
 
+class GroundWorld(NamedTuple):
+    """A world that the ground sent, as a sensor over it; or why it cannot be one."""
+
+    world_id: str
+    sensor: Sensor | None
+    problem: str
+
+
 class FlightControl:
     """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
 
-    Another thread sets `checks`, and `peers` (what the other robots say of themselves), whole.
-    `obeyed_sequence` and `operator` are the last ground state's; `origin` is the mission's.
+    Another thread sets `checks`, `peers` (what the other robots say of themselves), and `world` for
+    the `wanted_world_id`, whole. `obeyed_sequence` and `operator` are the last ground state's.
+    `assignment` is what is flown by, `not_taken` what of the ground's state it is not.
     """
 
     def __init__(
         self,
         *,
         robot: Robot,
+        world_id: str,
         autopilot: Autopilot,
         navigation: Navigation,
         pac: Pac,
@@ -46,7 +57,7 @@ class FlightControl:
         unix_clock_s: Callable[[], float],
         started_s: float,
     ) -> None:
-        self._robot = robot
+        self._configured = robot
         self._autopilot = autopilot
         self._navigation = navigation
         self._pac = pac
@@ -56,11 +67,15 @@ class FlightControl:
         self._started_s = started_s
         self._guidance = Guidance()
         self._last_tick_s: float | None = None
+        self._has_flown = False
         self.flight = Flight()
         self.alarms: tuple[str, ...] = ()
         self.checks: Checks | None = None
         self.peers: tuple[HeardStatus, ...] = ()
-        self.origin: Origin | None = None
+        self.assignment = Assignment(None, robot, world_id)
+        self.not_taken: tuple[str, ...] = ()
+        self.wanted_world_id: str | None = None
+        self.world: GroundWorld | None = None
         self.obeyed_sequence = -1
         self.operator = ""
 
@@ -72,7 +87,7 @@ class FlightControl:
             if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
                 self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
-            self._take_origin(ground.origin, vehicle.armed)
+            self._take_up(ground, vehicle.armed)
         odometry = self._navigation.estimate(vehicle)
         neighbours = self._neighbours(now_s)
         inputs = FlightInputs(
@@ -88,12 +103,14 @@ class FlightControl:
             ground=ground,
             ground_age_s=ground_age_s,
             failed_checks=self.failed_checks(now_s),
+            not_taken=self.not_taken,
             order=self._inbox.order(),
             uptime_s=now_s - self._started_s,
         )
-        before = self.flight
-        decision = step(self._robot, before, inputs)
+        before, robot = self.flight, self.assignment.robot
+        decision = step(robot, before, inputs)
         self.flight, self.alarms = decision.flight, decision.alarms
+        self._has_flown |= decision.flight.state in (FlightState.ARMING, *AIRBORNE)
         self._navigation.datum_m = decision.flight.datum_m
         if decision.new_trial:
             self._pac.forget()
@@ -101,7 +118,7 @@ class FlightControl:
             self._autopilot.command(action)
         dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s
         self._last_tick_s = now_s
-        setpoint, self._guidance = guide(self._robot, decision.flight, inputs, self._guidance, dt_s)
+        setpoint, self._guidance = guide(robot, decision.flight, inputs, self._guidance, dt_s)
         local = None if setpoint is None else self._navigation.to_local(setpoint, vehicle)
         sent = None if local is None else self._autopilot.send(local)
         if decision.flight.state is not before.state:
@@ -115,7 +132,9 @@ class FlightControl:
         checks = self.checks
         if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
             return None
-        return checks.failed if checks.origin == self.origin else None
+        if checks.assignment != self.assignment:
+            return None
+        return (*checks.failed, *self.not_taken)
 
     def leave(self, on_stop: Action) -> Action | None:
         """What the program that ends asks of the vehicle it was flying; None if it was not.
@@ -127,14 +146,68 @@ class FlightControl:
         obeys = self._autopilot.state().mode in (Mode.OFFBOARD, Mode.HOLD)
         return on_stop if self.flight.state in STEERED and obeys else None
 
-    def _take_origin(self, origin: Origin | None, armed: bool | None) -> None:
-        """The mission frame stays where it is while the vehicle is armed."""
-        grounded = armed is False and self.flight.state in ON_GROUND
-        if origin is None or origin == self.origin or not (grounded or self.origin is None):
+    def _take_up(self, ground: GroundState, armed: bool | None) -> None:
+        """Take what the ground sets for a flight, on the ground only.
+
+        A program that has not flown its vehicle, such as one that was started in flight, takes it
+        at any time: it steers nothing by it.
+        """
+        now = self.assignment
+        origin = now.origin if ground.origin is None else ground.origin
+        world_id = now.world_id if ground.world_id is None else ground.world_id
+        self.wanted_world_id = None
+        if self._has_flown and not (armed is False and self.flight.state in ON_GROUND):
+            fence, place = self._configured.told(ground)
+            told = {
+                "mission origin": (origin, now.origin),
+                "fence": (fence, now.robot.fence),
+                "place": (place, now.robot.place),
+                "world": (world_id, now.world_id),
+            }
+            where = "in flight" if armed else "not known to be on the ground"
+            self.not_taken = tuple(
+                f"{where}: keeps its {what}" for what, (new, own) in told.items() if new != own
+            )
             return
-        frame = origin.frame()
-        self.origin, self._navigation.frame, self._pac.frame_id = origin, frame, frame.frame_id
-        self._pac.forget()
+        robot, sensor, not_taken = now.robot, None, []
+        try:
+            robot = self._configured.assigned(ground)
+        except ValueError as error:
+            not_taken.append(str(error))
+        if world_id != now.world_id:
+            arrived = self.world if self.world and self.world.world_id == world_id else None
+            if arrived is None:
+                self.wanted_world_id = world_id
+                not_taken.append(f"world {world_id} of the ground has not arrived: wait")
+            elif arrived.sensor is None:
+                not_taken.append(f"the ground's world cannot be used: {arrived.problem}")
+            else:
+                sensor = arrived.sensor
+        self.not_taken = tuple(not_taken)
+        self._assign(
+            Assignment(origin, robot, now.world_id if sensor is None else world_id), sensor
+        )
+
+    def _assign(self, assignment: Assignment, sensor: Sensor | None) -> None:
+        """`sensor` is over the world, None if that stays."""
+        before, self.assignment = self.assignment, assignment
+        if assignment == before:
+            return
+        origin, robot, world_id = assignment
+        if origin is not None and origin != before.origin:
+            frame = origin.frame()
+            self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
+            self._pac.forget()
+        if sensor is not None:
+            self._pac.sensor = sensor
+            self._pac.forget()
+        _log.info(
+            "taken up from the ground",
+            origin=origin and asdict(origin),
+            fence=asdict(robot.fence),
+            place=asdict(robot.place),
+            world=world_id,
+        )
 
     def _neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
         """Whom to keep away from: also robots that are silent since their policy or sensor failed.
@@ -142,11 +215,11 @@ class FlightControl:
         They still tell their place in their status, if not as often.
         """
         heard = self._pac.mailbox.neighbours(now_s)
-        known = {self._robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
+        known = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
         told = []
         for status, heard_at_s, _ in self.peers:
             age_s = now_s - heard_at_s
-            comparable = status.origin == self.origin and age_s <= _MAX_STATUS_AGE_S
+            comparable = status.origin == self.assignment.origin and age_s <= _MAX_STATUS_AGE_S
             if status.robot_id in known or not comparable:
                 continue
             if status.position_m is not None and status.velocity_m_s is not None:

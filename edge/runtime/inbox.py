@@ -15,6 +15,7 @@ from edge.core.schema import ConfigError
 T = TypeVar("T")
 
 _MOST_ORDERS = 64
+_MOST_STATES = 16
 _STATUS_LIFETIME_S = 3.0
 
 
@@ -28,24 +29,33 @@ class Inbox:
     """`put_*` may be called from any thread, each other method from one thread."""
 
     def __init__(self, robot_id: int, ground_timeout_s: float) -> None:
-        """A ground state with a smaller sequence counts once no other came for the timeout."""
+        """Of several grounds' states the one with the greatest (sequence, operator) counts.
+
+        A smaller one does once no other came for the timeout.
+        """
         self._robot_id = robot_id
         self._ground_timeout_s = ground_timeout_s
         self._lock = Lock()
-        self._ground_arrived: _Arrived | None = None
+        self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
         self._orders: deque[bytes] = deque(maxlen=_MOST_ORDERS)
         self._statuses: dict[str, _Arrived] = {}
         self._ground: GroundState | None = None
         self._ground_at_s = -math.inf
         # The ground's wall clock minus this one, None while it is not known.
         self.ground_clock_offset_s: float | None = None
+        # The text of the newest world file that the ground sent.
+        self.world: bytes | None = None
         # Whose statuses could not be read when `peers` was asked last.
         self.not_understood: tuple[str, ...] = ()
         self.malformed = 0
 
     def put_ground(self, data: bytes, now_s: float, unix_now_s: float) -> None:
-        """The ground's state arrived."""
-        self._ground_arrived = _Arrived(data, now_s, unix_now_s)
+        """A ground's state arrived."""
+        self._grounds.append(_Arrived(data, now_s, unix_now_s))
+
+    def put_world(self, data: bytes) -> None:
+        """A world file arrived."""
+        self.world = data
 
     def put_order(self, data: bytes) -> None:
         """An order arrived."""
@@ -58,15 +68,20 @@ class Inbox:
 
     def ground(self, now_s: float) -> tuple[GroundState | None, float]:
         """The ground's newest state and its age, s (infinite if none came). Control thread."""
-        arrived, self._ground_arrived = self._ground_arrived, None
-        if arrived is not None:
+        while self._grounds:
+            arrived = self._grounds.popleft()
             state = self._decode(GroundState, arrived.data)
-            lost = now_s - self._ground_at_s > self._ground_timeout_s
-            if state and (self._ground is None or lost or state.sequence >= self._ground.sequence):
+            if state is not None and self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
                 if state.unix_time_s is not None:
                     self.ground_clock_offset_s = state.unix_time_s - arrived.unix_s
         return self._ground, now_s - self._ground_at_s
+
+    def _counts(self, state: GroundState, at_s: float) -> bool:
+        newest = self._ground
+        if newest is None or at_s - self._ground_at_s > self._ground_timeout_s:
+            return True
+        return (state.sequence, state.operator) >= (newest.sequence, newest.operator)
 
     def ground_age_s(self, now_s: float) -> float:
         """The age of the ground's newest state, s; infinite if none came. From any thread."""

@@ -59,12 +59,21 @@ class Navigation:
         position_m, velocity_m_s = vehicle.position_local_m, vehicle.velocity_local_m_s
         if transform is None or position_m is None or velocity_m_s is None:
             return None
-        if not vehicle.position_ok or self._clock_s() - vehicle.position_at_s > MAX_POSITION_AGE_S:
+        if not self._is_fresh(vehicle):
             return None
         return Odometry(
             _vector(transform.local_to_mission(np.array(position_m))),
             _vector(transform.velocity_to_mission(np.array(velocity_m_s))),
         )
+
+    def global_deg(self, vehicle: VehicleState) -> tuple[float, float] | None:
+        """Latitude and longitude, also without a mission frame; None when unknown or too old."""
+        origin_deg, position_m = vehicle.origin_deg, vehicle.position_local_m
+        if origin_deg is None or position_m is None or not self._is_fresh(vehicle):
+            return None
+        north_m, east_m, _ = position_m
+        # A mission that points north has x to the east.
+        return MissionFrame(*origin_deg, heading_rad=0.0).to_global_deg(east_m, north_m)
 
     def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
         """The setpoint in the vehicle's local frame; None when there is no telling.
@@ -84,6 +93,10 @@ class Navigation:
             place_m = np.array([x_m, y_m, height_m + self.datum_m])
             return Position(_vector(transform.mission_to_local(place_m)))
         return Velocity(_vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
+
+    def _is_fresh(self, vehicle: VehicleState) -> bool:
+        age_s = self._clock_s() - vehicle.position_at_s
+        return vehicle.position_ok and age_s <= MAX_POSITION_AGE_S
 
     def _transform(self, vehicle: VehicleState) -> LocalTransform | None:
         frame, origin_deg, fixed = self.frame, vehicle.origin_deg, self._fixed

@@ -18,6 +18,7 @@ from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage, HopBuffer
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
+from edge.core.mission import Bools
 from edge.core.perception import Perception, clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource, Sensor
 from edge.core.safety import limit_speed
@@ -92,7 +93,7 @@ class PolicyTick:
 class Pac:
     """The steps of one robot.
 
-    `perceive`, `infer` and `control` belong to one thread each, `receive` to any number. They
+    `perceive` (with `explored`) and `infer` belong to one thread each, the rest to any number. They
     exchange immutable values by reference and never wait for one another.
     """
 
@@ -117,7 +118,6 @@ class Pac:
         self._robot_id = robot_id
         self._boot_epoch = boot_epoch
         self._policy = policy
-        self._sensor = sensor
         self._odometry = odometry
         self._parameters = parameters
         self._world_size = manifest.perception.world_size
@@ -133,8 +133,10 @@ class Pac:
         self._features: _Timed | None = None
         self._action: _Timed | None = None
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
-        # Replaced whole when the ground sets another origin, which it does while nobody flies.
+        # Replaced whole when the ground sets another origin or another world, which it does while
+        # nobody flies.
         self.frame_id = 0
+        self.sensor = sensor
 
     def forget(self) -> None:
         """Start anew: no explored map and no messages. From any thread.
@@ -171,7 +173,7 @@ class Pac:
         if odometry is None:
             return None
         (own,) = self._to_model([odometry.position_m])
-        view = self._sensor.view(own)
+        view = self.sensor.view(own)
         if view is None or not self._is_valid(view):
             return None
         self._perception.observe(own, view)
@@ -182,6 +184,10 @@ class Pac:
         features = np.concatenate([self._policy.image_features(images), position])
         self._features = _Timed(features, now_s)
         return PerceptionTick(images, position, features)
+
+    def explored(self) -> Bools:
+        """What it has seen, as `mission.explored_to_bytes` takes it; valid until it goes on."""
+        return self._perception.explored
 
     def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
@@ -238,6 +244,11 @@ class Pac:
             action.value.astype(np.float64)
         )
         return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+
+    def feature_age_s(self, now_s: float) -> float | None:
+        """The age of the newest features, s; None if there are none."""
+        features = self._features
+        return None if features is None else now_s - features.time_s
 
     def _finite_odometry(self) -> Odometry | None:
         odometry = self._odometry.odometry()

@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import structlog
 
-from edge.core.failsafe import PARAMETERS, explain, required
+from edge.core.failsafe import PARAMETERS, Requirement, explain, required
 from edge.core.failsafe import check as check_parameters
-from edge.core.frames import MissionFrame
+from edge.core.flight import Robot
 from edge.core.mission import Origin
 from edge.core.ports import Autopilot, AutopilotSetup, Odometry
 from edge.core.preflight import HeardStatus, PreflightInputs, failed_checks
+from edge.core.safety import Fence
 from edge.runtime.config import RobotConfig
 
 # Parameters may be changed by others meanwhile.
@@ -25,12 +26,20 @@ _TRY_AGAIN_S = 3.0
 _log = structlog.get_logger(__name__)
 
 
+class Assignment(NamedTuple):
+    """What a robot flies by, as the ground sets it: where, its fence and place, and its world."""
+
+    origin: Origin | None
+    robot: Robot
+    world_id: str
+
+
 class Checks(NamedTuple):
-    """What preflight found at one time, for one mission origin: one line for each failed check."""
+    """What preflight found at one time, for one assignment: one line for each failed check."""
 
     failed: tuple[str, ...]
     at_s: float
-    origin: Origin | None
+    assignment: Assignment
 
 
 class Readiness:
@@ -47,48 +56,52 @@ class Readiness:
         setup: AutopilotSetup,
         *,
         bundle_id: str,
-        world_id: str,
         bundle_problem: str | None,
     ) -> None:
         self._config = config
         self._autopilot = autopilot
         self._setup = setup
         self._bundle_id = bundle_id
-        self._world_id = world_id
         self._bundle_problem = bundle_problem
-        self._requirements = required(
-            config.failsafe.rc, config.fence.ceiling_m, config.flight.command_timeout_s
-        )
+        self._requirements: tuple[Requirement, ...] = ()
         self._parameter_problems: tuple[str, ...] | None = None
         self._parameters_due_s = self._fence_due_s = -math.inf
-        self._fence_for: Origin | None = None
+        self._uploaded: tuple[Origin, Fence] | None = None
         self.explanations: tuple[str, ...] = ()
         self.changes: tuple[str, ...] = ()
 
-    def prepare(self, now_s: float, origin: Origin | None) -> None:
+    def prepare(self, now_s: float, assignment: Assignment) -> None:
         """Read, and set if the configuration says so, what the vehicle must be; only on the ground.
 
         The fence goes to the vehicle when the mission's origin is known.
         """
+        origin, fence = assignment.origin, assignment.robot.fence
+        failsafe, flight = self._config.failsafe, self._config.flight
+        requirements = required(failsafe.rc, fence.ceiling_m, flight.command_timeout_s)
+        if requirements != self._requirements:
+            self._requirements, self._parameter_problems = requirements, None
+            self._parameters_due_s = -math.inf
         vehicle = self._autopilot.state()
         if not vehicle.connected:
-            self._parameters_due_s, self._fence_for = -math.inf, None
+            self._parameters_due_s, self._uploaded = -math.inf, None
             return
         # Nothing is set while it is not sure which vehicle answers.
         if vehicle.armed is not False or vehicle.other_system_ids:
             return
         if now_s >= self._parameters_due_s:
             self._parameters_due_s = now_s + (_READ_AGAIN_S if self._read() else _TRY_AGAIN_S)
-        if origin is not None and origin != self._fence_for and now_s >= self._fence_due_s:
+        if origin is None or self._uploaded == (origin, fence):
+            return
+        if now_s >= self._fence_due_s:
             self._fence_due_s = now_s + _TRY_AGAIN_S
-            self._upload_fence(origin)
+            self._upload_fence(origin, fence)
 
     def checks(
         self,
         now_s: float,
         unix_now_s: float,
         *,
-        origin: Origin | None,
+        assignment: Assignment,
         odometry: Odometry | None,
         peers: Sequence[HeardStatus],
         not_understood: Sequence[str],
@@ -99,6 +112,7 @@ class Readiness:
     ) -> Checks:
         """All checks, now. `ground_age_s` is infinite if the ground was never heard."""
         config = self._config
+        origin, robot, world_id = assignment
         inputs = PreflightInputs(
             now_s=now_s,
             unix_now_s=unix_now_s,
@@ -106,17 +120,17 @@ class Readiness:
             duplicate_id=duplicate,
             bundle_problem=self._bundle_problem,
             bundle_id=self._bundle_id,
-            world_id=self._world_id,
+            world_id=world_id,
             system_id=config.autopilot.system_id,
             vehicle=self._autopilot.state(),
             failsafe_problems=self._parameter_problems,
-            fence=config.fence,
-            fence_uploaded=origin is not None and origin == self._fence_for,
+            fence=robot.fence,
+            fence_uploaded=origin is not None and self._uploaded == (origin, robot.fence),
             origin=origin,
             position_m=None if odometry is None else odometry.position_m,
-            slot_height_m=config.flight.slot_height_m,
-            landing_point_m=config.flight.landing_point_m,
-            min_separation_m=config.flight.min_separation_m,
+            slot_height_m=robot.parameters.slot_height_m,
+            landing_point_m=robot.parameters.landing_point_m,
+            min_separation_m=robot.parameters.min_separation_m,
             neighbours=peers,
             not_understood=not_understood,
             rc=config.failsafe.rc,
@@ -126,7 +140,7 @@ class Readiness:
         failed = failed_checks(inputs, config.preflight)
         if not watchdog_alive:
             failed = (*failed, "watchdog has ended: start this robot's program again")
-        return Checks(failed, now_s, origin)
+        return Checks(failed, now_s, assignment)
 
     def _read(self) -> bool:
         """Whether everything is as it must be."""
@@ -160,14 +174,12 @@ class Readiness:
             _log.warning("PX4 parameter set", change=change, why=requirement.why)
         return bool(wrong)
 
-    def _upload_fence(self, origin: Origin) -> None:
+    def _upload_fence(self, origin: Origin, fence: Fence) -> None:
+        frame = origin.frame()
+        grown_m = fence.grown_m(self._config.failsafe.fence_margin_m)
         try:
-            self._setup.upload_fence(self._fence_deg(origin.frame()))
+            self._setup.upload_fence([frame.to_global_deg(*vertex) for vertex in grown_m])
         except OSError as error:
             _log.warning("fence upload failed", error=str(error))
             return
-        self._fence_for = origin
-
-    def _fence_deg(self, frame: MissionFrame) -> list[tuple[float, float]]:
-        margin_m = self._config.failsafe.fence_margin_m
-        return [frame.to_global_deg(*vertex) for vertex in self._config.fence.grown_m(margin_m)]
+        self._uploaded = origin, fence

@@ -393,6 +393,31 @@ def test_what_cannot_be_opened_is_said_in_one_line() -> None:
     assert "no router answers" in nobody
 
 
+def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:
+    known, world = endpoint(), b"CircularBND 1.5 2.5 3.5 4.5\n" * 10_000
+    of_robot, of_first, of_second = Inbox(), Inbox(), Inbox()
+    with (
+        ZenohLink(
+            fleet="test", robot_id=1, listen=[known],
+            subscriptions={"ground/world": of_robot, "ground/state": of_robot},
+        ) as robot,
+        ZenohLink(fleet="test", connect=[known], subscriptions={
+            "ground/state": of_first, "robot/*/explored": of_first,
+        }) as first,
+        ZenohLink(
+            fleet="test", connect=[known], subscriptions={"ground/state": of_second}
+        ) as second,
+    ):  # fmt: skip
+        eventually(lambda: robot.peers() == 2 and first.present() == second.present() == {1})
+        eventually_hears(first, "state", b"first", "ground/state", of_robot, of_second)
+        eventually_hears(second, "state", b"second", "ground/state", of_robot, of_first)
+        assert of_second.newest["ground/state"] == b"first"
+        eventually_hears(first, "world", world, "ground/world", of_robot)
+        eventually_hears(robot, "explored", b"cells", "robot/1/explored", of_first)
+        with pytest.raises(KeyError):
+            robot.publish("world", world)
+
+
 def test_close_twice_then_publish() -> None:
     link = ZenohLink(fleet="test", robot_id=1)
     link.close()

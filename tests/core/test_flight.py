@@ -101,6 +101,7 @@ class World:
         self.closest: Closest | None = None
         self.busy: tuple[int, ...] = ()
         self.failed_checks: tuple[str, ...] | None = ()
+        self.not_taken: tuple[str, ...] = ()
         self.order: Order | None = None
         self.orders = 0
         # The program, and what it did.
@@ -310,6 +311,7 @@ class World:
             ground=self.ground,
             ground_age_s=self.now_s - self.ground_at_s,
             failed_checks=self.failed_checks,
+            not_taken=self.not_taken,
             order=self.order,
             uptime_s=self.now_s - self.started_s,
         )
@@ -347,6 +349,9 @@ class World:
                 allowed.add(Action.KILL)
             if state in ON_GROUND and vehicle.armed is False:
                 allowed.add(Action.HOLD)
+            if state is FlightState.PILOT and self.order is not None:
+                given: dict[OrderKind, Action] = {"pilot": Action.HOLD, "disarm": Action.DISARM}
+                allowed |= {action for kind, action in given.items() if kind == self.order.kind}
         assert set(decision.actions) <= allowed
         if setpoint is not None:
             assert all(math.isfinite(value) for value in setpoint[0])
@@ -532,6 +537,114 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
     world.battery = 0.2
     assert world.refuse("start") == "battery low: 20%"
     assert world.state() is FlightState.RETURN
+
+
+def test_only_the_commander_orders_but_anybody_kills(world: World) -> None:
+    world.ready()
+    kinds: tuple[OrderKind, ...] = ("takeoff", "start", "pilot", "rejoin", "reset", "disarm")
+    for kind in kinds:
+        answer = world.give(replace(world.new_order(kind), operator="eve"))
+        assert answer == OrderResult(answer.order_id, False, "op commands, not eve")
+    assert world.actions == []
+    assert world.give(replace(world.new_order("kill"), operator="eve")).accepted
+
+
+def test_without_a_ground_only_kill_is_taken(world: World) -> None:
+    world.run(3.0)
+    assert world.refuse("reset") == "the ground's state is not heard"
+    world.hover()
+    world.ground_on = False
+    world.run(3.5)
+    kinds: tuple[OrderKind, ...] = ("start", "pilot", "reset")
+    for kind in kinds:
+        assert world.refuse(kind) == "the ground's state is not heard"
+    world.obey("kill")
+
+
+def test_one_robot_alone_is_enabled(world: World) -> None:
+    world.enable()
+    assert world.ground is not None
+    world.ground = replace(world.ground, robot_enabled={"3": False})
+    world.run(8.0)
+    assert world.state() is FlightState.IDLE
+    world.ground = replace(world.ground, enabled=False, robot_enabled={"3": True})
+    world.until(FlightState.PREFLIGHT, 6.0)
+    world.obey("takeoff")
+    world.until(FlightState.HOLD, 25.0)
+    world.run(3.0)
+    world.obey("start")
+    world.ground = replace(world.ground, enabled=True, robot_enabled={"3": False})
+    world.tick()
+    assert world.state() is FlightState.HOLD
+
+
+def test_what_the_ground_says_and_the_robot_does_not_fly_by_keeps_it_from_starting(
+    world: World,
+) -> None:
+    world.hover()
+    world.not_taken = ("in flight: keeps its fence", "in flight: keeps its world")
+    assert world.refuse("start") == "in flight: keeps its fence; in flight: keeps its world"
+    world.not_taken = ()
+    world.obey("start")
+
+
+def test_the_next_trial_is_reset_on_the_ground_or_in_hold_and_then_started(world: World) -> None:
+    world.fly()
+    assert world.refuse("reset") == "reset is not taken in mission: mission started"
+    world.enable(calm="hold")
+    world.run(2.0)
+    for trial in ("second", "second", "third"):
+        world.order = world.new_order("reset", trial)
+        decision = world.tick()
+        assert decision.new_trial
+        assert decision.flight.state is FlightState.HOLD
+        assert decision.flight.trial == trial
+        assert decision.flight.answers[-1].accepted
+    world.enable()
+    world.run(1.0)
+    world.order = world.new_order("start", "third")
+    decision = world.tick()
+    assert decision.flight.state is FlightState.MISSION
+    assert not decision.new_trial
+
+
+def test_a_reset_is_taken_though_the_state_changes_in_the_same_tick(world: World) -> None:
+    world.hover()
+    world.enable(calm="land")
+    world.order = world.new_order("reset", "second")
+    decision = world.tick()
+    assert decision.flight.state is FlightState.LAND
+    assert decision.new_trial
+    assert decision.flight.answers[-1].accepted
+
+
+def test_disarm_stops_the_motors_on_the_ground_only(world: World) -> None:
+    world.ready()
+    assert world.refuse("disarm") == "is not armed"
+    # Before it is heard to be armed.
+    world.obey("takeoff")
+    while not world.flight.armed_asked:
+        world.tick()
+    world.obey("disarm")
+    world.until(FlightState.LANDED, 2.5)
+    world.run(3.0)
+    assert not world.armed
+    world.ready()
+    world.heavy = True
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 6.0)
+    world.run(2.5)
+    world.obey("disarm")
+    assert (world.state(), world.flight.reason) == (FlightState.PILOT, "disarm ordered")
+    world.until(FlightState.LANDED, 2.5)
+    assert not world.armed
+    assert world.height_m == 0.0
+    world.heavy = False
+    world.hover()
+    assert world.refuse("disarm") == "in the air: land it first"
+    world.enable(calm="land")
+    assert world.refuse("disarm") == "in the air: land it first"
+    world.until(FlightState.LANDED, 20.0)
 
 
 # Arming
@@ -962,6 +1075,46 @@ def test_a_pilot_who_took_it_during_a_lapse_keeps_it(world: World) -> None:
 # A pilot
 
 
+def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> None:
+    def start() -> None:
+        world.obey("start", "first")
+        world.run(1.0)
+
+    def hold() -> None:
+        world.enable(calm="hold")
+        world.run(1.0)
+
+    def fly_home() -> None:
+        world.enable(calm="return")
+        world.run(1.0)
+
+    calms: tuple[Calm, ...] = ("land", "return", "hold", "none")
+    world.hover()
+    for begin, state in (
+        (hold, FlightState.HOLD), (start, FlightState.MISSION), (fly_home, FlightState.RETURN),
+    ):  # fmt: skip
+        begin()
+        assert world.state() is state
+        world.obey("pilot")
+        assert (world.state(), world.flight.reason) == (FlightState.PILOT, "given to a pilot")
+        assert "given to a pilot" in world.tick().alarms
+        # Again is no mistake; and nothing that the ground repeats takes it back.
+        world.obey("pilot")
+        for calm in calms:
+            world.enable(calm=calm)
+            world.run(1.5)
+            assert world.state() is FlightState.PILOT
+            assert world.mode == Mode.HOLD
+        assert world.speed_m_s < 0.1
+        world.obey("rejoin")
+        world.run(3.0)
+        assert world.state() is FlightState.HOLD
+        assert world.mode is Mode.OFFBOARD
+    world.enable(calm="land")
+    world.run(1.0)
+    assert world.refuse("pilot") == "pilot is not taken in land: ground commands land"
+
+
 def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> None:
     world.fly()
     world.pilot(1.0, 0.0, 0.0)
@@ -1179,8 +1332,10 @@ def test_whatever_comes_nothing_raises_or_arms_unasked(
 
 
 def _order(world: World, draw: random.Random) -> None:
-    kinds: tuple[OrderKind, ...] = ("takeoff", "start", "rejoin", "kill")
-    kind = draw.choices(kinds, weights=(30, 20, 10, 1))[0]
+    kinds: tuple[OrderKind, ...] = (
+        "takeoff", "start", "rejoin", "pilot", "reset", "disarm", "kill",
+    )  # fmt: skip
+    kind = draw.choices(kinds, weights=(30, 20, 10, 5, 5, 5, 1))[0]
     order = world.new_order(kind, draw.choice(("", "a")))
     if draw.random() < 0.3:
         order = replace(order, order_id=f"o{draw.randrange(5)}")

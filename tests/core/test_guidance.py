@@ -62,6 +62,7 @@ def inputs(
         ground=None,
         ground_age_s=0.0,
         failed_checks=(),
+        not_taken=(),
         order=None,
         uptime_s=50.0,
     )

@@ -49,6 +49,15 @@ def ages(mailbox: Mailbox, now_s: float) -> dict[int, float]:
     return {known.robot_id: known.age_s for known in mailbox.neighbours(now_s)}
 
 
+def test_it_counts_what_it_accepts_of_each() -> None:
+    mailbox = Mailbox(OWN_ID)
+    for robot_id, sequence in ((7, 1), (2, 5), (2, 6), (2, 6), (OWN_ID, 1)):
+        receive(mailbox, message(robot_id, sequence))
+    assert mailbox.accepted() == {7: 1, 2: 2}
+    mailbox.clear()
+    assert mailbox.accepted() == {7: 1, 2: 2}
+
+
 def test_the_newest_of_each_by_robot_id() -> None:
     mailbox = Mailbox(OWN_ID)
     for robot_id, sequence in ((7, 1), (2, 5), (300, 1), (2, 6), (1, 9)):

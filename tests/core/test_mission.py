@@ -2,6 +2,7 @@
 
 import re
 
+import numpy as np
 import pytest
 
 from edge.core.mission import (
@@ -11,12 +12,17 @@ from edge.core.mission import (
     Order,
     OrderResult,
     Origin,
+    Place,
     RobotStatus,
+    explored_from_bytes,
+    explored_to_bytes,
     from_json,
     to_json,
 )
+from edge.core.safety import Fence
 from edge.core.schema import ConfigError
 
+FENCE = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0)), 2.0, 1.0, 30.0)
 STATUS = RobotStatus(
     robot_id=3, boot_nonce=2**47, sequence=9, uptime_s=12.5, unix_time_s=1.8e9,
     state=FlightState.HOLD, reason="at its height", ready=False, failed_checks=("a", "b"),
@@ -26,14 +32,18 @@ STATUS = RobotStatus(
     slot_height_m=8.0, landing_point_m=(1.0, 2.0), position_m=(1.0, 2.0, 3.0),
     velocity_m_s=None, heading_rad=0.1, mode="offboard", armed=True, battery=0.5, satellites=12,
     message_counts={"accepted": 4}, neighbour_ages_s={"2": 0.1},
-    loops={"control": LoopStatus(1, 0, 0, 0.1, 0.2, 0.3)},
+    loops={"control": LoopStatus(1, 0, 0, 0.1, 0.2, 0.3)}, fence=FENCE, not_taken=("in flight",),
+    in_air=True, global_deg=(40.0, -75.0), hdop=0.8, policy_velocity_m_s=(0.1, -0.2),
+    feature_age_s=0.1, neighbour_messages={"2": 40}, ground_age_s=0.1,
 )  # fmt: skip
 
 
 def test_messages_survive_the_way() -> None:
     state = GroundState(
-        7, "anna", Origin(1.0, 2.0, 3.0), enabled=True, calm="hold", robot_calm={"3": "land"}
-    )
+        7, "anna", Origin(1.0, 2.0, 3.0), enabled=True, robot_enabled={"4": False}, calm="hold",
+        calm_by="ben", robot_calm={"3": "land"}, fence=FENCE,
+        places={"3": Place(2, (1.0, 2.0))}, world_id="cd", trial="t1", unix_time_s=1.8e9,
+    )  # fmt: skip
     order = Order("x", 3, 2**47, "start", 22.5, "anna", trial="t1")
     for message in (state, order, STATUS):
         assert from_json(type(message), to_json(message)) == message
@@ -42,6 +52,32 @@ def test_messages_survive_the_way() -> None:
 def test_what_is_asked_of_one_robot_overrides_what_is_asked_of_all() -> None:
     state = GroundState(7, "anna", calm="hold", robot_calm={"3": "land", "4": "none"})
     assert [state.calm_for(robot) for robot in (2, 3, 4)] == ["hold", "land", "none"]
+    state = GroundState(7, "anna", enabled=True, robot_enabled={"3": False, "4": True})
+    assert [state.enabled_for(robot) for robot in (2, 3, 4)] == [True, False, True]
+
+
+def test_what_was_explored_survives_the_way() -> None:
+    explored = np.random.default_rng(0).random((64, 64)) < 0.3
+    data = explored_to_bytes(explored)
+    assert len(data) == 512
+    np.testing.assert_array_equal(explored_from_bytes(data), explored)
+    with pytest.raises(ValueError, match="explored has 511 bytes: must be 512"):
+        explored_from_bytes(data[:-1])
+    with pytest.raises(ValueError, match=r"shape \(63, 64\)"):
+        explored_to_bytes(explored[1:])
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ('"places": {"3": {"slot": -1, "landing_point_m": [1, 2]}}', "slot = -1: must be 0"),
+        ('"places": {"3": {"slot": 1, "landing_point_m": [1]}}', "landing_point_m = [1.0]: must"),
+        ('"fence": {"vertices_m": [], "buffer_m": 1, "floor_m": 1, "ceiling_m": 2}', "vertices_m"),
+    ],
+)
+def test_what_the_ground_sets_for_a_flight_is_checked(fields: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        from_json(GroundState, f'{{"sequence": 1, "operator": "a", {fields}}}'.encode())
 
 
 @pytest.mark.parametrize(

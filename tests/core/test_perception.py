@@ -1,5 +1,7 @@
 """The robot's memory and its images: against plain dense arrays, torch, and by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -153,3 +155,20 @@ def test_impossible_parameters_are_named(change: dict[str, float], text: str) ->
     }  # fmt: skip
     with pytest.raises(ValueError, match=text):
         PerceptionParameters(**{**sizes, **change})
+
+
+@pytest.mark.parametrize("world_size", [512, 300, 40])
+def test_a_coarse_cell_counts_as_seen_when_its_centre_was(world_size: int) -> None:
+    parameters = dataclasses.replace(PARAMETERS, world_size=world_size)
+    perception = Perception(parameters, channels=4, image_size=32)
+    centres = (np.arange(64) + 0.5) * world_size / 64
+    seen = np.zeros((64, 64), np.bool_)
+    assert not perception.explored.any()
+    for x, y in ((0.0, 100.0), (70.3, 250.0), (world_size + 20.0, 10.0), (-500.0, 9e3)):
+        perception.observe(np.array([x, y]), np.ones((64, 64), np.float32))
+        corner_x, corner_y = window_corner(np.array([x, y]), 64)
+        in_x = (centres >= corner_x) & (centres < corner_x + 64)
+        in_y = (centres >= corner_y) & (centres < corner_y + 64)
+        seen |= np.outer(in_x, in_y)
+        np.testing.assert_array_equal(perception.explored, seen)
+    assert seen.any()

@@ -118,7 +118,7 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
     ({"duplicate_id": True}, "another program says that it is robot 1: stop it"),
     ({"robot_id": 2}, "another program says that it is robot 2"),
     ({"bundle_id": "c"}, "robot 2 has another bundle: deploy one to all"),
-    ({"world_id": "v"}, "robot 2 has another world: deploy one to all"),
+    ({"world_id": "v"}, "robot 2 has another world: set one on the ground"),
     ({"origin": Origin(47.4, 8.5, 91.0)}, "robot 2 has another mission origin"),
     ({"slot_height_m": 6.0}, "robot 2 flies 1.0 m above or below, must be 2 m: change the slots"),
     ({"landing_point_m": (12.0, 9.0)}, "robot 2 lands 1.0 m away, must be 2 m"),

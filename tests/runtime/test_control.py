@@ -17,14 +17,16 @@ from edge.core.mission import (
     OrderKind,
     OrderResult,
     Origin,
+    Place,
     RobotStatus,
     to_json,
 )
 from edge.core.preflight import HeardStatus
+from edge.core.safety import Fence
 from edge.core.vehicle import Action, ActionResult, Mode, Setpoint, Vector, VehicleState, Velocity
 from edge.core.world import random_features, rasterize
 from edge.runtime.config import load_config
-from edge.runtime.control import FlightControl
+from edge.runtime.control import FlightControl, GroundWorld
 from edge.runtime.inbox import Inbox
 from edge.runtime.navigation import Navigation
 from edge.runtime.pac import Pac
@@ -37,12 +39,15 @@ from sim.px4.vehicle import Setpoint as Px4Setpoint
 from tests.core.test_preflight import NEIGHBOUR
 from tests.robot_rig import ORIGIN, new_vehicle, write_config
 
+FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
+PLACE = Place(slot=1, landing_point_m=(14.0, 12.0))
 ELSEWHERE = dataclasses.replace(ORIGIN, heading_deg=120.0)
 MODES = {
     Px4Mode.OFFBOARD: Mode.OFFBOARD,
     Px4Mode.HOLD: Mode.HOLD,
     Px4Mode.LAND: Mode.LAND,
     Px4Mode.POSCTL: Mode.POSITION,
+    Px4Mode.TAKEOFF: Mode.TAKEOFF,
 }
 NOT_SET = np.full(3, np.nan)
 
@@ -66,7 +71,7 @@ class DirectAutopilot:
             position_ok=vehicle.position_valid,
             heading_rad=vehicle.heading_rad,
             origin_deg=vehicle.global_origin[:2],
-            height_above_home_m=0.0,
+            height_above_home_m=float(-vehicle.position_m[2]),
             mode=MODES[vehicle.mode],
             armed=vehicle.armed,
             in_air=not vehicle.landed,
@@ -115,6 +120,7 @@ class Flown:
         )  # fmt: skip
         self.control = FlightControl(
             robot=config.robot(boot_nonce=11),
+            world_id="configured",
             autopilot=self.autopilot,
             navigation=self.navigation,
             pac=self.pac,
@@ -156,7 +162,7 @@ class Flown:
 
     def look(self) -> None:
         """Preflight's part."""
-        self.control.checks = Checks(self.failed_checks, self.now_s, self.control.origin)
+        self.control.checks = Checks(self.failed_checks, self.now_s, self.control.assignment)
 
     def until(self, *states: FlightState) -> None:
         for _ in range(400):
@@ -179,6 +185,16 @@ class Flown:
         self.until(FlightState.PREFLIGHT)
         assert self.order("takeoff").accepted
         self.until(FlightState.HOLD)
+
+    def take_off_by_hand(self, height_m: float) -> None:
+        """Somebody flies it, and leaves it to PX4 to hold."""
+        self.vehicle.parameters["MIS_TAKEOFF_ALT"] = height_m
+        self.vehicle.arm(force=True)
+        self.vehicle.set_mode(Px4Mode.TAKEOFF)
+        for _ in range(150):
+            self.tick()
+        self.vehicle.set_mode(Px4Mode.HOLD)
+        self.tick()
 
     def explore(self, trial: str) -> None:
         assert self.order("start", trial).accepted
@@ -260,10 +276,11 @@ def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
 def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
     def place() -> Origin | None:
         assert flown.navigation.frame is not None
-        assert flown.control.origin is not None
-        assert flown.navigation.frame.frame_id == flown.control.origin.frame().frame_id
+        origin = flown.control.assignment.origin
+        assert origin is not None
+        assert flown.navigation.frame.frame_id == origin.frame().frame_id
         assert flown.pac.frame_id == flown.navigation.frame.frame_id
-        return flown.control.origin
+        return origin
 
     flown.take_off()
     flown.say(origin=ELSEWHERE)
@@ -279,9 +296,106 @@ def test_a_program_that_starts_in_flight_takes_the_origin_it_hears(flown: Flown)
     flown.vehicle.arm(force=True)
     flown.until(FlightState.PILOT)
     flown.tick()
-    assert flown.control.origin == ORIGIN
+    assert flown.control.assignment.origin == ORIGIN
     assert not flown.sent
     assert flown.autopilot.commands == []
+
+
+def flies_by(flown: Flown) -> tuple[Fence, Place, str]:
+    _, robot, world_id = flown.control.assignment
+    return robot.fence, robot.place, world_id
+
+
+def test_fence_and_place_are_taken_up_together_on_the_ground_and_given_back(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    configured = flies_by(flown)
+    flown.say(fence=FENCE, places={"3": PLACE, "4": Place(7, (1.0, 1.0))})
+    # The checks were made for another fence.
+    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+    flown.take_off()
+    assert abs(-flown.vehicle.position_m[2] - 5.0) < 0.8
+    flown.say(fence=None, places={}, origin=ELSEWHERE, world_id="other")
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+    told = flown.control.not_taken
+    kept = ("mission origin", "fence", "place", "world")
+    assert told == tuple(f"in flight: keeps its {what}" for what in kept)
+    assert flown.order("start", "a").reason == "; ".join(told)
+    flown.say(calm="land", world_id=None)
+    flown.until(FlightState.LANDED)
+    flown.tick()
+    assert flies_by(flown) == configured
+    assert flown.control.not_taken == ()
+
+
+def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    before = flies_by(flown)
+    for place, problem in (
+        (Place(1, (29.0, 12.0)), "landing_point_m = [29.0, 12.0]: must be inside the fence, at"),
+        (Place(30, (14.0, 12.0)), "slot = 30 flies at 63 m: must be from floor_m = 2 to"),
+    ):
+        flown.say(fence=FENCE, places={"3": place})
+        reason = flown.order("takeoff").reason
+        assert reason.startswith(f"not ready: the ground's fence or place does not fit: {problem}")
+        assert flies_by(flown) == before
+    flown.say(fence=FENCE, places={"3": PLACE})
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+
+
+def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    flown.say(world_id="flat")
+    waiting = "world flat of the ground has not arrived: wait"
+    assert flown.order("takeoff").reason == f"not ready: {waiting}"
+    assert flown.control.not_taken == (waiting,)
+    assert flown.control.wanted_world_id == "flat"
+    assert flown.explored() > 0
+    flown.control.world = GroundWorld("stale", IdfSensor(np.ones((512, 512), np.float32), 64), "")
+    flown.tick()
+    assert flies_by(flown)[2] == "configured"
+    flown.control.world = GroundWorld("flat", None, "world flat: record 1 (X): unknown kind")
+    flown.tick()
+    problem = "the ground's world cannot be used: world flat: record 1 (X): unknown kind"
+    assert flown.control.failed_checks(flown.now_s) == (problem,)
+    assert flown.control.wanted_world_id is None
+    flown.control.world = GroundWorld("flat", IdfSensor(np.zeros((512, 512), np.float32), 64), "")
+    flown.tick()
+    assert flies_by(flown)[2] == "flat"
+    # Its checks, and what it sees, are of the new one.
+    flown.tick()
+    assert flown.control.failed_checks(flown.now_s) == ()
+    assert flown.explored() == 0
+    flown.take_off()
+
+
+def test_a_program_that_starts_in_flight_flies_on_by_what_the_ground_says(flown: Flown) -> None:
+    """What it was configured for is not what its predecessor took off with."""
+    flown.say(fence=FENCE, places={"3": PLACE}, world_id="flat")
+    flown.take_off_by_hand(5.0)
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+    flown.control.world = GroundWorld("flat", IdfSensor(np.zeros((512, 512), np.float32), 64), "")
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "flat")
+    assert flown.order("rejoin").accepted
+    flown.say(fence=None)
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "flat")
+    assert flown.control.not_taken == ("in flight: keeps its fence",)
+
+
+def test_a_reset_forgets_what_was_seen_and_moves_nothing(flown: Flown) -> None:
+    flown.take_off()
+    flown.explore("a")
+    explored = int(flown.pac.explored().sum())
+    flown.say(calm="hold")
+    flown.until(FlightState.HOLD)
+    assert flown.order("reset", "b").accepted
+    flown.tick()
+    assert int(flown.pac.explored().sum()) < explored
+    assert (flown.state, flown.control.flight.trial) == (FlightState.HOLD, "b")
 
 
 def test_checks_count_for_their_origin_and_not_for_long(

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -48,6 +49,28 @@ def test_a_ground_that_starts_anew_is_heard_once_the_old_one_is_lost() -> None:
     anew = GroundState(sequence=0, operator="ben")
     inbox.put_ground(to_json(anew), 5.0, 1e9)
     assert inbox.ground(5.0) == (anew, 0.0)
+
+
+def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_counts() -> None:
+    inbox = make_inbox()
+
+    def hear(now_s: float, *states: GroundState) -> tuple[GroundState | None, float]:
+        for state in states:
+            inbox.put_ground(to_json(state), now_s, 1e9)
+        return inbox.ground(now_s)
+
+    ben, cleo = (dataclasses.replace(STATE, operator=name) for name in ("ben", "cleo"))
+    assert hear(1.0, STATE, ben) == (ben, 0.0)
+    # The one that does not count comes last between two ticks of the control loop, for ever.
+    for now_s in (1.5, 3.0, 4.5, 6.0, 7.5):
+        assert hear(now_s, ben, STATE) == (ben, 0.0)
+    assert hear(8.0, STATE) == (ben, 0.5)
+    assert hear(8.5, cleo, ben) == (cleo, 0.0)
+    took_over = dataclasses.replace(STATE, sequence=6)
+    assert hear(9.0, took_over, cleo) == (took_over, 0.0)
+    # Once that one is silent, the other counts again.
+    assert hear(11.9, cleo) == (took_over, pytest.approx(2.9))
+    assert hear(12.1, cleo) == (cleo, 0.0)
 
 
 def test_orders_for_others_are_passed_over() -> None:

@@ -129,3 +129,26 @@ def test_when_the_estimators_origin_moves_the_position_stays() -> None:
     after = navigation(moved).odometry()
     assert before is not None and after is not None
     np.testing.assert_allclose(after.position_m, before.position_m, atol=1e-4)
+
+
+def test_latitude_and_longitude_need_no_mission() -> None:
+    made = Navigation(Standing(VEHICLE), lambda: 100.1)
+    place_deg = made.global_deg(VEHICLE)
+    assert place_deg is not None
+    # Seen from a mission that starts there, the estimator's origin is as far away.
+    back = MissionFrame(*place_deg, 0.0).relative_to(*VEHICLE.origin_deg or (0.0, 0.0))
+    np.testing.assert_allclose(back.local_origin_m, (-4.0, -3.0, 0.0), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"origin_deg": None},
+        {"position_local_m": None},
+        {"position_ok": False},
+        {"position_at_s": 100.1 - MAX_POSITION_AGE_S - 0.01},
+    ],
+)
+def test_without_a_fresh_position_there_is_no_latitude(change: dict[str, object]) -> None:
+    vehicle = dataclasses.replace(VEHICLE, **change)  # type: ignore[arg-type]
+    assert Navigation(Standing(vehicle), lambda: 100.1).global_deg(vehicle) is None

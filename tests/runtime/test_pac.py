@@ -261,7 +261,7 @@ def test_a_new_mission_forgets_map_and_messages(shipped_policy: Policy) -> None:
     assert flown.infer(0.1, 0.1) is None  # no features yet
     dark = World(seen=np.zeros((64, 64), np.float32))
     for robot in (flown, fresh):
-        robot._sensor = dark
+        robot.sensor = dark
     ticks = [robot.perceive(0.2) for robot in (flown, fresh)]
     assert ticks[0] and ticks[1]
     np.testing.assert_array_equal(ticks[0].images, ticks[1].images)

@@ -12,9 +12,10 @@ import pytest
 
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
 from edge.core.failsafe import PARAMETERS
-from edge.core.mission import Origin
+from edge.core.mission import GroundState, Origin
+from edge.core.safety import Fence
 from edge.runtime.config import load_config
-from edge.runtime.readiness import Checks, Readiness
+from edge.runtime.readiness import Assignment, Checks, Readiness
 from sim.px4.modes import Result
 from sim.px4.vehicle import Px4Vehicle
 from tests.robot_rig import ORIGIN, SYSTEM_ID, Rig, new_vehicle, rig, write_config
@@ -30,7 +31,7 @@ def readiness(
         with MavsdkAutopilot(config.autopilot.url, system_id=SYSTEM_ID) as autopilot:
             asked = Readiness(
                 config, autopilot, autopilot,
-                **{"bundle_id": "b", "world_id": "w", "bundle_problem": None} | facts,
+                **{"bundle_id": "b", "bundle_problem": None} | facts,
             )  # fmt: skip
             deadline_s = time.monotonic() + 20.0
             while not (autopilot.state().connected and autopilot.state().armable):
@@ -39,10 +40,14 @@ def readiness(
             yield asked, made
 
 
+def assignment(asked: Readiness, origin: Origin | None = ORIGIN) -> Assignment:
+    return Assignment(origin, asked._config.robot(boot_nonce=0), "w")
+
+
 def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> Checks:
     now_s = time.monotonic()
     known: dict[str, Any] = {
-        "origin": origin,
+        "assignment": assignment(asked, origin),
         "odometry": None,
         "peers": (),
         "not_understood": (),
@@ -63,7 +68,7 @@ def test_refuse_explains_and_changes_nothing(tmp_path: Path) -> None:
     with readiness(tmp_path, vehicle, "refuse") as (asked, _):
         before = dict(vehicle.parameters)
         assert any("parameters were not read" in line for line in checked(asked).failed)
-        asked.prepare(time.monotonic(), ORIGIN)
+        asked.prepare(time.monotonic(), assignment(asked))
         problems = about_parameters(checked(asked))
         assert any("COM_OBL_RC_ACT = 0" in line and "must land" in line for line in problems)
         assert any("if this program dies" in line for line in asked.explanations)
@@ -78,7 +83,7 @@ def test_set_makes_them_right_but_for_what_is_to_be_set_by_hand(tmp_path: Path) 
     vehicle = new_vehicle(COM_OBL_RC_ACT=0, EKF2_HGT_REF=3)
     with readiness(tmp_path, vehicle, "set") as (asked, _):
         before = dict(vehicle.parameters)
-        asked.prepare(time.monotonic(), ORIGIN)
+        asked.prepare(time.monotonic(), assignment(asked))
         (problem,) = about_parameters(checked(asked))
         assert "EKF2_HGT_REF = 3" in problem
         assert "by hand" in problem
@@ -92,24 +97,24 @@ def test_set_makes_them_right_but_for_what_is_to_be_set_by_hand(tmp_path: Path) 
 def test_a_parameter_that_others_change_later_is_noticed(tmp_path: Path) -> None:
     vehicle = new_vehicle()
     with readiness(tmp_path, vehicle, "set") as (asked, _):
-        asked.prepare(time.monotonic(), ORIGIN)
+        asked.prepare(time.monotonic(), assignment(asked))
         assert about_parameters(checked(asked)) == []
         vehicle.parameters["COM_OBL_RC_ACT"] = 3
-        asked.prepare(time.monotonic() + 3.0, ORIGIN)
+        asked.prepare(time.monotonic() + 3.0, assignment(asked))
         assert vehicle.parameters["COM_OBL_RC_ACT"] == 3
-        asked.prepare(time.monotonic() + 31.0, ORIGIN)
+        asked.prepare(time.monotonic() + 31.0, assignment(asked))
         assert vehicle.parameters["COM_OBL_RC_ACT"] == 4
 
 
 def test_the_fence_is_uploaded_with_its_margin_for_each_new_origin(tmp_path: Path) -> None:
     vehicle = new_vehicle()
     with readiness(tmp_path, vehicle, "set") as (asked, made):
-        asked.prepare(time.monotonic(), None)
+        asked.prepare(time.monotonic(), assignment(asked, None))
         assert not made.vehicle.fence
         for heading_deg in (30.0, 200.0):
             origin = dataclasses.replace(ORIGIN, heading_deg=heading_deg)
             assert any("does not have the fence" in line for line in checked(asked, origin).failed)
-            asked.prepare(time.monotonic() + heading_deg, origin)
+            asked.prepare(time.monotonic() + heading_deg, assignment(asked, origin))
             assert not any("fence: wait" in line for line in checked(asked, origin).failed)
             (polygon,) = made.vehicle.fence
             transform = origin.frame().relative_to(origin.latitude_deg, origin.longitude_deg)
@@ -118,6 +123,30 @@ def test_the_fence_is_uploaded_with_its_margin_for_each_new_origin(tmp_path: Pat
                 for place_m in ((along_m, 16.0), (16.0, along_m)):
                     local_m = transform.mission_to_local(np.array([*place_m, 0.0]))
                     assert polygon.contains(made.vehicle._world, *local_m[:2]) is inside, place_m
+
+
+def test_the_vehicle_gets_the_fence_that_the_ground_sets_and_a_ceiling_to_match(
+    tmp_path: Path,
+) -> None:
+    vehicle = new_vehicle(GF_MAX_VER_DIST=25)
+    with readiness(tmp_path, vehicle, "refuse") as (asked, made):
+        now_s = time.monotonic()
+        configured = assignment(asked)
+        asked.prepare(now_s, configured)
+        (before,) = made.vehicle.fence
+        assert not any("GF_MAX_VER_DIST" in line for line in checked(asked).failed)
+        fence = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
+        ground = GroundState(1, "op", fence=fence)
+        higher = configured._replace(robot=configured.robot.assigned(ground))
+        failed = checked(asked, assignment=higher).failed
+        assert any("does not have the fence" in line for line in failed)
+        asked.prepare(now_s + 3.0, higher)
+        checks = checked(asked, assignment=higher)
+        assert not any("fence: wait" in line for line in checks.failed)
+        assert any("GF_MAX_VER_DIST" in line for line in checks.failed)
+        assert checks.assignment == higher
+        (after,) = made.vehicle.fence
+        assert after != before
 
 
 def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
@@ -130,7 +159,7 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
         while asked._autopilot.state().armed is not True:
             assert time.monotonic() < deadline_s
             time.sleep(0.05)
-        asked.prepare(time.monotonic(), ORIGIN)
+        asked.prepare(time.monotonic(), assignment(asked))
         assert (vehicle.parameters, vehicle.fence) == (before, ())
         assert any("vehicle is armed" in line for line in checked(asked).failed)
 
@@ -150,10 +179,10 @@ def test_what_the_program_knows_itself(tmp_path: Path, facts: dict[str, Any], li
     config = load_config(write_config(tmp_path, url=url, endpoint=endpoint))
     asked = Readiness(
         config, MavsdkAutopilot(config.autopilot.url), MavsdkAutopilot(config.autopilot.url),
-        bundle_id="b", world_id="w", bundle_problem="cnn.onnx does not fit",
+        bundle_id="b", bundle_problem="cnn.onnx does not fit",
     )  # fmt: skip
     checks = checked(asked, **facts)
-    assert checks.origin == ORIGIN
+    assert checks.assignment == assignment(asked)
     assert any(line in failed for failed in checks.failed)
     assert not any(line in failed for failed in checked(asked).failed)
     assert any("cnn.onnx does not fit" in failed for failed in checks.failed)

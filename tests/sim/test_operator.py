@@ -17,10 +17,13 @@ from edge.core.mission import (
     Order,
     OrderResult,
     Origin,
+    Place,
     RobotStatus,
     from_json,
     to_json,
+    world_id,
 )
+from edge.core.safety import Fence
 from sim.fleet_vehicles import free_ports
 from sim.operator import Operator, waiting_to_land
 
@@ -42,10 +45,14 @@ class Talker:
         self._changed = threading.Condition()
         self.states: list[GroundState] = []
         self.orders: list[Order] = []
+        self.worlds: list[str] = []
         self.status = dataclasses.replace(STATUS, robot_id=robot)
         self.link = ZenohLink(
             fleet="test", robot_id=robot, listen=(endpoint,),
-            subscriptions={"ground/state": self._on_state, "ground/order": self._on_order},
+            subscriptions={
+                "ground/state": self._on_state, "ground/order": self._on_order,
+                "ground/world": self._on_world,
+            },
         )  # fmt: skip
 
     def say(self, **changes: object) -> None:
@@ -59,6 +66,11 @@ class Talker:
     def _on_state(self, _: str, data: bytes) -> None:
         with self._changed:
             self.states.append(from_json(GroundState, data))
+            self._changed.notify_all()
+
+    def _on_world(self, _: str, data: bytes) -> None:
+        with self._changed:
+            self.worlds.append(data.decode())
             self._changed.notify_all()
 
     def _on_order(self, _: str, data: bytes) -> None:
@@ -142,6 +154,26 @@ def test_the_state_is_repeated_and_its_sequence_grows_with_each_change() -> None
         assert (robot.states[0].sequence, state.sequence) == (1, 3)
         operator.calm("land")
         robot.wait_for(lambda: robot.states[-1].calm_for(3) == "land")
+
+
+def test_what_flights_go_by_is_said_and_the_world_sent_while_somebody_lacks_it() -> None:
+    world = "CircularBND 1 2 3 4\n"
+    fence = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0)), 2.0, 1.0, 30.0)
+    place = Place(2, (8.0, 8.0))
+    with talking() as (operator, [robot]):
+        operator.assign(fence=fence, places={0: place}, world=world)
+
+        def sent() -> bool:
+            robot.say()
+            return len(robot.worlds) >= 2
+
+        assert operator.wait_for(lambda _: sent(), 15.0)
+        state = robot.states[-1]
+        assert (state.fence, state.places, state.world_id) == (fence, {"0": place}, world_id(world))
+        assert set(robot.worlds) == {world}
+        operator.assign()
+        robot.wait_for(lambda: robot.states[-1].fence is None)
+        assert (robot.states[-1].places, robot.states[-1].world_id) == ({}, None)
 
 
 def test_a_silent_robot_is_no_longer_among_the_statuses() -> None:
