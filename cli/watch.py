@@ -1,6 +1,75 @@
-"""Ground control: watch."""
+"""`lpac watch`: the fleet in a terminal."""
+
+import dataclasses
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.fleet import DEFAULT_FLEET, Fleet
+
+if TYPE_CHECKING:
+    from ground.protocol import Picture, Setup
+
+# Where there is no terminal, all columns.
+_WIDE = 160
 
 
-def watch() -> None:
-    """Not built yet."""
-    raise ValueError("not built yet")
+def watch(
+    fleet: Fleet = DEFAULT_FLEET,
+    once: Annotated[bool, typer.Option("--once", help="Print it once, as plain text.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it once, as JSON.")] = False,
+    screenshot: Annotated[
+        Path | None, typer.Option("--screenshot", help="Save an SVG, and quit.", hidden=True)
+    ] = None,
+    size: Annotated[
+        str, typer.Option("--size", help="Of the screenshot, such as 100x30.", hidden=True)
+    ] = "100x30",
+) -> None:
+    """Show fleet and mission, alarms first; h holds all robots at once, l lands them, ? helps.
+
+    Without a terminal it prints them once.
+    """
+    from fleet.config import load_fleet
+
+    name = load_fleet(fleet).fleet
+    if screenshot is not None:
+        from ground.watch import Watch
+
+        # There is a ground process, or this ends here.
+        _look(name)
+        across, _, down = size.partition("x")
+        Watch(name, screenshot).run(headless=True, size=(int(across), int(down)))
+    elif as_json:
+        _, picture = _look(name)
+        typer.echo(json.dumps(dataclasses.asdict(picture)))
+    elif once or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        from ground.alarms import alarms
+        from ground.watch_text import all_of_it
+
+        setup, picture = _look(name)
+        width = shutil.get_terminal_size((_WIDE, 0)).columns
+        typer.echo(all_of_it(setup, picture, alarms(setup, picture), width))
+    else:
+        from ground.watch import Watch
+
+        # Without the mouse the terminal's own way to mark and copy text works.
+        Watch(name).run(mouse=False)
+
+
+def _look(fleet: str) -> tuple["Setup", "Picture"]:
+    """The fleet as it is now."""
+    from ground.client import subscribe
+    from ground.protocol import Picture, Setup
+
+    setup = None
+    with subscribe(fleet) as told:
+        for answer in told:
+            if isinstance(answer, Setup):
+                setup = answer
+            elif isinstance(answer, Picture) and setup is not None:
+                return setup, answer
+    raise AssertionError("it ends by a picture or an error")
