@@ -1,0 +1,149 @@
+"""`lpac mission run`: fly a script, and show how far it is."""
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cli.fleet import DEFAULT_FLEET, Fleet
+from cli.fleet_table import BAD, FAINT, NOTABLE, styled
+from cli.ground_report import address, looking
+
+if TYPE_CHECKING:
+    from rich.console import Console, Group
+    from rich.live import Live
+
+    from ground.lookout import Lookout
+
+
+def run(
+    script: Annotated[
+        Path, typer.Argument(metavar="SCRIPT.toml", help="The script; see docs/script.toml.")
+    ],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before the next trial takes off.")
+    ] = False,
+    fleet: Fleet = DEFAULT_FLEET,
+) -> None:
+    """Fly a script: origin, world, and trials from preflight to landing.
+
+    If a step fails, and at Ctrl-C, the fleet is told to hold. Before each further trial it asks.
+    """
+    from ground.script import Flight, ScriptError, load_script
+    from ground.site import Sites
+
+    to = address(fleet, None)
+    sites = Sites(to.path)
+    loaded = load_script(script, sites)
+    if loaded.trials > 1 and not yes and not sys.stdin.isatty():
+        raise ValueError(
+            f"{script}: trials = {loaded.trials}: asks before the next trial takes off, and there "
+            "is no terminal: add --yes"
+        )
+    # A terminal that is closed ends a script as Ctrl-C does.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    with looking(to) as lookout:
+        view = _View(lookout, yes)
+        flight = Flight(loaded, sites, lookout, view)
+        view.robots = flight.robots
+        try:
+            with view.shown():
+                flight.fly()
+        except ScriptError as error:
+            then = f"; {flight.hold()}" if error.hold else ""
+            raise ValueError(f"{script}: {error}{then}") from None
+        except OSError as error:
+            raise ValueError(
+                f"{script}: {error}; robots in the air hold by themselves, and then land"
+            ) from None
+        except KeyboardInterrupt:
+            typer.echo(f"lpac: {script}: interrupted; {flight.hold()}", err=True)
+            raise typer.Exit(130) from None
+    typer.echo(f"{script}: done", err=True)
+
+
+@dataclass(slots=True)
+class _View:
+    """On stderr: step, time left, and robots on a terminal; a line for each step elsewhere."""
+
+    lookout: "Lookout"
+    yes: bool
+    robots: tuple[str, ...] = ()
+    _step: str = "script"
+    _step_began_s: float = field(default_factory=time.monotonic)
+    _at_most_s: float | None = None
+    _began_s: float = field(default_factory=time.monotonic)
+    _console: "Console" = field(init=False)
+    _live: "Live" = field(init=False)
+
+    def __post_init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._console = Console(stderr=True, highlight=False, markup=False)
+        self._live = Live(get_renderable=self._render, console=self._console, transient=True)
+
+    def step(self, name: str, at_most_s: float | None) -> None:
+        """A step begins."""
+        self._step, self._at_most_s = name, at_most_s
+        self._step_began_s = time.monotonic()
+        self.line(name if at_most_s is None else f"{name}, {at_most_s:g} s")
+
+    def line(self, text: str) -> None:
+        """Something is worth a line, which stays."""
+        self._console.print(f"{time.monotonic() - self._began_s:7.1f} s  {text}", soft_wrap=True)
+
+    def may(self, question: str) -> bool:
+        """Ask the person at the terminal."""
+        if self.yes:
+            return True
+        self._live.stop()
+        answer = typer.confirm(question, err=True)
+        if self._console.is_terminal:
+            self._live.start()
+        return answer
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """The live part, as long as this context lasts and if there is a terminal."""
+        if self._console.is_terminal:
+            self._live.start()
+        try:
+            yield
+        finally:
+            self._live.stop()
+
+    def _render(self) -> "Group":
+        from rich.console import Group
+        from rich.table import Table
+        from rich.text import Text
+
+        from edge.core.mission import FlightState
+
+        passed_s = time.monotonic() - self._step_began_s
+        clock = f"{passed_s:.0f} s"
+        if self._at_most_s is not None:
+            clock += f", {max(0.0, self._at_most_s - passed_s):.0f} s left"
+        rows = Table.grid(padding=(0, 2, 0, 0))
+        for robot in self.lookout.picture.robots:
+            if robot.name not in self.robots:
+                continue
+            status = robot.status
+            if status is None or not robot.fresh:
+                rows.add_row(styled(robot.name, ""), styled("not heard", BAD))
+                continue
+            style = "" if status.state is FlightState.MISSION else NOTABLE
+            rows.add_row(
+                styled(robot.name, ""),
+                styled(status.state.value, style),
+                styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
+                styled(status.reason, FAINT),
+            )
+        return Group(Text(f"{self._step}: {clock}", "bold"), rows)

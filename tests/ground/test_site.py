@@ -1,0 +1,259 @@
+"""Measuring where robots stand, who stands at which pad, and the files of sites."""
+
+import itertools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.core.mission import FlightState, Origin, RobotStatus
+from edge.core.safety import Fence
+from ground.site import (
+    CLEARLY_FURTHER_M,
+    MAX_PAD_DISTANCE_M,
+    OnPad,
+    SavedSite,
+    Sites,
+    SiteSlot,
+    assign,
+    average_position,
+    bearing_deg,
+    circular_mean_deg,
+    distance_m,
+    origin_at,
+    place_m,
+    standing,
+    turn_deg,
+    wide_fence,
+)
+
+FENCE = Fence(((-2.0, -2.0), (34.0, -2.0), (34.0, 34.0), (-2.0, 34.0)), 1.5, 2.0, 30.0)
+SITE = SavedSite(
+    Origin(-33.86, 151.2, 359.99),
+    FENCE,
+    (SiteSlot(0, (2.0, 2.0), (4.0, 4.0)), SiteSlot(3, (6.0, 2.0), (8.0, 4.0))),
+)
+
+headings = st.floats(0.0, 360.0, exclude_max=True)
+latitudes = st.floats(-89.9, 89.9)
+longitudes = st.floats(-180.0, 180.0)
+
+
+def status(position_deg: tuple[float, float] | None, heading_deg: float | None) -> RobotStatus:
+    return RobotStatus(
+        robot_id=1, boot_nonce=1, sequence=1, uptime_s=1.0, unix_time_s=1.0,
+        state=FlightState.IDLE, reason="", ready=False, failed_checks=(), alarms=(),
+        obeyed_sequence=0, operator="", orders=(), bundle_id="", world_id="", trial="",
+        origin=None, system_id=None, slot_height_m=4.0, landing_point_m=(4.0, 4.0),
+        position_m=None, velocity_m_s=None,
+        heading_rad=None if heading_deg is None else math.radians(heading_deg),
+        mode=None, armed=False, battery=None, satellites=None, message_counts={},
+        neighbour_ages_s={}, loops={}, global_deg=position_deg,
+    )  # fmt: skip
+
+
+def moved(start: tuple[float, float], azimuth_deg: float, by_m: float) -> tuple[float, float]:
+    """The place that far away, by the mission frame's own geodesic."""
+    return Origin(*start, azimuth_deg % 360.0).frame().to_global_deg(0.0, by_m)
+
+
+# Means
+
+
+@given(st.lists(st.floats(-80.0, 80.0), min_size=1, max_size=20), headings)
+def test_headings_have_the_same_mean_wherever_north_lies(
+    turns: list[float], north_deg: float
+) -> None:
+    mean_deg, spread_deg = circular_mean_deg([(turn + north_deg) % 360.0 for turn in turns])
+    assert 0.0 <= mean_deg < 360.0
+    around_zero = circular_mean_deg([turn % 360.0 for turn in turns])
+    assert abs(turn_deg(mean_deg, around_zero.mean_deg + north_deg)) < 1e-6
+    assert spread_deg == pytest.approx(around_zero.spread_deg, abs=1e-6)
+    assert min(turns) - 1e-6 <= turn_deg(0.0, around_zero.mean_deg) <= max(turns) + 1e-6
+
+
+def test_headings_on_both_sides_of_north_have_their_mean_in_the_north() -> None:
+    mean_deg, spread_deg = circular_mean_deg([358.0, 4.0])
+    assert mean_deg == pytest.approx(1.0)
+    assert spread_deg == pytest.approx(3.0)
+    with pytest.raises(ValueError, match="no mean"):
+        circular_mean_deg([0.0, 180.0])
+
+
+@given(latitudes, longitudes, st.lists(st.tuples(headings, st.floats(0.0, 50.0)), max_size=8))
+def test_places_have_their_middle_between_them(
+    latitude: float, longitude: float, offsets: list[tuple[float, float]]
+) -> None:
+    """Also at the date line and beside the poles: pairs opposite each other leave the middle."""
+    centre = (latitude, longitude)
+    places = [centre]
+    for azimuth, by_m in offsets:
+        places += [moved(centre, azimuth, by_m), moved(centre, azimuth + 180.0, by_m)]
+    assert distance_m(average_position(places), centre) < 1e-3
+
+
+@given(latitudes, longitudes, headings, st.floats(1.0, 1000.0))
+def test_bearing_and_distance_lead_to_the_second_place(
+    latitude: float, longitude: float, azimuth_deg: float, by_m: float
+) -> None:
+    start = (latitude, longitude)
+    end = moved(start, azimuth_deg, by_m)
+    assert 0.0 <= bearing_deg(start, end) < 360.0
+    assert abs(turn_deg(bearing_deg(start, end), azimuth_deg)) < 1e-3
+    assert distance_m(start, end) == pytest.approx(by_m, abs=1e-4)
+    origin = Origin(*start, azimuth_deg)
+    assert place_m(origin, end) == pytest.approx((0.0, by_m), abs=1e-3)
+
+
+# Origins
+
+
+def test_origin_is_where_the_robot_stands_and_points() -> None:
+    centre = (48.0, 11.0)
+    heard = [status(moved(centre, 90.0 * i, 0.5), h) for i, h in enumerate((359.0, 3.0, 1.0, 1.0))]
+    first = standing("r1", heard)
+    assert first.spread_m == pytest.approx(0.5, abs=1e-3)
+    assert first.heading is not None
+    assert first.heading.spread_deg == pytest.approx(2.0)
+    origin = origin_at(first, None)
+    assert distance_m((origin.latitude_deg, origin.longitude_deg), centre) < 0.01
+    assert origin.heading_deg == 1.0
+
+    second = standing("r2", [status(moved(centre, 359.999, 30.0), None)])
+    assert abs(turn_deg(origin_at(first, second).heading_deg, 0.0)) < 0.02
+    with pytest.raises(ValueError, match="r2 does not know its heading yet"):
+        origin_at(second, None)
+    close = standing("r2", [status(moved(centre, 20.0, 1.0), None)])
+    with pytest.raises(ValueError, match=r"r2 stands 1.0 m from r1: it must be 2 m or more"):
+        origin_at(first, close)
+
+
+def test_robot_that_moves_or_knows_nothing_gives_no_origin() -> None:
+    centre = (48.0, 11.0)
+    with pytest.raises(ValueError, match="r1 is not heard"):
+        standing("r1", [])
+    with pytest.raises(ValueError, match="r1 does not know its position yet"):
+        standing("r1", [status(None, 10.0)])
+    carried = [status(centre, 10.0), status(moved(centre, 0.0, 12.0), 10.0)]
+    with pytest.raises(ValueError, match=r"r1: its position moved by 6.0 m, allowed are 2 m"):
+        standing("r1", carried)
+    turned = standing("r1", [status(centre, 10.0), status(centre, 60.0)])
+    with pytest.raises(ValueError, match="r1: its heading moved by 25 deg, allowed are 10"):
+        origin_at(turned, None)
+
+
+# Robots and pads
+
+PADS = {0: (2.0, 2.0), 1: (6.0, 2.0), 2: (10.0, 2.0)}
+
+
+def test_robots_are_at_the_pads_nearest_to_them() -> None:
+    assigned = assign({"r1": (9.5, 2.0), "r2": (2.0, 3.0)}, PADS)
+    assert assigned == {"r1": OnPad(2, 0.5), "r2": OnPad(0, 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("places", "problem"),
+    [
+        ({"r1": (2.0, 6.5)}, r"r1 at \(2.0, 6.5\) m stands within 3 m of no pad; the nearest, 0, "
+                             r"is 4.5 m away"),
+        ({"r1": (4.2, 2.0)}, r"r1 at \(4.2, 2.0\) m is ambiguous: pad 1 is 1.8 m and pad 0 2.2 m"),
+        ({"r1": (2.0, 2.0), "r2": (1.0, 2.0)}, "r1 and r2 stand at one pad, 0"),
+        ({"r1": (20.0, 2.0), "r2": (21.0, 2.0)}, "r1 at .*; r2 at "),
+    ],
+)  # fmt: skip
+def test_doubtful_places_are_refused(places: dict[str, tuple[float, float]], problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        assign(places, PADS)
+
+
+coordinates = st.tuples(st.floats(0.0, 12.0), st.floats(0.0, 4.0))
+
+
+@given(
+    st.lists(coordinates, min_size=1, max_size=4, unique=True),
+    st.lists(coordinates, min_size=4, max_size=5, unique=True),
+)
+def test_what_is_assigned_has_the_least_total_distance(
+    places: list[tuple[float, float]], pads: list[tuple[float, float]]
+) -> None:
+    named = {f"r{i}": place for i, place in enumerate(places)}
+    try:
+        assigned = assign(named, dict(enumerate(pads)))
+    except ValueError:
+        return
+    total_m = sum(on_pad.distance_m for on_pad in assigned.values())
+    least_m = min(
+        sum(map(math.dist, places, chosen)) for chosen in itertools.permutations(pads, len(places))
+    )
+    assert total_m == pytest.approx(least_m)
+    assert len({on_pad.height for on_pad in assigned.values()}) == len(places)
+    for robot, on_pad in assigned.items():
+        assert on_pad.distance_m <= MAX_PAD_DISTANCE_M
+        others = [math.dist(named[robot], p) for h, p in enumerate(pads) if h != on_pad.height]
+        assert min(others) >= on_pad.distance_m + CLEARLY_FURTHER_M
+
+
+def test_fence_that_is_off_keeps_the_heights_only() -> None:
+    wide = wide_fence(FENCE)
+    assert wide.distance_m(0.0, 0.0) == 250.0
+    assert (wide.floor_m, wide.ceiling_m) == (2.0, 30.0)
+
+
+# Files
+
+
+def test_site_is_read_as_it_was_saved(tmp_path: Path) -> None:
+    sites = Sites(tmp_path / "fleet.toml")
+    assert sites.names() == []
+    assert sites.used() is None
+    path = sites.save("park", SITE)
+    assert path == tmp_path / "sites" / "park.toml"
+    assert sites.load("park") == SITE
+    sites.use("park")
+    assert sites.used() == "park"
+    assert sites.names() == ["park"]
+
+    other = replace(SITE, slots=SITE.slots[:1])
+    with pytest.raises(ValueError, match=r"park.toml: is there already: add --force"):
+        sites.require_new("park")
+    sites.save("park", other)
+    assert sites.load("park") == other
+    assert sorted(p.name for p in path.parent.iterdir()) == ["park.toml", "used"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "problem"),
+    [
+        ("latitude_deg = -33.86", "latitude_deg = 91.0", "origin: mission origin latitude = 91"),
+        ("heading_deg = 359.99", "heading_deg = 360.0", r"heading_deg = 360.0: must be in \[0"),
+        ("height = 3", "height = 0", "height 0: two slots have it"),
+        ("pad_m = [2.0, 2.0]", "pad_m = [2.0, 200.0]", "height 0: pad_m = .*inside the fence"),
+        ("[4.0, 4.0]", "[-1.0, 4.0]", r"height 0: landing_point_m = .*at least buffer_m = 1.5"),
+        ("[8.0, 4.0]", "[5.0, 4.0]", r"height 3: landing_point_m is 1.0 m from that of height 0"),
+        ("buffer_m = 1.5", "bufer_m = 1.5", "fence: unknown key 'bufer_m'"),
+        ("[origin]", "[origin", "no TOML"),
+    ],
+)  # fmt: skip
+def test_mistake_in_a_site_is_one_line(
+    tmp_path: Path, before: str, after: str, problem: str
+) -> None:
+    sites = Sites(tmp_path / "fleet.toml")
+    path = sites.save("park", SITE)
+    path.write_text(path.read_text().replace(before, after))
+    with pytest.raises(ValueError, match=problem) as raised:
+        sites.load("park")
+    assert str(path) in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_sites_names_are_names(tmp_path: Path) -> None:
+    sites = Sites(tmp_path / "fleet.toml")
+    for name in ("../park", "", "a b", "-x"):
+        with pytest.raises(ValueError, match="must be 1 to 32 letters"):
+            sites.save(name, SITE)
+    with pytest.raises(ValueError, match=r"field.toml: there is no such site; known are none"):
+        sites.load("field")
