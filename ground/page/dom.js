@@ -1,0 +1,84 @@
+// Small helpers for the page. What the fleet says is only ever put in as text, never as HTML.
+
+export const $ = (selector) => document.querySelector(selector);
+
+// An element with a class, and children: elements or texts.
+export function make(tag, className = "", ...children) {
+  const element = document.createElement(tag);
+  if (className) element.className = className;
+  element.append(...children);
+  return element;
+}
+
+// Only what changes is touched, so that a text can be selected while the page is live.
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function setClass(element, className) {
+  if (element.className !== className) element.className = className;
+}
+
+const kept = new WeakMap();
+
+// Children of `parent` by key: makes, keeps, reorders and removes them.
+export function sync(parent, items, keyOf, create, update) {
+  if (!kept.has(parent)) kept.set(parent, new Map());
+  const rows = kept.get(parent);
+  const seen = new Set();
+  let place = parent.firstElementChild;
+  for (const item of items) {
+    const key = keyOf(item);
+    if (seen.has(key)) continue;
+    seen.add(key);
+    let row = rows.get(key);
+    if (!row) rows.set(key, (row = create(item)));
+    update(row, item);
+    if (row === place) place = place.nextElementSibling;
+    else parent.insertBefore(row, place);
+  }
+  for (const [key, row] of rows) {
+    if (!seen.has(key)) {
+      row.remove();
+      rows.delete(key);
+    }
+  }
+}
+
+// A colour of the style sheet, for a canvas: what `var(--name)` is in the present theme.
+export function colour(name) {
+  const probe = $("#probe") ?? document.body.appendChild(make("i"));
+  probe.id = "probe";
+  probe.style.color = `var(--${name})`;
+  return getComputedStyle(probe).color;
+}
+
+// A number with as many decimals, or a dash.
+export function number(value, digits = 0, unit = "") {
+  return value === null || value === undefined ? "–" : value.toFixed(digits) + unit;
+}
+
+export function clock(seconds) {
+  const whole = Math.max(0, Math.floor(seconds));
+  return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;
+}
+
+export const age = (seconds) =>
+  seconds === null || seconds === undefined ? "never"
+    : seconds < 10 ? `${seconds.toFixed(1)} s`
+    : seconds < 100 ? `${seconds.toFixed(0)} s`
+    : `${Math.floor(seconds / 60)} min`;
+
+// The letter that stands for a state beside its colour.
+export const LETTERS = {
+  init: "I", idle: "–", preflight: "C", arming: "A", takeoff: "T", hold: "H", mission: "M",
+  return: "R", land: "L", landed: "D", pilot: "P", fault: "F",
+};
+
+// How a robot looks: its state, or what is more important to know.
+export function look(robot) {
+  if (!robot.state) return { name: "never heard", style: "lost", letter: "?" };
+  if (!robot.fresh) return { name: `lost in ${robot.state}`, style: "lost", letter: "?" };
+  if (robot.state === "preflight" && robot.ready) return { name: "ready", style: "ready", letter: "✓" };
+  return { name: robot.state, style: robot.state, letter: LETTERS[robot.state] ?? "?" };
+}

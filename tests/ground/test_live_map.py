@@ -1,0 +1,410 @@
+"""The live map: who may see it, that it keeps up, and a real browser on it."""
+
+import asyncio
+import json
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager
+from dataclasses import replace
+from typing import Any
+
+import aiohttp
+import pytest
+
+from edge.core.mission import ON_GROUND, FlightState, GroundState
+from ground.client import command, listen
+from ground.live_map import Outbox, serving
+from ground.live_map_access import Access, is_loopback
+from ground.live_map_view import Missions, detail_view
+from ground.protocol import Picture, RobotPicture, SetOrigin, Setup
+from tests.ground.browser import PATIENCE_S, Opened, live_map, lpac, opened
+from tests.ground.pretend import FENCE, ORIGIN, PretendedFleet, PretendedRobot, pretended
+
+TOKEN = "correct-horse"
+HOSTILE = "<img src=x onerror=document.title='owned'> & <b>bold</b>"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PretendedFleet]:
+    """Thirty robots and their ground process; nobody has taken off."""
+    with (
+        pretended(tmp_path_factory.mktemp("fleet"), 30) as robots,
+        lpac("ground", "--fleet", str(robots.fleet_toml), "--name", "alice"),
+    ):
+        yield robots
+
+
+# Who may see it
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "allowed"),
+    [
+        ("127.0.0.1:8300", None, True),
+        ("localhost:8300", "http://localhost:8300", True),
+        ("[::1]:8300", "http://[::1]:8300", True),
+        # Names of others that lead here, and pages of others.
+        ("evil.example:8300", None, False),
+        ("evil.example:8300", "http://evil.example:8300", False),
+        ("127.0.0.1.evil.example", None, False),
+        ("127.0.0.1:8300", "http://evil.example", False),
+        ("127.0.0.1:8300", "http://127.0.0.1:5000", False),
+        ("127.0.0.1:8300", "null", False),
+        ("[::1", None, False),
+        ("", None, False),
+    ],
+)
+def test_only_this_machines_own_page_is_served(
+    host: str, origin: str | None, allowed: bool
+) -> None:
+    refusal = Access(local=True, token=None).refusal(host, origin, ())
+    assert (refusal is None) == allowed
+
+
+def test_beyond_this_machine_a_token_is_asked_for() -> None:
+    assert not is_loopback("0.0.0.0") and not is_loopback("192.168.8.2")
+    assert is_loopback("127.0.0.1") and is_loopback("::1") and is_loopback("localhost")
+    access = Access(local=False, token=TOKEN)
+    host = "192.168.8.2:8300"
+    assert access.refusal(host, None, (None, TOKEN)) is None
+    assert access.refusal(host, f"http://{host}", (TOKEN, None)) is None
+    for tokens in ((None, None), ("", "wrong"), ("corréct-horse", None), (f"{TOKEN} ", None)):
+        assert access.refusal(host, None, tokens) is not None
+    assert access.refusal(host, "http://evil.example", (TOKEN, None)) is not None
+
+
+Ask = Callable[..., Awaitable[aiohttp.ClientResponse]]
+
+
+@asynccontextmanager
+async def asking(
+    fleet: str, *, token: str | None = None, operate: bool = False
+) -> AsyncIterator[tuple[str, aiohttp.ClientSession]]:
+    access = Access(local=True, token=token)
+    async with (
+        serving(fleet, host="127.0.0.1", port=0, access=access, operate=operate) as address,
+        # Cookies of addresses are kept, as browsers do.
+        aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session,
+    ):
+        yield address, session
+
+
+def test_what_a_stranger_gets_from_the_server() -> None:
+    async def ask() -> None:
+        async with asking("nobody", token=TOKEN) as (address, session):
+            bare = address.partition("?")[0]
+            for path in ("", "map.js", "map.css", "live", "nothing"):
+                assert (await session.get(bare + path)).status == 403
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                await session.ws_connect(bare + "live")
+            # The address that was printed gives a cookie, and hides the token.
+            page = await session.get(address)
+            assert page.status == 200 and page.url.query_string == ""
+            assert "script-src 'self'" in page.headers["Content-Security-Policy"]
+            assert "http" not in (await page.text()).replace("http-equiv", "")
+            assert (await session.get(bare + "map.js")).content_type == "text/javascript"
+            assert (await session.get(bare + "../live_map.py")).status == 404
+            async with session.ws_connect(bare + "live") as stream:
+                assert (await stream.receive_json())["kind"] == "hello"
+            for headers in ({"Origin": "http://evil.example"}, {"Host": "evil.example"}):
+                assert (await session.get(bare, headers=headers)).status == 403
+                with pytest.raises(aiohttp.WSServerHandshakeError):
+                    await session.ws_connect(bare + "live", headers=headers)
+
+    asyncio.run(ask())
+
+
+def test_on_the_network_the_address_has_a_token(fleet: PretendedFleet) -> None:
+    async def ask(address: str) -> None:
+        async with aiohttp.ClientSession() as session:
+            assert (await session.get(address.partition("?")[0])).status == 403
+            assert (await session.get(address, allow_redirects=False)).status == 303
+
+    with live_map(fleet.fleet_toml, "--host", "0.0.0.0") as address:
+        assert len(address.partition("?token=")[2]) >= 16
+        asyncio.run(ask(address))
+
+
+def test_a_port_that_is_taken_is_told_in_one_line() -> None:
+    async def ask() -> None:
+        async with asking("nobody") as (address, _):
+            port = int(address.rstrip("/").rpartition(":")[2])
+            access = Access(local=True, token=None)
+            with pytest.raises(OSError, match=f"--port {port}: cannot serve there: .*in use"):
+                async with serving(
+                    "nobody", host="127.0.0.1", port=port, access=access, operate=False
+                ):
+                    pass
+
+    asyncio.run(ask())
+
+
+# What it tells
+
+
+async def until(
+    stream: aiohttp.ClientWebSocketResponse, wanted: Callable[[dict[str, Any]], bool]
+) -> dict[str, Any]:
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            message: dict[str, Any] = await stream.receive_json()
+            if wanted(message):
+                return message
+
+
+def of_kind(kind: str) -> Callable[[dict[str, Any]], bool]:
+    return lambda message: message["kind"] == kind
+
+
+def test_without_a_ground_it_says_so() -> None:
+    async def ask() -> None:
+        async with (
+            asking("nobody") as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            told = await until(stream, lambda m: m["kind"] == "ground" and "lpac" in m["problem"])
+            assert "no ground station runs for fleet nobody" in told["problem"]
+
+    asyncio.run(ask())
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [
+        {"do": "takeoff", "robots": []},
+        {"do": "hold", "robots": ["r3"]},
+        {"do": "kill", "robots": ["r3"]},
+    ],
+)
+def test_a_map_that_only_observes_refuses_every_action(
+    fleet: PretendedFleet, wish: dict[str, Any]
+) -> None:
+    async def ask() -> None:
+        async with (
+            asking(fleet.name) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            await until(stream, of_kind("picture"))
+            for nonsense in ("", "[", "[]", '{"do": 3, "robots": []}', '{"do": "land"}'):
+                await stream.send_str(nonsense)
+            await stream.send_json(wish)
+            report = await until(stream, of_kind("report"))
+            assert not report["done"] and "only observes" in report["problem"]
+            picture = await until(stream, of_kind("picture"))
+            assert picture["calm"] == "none"
+
+    asyncio.run(ask())
+    assert all(robot.state in ON_GROUND for robot in fleet.robots)
+
+
+def test_kill_is_no_action_of_the_map(fleet: PretendedFleet) -> None:
+    async def ask() -> None:
+        async with (
+            asking(fleet.name, operate=True) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            await stream.send_json({"do": "kill", "robots": ["r3"]})
+            report = await until(stream, of_kind("report"))
+            assert report["problem"] == "there is no such command here"
+
+    asyncio.run(ask())
+
+
+def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
+    fleet: PretendedFleet,
+) -> None:
+    """Five times a second of the ground's own clock, whatever else this machine does."""
+
+    async def straight(told_s: list[float], enough: asyncio.Event) -> None:
+        async for told in listen(fleet.name):
+            if isinstance(told, Picture):
+                told_s.append(told.unix_time_s)
+                if len(told_s) >= 40:
+                    enough.set()
+
+    async def ask() -> tuple[list[float], list[float], int]:
+        told_s: list[float] = []
+        shown_s: list[float] = []
+        sizes: list[int] = []
+        enough = asyncio.Event()
+        async with (
+            asking(fleet.name) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            await until(stream, of_kind("picture"))
+            direct = asyncio.create_task(straight(told_s, enough))
+            async with asyncio.timeout(PATIENCE_S):
+                while not enough.is_set():
+                    text = await stream.receive_str()
+                    message = json.loads(text)
+                    if message["kind"] == "picture":
+                        assert len(message["robots"]) == 30
+                        shown_s.append(message["unix_time_s"])
+                        sizes.append(len(text))
+            direct.cancel()
+            await asyncio.gather(direct, return_exceptions=True)
+        return told_s, shown_s, max(sizes)
+
+    told_s, shown_s, size = asyncio.run(ask())
+    # The last ones may still be on their way.
+    wanted_s = [time_s for time_s in told_s if shown_s[0] <= time_s <= shown_s[-1]]
+    assert len(set(wanted_s) & set(shown_s)) >= 0.9 * len(wanted_s)
+    assert len(wanted_s) >= 30
+    assert (wanted_s[-1] - wanted_s[0]) / (len(wanted_s) - 1) < 0.3
+    assert size < 40_000
+
+
+def test_a_page_that_takes_nothing_misses_pictures() -> None:
+    async def ask() -> list[str]:
+        page = Outbox()
+        page.put("setup", "setup")
+        for n in range(1000):
+            page.put(f"picture {n}", "picture")
+            page.put_each(f"event {n}")
+        return await page.take()
+
+    taken = asyncio.run(ask())
+    assert taken[:2] == ["setup", "picture 999"]
+    assert taken[-1] == "event 999" and len(taken) <= 202
+
+
+def test_a_page_that_opens_late_has_the_whole_curve() -> None:
+    missions = Missions()
+    waiting, flying = (
+        picture_of(state, 100.0) for state in (FlightState.HOLD, FlightState.MISSION)
+    )
+    missions.take(waiting)
+    assert not missions.begins(waiting) and missions.time_s(waiting) is None
+    assert missions.begins(flying)
+    curve = missions.begin(flying, 50.0)
+    curve.bound = curve.share(10.0)
+    for n in range(5000):
+        curve.add(0.4 * n, 50.0 - 0.005 * n)
+    view = curve.view()
+    assert view["whole"] and view["began_s"] == 100.0 and view["bound"] == 0.2
+    assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
+    assert len(view["points"]) <= 3000
+    # Hold is part of a mission, landing is not; another trial is another mission.
+    assert missions.time_s(picture_of(FlightState.HOLD, 160.0)) == 60.0
+    assert missions.time_s(picture_of(FlightState.LAND, 160.0)) is None
+    assert not missions.begins(picture_of(FlightState.MISSION, 170.0))
+    assert missions.begins(picture_of(FlightState.MISSION, 180.0, trial="t2"))
+
+
+def picture_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> Picture:
+    robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
+    status = replace(robot.status(0.0), state=state)
+    ground = GroundState(1, "alice", trial=trial)
+    return Picture(unix_time_s, "alice", ground, (RobotPicture("r1", 1, status, 0.1),))
+
+
+def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
+    (robot,) = picture_of(FlightState.HOLD, 0.0).robots
+    assert robot.status is not None
+    broken = replace(robot.status, velocity_m_s=(math.nan, math.inf, 0.0), hdop=math.nan)
+    setup = Setup(
+        "f", "alice", {"r1": 1}, (), FENCE, 1.0, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0
+    )
+    view = detail_view(setup, replace(robot, status=broken))
+    assert json.loads(json.dumps(view, allow_nan=False))["status"]["velocity_m_s"] == [
+        None, None, 0.0,
+    ]  # fmt: skip
+
+
+# A real browser
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PretendedFleet]:
+    """Three robots, of which one says things that a careless page would run."""
+    with pretended(tmp_path_factory.mktemp("few"), 3) as robots:
+        robots.robots[2].refuses = HOSTILE
+        yield robots
+
+
+def check_innocence(seen: Opened) -> None:
+    assert seen.errors == []
+    assert seen.hosts == {"127.0.0.1"}
+    assert seen.page.locator("img").count() == 0
+    assert "owned" not in seen.page.title()
+
+
+def test_a_flight_by_clicks(few: PretendedFleet) -> None:
+    with (
+        lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"),
+        live_map(few.fleet_toml, "--operate") as address,
+        opened(address) as seen,
+    ):
+        page = seen.page
+        assert command(few.name, SetOrigin(ORIGIN)).done
+        seen.act("enable")
+        seen.wait_for_states(dict.fromkeys(("r0", "r1", "r2"), "preflight"))
+        # Takeoff asks first; who will not is named, in text.
+        seen.act("takeoff")
+        page.wait_for_selector("#ask >> text=Take off 2 of 3")
+        assert HOSTILE in page.inner_text("#ask")
+        page.click("#ask-no")
+        assert page.is_hidden("#ask")
+        assert seen.state_of("r0") == "preflight"
+        seen.act("takeoff", sure=True)
+        seen.wait_for_states({"r0": "hold", "r1": "hold", "r2": "preflight"})
+        page.wait_for_selector(f"#toasts >> text={HOSTILE}")
+        seen.act("start")
+        seen.wait_for_states({"r0": "mission", "r1": "mission"})
+        assert few.robots[0].trial == page.inner_text("#trial")
+        # The cost, and its bound.
+        page.wait_for_function("Number(document.querySelector('#bound').textContent) > 0")
+        page.wait_for_function("Number(document.querySelector('#share').textContent) > 0")
+        # One robot, from its drawer.
+        page.click("tr[data-robot=r1]")
+        page.wait_for_selector("#drawer >> text=landing point")
+        page.wait_for_selector("#drawer table td >> text=r0")
+        page.click("#drawer [data-robot-do=hold]")
+        page.wait_for_selector("#drawer .state >> text=hold")
+        seen_states = {"r0": "mission", "r1": "hold"}
+        page.keyboard.press("Escape")
+        seen.wait_for_states(seen_states)
+        # Hold is one key, also while something is asked.
+        seen.act("land")
+        page.wait_for_selector("#ask >> text=Land")
+        page.keyboard.press("h")
+        seen.wait_for_states({"r0": "hold"})
+        page.wait_for_selector("#calm >> text=HOLD by alice")
+        page.click("#ask-no")
+        seen.act("resume")
+        seen.wait_for_states({"r0": "mission"})
+        page.click("#hold")
+        seen.wait_for_states({"r0": "hold", "r1": "hold"})
+        seen.act("land", sure=True)
+        seen.wait_for_states({"r0": "landed", "r1": "landed"})
+        check_innocence(seen)
+
+
+def test_a_page_that_observes(few: PretendedFleet) -> None:
+    """It has nothing to command with; and it comes back by itself when the ground does."""
+    with live_map(few.fleet_toml) as address, ExitStack() as first:
+        ground = "ground", "--fleet", str(few.fleet_toml), "--name", "alice"
+        first.enter_context(lpac(*ground))
+        with opened(address, theme="dark") as seen:
+            page = seen.page
+            assert page.is_hidden("#bar")
+            assert "lpac mission hold" in page.inner_text("#observing")
+            page.keyboard.press("h")
+            page.click("tr[data-robot=r1]")
+            page.wait_for_selector("#drawer >> text=satellites")
+            assert page.locator("[data-robot-do]:visible").count() == 0
+            page.wait_for_selector("#banner", state="hidden")
+            first.close()
+            page.wait_for_selector("#banner >> text=lpac ground")
+            with lpac(*ground):
+                page.wait_for_selector("#banner", state="hidden")
+                assert page.inner_text("#link") == "ground live"
+                assert page.is_hidden("#calm")
+            check_innocence(seen)
