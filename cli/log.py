@@ -1,4 +1,4 @@
-"""`lpac log`: what flight logs hold."""
+"""`lpac log`: what the robots' and the ground's logs hold."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(name="log", help="What flight logs hold.")
+app = typer.Typer(name="log", help="What the robots' and the ground's logs hold.")
 
 
 @app.callback()
@@ -16,7 +16,7 @@ def main() -> None:
 
 @app.command()
 def trials(
-    folder: Annotated[Path, typer.Argument(help="Folder of flight logs (*.mcap).")],
+    folder: Annotated[Path, typer.Argument(help="Folder of logs (*.mcap).")],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Say which trials were flown, and when.

@@ -22,18 +22,31 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 
-from edge.adapters.flight_log import FlightLog, FlightLogError, FlightMetadata, read, read_metadata
-from edge.core.mission import FlightState, Order, OrderResult, Origin
+from edge.adapters.flight_log import (
+    FlightLog,
+    FlightLogError,
+    FlightMetadata,
+    read,
+    read_metadata,
+    topic,
+)
+from edge.core.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
+from edge.core.safety import Fence
 from edge.core.vehicle import Action, ActionResult, VehicleState, Velocity
 from tests.conftest import ROOT
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", '{"robot": {"id": 3}}', "0.1.0")
 NOW = 1.7e9
+STATE = GroundState(
+    sequence=1, operator="ann", origin=Origin(47.0, 8.0, 0.0), robot_enabled={"3": True},
+    robot_calm={"3": "hold"}, fence=Fence(((0.0, 0.0), (9.0, 0.0), (9.0, 9.0)), 0.5, 1.0, 9.0),
+    places={"3": Place(1, (1.0, 2.0))}, world_id="abc",
+)  # fmt: skip
 NOISE = np.random.default_rng(0).integers(0, 256, 50_000, np.uint8)  # does not compress
 
 
 @contextlib.contextmanager
-def flight_log(directory: Path, **settings: int) -> Iterator[FlightLog]:
+def flight_log(directory: Path, **settings: Any) -> Iterator[FlightLog]:
     with contextlib.closing(FlightLog(directory, METADATA, **settings)) as log:
         yield log
 
@@ -139,7 +152,7 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
         "control": {"state": FlightState.MISSION, "sent_local": Velocity((1.0, 0.0, 0.0))[0]},
         "status": {"origin": Origin(47.0, 8.0, 0.0)},
         "order": {**dataclasses.asdict(order), "answer": OrderResult("a", True)},
-        "ground": {"sequence": 1},
+        "ground": dataclasses.asdict(STATE),
         "vehicle": dataclasses.asdict(state),
         "/pose": {"position_m": (1.0, 2.0, 3.0), "yaw_rad": math.pi / 2},
         "/log": {"level": "warning", "message": "hello", "name": "robot"},
@@ -159,6 +172,7 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
             assert schema is not None and schema.encoding == "jsonschema"
             assert channel.message_encoding == "json"
             found[channel.topic] = (schema.name, json.loads(record.data))
+            assert_foxglove_reads(json.loads(schema.data))
             assert_fits(found[channel.topic][1], json.loads(schema.data))
     assert found["/pose"] == (
         "foxglove.PoseInFrame",
@@ -188,10 +202,58 @@ def assert_fits(value: object, schema: dict[str, Any]) -> None:
     assert isinstance(value, types[schema["type"]]), (value, schema)
     if isinstance(value, dict):
         for key, entry in value.items():
-            assert_fits(entry, schema["properties"][key])
+            if key not in schema["properties"] and is_list_of_lists(entry):
+                continue
+            assert_fits(entry, schema["properties"].get(key) or schema["additionalProperties"])
     elif isinstance(value, list):
         for entry in value:
             assert_fits(entry, schema["items"])
+
+
+def is_list_of_lists(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, list) for entry in value)
+
+
+def assert_foxglove_reads(schema: dict[str, Any]) -> None:
+    """Its parser needs properties, and no lists of lists."""
+    if schema["type"] == "object":
+        for entry in schema["properties"].values():
+            assert_foxglove_reads(entry)
+    elif schema["type"] == "array":
+        assert schema["items"]["type"] != "array" and "contentEncoding" not in schema["items"]
+        assert_foxglove_reads(schema["items"])
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Station:
+    """Whoever else writes such logs."""
+
+    operator: str
+    log_name: str = "ground+"
+
+
+def test_the_ground_writes_what_it_likes(tmp_path: Path) -> None:
+    """Its own names and topics; dataclasses in dataclasses and in dictionaries."""
+    topics = {"state": topic("State", GroundState), "cost": topic("Cost", Place, by_robot=float)}
+    (tmp_path / "ground-0007.mcap").touch()
+    for _start in range(2):
+        with contextlib.closing(FlightLog(tmp_path, Station("ann"), topics)) as log:
+            log.record("state", NOW, dataclasses.asdict(STATE))
+            log.record("cost", NOW, {"slot": 1, "landing_point_m": (1.0, 2.0), "by_robot": 3.5})
+            log.record("status", NOW, {"robot_id": 1})
+        assert log.dropped == 1
+    path = tmp_path / "ground+-0002.mcap"
+    (_, _, state), (name, _, cost) = read(path)
+    assert name == "cost" and cost == {"slot": 1, "landing_point_m": [1.0, 2.0], "by_robot": 3.5}
+    assert state["places"] == {"3": {"slot": 1, "landing_point_m": [1.0, 2.0]}}
+    assert state["fence"]["vertices_m"] == [[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]]
+    with path.open("rb") as file:
+        for schema, _, record in make_reader(file).iter_messages():
+            assert schema is not None
+            assert_foxglove_reads(json.loads(schema.data))
+            assert_fits(json.loads(record.data), json.loads(schema.data))
+    with pytest.raises(FlightLogError, match=r"ground\+-0002\.mcap: was not written by a robot"):
+        read_metadata(path)
 
 
 def test_a_file_cut_at_any_byte_is_read_up_to_there(tmp_path: Path) -> None:
@@ -406,7 +468,7 @@ def test_a_closed_log_takes_nothing_more(tmp_path: Path) -> None:
         ({"max_queued_messages": 0}, "max_queued_messages = 0: must be at least 1"),
     ],
 )
-def test_impossible_limits_are_named(tmp_path: Path, limits: dict[str, int], text: str) -> None:
+def test_impossible_limits_are_named(tmp_path: Path, limits: dict[str, Any], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         FlightLog(tmp_path, METADATA, **limits)
 

@@ -1,0 +1,168 @@
+"""What the fleet's positions are worth, held against the core's own coverage."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.core import F64
+from edge.core.coverage import coverage_cost, voronoi_cells
+from edge.core.mission import FlightState, RobotStatus
+from edge.core.world import format_world, parse_world, random_features, rasterize
+from ground.coverage import Coverage, counted
+from ground.protocol import Picture, RobotPicture
+
+SIZE, SCALE = 128, 4.0
+S = FlightState
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    world: str
+    world_id: str = "abc"
+    world_size: int = SIZE
+    env_scale: float = SCALE
+    truncation: float = 2.0
+    norm: float = 1.0
+
+
+def model(seed: int = 0) -> Model:
+    rng = np.random.default_rng(seed)
+    return Model(format_world(random_features(rng, 5, SIZE, sigma=(6.0, 15.0))))
+
+
+COVERAGE = Coverage(model())
+PLACE_M = st.tuples(st.floats(-10.0, 42.0), st.floats(-10.0, 42.0))
+FLEETS_M = st.lists(PLACE_M, min_size=1, max_size=12).map(np.array)
+
+
+def area(corners_m: list[tuple[float, float]]) -> float:
+    x, y = np.array(corners_m).reshape(-1, 2).T
+    return float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2.0)
+
+
+def inside(corners_m: list[tuple[float, float]], points_m: F64) -> F64:
+    """How far inside a convex polygon points are, the least over its sides; m."""
+    corners = np.array(corners_m)
+    sides = np.roll(corners, -1, axis=0) - corners
+    sides, corners = (part[np.linalg.norm(sides, axis=1) > 1e-6] for part in (sides, corners))
+    offsets = points_m[:, None] - corners
+    cross = sides[:, 0] * offsets[..., 1] - sides[:, 1] * offsets[..., 0]
+    depth: F64 = (cross / np.linalg.norm(sides, axis=1)).min(axis=1)
+    return depth
+
+
+@settings(deadline=None, max_examples=50)
+@given(FLEETS_M)
+def test_cost_is_the_cores_in_model_units(positions_m: F64) -> None:
+    raster = rasterize(parse_world(model().world), SIZE, 2.0, 1.0)
+    assert np.array_equal(COVERAGE.importance, raster) and COVERAGE.size_m == 32.0
+    assert COVERAGE.cost(positions_m) == coverage_cost(raster, positions_m * SCALE)
+
+
+@settings(deadline=None, max_examples=50)
+@given(FLEETS_M)
+def test_cells_part_the_world_by_the_nearest_robot(positions_m: F64) -> None:
+    positions_m = np.unique(positions_m, axis=0)
+    cells_m = COVERAGE.cells_m(positions_m)
+    assert len(cells_m) == len(positions_m)
+    nearest = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
+    np.fill_diagonal(nearest, np.inf)
+    if nearest.min() < 1e-3:  # whose the ground between them is, is then a matter of rounding
+        return
+    assert sum(map(area, cells_m)) == pytest.approx(32.0**2, rel=1e-6)
+    points_m = np.random.default_rng(0).uniform(0.0, 32.0, (300, 2))
+    distances_m = np.linalg.norm(points_m[:, None] - positions_m, axis=2)
+    for robot, cell_m in enumerate(cells_m):
+        own = points_m[distances_m.argmin(axis=1) == robot]
+        if len(own):
+            assert inside(cell_m, own).min() > -1e-6
+        assert all(-1e-9 <= c <= 32.0 + 1e-9 for corner in cell_m for c in corner)
+
+
+def test_robots_at_one_point_and_outside_have_cells_too() -> None:
+    shared, other, far = COVERAGE.cells_m(np.array([(5.0, 5.0), (5.0, 5.0), (-100.0, 5.0)]))
+    assert shared == other and area(shared) == pytest.approx(32.0**2) and far == []
+
+
+@settings(deadline=None, max_examples=5)
+@given(FLEETS_M)
+def test_the_bound_is_below_what_lloyd_reaches_from_there(positions_m: F64) -> None:
+    bound = COVERAGE.clairvoyant(positions_m)
+    assert bound == COVERAGE.clairvoyant(positions_m)
+    assert 0.0 < bound <= COVERAGE.cost(positions_m)
+    positions = positions_m * SCALE
+    for _ in range(300):
+        positions = voronoi_cells(COVERAGE.importance, positions).centroid
+    assert bound <= coverage_cost(COVERAGE.importance, positions) * 1.01
+
+
+def test_the_bound_of_one_robot_is_the_centre_of_mass() -> None:
+    centre = voronoi_cells(COVERAGE.importance, np.array([(1.0, 1.0)])).centroid
+    least = coverage_cost(COVERAGE.importance, centre)
+    assert COVERAGE.clairvoyant(np.array([(1.0, 1.0)])) == pytest.approx(least, rel=1e-3)
+
+
+@pytest.mark.parametrize("size", [50, SIZE, 200])
+def test_the_density_keeps_the_worlds_shape(size: int) -> None:
+    image = COVERAGE.density(size)
+    assert image.shape == (size, size) and image.dtype == np.uint8 and image.max() == 255
+    # Where the most is, in the world's own share: [x, y], not turned.
+    highest = np.array(np.unravel_index(COVERAGE.importance.argmax(), (SIZE, SIZE))) / SIZE
+    found = np.array(np.unravel_index(image.argmax(), image.shape)) / size
+    assert np.abs(found - highest).max() < 2.0 / min(size, SIZE)
+
+
+def test_an_empty_world_costs_nothing() -> None:
+    empty = Coverage(Model(""))
+    positions_m = np.array([(1.0, 2.0), (3.0, 4.0)])
+    assert empty.cost(positions_m) == empty.clairvoyant(positions_m) == 0.0
+    assert empty.density(10).max() == 0 and len(empty.cells_m(positions_m)) == 2
+
+
+def test_a_broken_world_is_one_line() -> None:
+    with pytest.raises(ValueError, match=r"world abc: record 1 \(Circle\): unknown kind"):
+        Coverage(Model("Circle 1 2"))
+
+
+STATUS = RobotStatus(
+    robot_id=0, boot_nonce=1, sequence=1, uptime_s=1.0, unix_time_s=1.0, state=S.IDLE, reason="",
+    ready=True, failed_checks=(), alarms=(), obeyed_sequence=0, operator="", orders=(),
+    bundle_id="", world_id="", trial="", origin=None, system_id=1, slot_height_m=4.0,
+    landing_point_m=(0.0, 0.0), position_m=(1.0, 2.0, 3.0), velocity_m_s=None, heading_rad=None,
+    mode=None, armed=False, battery=None, satellites=None, message_counts={}, neighbour_ages_s={},
+    loops={},
+)  # fmt: skip
+
+
+def picture(*robots: tuple[S, bool, float, float | None]) -> Picture:
+    """Robots of (state, armed, age_s, x_m)."""
+    pictures = (
+        RobotPicture(
+            f"r{i}", i,
+            dataclasses.replace(
+                STATUS, robot_id=i, state=state, armed=armed,
+                position_m=None if x_m is None else (x_m, 2.0, 3.0),
+            ),
+            age_s,
+        )
+        for i, (state, armed, age_s, x_m) in enumerate(robots)
+    )  # fmt: skip
+    return Picture(0.0, "", None, (*pictures, RobotPicture("silent", 99)))
+
+
+def test_who_counts() -> None:
+    waiting = picture(
+        (S.IDLE, False, 0.1, 1.0), (S.IDLE, False, 9.0, 2.0), (S.IDLE, False, 0.1, None)
+    )
+    assert counted(waiting) == {"r0": (1.0, 2.0)}
+    flying = picture(
+        (S.MISSION, True, 0.1, 1.0), (S.IDLE, False, 0.1, 2.0), (S.LAND, True, 0.1, 3.0),
+        (S.LAND, False, 0.1, 4.0), (S.PILOT, True, 0.1, 5.0), (S.PILOT, False, 0.1, 6.0),
+        (S.HOLD, True, 3.0, 7.0), (S.MISSION, True, 0.1, math.nan), (S.MISSION, True, 0.1, None),
+    )  # fmt: skip
+    assert counted(flying) == {"r0": (1.0, 2.0), "r2": (3.0, 2.0), "r4": (5.0, 2.0)}
+    assert counted(picture()) == {}

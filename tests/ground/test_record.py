@@ -1,0 +1,265 @@
+"""The ground's log: each thing once, and from the real ground process, which may start again."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.adapters.flight_log import FlightLogError, read, read_metadata
+from edge.core.coverage import coverage_cost
+from edge.core.mission import FlightState, GroundState, Origin, Place
+from edge.core.safety import Fence
+from edge.core.world import parse_world, rasterize
+from ground.client import GroundError, command, subscribe
+from ground.protocol import (
+    Calm,
+    Enable,
+    Event,
+    Explored,
+    Picture,
+    RobotPicture,
+    SetOrigin,
+    Setup,
+    Start,
+    Takeoff,
+    Told,
+)
+from ground.record import Recording
+from tests.conftest import ROOT
+from tests.ground.pretend import ORIGIN, pretended
+from tests.ground.test_coverage import STATUS, model
+
+S = FlightState
+FENCE = Fence(((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)), 0.5, 1.0, 20.0)
+WORLD = model()
+SETUP = Setup(
+    fleet="f", operator="ann", robots={"r0": 0, "r1": 1}, slots=(), fence=FENCE, max_speed_m_s=1.0,
+    world=WORLD.world, world_id=WORLD.world_id, bundle_id="b", world_size=WORLD.world_size,
+    sensor_size=16, communication_range=64.0, env_scale=WORLD.env_scale,
+    truncation=WORLD.truncation, norm=WORLD.norm,
+)  # fmt: skip
+STATE = GroundState(3, "ann", Origin(47.0, 8.0, 0.0), places={"0": Place(0, (1.0, 2.0))})
+PATIENCE_S = 60.0
+
+
+class Kept:
+    """What a `Recording` records."""
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[str, float, Mapping[str, Any]]] = []
+        self.recording = Recording(lambda *entry: self.entries.append(entry))
+
+    def of(self, topic: str) -> list[Mapping[str, Any]]:
+        return [message for name, _, message in self.entries if name == topic]
+
+
+def picture(now_s: float, sequence: int, x_m: float, state: S = S.MISSION, **more: Any) -> Picture:
+    """Two robots, of which the second was heard 0.1 s ago."""
+    statuses = (
+        dataclasses.replace(
+            STATUS, robot_id=i, sequence=sequence, state=state, armed=True, trial="t1",
+            position_m=(x_m, 5.0 + 20.0 * i, 4.0),
+        )
+        for i in range(2)
+    )  # fmt: skip
+    robots = tuple(
+        RobotPicture(f"r{i}", i, status, 0.1 * i, 0.5) for i, status in enumerate(statuses)
+    )
+    return Picture(now_s, "ann", STATE, robots, **more)
+
+
+def test_each_thing_is_recorded_once() -> None:
+    kept = Kept()
+    event = Event(99.0, "command", "", "takeoff", "ann", "t1")
+    told: list[tuple[float, Told]] = [
+        (100.0, SETUP), (100.0, event), (100.0, Explored("r0", "AAAA")),
+        (100.2, picture(100.2, 1, 1.0)), (100.4, picture(100.4, 1, 1.0)),
+        # The same again from the ground's next process, and something new.
+        (105.0, event), (105.0, Explored("r0", "AAAA")), (105.0, Explored("r0", "AAAB")),
+        (105.2, picture(105.2, 2, 2.0)),
+        (166.0, picture(166.0, 3, 3.0)),
+    ]  # fmt: skip
+    for now_s, message in told:
+        kept.recording.take(message, now_s)
+    kept.recording.close()
+    assert kept.of("event") == [dataclasses.asdict(event)]
+    assert [e["cells"] for e in kept.of("explored")] == ["AAAA", "AAAB"]
+    assert [s["sequence"] for s in kept.of("state")] == [3]
+    said = [(s["name"], s["sequence"]) for s in kept.of("status")]
+    assert said == [("r0", 1), ("r1", 1), ("r0", 2), ("r1", 2), ("r0", 3), ("r1", 3)]
+    # When they were heard, by the ground's clock.
+    heard = [(at_s, m["heard_at_unix_s"]) for topic, at_s, m in kept.entries if topic == "status"]
+    assert heard[:2] == [(100.2, 100.2), (pytest.approx(100.1), pytest.approx(100.1))]
+    assert {s["clock_offset_s"] for s in kept.of("status")} == {0.5}
+    assert len(kept.of("setup")) == 2  # the second after a minute
+    # No cost for the second picture, which came too soon after the first.
+    assert [at_s for topic, at_s, _ in kept.entries if topic == "cost"] == [100.2, 105.2, 166.0]
+
+
+def test_the_cost_is_normalised_by_each_trials_begin() -> None:
+    kept = Kept()
+    kept.recording.take(SETUP, 0.0)
+    kept.recording.take(picture(1.0, 1, 1.0, S.HOLD), 1.0)
+    kept.recording.take(picture(2.0, 2, 5.0), 2.0)
+    kept.recording.take(picture(3.0, 3, 9.0), 3.0)
+    kept.recording.close()
+    raster = rasterize(parse_world(WORLD.world), WORLD.world_size, 2.0, 1.0)
+    expected = [
+        coverage_cost(raster, np.array([(x_m, 5.0), (x_m, 25.0)]) * WORLD.env_scale)
+        for x_m in (1.0, 5.0, 9.0)
+    ]
+    costs = kept.of("cost")
+    assert [cost["cost"] for cost in costs] == expected
+    assert [cost["initial"] for cost in costs] == [None, expected[1], expected[1]]
+    assert costs[2]["normalized"] == expected[2] / expected[1]
+    assert [cost["flying_mission"] for cost in costs] == [False, True, True]
+    assert {(cost["trial"], cost["robots"]) for cost in costs} == {("t1", ("r0", "r1"))}
+
+
+@pytest.mark.parametrize("world", ["", "Circle 1 2"])
+def test_without_a_world_all_else_is_recorded(world: str) -> None:
+    kept = Kept()
+    kept.recording.take(dataclasses.replace(SETUP, world=world), 0.0)
+    kept.recording.take(picture(1.0, 1, 1.0), 1.0)
+    kept.recording.close()
+    assert [topic for topic, _, _ in kept.entries] == ["setup", "state", "status", "status"]
+
+
+class Recorder:
+    """`lpac record` as a process, and the lines that it prints."""
+
+    def __init__(self, fleet_toml: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet_toml)],
+            cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self._output = self.process.stdout
+
+    def wait_for(self, text: str) -> None:
+        watchdog = threading.Timer(PATIENCE_S, self.process.kill)
+        watchdog.start()
+        for line in self._output:
+            if text in line:
+                watchdog.cancel()
+                return
+        raise AssertionError(f"it ended, and never said {text!r}")
+
+    def stop(self, number: signal.Signals) -> int:
+        self.process.send_signal(number)
+        self._output.read()
+        return self.process.wait(PATIENCE_S)
+
+
+def ground_process(fleet_toml: Path) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(
+        [sys.executable, "-m", "cli.main", "ground", "--name", "ann", "--fleet", str(fleet_toml)],
+        cwd=ROOT, stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+
+
+def wait_until(fleet: str, true_of: Callable[[Picture], bool]) -> None:
+    """Until a picture of the ground is so; it may have to start first."""
+    gives_up = threading.Event()
+    watchdog = threading.Timer(PATIENCE_S, gives_up.set)
+    watchdog.start()
+    while not gives_up.is_set():
+        try:
+            with subscribe(fleet) as answers:
+                for told in answers:
+                    if isinstance(told, Picture) and true_of(told):
+                        watchdog.cancel()
+                        return
+                    assert not gives_up.is_set()
+        except GroundError:
+            gives_up.wait(0.1)
+    raise AssertionError("that was never so")
+
+
+def test_a_flight_is_recorded_also_when_the_ground_starts_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    processes: list[subprocess.Popen[Any]] = []
+    with pretended(tmp_path, 2) as fleet:
+        recorder = Recorder(fleet.fleet_toml)
+        try:
+            recorder.wait_for("waiting for it")
+            processes.append(ground_process(fleet.fleet_toml))
+            recorder.wait_for("hears the ground station")
+            wait_until(fleet.name, lambda told: all(robot.fresh for robot in told.robots))
+            for request in (SetOrigin(ORIGIN), Enable(), Takeoff(interval_s=0.1), Start()):
+                assert command(fleet.name, request).done
+            recorder.wait_for("trial t1 begins with 2 robots")
+            processes[0].kill()
+            recorder.wait_for("has ended")
+            processes.append(ground_process(fleet.fleet_toml))
+            recorder.wait_for("hears the ground station")
+            wait_until(fleet.name, lambda told: told.commander == "ann")
+            assert command(fleet.name, Calm("land", wait=True)).done
+            assert recorder.stop(signal.SIGTERM) == 0
+        finally:
+            processes += [recorder.process]
+            for process in processes:
+                with process:
+                    process.kill()
+    (path,) = (tmp_path / "logs").iterdir()
+    assert path.name == "ground-0001.mcap"
+    entries = list(read(path))
+    by_topic: dict[str, list[dict[str, Any]]] = {}
+    for topic, _, message in entries:
+        by_topic.setdefault(topic, []).append(message)
+    assert by_topic["setup"][0]["fleet"] == fleet.name and by_topic["setup"][0]["world"]
+    said = [(s["name"], s["boot_nonce"], s["sequence"]) for s in by_topic["status"]]
+    assert len(set(said)) == len(said)
+    flown = {(s["name"], s["state"]) for s in by_topic["status"]}
+    assert {
+        (name, state) for name in ("r0", "r1") for state in ("hold", "mission", "land")
+    } <= flown
+    assert all(abs(s["clock_offset_s"]) < PATIENCE_S for s in by_topic["status"])
+    commands = [e for e in by_topic["event"] if e["kind"] == "command"]
+    assert {e["operator"] for e in commands} == {"ann"} and len(commands) >= 4
+    assert any(s["calm"] == "land" for s in by_topic["state"])
+    assert_costs_are_of_the_last_statuses(entries)
+    with pytest.raises(FlightLogError, match="was not written by a robot"):
+        read_metadata(path)
+
+
+def assert_costs_are_of_the_last_statuses(entries: list[tuple[str, float, dict[str, Any]]]) -> None:
+    setup = next(message for topic, _, message in entries if topic == "setup")
+    raster = rasterize(
+        parse_world(setup["world"]), setup["world_size"], setup["truncation"], setup["norm"]
+    )
+    last: dict[str, dict[str, Any]] = {}
+    compared = 0
+    for topic, _, message in entries:
+        if topic == "status":
+            last[message["name"]] = message
+        elif topic == "cost":
+            positions_m = np.array([last[name]["position_m"][:2] for name in message["robots"]])
+            expected = coverage_cost(raster, positions_m * setup["env_scale"])
+            assert message["cost"] == pytest.approx(expected)
+            compared += message["flying_mission"]
+    assert compared > 0
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "logs").write_text("")
+    with pretended(tmp_path, 1) as fleet:
+        done = subprocess.run(
+            [sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet.fleet_toml)],
+            cwd=ROOT, capture_output=True, text=True, check=False,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert "nothing more can be written there" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
