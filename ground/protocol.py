@@ -1,24 +1,31 @@
 """What the ground process and its clients say to each other, and its JSON.
 
 The ground process (`lpac ground`) alone speaks to the fleet. Its clients (commands, views, scripts)
-connect to its Unix socket and send one line: a command, or "subscribe". Each line of the answer
+connect to its Unix socket and send one line: a command, or `SUBSCRIBE`. Each line of the answer
 is one JSON object whose only key names its kind, such as {"picture": {...}}.
 
-A command is answered by any number of `Progress`, and then one `Report`. A subscription is answered
+A command is answered by any number of `Progress`, and then one `Report`. A client that leaves
+before abandons what is not ordered yet. A subscription is answered
 by a `Setup` (again whenever the world changes), what is known of each robot's `Explored`, the last
 `Event`s, and then a `Picture` at 5 Hz, and the rest as it happens, until the client leaves.
 """
 
 import dataclasses
 import json
+import re
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
 from edge.core.mission import GroundState, Origin, Place, RobotStatus
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
+from edge.core.world import parse_world
 
 PICTURE_PERIOD_S = 0.2
+SUBSCRIBE = b"subscribe\n"
+# What the radio takes at once.
+LARGEST_WORLD = 400_000
+_TRIAL = re.compile(r"[A-Za-z0-9_.-]{0,32}")
 
 T = TypeVar("T")
 
@@ -52,6 +59,15 @@ class SetWorld:
     name: str
     robots: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        if not self.name.isprintable():
+            raise ValueError(f"name = {self.name!r}: must be printable")
+        if len(self.text) > LARGEST_WORLD:
+            raise ValueError(
+                f"{self.name} has {len(self.text)} characters: must be {LARGEST_WORLD} at most"
+            )
+        parse_world(self.text, self.name)
+
 
 @dataclass(frozen=True, slots=True)
 class SetPlaces:
@@ -78,6 +94,10 @@ class Takeoff:
     robots: tuple[str, ...] = ()
     interval_s: float = 2.0
     abort_on_failure: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.interval_s <= 600.0:
+            raise ValueError(f"interval_s = {self.interval_s}: must be from 0 to 600")
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +147,12 @@ class Again:
     trial: str = ""
     robots: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        if _TRIAL.fullmatch(self.trial) is None:
+            raise ValueError(
+                f"trial = {self.trial!r}: must be at most 32 letters, digits, '.', '-' and '_'"
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -143,7 +169,10 @@ Request = (
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Something became known of one robot (its name) while a command runs; "" is the fleet."""
+    """Something became known of one robot (its name) while a command runs; "" is the fleet.
+
+    Each robot's result is told so, too, as soon as it is known.
+    """
 
     robot: str
     text: str
@@ -191,7 +220,8 @@ class Setup:
     policy's world is `world_size` cells wide, `env_scale` of them per m, from the mission origin
     on; its sensor sees `sensor_size` cells. `world` is the text of the robots' world file, called
     `world_id`; `truncation` and `norm` are what `rasterize` needs for it. `fence` is the configured
-    one, `max_speed_m_s` the fleet's speed limit.
+    one, `max_speed_m_s` the fleet's speed limit. A slot's height is `base_height_m` + its number x
+    `slot_spacing_m`.
     """
 
     fleet: str
@@ -209,6 +239,8 @@ class Setup:
     env_scale: float
     truncation: float
     norm: float
+    base_height_m: float = 4.0
+    slot_spacing_m: float = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +271,8 @@ class Picture:
     """The fleet now. `unix_time_s` is the ground's clock.
 
     `commander` is who commands, "" if nobody does yet; `ground` is the state that robots are told,
-    by whoever commands. `running` are the commands that run now, in words.
+    by whoever commands. `running` are the commands that run now, in words. `commander_age_s` is how
+    long ago the commander was heard, 0 if that is this station.
     """
 
     unix_time_s: float
@@ -247,6 +280,7 @@ class Picture:
     ground: GroundState | None
     robots: tuple[RobotPicture, ...]
     running: tuple[str, ...] = ()
+    commander_age_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,136 @@
+"""How commands, views and scripts speak to the ground process of this machine."""
+
+import asyncio
+import os
+import socket
+import stat
+import tempfile
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from contextlib import aclosing, contextmanager
+from pathlib import Path
+
+from ground.protocol import (
+    SUBSCRIBE,
+    Progress,
+    Report,
+    Request,
+    Told,
+    to_line,
+    told_from_line,
+)
+
+# Worlds are the longest lines.
+MAX_LINE = 1 << 26
+_MAX_PATH = 107
+
+
+class GroundError(OSError):
+    """No ground process runs for the fleet, or it has ended; the text says what to do."""
+
+
+def socket_path(fleet: str) -> Path:
+    """Where the fleet's ground process listens: for this user alone.
+
+    Raises GroundError if the folder could be somebody else's.
+    """
+    folder = os.environ.get("XDG_RUNTIME_DIR") or _own_folder()
+    path = Path(folder, f"lpac-ground-{fleet}.sock")
+    if len(os.fsencode(path)) > _MAX_PATH:
+        raise GroundError(f"{path}: is too long for a socket: set XDG_RUNTIME_DIR to a short path")
+    return path
+
+
+def command(
+    fleet: str, request: Request, on_progress: Callable[[Progress], None] = lambda _: None
+) -> Report:
+    """Have a command done, and wait for what came of it.
+
+    Whoever leaves before, as by Ctrl-C, abandons what is not ordered yet. Raises GroundError.
+    """
+    with _connected(fleet, to_line(request)) as answers:
+        for told in answers:
+            if isinstance(told, Report):
+                return told
+            if isinstance(told, Progress):
+                on_progress(told)
+    raise AssertionError("it ends by a report or an error")
+
+
+@contextmanager
+def subscribe(fleet: str) -> Iterator[Iterator[Told]]:
+    """What the ground process tells from now on. Raises GroundError, also when it ends."""
+    with _connected(fleet, SUBSCRIBE) as answers:
+        yield answers
+
+
+async def send(fleet: str, request: Request) -> Report:
+    """`command` for views."""
+    async with aclosing(_answers(fleet, to_line(request))) as answers:
+        async for told in answers:
+            if isinstance(told, Report):
+                return told
+    raise AssertionError("it ends by a report or an error")
+
+
+async def listen(fleet: str) -> AsyncIterator[Told]:
+    """`subscribe` for asyncio."""
+    async with aclosing(_answers(fleet, SUBSCRIBE)) as answers:
+        async for told in answers:
+            yield told
+
+
+@contextmanager
+def _connected(fleet: str, line: bytes) -> Iterator[Iterator[Told]]:
+    with socket.socket(socket.AF_UNIX) as connection:
+        try:
+            connection.connect(str(socket_path(fleet)))
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise _not_running(fleet) from None
+        with connection.makefile("rb") as lines:
+            yield _read(fleet, connection, line, lines.readline)
+
+
+def _read(
+    fleet: str, connection: socket.socket, line: bytes, readline: Callable[[], bytes]
+) -> Iterator[Told]:
+    try:
+        connection.sendall(line)
+        while answer := readline():
+            yield told_from_line(answer)
+    except ConnectionError:
+        pass
+    raise _ended(fleet)
+
+
+async def _answers(fleet: str, line: bytes) -> AsyncGenerator[Told]:
+    try:
+        reader, writer = await asyncio.open_unix_connection(socket_path(fleet), limit=MAX_LINE)
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise _not_running(fleet) from None
+    try:
+        writer.write(line)
+        await writer.drain()
+        while answer := await reader.readline():
+            yield told_from_line(answer)
+    except ConnectionError:
+        pass
+    finally:
+        writer.close()
+    raise _ended(fleet)
+
+
+def _own_folder() -> Path:
+    folder = Path(tempfile.gettempdir(), f"lpac-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise GroundError(f"{folder}: must be a folder of this user alone: remove it")
+    return folder
+
+
+def _not_running(fleet: str) -> GroundError:
+    return GroundError(f"no ground station runs for fleet {fleet} here: start `lpac ground`")
+
+
+def _ended(fleet: str) -> GroundError:
+    return GroundError(f"the ground station of fleet {fleet} has ended: start `lpac ground` again")

@@ -1,0 +1,182 @@
+"""A ground station as a real process, with a socket of its own."""
+
+import itertools
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+
+from ground import client
+from ground.protocol import Picture, Progress, Report, Request, Setup, Told, to_line, told_from_line
+from tests.conftest import ROOT
+
+# Nothing here takes so long unless it is broken.
+PATIENCE_S = 40.0
+
+
+class GroundStation:
+    """`lpac ground` in a process; commands and pictures by way of its socket."""
+
+    def __init__(self, fleet_toml: Path, runtime: Path, name: str, log: Path) -> None:
+        self.runtime = runtime
+        self.name = name
+        self.log = log
+        arguments = ["ground", "--fleet", str(fleet_toml), "--name", name]
+        self._command = [sys.executable, "-m", "cli.main", *arguments]
+        match = re.search(r'^fleet = "(.*)"', fleet_toml.read_text(), re.MULTILINE)
+        assert match is not None
+        self.fleet = match[1]
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it, and wait until it listens."""
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                self._command, env=_environment(self.runtime),
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+        self.wait_for(lambda _: True)
+
+    def end(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Send the signal; the exit code."""
+        assert self.process is not None
+        self.process.send_signal(number)
+        return self.process.wait(PATIENCE_S)
+
+    @property
+    def socket_path(self) -> Path:
+        return self.runtime / f"lpac-ground-{self.fleet}.sock"
+
+    def twin(self, runtime: Path | None = None) -> subprocess.CompletedProcess[str]:
+        """Another one of the same name, until it ends; by default as on another laptop."""
+        elsewhere = self.runtime / "twin"
+        elsewhere.mkdir(exist_ok=True)
+        return subprocess.run(
+            self._command, env=_environment(runtime or elsewhere),
+            capture_output=True, text=True, timeout=PATIENCE_S, check=False,
+        )  # fmt: skip
+
+    def kill(self) -> None:
+        """As by a power loss."""
+        assert self.process is not None
+        self.process.kill()
+        self.process.wait()
+
+    def command(
+        self, request: Request, on_progress: Callable[[Progress], None] = lambda _: None
+    ) -> Report:
+        with self._here():
+            return client.command(self.fleet, request, on_progress)
+
+    def begin(self, request: Request) -> "Pending":
+        """A command that runs beside the test; it has been taken when this returns."""
+        return Pending(self, request)
+
+    def wait_for(self, condition: Callable[[Picture], object]) -> Picture:
+        """The first picture that is so. Waits for a socket, too."""
+        end_s = time.monotonic() + PATIENCE_S
+        last: Picture | None = None
+        while time.monotonic() < end_s:
+            assert self.process is not None
+            assert self.process.poll() is None, self.log.read_text()
+            try:
+                with self._here(), client.subscribe(self.fleet) as told:
+                    for last in (t for t in told if isinstance(t, Picture)):
+                        if condition(last):
+                            return last
+                        if time.monotonic() > end_s:
+                            break
+            except client.GroundError:
+                time.sleep(0.02)
+        raise AssertionError(f"{last}\n{self.log.read_text()}")
+
+    def told(self) -> list[Told]:
+        """What a new subscriber is told first, up to a picture."""
+        with self._here(), client.subscribe(self.fleet) as told:
+            return [*itertools.takewhile(lambda t: not isinstance(t, Picture), told)]
+
+    def setup(self) -> Setup:
+        """The fleet as it is now."""
+        return next(told for told in self.told() if isinstance(told, Setup))
+
+    def subscribed(self) -> Iterator[Told]:
+        """All that a subscriber is told."""
+        with ExitStack() as stack:
+            with self._here():
+                told = stack.enter_context(client.subscribe(self.fleet))
+            yield from told
+
+    @contextmanager
+    def _here(self) -> Iterator[None]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XDG_RUNTIME_DIR", str(self.runtime))
+            yield
+
+
+def _environment(runtime: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(runtime)}
+
+
+class Pending:
+    """A command that runs beside the test."""
+
+    def __init__(self, station: GroundStation, request: Request) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(PATIENCE_S)
+        self._socket.connect(str(station.socket_path))
+        self._socket.sendall(to_line(request))
+        self._lines = self._socket.makefile("rb")
+
+    def progress(self, of: str) -> Progress:
+        """The next of one robot."""
+        for told in self._told():
+            if isinstance(told, Progress) and told.robot == of:
+                return told
+        raise AssertionError("it has ended")
+
+    def report(self) -> Report:
+        """What came of it."""
+        report = next(told for told in self._told() if isinstance(told, Report))
+        self.leave()
+        return report
+
+    def leave(self) -> None:
+        """As by Ctrl-C."""
+        self._lines.close()
+        self._socket.close()
+
+    def _told(self) -> Iterator[Told]:
+        return map(told_from_line, self._lines)
+
+
+class NewStation(Protocol):
+    """Starts a station: whoever has another name has another socket, as on another laptop."""
+
+    def __call__(self, fleet_toml: Path, name: str = ...) -> GroundStation: ...
+
+
+@pytest.fixture
+def new_station(tmp_path: Path) -> Iterator[NewStation]:
+    """They are killed in the end, if they still run."""
+    # A socket's path must be short.
+    with tempfile.TemporaryDirectory(prefix="lpac-") as folder, ExitStack() as stack:
+
+        def start(fleet_toml: Path, name: str = "alice") -> GroundStation:
+            runtime = Path(folder, name)
+            runtime.mkdir(exist_ok=True)
+            station = GroundStation(fleet_toml, runtime, name, tmp_path / f"{name}.log")
+            stack.callback(station.kill)
+            station.start()
+            return station
+
+        yield start

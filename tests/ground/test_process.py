@@ -1,0 +1,288 @@
+"""`lpac ground` as a real process, over real zenoh, with pretended robots."""
+
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from edge.core.mission import FlightState, world_id
+from ground import client
+from ground.protocol import (
+    Again,
+    Calm,
+    Command,
+    Enable,
+    Event,
+    Explored,
+    Give,
+    Picture,
+    Report,
+    Result,
+    Resume,
+    SetOrigin,
+    SetWorld,
+    Start,
+    Takeoff,
+)
+from tests.ground.conftest import GroundStation, NewStation
+from tests.ground.pretend import ORIGIN, PretendedFleet, pretended
+
+_S = FlightState
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[PretendedFleet]:
+    """Three robots r0, r1, r2, and r3, a spare."""
+    with pretended(tmp_path, 3, spares=1) as running:
+        yield running
+
+
+def everywhere(picture: Picture, state: FlightState, count: int = 3) -> bool:
+    return all(r.status and r.status.state is state for r in picture.robots[:count])
+
+
+def obeying(picture: Picture, operator: str) -> bool:
+    return all(r.status and r.status.operator == operator for r in picture.robots[:3])
+
+
+def done(report: Report) -> Report:
+    assert report.done, report
+    return report
+
+
+def make_ready(station: GroundStation) -> None:
+    done(station.command(SetOrigin(ORIGIN)))
+    done(station.command(Enable()))
+
+
+def fly(station: GroundStation) -> None:
+    make_ready(station)
+    done(station.command(Takeoff(interval_s=0.0)))
+    done(station.command(Start()))
+
+
+def refusals(report: Report) -> dict[str, str]:
+    return {result.robot: result.text for result in report.results if not result.done}
+
+
+def test_a_whole_flight(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    assert "no mission origin" in station.command(Takeoff()).problem
+    make_ready(station)
+    progress: list[str] = []
+    report = station.command(Takeoff(interval_s=0.1), lambda p: progress.append(p.robot))
+    assert done(report).results[0] == Result("r0", True, "at its height, 4 m")
+    assert list(dict.fromkeys(progress)) == ["r2", "r1", "r0"], "the highest first"
+    done(station.command(Start()))
+    done(station.command(Calm("hold")))
+    done(station.command(Resume()))
+    assert everywhere(station.wait_for(lambda p: everywhere(p, _S.MISSION)), _S.MISSION)
+    assert "are armed" in station.command(SetWorld("Uniform 3 1 0 0 9 0 9 9", "w.env")).problem
+    done(station.command(Give("pilot", ("r1",))))
+    done(station.command(Give("rejoin", ("r1",))))
+    done(station.command(Calm("return", wait=True)))
+    done(station.command(Again()))
+    # What brought them down does not keep them there.
+    done(station.command(Takeoff(interval_s=0.0)))
+    done(station.command(Calm("land", wait=True)))
+    picture = station.wait_for(lambda p: p.ground is not None)
+    assert picture.ground is not None
+    assert picture.ground.trial == "t2"
+
+
+def test_who_joins_late_has_the_state(tmp_path: Path, new_station: NewStation) -> None:
+    text = "CircularBND 100 100 20 5\n"
+    with pretended(tmp_path, 3, absent=[2]) as fleet:
+        station = new_station(fleet.fleet_toml)
+        report = station.command(SetOrigin(ORIGIN))
+        assert refusals(report) == {"r2": "not heard"}
+        assert refusals(station.command(SetWorld(text, "w.env"))) == {"r2": "not heard"}
+        fleet.join(2)
+        station.wait_for(
+            lambda p: all(
+                r.status and r.status.origin == ORIGIN and r.status.world_id == world_id(text)
+                for r in p.robots
+            )
+        )
+
+
+def test_a_station_that_was_killed_goes_on_where_it_was(
+    fleet: PretendedFleet, new_station: NewStation
+) -> None:
+    text = "CircularBND 100 100 20 5\n"
+    for robot in fleet.robots:
+        robot.takeoff_s = 3.0
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    done(station.command(SetWorld(text, "w.env")))
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    takeoff.progress("r2")
+    station.wait_for(lambda p: p.robots[2].status and p.robots[2].status.state is _S.TAKEOFF)
+    station.kill()
+    takeoff.leave()
+    station.start()
+    picture = station.wait_for(lambda p: p.ground is not None)
+    assert picture.ground is not None
+    assert picture.ground.origin == ORIGIN
+    assert picture.ground.enabled
+    # Nothing half done: what had taken off comes to hold, and nothing else takes off.
+    station.wait_for(lambda p: p.robots[2].status and p.robots[2].status.state is _S.HOLD)
+    assert all(robot.state is _S.PREFLIGHT for robot in fleet.robots[:2])
+    assert station.setup().world == text
+    done(station.command(Takeoff(interval_s=0.0)))
+    done(station.command(Start()))
+
+
+def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
+    alice = new_station(fleet.fleet_toml)
+    fly(alice)
+    bob = new_station(fleet.fleet_toml, "bob")
+    assert bob.wait_for(lambda p: p.ground is not None).commander == "alice"
+    for request in (Calm("land"), Start(), Again(), Give("disarm", ("r0",))):
+        assert bob.command(request).problem == (
+            "alice commands the fleet: `lpac mission command` takes over"
+        )
+    # Anybody may hold.
+    done(bob.command(Calm("hold")))
+    picture = alice.wait_for(lambda p: p.ground and p.ground.calm == "hold")
+    assert picture.commander == "alice"
+    assert picture.ground is not None
+    assert picture.ground.calm_by == "bob"
+    assert "hold is commanded by bob" in alice.command(Start()).problem
+    done(alice.command(Resume()))
+    assert everywhere(bob.wait_for(lambda p: everywhere(p, _S.MISSION)), _S.MISSION)
+    # Taking over, on purpose, in flight.
+    done(bob.command(Command()))
+    assert everywhere(alice.wait_for(lambda p: p.commander == "bob"), _S.MISSION)
+    assert "bob commands the fleet" in alice.command(Calm("return")).problem
+    # Killing is everybody's, too.
+    done(alice.command(Give("kill", ("r0",))))
+    # With the commander gone, a hold commands.
+    bob.kill()
+    alice.wait_for(lambda p: p.commander_age_s > 2.0)
+    done(alice.command(Calm("hold", robots=("r1", "r2"))))
+    alice.wait_for(lambda p: p.commander == "alice")
+
+
+def test_two_stations_of_one_name(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    second = station.twin()
+    assert second.returncode == 1
+    assert "another ground station commands this fleet as alice" in second.stderr
+    # Nor is there a second one of the same user.
+    second = station.twin(station.runtime)
+    assert second.returncode == 1
+    assert second.stderr == (f"lpac: `lpac ground` already runs for fleet {fleet.name} here\n")
+    assert station.wait_for(lambda p: obeying(p, "alice")).commander == "alice"
+
+
+def test_another_fleet_is_not_reached(fleet: PretendedFleet, new_station: NewStation) -> None:
+    text = fleet.fleet_toml.read_text()
+    other = fleet.fleet_toml.with_name("other.toml")
+    other.write_text(text.replace(fleet.name, f"{fleet.name}x"))
+    station = new_station(other)
+    report = station.command(SetOrigin(ORIGIN))
+    assert refusals(report) == dict.fromkeys(("r0", "r1", "r2"), "not heard")
+    assert refusals(station.command(Give("kill", ("r0",)))) == {"r0": "not heard"}
+    assert all(robot.ground is None for robot in fleet.robots)
+
+
+def test_mistakes(fleet: PretendedFleet, new_station: NewStation) -> None:
+    with pytest.raises(client.GroundError, match="no ground station runs for fleet"):
+        client.command(fleet.name, Start())
+    station = new_station(fleet.fleet_toml)
+    assert station.command(Start(robots=("r7",))).problem == (
+        "robot 'r7' is unknown; known are r0, r1, r2, r3"
+    )
+    assert "no robot is named" in station.command(Give("kill", ())).problem
+    make_ready(station)
+    fleet.robots[1].refuses = "the battery is low: 20 %"
+    report = station.command(Takeoff(interval_s=0.0))
+    assert refusals(report) == {"r1": "not ready: the battery is low: 20 %"}
+    # A spare does not fly by default, but has the state.
+    assert fleet.robots[3].state is _S.PREFLIGHT
+
+
+def test_lines_that_are_no_commands(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    for line in (
+        b"", b"\n", b"{}\n", b"[" * 100_000 + b"\n", b'{"takeoff": {"interval_s": "x"}}\n',
+        b"\xff\xfe\n", b'{"picture": {}}\n', b"subscribe", b"x" * 1000,
+    ):  # fmt: skip
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(station.socket_path))
+            connection.sendall(line)
+            connection.shutdown(socket.SHUT_WR)
+            with connection.makefile("rb") as answers:
+                answers.readline()
+    make_ready(station)
+
+
+def test_who_leaves_abandons_what_is_not_ordered(
+    fleet: PretendedFleet, new_station: NewStation
+) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    takeoff.progress("r2")
+    takeoff.leave()
+    station.wait_for(lambda p: not p.running and fleet.robots[2].state is _S.HOLD)
+    assert [robot.state for robot in fleet.robots[:2]] == [_S.PREFLIGHT] * 2
+    # A hold ends a takeoff, too, and then land is just as quick.
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    takeoff.progress("r1")
+    done(station.command(Calm("hold")))
+    assert refusals(takeoff.report())["r0"] == "abandoned: hold"
+    done(station.command(Calm("land", wait=True)))
+
+
+def test_two_programs_of_one_robot(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    fleet.duplicate(1)
+    station.wait_for(lambda p: p.robots[1].duplicate)
+    assert refusals(station.command(Takeoff(interval_s=0.0))) == {
+        "r1": "two programs say that they are this robot"
+    }
+
+
+def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    assert station.end(signal.SIGINT) == 0
+    station.start()
+    fly(station)
+    assert station.process is not None
+    station.process.send_signal(signal.SIGINT)
+    station.wait_for(lambda _: "hold after 3 s" in station.log.read_text())
+    assert station.end(signal.SIGINT) == 0
+    assert not station.socket_path.exists()
+    station.start()
+    assert station.end(signal.SIGTERM) == 0
+    station.start()
+    # What is left of a station that was killed is in nobody's way.
+    station.kill()
+    assert station.socket_path.exists()
+    station.start()
+    subscribed = station.subscribed()
+    next(subscribed)
+    station.kill()
+    with pytest.raises(client.GroundError, match="has ended"):
+        list(subscribed)
+
+
+def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
+    with pretended(tmp_path, 30) as fleet:
+        station = new_station(fleet.fleet_toml)
+        station.wait_for(lambda p: all(robot.fresh for robot in p.robots))
+        # It never reads.
+        with socket.socket(socket.AF_UNIX) as late:
+            late.connect(str(station.socket_path))
+            late.sendall(b"subscribe\n")
+            fly(station)
+            done(station.command(Calm("hold")))
+        told = station.told()
+        assert {t.robot for t in told if isinstance(t, Explored)} == set(station.setup().robots)
+        assert any(isinstance(t, Event) and t.kind == "result" for t in told)
