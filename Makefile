@@ -5,11 +5,12 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup test lint bench export image lock deploy start stop status fleet-demo clean
+.PHONY: help demo fly setup test lint bench export image lock deploy start stop status fleet-demo screenshots \
+	clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
 
 demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
 	.venv/bin/lpac demo --out out/demo
@@ -61,6 +62,9 @@ deploy start stop status:
 fleet-demo: .venv/sim .venv/fleet ## three robot computers on this machine to try it on, until Ctrl-C (root)
 	@mkdir -p out
 	$(if $(filter-out 0,$(shell id -u)),sudo) .venv/bin/lpac hosts -n 3 --out out/fleet-demo
+
+screenshots: .venv/test ## the README's pictures of ground control, from a simulated flight (chromium): docs
+	PATH="$(CURDIR)/.venv/bin:$$PATH" docs/screenshots.sh
 
 clean: ## remove .venv and everything made
 	rm -rf .venv out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

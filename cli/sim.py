@@ -2,6 +2,7 @@
 
 import gc
 import json
+import shlex
 import signal
 import tempfile
 import time
@@ -10,7 +11,7 @@ from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from sim.fleet import Fleet, FleetScenario
     from sim.operator import Statuses
 
+DEFAULT_OUT = Path("out/sim")
 DEFAULT_BUNDLE = Path(__file__).resolve().parents[1] / "policies" / "lpac_l2_k3_n10_512"
 
 
@@ -90,7 +92,11 @@ def sim(
     ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the flight, its world, figure and flight logs.")
+        Path | None,
+        typer.Option(
+            help="Folder for the flight, its world, figure and flight logs; with --no-script "
+            f"{DEFAULT_OUT} if not given."
+        ),
     ] = None,
 ) -> None:
     """Fly a swarm over an unknown world and print how well it covers it."""
@@ -111,7 +117,10 @@ def sim(
         )
         if vehicle is Vehicle.PX4 and px4 is None:
             raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
-        _launch(fleet_scenario, bundle, px4, script, as_json, out)
+        if not script:
+            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT)
+            return
+        _launch(fleet_scenario, bundle, px4, as_json, out)
         return
     from edge.core.frames import ModelScale
     from sim.experiment import FIELD_SCALE, Scenario
@@ -201,26 +210,17 @@ def _require_options_of(context: typer.Context, vehicle: Vehicle) -> None:
 
 
 def _launch(
-    scenario: "FleetScenario",
-    bundle: Path,
-    px4: Path | None,
-    script: bool,
-    as_json: bool,
-    out: Path | None,
+    scenario: "FleetScenario", bundle: Path, px4: Path | None, as_json: bool, out: Path | None
 ) -> None:
     """Run a fleet of processes; exit code 1 if its flight did not end as it should."""
     from sim.fleet import Fleet
+    from sim.fleet_flight import fly, summary_lines
 
     # Whoever stops this program means the fleet too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
         fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
         with fleet:
-            if not script:
-                _wait_for_ground(fleet, show)
-                return
-            from sim.fleet_flight import fly, summary_lines
-
             flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
     if out:
         from sim.fleet_report import write_fleet_flight
@@ -237,18 +237,47 @@ def _launch(
         raise typer.Exit(1)
 
 
-def _wait_for_ground(fleet: "Fleet", show: Callable[[str, "Statuses"], None]) -> None:
-    typer.echo(
-        f"fleet {fleet.name}, robots 0 to {len(fleet.robots) - 1}; connect a ground to "
-        f"{', '.join(fleet.endpoints)}; Ctrl-C ends all"
-    )
+def _serve(scenario: "FleetScenario", bundle: Path, px4: Path | None, out: Path) -> None:
+    """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
+    from sim.fleet import Fleet
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        while True:
-            fleet.require_running()
-            show("no script", fleet.operator.statuses())
-            time.sleep(0.2)
+        with _live() as (show, say):
+            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say)
+            with fleet:
+                while not fleet.operator.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
+                    fleet.require_running()
+                    show("programs start", fleet.operator.statuses())
+                typer.echo(
+                    f"{len(fleet.robots)} robots run until Ctrl-C; in a second terminal:\n\n"
+                    f"  export LPAC_FLEET={shlex.quote(str(out / fleet.fleet_toml.name))}\n"
+                    "  lpac ground\n"
+                )
+                try:
+                    _watch_over(fleet, show, say)
+                finally:
+                    # The robots' programs must be ended, whoever is in a hurry.
+                    for number in (signal.SIGINT, signal.SIGTERM):
+                        signal.signal(number, signal.SIG_IGN)
     except KeyboardInterrupt:
-        return
+        typer.echo("ended")
+
+
+def _watch_over(
+    fleet: "Fleet", show: Callable[[str, "Statuses"], None], say: Callable[[str], None]
+) -> None:
+    """Say once of each robot that its program has ended; raises FleetError if all have."""
+    from sim.fleet import FleetError
+
+    running = list(fleet.robots)
+    while running:
+        for robot in [robot for robot in running if not robot.running]:
+            running.remove(robot)
+            say(f"the program of {robot.name} has ended, {robot.ending()}")
+        show(f"fleet {fleet.name}", fleet.operator.statuses())
+        time.sleep(0.2)
+    raise FleetError("the programs of all robots have ended")
 
 
 @contextmanager
@@ -287,12 +316,13 @@ def _table(title: str, statuses: "Statuses") -> "Table":
         ("robot", ""), ("state", "bold"), ("x", ""), ("y", ""), ("height", ""), ("m/s", ""),
         ("hears", ""), ("battery", ""), ("", ""),
     ):  # fmt: skip
-        table.add_column(heading, style=style, justify="left" if not heading else "right")
+        justify: Literal["left", "right"] = "right" if heading else "left"
+        table.add_column(heading, style=style, justify=justify, no_wrap=True)
     for robot, status in sorted(statuses.items()):
         position_m = status.position_m or ()
         speed_m_s = sum(v * v for v in (status.velocity_m_s or ())[:2]) ** 0.5
         table.add_row(
-            str(robot),
+            f"r{robot}",
             status.state.value,
             *(f"{metres:.1f}" for metres in position_m),
             *("" for _ in range(3 - len(position_m))),

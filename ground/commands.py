@@ -256,7 +256,11 @@ class Running:
                 return None
             return f"slot {place.slot}, {height_m:g} m high"
 
-        sequence = self._station.change(places={str(r): place for r, place in places.items()})
+        before = {} if self._station.state is None else self._station.state.places
+        taken = {place.slot for place in places.values()}
+        others = {robot: place for robot, place in before.items() if place.slot not in taken}
+        given = {str(robot): place for robot, place in places.items()}
+        sequence = self._station.change(places=others | given)
         yield from self._take_up(sequence, effect)
 
     def _check_places(self, request: SetPlaces) -> None:

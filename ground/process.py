@@ -214,7 +214,7 @@ class GroundProcess:
 
     def _recall_world(self) -> None:
         with suppress(OSError, UnicodeDecodeError):
-            self._station.remember_world(self._world_path.read_text())
+            self._station.remember_world(self._world_path.read_text("utf-8-sig"))
 
     # Clients
 

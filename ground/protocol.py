@@ -71,7 +71,10 @@ class SetWorld:
 
 @dataclass(frozen=True, slots=True)
 class SetPlaces:
-    """Who flies and lands where, by the robots' names. Refused while one of them is armed."""
+    """Who flies and lands where, by the robots' names; all others stay where they are.
+
+    Who sat in one of these slots sits in none. Refused while one of the robots is armed.
+    """
 
     places: dict[str, Place]
 

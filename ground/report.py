@@ -144,13 +144,13 @@ class _Worlds:
         self, logs: Logs, folders: Iterable[Path], wanted: Wanted, notes: list[str]
     ) -> None:
         self._notes = notes
-        self._given = None if wanted.world is None else wanted.world.read_text()
+        self._given = None if wanted.world is None else wanted.world.read_text("utf-8-sig")
         self._texts = {setup.world_id: setup.world for setup in logs.setups if setup.world}
         paths = [path for folder in folders for path in sorted(folder.rglob("*.env"))]
         paths += [Path(_policy(m.configuration).get("world", "")) for m in logs.metadata]
         for path in dict.fromkeys(paths):
             if path.is_file():
-                text = path.read_text()
+                text = path.read_text("utf-8-sig")
                 self._texts.setdefault(id_of(text), text)
         self._sizes = _sizes(logs, wanted.bundle, notes)
         self.sensor_size = self._sizes.sensor_size

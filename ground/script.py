@@ -229,7 +229,7 @@ def load_script(path: Path, sites: Sites) -> Script:
 def read_world(path: Path) -> str:
     """The text of a world file. Raises ConfigError that names the file and what is wrong in it."""
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

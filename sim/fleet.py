@@ -45,6 +45,7 @@ _FENCE_BEYOND_FIELD_M = 2.0
 _FENCE_BUFFER_M = 1.5
 _PAD_INSIDE_FIELD_M = 2.0
 _PAD_TRIALS = 20_000
+_ON_STOP = "land"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,11 +90,12 @@ class Usage(NamedTuple):
 class RobotProcess:
     """One `lpac robot run`; `folder` holds robot.toml, what it prints (robot.log), its flight log.
 
-    `running` tells whether it has not ended yet.
+    `name` is what people call the robot; `running` tells whether it has not ended yet.
     """
 
     def __init__(self, robot_id: int, folder: Path) -> None:
         self.robot_id = robot_id
+        self.name = f"r{robot_id}"
         self.folder = folder
         self._process: subprocess.Popen[bytes] | None = None
         self._first_start_unix_s = math.inf
@@ -148,11 +150,15 @@ class RobotProcess:
             if path.stat().st_mtime >= self._first_start_unix_s
         )
 
-    def last_words(self) -> str:
-        """The last line that the program printed."""
+    def ending(self) -> str:
+        """How the program has ended, in words; with the last line that it printed, if by itself."""
+        code = self.wait(0.0)
+        if code is not None and code < 0:
+            return f"by {signal.Signals(-code).name}"
         log = self.folder / "robot.log"
         lines = log.read_text(errors="replace").split("\n") if log.exists() else []
-        return next((line for line in reversed(lines) if line.strip()), "it printed nothing")
+        last = next((line for line in reversed(lines) if line.strip()), "it printed nothing")
+        return f"exit code {code}: {last}"
 
 
 def process_usage(pid: int) -> Usage:
@@ -173,6 +179,7 @@ class Fleet:
     themselves, for whoever wants to do something to them; None where they are real PX4.
     `pads_m` (N, 2) is where they really stand, `landing_points_m` (N, 2) where they return to, both
     in the mission frame. `endpoints` are the robots' zenoh addresses, `name` the fleet's.
+    `fleet_toml` describes the fleet to `lpac ground`, as if its robots were in the field.
     """
 
     def __init__(
@@ -184,7 +191,7 @@ class Fleet:
         px4_build: Path | None = None,
         say: Say = lambda _: None,
     ) -> None:
-        """Prepare the fleet in `folder`: world, and a folder for each robot. Starts nothing.
+        """Prepare the fleet in `folder`: fleet.toml, world, a folder per robot. Starts nothing.
 
         With `px4_build` the vehicles are real PX4s of that build folder.
 
@@ -198,6 +205,7 @@ class Fleet:
         self.scenario = scenario
         self._bundle_path = bundle_path.resolve()
         self.folder = folder.resolve()
+        self.fleet_toml = self.folder / "fleet.toml"
         self.field_m = perception.world_size / FIELD_SCALE.env_scale
         self.max_speed_m_s = training.max_speed * FIELD_SCALE.velocity_scale
         self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
@@ -259,7 +267,7 @@ class Fleet:
         for robot in self.robots:
             if not robot.running:
                 raise FleetError(
-                    f"the program of robot {robot.robot_id} has ended: {robot.last_words()}"
+                    f"the program of robot {robot.robot_id} has ended, {robot.ending()}"
                 )
 
     def true_positions_m(self) -> F64:
@@ -334,7 +342,7 @@ class Fleet:
         north_m, east_m, _ = self.to_mission.mission_to_local(np.array([*place_m, 0.0])).tolist()
         return north_m, east_m
 
-    # What the robots read
+    # What the robots and the ground read
 
     def _write_files(self) -> None:
         assert self.features is not None
@@ -344,29 +352,77 @@ class Fleet:
             robot.folder.mkdir(parents=True, exist_ok=True)
             config = _toml(self._config(robot.robot_id, autopilot))
             (robot.folder / "robot.toml").write_text(config)
+        self.fleet_toml.write_text(
+            "# Made by `lpac sim`: the robots are programs of this machine, without image or SSH.\n"
+            + _toml(self._description())
+        )
 
     def _config(self, robot: int, autopilot: Autopilot) -> dict[str, object]:
-        return {
-            "fleet": self.name,
-            "robot_id": robot,
-            "on_stop": "land",
-            "policy": {
-                "bundle": str(self._bundle_path),
-                "world": "../../world.env",
-                "env_scale": FIELD_SCALE.env_scale,
-                "velocity_scale": FIELD_SCALE.velocity_scale,
-            },
+        """robot.toml."""
+        own: dict[str, dict[str, object]] = {
+            "policy": {"bundle": str(self._bundle_path), "world": "../../world.env"},
             "autopilot": {"url": autopilot.url, "system_id": autopilot.system_id},
             "link": {
                 "listen": [self.endpoints[robot]],
                 "connect": list(self.endpoints[:robot]),
             },
-            "flight": {
-                "slot": robot,
-                "base_height_m": _BASE_HEIGHT_M,
-                "slot_spacing_m": _SLOT_SPACING_M,
-                "landing_point_m": [round(c, 3) for c in self.landing_points_m[robot].tolist()],
+            "flight": {"slot": robot, "landing_point_m": self._pad_seen_m(robot)},
+        }
+        shared = self._shared()
+        return {
+            "fleet": self.name,
+            "robot_id": robot,
+            "on_stop": _ON_STOP,
+            **{name: shared.get(name, {}) | own.get(name, {}) for name in {**own, **shared}},
+        }
+
+    def _description(self) -> dict[str, object]:
+        """fleet.toml. No computer has such a host name, so that nobody deploys to this machine."""
+        robots = {
+            f"robots.{robot.name}": {
+                "host": f"{robot.name}.invalid",
+                "address": "127.0.0.1",
+                "zenoh_port": int(endpoint.rpartition(":")[2]),
+                "robot_id": robot.robot_id,
+                "system_id": autopilot.system_id,
+                "mavlink_url": autopilot.url,
+            }
+            for robot, endpoint, autopilot in zip(
+                self.robots, self.endpoints, self.vehicles.autopilots, strict=True
+            )
+        }
+        slots = [
+            {
+                "robot": robot.name,
+                "height": robot.robot_id,
+                "pad_m": self._pad_seen_m(robot.robot_id),
+                "landing_point_m": self._pad_seen_m(robot.robot_id),
+            }
+            for robot in self.robots
+        ]
+        return {
+            "fleet": self.name,
+            "image": "none",
+            "bundle": str(self._bundle_path),
+            "world": "world.env",
+            "robot": {"on_stop": _ON_STOP},
+            **{f"robot.{name}": table for name, table in self._shared().items()},
+            **robots,
+            "slots": slots,
+        }
+
+    def _pad_seen_m(self, robot: int) -> list[float]:
+        """Where a robot takes its pad to be: mission frame, m."""
+        return [round(c, 3) for c in self.landing_points_m[robot].tolist()]
+
+    def _shared(self) -> dict[str, dict[str, object]]:
+        """The tables of robot.toml, as far as all robots have the same."""
+        return {
+            "policy": {
+                "env_scale": FIELD_SCALE.env_scale,
+                "velocity_scale": FIELD_SCALE.velocity_scale,
             },
+            "flight": {"base_height_m": _BASE_HEIGHT_M, "slot_spacing_m": _SLOT_SPACING_M},
             "fence": {
                 "vertices_m": [list(vertex) for vertex in self.fence.vertices_m],
                 "buffer_m": self.fence.buffer_m,
@@ -398,9 +454,15 @@ def _apart(place_m: F64, others_m: Sequence[F64]) -> bool:
 
 
 def _toml(config: Mapping[str, object]) -> str:
-    """TOML of plain values, and of tables of them; JSON's values are TOML's too."""
-    lines = [f"{k} = {json.dumps(v)}" for k, v in config.items() if not isinstance(v, dict)]
-    for name, table in config.items():
-        if isinstance(table, dict):
-            lines += ["", f"[{name}]", *(f"{k} = {json.dumps(v)}" for k, v in table.items())]
-    return "\n".join(lines) + "\n"
+    """TOML of plain values, of tables and of lists of tables; JSON's values are TOML's too."""
+    top, tables = [], []
+    for name, value in config.items():
+        if isinstance(value, dict):
+            tables.append((f"[{name}]", value))
+        elif isinstance(value, list):
+            tables += [(f"[[{name}]]", entry) for entry in value]
+        else:
+            top.append(f"{name} = {json.dumps(value)}")
+    for heading, table in tables:
+        top += ["", heading, *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
+    return "\n".join(top) + "\n"

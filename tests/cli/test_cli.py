@@ -3,13 +3,16 @@
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 
+from cli.main import app
 from edge.core.world import parse_world
 from tests.conftest import ROOT, SHIPPED
 
@@ -33,8 +36,24 @@ def error_line(result: subprocess.CompletedProcess[str]) -> str:
 def test_help_names_the_commands() -> None:
     result = lpac("--help")
     assert result.returncode == 0
-    for command in ("export", "bundle", "sim", "demo", "robot", "replay"):
+    for command in (
+        "export", "bundle", "sim", "demo", "robot", "replay", "log", "fleet", "ground", "mission",
+        "site", "watch", "map", "record", "report",
+    ):  # fmt: skip
         assert command in result.stdout
+
+
+def test_every_command_that_people_are_pointed_to_exists() -> None:
+    """In the documents, and in what programs say."""
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.*")]
+    parts = ("cli", "edge", "fleet", "ground", "sim")
+    programs = [path for part in parts for path in (ROOT / part).rglob("*.py")]
+    for path in [*(page for page in pages if page.suffix in (".md", ".toml")), *programs]:
+        for name, sub in re.findall(r"`lpac ([a-z]+)(?: ([a-z]+))?", path.read_text()):
+            assert name in commands, (path, name)
+            below = getattr(commands[name], "commands", {})
+            assert not below or not sub or sub in below, (path, name, sub)
 
 
 def test_bundle_info_for_people_and_for_scripts() -> None:

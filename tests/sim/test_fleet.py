@@ -1,11 +1,14 @@
 """A fleet of real robot programs on simulated vehicles, from takeoff to landing."""
 
+import contextlib
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,6 +23,7 @@ from edge.core.mission import FlightState
 from edge.core.world import parse_world
 from edge.runtime.bundle import Bundle
 from edge.runtime.config import load_config
+from fleet.config import load_fleet
 from sim.experiment import Scenario
 from sim.experiment import fly as fly_in_process
 from sim.fleet import MIN_APART_M, Fleet, FleetError, FleetScenario
@@ -197,14 +201,60 @@ def test_ctrl_c_lands_all() -> None:
     assert flight["problem"] == "stopped by Ctrl-C" and flight["all_landed"]
 
 
-def test_without_the_script_another_ground_commands() -> None:
-    with launched("-n", 1, "--no-script") as process:
-        fleet, endpoint = read_until(process.stdout, r"fleet (\S+), .* ground to (\S+);").groups()
-        with Operator(fleet=fleet, connect=[endpoint]) as operator:
-            assert operator.wait_for(lambda statuses: 0 in statuses, 60.0)
+def test_without_the_script_it_waits_for_a_ground(tmp_path: Path) -> None:
+    """What it says to type next is right; it outlives a robot's program, and ends by Ctrl-C."""
+    out = tmp_path / "a fleet"
+    with launched("-n", 2, "--no-script", "--out", out) as process:
+        (setting,) = read_until(process.stdout, r"^  export (\S.*)$").groups()
+        read_until(process.stdout, "^  lpac ground$")
+        (setting,) = shlex.split(setting)
+        assert setting == f"LPAC_FLEET={out / 'fleet.toml'}"
+        config = load_fleet(out / "fleet.toml")
+        endpoints = [f"tcp/{r.address}:{r.zenoh_port}" for r in config.robots.values()]
+        with Operator(fleet=config.fleet, connect=endpoints) as operator:
+            assert operator.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
+            # It only listens: nobody commands.
+            assert {status.operator for status in operator.statuses().values()} == {""}
+            assert len(list((out / "robots" / "1" / "logs").glob("*.mcap"))) == 1
+            os.kill(pid_of_robot(out / "robots" / "1"), signal.SIGKILL)
+            read_until(process.stderr, r"the program of r1 has ended, by SIGKILL$")
+            assert operator.wait_for(lambda statuses: set(statuses) == {0}, 20.0)
             process.send_signal(signal.SIGINT)
             assert process.wait(20.0) == 0
             assert operator.wait_for(lambda statuses: not statuses, 20.0)
+
+
+def pid_of_robot(folder: Path) -> int:
+    """The process that runs with the folder's robot.toml."""
+    config = str(folder / "robot.toml").encode()
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):  # It may end meanwhile.
+            found += [int(path.parent.name)] if config in path.read_bytes() else []
+    (pid,) = found
+    return pid
+
+
+@pytest.mark.parametrize("robots", [1, 20])
+def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -> None:
+    """The ground reads fleet.toml, the robots their robot.toml."""
+    fleet = Fleet(FleetScenario(robots=robots, seed=robots), tmp_path, SHIPPED)
+    config = load_fleet(fleet.fleet_toml)
+    assert config.bundle == SHIPPED and config.world == tmp_path / "world.env"
+    assert list(config.robots) == [f"r{i}" for i in range(robots)]
+    assert len({robot.host for robot in config.robots.values()}) == robots
+    for i, (name, slot) in enumerate(zip(config.robots, config.slots, strict=True)):
+        described = tomllib.loads(config.robot_toml(name))
+        robot = tomllib.loads((fleet.robots[i].folder / "robot.toml").read_text())
+        # Where a robot keeps its files is its own matter, and which of its addresses are open.
+        del described["log"]
+        for mapping in (described, robot):
+            del mapping["policy"]["bundle"], mapping["policy"]["world"]
+            mapping["link"]["listen"] = [e.rpartition(":")[2] for e in mapping["link"]["listen"]]
+        assert described == robot
+        assert slot.robot == name and slot.height == i
+        np.testing.assert_allclose(slot.pad_m, fleet.landing_points_m[i], atol=1e-3)
+        assert slot.landing_point_m == slot.pad_m
 
 
 @pytest.mark.parametrize(
