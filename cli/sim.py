@@ -276,6 +276,7 @@ def _watch_over(
             running.remove(robot)
             say(f"the program of {robot.name} has ended, {robot.ending()}")
         show(f"fleet {fleet.name}", fleet.operator.statuses())
+        fleet.forget()
         time.sleep(0.2)
     raise FleetError("the programs of all robots have ended")
 

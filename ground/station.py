@@ -11,14 +11,13 @@ the commander's own state with hold in it and the next sequence, until the comma
 import math
 import re
 from collections import Counter, deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import Literal, TypeVar
 
 from edge.core.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
-    STEERED,
     Calm,
     FlightState,
     GroundState,
@@ -27,6 +26,8 @@ from edge.core.mission import (
     OrderResult,
     Place,
     RobotStatus,
+    is_over_landing_point,
+    waiting_to_land,
     world_id,
 )
 from ground.heard import FRESH_S, HeardRobots
@@ -39,7 +40,6 @@ COMMANDER_SILENT_S = 2.0
 # ... also if robots say so, who hear what this station may not.
 _ROBOTS_HEAR_NOBODY_S = 1.0
 _OVERTAKEN_S = 1.0
-_OVER_LANDING_POINT_M = 1.5
 _EVENTS_KEPT = 200
 _AT_PLACE_M = 0.01
 
@@ -51,22 +51,6 @@ T = TypeVar("T")
 
 class NameTakenError(ValueError):
     """Another station has this one's name; the text says what to do."""
-
-
-def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:
-    """Who of those that `arrived` over their landing points must not land yet.
-
-    Landing leads through the heights of all lower robots: somebody still flies home there.
-    """
-    lowest_m = min(
-        (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
-        default=math.inf,
-    )
-    return {
-        robot
-        for robot, status in statuses.items()
-        if robot in arrived and status.state in STEERED and status.slot_height_m > lowest_m
-    }
 
 
 def is_down(status: RobotStatus) -> bool:
@@ -468,7 +452,7 @@ class Station:
         waiting = {
             robot
             for robot, status in self.statuses().items()
-            if state.robot_calm.get(str(robot)) == "hold" and _is_over_landing_point(status)
+            if state.robot_calm.get(str(robot)) == "hold" and is_over_landing_point(status)
         }
         return frozenset(asked | waiting) if asked else frozenset()
 
@@ -477,7 +461,7 @@ class Station:
         if not self._returning or self.state is None:
             return
         statuses = {r: s for r, s in self.statuses().items() if r in self._returning}
-        self._arrived |= {r for r, status in statuses.items() if _is_over_landing_point(status)}
+        self._arrived |= {r for r, status in statuses.items() if is_over_landing_point(status)}
         waiting = waiting_to_land(statuses, self._arrived)
         asked: dict[str, Calm] = {
             r: c for r, c in self.state.robot_calm.items() if int(r) not in self._returning
@@ -599,12 +583,6 @@ def _agreed(values: Iterable[T | None]) -> T | None:
 
 def _commonest(values: Iterable[str]) -> str | None:
     return next((value for value, _ in Counter(values).most_common(1)), None)
-
-
-def _is_over_landing_point(status: RobotStatus) -> bool:
-    if status.position_m is None:
-        return False
-    return math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
 
 
 def _is_at(status: RobotStatus, place: Place) -> bool:

@@ -270,6 +270,11 @@ class Fleet:
                     f"the program of robot {robot.robot_id} has ended, {robot.ending()}"
                 )
 
+    def forget(self) -> None:
+        """Keep nothing of the past, which only grows, and which a flight's figures alone need."""
+        self.operator.forget()
+        self.vehicles.forget()
+
     def true_positions_m(self) -> F64:
         """Where simulated vehicles really are: the mission frame, (N, 3)."""
         assert self.simulated is not None

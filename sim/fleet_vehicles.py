@@ -53,6 +53,9 @@ class Vehicles(Protocol):
     def tracks(self) -> tuple[Track, ...]:
         """What they did so far, each."""
 
+    def forget(self) -> None:
+        """Keep of each only where it is."""
+
     def lost_s(self) -> float:
         """By how much they fell behind real time, s."""
 
@@ -108,6 +111,12 @@ class SimulatedVehicles:
             )
             for truth in truths
         )
+
+    def forget(self) -> None:
+        """Keep of each only where it is."""
+        with self.stepped:
+            for vehicle in self.vehicles:
+                del vehicle.truth[:-1]
 
     def lost_s(self) -> float:
         """Time that this process was held up for, and that the vehicles left out."""

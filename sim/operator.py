@@ -20,7 +20,6 @@ from edge.adapters.zenoh_link import ZenohLink
 from edge.core.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
-    STEERED,
     Calm,
     FlightState,
     GroundState,
@@ -31,7 +30,9 @@ from edge.core.mission import (
     Place,
     RobotStatus,
     from_json,
+    is_over_landing_point,
     to_json,
+    waiting_to_land,
     world_id,
 )
 from edge.core.safety import Fence
@@ -126,6 +127,12 @@ class Operator:
         """Everything that a robot has said of itself, in order."""
         with self._changed:
             return tuple(self._heard.get(robot, ()))
+
+    def forget(self) -> None:
+        """Keep of each robot only what it said last."""
+        with self._changed:
+            for heard in self._heard.values():
+                del heard[:-1]
 
     def wait_for(self, condition: Callable[[Statuses], bool], timeout_s: float) -> bool:
         """Wait until `condition` holds of the statuses; False if that took too long."""
@@ -288,23 +295,6 @@ _START_AGAIN_S = 3.0
 # Until each robot has heard that the last one has taken off.
 _SETTLE_S = 1.0
 _EXPLAIN_AFTER_S = 8.0
-_OVER_LANDING_POINT_M = 1.5
-
-
-def waiting_to_land(statuses: Statuses, arrived: Collection[int]) -> set[int]:
-    """Who of those that `arrived` over their landing points must not land yet.
-
-    Landing leads through the heights of all lower robots: somebody still flies home there.
-    """
-    lowest_m = min(
-        (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
-        default=math.inf,
-    )
-    return {
-        robot
-        for robot, status in statuses.items()
-        if robot in arrived and status.state in STEERED and status.slot_height_m > lowest_m
-    }
 
 
 class ScriptError(RuntimeError):
@@ -477,10 +467,7 @@ class Script:
         """All fly home at their own heights; who is there waits until nobody flies below."""
         statuses = self._operator.statuses()
         self._over_landing_point |= {
-            robot
-            for robot, status in statuses.items()
-            if status.position_m is not None
-            and math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
+            robot for robot, status in statuses.items() if is_over_landing_point(status)
         }
         waiting = waiting_to_land(statuses, self._over_landing_point)
         self._operator.calm_each("return", dict.fromkeys(waiting, "hold"))

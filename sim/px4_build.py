@@ -121,6 +121,12 @@ class Px4Build:
             tracks.append(Track(np.array([place.time_s for place in places]), position_m, airborne))
         return tuple(tracks)
 
+    def forget(self) -> None:
+        """Keep of each only where it is."""
+        with self._places_lock:
+            for places in self._places:
+                del places[:-1]
+
     def lost_s(self) -> float:
         """Not known of PX4."""
         return 0.0

@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import json
 import math
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal, TypeVar
@@ -26,6 +27,7 @@ from edge.core.vehicle import Vector
 
 ORDER_LIFETIME_S = 10.0
 EXPLORED_CELLS = 64
+_OVER_LANDING_POINT_M = 1.5
 
 Bools = npt.NDArray[np.bool_]
 T = TypeVar("T")
@@ -235,6 +237,29 @@ class RobotStatus:
             value = getattr(self, name)
             if value is not None and len(value) != size:
                 raise ValueError(f"{name} = {list(value)}: must be {size} numbers")
+
+
+def is_over_landing_point(status: RobotStatus) -> bool:
+    """Whether the robot has come home, as far as it knows."""
+    if status.position_m is None:
+        return False
+    return math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
+
+
+def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:
+    """Who of those that `arrived` over their landing points must not land yet; robot ids.
+
+    Landing leads through the heights of all lower robots: somebody still flies home there.
+    """
+    lowest_m = min(
+        (s.slot_height_m for r, s in statuses.items() if s.state in STEERED and r not in arrived),
+        default=math.inf,
+    )
+    return {
+        robot
+        for robot, status in statuses.items()
+        if robot in arrived and status.state in STEERED and status.slot_height_m > lowest_m
+    }
 
 
 def world_id(text: str) -> str:

@@ -1,9 +1,12 @@
 """What ground and robots say to each other survives the way, and what is wrong is named."""
 
+import dataclasses
 import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge.core.mission import (
     FlightState,
@@ -18,6 +21,7 @@ from edge.core.mission import (
     explored_to_bytes,
     from_json,
     to_json,
+    waiting_to_land,
 )
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError
@@ -102,3 +106,34 @@ def test_an_origin_off_the_earth_is_named() -> None:
             b'{"sequence": 1, "operator": "a", "origin": '
             b'{"latitude_deg": 1.0, "longitude_deg": 2.0, "heading_deg": 360.0}}',
         )
+
+
+robots_in_the_air = st.dictionaries(
+    st.integers(0, 9),
+    st.tuples(
+        st.sampled_from(
+            [FlightState.HOLD, FlightState.RETURN, FlightState.LAND, FlightState.LANDED]
+        ),
+        st.booleans(),
+    ),
+    min_size=1,
+)
+
+
+@given(robots_in_the_air)
+def test_nobody_lands_through_the_height_of_one_who_flies_home(
+    robots: dict[int, tuple[FlightState, bool]],
+) -> None:
+    statuses = {
+        robot: dataclasses.replace(STATUS, robot_id=robot, state=state, slot_height_m=4.0 + robot)
+        for robot, (state, _) in robots.items()
+    }
+    arrived = {robot for robot, (_, there) in robots.items() if there}
+    waiting = waiting_to_land(statuses, arrived)
+    flying = {r for r, (s, _) in robots.items() if s in (FlightState.HOLD, FlightState.RETURN)}
+    for robot in flying & arrived:
+        others_below = any(other < robot for other in flying - arrived)
+        assert (robot in waiting) == others_below
+    assert waiting <= flying & arrived
+    # Somebody can always go on.
+    assert not flying or flying - waiting

@@ -33,7 +33,7 @@ from ground.protocol import (
     Start,
     Takeoff,
 )
-from ground.station import NameTakenError, Station, next_trial, waiting_to_land
+from ground.station import NameTakenError, Station, next_trial
 from tests.ground.pretend import BASE_HEIGHT_M, FENCE, ORIGIN, SLOT_SPACING_M, PretendedRobot
 
 _S = FlightState
@@ -708,13 +708,3 @@ def test_stations_agree_whatever_they_are_told(
     flying = {s for s in field.states() if s in (_S.MISSION, _S.RETURN, _S.TAKEOFF)}
     assert not flying
     assert field.stations[commander].commands
-
-
-def test_waiting_to_land() -> None:
-    robots = [Field(3).new_robot(i, 3) for i in range(3)]
-    for robot in robots:
-        robot._enter(_S.RETURN, "")
-    statuses = {robot.robot_id: robot.status(0.0) for robot in robots}
-    assert waiting_to_land(statuses, {1, 2}) == {1, 2}
-    assert waiting_to_land(statuses, {0, 2}) == {2}
-    assert waiting_to_land(statuses, {0, 1, 2}) == set()

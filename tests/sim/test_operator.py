@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from edge.adapters.zenoh_link import ZenohLink
 from edge.core.mission import (
@@ -25,7 +23,7 @@ from edge.core.mission import (
 )
 from edge.core.safety import Fence
 from sim.fleet_vehicles import free_ports
-from sim.operator import Operator, waiting_to_land
+from sim.operator import Operator
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
 STATUS = RobotStatus(
@@ -186,34 +184,3 @@ def test_a_silent_robot_is_no_longer_among_the_statuses() -> None:
         assert operator.wait_for(only_the_other, 15.0)
         assert len(operator.history(0)) >= 1
         assert not operator.wait_for(lambda statuses: 0 in statuses, 0.1)
-
-
-robots_in_the_air = st.dictionaries(
-    st.integers(0, 9),
-    st.tuples(
-        st.sampled_from(
-            [FlightState.HOLD, FlightState.RETURN, FlightState.LAND, FlightState.LANDED]
-        ),
-        st.booleans(),
-    ),
-    min_size=1,
-)
-
-
-@given(robots_in_the_air)
-def test_nobody_lands_through_the_height_of_one_who_flies_home(
-    robots: dict[int, tuple[FlightState, bool]],
-) -> None:
-    statuses = {
-        robot: dataclasses.replace(STATUS, robot_id=robot, state=state, slot_height_m=4.0 + robot)
-        for robot, (state, _) in robots.items()
-    }
-    arrived = {robot for robot, (_, there) in robots.items() if there}
-    waiting = waiting_to_land(statuses, arrived)
-    flying = {r for r, (s, _) in robots.items() if s in (FlightState.HOLD, FlightState.RETURN)}
-    for robot in flying & arrived:
-        others_below = any(other < robot for other in flying - arrived)
-        assert (robot in waiting) == others_below
-    assert waiting <= flying & arrived
-    # Somebody can always go on.
-    assert not flying or flying - waiting
