@@ -30,7 +30,7 @@ from ground.station import COMMANDER_SILENT_S, Station, is_down, next_trial
 
 _GATHER_S = 3.0
 # Until a robot has obeyed; then, until what it was told shows.
-_OBEY_S = 6.0
+_OBEY_S = 10.0
 _TAKE_UP_S = 3.0
 _CALM_S = 1.5
 # A world is long, and computed with.
@@ -168,7 +168,7 @@ class Running:
     # What is known of the robots
 
     def _status(self, name: str) -> RobotStatus | None:
-        return self._station.status(name)
+        return self._station.lately(name)
 
     def _heard(self) -> dict[str, RobotStatus]:
         """The open ones that are heard; the others have failed."""
@@ -318,6 +318,8 @@ class Running:
             for name, status in heard.items():
                 if is_down(status):
                     self._settle(name, "on the ground")
+                elif status.state in (_S.PILOT, _S.FAULT):
+                    self._fail([name], f"{status.state}: {status.reason}")
                 elif known.get(name) != status.reason:
                     known[name], changed_s = status.reason, station.now_s
                     self._say(name, f"{status.state}: {status.reason}")
@@ -416,6 +418,9 @@ class Running:
                 self._fail(waiting, f"not ordered: {failed[0]} failed")
                 waiting.clear()
             # The highest first: it climbs past nobody.
+            if waiting and station.status(waiting[-1]) is None:
+                # Who falls silent may come back, and then runs its checks again.
+                ready_by_s = station.now_s + _READY_S
             if waiting and station.now_s >= next_s:
                 decided = self._order_takeoff(waiting[-1], late=station.now_s >= ready_by_s)
                 if decided is not None:
@@ -435,6 +440,8 @@ class Running:
         status = self._status(name)
         if status is None:
             self._fail([name], "not heard")
+        elif self._station.status(name) is None:
+            return None
         elif status.state is _S.PREFLIGHT and status.ready:
             self._order("takeoff", name)
             self._say(name, "takes off")
@@ -493,6 +500,8 @@ class Running:
                 elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
                     why = f"start is from hold: {status.state}: {status.reason}"
                     self._fail([name], refusals.get(name, why))
+                elif self._station.status(name) is None:
+                    until_s = now_s + _START_S
                 elif not order_id and status.state is _S.HOLD and now_s >= again_s.get(name, 0.0):
                     self._order("start", name, trial)
             if self._open:

@@ -40,6 +40,7 @@ COMMANDER_SILENT_S = 2.0
 # ... also if robots say so, who hear what this station may not.
 _ROBOTS_HEAR_NOBODY_S = 1.0
 _OVERTAKEN_S = 1.0
+_LATELY_S = 10.0
 _EVENTS_KEPT = 200
 _AT_PLACE_M = 0.01
 
@@ -178,6 +179,11 @@ class Station:
     def status(self, name: str) -> RobotStatus | None:
         """The robot's newest, if it was heard within 2 s."""
         return self._robots.status(self._setup.robots[name], self._now_s)
+
+    def lately(self, name: str) -> RobotStatus | None:
+        """The robot's newest, if it was heard within 10 s: a bad link is silent for seconds."""
+        last = self._robots.last(self._setup.robots[name], self._now_s)
+        return last[0] if last is not None and last[1] <= _LATELY_S else None
 
     def is_duplicate(self, name: str) -> bool:
         """Whether two programs say that they are this robot."""

@@ -183,6 +183,9 @@ class ZenohLink:
             # How soon a lost neighbour is noticed.
             "transport/link/tx/lease": 1000,
             "transport/link/tx/queue/size/background": _PATIENT_BATCHES,
+            # An attempt that a lost packet holds up is given up soon, and made again.
+            "transport/unicast/open_timeout": 2000,
+            "transport/unicast/accept_timeout": 2000,
             # 200 MB among ten robots, for no gain.
             "transport/shared_memory/enabled": False,
         }.items():

@@ -454,9 +454,22 @@ def test_an_order_that_is_not_answered_expires() -> None:
     field.robots[1].deaf = True
     assert why_not(field.do(Takeoff(interval_s=0.0))) == {"r1": "it did not answer"}
     field.robots[0].silent = True
-    field.run(3.0)
+    field.run(12.0)
     report = field.do(Give("disarm", ("r0", "r2")))
     assert why_not(report)["r0"] == "not heard"
+
+
+def test_a_robot_that_is_silent_for_a_moment_is_waited_for() -> None:
+    field = a_field()
+    field.make_ready()
+    field.robots[0].silent = field.robots[0].deaf = True
+    field.run(3.0)
+    takeoff = field.begin(Takeoff(interval_s=0.0))
+    field.run(4.0)
+    field.robots[0].silent = field.robots[0].deaf = False
+    field.until(lambda: takeoff.report, 30.0)
+    assert takeoff.report is not None
+    assert takeoff.report.done
 
 
 def test_a_silent_robot_is_killed_too() -> None:
