@@ -51,6 +51,8 @@ from edge.runtime.verify import verify
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
 _EXPLORED_PERIOD_S = 1.0
+# To make a raster of more takes minutes.
+_MOST_FEATURES = 2000
 # A control loop without a tick for longer hangs: the vehicle was told to hold before that.
 _CONTROL_FRESH_S = 1.0
 # On leaving: for the autopilot's answer, and for a loop that hangs.
@@ -106,6 +108,8 @@ def _sensor(text: str, source: str, manifest: Manifest) -> IdfSensor:
     perception, training = manifest.perception, manifest.training
     assert perception is not None  # Without it no robot is loaded.
     features = parse_world(text, source)
+    if len(features) > _MOST_FEATURES:
+        raise ValueError(f"{source}: has {len(features)} features, at most {_MOST_FEATURES} may be")
     truncation, norm = training.idf_truncation, training.idf_norm
     importance = rasterize(features, perception.world_size, truncation, norm)
     return IdfSensor(importance, perception.sensor_size)
@@ -370,7 +374,7 @@ class _Program:
             return
         try:
             sensor = _sensor(text, f"world {wanted}", self._loaded.policy.manifest)
-        except ValueError as error:
+        except (ValueError, ArithmeticError) as error:
             self._control.world = GroundWorld(wanted, None, str(error))
         else:
             self._control.world = GroundWorld(wanted, sensor, "")

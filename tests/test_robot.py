@@ -134,7 +134,7 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
         made.wait_for_state(FlightState.LANDED)
         assert explored[-1] > 1.3 * ONE_LOOK
         made.order("reset", "b")
-        made.wait(lambda status: status.trial == "b")
+        made.wait(lambda status: status.trial == "")
         wait_until(lambda: explored[-1] <= 1.3 * ONE_LOOK)
 
         # Without a word of the ground's, the configured fence and place count again.

@@ -16,6 +16,7 @@ from edge.core import F64
 from edge.core.mailbox import Neighbour
 from edge.core.mission import (
     AIRBORNE,
+    MAX_SLOT,
     ON_GROUND,
     ORDER_LIFETIME_S,
     STEERED,
@@ -74,8 +75,8 @@ class FlightParameters:
     takeoff_timeout_s: float = 15.0
 
     def __post_init__(self) -> None:
-        if self.slot < 0:
-            raise ValueError(f"slot = {self.slot}: must be 0 or above")
+        if not 0 <= self.slot <= MAX_SLOT:
+            raise ValueError(f"slot = {self.slot}: must be from 0 to {MAX_SLOT}")
         if len(self.landing_point_m) != 2 or not all(map(math.isfinite, self.landing_point_m)):
             raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
         for name in (
@@ -654,7 +655,7 @@ def step(robot: Robot, flight: Flight, inputs: FlightInputs) -> Decision:
     new_trial = False
     if obeyed is not None and obeyed.kind in ("start", "reset"):
         new_trial = obeyed.kind == "reset" or obeyed.trial != flight.trial
-        flight = replace(flight, trial=obeyed.trial)
+        flight = replace(flight, trial="" if obeyed.kind == "reset" else obeyed.trial)
     tick = _Tick(robot, flight, inputs, None)
     asked = _ask(tick)
     flight = replace(

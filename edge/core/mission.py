@@ -27,6 +27,7 @@ from edge.core.vehicle import Vector
 
 ORDER_LIFETIME_S = 10.0
 EXPLORED_CELLS = 64
+MAX_SLOT = 1000
 _OVER_LANDING_POINT_M = 1.5
 
 Bools = npt.NDArray[np.bool_]
@@ -89,8 +90,8 @@ class Place:
     landing_point_m: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        if self.slot < 0:
-            raise ValueError(f"slot = {self.slot}: must be 0 or above")
+        if not 0 <= self.slot <= MAX_SLOT:
+            raise ValueError(f"slot = {self.slot}: must be from 0 to {MAX_SLOT}")
         if len(self.landing_point_m) != 2 or not all(map(math.isfinite, self.landing_point_m)):
             raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
 
@@ -138,8 +139,9 @@ class Order:
 
     It is for the start of the program whose `boot_nonce` it names, and expires at
     `expires_at_uptime_s` of the robot's own uptime, `ORDER_LIFETIME_S` after the status that the
-    ground saw: clocks need not agree. `trial` names the mission of a start or a reset: a start of
-    another mission than the last, and each reset, has the explored map and the mailbox forgotten.
+    ground saw: clocks need not agree. `trial` names the mission of a start: another one than the last
+    has the explored map and the mailbox forgotten. A reset does, too; the robot's own trial is then
+    "" until it starts again.
 
     `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
     motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone.

@@ -132,7 +132,8 @@ class FlightControl:
         checks = self.checks
         if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
             return None
-        if checks.assignment != self.assignment:
+        # The same one, not an equal one: what was set in between may be on its way to the vehicle.
+        if checks.assignment is not self.assignment:
             return None
         return (*checks.failed, *self.not_taken)
 
@@ -190,9 +191,10 @@ class FlightControl:
 
     def _assign(self, assignment: Assignment, sensor: Sensor | None) -> None:
         """`sensor` is over the world, None if that stays."""
-        before, self.assignment = self.assignment, assignment
+        before = self.assignment
         if assignment == before:
             return
+        self.assignment = assignment
         origin, robot, world_id = assignment
         if origin is not None and origin != before.origin:
             frame = origin.frame()

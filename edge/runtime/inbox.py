@@ -17,6 +17,9 @@ T = TypeVar("T")
 _MOST_ORDERS = 64
 _MOST_STATES = 16
 _STATUS_LIFETIME_S = 3.0
+# What is longer is not of this fleet, and would hold up the loop that decodes it.
+_LONGEST_MESSAGE_BYTES = 65_536
+_LONGEST_WORLD_BYTES = 2**20
 
 
 class _Arrived(NamedTuple):
@@ -51,18 +54,23 @@ class Inbox:
 
     def put_ground(self, data: bytes, now_s: float, unix_now_s: float) -> None:
         """A ground's state arrived."""
-        self._grounds.append(_Arrived(data, now_s, unix_now_s))
+        if self._is_short(data):
+            self._grounds.append(_Arrived(data, now_s, unix_now_s))
 
     def put_world(self, data: bytes) -> None:
         """A world file arrived."""
-        self.world = data
+        if self._is_short(data, _LONGEST_WORLD_BYTES):
+            self.world = data
 
     def put_order(self, data: bytes) -> None:
         """An order arrived."""
-        self._orders.append(data)
+        if self._is_short(data):
+            self._orders.append(data)
 
     def put_status(self, key: str, data: bytes, now_s: float, unix_now_s: float) -> None:
         """Another robot's status arrived, with `key`."""
+        if not self._is_short(data):
+            return
         with self._lock:
             self._statuses[key] = _Arrived(data, now_s, unix_now_s)
 
@@ -113,6 +121,10 @@ class Inbox:
             for key, status in decoded.items()
             if status is not None
         )
+
+    def _is_short(self, data: bytes, limit_bytes: int = _LONGEST_MESSAGE_BYTES) -> bool:
+        self.malformed += len(data) > limit_bytes
+        return len(data) <= limit_bytes
 
     def _decode(self, kind: type[T], data: bytes) -> T | None:
         try:

@@ -177,6 +177,8 @@ class Readiness:
     def _upload_fence(self, origin: Origin, fence: Fence) -> None:
         frame = origin.frame()
         grown_m = fence.grown_m(self._config.failsafe.fence_margin_m)
+        # Without an answer the vehicle may have this one, the one before, or none.
+        self._uploaded = None
         try:
             self._setup.upload_fence([frame.to_global_deg(*vertex) for vertex in grown_m])
         except OSError as error:

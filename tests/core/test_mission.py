@@ -74,7 +74,7 @@ def test_what_was_explored_survives_the_way() -> None:
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ('"places": {"3": {"slot": -1, "landing_point_m": [1, 2]}}', "slot = -1: must be 0"),
+        ('"places": {"3": {"slot": -1, "landing_point_m": [1, 2]}}', "slot = -1: must be from 0"),
         ('"places": {"3": {"slot": 1, "landing_point_m": [1]}}', "landing_point_m = [1.0]: must"),
         ('"fence": {"vertices_m": [], "buffer_m": 1, "floor_m": 1, "ceiling_m": 2}', "vertices_m"),
     ],

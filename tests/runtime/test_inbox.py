@@ -93,3 +93,17 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     assert inbox.order() is None
     assert inbox.peers(2.0) == ()
     assert inbox.malformed == 3
+
+
+def test_what_is_far_too_long_is_not_even_decoded() -> None:
+    inbox = make_inbox()
+    long = b"[" + 100_000 * b"1," + b"1]"
+    inbox.put_ground(long, 1.0, 1e9)
+    inbox.put_order(long)
+    inbox.put_status("robot/4/status", long, 1.0, 1e9)
+    inbox.put_world(20 * long)
+    assert inbox.malformed == 4
+    assert inbox.ground(1.0) == (None, math.inf)
+    assert inbox.order() is None
+    assert inbox.peers(1.0) == ()
+    assert inbox.world is None
