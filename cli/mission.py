@@ -36,7 +36,9 @@ WaitFor = Annotated[
 ]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Until all have landed.")]
-Names = Annotated[list[str], typer.Argument(metavar="ROBOT...", help="The robots' names.")]
+Names = Annotated[
+    list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
+]
 
 
 # Where
@@ -82,7 +84,10 @@ def origin(
             "origin: give LAT LON HEADING_DEG, or --from ROBOT, with or without --toward ROBOT"
         )
     else:
-        where = Origin(latitude, longitude, heading)
+        try:
+            where = Origin(latitude, longitude, heading)
+        except ValueError as error:
+            raise ValueError(f"origin: {error}") from None
         with looking(to) as lookout:
             far_m = furthest_m(where, lookout.picture)
         if far_m > FAR_M:
@@ -243,25 +248,36 @@ def assign(
 
 
 @app.command()
-def enable(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+def enable(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
     """Let the robots run their checks, and fly."""
     from ground.protocol import Enable
 
-    to = address(fleet, robots)
+    to = _named(names, fleet, robots)
     ask(to, Enable(True, to.robots), "enable", as_json=as_json)
 
 
 @app.command()
-def disable(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+def disable(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
     """Nothing is to fly: what is in the air holds."""
     from ground.protocol import Enable
 
-    to = address(fleet, robots)
+    to = _named(names, fleet, robots)
     ask(to, Enable(False, to.robots), "disable", as_json=as_json)
 
 
 @app.command()
 def takeoff(
+    names: Names = None,
     interval: Annotated[
         float, typer.Option("--interval", min=0, max=60, help="Between two robots, s.")
     ] = 2.0,
@@ -275,61 +291,78 @@ def takeoff(
     """Take off, the highest first; done when all hold at their heights."""
     from ground.protocol import Takeoff
 
-    to = address(fleet, robots)
+    to = _named(names, fleet, robots)
     ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=as_json)
 
 
 @app.command()
-def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+def start(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
     """Fly the mission, from hold."""
     from ground.protocol import Start
 
-    to = address(fleet, robots)
+    to = _named(names, fleet, robots)
     ask(to, Start(to.robots), "start", as_json=as_json)
 
 
 @app.command()
-def hold(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+def hold(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
     """Stay where they are. Anybody may command it."""
-    _calm("hold", fleet, robots, wait=False, as_json=as_json)
+    _calm("hold", _named(names, fleet, robots), wait=False, as_json=as_json)
 
 
 @app.command()
-def resume(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+def resume(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
     """Withdraw hold, return or land; who flew the mission flies it again."""
     from ground.protocol import Resume
 
-    to = address(fleet, robots)
+    to = _named(names, fleet, robots)
     ask(to, Resume(to.robots), "resume", as_json=as_json)
 
 
 @app.command()
 def land(
-    wait: Wait = False, fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False
+    names: Names = None,
+    wait: Wait = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
 ) -> None:
     """Land where they are."""
-    _calm("land", fleet, robots, wait=wait, as_json=as_json)
+    _calm("land", _named(names, fleet, robots), wait=wait, as_json=as_json)
 
 
 @app.command("return")
 def return_(
-    wait: Wait = False, fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False
+    names: Names = None,
+    wait: Wait = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
 ) -> None:
     """Fly to the landing points at their own heights, and land there, the lowest first."""
-    _calm("return", fleet, robots, wait=wait, as_json=as_json)
+    _calm("return", _named(names, fleet, robots), wait=wait, as_json=as_json)
 
 
 def _calm(
-    calm: Literal["hold", "return", "land"],
-    fleet: Path,
-    robots: str | None,
-    *,
-    wait: bool,
-    as_json: bool,
+    calm: Literal["hold", "return", "land"], to: Addressed, *, wait: bool, as_json: bool
 ) -> None:
     from ground.protocol import Calm
 
-    to = address(fleet, robots)
     ask(to, Calm(calm, to.robots, wait), calm, as_json=as_json)
 
 
@@ -337,44 +370,54 @@ def _calm(
 
 
 @app.command()
-def pilot(names: Names, fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
-    """Hand robots to a human pilot: the program commands nothing until `rejoin`."""
-    _give("pilot", address(fleet, ",".join(names)), as_json=as_json)
+def pilot(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Hand robots to human pilots: the program commands nothing until `rejoin`."""
+    _give("pilot", _named(names, fleet, robots), as_json=as_json)
 
 
 @app.command()
-def rejoin(names: Names, fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
-    """Take robots back from a pilot: they hold; then `start`."""
-    _give("rejoin", address(fleet, ",".join(names)), as_json=as_json)
+def rejoin(
+    names: Names = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take robots back from their pilots: they hold; then `start`."""
+    _give("rejoin", _named(names, fleet, robots), as_json=as_json)
 
 
 @app.command()
 def disarm(
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
-    ] = None,
+    names: Names = None,
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     as_json: AsJson = False,
 ) -> None:
     """Stop the motors on the ground. A robot in the air refuses."""
-    if names and robots is not None:
-        raise ValueError("disarm: give the robots' names, or --robots, not both")
-    to = address(fleet, ",".join(names) if names else robots)
-    if not to.robots:
-        from ground.lookout import addressed
-
-        with looking(to) as lookout:
-            to = to._replace(robots=addressed(lookout.setup, ()))
-    _give("disarm", to, as_json=as_json)
+    _give("disarm", _named(names, fleet, robots), as_json=as_json)
 
 
 @app.command()
 def kill(
-    names: Names, yes: Yes = False, fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
+    ] = None,
+    yes: Yes = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
 ) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
-    to = address(fleet, ",".join(names))
+    to = _named(names, fleet, robots)
+    if not to.robots:
+        raise ValueError(
+            "kill: name the robots, such as `lpac mission kill r3`: it is never for all"
+        )
     confirm(f"KILL {_whom(to)}? What flies falls.", "kill", yes=yes)
     _give("kill", to, as_json=as_json)
 
@@ -382,9 +425,20 @@ def kill(
 def _give(
     kind: Literal["pilot", "rejoin", "disarm", "kill"], to: Addressed, *, as_json: bool
 ) -> None:
+    from ground.lookout import addressed
     from ground.protocol import Give
 
+    if not to.robots:
+        with looking(to) as lookout:
+            to = to._replace(robots=addressed(lookout.setup, ()))
     ask(to, Give(kind, to.robots), kind, as_json=as_json)
+
+
+def _named(names: list[str] | None, fleet: Path, robots: str | None) -> Addressed:
+    """Whom a command addresses that takes robots' names as well as --robots."""
+    if names and robots is not None:
+        raise ValueError("give the robots' names, or --robots, not both")
+    return address(fleet, ",".join(names) if names else robots)
 
 
 # Trials, and who commands

@@ -65,7 +65,7 @@ def _watch(lookout: "Lookout", names: "Sequence[str]", end_s: float, *, as_json:
                 _print_json(lookout, names)
             elif not console.is_terminal:
                 for row in _rows(lookout, names):
-                    console.print("  ".join(filter(None, map(str, row))), soft_wrap=True)
+                    console.print(_line(row), soft_wrap=True)
             wait_s = min(_PERIOD_S, end_s - time.monotonic())
             lookout.wait_for(lambda _: False, max(0.0, wait_s))
             _require_disarmed(lookout, names)
@@ -104,6 +104,21 @@ def _table(lookout: "Lookout", names: "Sequence[str]") -> "Table":
     for row in _rows(lookout, names):
         table.add_row(*row)
     return table
+
+
+def _line(row: "list[Text]") -> str:
+    """A row with what stands above and beside it in the table: "r1: x 4.5 m, y 2.0 m, ..."."""
+    robot, *cells = map(str, row)
+    if len(cells) < len(_HEADINGS) - 1:
+        return f"{robot}: {cells[0]}"
+    x, y, nose, fence_m, arrow, words = cells
+    told = [
+        f"x {x} m, y {y} m" if y else x,
+        f"nose {nose}" if nose else "",
+        f"inside the fence by {fence_m} m" if fence_m else "",
+        f"commanded: {arrow} {words}".rstrip(),
+    ]
+    return f"{robot}: {', '.join(filter(None, told))}"
 
 
 def _rows(lookout: "Lookout", names: "Sequence[str]") -> list[list["Text"]]:

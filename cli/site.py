@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots
-from cli.fleet_table import print_table
+from cli.fleet_table import BAD, print_table, styled
 from cli.ground_report import address, interruptible, looking, measure, print_json, show
 
 if TYPE_CHECKING:
@@ -97,15 +97,22 @@ def list_(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
     from ground.site import Sites
 
     sites = Sites(address(fleet, None).path)
-    saved = {name: sites.load(name) for name in sites.names()}
+    saved: dict[str, SavedSite] = {}
+    problems: dict[str, str] = {}
+    for name in sites.names():
+        try:
+            saved[name] = sites.load(name)
+        except ValueError as error:
+            problems[name] = str(error)
     used = sites.used()
     if as_json:
         described = {
-            name: {"used": name == used, **_described(site)} for name, site in saved.items()
-        }
+            name: {"used": name == used, "problem": None, **_described(site)}
+            for name, site in saved.items()
+        } | {name: {"used": name == used, "problem": why} for name, why in problems.items()}
         print_json({"sites": described})
         return
-    if not saved:
+    if not saved and not problems:
         typer.echo(f"{sites.folder}: no sites: `lpac site save NAME` saves one")
         return
     headings = ("site", "latitude", "longitude", "heading", "slots", "")
@@ -118,9 +125,11 @@ def list_(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
                 "used last" if name == used else "",
             ]
             for name, site in saved.items()
-        ],
+        ] + [[name, "", "", "", "", styled("unreadable", BAD)] for name in problems],
         headings[1:5],
     )  # fmt: skip
+    for why in problems.values():
+        typer.echo(why, err=True)
 
 
 def _print_slots(site: "SavedSite") -> None:

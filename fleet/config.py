@@ -358,6 +358,10 @@ def _read(path: Path) -> str:
     try:
         # Not read_text, which would change the ends of lines.
         return path.read_bytes().decode()
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{path}: cannot be read: {error.strerror}: give --fleet, or set LPAC_FLEET"
+        ) from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -35,7 +35,7 @@ class Lookout:
         self._thread.start()
         if not self.wait_for(lambda _: True, _PATIENCE_S):
             self._leaving = True
-            raise GroundError(f"the ground station of fleet {self.fleet} does not answer")
+            raise self._no_answer()
         return self
 
     def __exit__(
@@ -72,6 +72,13 @@ class Lookout:
                 if not self._changed.wait(max(0.0, deadline_s - time.monotonic())):
                     return False
 
+    def fresh_picture(self) -> Picture:
+        """The fleet as it is told from now on. Raises GroundError if nothing comes."""
+        asked_unix_s = time.time()
+        if not self.wait_for(lambda picture: picture.unix_time_s >= asked_unix_s, _PATIENCE_S):
+            raise self._no_answer()
+        return self.picture
+
     def gather(self, robots: Collection[str], duration_s: float) -> dict[str, list[RobotStatus]]:
         """What these robots say from now on, each status once.
 
@@ -90,6 +97,9 @@ class Lookout:
 
         self.wait_for(take, duration_s + FRESH_S)
         return {robot: list(statuses.values()) for robot, statuses in heard.items()}
+
+    def _no_answer(self) -> GroundError:
+        return GroundError(f"the ground station of fleet {self.fleet} does not answer")
 
     def _run(self) -> None:
         try:

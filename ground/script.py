@@ -143,6 +143,18 @@ class MissionStep:
                     f"perturb: at_s = {perturbation.at_s}: must be 0 or above, and below "
                     f"duration_s = {self.duration_s}"
                 )
+        given: set[str] = set()
+        for perturbation in self.in_time():
+            at = f"perturb: at_s = {perturbation.at_s}: {perturbation.robot}"
+            if perturbation.do == "pilot" and perturbation.robot in given:
+                raise ValueError(f"{at} has a pilot already: must rejoin before")
+            if perturbation.do == "rejoin" and perturbation.robot not in given:
+                raise ValueError(f"{at} has no pilot: must be given to one before it rejoins")
+            given ^= {perturbation.robot}
+
+    def in_time(self) -> list[Perturbation]:
+        """What is to be done, by its time."""
+        return sorted(self.perturb, key=lambda perturbation: perturbation.at_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +235,7 @@ def load_script(path: Path, sites: Sites) -> Script:
         elif isinstance(step, SiteStep):
             sites.load(step.name)
     steps = _steps(table.steps, _STEPS, f"{path}: steps")
+    _check_order(steps, f"{path}: steps")
     return Script(path, table.trial, table.trials, table.robots, before, steps)
 
 
@@ -251,6 +264,29 @@ def _steps(
         keys = {key: value for key, value in table.items() if key != "do"}
         steps.append(from_mapping(kinds[kind], keys, f"{where}[{i}] ({kind})"))
     return tuple(steps)
+
+
+def _check_order(steps: Sequence[Step], where: str) -> None:
+    """A trial begins on the ground and ends there, with one mission between takeoff and landing."""
+    in_air = flown = False
+    for i, step in enumerate(steps):
+        at = f"{where}[{i}] ({_NAMES[type(step)]})"
+        match step:
+            case PreflightStep() | TakeoffStep() if in_air:
+                raise ConfigError(f"{at}: robots are in the air: must come after return or land")
+            case MissionStep() | ReturnStep() | LandStep() if not in_air:
+                raise ConfigError(f"{at}: robots are on the ground: must come after takeoff")
+            case MissionStep() if flown:
+                raise ConfigError(f"{at}: return or land must come between two missions")
+            case TakeoffStep():
+                in_air, flown = True, False
+            case MissionStep():
+                flown = True
+            case ReturnStep() | LandStep():
+                in_air = False
+    if not isinstance(steps[-1], ReturnStep | LandStep):
+        last = _NAMES[type(steps[-1])]
+        raise ConfigError(f"{where}: the last step is {last!r}: must be 'return' or 'land'")
 
 
 def _check_duration(name: str, value_s: float) -> None:
@@ -317,13 +353,14 @@ class Flight:
         script = self._script
         for i, step in enumerate(script.before):
             self._go(step, f"before[{i}]", "")
+        first = self._first_number()
         for trial in range(1, script.trials + 1):
             count = f"trial {trial} of {script.trials}: " if script.trials > 1 else ""
             self._said.clear()
             self._given.clear()
             if trial > 1 and not self._teller.may(f"{count}let the robots take off again?"):
                 raise ScriptError(f"{count}not wanted", hold=False)
-            self._begin_trial(trial, count)
+            self._begin_trial(first + trial - 1, count)
             for i, step in enumerate(script.steps):
                 self._go(step, f"steps[{i}]", count)
 
@@ -345,7 +382,7 @@ class Flight:
             if isinstance(step, MissionStep):
                 # Its time counts from when all fly it.
                 self._teller.step(f"{count}start", None)
-                self._require(Start(self._script.robots))
+                self._require_of_flying(Start(self._script.robots))
             self._teller.step(name, _duration_s(step))
             self._do(step)
         except ScriptError as error:
@@ -368,13 +405,20 @@ class Flight:
             case PreflightStep():
                 self._prepare(step)
             case TakeoffStep():
-                self._require(Takeoff(robots, step.interval_s, step.abort_on_failure))
+                self._require_of_flying(Takeoff(robots, step.interval_s, step.abort_on_failure))
             case MissionStep():
                 self._fly_mission(step)
             case ReturnStep():
                 self._bring_down(Calm("return", robots, wait=True))
             case LandStep():
                 self._bring_down(Calm("land", robots, wait=True))
+
+    def _first_number(self) -> int:
+        """Of the first trial's name: a script that is run again numbers on."""
+        ground = self._lookout.picture.ground
+        name = re.escape(self._script.trial)
+        match = re.fullmatch(rf"{name}-(\d{{1,6}})", "" if ground is None else ground.trial)
+        return 1 if match is None else int(match[1]) + 1
 
     def _begin_trial(self, number: int, count: str) -> None:
         trial = f"{self._script.trial}-{number}" if self._script.trial else ""
@@ -444,8 +488,10 @@ class Flight:
     # The mission
 
     def _fly_mission(self, step: MissionStep) -> None:
+        # An older picture may show robots that have not started yet.
+        self._lookout.fresh_picture()
         began_s = time.monotonic()
-        due = sorted(step.perturb, key=lambda perturbation: perturbation.at_s)
+        due = step.in_time()
         before = dict.fromkeys(self.robots, _S.MISSION)
         left_alone: set[str] = set()
         while (left_s := began_s + step.duration_s - time.monotonic()) > 0.0:
@@ -484,7 +530,7 @@ class Flight:
 
     def _perturb(self, perturbation: Perturbation) -> None:
         name = perturbation.robot
-        self._require(Give(perturbation.do, (name,)))
+        self._require_of_flying(Give(perturbation.do, (name,)))
         if perturbation.do == "pilot":
             self._given.add(name)
             self._teller.line(f"{name} is given to a pilot")
@@ -495,13 +541,14 @@ class Flight:
             return status is not None and status.state is _S.HOLD
 
         if not self._lookout.wait_for(holds, _REJOIN_WITHIN_S):
+            self._look_for_others(self._lookout.picture)
             raise ScriptError(f"{name} does not come to hold")
-        self._require(Start((name,)))
+        self._require_of_flying(Start((name,)))
         self._given.discard(name)
         self._teller.line(f"{name} is back in the mission")
 
     def _look_for_others(self, picture: Picture) -> None:
-        """The script gives no calm in a mission: if there is one, somebody has the fleet."""
+        """The script calms nobody from takeoff on: if all are calmed, somebody has the fleet."""
         ground = picture.ground
         asked = [_asked(ground, self._lookout.setup.robots[name]) for name in self.robots]
         if ground is not None and "none" not in asked:
@@ -523,6 +570,16 @@ class Flight:
 
     def _require(self, request: Request) -> None:
         _require(self._command(request))
+
+    def _require_of_flying(self, request: Takeoff | Start | Give) -> None:
+        """What fails because somebody has the fleet meanwhile is no failure of the script's."""
+        report = self._command(request)
+        if not report.done:
+            picture = self._lookout.fresh_picture()
+            # On the ground a calm may be left from the last landing.
+            if any(_flies(status) for status in self._statuses(picture).values()):
+                self._look_for_others(picture)
+            raise ScriptError(_failures(report))
 
     def _say_once(self, text: str) -> None:
         """Say a text unless it differs from one that was said by its numbers only."""

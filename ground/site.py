@@ -102,10 +102,10 @@ def bearing_deg(from_deg: Point, to_deg: Point) -> float:
 def standing(robot: str, statuses: Sequence[RobotStatus]) -> Standing:
     """Where a robot stands, from what it said of itself while it was listened to.
 
-    Raises ValueError, one line, if it was not heard, does not know its position, or moves.
+    Raises ValueError, one line, if it was not heard, is armed, does not know its position, or
+    moves.
     """
-    if not statuses:
-        raise ValueError(f"{robot} is not heard")
+    _require_disarmed(robot, statuses)
     places = [(s.global_deg[0], s.global_deg[1]) for s in statuses if s.global_deg is not None]
     if not places:
         raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
@@ -247,11 +247,10 @@ def pads_in_use(sites: "Sites", name: str, setup: Setup, origin: Origin) -> Pads
 def place_now_m(robot: str, statuses: Sequence[RobotStatus], origin: Origin) -> Point:
     """(x, y) of the mission frame, m, averaged.
 
-    Raises ValueError, one line, if the robot was not heard, has another origin, does not know its
-    position, or moves.
+    Raises ValueError, one line, if the robot was not heard, is armed, has another origin, does not
+    know its position, or moves.
     """
-    if not statuses:
-        raise ValueError(f"{robot} is not heard")
+    _require_disarmed(robot, statuses)
     if statuses[-1].origin != origin:
         raise ValueError(f"{robot} has not taken up the mission's origin")
     points = [s.position_m[:2] for s in statuses if s.position_m is not None and s.origin == origin]
@@ -394,15 +393,16 @@ def site_as_it_stands(
     else:
         raise ValueError("the origin is not set: `lpac mission origin` sets it, or use --from")
     seated = {slot.robot: slot.place for slot in setup.slots if slot.robot}
+    fence = setup.fence if ground is None or ground.fence is None else ground.fence
     slots = []
     for robot, its in stands.items():
         if robot not in seated:
             raise ValueError(_is_spare(robot))
         # Without the minus of a zero.
         x_m, y_m = (round(value, 2) + 0.0 for value in place_m(origin, its.position_deg))
+        _require_inside(robot, (x_m, y_m), fence, lands=land_at_pads)
         landing_m = (x_m, y_m) if land_at_pads else seated[robot].landing_point_m
         slots.append(SiteSlot(seated[robot].slot, (x_m, y_m), landing_m))
-    fence = setup.fence if ground is None or ground.fence is None else ground.fence
     return SavedSite(origin, fence, tuple(sorted(slots, key=lambda slot: slot.height)))
 
 
@@ -465,6 +465,27 @@ class Sites:
         except FileNotFoundError:
             return None
         return name if name in self.names() else None
+
+
+def _require_disarmed(robot: str, statuses: Sequence[RobotStatus]) -> None:
+    if not statuses:
+        raise ValueError(f"{robot} is not heard")
+    if statuses[-1].armed:
+        raise ValueError(f"{robot} is armed: land first")
+
+
+def _require_inside(robot: str, place: Point, fence: Fence, *, lands: bool) -> None:
+    inside_m = fence.distance_m(*place)
+    if inside_m > 0.0 and (inside_m >= fence.buffer_m or not lands):
+        return
+    if inside_m > 0.0:
+        where = f"{inside_m:.1f} m inside the fence, must be {fence.buffer_m:g} m to land there"
+    else:
+        where = "outside the fence"
+    raise ValueError(
+        f"{robot} stands at {_written(place)} m, {where}: another --from/--toward, or `lpac "
+        "mission fence set`"
+    )
 
 
 def _is_spare(robot: str) -> str:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from cli.main import main
-from edge.core.mission import FlightState, RobotStatus
+from edge.core.mission import FlightState, Order, RobotStatus
 from ground.client import socket_path
 from tests.conftest import ROOT
 from tests.ground.pretend import ORIGIN, PretendedFleet, PretendedRobot, pretended
@@ -179,9 +179,9 @@ def test_operators_mistakes_are_one_line_each(field: Field, tmp_path: Path) -> N
     assert "is unknown; known are r0, r1, r2" in mission("mission", "hold", "--robots", "r7")
     assert "is unknown; known are" in mission("mission", "kill", "r7", "--yes")
     assert mission("mission", "origin", "48", "11", "360") == (
-        "heading_deg = 360.0: must be in [0, 360)"
+        "origin: heading_deg = 360.0: must be in [0, 360)"
     )
-    assert "latitude = 91.0 deg: must be in [-90, 90]" in mission(
+    assert "origin: mission origin latitude = 91.0 deg: must be in [-90, 90]" in mission(
         "mission", "origin", "91", "11", "0"
     )
     assert "LAT LON HEADING_DEG, or --from ROBOT" in mission("mission", "origin", "48", "11")
@@ -191,6 +191,9 @@ def test_operators_mistakes_are_one_line_each(field: Field, tmp_path: Path) -> N
     assert "fence set: vertices_m has 2" in mission("mission", "fence", "set", "3,3", "4,5")
     assert "--yes" in mission("mission", "fence", "off")
     assert "--yes" in mission("mission", "kill", "r1")
+    assert "--yes" in mission("mission", "kill", "--robots", "r1")
+    assert "kill: name the robots" in mission("mission", "kill", "--yes")
+    assert "not both" in mission("mission", "pilot", "r1", "--robots", "r1")
     assert f"{bad}: record 1 (CircularBND): sigma is missing" in mission("mission", "world", bad)
     assert "cannot be read" in mission("mission", "world", tmp_path / "none.env")
     assert "there is no such site; known are none" in mission("site", "use", "park")
@@ -232,6 +235,7 @@ def test_fleet_flies_as_it_is_told(field: Field) -> None:
     assert "are armed" in field.refused("mission", "origin", *AT)
     assert "are armed" in field.refused("mission", "fence", "on")
     assert "armed: carry disarmed robots only" in field.refused("mission", "rehearse")
+    assert "r0 is armed: land first" in field.refused("mission", "assign", "--seconds", "0.5")
 
     done = field.lpac("mission", "disarm", "r1")
     assert done.code == 1
@@ -242,8 +246,8 @@ def test_fleet_flies_as_it_is_told(field: Field) -> None:
     assert states(field) == [_S.MISSION] * 3
     field.do("mission", "pilot", "r2")
     assert states(field) == [_S.MISSION, _S.MISSION, _S.PILOT]
-    field.do("mission", "rejoin", "r2")
-    field.do("mission", "hold", "--robots", "r0")
+    field.do("mission", "rejoin", "--robots", "r2")
+    field.do("mission", "hold", "r0")
     assert states(field) == [_S.HOLD, _S.MISSION, _S.HOLD]
     field.do("mission", "resume", "--robots", "r0")
     assert states(field)[0] is _S.MISSION
@@ -255,12 +259,11 @@ def test_fleet_flies_as_it_is_told(field: Field) -> None:
     assert states(field) == [_S.LANDED] * 3
 
     field.do("mission", "again", "windy")
-    assert {robot.trial for robot in field.robots} == {"windy"}
+    assert {robot.ground.trial for robot in field.robots if robot.ground} == {"windy"}
     field.do("mission", "disarm")
 
 
 def test_kill_names_its_robots_and_asks(field: Field) -> None:
-    assert field.lpac("mission", "kill", "--yes").code == 2
     field.do("mission", "enable")
     field.do("mission", "takeoff", "--robots", "r1")
     assert "KILL r1? What flies falls." in on_terminal(field, "n\n", "mission", "kill", "r1")
@@ -333,13 +336,6 @@ def test_origin_is_as_given_or_as_robots_stand(field: Field) -> None:
     assert origin is not None
     assert origin.heading_deg == pytest.approx(ORIGIN.heading_deg + 90.0, abs=0.1)
 
-    field.robots[2].silent = True
-    assert "r2 is not heard" in field.refused(
-        "mission", "origin", "--from", "r2", "--seconds", "0.5"
-    )
-    field.robots[2].silent = False
-    until(lambda: field.lpac("mission", "origin", *AT).code == 0)
-
 
 def test_fence_is_set_switched_off_and_on(field: Field) -> None:
     corners = ("-2,-2", "20,-2", "20,20", "-2,20")
@@ -400,9 +396,10 @@ def test_site_is_saved_and_used_again(field: Field) -> None:
     assert "park.toml: is there already: add --force" in field.refused("site", "save", "park")
 
     # Another site, from the robots: r0 is its origin, and r1 stands along its y axis.
-    field.refused("site", "save", "yard", "--from", "r0", "--toward", "r1", "--seconds", "0.5")
+    save = ("site", "save", "yard", "--from", "r0", "--toward", "r1", "--seconds", "0.5")
+    assert "r0 stands at (0.0, 0.0) m, outside the fence: another --from" in field.refused(*save)
     field.do("mission", "fence", "on")
-    field.do("site", "save", "yard", "--from", "r0", "--toward", "r1", "--seconds", "0.5")
+    field.do(*save)
     yard = (field.fleet.folder / "sites" / "yard.toml").read_text()
     assert "pad_m = [0.0, 4.0]" in yard
     assert "landing_point_m = [4.5, 2.0]" in yard
@@ -413,8 +410,11 @@ def test_site_is_saved_and_used_again(field: Field) -> None:
         assert robot.origin == ORIGIN
         assert robot.fence.vertices_m[2] == (30.0, 30.0)
         assert list(robot.landing_point_m) == slot["landing_point_m"]
+    (field.fleet.folder / "sites" / "torn.toml").write_text("[origin")
     done = field.do("site", "list")
-    assert re.search(r"park .* used last\n", done.out)
+    assert re.search(r"torn +unreadable *\n", done.out)
+    assert "torn.toml: no TOML" in done.err
+    assert re.search(r"park .* used last *\n", done.out)
     assert re.search(r"yard .* 3 +\n", done.out)
     assert "pads of site park" in field.do("mission", "assign", "--seconds", "0.5").err
     assert "yard has another origin than the fleet" in field.refused(
@@ -433,7 +433,10 @@ def test_site_is_saved_and_used_again(field: Field) -> None:
 
 def test_rehearsal_shows_the_command_from_the_nose(field: Field) -> None:
     done = field.do("mission", "rehearse", "--robots", "r1", "--seconds", "0.5")
-    assert "r1  4.5  2.0  0 deg  4.0  →  0.5 m/s, right 112 deg" in done.out
+    assert (
+        "r1: x 4.5 m, y 2.0 m, nose 0 deg, inside the fence by 4.0 m, commanded: → 0.5 m/s, right "
+        "112 deg\n"
+    ) in done.out
     done = field.do("mission", "rehearse", "--robots", "r1", "--seconds", "0.5", "--json")
     seen = json.loads(done.out.splitlines()[0])
     assert seen["position_m"] == [4.5, 2.0]
@@ -461,11 +464,23 @@ def write_script(field: Field, duration_s: float, **changes: str) -> Path:
     return path
 
 
+@contextlib.contextmanager
+def flown(field: Field, script: Path) -> Iterator["subprocess.Popen[str]"]:
+    """A process that runs the script, from when the mission is flown."""
+    with field.running("mission", "run", script, "--yes") as process:
+        assert process.stderr is not None
+        while "mission, 600 s" not in process.stderr.readline():
+            assert process.poll() is None
+        yield process
+
+
 def test_example_script_is_flown(field: Field) -> None:
     assert "asks before the next trial takes off" in field.refused(
         "mission", "run", write_script(field, 2.0)
     )
+    field.do("mission", "again", "paper-4")
     done = field.do("mission", "run", write_script(field, 2.0), "--yes")
+    assert "left the mission" not in done.err
     lines = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in done.err.splitlines()]
     in_trial = ["reset maps", "preflight, 60 s", "takeoff", "start", "mission, 2 s",
                 "r2 is given to a pilot", "r2 is back in the mission", "return"]  # fmt: skip
@@ -474,7 +489,7 @@ def test_example_script_is_flown(field: Field) -> None:
     assert steps[0] == "origin"
     assert lines[-1].endswith("script.toml: done")
     assert states(field) == [_S.LANDED] * 3
-    assert {robot.trial for robot in field.robots} == {"paper-2"}
+    assert {robot.trial for robot in field.robots} == {"paper-6"}
 
 
 def test_interrupted_script_holds_the_fleet(field: Field) -> None:
@@ -494,10 +509,7 @@ def test_script_starts_again_who_holds_by_itself_and_gives_way_to_people(field: 
     script = write_script(
         field, 600.0, **{"at_s = 0.5": "at_s = 599.0", "at_s = 1.5": "at_s = 599.5"}
     )
-    with field.running("mission", "run", script, "--yes") as process:
-        assert process.stderr is not None
-        while "mission, 600 s" not in process.stderr.readline():
-            assert process.poll() is None
+    with flown(field, script) as process:
         field.robots[0].state, field.robots[0].reason = _S.HOLD, "robot 1 is too close, 1.2 m"
         until(lambda: field.robots[0].state is _S.MISSION)
         field.do("mission", "hold")
@@ -509,10 +521,13 @@ def test_script_starts_again_who_holds_by_itself_and_gives_way_to_people(field: 
 
 
 def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Field) -> None:
-    script = write_script(field, 600.0, **{'do = "rejoin"': 'do = "pilot"'})
-    why = field.refused("mission", "run", script, "--yes")
+    script = write_script(field, 600.0)
+    with flown(field, script) as process:
+        field.robots[2].state = _S.PILOT
+        _, why = process.communicate(timeout=60.0)
+    assert process.returncode == 1
     assert "trial 1 of 2: mission (steps[2]): r2: pilot is not taken in pilot" in why
-    assert "the fleet is told to hold, but r2: pilot: given to the pilot" in why
+    assert "the fleet is told to hold, but r2: pilot: " in why
     assert "next `lpac mission land`" in why
     assert states(field)[:2] == [_S.HOLD, _S.HOLD]
 
@@ -522,10 +537,31 @@ def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Field) 
     )
 
 
+def test_hold_is_the_operators_also_while_the_script_starts_a_robot(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused: list[Order] = []
+    problem = field.robots[2]._problem
+
+    def refuse_start(order: Order) -> str:
+        if order.kind != "start":
+            return problem(order)
+        refused.append(order)
+        return "robot 1 is too close, 1.2 m"
+
+    with flown(field, write_script(field, 600.0)) as process:
+        monkeypatch.setattr(field.robots[2], "_problem", refuse_start)
+        until(lambda: bool(refused))
+        field.do("mission", "hold")
+        _, err = process.communicate(timeout=60.0)
+    assert process.returncode == 1
+    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in err
+    assert "told to hold" not in err
+
+
 def test_script_says_what_is_missing(field: Field) -> None:
-    field.robots[1].refuses = "battery 12 %"
+    field.do("mission", "hold", "r1")
     script = write_script(field, 2.0, **{"# at_most_s = 60": "at_most_s = 1"})
     why = field.refused("mission", "run", script, "--yes")
-    assert "trial 1 of 2: preflight (steps[0]): not ready after 1 s: r1: battery 12 %" in why
+    assert "trial 1 of 2: preflight (steps[0]): not ready after 1 s: r1 is told to hold" in why
     assert "nobody is in the air" in why
-    field.robots[1].refuses = ""

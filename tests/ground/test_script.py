@@ -76,6 +76,16 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
         ("# from_robot", "from_robot", r"before\[0\] \(origin\): from_robot: measures the origin"),
         ('file = "world.env"', 'file = "w.env"', r"w.env: cannot be read: No such file"),
         ('[[steps]]\ndo = "takeoff"', "[steps]", "no TOML"),
+        ('at_s = 40.0\nrobot = "r2"', 'at_s = 90.0\nrobot = "r2"',
+         r"perturb: at_s = 80.0: r2 has no pilot: must be given"),
+        ('do = "rejoin"', 'do = "pilot"', r"perturb: at_s = 80.0: r2 has a pilot already"),
+        ('do = "return"', 'do = "preflight"', r"steps\[3\] \(preflight\): robots are in the air"),
+        ('[[steps]]\ndo = "return"', "", r"steps: the last step is 'mission': must be 'return' or"),
+        ('do = "takeoff"', 'do = "preflight"', r"steps\[2\] \(mission\): robots are on the ground"),
+        ('do = "mission"', 'do = "return"\n[[steps]]\ndo = "mission"',
+         r"steps\[3\] \(mission\): robots are on the ground: must come after takeoff"),
+        ('do = "return"', 'do = "mission"\nduration_s = 5\n[[steps]]\ndo = "return"',
+         r"steps\[3\] \(mission\): return or land must come between two missions"),
     ],
 )  # fmt: skip
 def test_mistake_is_one_line(script: Path, before: str, after: str, problem: str) -> None:

@@ -135,6 +135,8 @@ def test_robot_that_moves_or_knows_nothing_gives_no_origin() -> None:
     centre = (48.0, 11.0)
     with pytest.raises(ValueError, match="r1 is not heard"):
         standing("r1", [])
+    with pytest.raises(ValueError, match="r1 is armed: land first"):
+        standing("r1", [replace(status(centre, 10.0), armed=True)])
     with pytest.raises(ValueError, match="r1 does not know its position yet"):
         standing("r1", [status(None, 10.0)])
     carried = [status(centre, 10.0), status(moved(centre, 0.0, 12.0), 10.0)]
