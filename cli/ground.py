@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ground.protocol import Event
 
 _AGAIN_S = 5.0
+_LOOK_AGAIN_S = 1.0
 _LONGEST_NAME = 64
 
 
@@ -68,9 +69,16 @@ async def _run(process: "GroundProcess", on_listening: Callable[[], None]) -> No
             err=True,
         )
 
+    def hang_up() -> None:
+        # Its terminal was closed: it cannot ask, so it ends when nobody is in the air.
+        if process.needed():
+            loop.call_later(_LOOK_AGAIN_S, hang_up)
+        else:
+            running.cancel()
+
     loop.add_signal_handler(signal.SIGINT, interrupt)
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, running.cancel)
+    loop.add_signal_handler(signal.SIGHUP, hang_up)
+    loop.add_signal_handler(signal.SIGTERM, running.cancel)
     with contextlib.suppress(asyncio.CancelledError):
         await running
 

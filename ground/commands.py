@@ -4,7 +4,7 @@ Pure, like the station: a command is a generator that looks at the station, chan
 and yields whenever it has to wait for what comes next.
 """
 
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
 from edge.core.mission import FlightState, OrderKind, RobotStatus
@@ -195,7 +195,14 @@ class Running:
     # Desired state
 
     def _refuse_armed(self, _: Request) -> None:
-        armed = [n for n in self.names if (s := self._status(n)) and not is_down(s)]
+        """Whoever is addressed: the mission frame, fence, world and places are the fleet's."""
+        heard = {n: s for n in self._station.setup.robots if (s := self._status(n))}
+        armed = [
+            name
+            for name, status in heard.items()
+            # Who was killed is in fault until its program starts again.
+            if not is_down(status) and (status.state is not _S.FAULT or status.armed is not False)
+        ]
         if armed:
             verb = "is" if len(armed) == 1 else "are"
             raise _ProblemError(f"{', '.join(armed)} {verb} armed: land and disarm first")
@@ -312,6 +319,7 @@ class Running:
         if not request.wait:
             yield from self._take_up(sequence, _obeying_words(request.calm), _CALM_S)
             return
+        yield from self._obeyed(sequence)
         known: dict[str, str] = {}
         changed_s = station.now_s
         while heard := self._heard():
@@ -328,22 +336,26 @@ class Running:
             if self._open:
                 yield
 
+    def _obeyed(self, sequence: int = 0) -> Waits:
+        """Each robot obeys that state, or has failed: what it said before counts no more."""
+        until_s = self._station.now_s + _OBEY_S
+        while heard := self._heard():
+            deaf = {n: s for n, s in heard.items() if not self._obeys(s, sequence)}
+            if deaf and self._station.now_s > until_s:
+                for name, status in deaf.items():
+                    self._fail([name], self._not_obeying(status))
+                deaf = {}
+            if not deaf:
+                return
+            yield
+
     # Orders
 
     def _reach(self) -> Waits:
         """Before orders: each robot obeys this station, or has failed."""
         station = self._station
         station.take_command()
-        began_s = station.now_s
-        while heard := self._heard():
-            deaf = {name: status for name, status in heard.items() if not self._obeys(status)}
-            if deaf and station.now_s - began_s > _OBEY_S:
-                for name, status in deaf.items():
-                    self._fail([name], self._not_obeying(status))
-                deaf = {}
-            if not deaf:
-                break
-            yield
+        yield from self._obeyed()
         twice = [name for name in self._open if station.is_duplicate(name)]
         self._fail(twice, "two programs say that they are this robot")
 
@@ -388,17 +400,28 @@ class Running:
         state = self._station.state
         if state is not None and not any(map(state.enabled_for, self._ids())):
             raise _ProblemError("not enabled: `lpac mission enable`")
-        if not self._all_down(self.names):
+        if not self._brought_down(self.names):
             self._refuse_calmed(request)
 
-    def _all_down(self, names: Iterable[str]) -> bool:
-        return all(is_down(status) for name in names if (status := self._status(name)))
+    def _brought_down(self, names: Collection[str]) -> bool:
+        """Whether all are down who are asked to return or to land, and nobody is asked to hold.
+
+        Who is not heard, and should be, may be in the air.
+        """
+        station = self._station
+        state, robots = station.state, station.setup.robots
+        awaited = {*self.names, *station.flying}
+        return state is not None and all(
+            state.calm_for(robots[name]) != "hold"
+            and (name not in awaited if (s := self._status(name)) is None else is_down(s))
+            for name in names
+        )
 
     def _take_off(self, request: Takeoff) -> Waits:
         station = self._station
-        # What brought the robots down before does not keep them there.
-        if self._calmed() and self._all_down(self.names):
-            whole = self._all_down(station.setup.robots)
+        # What brought the robots down before does not keep them there; somebody's hold does.
+        if self._calmed() and self._brought_down(self.names):
+            whole = self._brought_down(station.setup.robots)
             station.calm("none", None if whole else self._ids())
         for name, why in self._calmed().items():
             self._fail([name], why)
@@ -510,33 +533,38 @@ class Running:
     def _resume(self, _: Resume) -> Waits:
         station = self._station
         yield from self._reach()
-        homeward = {n: s for n, s in self._heard().items() if s.state is _S.RETURN}
-        if homeward:
-            # From return the way to the mission leads through hold.
-            until_s = station.now_s + _OBEY_S
-            station.calm("hold", [status.robot_id for status in homeward.values()])
-            while station.now_s < until_s and any(
-                (s := self._status(name)) and s.state is _S.RETURN for name in homeward
-            ):
-                yield
-        sequence = station.calm("none", self._those)
-        until_s = station.now_s + _OBEY_S
-        while station.now_s < until_s and not all(
-            self._obeys(status, sequence) for status in self._heard().values()
-        ):
-            yield
+        yield from self._stop_homeward()
+        yield from self._obeyed(station.calm("none", self._those))
         assert station.state is not None
         trial = station.state.trial
         for name, status in self._heard().items():
-            if not self._obeys(status, sequence):
-                self._fail([name], self._not_obeying(status))
-            elif is_down(status):
+            if is_down(status):
                 self._settle(name, "on the ground")
             elif status.state not in (_S.HOLD, _S.MISSION):
                 self._fail([name], f"{status.state}: {status.reason}")
             elif not trial or status.trial != trial:
                 self._settle(name, "holds: it has not begun this trial; `lpac mission start`")
         yield from self._order_start(trial)
+
+    def _stop_homeward(self) -> Waits:
+        """From return the way to the mission leads through hold."""
+        station = self._station
+        homeward = {n: s for n, s in self._heard().items() if s.state is _S.RETURN}
+        if not homeward:
+            return
+        ids = [status.robot_id for status in homeward.values()]
+        until_s = station.now_s + _OBEY_S
+        station.calm("hold", ids)
+        try:
+            while station.now_s < until_s and any(
+                (s := self._status(name)) and s.state is _S.RETURN for name in homeward
+            ):
+                yield
+        except GeneratorExit:
+            # Abandoned: nobody wants them to stay, unless somebody else asked for it since.
+            if station.commands and station.state is not None and not station.state.calm_by:
+                station.calm("return", ids)
+            raise
 
     def _give(self, request: Give) -> Waits:
         if request.kind != "kill":
@@ -620,6 +648,8 @@ class Commands:
 
     def begin(self, request: Request) -> Running:
         """Begin a command."""
+        # What another station did before does not end this one.
+        self.step()
         running = Running(self._station, request, self._end_others)
         running.step()
         self._running.append(running)
@@ -629,10 +659,16 @@ class Commands:
         """Time has passed, or something was heard."""
         why, self._station.interruption = self._station.interruption, ""
         for running in self._running:
-            if why and isinstance(running.request, _IN_FLIGHT):
+            if why and self._is_interrupted(running.request):
                 running.abandon(why, withdraw=True)
             running.step()
         self._running = [running for running in self._running if running.report is None]
+
+    def _is_interrupted(self, request: Request) -> bool:
+        """Another's hold ends what sets robots in motion; a new commander all that was wanted."""
+        if self._station.commands:
+            return isinstance(request, _IN_FLIGHT)
+        return not isinstance(request, Command) and not _is_kill(request)
 
     @property
     def texts(self) -> tuple[str, ...]:
@@ -652,19 +688,20 @@ class Commands:
 _IN_FLIGHT = (Takeoff, Start, Resume, Calm)
 
 
+def _is_kill(request: Request) -> bool:
+    return isinstance(request, Give) and request.kind == "kill"
+
+
 def _supersedes(request: Request) -> bool:
     if isinstance(request, Enable):
         return not request.on
-    if isinstance(request, Give):
-        return request.kind == "kill"
-    return isinstance(request, Calm | Resume)
+    return isinstance(request, Calm | Resume) or _is_kill(request)
 
 
 def _is_everybodys(request: Request) -> bool:
     """Whether it needs no command of the fleet."""
-    if isinstance(request, Give):
-        return request.kind == "kill"
-    return isinstance(request, Command) or (isinstance(request, Calm) and request.calm == "hold")
+    is_hold = isinstance(request, Calm) and request.calm == "hold"
+    return isinstance(request, Command) or is_hold or _is_kill(request)
 
 
 def in_words(request: Request) -> str:

@@ -88,6 +88,11 @@ class _Robot:
         alive = [p for p in self._programs.values() if now_s - p.newest.at_s <= FRESH_S]
         return len(alive) > 1 and max(p.first_s for p in alive) < min(p.newest.at_s for p in alive)
 
+    def others(self, now_s: float) -> list[tuple[RobotStatus, float]]:
+        """The newest status, and its age, s, of each other program that speaks."""
+        newest = (p.newest for nonce, p in self._programs.items() if nonce != self._nonce)
+        return [(h.status, now_s - h.at_s) for h in newest if now_s - h.at_s <= FRESH_S]
+
     def picture(self, now_s: float) -> RobotPicture:
         program = self.program
         if program is None:
@@ -154,6 +159,10 @@ class HeardRobots:
         """The robot's newest status, however old, and its age, s; None if it was never heard."""
         program = self._robots[robot_id].program
         return None if program is None else (program.newest.status, now_s - program.newest.at_s)
+
+    def others(self, robot_id: int, now_s: float) -> list[tuple[RobotStatus, float]]:
+        """The same of each other program that says it is this robot, if it was heard within 2 s."""
+        return self._robots[robot_id].others(now_s)
 
     def statuses(self, now_s: float) -> dict[int, RobotStatus]:
         """The newest of each robot that was heard within 2 s, by robot id."""

@@ -65,8 +65,10 @@ class GroundProcess:
         self._world_at_s = 0.0
         self._complained: set[str] = set()
         self._socket_path = socket_path(setup.fleet)
-        # The last world that was given to the robots outlives this process.
+        # What the robots were told last outlives this process.
         self._world_path = self._socket_path.with_suffix(".world")
+        self._state_path = self._socket_path.with_suffix(".state")
+        self._kept: GroundState | None = None
         self._stepped = asyncio.Event()
         self._failed: asyncio.Future[None] | None = None
         self._link: ZenohLink | None = None
@@ -80,7 +82,7 @@ class GroundProcess:
         fleet = self._config.setup.fleet
         loop = asyncio.get_running_loop()
         self._failed = loop.create_future()
-        self._recall_world()
+        self._recall()
 
         def received(key: str, data: bytes) -> None:
             with suppress(RuntimeError):  # The loop has ended.
@@ -113,8 +115,9 @@ class GroundProcess:
                 self._socket_path.unlink(missing_ok=True)
 
     def needed(self) -> bool:
-        """Whether robots fly that this station commands."""
-        return self._station.commands and not all(map(is_down, self._station.statuses().values()))
+        """Whether robots fly that this station commands, or did a few seconds ago."""
+        statuses = map(self._station.lately, self._config.setup.robots)
+        return self._station.commands and not all(map(is_down, filter(None, statuses)))
 
     # What comes
 
@@ -174,6 +177,7 @@ class GroundProcess:
     def _publish(self, now_s: float) -> None:
         link = self._link
         assert link is not None
+        self._keep()
         state = self._station.published_state()
         orders = self._station.published_orders()
         self._published = (None if state is None else state.sequence, len(orders))
@@ -212,9 +216,22 @@ class GroundProcess:
             for client in tuple(self._clients):
                 client.send(line)
 
-    def _recall_world(self) -> None:
+    def _keep(self) -> None:
+        """Before robots hear of it."""
+        state = self._station.state
+        if state is None or state == self._kept or not self._station.commands:
+            return
+        self._kept = state
+        new = self._state_path.with_suffix(".state-new")
+        with suppress(OSError):  # Only the next one misses it.
+            new.write_bytes(to_json(state))
+            new.replace(self._state_path)
+
+    def _recall(self) -> None:
         with suppress(OSError, UnicodeDecodeError):
             self._station.remember_world(self._world_path.read_text("utf-8-sig"))
+        with suppress(OSError, ConfigError):
+            self._station.remember(_state(self._state_path.read_bytes()))
 
     # Clients
 

@@ -30,7 +30,7 @@ from edge.core.mission import (
     waiting_to_land,
     world_id,
 )
-from ground.heard import FRESH_S, HeardRobots
+from ground.heard import HeardRobots
 from ground.protocol import Event, Picture, Setup
 
 # Before it says anything, a station listens: who commands, whom do the robots obey?
@@ -40,9 +40,20 @@ COMMANDER_SILENT_S = 2.0
 # ... also if robots say so, who hear what this station may not.
 _ROBOTS_HEAR_NOBODY_S = 1.0
 _OVERTAKEN_S = 1.0
+# Who restarts knows of its robots only when it has heard them for a while.
+_GATHER_S = 3.0
+# Robots that heard this station's name a moment ago have heard another one of that name, unless it
+# was an observer's hold: that ends before this time.
+_SPOKE_S = 0.6
+_NAME_TAKEN_S = 3.0
 _LATELY_S = 10.0
+# A robot refuses an order that expires later than the lifetime, or not after one that it obeyed.
+_EXPIRY_MARGIN_S = 0.5
+_LATER_S = 1e-3
 _EVENTS_KEPT = 200
 _AT_PLACE_M = 0.01
+# As a robot says it of a world whose text it has.
+_UNUSABLE_WORLD = "world cannot be used"
 
 EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]
 
@@ -85,13 +96,17 @@ class Station:
         self._obeyed_since_s: float | None = None
         self._decided = False
         self._ahead_since_s: dict[int, float] = {}
-        # The hold that this station asks for while another commands.
+        # The hold that this station asks for while another commands, and of whom; None: of all.
         self._asked: GroundState | None = None
+        self._asked_of: frozenset[int] | None = None
         self._orders: dict[str, tuple[Order, float]] = {}
         self._orders_made = 0
+        self._expiries_s: dict[tuple[int, int], float] = {}
+        # Kills of second programs of one robot: nobody waits for their answers.
+        self._more_kills: list[tuple[Order, float]] = []
         self._orders_prefix = f"{setup.operator}-{int(unix_now_s * 1e3)}"
-        self._returning: frozenset[int] = frozenset()
         self._arrived: set[int] = set()
+        self._remembered: GroundState | None = None
         self._events: deque[Event] = deque(maxlen=_EVENTS_KEPT)
         self._new_events: list[Event] = []
 
@@ -248,20 +263,35 @@ class Station:
         self.results[result.order_id] = result
 
     def _look_who_is_obeyed(self, status: RobotStatus) -> None:
-        """A robot may have obeyed this station's former life, which said more than is known."""
+        """A robot may obey what this station does not know of: its former life, or another one."""
         state = self.state
-        if (
-            not self.commands
-            or state is None
-            or status.operator != state.operator
-            or status.obeyed_sequence <= state.sequence
-        ):
+        obeyed = status.obeyed_sequence, status.operator
+        own = status.operator == self.operator
+        # Who obeys a station that is gone does so no longer than it takes to hear this one.
+        heard = own or _hears_ground(status)
+        if not self.commands or state is None or obeyed <= _rank(state) or not heard:
             self._ahead_since_s.pop(status.robot_id, None)
             return
-        # It may also obey an observer's hold, which comes here too.
+        # An observer's hold, or another commander, mostly comes here too.
         since_s = self._ahead_since_s.setdefault(status.robot_id, self._now_s)
-        if self._now_s - since_s > _OVERTAKEN_S:
+        if self._now_s - since_s <= _OVERTAKEN_S:
+            return
+        if own:
             self.state = replace(state, sequence=status.obeyed_sequence + 1)
+            return
+        self._step_down(status.operator)
+        self._tell_commander(status.operator)
+        # What the other one wants is not known.
+        self.state, self._decided = None, True
+
+    def _step_down(self, operator: str) -> None:
+        """Another station commands from now on."""
+        self.commands = False
+        self._ahead_since_s.clear()
+        self.interruption = f"{operator} commands the fleet"
+        for order, _ in tuple(self._orders.values()):
+            if order.kind != "kill":
+                self._settle(OrderResult(order.order_id, False, self.interruption))
 
     def hear_state(self, state: GroundState) -> None:
         """Another station's state came. Raises NameTakenError if it has this one's name."""
@@ -274,10 +304,7 @@ class Station:
             return
         if before is None or before.operator != state.operator:
             if self.commands:
-                self.interruption = f"{state.operator} commands the fleet"
-                for order, _ in tuple(self._orders.values()):
-                    if order.kind != "kill":
-                        self._settle(OrderResult(order.order_id, False, self.interruption))
+                self._step_down(state.operator)
             self._tell_commander(state.operator)
         elif before.sequence != state.sequence:
             by = state.calm_by if _is_calmed(before, state) else ""
@@ -285,9 +312,9 @@ class Station:
         self.state, self.commands, self._heard_s = state, False, self._now_s
         self._keep_world_of(state)
         if self._asked is not None and state.sequence >= self._asked.sequence:
-            held = _holds_as(state, self._asked)
-            asked = replace(_with_hold_of(state, self._asked), sequence=state.sequence + 1)
-            self._asked = None if held else asked
+            asked = _held(state, self._asked_of, self.operator)
+            held = _holds(state, self._asked_of)
+            self._asked = None if held else replace(asked, sequence=state.sequence + 1)
 
     def _hear_own_name(self, state: GroundState) -> None:
         """It is an observer's hold, or somebody else has this name."""
@@ -306,7 +333,6 @@ class Station:
         self._tell_changes(own, after, state.calm_by)
         self.interruption = f"{state.calm_by} commands hold"
         self.state = after
-        self._returning = self._returning_by(after)
 
     def _name_taken(self) -> NameTakenError:
         return NameTakenError(
@@ -327,6 +353,11 @@ class Station:
         for order_id, (_, made_s) in list(self._orders.items()):
             if self._now_s - made_s > ORDER_LIFETIME_S + 1.0:
                 self._settle(OrderResult(order_id, False, "it did not answer"))
+        self._more_kills = [
+            (order, made_s)
+            for order, made_s in self._more_kills
+            if self._now_s - made_s <= ORDER_LIFETIME_S
+        ]
         self._listen()
         if self._asked is not None:
             self._end_asking(self._asked)
@@ -334,19 +365,39 @@ class Station:
             self._bring_home()
 
     def _listen(self) -> None:
-        """Find out who commands robots that obey somebody; take those that were left alone."""
+        """Find out who commands robots that obey somebody; take those that were left alone.
+
+        Raises NameTakenError if that is somebody else of this name.
+        """
         obeyed = {s.operator for s in self.statuses().values() if s.operator}
         if self.state is not None or self._decided or not obeyed:
             self._obeyed_since_s = None
             return
         if self._obeyed_since_s is None:
             self._obeyed_since_s = self._now_s
-        if self._now_s - self._obeyed_since_s < LISTEN_S:
+        listened_s = self._now_s - self._obeyed_since_s
+        if listened_s < LISTEN_S:
+            return
+        if self._own_name_age_s() < _SPOKE_S:
+            if listened_s > _NAME_TAKEN_S:
+                raise self._name_taken()
             return
         self._decided = True
         # The robots' ages tell of a commander that this station does not hear, but they do.
         if obeyed == {self.operator} or self.commander_age_s > _ROBOTS_HEAR_NOBODY_S:
             self.take_command()
+
+    def _own_name_age_s(self) -> float:
+        """How long ago a robot heard a station of this name; infinite if none does, s."""
+        lasts = (self._robots.last(robot, self._now_s) for robot in self.statuses())
+        return min(
+            (
+                status.ground_age_s + age_s
+                for status, age_s in filter(None, lasts)
+                if status.operator == self.operator and status.ground_age_s is not None
+            ),
+            default=math.inf,
+        )
 
     # Who commands
 
@@ -354,8 +405,8 @@ class Station:
         """Command from now on, with what the fleet is told already."""
         if self.commands:
             return
-        before = self.state or self._state_of_robots()
-        obeyed = max((s.obeyed_sequence for s in self.statuses().values()), default=0)
+        before = self._known_state()
+        obeyed = self._greatest_obeyed()
         by = before.calm_by or before.operator
         self.state = replace(
             before,
@@ -365,26 +416,45 @@ class Station:
         )
         self.commands = True
         self._asked = None
-        self._returning = self._returning_by(self.state)
         self._keep_world_of(self.state)
         self._tell_commander(self.operator)
+
+    def _greatest_obeyed(self) -> int:
+        return max((s.obeyed_sequence for s in self.statuses().values()), default=0)
+
+    def _known_state(self) -> GroundState:
+        """What the fleet is told, by whoever was heard, or as it is remembered or seen."""
+        if self.state is not None:
+            return self.state
+        obeyed = [(s.obeyed_sequence, s.operator) for s in self.statuses().values() if s.operator]
+        remembered = self._remembered
+        if remembered is not None and _rank(remembered) == max(obeyed, default=None):
+            return remembered
+        return self._state_of_robots()
+
+    def remember(self, state: GroundState) -> None:
+        """What the last process said: it counts if robots still obey just that."""
+        self._remembered = state
 
     def _state_of_robots(self) -> GroundState:
         """What the robots were told by a station that is not heard, as far as they show it."""
         statuses = [s for s in self.statuses().values() if s.operator]
-        enabled = any(s.state not in (_S.INIT, _S.IDLE) for s in statuses)
         idle = {str(s.robot_id): False for s in statuses if s.state is _S.IDLE}
-        fence = _agreed(s.fence for s in statuses)
+        # Who is not heard yet may be in the air.
+        enabled = bool(statuses) and len(idle) < len(self._setup.robots)
+        # Of two fences that as many have, the configured one is not what the ground asked for.
+        fences = sorted((s.fence for s in statuses), key=lambda fence: fence == self._setup.fence)
+        fence = _commonest(fences)
         return GroundState(
             sequence=0,
             operator=self.commander or self.operator,
-            origin=_agreed(s.origin for s in statuses),
+            origin=_commonest(s.origin for s in statuses),
             enabled=enabled,
             robot_enabled=idle if enabled else {},
             fence=None if fence == self._setup.fence else fence,
             places=self._places_of(statuses),
             world_id=_commonest(s.world_id for s in statuses),
-            trial=_commonest(s.trial for s in statuses if s.trial) or "",
+            trial=_commonest(s.trial for s in statuses) or "",
         )
 
     def _places_of(self, statuses: Iterable[RobotStatus]) -> dict[str, Place]:
@@ -394,7 +464,10 @@ class Station:
         places = {}
         for status in statuses:
             above_m = status.slot_height_m - setup.base_height_m
-            place = Place(max(0, round(above_m / setup.slot_spacing_m)), status.landing_point_m)
+            try:
+                place = Place(max(0, round(above_m / setup.slot_spacing_m)), status.landing_point_m)
+            except (ValueError, OverflowError):  # It says what no place is.
+                continue
             known = configured.get(status.robot_id)
             if known is None or known.slot != place.slot or not _is_at(status, known):
                 places[str(status.robot_id)] = place
@@ -417,67 +490,68 @@ class Station:
         assert self.state is not None
         these = frozenset(self._robots.names if robots is None else robots)
         self._arrived -= these
-        self._returning = self._returning | these if calm == "return" else self._returning - these
         if robots is None:
-            return self.change(calm=calm, calm_by="", robot_calm={})
+            return self.change(calm=calm, calm_by="", robot_calm={}, waiting=())
         asked: dict[str, Calm] = dict.fromkeys(map(str, sorted(robots)), calm)
         asked = {r: c for r, c in (self.state.robot_calm | asked).items() if c != self.state.calm}
-        return self.change(calm_by="", robot_calm=asked)
+        waiting = tuple(r for r in self.state.waiting if r not in these)
+        return self.change(calm_by="", robot_calm=asked, waiting=waiting)
 
     def hold(self, robots: Collection[int] | None = None) -> int:
         """Hold, whoever commands; the sequence that says so."""
         lost = self.commander_age_s > COMMANDER_SILENT_S
         if self.commands or not self.commander or lost:
-            return self.calm("hold", robots)
-        state = self._asked or self.state or self._state_of_robots()
-        obeyed = max((s.obeyed_sequence for s in self.statuses().values()), default=0)
-        asked = replace(state, calm_by=self.operator, sequence=max(state.sequence, obeyed) + 1)
-        held: dict[str, Calm] = {str(robot): "hold" for robot in robots or ()}
-        if robots is None:
-            asked = replace(asked, calm="hold", robot_calm={})
-        else:
-            asked = replace(asked, robot_calm=state.robot_calm | held)
-        self._asked = asked
-        return asked.sequence
+            return self._hold_as_commander(robots)
+        state = self._asked or self._known_state()
+        sequence = max(state.sequence, self._greatest_obeyed()) + 1
+        asked_of: frozenset[int] | None = frozenset() if self._asked is None else self._asked_of
+        self._asked_of = None if robots is None or asked_of is None else asked_of | set(robots)
+        self._asked = replace(_held(state, self._asked_of, self.operator), sequence=sequence)
+        return sequence
+
+    def _hold_as_commander(self, robots: Collection[int] | None) -> int:
+        self.calm("hold", robots)
+        assert self.state is not None
+        # Robots may obey somebody who took over without being heard here.
+        others = (s for s in self.statuses().values() if s.operator != self.operator)
+        beyond = max((s.obeyed_sequence for s in others), default=0) + 1
+        self.state = replace(self.state, sequence=max(self.state.sequence, beyond))
+        return self.state.sequence
 
     def _end_asking(self, asked: GroundState) -> None:
         """The commander takes the hold up, or is gone, or is out of reach of this station."""
         if self.commander_age_s > COMMANDER_SILENT_S:
             self.take_command()
-            self.change(calm=asked.calm, calm_by="", robot_calm=asked.robot_calm)
-            self._returning = frozenset()
+            self.change(
+                calm=asked.calm, calm_by="", robot_calm=asked.robot_calm, waiting=asked.waiting
+            )
         elif self.state is None and all(
             s.obeyed_sequence >= asked.sequence for s in self.statuses().values() if s.operator
         ):
             self._asked = None
 
-    def _returning_by(self, state: GroundState) -> frozenset[int]:
-        """Who returns according to the state; who waits for that above its landing point, too."""
-        robots = self._robots.names
-        asked = {robot for robot in robots if state.calm_for(robot) == "return"}
-        waiting = {
-            robot
-            for robot, status in self.statuses().items()
-            if state.robot_calm.get(str(robot)) == "hold" and is_over_landing_point(status)
-        }
-        return frozenset(asked | waiting) if asked else frozenset()
-
     def _bring_home(self) -> None:
         """Who returns and is over its landing point waits while somebody lower still flies home."""
-        if not self._returning or self.state is None:
+        state = self.state
+        assert state is not None
+        asked_home = {r for r in self._robots.names if state.calm_for(r) == "return"}
+        returning = asked_home.union(state.waiting)
+        if not returning:
             return
-        statuses = {r: s for r, s in self.statuses().items() if r in self._returning}
+        statuses = {r: s for r, s in self.statuses().items() if r in returning}
         self._arrived |= {r for r, status in statuses.items() if is_over_landing_point(status)}
         waiting = waiting_to_land(statuses, self._arrived)
+        # Who is not heard, or may have somebody below who was not heard yet, waits on.
+        waiting |= {r for r in state.waiting if self.age_s < _GATHER_S or r not in statuses}
         asked: dict[str, Calm] = {
-            r: c for r, c in self.state.robot_calm.items() if int(r) not in self._returning
+            r: c for r, c in state.robot_calm.items() if int(r) not in returning
         }
-        for robot in sorted(self._returning):
+        for robot in sorted(returning):
             if robot in waiting:
                 asked[str(robot)] = "hold"
-            elif self.state.calm != "return":
+            elif state.calm != "return":
                 asked[str(robot)] = "return"
-        self.change(robot_calm=asked)
+        self.change(robot_calm=asked, waiting=tuple(sorted(waiting)))
 
     def set_world(self, text: str) -> int:
         """Want that world of the robots; the sequence."""
@@ -505,20 +579,31 @@ class Station:
         last = self._robots.last(self._setup.robots[name], self._now_s)
         if last is None:
             return None
-        status, age_s = last
-        uptime_s = status.uptime_s + (0.0 if age_s <= FRESH_S else age_s - FRESH_S)
+        order = self._new_order(kind, *last, trial)
+        self._orders[order.order_id] = order, self._now_s
+        if kind == "kill":
+            others = self._robots.others(order.robot_id, self._now_s)
+            self._more_kills += [(self._new_order(kind, *o, trial), self._now_s) for o in others]
+        return order.order_id
+
+    def _new_order(self, kind: OrderKind, status: RobotStatus, age_s: float, trial: str) -> Order:
+        """For the program that said the status so long ago."""
         self._orders_made += 1
-        order = Order(
+        program = status.robot_id, status.boot_nonce
+        expiry_s = max(
+            status.uptime_s + age_s + ORDER_LIFETIME_S - _EXPIRY_MARGIN_S,
+            self._expiries_s.get(program, -math.inf) + _LATER_S,
+        )
+        self._expiries_s[program] = expiry_s
+        return Order(
             order_id=f"{self._orders_prefix}-{self._orders_made}",
             robot_id=status.robot_id,
             boot_nonce=status.boot_nonce,
             kind=kind,
-            expires_at_uptime_s=uptime_s + ORDER_LIFETIME_S,
+            expires_at_uptime_s=expiry_s,
             operator=self.operator,
             trial=trial,
         )
-        self._orders[order.order_id] = order, self._now_s
-        return order.order_id
 
     def withdraw(self, order_id: str) -> None:
         """Say an order no more, if it is open."""
@@ -533,15 +618,18 @@ class Station:
 
     def published_orders(self) -> tuple[Order, ...]:
         """Those that are not answered."""
-        return tuple(order for order, _ in self._orders.values())
+        return tuple(order for order, _ in (*self._orders.values(), *self._more_kills))
 
     def published_world(self) -> str | None:
-        """The world's text, while a robot on the ground lacks it."""
+        """The world's text, while a robot on the ground lacks it, and may have use for it."""
         wanted = self.state.world_id if self.commands and self.state else None
         if wanted is None or wanted != self._setup.world_id:
             return None
         lacking = any(
-            s.world_id != wanted and s.state in ON_GROUND for s in self.statuses().values()
+            s.world_id != wanted
+            and s.state in ON_GROUND
+            and not any(_UNUSABLE_WORLD in why for why in s.not_taken)
+            for s in self.statuses().values()
         )
         return self._setup.world if lacking else None
 
@@ -581,33 +669,42 @@ def _rank(state: GroundState) -> tuple[int, str]:
     return state.sequence, state.operator
 
 
-def _agreed(values: Iterable[T | None]) -> T | None:
-    """What all say that say anything; None if they differ."""
-    said = [value for value in values if value]
-    return said[0] if said and all(value == said[0] for value in said) else None
+def _hears_ground(status: RobotStatus) -> bool:
+    """Whether somebody still says what the robot obeys."""
+    return status.ground_age_s is not None and status.ground_age_s <= _ROBOTS_HEAR_NOBODY_S
 
 
-def _commonest(values: Iterable[str]) -> str | None:
-    return next((value for value, _ in Counter(values).most_common(1)), None)
+def _commonest(values: Iterable[T | None]) -> T | None:
+    """What most say, of those that say anything; of equals the first."""
+    said = Counter(value for value in values if value)
+    return next((value for value, _ in said.most_common(1)), None)
 
 
 def _is_at(status: RobotStatus, place: Place) -> bool:
     return math.dist(status.landing_point_m, place.landing_point_m) < _AT_PLACE_M
 
 
-def _with_hold_of(state: GroundState, asked: GroundState) -> GroundState:
-    """The state with the hold that another station asks for, and nothing else of it."""
-    if asked.calm == "hold":
-        return replace(state, calm="hold", robot_calm={}, calm_by=asked.calm_by)
-    held: dict[str, Calm] = {r: c for r, c in asked.robot_calm.items() if c == "hold"}
-    return replace(state, robot_calm=state.robot_calm | held, calm_by=asked.calm_by)
+def _held(state: GroundState, robots: Collection[int] | None, by: str) -> GroundState:
+    """The state with a hold of these robots, None: of all; and nothing else of it."""
+    if robots is None:
+        return replace(state, calm="hold", robot_calm={}, calm_by=by, waiting=())
+    held: dict[str, Calm] = dict.fromkeys(map(str, sorted(robots)), "hold")
+    waiting = tuple(robot for robot in state.waiting if robot not in robots)
+    return replace(state, robot_calm=state.robot_calm | held, calm_by=by, waiting=waiting)
 
 
-def _holds_as(state: GroundState, asked: GroundState) -> bool:
-    """Whether the state has the hold that is asked for."""
-    if asked.calm == "hold":
+def _holds(state: GroundState, robots: Collection[int] | None) -> bool:
+    """Whether the state has that hold."""
+    if robots is None:
         return state.calm == "hold" and set(state.robot_calm.values()) <= {"hold"}
-    return all(state.calm_for(int(r)) == c for r, c in asked.robot_calm.items() if c == "hold")
+    return all(state.calm_for(robot) == "hold" for robot in robots)
+
+
+def _with_hold_of(state: GroundState, asked: GroundState) -> GroundState:
+    """The state with the hold that another station asks for."""
+    held = {int(robot) for robot, calm in asked.robot_calm.items() if calm == "hold"}
+    held = held.difference(asked.waiting)
+    return _held(state, None if asked.calm == "hold" else held, asked.calm_by)
 
 
 def _is_calmed(before: GroundState, after: GroundState) -> bool:

@@ -107,7 +107,8 @@ class GroundState:
     calm sets nothing in motion. `origin`, `fence` (None: the robot's configured one), `places` (by
     robot id; who is not in it keeps its configured one) and `world_id` (None: whatever the robot
     has) are taken up on the ground only. `trial` is the mission's name. `unix_time_s` is the
-    ground's clock when it said so.
+    ground's clock when it said so. `waiting` are those that hold in a return only until their way
+    down is free: nobody asked them to.
     """
 
     sequence: int
@@ -123,6 +124,7 @@ class GroundState:
     world_id: str | None = None
     trial: str = ""
     unix_time_s: float | None = None
+    waiting: tuple[int, ...] = ()
 
     def enabled_for(self, robot_id: int) -> bool:
         """Whether one robot may run its checks and fly."""

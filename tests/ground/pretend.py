@@ -148,7 +148,7 @@ class PretendedRobot:
             self._enter(_S.HOLD, "taken back by the operator")
         elif order.kind == "reset":
             self.explored[:] = False
-            self.trial = order.trial
+            self.trial = ""
         elif order.kind == "kill":
             self._enter(_S.FAULT, "killed by the operator")
 

@@ -26,7 +26,7 @@ from ground.protocol import (
     Start,
     Takeoff,
 )
-from tests.ground.conftest import GroundStation, NewStation
+from tests.ground.conftest import PATIENCE_S, GroundStation, NewStation
 from tests.ground.pretend import ORIGIN, PretendedFleet, pretended
 
 _S = FlightState
@@ -133,6 +133,19 @@ def test_a_station_that_was_killed_goes_on_where_it_was(
     assert station.setup().world == text
     done(station.command(Takeoff(interval_s=0.0)))
     done(station.command(Start()))
+    # What robots do not say is not forgotten either.
+    done(station.command(Calm("hold")))
+    station.kill()
+    station.start()
+    picture = station.wait_for(lambda p: p.ground is not None)
+    assert picture.ground is not None
+    assert picture.ground.calm == "hold"
+    assert "hold is commanded" in station.command(Start()).problem
+    # A memory that is broken is none.
+    station.kill()
+    station.socket_path.with_suffix(".state").write_text("{")
+    station.start()
+    station.wait_for(lambda p: p.ground is not None)
 
 
 def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
@@ -259,6 +272,13 @@ def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) ->
     station.wait_for(lambda _: "hold after 3 s" in station.log.read_text())
     assert station.end(signal.SIGINT) == 0
     assert not station.socket_path.exists()
+    station.start()
+    station.wait_for(lambda p: p.ground is not None)
+    assert station.process is not None
+    # Its terminal is closed, which is no reason to leave robots in the air alone.
+    station.process.send_signal(signal.SIGHUP)
+    done(station.command(Calm("land", wait=True)))
+    assert station.process.wait(PATIENCE_S) == 0
     station.start()
     assert station.end(signal.SIGTERM) == 0
     station.start()

@@ -40,6 +40,7 @@ from tests.ground.browser import live_map, opened
 _S = FlightState
 NAMES = ("r0", "r1")
 PATIENCE_S = 60.0
+OUT_OF_REACH = ("not heard", "it did not answer", "does not hear this station")
 
 
 @pytest.fixture(scope="module")
@@ -116,16 +117,18 @@ class Ground:
         report = self.ask(request)
         assert report.done, report
 
-    def insist(self, request: Request) -> None:
-        """Command something until all robots have done it, as a person does on a bad link."""
-        until_s = time.monotonic() + PATIENCE_S
-        while not (report := self.ask(request)).done:
+    def do_at_second_try(self, request: Request) -> None:
+        """Command something, once again if a robot was out of reach for all of a command's 10 s."""
+        report = self.ask(request)
+        if not report.done:
+            assert {r.text for r in report.results if not r.done} <= set(OUT_OF_REACH), report
             print(f"again, since {refusals(report)}: {request}")
-            assert time.monotonic() < until_s, report
+            self.do(request)
 
     def make_ready(self) -> None:
-        """Origin, enable, and the robots' checks."""
+        """Origin, enable, and the robots' checks; the last test's landing is over."""
         self.do(SetOrigin(ORIGIN))
+        self.do(Resume())
         self.do(Enable())
         self.wait(lambda p: all(r.status and r.status.ready for r in p.robots))
 
@@ -245,7 +248,8 @@ def test_a_page_flies_the_fleet(fleet: Fleet, tmp_path: Path) -> None:
 def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Path) -> None:
     """Every command arrives through a link that loses 30 % each way; then its ground dies.
 
-    Commands are repeated if the link breaks for so long that robots count as not heard.
+    TCP doubles its pause at every retransmission that is lost, too: now and then a link says
+    nothing for longer than commands wait.
     """
     with lossy_network() as (enter, address):
         far_toml = fleet.folder / "far.toml"
@@ -256,7 +260,7 @@ def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Pa
                 SetOrigin(ORIGIN), Enable(), Takeoff(interval_s=0.5), Start(), Calm("hold"),
                 Resume(),
             ):  # fmt: skip
-                ground.insist(request)
+                ground.do_at_second_try(request)
             trial = ground.wait_states(_S.MISSION, _S.HOLD).ground
             assert trial is not None
             ground.kill()

@@ -4,6 +4,7 @@ Time is counted, nothing waits: a minute in the field takes a moment.
 """
 
 import itertools
+import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.core.mission import FlightState, Place
+from edge.core.mission import ORDER_LIFETIME_S, FlightState, Place
 from ground.commands import Commands, Running
 from ground.protocol import (
     Again,
@@ -94,6 +95,16 @@ class Field:
         """Start a station, or start it again."""
         station = Station(setup(name, self._n, self._spares), self.now_s, 1e9 + self.now_s)
         self.stations[name], self.commands[name] = station, Commands(station)
+        return station
+
+    def restart(self, name: str, away_s: float = 0.5) -> Station:
+        """As on the same laptop, where the last process' memory is."""
+        former = self.stations[name]
+        self.leave(name)
+        self.run(away_s)
+        station = self.join(name)
+        if former.commands and former.state is not None:
+            station.remember(former.state)
         return station
 
     def leave(self, name: str) -> None:
@@ -333,6 +344,67 @@ def test_who_returns_waits_for_those_below() -> None:
     assert landing[0] == 0
 
 
+def a_return(field: Field, slow: int) -> None:
+    """All return, and robot `slow` is so slow that the others wait for it over their places."""
+    field.fly()
+    field.run(5.0)
+    field.robots[slow].speed_m_s = 0.1
+    field.begin(Calm("return"))
+    above = field.robots[slow + 1 :]
+    field.until(lambda: all(robot.state is _S.HOLD for robot in above))
+
+
+@pytest.mark.parametrize("by", ["alice", "bob"])
+def test_whom_somebody_holds_in_a_return_stays(by: str) -> None:
+    field = a_field()
+    field.join("bob")
+    a_return(field, slow=1)
+    over = field.robots[0]
+    field.until(lambda: over.state is _S.LAND or over._away_m(over.landing_point_m) < 1.4)
+    # Also where it could be taken for one that waits.
+    field.done(Calm("hold", robots=("r0",)), by)
+    states = set()
+    for _ in range(100):
+        field.step()
+        states.add(over.state)
+    assert states == {_S.HOLD}
+    # Who waits goes on when its way is free, and not before.
+    assert [robot.state for robot in field.robots[1:]] == [_S.RETURN, _S.HOLD]
+    field.done(Calm("hold", robots=("r1",)), by)
+    field.until(lambda: field.robots[2].state is _S.LANDED)
+    field.run(5.0)
+    assert [robot.state for robot in field.robots[:2]] == [_S.HOLD, _S.HOLD]
+    field.done(Calm("return", robots=("r0",), wait=True))
+    assert field.robots[1].state is _S.HOLD
+    field.done(Calm("land", robots=("r1",), wait=True))
+
+
+@pytest.mark.parametrize("by", ["alice", "bob"])
+def test_who_waits_in_a_return_may_be_held(by: str) -> None:
+    field = a_field()
+    field.join("bob")
+    a_return(field, slow=0)
+    field.done(Calm("hold", robots=("r0", "r2")), by)
+    field.until(lambda: field.robots[1].state is _S.LANDED)
+    field.done(Command(), "bob")
+    field.run(20.0)
+    assert [robot.state for robot in field.robots] == [_S.HOLD, _S.LANDED, _S.HOLD]
+    field.robots[0].speed_m_s = 1.0
+    field.done(Calm("return", wait=True), "bob")
+
+
+def test_a_return_goes_on_with_another_commander() -> None:
+    field = a_field()
+    field.join("bob")
+    a_return(field, slow=0)
+    field.done(Command(), "bob")
+    field.run(2.0)
+    assert [robot.state for robot in field.robots] == [_S.RETURN, _S.HOLD, _S.HOLD]
+    field.leave("alice")
+    field.robots[0].speed_m_s = 1.0
+    field.land()
+
+
 def test_places_and_spares() -> None:
     field = a_field(3, spares=1)
     station = field.stations["alice"]
@@ -364,6 +436,21 @@ def test_a_world_comes_with_its_text() -> None:
     field.robots[1].deaf = False
     field.run(2.0)
     assert field.stations["alice"].published_world() is None
+
+
+def test_a_world_that_cannot_be_used_is_not_sent_for_ever() -> None:
+    field = a_field(1)
+    station = field.stations["alice"]
+    field.robots[0].deaf = True
+    station.set_world(OTHER_WORLD)
+    status = field.robots[0].status(field.now_s)
+    for why, text in (("has not arrived: wait", OTHER_WORLD), ("cannot be used: too long", None)):
+        field.run(STEP_S)
+        status = replace(status, not_taken=(f"the ground's world {why}",))
+        station.hear_status(replace(status, sequence=field.robots[0].sequence + 1))
+        field.robots[0].silent = True
+        assert station.published_world() == text
+        field.robots[0].sequence += 1
 
 
 def test_trials_are_numbered() -> None:
@@ -490,6 +577,34 @@ def test_a_silent_robot_is_killed_too() -> None:
     assert why_not(never.do(Give("kill", ("r0",)))) == {"r0": "not heard"}
 
 
+def test_of_two_orders_the_later_expires_later() -> None:
+    field = a_field()
+    field.make_ready()
+    station, robot = field.stations["alice"], field.robots[0]
+    robot.silent = robot.deaf = True
+    last_s = 0.0
+    for pause_s in (0.0, 0.0, 0.1, 1.0, 5.0):
+        field.run(pause_s)
+        station.order("reset", "r0")
+        expiry_s = station.published_orders()[-1].expires_at_uptime_s
+        uptime_s = field.now_s - robot.began_s
+        assert last_s < expiry_s <= uptime_s + ORDER_LIFETIME_S
+        last_s = expiry_s
+
+
+def test_all_programs_of_one_robot_are_killed() -> None:
+    field = a_field()
+    field.take_off()
+    second = field.new_robot(1, 3)
+    field.programs.append(second)
+    field.run(1.0)
+    field.done(Give("kill", ("r1",)))
+    field.run(1.0)
+    assert (field.robots[1].state, second.state) == (_S.FAULT, _S.FAULT)
+    field.run(12.0)
+    assert not field.stations["alice"].published_orders()
+
+
 def test_two_programs_of_one_robot_settle_nothing() -> None:
     field = a_field()
     field.make_ready()
@@ -548,6 +663,102 @@ def test_a_station_started_again_takes_up_what_robots_do() -> None:
     field.done(Calm("land", wait=True))
 
 
+def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
+    field = a_field()
+    field.make_ready()
+    field.done(SetPlaces({"r2": Place(7, (20.0, 20.0))}))
+    field.done(Takeoff(interval_s=0.0))
+    field.done(Start(robots=("r0", "r1")))
+    field.done(Calm("hold"))
+    before = field.stations["alice"].state
+    # Of whom it hears one alone.
+    field.cut = {frozenset(("alice", f"r{i}")) for i in (1, 2)}
+    after = field.restart("alice")
+    field.run(1.2)
+    assert before is not None
+    assert after.state == replace(before, sequence=before.sequence + 1)
+    field.cut.clear()
+    field.run(2.0)
+    assert "hold is commanded" in field.do(Start()).problem
+    # What somebody else said since is what counts.
+    field.join("bob")
+    field.run(1.0)
+    field.done(Command(), "bob")
+    field.done(Resume(), "bob")
+    bob = field.stations["bob"].state
+    field.leave("bob")
+    after = field.restart("alice")
+    after.remember(before)
+    field.run(5.0)
+    assert after.commands
+    assert after.state is not None
+    assert bob is not None
+    assert (after.state.calm, after.state.sequence) == ("none", bob.sequence + 1)
+
+
+def test_a_return_goes_on_after_a_restart() -> None:
+    field = a_field()
+    a_return(field, slow=0)
+    # Whom the others wait for is heard last.
+    field.cut = {frozenset(("alice", "r0"))}
+    field.restart("alice")
+    field.run(2.0)
+    field.cut.clear()
+    field.run(5.0)
+    assert [robot.state for robot in field.robots] == [_S.RETURN, _S.HOLD, _S.HOLD]
+    field.robots[0].speed_m_s = 1.0
+    field.land()
+
+
+def test_robots_in_the_air_stay_enabled_although_one_on_the_ground_is_heard_first() -> None:
+    field = a_field()
+    field.done(SetOrigin(ORIGIN))
+    field.done(Enable(robots=("r1", "r2")))
+    field.done(Takeoff(robots=("r1", "r2"), interval_s=0.0))
+    field.done(Start(robots=("r1", "r2")))
+    field.leave("alice")
+    field.cut = {frozenset(("alice", f"r{i}")) for i in (1, 2)}
+    field.join("alice")
+    field.run(1.2)
+    field.cut.clear()
+    field.run(3.0)
+    assert [robot.state for robot in field.robots] == [_S.IDLE, _S.MISSION, _S.MISSION]
+
+
+def test_a_fence_that_one_robot_does_not_take_stays_the_others() -> None:
+    field = a_field(2)
+    field.make_ready()
+    site = replace(FENCE, ceiling_m=50.0)
+    field.done(SetFence(site))
+    field.leave("alice")
+    field.robots[0].silent = field.robots[0].deaf = True
+    again = field.join("alice")
+    robot = field.robots[0]
+    for _ in range(30):
+        field.step()
+        again.hear_status(replace(robot.status(field.now_s), fence=FENCE))
+    assert again.commands
+    assert field.robots[1].fence == site
+
+
+def test_numbers_that_are_none_end_nothing() -> None:
+    field = a_field(2)
+    field.make_ready()
+    field.leave("alice")
+    robot = field.robots[0]
+    robot.silent = True
+    for odd in ({"slot_height_m": math.nan}, {"slot_height_m": math.inf},
+                {"slot_height_m": 1e9}, {"landing_point_m": (math.nan, 0.0)}):  # fmt: skip
+        again = field.join("alice")
+        for _ in range(30):
+            field.step()
+            again.hear_status(replace(robot.status(field.now_s), **odd))
+        assert again.commands
+        assert again.state is not None
+        assert not again.state.places
+        field.leave("alice")
+
+
 def test_robots_that_are_heard_late_are_taken_up_too() -> None:
     field = a_field()
     field.fly()
@@ -591,6 +802,35 @@ def test_a_station_does_not_take_over_from_one_that_only_robots_hear() -> None:
 
 
 # Several stations
+
+
+def test_stations_that_do_not_hear_each_other() -> None:
+    field = a_field()
+    field.fly()
+    field.cut.add(frozenset(("alice", "bob")))
+    bob = field.join("bob")
+    field.run(2.0)
+    field.done(Command(), "bob")
+    for trial in ("t7", "t8", "t9"):
+        bob.change(trial=trial)
+    field.run(0.5)
+    # It may hold at once, also before it knows.
+    alice = field.stations["alice"]
+    assert alice.commands
+    field.done(Calm("hold"))
+    assert field.states() == {_S.HOLD}
+    field.run(2.0)
+    assert field.states() == {_S.HOLD}
+    assert (bob.commands, bob.commander) == (False, "alice")
+    assert "alice commands the fleet" in field.do(Start(), "bob").problem
+    # Who is told so by robots alone does not say that it commands.
+    field.done(Command(), "bob")
+    takeoff = field.begin(Takeoff())
+    field.run(2.0)
+    assert takeoff.report is not None
+    assert (alice.commands, alice.commander) == (False, "bob")
+    assert {robot.ground.operator for robot in field.robots if robot.ground} == {"bob"}
+    field.done(Calm("hold"))
 
 
 def test_an_observer_holds_and_nothing_else() -> None:
@@ -679,6 +919,29 @@ def test_a_name_is_one_stations() -> None:
         field.stations["alice"].hear_state(replace(state, sequence=state.sequence + 1))
 
 
+def test_a_second_station_of_a_name_ends_and_not_the_first() -> None:
+    field = a_field()
+    field.fly()
+    # Each hears the robots, and not the other.
+    twin = Station(setup("alice", 3), field.now_s, 1e9)
+
+    def listen() -> None:
+        while field.now_s < 60.0:
+            field.step()
+            twin.set_time(field.now_s, 1e9)
+            for robot in field.robots:
+                twin.hear_status(robot.status(field.now_s))
+            twin.tick()
+
+    with pytest.raises(NameTakenError, match="--name"):
+        listen()
+    assert not twin.commands
+    assert twin.published_state() is None
+    field.run(5.0)
+    assert field.stations["alice"].commands
+    assert field.states() == {_S.MISSION}
+
+
 REQUESTS = st.sampled_from([
     Calm("hold"), Calm("hold", robots=("r0",)), Calm("land"), Calm("return"), Command(), Start(),
     Takeoff(interval_s=0.0), Resume(), Enable(), Again(), Give("pilot", ("r1",)),
@@ -707,7 +970,7 @@ def test_stations_agree_whatever_they_are_told(
     field.run(2.0)
     for i, (name, request, pause_s) in enumerate(steps):
         if i in restarts:
-            field.join(name)
+            field.restart(name, pause_s)
         field.begin(request, name)
         field.run(pause_s)
     # In the end one commands, all know who, and the robots obey it.
