@@ -37,6 +37,7 @@ _CALM_S = 1.5
 _WORLD_S = 30.0
 # From idle, or after a landing, until all checks have been run.
 _READY_S = 8.0
+_CHECKS_S = 20.0
 # What keeps a robot in hold from starting is often that it has not heard yet that all hold.
 _START_S = 6.0
 _START_AGAIN_S = 0.5
@@ -196,19 +197,15 @@ class Running:
 
     def _refuse_armed(self, _: Request) -> None:
         """Whoever is addressed: the mission frame, fence, world and places are the fleet's."""
-        heard = {n: s for n in self._station.setup.robots if (s := self._status(n))}
-        armed = [
-            name
-            for name, status in heard.items()
-            # Who was killed is in fault until its program starts again.
-            if not is_down(status) and (status.state is not _S.FAULT or status.armed is not False)
-        ]
+        robots = self._station.setup.robots
+        armed = [name for name in robots if (s := self._status(name)) and not is_down(s)]
         if armed:
             verb = "is" if len(armed) == 1 else "are"
             raise _ProblemError(f"{', '.join(armed)} {verb} armed: land and disarm first")
 
     def _take_up(self, sequence: int, effect: Effect, patience_s: float = _TAKE_UP_S) -> Waits:
         """Wait until each robot has obeyed that state, and has taken up what it says."""
+        assigned = isinstance(self.request, SetOrigin | SetFence | SetWorld | SetPlaces)
         began_s = self._station.now_s
         obeyed_s: dict[str, float] = {}
         while heard := self._heard():
@@ -222,9 +219,13 @@ class Running:
                 how = effect(status)
                 if how is not None:
                     self._settle(name, how)
+                elif not assigned and status.state in _NOT_STEERED:
+                    self._fail([name], _why(status))
                 elif now_s - obeyed_s[name] > patience_s:
-                    why = "; ".join(status.not_taken) or f"{status.state}: {status.reason}"
-                    self._fail([name], why)
+                    not_taken = "; ".join(status.not_taken) if assigned else ""
+                    withdraw = isinstance(self.request, SetFence) and self.request.fence is not None
+                    help_ = "; `lpac mission fence on` withdraws it" if withdraw else ""
+                    self._fail([name], f"{not_taken or _why(status)}{help_}")
             if self._open:
                 yield
 
@@ -235,10 +236,15 @@ class Running:
         )
 
     def _fence(self, request: SetFence) -> Waits:
+        fence = self._station.setup.fence if request.fence is None else request.fence
+        own = "its configured one" if request.fence is None else "taken up"
+
         def effect(status: RobotStatus) -> str | None:
-            if request.fence is None:
-                return None if status.not_taken else "its configured one"
-            return "taken up" if status.fence == request.fence else None
+            if status.fence == fence:
+                return own
+            # A robot's own file may say otherwise than the fleet's.
+            others = not any("fence" in why for why in status.not_taken)
+            return own if request.fence is None and others else None
 
         yield from self._take_up(self._station.change(fence=request.fence), effect)
 
@@ -292,23 +298,20 @@ class Running:
             before = {} if station.state is None else station.state.robot_enabled
             these = dict.fromkeys(map(str, self._those), request.on)
             sequence = station.change(robot_enabled=before | these)
-        late_s = station.now_s + _READY_S
 
         def on(status: RobotStatus) -> str | None:
-            if status.state in (_S.INIT, _S.IDLE):
+            if status.state in (_S.INIT, _S.IDLE, *_NOT_STEERED):
                 return None
             if status.state is not _S.PREFLIGHT:
                 return f"enabled, in {status.state}"
-            if status.ready:
-                return "ready"
-            return f"enabled, {_not_ready(status)}" if station.now_s > late_s else None
+            return "ready" if status.ready else None
 
         def off(status: RobotStatus) -> str | None:
             if is_down(status):
                 return None if status.state is _S.PREFLIGHT else "disabled"
             return "disabled: it holds" if status.state is _S.HOLD else None
 
-        yield from self._take_up(sequence, on if request.on else off, _READY_S + _TAKE_UP_S)
+        yield from self._take_up(sequence, on if request.on else off, _CHECKS_S)
 
     def _calm(self, request: Calm) -> Waits:
         station = self._station
@@ -326,13 +329,13 @@ class Running:
             for name, status in heard.items():
                 if is_down(status):
                     self._settle(name, "on the ground")
-                elif status.state in (_S.PILOT, _S.FAULT):
-                    self._fail([name], f"{status.state}: {status.reason}")
+                elif status.state in _NOT_STEERED:
+                    self._fail([name], _why(status))
                 elif known.get(name) != status.reason:
                     known[name], changed_s = status.reason, station.now_s
                     self._say(name, f"{status.state}: {status.reason}")
                 elif station.now_s - changed_s > _LANDING_S:
-                    self._fail([name], f"{status.state}: {status.reason}")
+                    self._fail([name], _why(status))
             if self._open:
                 yield
 
@@ -426,11 +429,7 @@ class Running:
         for name, why in self._calmed().items():
             self._fail([name], why)
         yield from self._reach()
-        for name, status in self._heard().items():
-            if status.state in (_S.HOLD, _S.MISSION):
-                self._settle(name, f"already in the air, in {status.state}")
-            elif not status.ready:
-                self._say(name, _not_ready(status))
+        self._settle_who_does_not_take_off()
         waiting = sorted(self._open, key=self._height_m)
         ordered_s: dict[str, float] = {}
         ready_by_s, next_s = station.now_s + _READY_S, station.now_s
@@ -454,6 +453,21 @@ class Running:
             if self._open:
                 yield
 
+    def _settle_who_does_not_take_off(self) -> None:
+        for name, status in self._heard().items():
+            if status.state in (_S.HOLD, _S.MISSION):
+                self._settle(name, f"already in the air, in {status.state}")
+            elif not self._is_enabled(name):
+                self._fail([name], "not enabled: `lpac mission enable`")
+            elif status.state in _NOT_STEERED:
+                self._fail([name], _why(status))
+            elif not status.ready:
+                self._say(name, _why(status))
+
+    def _is_enabled(self, name: str) -> bool:
+        state = self._station.state
+        return state is not None and state.enabled_for(self._station.setup.robots[name])
+
     def _height_m(self, name: str) -> float:
         status = self._status(name)
         return 0.0 if status is None else status.slot_height_m
@@ -470,7 +484,7 @@ class Running:
             self._say(name, "takes off")
             return True
         elif late:
-            self._fail([name], _not_ready(status))
+            self._fail([name], _why(status))
         else:
             return None
         return False
@@ -579,7 +593,8 @@ class Running:
         yield from self._answers(_GIVEN[request.kind])
 
     def _refuse_on_mission(self, _: Again) -> None:
-        flying = [n for n in self.names if (s := self._status(n)) and s.state is _S.MISSION]
+        robots = self._station.setup.robots
+        flying = [n for n in robots if (s := self._status(n)) and s.state is _S.MISSION]
         if flying:
             verb = "flies" if len(flying) == 1 else "fly"
             raise _ProblemError(f"{', '.join(flying)} {verb} the mission: hold or land first")
@@ -609,6 +624,8 @@ class Running:
                 yield
 
 
+# A robot flies itself down in none of these, and does not stop there.
+_NOT_STEERED = (_S.PILOT, _S.FAULT)
 _CLIMBING = (_S.PREFLIGHT, _S.ARMING, _S.TAKEOFF)
 _GIVEN = {
     "pilot": "the pilot has it", "rejoin": "taken back: it holds", "disarm": "disarmed",
@@ -681,11 +698,19 @@ class Commands:
             return
         for running in self._running:
             shared = set(running.names) & set(new.names)
-            if running is not new and shared and isinstance(running.request, _IN_FLIGHT):
+            same = _calm_of(running.request) == _calm_of(new.request) != ""
+            if running is new or same or not shared:
+                continue
+            if isinstance(running.request, _IN_FLIGHT):
                 running.abandon(new.text, withdraw=True)
 
 
 _IN_FLIGHT = (Takeoff, Start, Resume, Calm)
+
+
+def _calm_of(request: Request) -> str:
+    """What it asks the robots for again, if the same was asked already."""
+    return request.calm if isinstance(request, Calm) else ""
 
 
 def _is_kill(request: Request) -> bool:
@@ -737,7 +762,13 @@ def _obeying_words(calm: str) -> Effect:
     return effect
 
 
-def _not_ready(status: RobotStatus) -> str:
-    if status.state is not _S.PREFLIGHT:
-        return f"{status.state}: {status.reason}"
-    return f"not ready: {'; '.join(status.failed_checks) or 'the checks are still running'}"
+def _why(status: RobotStatus) -> str:
+    """What keeps a robot from what it was told, and what helps."""
+    text = f"{status.state}: {status.reason}"
+    if status.state is _S.PILOT:
+        return f"{text}; `lpac mission rejoin` takes it back"
+    if status.state is _S.FAULT and status.armed is False:
+        return f"{text}; look at it, then `lpac fleet restart`"
+    if status.state is _S.PREFLIGHT and not status.ready:
+        return f"not ready: {'; '.join(status.failed_checks) or 'the checks are still running'}"
+    return text

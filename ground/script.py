@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from edge.core.mission import ON_GROUND, FlightState, GroundState, Origin, RobotStatus
+from edge.core.mission import FlightState, GroundState, Origin, RobotStatus
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.world import parse_world
 from ground.client import command
@@ -37,6 +37,7 @@ from ground.protocol import (
     Takeoff,
 )
 from ground.site import SavedSite, Sites, origin_at, places_at, standing
+from ground.station import is_down
 
 _S = FlightState
 
@@ -366,7 +367,7 @@ class Flight:
 
     def hold(self) -> str:
         """Hold whoever flies; what came of it, and what to do next, in words."""
-        if not any(_flies(status) for status in self._statuses(self._lookout.picture).values()):
+        if all(map(is_down, self._statuses(self._lookout.picture).values())):
             return "nobody is in the air"
         report = self._command(Calm("hold", self._script.robots))
         told = "the fleet is told to hold"
@@ -516,7 +517,7 @@ class Flight:
                 before[name] = status.state
                 if step.restart and name in left_alone and free_s > _START_TAKES_S:
                     self._start_again(name)
-            if statuses and not any(_flies(status) for status in statuses.values()):
+            if statuses and all(map(is_down, statuses.values())):
                 raise ScriptError("nobody flies any more")
             self._lookout.wait_for(lambda _: False, max(0.0, min(free_s, _PERIOD_S)))
 
@@ -577,7 +578,7 @@ class Flight:
         if not report.done:
             picture = self._lookout.fresh_picture()
             # On the ground a calm may be left from the last landing.
-            if any(_flies(status) for status in self._statuses(picture).values()):
+            if not all(map(is_down, self._statuses(picture).values())):
                 self._look_for_others(picture)
             raise ScriptError(_failures(report))
 
@@ -635,10 +636,6 @@ def _asked(ground: GroundState | None, robot_id: int) -> str:
         return "none"
     calm = ground.calm_for(robot_id)
     return "hold" if calm == "none" and not ground.enabled_for(robot_id) else calm
-
-
-def _flies(status: RobotStatus) -> bool:
-    return status.state not in ON_GROUND or bool(status.armed)
 
 
 def _duration_s(step: Step) -> float | None:

@@ -66,7 +66,9 @@ class NameTakenError(ValueError):
 
 
 def is_down(status: RobotStatus) -> bool:
-    """Whether it stands on the ground, disarmed as far as it knows."""
+    """Whether it stands on the ground, disarmed as far as it knows; or lies there, killed."""
+    if status.state is FlightState.FAULT:
+        return status.armed is False
     return status.state in ON_GROUND and not status.armed
 
 

@@ -239,3 +239,55 @@ def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
     field.robots[1].state = _S.HOLD
     field.done(Calm("land", wait=True))
     assert field.states() == {_S.LANDED}
+
+
+# Who cannot do it is said so at once, and does not count as done
+
+
+def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
+    field = two_stations()
+    field.done(Give("kill", ("r1",)))
+    why = "fault: killed by the operator; look at it, then `lpac fleet restart`"
+    assert why_not(field.do(Enable())) == {"r1": why}
+    assert field.done(Calm("land", wait=True))
+    field.done(Resume())
+    abort = replace(TAKEOFF, abort_on_failure=True)
+    assert why_not(field.do(abort)) == {
+        "r1": why, "r0": "not ordered: r1 failed", "r2": "not ordered: r1 failed",
+    }  # fmt: skip
+    assert field.robots[0].state is field.robots[2].state is _S.PREFLIGHT
+
+
+def test_who_is_not_ready_is_not_done_with_enable() -> None:
+    field = a_field()
+    field.robots[2].refuses = "GPS: 4 satellites"
+    field.done(SetOrigin(ORIGIN))
+    assert why_not(field.do(Enable())) == {"r2": "not ready: GPS: 4 satellites"}
+
+
+def test_who_is_not_enabled_is_not_waited_for() -> None:
+    field = a_field()
+    field.done(SetOrigin(ORIGIN))
+    field.done(Enable(robots=("r0",)))
+    refused = "not enabled: `lpac mission enable`"
+    assert why_not(field.do(TAKEOFF)) == {"r1": refused, "r2": refused}
+
+
+def test_two_holds_at_once_are_both_done() -> None:
+    field = a_field()
+    field.fly()
+    field.robots[1].silent = True
+    first = field.begin(Calm("hold"))
+    field.run(1.0)
+    field.robots[1].silent = False
+    assert field.do(Calm("hold")).done
+    assert first.report is not None
+    assert first.report.done
+
+
+def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
+    field = a_field()
+    field.fly()
+    field.done(Calm("hold", robots=("r0",)))
+    problem = field.do(Again(robots=("r0",))).problem
+    assert problem == "r1, r2 fly the mission: hold or land first"
