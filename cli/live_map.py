@@ -41,12 +41,13 @@ def live_map(
     if token is None and not local:
         token = secrets.token_urlsafe(16)
 
-    def ready(address: str) -> None:
-        typer.echo(f"map of {config.fleet}: {address}")
+    def ready(addresses: list[str]) -> None:
+        for address in addresses:
+            typer.echo(f"map of {config.fleet}: {address}")
         typer.echo("commands the fleet" if operate else "only observes; --operate commands")
         typer.echo("Ctrl-C ends it, and nothing else")
         if open_page:
-            webbrowser.open(address)
+            webbrowser.open(addresses[0])
 
     asyncio.run(
         serve(

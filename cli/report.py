@@ -2,6 +2,7 @@
 
 import json
 import sys
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -85,7 +86,12 @@ def _line(values: dict[str, object]) -> str:
     """A trial in one line."""
     cost, separation = values["cost"], values["separation"]
     assert isinstance(cost, dict) and isinstance(values["robots"], list)
-    words = [f"{values['trial']}: {len(values['robots'])} robots, {values['duration_s']:.0f} s"]
+    began_unix_s = values["began_unix_s"]
+    assert isinstance(began_unix_s, float)
+    words = [
+        f"{values['trial']}: {datetime.fromtimestamp(began_unix_s):%Y-%m-%d %H:%M:%S}, "
+        f"{len(values['robots'])} robots, {values['duration_s']:.0f} s"
+    ]
     if cost["normalized"] is not None:
         words.append(f"cost {cost['normalized']:.2f} of the initial")
     if cost["normalized_bound"] is not None:

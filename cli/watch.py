@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -39,10 +40,15 @@ def watch(
     if screenshot is not None:
         from ground.watch import Watch
 
-        # There is a ground process, or this ends here.
-        _look(name)
-        across, _, down = size.partition("x")
-        Watch(name, screenshot).run(headless=True, size=(int(across), int(down)))
+        columns_and_lines = re.fullmatch(r"([1-9]\d{1,3})x([1-9]\d{1,3})", size)
+        if columns_and_lines is None:
+            raise ValueError(f"--size {size}: must be columns x lines, such as 100x30")
+        across, down = map(int, columns_and_lines.groups())
+        with screenshot.open("w") as file:
+            # There is a ground process, or this ends here.
+            _look(name)
+            app = Watch(name, screenshot=True)
+            file.write(app.run(headless=True, size=(across, down)) or "")
     elif as_json:
         _, picture = _look(name)
         typer.echo(json.dumps(dataclasses.asdict(picture)))

@@ -208,21 +208,26 @@ def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _world(fleet: _Fleet, seen: _Seen) -> _Found:
     theirs, ours = seen.status.world_id, fleet.world
-    if theirs == ours:
+    if theirs == ours or _says_why(seen, "world"):
         return None
     return "warning", f"world {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
 
 
 def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.origin in (None, fleet.origin):
+    if seen.status.origin in (None, fleet.origin) or _says_why(seen, "origin"):
         return None
     return "warning", "another origin than the fleet's"
 
 
 def _fence(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.fence in (None, fleet.fence):
+    if seen.status.fence in (None, fleet.fence) or _says_why(seen, "fence"):
         return None
     return "warning", "another fence than the fleet's"
+
+
+def _says_why(seen: _Seen, what: str) -> bool:
+    """Whether it says itself that it does not take the fleet's: that is told, once."""
+    return any(what in text for text in seen.status.not_taken)
 
 
 def _not_taken(fleet: _Fleet, seen: _Seen) -> _Found:

@@ -19,6 +19,8 @@ _SEED = 0
 _COARSE_CELLS = 128
 # It ends when a step gains less than this share of the cost.
 _LEAST_GAIN = 1e-5
+# A robot that does not know where it is, is still where it was.
+_REMEMBERED_S = 2.0
 
 
 class World(Protocol):
@@ -85,20 +87,35 @@ class Coverage:
         return np.asarray(np.rint(shrunk * (255.0 / highest)), np.uint8)
 
 
-def counted(picture: Picture) -> dict[str, tuple[float, float]]:
-    """The robots whose positions count for J, by name: (x, y) in the mission frame, m.
+class Whereabouts:
+    """Tells which robots' positions count for J; it remembers where they were."""
 
-    Those in the air; while nobody is, all. Who was not heard for a while, or does not know where it
-    is, never counts.
-    """
-    known = {
-        robot.name: robot.status
-        for robot in picture.robots
-        if robot.fresh and robot.status is not None and _position_m(robot.status) is not None
-    }
-    flying = {name: status for name, status in known.items() if in_air(status)}
-    places_m = {name: _position_m(status) for name, status in (flying or known).items()}
-    return {name: place_m for name, place_m in places_m.items() if place_m is not None}
+    def __init__(self) -> None:
+        # By name: when it was known, by the ground's clock, and (x, y).
+        self._last: dict[str, tuple[float, tuple[float, float]]] = {}
+
+    def counted(self, picture: Picture) -> dict[str, tuple[float, float]]:
+        """The robots that count, by name: (x, y) in the mission frame, m. Pictures come in order.
+
+        Those in the air; while nobody is, all. Who does not know where it is counts in the air for
+        a moment with where it was, else not; who was not heard for a while never counts.
+        """
+        flying, known = {}, {}
+        for robot in picture.robots:
+            status = robot.status
+            if status is None or not robot.fresh:
+                continue
+            place_m = _position_m(status)
+            if place_m is not None:
+                self._last[robot.name] = picture.unix_time_s, place_m
+            elif in_air(status) and robot.name in self._last:
+                known_at_s, last_m = self._last[robot.name]
+                place_m = last_m if picture.unix_time_s - known_at_s <= _REMEMBERED_S else None
+            if place_m is not None:
+                known[robot.name] = place_m
+                if in_air(status):
+                    flying[robot.name] = place_m
+        return flying or known
 
 
 class Flying(Protocol):

@@ -19,8 +19,8 @@ from aiohttp import WSMsgType, web
 from edge.core import F64
 from ground.alarms import BEFORE_S, Alarm, alarms
 from ground.client import GroundError, listen, send
-from ground.coverage import Coverage, counted
-from ground.live_map_access import Access
+from ground.coverage import Coverage
+from ground.live_map_access import Access, reached_at
 from ground.live_map_view import (
     Json,
     Missions,
@@ -128,6 +128,8 @@ class LiveMap:
         self._coverage: Coverage | None = None
         self._setup_text = ""
         self._picture: Picture | None = None
+        # Of the robots that count for the cost, in this picture, m.
+        self._places_m: dict[str, tuple[float, float]] = {}
         self._alarms: tuple[Alarm, ...] = ()
         self._before: deque[Picture] = deque()
         self._explored: dict[str, Explored] = {}
@@ -189,7 +191,7 @@ class LiveMap:
             self._before.popleft()
         before = self._before[0] if self._before[0].unix_time_s <= earliest_s else None
         self._alarms = alarms(self._setup, picture, before)
-        self._missions.take(picture)
+        self._places_m = self._missions.take(picture)
         self._new_picture.set()
         if self._problem:
             self._problem = ""
@@ -213,10 +215,11 @@ class LiveMap:
             await self._new_picture.wait()
             self._new_picture.clear()
             if self._picture is not None and self._coverage is not None:
-                await self._compute(self._picture, self._coverage)
+                await self._compute(self._picture, self._places_m, self._coverage)
 
-    async def _compute(self, picture: Picture, coverage: Coverage) -> None:
-        places_m = counted(picture)
+    async def _compute(
+        self, picture: Picture, places_m: dict[str, tuple[float, float]], coverage: Coverage
+    ) -> None:
         if not places_m:
             self._put({"kind": "coverage", "cost": None, "time_s": None, "cells": {}})
             return
@@ -405,8 +408,8 @@ def _cookie(request: web.Request) -> str:
 @contextlib.asynccontextmanager
 async def serving(
     fleet: str, *, host: str, port: int, access: Access, operate: bool
-) -> AsyncIterator[str]:
-    """Serve the map of a fleet as long as this context lasts; gives its address.
+) -> AsyncIterator[list[str]]:
+    """Serve the map of a fleet as long as this context lasts; gives its addresses.
 
     Port 0 takes a free one. Raises OSError if it cannot listen there.
     """
@@ -420,12 +423,12 @@ async def serving(
             reason = error.strerror or error
             raise OSError(f"--host {host} --port {port}: cannot serve there: {reason}") from None
         own, own_port, *_ = runner.addresses[0]
-        name = f"[{own}]" if ":" in own else own
+        names = [f"[{name}]" if ":" in name else name for name in reached_at(own)]
         query = "" if access.token is None else f"?token={access.token}"
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(live_map.follow()), group.create_task(live_map.compute())]
             try:
-                yield f"http://{name}:{own_port}/{query}"
+                yield [f"http://{name}:{own_port}/{query}" for name in names]
             finally:
                 for task in tasks:
                     task.cancel()
@@ -440,13 +443,13 @@ async def serve(
     port: int,
     access: Access,
     operate: bool,
-    ready: Callable[[str], None],
+    ready: Callable[[list[str]], None],
 ) -> None:
-    """Serve until SIGINT or SIGTERM; `ready` is told the address. Raises OSError."""
+    """Serve until SIGINT or SIGTERM; `ready` is told the addresses. Raises OSError."""
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    async with serving(fleet, host=host, port=port, access=access, operate=operate) as address:
-        ready(address)
+    async with serving(fleet, host=host, port=port, access=access, operate=operate) as addresses:
+        ready(addresses)
         await ended.wait()

@@ -1,14 +1,20 @@
-"""Who may see the live map, and act through it: pure rules about a request's headers.
+"""Where the live map is reached, and who may see it and act through it: rules about headers.
 
 Any page that the operator's browser shows can send requests to this machine. So what comes must
 name this very server (a name of somebody else's that leads here, DNS rebinding, does not), and must
 come from its own page. On the network, a token is asked for besides.
 """
 
+import fcntl
 import ipaddress
 import secrets
+import socket
+import struct
 from dataclasses import dataclass
 from urllib.parse import urlsplit
+
+# Linux: an interface's first address; see netdevice(7).
+_SIOCGIFADDR = 0x8915
 
 
 def is_loopback(host: str) -> bool:
@@ -19,6 +25,24 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def reached_at(host: str) -> list[str]:
+    """The addresses at which others reach a server bound to `host`: of 0.0.0.0, this machine's."""
+    return (host == "0.0.0.0" and _own_addresses()) or [host]
+
+
+def _own_addresses() -> list[str]:
+    """This machine's IPv4 addresses, but for loopback's; needs no route and no name server."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            try:
+                answer = fcntl.ioctl(asking, _SIOCGIFADDR, struct.pack("256s", name.encode()))
+            except OSError:
+                continue  # it has none
+            found.append(socket.inet_ntoa(answer[20:24]))
+    return [address for address in found if not is_loopback(address)]
 
 
 @dataclass(frozen=True, slots=True)

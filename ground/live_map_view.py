@@ -13,8 +13,9 @@ from typing import Any, cast
 
 from edge.core.mission import FlightState, GroundState, RobotStatus
 from ground.alarms import Alarm
-from ground.coverage import Coverage, counted, in_air
+from ground.coverage import Coverage, Whereabouts, in_air
 from ground.protocol import Picture, Report, RobotPicture, Setup
+from ground.under_way import UnderWay
 
 Json = dict[str, Any]
 
@@ -169,12 +170,12 @@ class Missions:
         self.curve: Curve | None = None
         self._paths: dict[str, deque[tuple[float, float]]] = {}
         self._seen_before = False
+        self._under_way = UnderWay()
+        self._whereabouts = Whereabouts()
 
     def begins(self, picture: Picture) -> bool:
-        """Whether this picture is the first of another trial's mission."""
-        return _flies_mission(picture) and (
-            self.curve is None or self.curve.trial != _trial(picture)
-        )
+        """Whether this picture shows a mission that has no curve yet."""
+        return self.curve is None and _flies_mission(picture)
 
     def begin(self, picture: Picture, cost: float) -> Curve:
         """Begin another curve, and other paths."""
@@ -184,33 +185,41 @@ class Missions:
 
     def time_s(self, picture: Picture) -> float | None:
         """The mission time; None if none is flown now."""
-        curve = self.curve
-        if curve is None or curve.trial != _trial(picture):
+        if self.curve is None or not any(
+            robot.fresh
+            and robot.status is not None
+            and robot.status.state in _IN_MISSION
+            and robot.robot_id in self._under_way.robots
+            for robot in picture.robots
+        ):
             return None
-        states = [r.status.state for r in picture.robots if r.fresh and r.status is not None]
-        if not any(state in _IN_MISSION for state in states):
-            return None
-        return max(0.0, picture.unix_time_s - curve.began_s)
+        return max(0.0, picture.unix_time_s - self.curve.began_s)
 
     def interrupt(self) -> None:
         """The ground is gone: who knows what begins meanwhile."""
         self._seen_before = False
 
-    def take(self, picture: Picture) -> None:
-        """Remember where the robots in the air have been."""
+    def take(self, picture: Picture) -> dict[str, tuple[float, float]]:
+        """Take the next picture; gives the robots that count for J, and where they are, m."""
         if not _flies_mission(picture):
             self._seen_before = True
-        flying = {
-            robot.name
-            for robot in picture.robots
-            if robot.status is not None and in_air(robot.status)
-        }
-        for name, (x_m, y_m) in counted(picture).items():
+        flying = set()
+        for robot in picture.robots:
+            if robot.status is None or robot.age_s is None:
+                continue
+            if in_air(robot.status):
+                flying.add(robot.name)
+            heard_s = picture.unix_time_s - robot.age_s
+            if self._under_way.begins(robot.robot_id, robot.status, heard_s):
+                self.curve = None
+        places_m = self._whereabouts.counted(picture)
+        for name, (x_m, y_m) in places_m.items():
             if name not in flying:
                 continue
             path = self._paths.setdefault(name, deque(maxlen=_PATH_POINTS))
             if not path or math.dist(path[-1], (x_m, y_m)) >= _PATH_STEP_M:
                 path.append((round(x_m, 2), round(y_m, 2)))
+        return places_m
 
     def paths_view(self) -> Json:
         """The robots' paths, for a page that opens."""

@@ -30,8 +30,9 @@ from edge.adapters.flight_log import FlightLog, topic
 from edge.core import F64
 from edge.core.mission import FlightState, GroundState, RobotStatus
 from ground.client import GroundError, listen
-from ground.coverage import Coverage, counted
+from ground.coverage import Coverage, Whereabouts
 from ground.protocol import Event, Explored, Picture, Setup, Told
+from ground.under_way import UnderWay
 
 COST_PERIOD_S = 0.5
 _SETUP_PERIOD_S = 60.0
@@ -44,9 +45,10 @@ _MAX_TOTAL_BYTES = 2**34
 class Cost:
     """What the robots' positions are worth now: the paper's J, model units.
 
-    `robots` are those that count, by name (see `ground.coverage.counted`); `flying_mission` whether
-    one of them flies its mission. `initial` is J when the first of this trial did; `normalized` is
-    J over that; `bound` is the clairvoyant bound for so many robots. These are None before.
+    `robots` are those that count, by name (see `ground.coverage.Whereabouts`); `flying_mission`
+    whether one of them flies its mission, which begins anew as `ground.under_way` says. `initial`
+    is J when the first of this trial did; `normalized` is J over that; `bound` is the clairvoyant
+    bound for so many robots. These are None before.
     """
 
     trial: str
@@ -86,6 +88,7 @@ class Recording:
         """`record` gets topic, Unix time in s, and message."""
         self._record = record
         self._pool = ThreadPoolExecutor(1)
+        # Of the mission that began last, by world, trial and number of robots.
         self._bounds: dict[tuple[str, str, int], Future[float]] = {}
         self._setup: Setup | None = None
         self._setup_at_s = 0.0
@@ -96,8 +99,10 @@ class Recording:
         self._events: set[Event] = set()
         self._explored: dict[str, str] = {}
         self._cost_at_s = 0.0
-        self._begun_trial: str | None = None
-        self._initial = 0.0
+        self._whereabouts = Whereabouts()
+        self._under_way = UnderWay()
+        # J at the begin of each trial's last mission.
+        self._initial: dict[str, float] = {}
         self.cost: Cost | None = None
 
     def take(self, told: Told, unix_now_s: float) -> None:
@@ -139,6 +144,9 @@ class Recording:
             status = robot.status
             if status is None or robot.age_s is None:
                 continue
+            if self._under_way.begins(robot.robot_id, status, now_s - robot.age_s):
+                self._initial.pop(status.trial, None)
+                self._bounds.clear()
             at = (status.boot_nonce, status.sequence)
             if self._statuses.get(robot.name) == at:
                 continue
@@ -149,29 +157,30 @@ class Recording:
                 "clock_offset_s": robot.clock_offset_s,
             }  # fmt: skip
             self._record("status", heard_at_s, heard)
+        places_m = self._whereabouts.counted(picture)
         if abs(now_s - self._cost_at_s) >= COST_PERIOD_S and self._coverage is not None:
-            self._take_cost(picture, self._coverage)
+            self._take_cost(picture, places_m, self._coverage)
 
-    def _take_cost(self, picture: Picture, coverage: Coverage) -> None:
+    def _take_cost(
+        self, picture: Picture, places_m: Mapping[str, tuple[float, float]], coverage: Coverage
+    ) -> None:
         self._cost_at_s = picture.unix_time_s
-        places_m = counted(picture)
         if not places_m:
             self.cost = None
             return
         positions_m = np.array(list(places_m.values()))
         cost = coverage.cost(positions_m)
         statuses = [r.status for r in picture.robots if r.name in places_m and r.status is not None]
+        flying = [status for status in statuses if status.state is FlightState.MISSION]
         # As the robots say: a ground that has just started does not know it yet.
-        ((trial, _),) = Counter(status.trial for status in statuses).most_common(1)
-        flying_mission = any(status.state is FlightState.MISSION for status in statuses)
-        if flying_mission and self._begun_trial != trial:
-            self._begun_trial, self._initial = trial, cost
-        begun = self._begun_trial == trial
+        ((trial, _),) = Counter(s.trial for s in flying or statuses).most_common(1)
+        if flying:
+            self._initial.setdefault(trial, cost)
+        initial = self._initial.get(trial)
         self.cost = Cost(
-            trial, tuple(places_m), flying_mission, cost,
-            initial=self._initial if begun else None,
-            normalized=cost / self._initial if begun and self._initial else None,
-            bound=self._bound(coverage, trial, positions_m) if begun else None,
+            trial, tuple(places_m), bool(flying), cost, initial,
+            normalized=cost / initial if initial else None,
+            bound=None if initial is None else self._bound(coverage, trial, positions_m),
         )  # fmt: skip
         self._record("cost", picture.unix_time_s, dataclasses.asdict(self.cost))
 

@@ -269,12 +269,12 @@ def messages(trial: Trial, told: Messages) -> Figure:
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(_WIDTH_IN, 4.6), layout="constrained")
         rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1.0))
-        above, below = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
-        panels = above.subplots(1, 2)
+        upper, lower = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
+        panels = upper.subplots(1, 2)
         age_ms, loss = 1e3 * told.age_s, 100.0 * told.loss
-        _draw_matrix(above, panels[0], age_ms, names, "median age (ms)", _MUCH_MS)
-        _draw_matrix(above, panels[1], loss, names, "lost (%)", _MUCH_LOSS)
-        left, right = below.subplots(1, 2)
+        _draw_matrix(upper, panels[0], age_ms, names, "median age (ms)", _MUCH_MS)
+        _draw_matrix(upper, panels[1], loss, names, "lost (%)", _MUCH_LOSS)
+        left, right = lower.subplots(1, 2)
         edges_s = np.linspace(0.0, trial.duration_s, max(2, min(61, int(trial.duration_s) + 1)))
         middles_s = (edges_s[1:] + edges_s[:-1]) / 2.0
         bins = np.digitize(told.heard_at_s, edges_s) - 1
@@ -286,11 +286,15 @@ def messages(trial: Trial, told: Messages) -> Figure:
         came = np.histogram(told.heard_at_s, edges_s)[0]
         missing = np.histogram(told.gaps[:, 0], edges_s, weights=told.gaps[:, 1])[0]
         share_lost = 100.0 * missing / np.maximum(came + missing, 1)
-        right.fill_between(middles_s, share_lost, step="mid", color="#d55e00", alpha=0.7, lw=0)
+        right.stairs(share_lost, edges_s, fill=True, color="#d55e00", alpha=0.4, lw=0, zorder=2)
+        right.stairs(share_lost, edges_s, baseline=None, color="#d55e00", lw=1.4, zorder=3)
         right.set(ylabel="lost (%)")
-        for axes, least in ((left, 10.0), (right, _MUCH_LOSS)):
+        # That nothing was lost is a line to be seen, too: above the axis.
+        for axes, least, below in ((left, 10.0, 0.0), (right, _MUCH_LOSS, 0.05)):
             highest = max(1.25 * axes.get_ylim()[1], least)
-            axes.set(xlabel="time (s)", xlim=(0.0, trial.duration_s), ylim=(0.0, highest))
+            axes.set(
+                xlabel="time (s)", xlim=(0.0, trial.duration_s), ylim=(-below * highest, highest)
+            )
             _tidy(axes)
         return figure
 

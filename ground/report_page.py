@@ -91,7 +91,7 @@ def _summary(trials: Sequence[Trial]) -> str:
         rows.append(
             (
                 f'<a href="#trial-{number}">{_text(trial.name)}</a>',
-                f"{datetime.fromtimestamp(trial.begin_s).astimezone():%H:%M:%S}",
+                f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S}",
                 f"{trial.duration_s:.0f}",
                 str(len(trial.tracks)),
                 f"{cost[0]:.3g}" if len(cost) else "",
@@ -107,7 +107,7 @@ def _summary(trials: Sequence[Trial]) -> str:
                 _marked(str(sum(trial.restarts.values())), bool(trial.restarts)),
             )
         )
-    return _table(header, rows, numbers=range(2, len(header)))
+    return _table(header, rows, numbers=range(1, len(header)))
 
 
 def _about(trial: Trial) -> str:

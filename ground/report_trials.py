@@ -1,12 +1,13 @@
 """Trials in the logs, and what is to be said of each. Times are s from the trial's begin.
 
 A trial begins when its first robot flies the mission of that name, and ends when the last one does
-no more. A name flown by other starts of all programs is another trial.
+no more. A name that is flown again after all were on the ground, or reset, is another trial.
 """
 
+import heapq
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from edge.core.perception import part_in_world, window_corner
 from edge.core.safety import Fence
 from ground.coverage import Coverage, in_air
 from ground.report_logs import Logs, Received, Said
+from ground.under_way import UnderWay
 
 # Who says nothing for so long does not count, as in the live cost.
 FRESH_S = 2.0
@@ -27,8 +29,6 @@ _COST_PERIOD_S = 0.5
 _MOST_COSTS = 600
 _SEPARATION_PERIOD_S = 0.2
 _SEEN_PERIOD_S = 0.2
-# A pause of a mission so long may be the time between two flights of one name.
-_PAUSE_S = 10.0
 # A mission of which there is one status lasted as long as one is valid for.
 _LEAST_S = 0.25
 # What is shown before takeoff and after landing.
@@ -58,20 +58,26 @@ class Track:
     flying: npt.NDArray[np.bool_]
 
     def places_at(self, times_s: F64) -> F64:
-        """(len(times_s), 3): where it was in the air, m; NaN where it was not, or is not known."""
-        if len(self.time_s) == 0:
+        """(len(times_s), 3): where it was in the air, m; NaN where it was not, or is not known.
+
+        Between two positions that it knew, no more than a moment apart, it is on the way.
+        """
+        known = np.isfinite(self.position_m[:, 0])
+        if not known.any():
             return np.full((len(times_s), 3), np.nan)
-        before = np.searchsorted(self.time_s, times_s, side="right") - 1
-        after = np.minimum(before + 1, len(self.time_s) - 1)
+        latest = np.searchsorted(self.time_s, times_s, side="right") - 1
+        in_air = (latest >= 0) & self.flying[latest]
+        in_air &= times_s - self.time_s[latest] <= FRESH_S
+        known_s, known_m = self.time_s[known], self.position_m[known]
+        before = np.searchsorted(known_s, times_s, side="right") - 1
+        after = np.minimum(before + 1, len(known_s) - 1)
         at = np.maximum(before, 0)
-        known = (before >= 0) & (times_s - self.time_s[at] <= FRESH_S) & self.flying[at]
-        span_s = self.time_s[after] - self.time_s[at]
-        share = np.clip((times_s - self.time_s[at]) / np.maximum(span_s, 1e-9), 0.0, 1.0)
-        usable = (span_s <= FRESH_S) & np.isfinite(self.position_m[after, 0])
-        share = np.where(usable, share, 0.0)[:, None]
-        later_m = np.where(usable[:, None], self.position_m[after], 0.0)
-        places_m = self.position_m[at] * (1.0 - share) + later_m * share
-        return np.where(known[:, None], places_m, np.nan)
+        in_air &= (before >= 0) & (times_s - known_s[at] <= FRESH_S)
+        span_s = known_s[after] - known_s[at]
+        share = np.clip((times_s - known_s[at]) / np.maximum(span_s, 1e-9), 0.0, 1.0)
+        share = np.where(span_s <= FRESH_S, share, 0.0)[:, None]
+        places_m = known_m[at] * (1.0 - share) + known_m[after] * share
+        return np.where(in_air[:, None], places_m, np.nan)
 
     def intervals(self, end_s: float) -> list[Interval]:
         """Its states, one after another."""
@@ -233,30 +239,30 @@ class Mission(NamedTuple):
 
 def find_missions(logs: Logs) -> list[Mission]:
     """All missions, the first first."""
-    flown: dict[str, list[tuple[float, int, int]]] = {}
-    for robot_id, statuses in logs.statuses.items():
-        for said in statuses:
-            if said.state is FlightState.MISSION:
-                flown.setdefault(said.trial, []).append((said.time_s, robot_id, said.boot_nonce))
-    missions = []
-    for name, moments in flown.items():
-        moments.sort()
-        parts = [[moments[0]]]
-        for last, moment in itertools.pairwise(moments):
-            if moment[0] - last[0] > _PAUSE_S:
-                parts.append([])
-            parts[-1].append(moment)
-        joined = [parts[0]]
-        for part in parts[1:]:
-            if {m[1:] for m in joined[-1]} & {m[1:] for m in part}:
-                joined[-1] += part
-            else:
-                joined.append(part)
-        for number, part in enumerate(joined, 1):
-            again = "" if number == 1 else f" ({number})"
-            robots = tuple(sorted({robot_id for _, robot_id, _ in part}))
-            missions.append(Mission((name or "no name") + again, part[0][0], part[-1][0], robots))
+    under_way = UnderWay()
+    parts: dict[str, list[dict[int, list[float]]]] = {}
+    for robot_id, said in _in_order(logs):
+        if under_way.begins(robot_id, said, said.time_s):
+            parts.setdefault(said.trial, []).append({})
+        if said.state is FlightState.MISSION:
+            parts[said.trial][-1].setdefault(robot_id, []).append(said.time_s)
+    missions = [
+        Mission(
+            (name or "no name") + ("" if number == 1 else f" ({number})"),
+            min(times_s[0] for times_s in part.values()),
+            max(times_s[-1] for times_s in part.values()),
+            tuple(sorted(part)),
+        )
+        for name, flown in parts.items()
+        for number, part in enumerate(flown, 1)
+    ]
     return sorted(missions, key=lambda mission: mission.begin_s)
+
+
+def _in_order(logs: Logs) -> Iterator[tuple[int, Said]]:
+    """What all robots said, by robot id."""
+    said = [zip(itertools.repeat(robot), statuses) for robot, statuses in logs.statuses.items()]
+    return heapq.merge(*said, key=lambda one: one[1].time_s)
 
 
 def trial_of(

@@ -9,7 +9,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from rich.segment import Segment
@@ -22,7 +21,7 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 from textual.theme import Theme
 
-from edge.core.mission import FlightState
+from edge.core.mission import ON_GROUND, FlightState
 from ground.alarms import BEFORE_S, Alarm, Severity, alarms, is_flying
 from ground.client import listen, send
 from ground.protocol import (
@@ -36,7 +35,7 @@ from ground.protocol import (
     Told,
 )
 from ground.watch_lines import Line, Span, TextStyle, line
-from ground.watch_robot import detail
+from ground.watch_robot import detail, in_short
 from ground.watch_table import Row, columns, gravest, heading, in_order, table_row
 from ground.watch_text import HELP, KEYS, alarm_lines, few_alarms, header, lost, outcome
 
@@ -45,6 +44,8 @@ _CONNECT_AGAIN_S = 0.5
 _SILENT_S = 2.0
 # A robot whose alarm is over stays on top for so long, so that no row jumps to and fro.
 _STAYS_UP_S = 5.0
+# From the top.
+_PARTS = ("banner", "header", "alarms", "heading", "body", "selected", "message", "keys")
 # Of the height.
 _ALARMS_SHARE = 6
 _SCREENSHOT_AFTER_S = 3.0
@@ -123,8 +124,8 @@ class _Question(NamedTuple):
     request: Request
 
 
-class Watch(App[None]):
-    """The view. `screenshot`: save it there as SVG after the first few pictures, and quit."""
+class Watch(App[str]):
+    """The view. `screenshot`: quit after the first few pictures, and give it as SVG."""
 
     ENABLE_COMMAND_PALETTE = False
     TITLE = "lpac watch"
@@ -136,23 +137,26 @@ class Watch(App[None]):
     #body {
         height: 1fr; overflow-y: auto; scrollbar-color: $faint; scrollbar-background: $panel;
     }
+    #selected { height: 2; background: $panel; }
     #message { height: 1; background: $panel; }
     #keys { height: 1; background: $panel; }
     """
 
-    def __init__(self, fleet: str, screenshot: Path | None = None) -> None:
+    def __init__(self, fleet: str, *, screenshot: bool = False) -> None:
         super().__init__()
         for theme in (_DARK, _LIGHT):
             self.register_theme(theme)
         self.theme = _DARK.name
         self.styles_of_text: dict[str, RichStyle] = {}
         self._fleet = fleet
-        self._save_to = screenshot
+        self._ends_by_screenshot = screenshot
         self._setup: Setup | None = None
         # Of the last few seconds, by when they came.
         self._pictures: deque[tuple[float, Picture]] = deque()
         self._began_s = time.monotonic()
         self._problem = "connecting"
+        # Who is in the air, by its events; and when each trial's mission began.
+        self._aloft: set[str] = set()
         self._mission_began_s: dict[str, float] = {}
         self._up_until_s: dict[str, tuple[Severity, float]] = {}
         self._rows: list[Row] = []
@@ -163,7 +167,7 @@ class Watch(App[None]):
         self._message = Span("")
 
     def compose(self) -> ComposeResult:
-        for name in ("banner", "header", "alarms", "heading", "body", "message", "keys"):
+        for name in _PARTS:
             yield Lines(name)
 
     def on_mount(self) -> None:
@@ -206,8 +210,7 @@ class Watch(App[None]):
         if isinstance(told, Setup):
             self._setup = told
         elif isinstance(told, Event):
-            if told.kind == "state" and told.text.startswith(FlightState.MISSION):
-                self._mission_began_s.setdefault(told.trial, told.unix_time_s)
+            self._take_event(told)
         elif isinstance(told, Picture) and self._setup is not None:
             if self._problem:
                 self._pictures.clear()
@@ -217,9 +220,22 @@ class Watch(App[None]):
                 self._pictures.popleft()
             self._look_at(told, now_s)
             self._draw()
-            if self._save_to is not None and now_s - self._began_s > _SCREENSHOT_AFTER_S:
-                self._save_to.write_text(self.export_screenshot())
-                self.exit()
+            if self._ends_by_screenshot and now_s - self._began_s > _SCREENSHOT_AFTER_S:
+                self.exit(self.export_screenshot())
+
+    def _take_event(self, event: Event) -> None:
+        """Some are older than this view: what was flown before all landed is over."""
+        if event.kind != "state":
+            return
+        state = event.text.partition(":")[0]
+        if state not in ON_GROUND:
+            self._aloft.add(event.robot)
+        else:
+            self._aloft.discard(event.robot)
+            if not self._aloft:
+                self._mission_began_s.clear()
+        if state == FlightState.MISSION:
+            self._mission_began_s.setdefault(event.trial, event.unix_time_s)
 
     def _look_at(self, picture: Picture, now_s: float) -> None:
         assert self._setup is not None
@@ -231,6 +247,7 @@ class Watch(App[None]):
         lasting = {r: sev for r, (sev, until_s) in self._up_until_s.items() if now_s < until_s}
         self._rows = in_order(self._setup, picture, self._alarms, lasting)
         if not _flying(picture):
+            self._aloft.clear()
             self._mission_began_s.clear()
         if self._selected not in self._setup.robots and self._rows:
             self._selected = self._rows[0].robot.name
@@ -280,7 +297,10 @@ class Watch(App[None]):
         ]
         names = [row.robot.name for row in rows]
         at = names.index(self._selected) if self._selected in names else 0
+        self.query_one("#selected").display = self._view == "table"
         if self._view == "table":
+            if rows:
+                self._show("selected", in_short(rows[at], width))
             shown = columns(self._setup, width)
             self._show("heading", heading(shown))
             self._show("body", [table_row(shown, row) for row in rows], at)

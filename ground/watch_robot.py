@@ -44,6 +44,30 @@ def detail(row: Row, picture: Picture, alarms: Sequence[Alarm], width: int) -> l
     ]
 
 
+def in_short(row: Row, width: int) -> tuple[Line, Line]:
+    """Of a robot what the table may have no room for: why it is in its state, fence, release."""
+    status = row.robot.status
+    name = Span(f" {row.robot.name}  ", "strong")
+    if status is None:
+        return line(width, name, Span("was never heard", "faint")), line(width)
+    margin_m = fence_margin_m(status, row.setup.fence)
+    fence = "-" if margin_m is None else f"{margin_m:.1f} m"
+    return (
+        line(width, name, Span(status.reason)),
+        line(
+            width,
+            Span(" fence margin ", "faint"),
+            Span(fence, "critical" if margin_m is not None and margin_m < 0.0 else ""),
+            Span("   bundle ", "faint"),
+            Span(status.bundle_id[:ID] or "-"),
+            Span("   world ", "faint"),
+            Span(status.world_id[:ID] or "-"),
+            Span("   trial ", "faint"),
+            Span(status.trial or "-"),
+        ),
+    )
+
+
 def _detail_title(robot: RobotPicture, width: int) -> Line:
     status = robot.status
     name = Span(f"{robot.name} ", "strong")

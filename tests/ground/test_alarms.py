@@ -59,6 +59,11 @@ OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
         ({"origin": Origin(47.0, 8.0, 0.0)}, "warning", "another origin than the fleet's"),
         ({"fence": OTHER_FENCE}, "warning", "another fence than the fleet's"),
         ({"not_taken": ("fence: not in flight",)}, "warning", "fence: not in flight"),
+        # Of one difference there is one alarm.
+        ({"origin": Origin(47.0, 8.0, 0.0), "not_taken": ("in flight: keeps its mission origin",)},
+         "warning", "in flight: keeps its mission origin"),
+        ({"world_id": "", "not_taken": ("world c64e4b1b of the ground has not arrived: wait",)},
+         "warning", "world c64e4b1b of the ground has not arrived: wait"),
         ({"satellites": 7}, "warning", "GPS sees 7 satellites"),
         ({"hdop": 2.5}, "warning", "GPS precision (HDOP) is 2.5"),
         ({"hdop": float("nan")}, "warning", "GPS precision (HDOP) is nan"),

@@ -12,7 +12,7 @@ from edge.core import F64
 from edge.core.coverage import coverage_cost, voronoi_cells
 from edge.core.mission import FlightState, RobotStatus
 from edge.core.world import format_world, parse_world, random_features, rasterize
-from ground.coverage import Coverage, counted
+from ground.coverage import Coverage, Whereabouts
 from ground.protocol import Picture, RobotPicture
 
 SIZE, SCALE = 128, 4.0
@@ -138,7 +138,7 @@ STATUS = RobotStatus(
 )  # fmt: skip
 
 
-def picture(*robots: tuple[S, bool, float, float | None]) -> Picture:
+def picture(*robots: tuple[S, bool, float, float | None], unix_time_s: float = 0.0) -> Picture:
     """Robots of (state, armed, age_s, x_m)."""
     pictures = (
         RobotPicture(
@@ -151,7 +151,11 @@ def picture(*robots: tuple[S, bool, float, float | None]) -> Picture:
         )
         for i, (state, armed, age_s, x_m) in enumerate(robots)
     )  # fmt: skip
-    return Picture(0.0, "", None, (*pictures, RobotPicture("silent", 99)))
+    return Picture(unix_time_s, "", None, (*pictures, RobotPicture("silent", 99)))
+
+
+def counted(seen: Picture) -> dict[str, tuple[float, float]]:
+    return Whereabouts().counted(seen)
 
 
 def test_who_counts() -> None:
@@ -166,3 +170,15 @@ def test_who_counts() -> None:
     )  # fmt: skip
     assert counted(flying) == {"r0": (1.0, 2.0), "r2": (3.0, 2.0), "r4": (5.0, 2.0)}
     assert counted(picture()) == {}
+
+
+def test_who_does_not_know_where_it_is_counts_for_a_moment() -> None:
+    whereabouts = Whereabouts()
+    here, nowhere = (S.HOLD, True, 0.1, 1.0), (S.HOLD, True, 0.1, None)
+    other = (S.HOLD, True, 0.1, 5.0)
+    whereabouts.counted(picture(here, other))
+    assert whereabouts.counted(picture(nowhere, other, unix_time_s=1.9))["r0"] == (1.0, 2.0)
+    assert "r0" not in whereabouts.counted(picture(nowhere, other, unix_time_s=2.1))
+    whereabouts.counted(picture(here, other, unix_time_s=3.0))
+    on_ground = (S.LANDED, False, 0.1, None)
+    assert "r0" not in whereabouts.counted(picture(on_ground, other, unix_time_s=3.5))

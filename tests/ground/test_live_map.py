@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import replace
 from typing import Any
+from urllib.parse import urlsplit
 
 import aiohttp
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from edge.core.mission import ON_GROUND, FlightState, GroundState
 from ground.client import command, listen
 from ground.live_map import Outbox, serving
-from ground.live_map_access import Access, is_loopback
+from ground.live_map_access import Access, is_loopback, reached_at
 from ground.live_map_view import Missions, detail_view
 from ground.protocol import Picture, RobotPicture, SetOrigin, Setup
 from tests.ground.browser import PATIENCE_S, Opened, live_map, lpac, opened
@@ -89,7 +90,7 @@ async def asking(
 ) -> AsyncIterator[tuple[str, aiohttp.ClientSession]]:
     access = Access(local=True, token=token)
     async with (
-        serving(fleet, host="127.0.0.1", port=0, access=access, operate=operate) as address,
+        serving(fleet, host="127.0.0.1", port=0, access=access, operate=operate) as (address,),
         # Cookies of addresses are kept, as browsers do.
         aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session,
     ):
@@ -123,13 +124,20 @@ def test_what_a_stranger_gets_from_the_server() -> None:
 
 def test_on_the_network_the_address_has_a_token(fleet: PretendedFleet) -> None:
     async def ask(address: str) -> None:
-        async with aiohttp.ClientSession() as session:
-            assert (await session.get(address.partition("?")[0])).status == 403
-            assert (await session.get(address, allow_redirects=False)).status == 303
+        async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
+            bare = address.partition("?")[0]
+            assert (await session.get(bare)).status == 403
+            assert (await session.get(address)).status == 200
+            async with session.ws_connect(bare + "live", headers={"Origin": bare[:-1]}) as stream:
+                assert (await stream.receive_json())["kind"] == "hello"
 
     with live_map(fleet.fleet_toml, "--host", "0.0.0.0") as address:
         assert len(address.partition("?token=")[2]) >= 16
+        name = urlsplit(address).hostname
+        # One that a tablet can open, unless this machine is on no network.
+        assert name in reached_at("0.0.0.0") and name is not None and not is_loopback(name)
         asyncio.run(ask(address))
+    assert reached_at("127.0.0.1") == ["127.0.0.1"]
 
 
 def test_a_port_that_is_taken_is_told_in_one_line() -> None:
@@ -275,6 +283,15 @@ def test_a_page_that_takes_nothing_misses_pictures() -> None:
     assert taken[-1] == "event 999" and len(taken) <= 202
 
 
+def picture_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> Picture:
+    robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
+    status = replace(
+        robot.status(0.0), state=state, trial=trial, armed=state not in ON_GROUND, boot_nonce=7
+    )
+    ground = GroundState(1, "alice", trial=trial)
+    return Picture(unix_time_s, "alice", ground, (RobotPicture("r1", 1, status, 0.1),))
+
+
 def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     missions = Missions()
     waiting, flying = (
@@ -282,6 +299,7 @@ def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     )
     missions.take(waiting)
     assert not missions.begins(waiting) and missions.time_s(waiting) is None
+    missions.take(flying)
     assert missions.begins(flying)
     curve = missions.begin(flying, 50.0)
     curve.bound = curve.share(10.0)
@@ -291,18 +309,34 @@ def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     assert view["whole"] and view["began_s"] == 100.0 and view["bound"] == 0.2
     assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
     assert len(view["points"]) <= 3000
-    # Hold is part of a mission, landing is not; another trial is another mission.
+    # Hold is part of a mission, landing is not.
     assert missions.time_s(picture_of(FlightState.HOLD, 160.0)) == 60.0
     assert missions.time_s(picture_of(FlightState.LAND, 160.0)) is None
     assert not missions.begins(picture_of(FlightState.MISSION, 170.0))
-    assert missions.begins(picture_of(FlightState.MISSION, 180.0, trial="t2"))
 
 
-def picture_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> Picture:
-    robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
-    status = replace(robot.status(0.0), state=state)
-    ground = GroundState(1, "alice", trial=trial)
-    return Picture(unix_time_s, "alice", ground, (RobotPicture("r1", 1, status, 0.1),))
+@pytest.mark.parametrize(
+    ("between", "trial", "anew"),
+    [
+        (picture_of(FlightState.HOLD, 110.0), "t1", False),
+        (picture_of(FlightState.LANDED, 110.0), "t1", True),
+        (picture_of(FlightState.HOLD, 110.0, ""), "t1", True),
+        (picture_of(FlightState.HOLD, 110.0), "t2", True),
+    ],
+)
+def test_a_mission_after_another_is_a_new_curve(between: Picture, trial: str, anew: bool) -> None:
+    missions = Missions()
+    flying = picture_of(FlightState.MISSION, 100.0)
+    missions.take(flying)
+    missions.begin(flying, 50.0)
+    missions.take(between)
+    waiting, again = (
+        picture_of(state, 120.0, trial) for state in (FlightState.HOLD, FlightState.MISSION)
+    )
+    missions.take(waiting)
+    assert (missions.time_s(waiting) is None) == anew
+    missions.take(again)
+    assert missions.begins(again) == anew
 
 
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
@@ -406,5 +440,5 @@ def test_a_page_that_observes(few: PretendedFleet) -> None:
             with lpac(*ground):
                 page.wait_for_selector("#banner", state="hidden")
                 assert page.inner_text("#link") == "ground live"
-                assert page.is_hidden("#calm")
+                assert "HOLD" not in page.inner_text("#calm")
             check_innocence(seen)

@@ -65,8 +65,8 @@ def picture(now_s: float, sequence: int, x_m: float, state: S = S.MISSION, **mor
     """Two robots, of which the second was heard 0.1 s ago."""
     statuses = (
         dataclasses.replace(
-            STATUS, robot_id=i, sequence=sequence, state=state, armed=True, trial="t1",
-            position_m=(x_m, 5.0 + 20.0 * i, 4.0),
+            STATUS, robot_id=i, sequence=sequence, state=state, armed=state is not S.LANDED,
+            trial="t1", position_m=(x_m, 5.0 + 20.0 * i, 4.0),
         )
         for i in range(2)
     )  # fmt: skip
@@ -122,6 +122,20 @@ def test_the_cost_is_normalised_by_each_trials_begin() -> None:
     assert costs[2]["normalized"] == expected[2] / expected[1]
     assert [cost["flying_mission"] for cost in costs] == [False, True, True]
     assert {(cost["trial"], cost["robots"]) for cost in costs} == {("t1", ("r0", "r1"))}
+
+
+def test_a_name_that_is_flown_again_begins_anew() -> None:
+    kept = Kept()
+    kept.recording.take(SETUP, 0.0)
+    flown = ((S.MISSION, 1.0), (S.HOLD, 5.0), (S.MISSION, 6.0), (S.LANDED, 7.0), (S.HOLD, 7.0))
+    for second, (state, x_m) in enumerate((*flown, (S.MISSION, 9.0)), 1):
+        kept.recording.take(picture(float(second), second, x_m, state), float(second))
+    kept.recording.close()
+    costs = kept.of("cost")
+    first = costs[0]["cost"]
+    # A pause is no new mission; after landing there is a new one.
+    assert [cost["initial"] for cost in costs] == [*[first] * 5, costs[5]["cost"]]
+    assert costs[5]["normalized"] == 1.0 != costs[4]["normalized"]
 
 
 @pytest.mark.parametrize("world", ["", "Circle 1 2"])

@@ -377,14 +377,61 @@ def test_one_name_flown_twice_is_two_trials(tmp_path: Path) -> None:
     again = dataclasses.replace(FIRST, begin_s=200.0)
     for folder, flight, nonce in (("a", FIRST, 10), ("b", again, 20)):
         Writer((flight,), nonce=nonce).robots(tmp_path / folder)
-        # A pause of one flight is no new trial.
-        pause = dataclasses.replace(again, trial="p", begin_s=400.0)
-        Writer((pause, dataclasses.replace(pause, begin_s=450.0)), nonce=30).robots(tmp_path / "c")
     # As `lpac fleet pull` names its folders.
     (tmp_path / "a/robots/0").rename(tmp_path / "a/robots/alpha")
-    logs = read_logs([tmp_path / name for name in "abc"], lambda *_: None)
-    assert [mission.name for mission in find_missions(logs)] == ["t1", "t1 (2)", "p"]
+    logs = read_logs([tmp_path / name for name in "ab"], lambda *_: None)
+    assert [mission.name for mission in find_missions(logs)] == ["t1", "t1 (2)"]
     assert [logs.name(robot) for robot in range(3)] == ["alpha", "1", "2"]
+
+
+def landed(status: RobotStatus, _: float) -> RobotStatus:
+    return status
+
+
+def reset_in_the_air(status: RobotStatus, at_s: float) -> RobotStatus:
+    return dataclasses.replace(held(status, at_s), trial="" if 35.0 < at_s < 50.0 else "t1")
+
+
+def held(status: RobotStatus, _: float) -> RobotStatus:
+    return status if status.state is S.MISSION else dataclasses.replace(status, state=S.HOLD)
+
+
+def one_landed(status: RobotStatus, at_s: float) -> RobotStatus:
+    return status if status.robot_id == 0 else held(status, at_s)
+
+
+@pytest.mark.parametrize(
+    ("change", "flights"), [(landed, 2), (reset_in_the_air, 2), (held, 1), (one_landed, 1)]
+)
+def test_a_trial_ends_when_all_have_landed_or_are_reset(
+    tmp_path: Path, change: Callable[[RobotStatus, float], RobotStatus], flights: int
+) -> None:
+    """As `lpac mission run` twice flies a script's trial: the robots' programs run on."""
+    writer = Writer((FIRST, dataclasses.replace(FIRST, begin_s=50.0)))
+    writer.change = change
+    writer.ground(tmp_path)
+    found = find_missions(read_logs([tmp_path], lambda *_: None))
+    assert [mission.name for mission in found] == ["t1", "t1 (2)"][:flights]
+    for mission in found:
+        lasted_s = mission.end_s - mission.begin_s
+        assert lasted_s == pytest.approx(10.0 if flights == 2 else 40.0, abs=0.01)
+
+
+def test_a_position_that_is_unknown_for_a_moment_moves_no_cost(tmp_path: Path) -> None:
+    writer = Writer((FIRST,))
+
+    def change(status: RobotStatus, at_s: float) -> RobotStatus:
+        lost = status.robot_id == 1 and (22.0 < at_s < 23.5 or at_s > 26.0)
+        return dataclasses.replace(status, position_m=None) if lost else status
+
+    writer.change = change
+    writer.ground(tmp_path)
+    cost = examined(tmp_path).trials[0]
+    after_s = cost.cost_time_s
+    expected = np.array([FIRST.cost(20.0 + at_s) for at_s in after_s])
+    assert cost.cost[after_s < 6.0] == pytest.approx(expected[after_s < 6.0], rel=1e-3)
+    # Not for ever.
+    assert cost.cost[-1] > 1.01 * expected[-1]
 
 
 def nowhere(status: RobotStatus, _: float) -> RobotStatus:
@@ -450,7 +497,8 @@ def test_the_command_prints_the_summary(tmp_path: Path, flown: Path) -> None:
     assert result.exit_code == 0
     line, last = result.stdout.splitlines()
     assert re.fullmatch(
-        r"t2: 3 robots, 12 s, cost \d\.\d\d of the initial, bound \d\.\d\d, "
+        r"t2: 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d, 3 robots, 12 s, "
+        r"cost \d\.\d\d of the initial, bound \d\.\d\d, "
         r"least distance \d\.\d\d m, \d\.\d % of the messages lost", line
     )  # fmt: skip
     assert last == f"see {tmp_path / 'report.html'}"

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -24,12 +24,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 from textual.pilot import Pilot
+from typer.testing import CliRunner
 
+from cli.main import app
 from edge.core.mission import FlightState, GroundState
 from ground.alarms import Alarm, alarms
 from ground.client import command, socket_path
 from ground.protocol import (
     Enable,
+    Event,
     Picture,
     Report,
     Result,
@@ -42,7 +45,7 @@ from ground.protocol import (
 )
 from ground.watch import Lines, Watch
 from ground.watch_lines import Line, age, fit, number, some
-from ground.watch_robot import detail
+from ground.watch_robot import detail, in_short
 from ground.watch_table import Row, columns, heading, in_order, table_row
 from ground.watch_text import all_of_it, few_alarms, header, outcome
 from tests.conftest import ROOT
@@ -95,8 +98,8 @@ def test_no_value_moves_a_column(said: Any, age_s: Any, name: str, width: int) -
     for line in (table_row(shown, row), table_row(shown, ordinary)):
         assert [cell_len(span.text) for span in line[::2]] == [cell - 1 for cell in cells]
         assert all(span.text == " " for span in line[1::2])
-    for line in detail(row, picture(row.robot), (), max(width, 40)):
-        assert width_of(line) == max(width, 40)
+    for line in (*detail(row, picture(row.robot), (), max(width, 40)), *in_short(row, width)):
+        assert width_of(line) in (width, max(width, 40))
 
 
 def test_what_is_seen_at_80_columns() -> None:
@@ -172,7 +175,7 @@ def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:
 class Seen:
     """What stands on the screen."""
 
-    def __init__(self, app: Watch, pilot: Pilot[None]) -> None:
+    def __init__(self, app: Watch, pilot: Pilot[str]) -> None:
         self.app, self.pilot = app, pilot
 
     def lines(self, name: str) -> list[str]:
@@ -307,11 +310,14 @@ def test_a_ground_process_that_ends_and_comes_back(tmp_path: Path) -> None:
 
 
 @asynccontextmanager
-async def told(fleet: Setup, seen: Callable[[], Picture]) -> AsyncIterator[None]:
-    """A ground process that tells whatever picture it is given."""
+async def told(
+    fleet: Setup, seen: Callable[[], Picture], events: Sequence[Event] = ()
+) -> AsyncIterator[None]:
+    """A ground process that tells events, and then whatever picture it is given."""
 
     async def serve(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(to_line(fleet))
+        writer.writelines(to_line(event) for event in events)
         try:
             while not ended.is_set():
                 writer.write(to_line(seen()))
@@ -328,6 +334,23 @@ async def told(fleet: Setup, seen: Callable[[], Picture]) -> AsyncIterator[None]
         yield
         ended.set()
         await left.wait()
+
+
+def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
+    """To a view that opens late, both flights' events are told."""
+
+    async def use() -> None:
+        landed = ((800.0, "mission: mission started"), (900.0, "landed: the vehicle is disarmed"))
+        events = [
+            Event(at_s, "state", name, text, trial="t1")
+            for at_s, text in (*landed, (935.0, "hold: at its height"), (940.0, landed[0][1]))
+            for name in ("r0", "r1")
+        ]
+        seen_last = picture(robot(status(0)), robot(status(1)), unix_time_s=1000.0)
+        async with told(setup(2), lambda: seen_last, events), watching("field") as seen:
+            await seen.until(lambda: "mission 01:00" in seen.text("header"))
+
+    asyncio.run(use())
 
 
 def test_thirty_robots_at_80_columns_and_24_lines() -> None:
@@ -357,6 +380,10 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
             assert all(len(line.rstrip()) == 79 and line[74] == " " for line in shown), shown
             await seen.press("end")
             await seen.until(lambda: "r28 " in seen.text("body"))
+            why, more = seen.lines("selected")
+            assert why.startswith(" r28  mission started")
+            assert more.startswith(" fence margin 6.0 m   bundle 79929121   world c64e4b1b ")
+            assert seen.text("body").count("\n") == 10
             await seen.press("enter")
             assert seen.text("heading").startswith("r28 (robot 28)  mission: mission started")
             # Who was selected stays so, wherever his row goes.
@@ -394,6 +421,11 @@ def test_the_command_on_a_terminal_and_without(tmp_path: Path) -> None:
                 stdin=subprocess.DEVNULL, capture_output=True, text=True, check=True,
             ).stdout  # fmt: skip
 
+        def mistake(*arguments: object) -> str:
+            called = CliRunner().invoke(app, ["watch", *map(str, (*at, *arguments))])
+            assert called.exit_code == 1
+            return str(called.exception)
+
         # There is no terminal here.
         lines = printed(COLUMNS="80").splitlines()
         assert lines[0].startswith(f"{fleet.name}  nobody commands (this is alice)")
@@ -403,6 +435,10 @@ def test_the_command_on_a_terminal_and_without(tmp_path: Path) -> None:
         svg = tmp_path / "watch.svg"
         printed("--screenshot", svg, "--size", "100x30")
         assert "commands" in svg.read_text()
+        nowhere = tmp_path / "nowhere/watch.svg"
+        assert mistake("--screenshot", nowhere).endswith(f"No such file or directory: '{nowhere}'")
+        text = "--size 80: must be columns x lines, such as 100x30"
+        assert mistake("--screenshot", svg, "--size", "80") == text
         with terminal(lpac("watch", *at), 80, 24) as (process, screen):
             read_until(screen, "nobody")
             os.write(screen, b"q")
