@@ -141,9 +141,9 @@ class Order:
 
     It is for the start of the program whose `boot_nonce` it names, and expires at
     `expires_at_uptime_s` of the robot's own uptime, `ORDER_LIFETIME_S` after the status that the
-    ground saw: clocks need not agree. `trial` names the mission of a start: another one than the last
-    has the explored map and the mailbox forgotten. A reset does, too; the robot's own trial is then
-    "" until it starts again.
+    ground saw: clocks need not agree. `trial` names the mission of a start: another one than the
+    last has the explored map and the mailbox forgotten. A reset does, too; the robot's own trial is
+    then "" until it starts again.
 
     `pilot` gives the vehicle, which holds, to a human; `rejoin` takes it back. `disarm` stops the
     motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone.

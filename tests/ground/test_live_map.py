@@ -394,8 +394,8 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         seen.wait_for_states({"r0": "mission", "r1": "mission"})
         assert few.robots[0].trial == page.inner_text("#trial")
         # The cost, and its bound.
-        page.wait_for_function("Number(document.querySelector('#bound').textContent) > 0")
-        page.wait_for_function("Number(document.querySelector('#share').textContent) > 0")
+        page.wait_for_function("() => Number(document.querySelector('#bound').textContent) > 0")
+        page.wait_for_function("() => Number(document.querySelector('#share').textContent) > 0")
         # One robot, from its drawer.
         page.click("tr[data-robot=r1]")
         page.wait_for_selector("#drawer >> text=landing point")
