@@ -84,6 +84,10 @@ class Running:
         except _ProblemError as problem:
             self.report = Report(problem=str(problem))
             self._station.tell("refusal", "", f"{self.text}: {problem}", self._station.operator)
+        except Exception:
+            # It goes no further; the others, and the station, do.
+            self.report = Report(problem="a defect of lpac ground ended this command")
+            raise
 
     def abandon(self, why: str, *, withdraw: bool) -> None:
         """Order nothing more; `withdraw` what was ordered and is not answered."""

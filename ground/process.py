@@ -7,6 +7,7 @@ import asyncio
 import base64
 import socket
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -27,7 +28,7 @@ from ground.protocol import (
     request_from_line,
     to_line,
 )
-from ground.station import Station, is_down
+from ground.station import NameTakenError, Station, is_down
 
 _WORLD_PERIOD_S = 1.0
 # A client that does not read misses pictures, and in the end is left alone.
@@ -125,9 +126,11 @@ class GroundProcess:
         assert self._failed is not None
         try:
             self._receive(key, data)
-        except Exception as error:
+        except NameTakenError as error:
             if not self._failed.done():
                 self._failed.set_exception(error)
+        except Exception as error:
+            self._survive(key, error)
 
     def _receive(self, key: str, data: bytes) -> None:
         self._station.set_time(time.monotonic(), time.time())
@@ -151,6 +154,12 @@ class GroundProcess:
             self._complain(key, "", f"{source.replace('/', ' ')} is heard, and not in fleet.toml")
         self._step()
 
+    def _survive(self, what: str, error: Exception) -> None:
+        """Robots that fly need this process more than they need what it could not do."""
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(where.filename).name}, line {where.lineno}"
+        self._complain(what, "", f"a defect of lpac ground ({what}): {error!r} in {place}")
+
     def _complain(self, key: str, robot: str, text: str) -> None:
         """Once for each key is enough."""
         if key not in self._complained:
@@ -164,8 +173,13 @@ class GroundProcess:
         while True:
             now_s = time.monotonic()
             self._station.set_time(now_s, time.time())
-            self._station.tick()
-            self._step()
+            try:
+                self._station.tick()
+                self._step()
+            except NameTakenError:
+                raise
+            except Exception as error:
+                self._survive("tick", error)
             self._publish(now_s)
             if self._clients:
                 picture = to_line(self._station.picture(self._commands.texts))

@@ -291,3 +291,15 @@ def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
     field.done(Calm("hold", robots=("r0",)))
     problem = field.do(Again(robots=("r0",))).problem
     assert problem == "r1, r2 fly the mission: hold or land first"
+
+
+def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = a_field()
+    field.fly()
+    hold = field.begin(Calm("hold", wait=True))
+    monkeypatch.setattr(hold, "_steps", (1 / 0 for _ in range(1)))
+    with pytest.raises(ZeroDivisionError):
+        field.commands["alice"].step()
+    assert hold.report is not None
+    assert hold.report.problem == "a defect of lpac ground ended this command"
+    field.done(Calm("land", wait=True))
