@@ -30,7 +30,7 @@ from ground.protocol import (
 )
 from ground.station import NameTakenError, Station, is_down
 
-_WORLD_PERIOD_S = 1.0
+_WORLD_PERIOD_S = 0.5
 # A client that does not read misses pictures, and in the end is left alone.
 _LATE_BYTES = 1 << 20
 _LOST_BYTES = 1 << 25
