@@ -137,7 +137,9 @@ def fence_off(
 
     to = address(fleet, robots)
     confirm(
-        f"Let {_whom(to)} fly {WIDE_FENCE_M / 2:g} m far from the origin?", "fence off", yes=yes
+        f"Let all robots of fleet {to.fleet} fly {WIDE_FENCE_M / 2:g} m far from the origin?",
+        "fence off",
+        yes=yes,
     )
     with looking(to) as lookout:
         wide = wide_fence(lookout.setup.fence)
@@ -418,7 +420,7 @@ def kill(
         raise ValueError(
             "kill: name the robots, such as `lpac mission kill r3`: it is never for all"
         )
-    confirm(f"KILL {_whom(to)}? What flies falls.", "kill", yes=yes)
+    confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
     _give("kill", to, as_json=as_json)
 
 
@@ -466,10 +468,6 @@ def command(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
     from ground.protocol import Command
 
     ask(address(fleet, None), Command(), "command", as_json=as_json)
-
-
-def _whom(to: Addressed) -> str:
-    return ", ".join(to.robots) or f"all robots of fleet {to.fleet}"
 
 
 app.command()(rehearse)

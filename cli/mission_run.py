@@ -35,6 +35,7 @@ def run(
 
     If a step fails, and at Ctrl-C, the fleet is told to hold. Before each further trial it asks.
     """
+    from ground.client import GroundError
     from ground.script import Flight, ScriptError, load_script
     from ground.site import Sites
 
@@ -59,12 +60,15 @@ def run(
         except ScriptError as error:
             then = f"; {flight.hold()}" if error.hold else ""
             raise ValueError(f"{script}: {error}{then}") from None
-        except OSError as error:
+        except GroundError as error:
             raise ValueError(
                 f"{script}: {error}; robots in the air hold by themselves, and then land"
             ) from None
-        except KeyboardInterrupt:
-            typer.echo(f"lpac: {script}: interrupted; {flight.hold()}", err=True)
+        except (KeyboardInterrupt, OSError, SystemExit) as error:
+            # A terminal that is gone cannot be written to; rich exits when its pipe breaks.
+            then = flight.hold()
+            why = str(error) if isinstance(error, OSError) else "interrupted"
+            typer.echo(f"lpac: {script}: {why}; {then}", err=True)
             raise typer.Exit(130) from None
     typer.echo(f"{script}: done", err=True)
 

@@ -12,9 +12,9 @@ mkdir -p "$out"
 # Each is ended as by Ctrl-C, which a background program of a script would not see.
 trap 'jobs -p | xargs -r kill; wait' EXIT
 lpac sim --vehicle mavlink -n 10 --seed 3 --no-script --out "$out" &> "$out/sim.log" &
-until grep -q 'lpac ground' "$out/sim.log"; do kill -0 $! && sleep 0.2; done
+until grep -q 'lpac ground' "$out/sim.log"; do kill -0 $!; sleep 0.2; done
 lpac ground --name alice@laptop &> "$out/ground.log" &
-until lpac watch --once &> /dev/null; do kill -0 $! && sleep 0.2; done
+until lpac watch --once &> /dev/null; do kill -0 $!; sleep 0.2; done
 lpac record &> "$out/record.log" &
 lpac map --port 0 > "$out/map.log" &
 

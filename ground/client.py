@@ -21,7 +21,7 @@ from ground.protocol import (
 
 # Worlds are the longest lines.
 MAX_LINE = 1 << 26
-_MAX_PATH = 107
+_MAX_PATH = 103  # macOS; Linux has a few more
 
 
 class GroundError(OSError):

@@ -28,6 +28,8 @@ from ground.protocol import (
 )
 from ground.station import COMMANDER_SILENT_S, Station, is_down, next_trial
 
+DEFECT = "a defect of lpac ground ended this command"
+
 _GATHER_S = 3.0
 # Until a robot has obeyed; then, until what it was told shows.
 _OBEY_S = 10.0
@@ -86,7 +88,7 @@ class Running:
             self._station.tell("refusal", "", f"{self.text}: {problem}", self._station.operator)
         except Exception:
             # It goes no further; the others, and the station, do.
-            self.report = Report(problem="a defect of lpac ground ended this command")
+            self.report = Report(problem=DEFECT)
             raise
 
     def abandon(self, why: str, *, withdraw: bool) -> None:

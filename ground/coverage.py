@@ -21,6 +21,8 @@ _COARSE_CELLS = 128
 _LEAST_GAIN = 1e-5
 # A robot that does not know where it is, is still where it was.
 _REMEMBERED_S = 2.0
+# Nobody flies there, and squares of more are not finite.
+_FURTHEST_M = 1e6
 
 
 class World(Protocol):
@@ -135,7 +137,7 @@ def in_air(status: Flying) -> bool:
 
 
 def _position_m(status: RobotStatus) -> tuple[float, float] | None:
-    if status.position_m is None or not all(map(math.isfinite, status.position_m)):
+    if status.position_m is None or not all(abs(c) < _FURTHEST_M for c in status.position_m):
         return None
     x_m, y_m, _ = status.position_m
     return x_m, y_m

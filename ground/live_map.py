@@ -18,7 +18,7 @@ from aiohttp import WSMsgType, web
 
 from edge.core import F64
 from ground.alarms import BEFORE_S, Alarm, alarms
-from ground.client import GroundError, listen, send
+from ground.client import listen, send
 from ground.coverage import Coverage
 from ground.live_map_access import Access, reached_at
 from ground.live_map_view import (
@@ -175,7 +175,9 @@ class LiveMap:
                 self._put(_explored_view(message), message.robot)
 
     async def _take_setup(self, setup: Setup) -> None:
-        coverage = await asyncio.to_thread(Coverage, setup)
+        coverage = self._coverage
+        if coverage is None or self._setup is None or self._setup.world != setup.world:
+            coverage = await asyncio.to_thread(Coverage, setup)
         self._setup, self._coverage = setup, coverage
         self._setup_text = _text(setup_view(setup, coverage))
         for page in self._pages:
@@ -363,7 +365,7 @@ class LiveMap:
         else:
             try:
                 report = await send(self._fleet, _ACTIONS[action](robots))
-            except GroundError as error:
+            except (OSError, ValueError) as error:
                 report = Report(problem=str(error))
         page.put_each(_text(report_view(action, report)))
 

@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from edge.adapters.zenoh_link import ZenohLink
-from edge.core.mission import GroundState, RobotStatus, from_json, to_json
+from edge.core.mission import EXPLORED_CELLS, GroundState, RobotStatus, from_json, to_json
 from edge.core.schema import ConfigError
 from ground.client import MAX_LINE, GroundError, socket_path
-from ground.commands import Commands
+from ground.commands import DEFECT, Commands
 from ground.config import GroundConfig
 from ground.protocol import (
     PICTURE_PERIOD_S,
@@ -31,6 +31,8 @@ from ground.protocol import (
 from ground.station import NameTakenError, Station, is_down
 
 _WORLD_PERIOD_S = 0.5
+# As robots do: what is longer would hold up everything else.
+_LONGEST_MESSAGE_BYTES = 65_536
 # A client that does not read misses pictures, and in the end is left alone.
 _LATE_BYTES = 1 << 20
 _LOST_BYTES = 1 << 25
@@ -137,9 +139,13 @@ class GroundProcess:
         source, _, topic = key.rpartition("/")
         name = self._names.get(source)
         if topic == "explored":
-            if name is not None and self._explored.get(name) != data:
+            sane = len(data) == EXPLORED_CELLS**2 // 8
+            if name is not None and sane and self._explored.get(name) != data:
                 self._explored[name] = data
                 self._send(_explored(name, data))
+            return
+        if len(data) > _LONGEST_MESSAGE_BYTES:
+            self._complain(f"long {key}", name or "", f"{topic} of {len(data)} bytes: not read")
             return
         try:
             if key == "ground/state":
@@ -158,7 +164,8 @@ class GroundProcess:
         """Robots that fly need this process more than they need what it could not do."""
         where = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{Path(where.filename).name}, line {where.lineno}"
-        self._complain(what, "", f"a defect of lpac ground ({what}): {error!r} in {place}")
+        text = f"a defect of lpac ground ({what}): {error!r} in {place}"
+        self._complain(f"defect {what}", "", text)
 
     def _complain(self, key: str, robot: str, text: str) -> None:
         """Once for each key is enough."""
@@ -180,11 +187,14 @@ class GroundProcess:
                 raise
             except Exception as error:
                 self._survive("tick", error)
-            self._publish(now_s)
-            if self._clients:
-                picture = to_line(self._station.picture(self._commands.texts))
-                for client in tuple(self._clients):
-                    client.send(picture, may_be_missed=True)
+            try:
+                self._publish(now_s)
+                if self._clients:
+                    picture = to_line(self._station.picture(self._commands.texts))
+                    for client in tuple(self._clients):
+                        client.send(picture, may_be_missed=True)
+            except Exception as error:
+                self._survive("publish", error)
             next_s = max(next_s + PICTURE_PERIOD_S, now_s)
             await asyncio.sleep(next_s - time.monotonic())
 
@@ -212,8 +222,8 @@ class GroundProcess:
         setup = self._station.setup
         if setup != self._told_setup:
             if setup.world != self._told_setup.world:
-                with suppress(OSError):  # Only the next one misses it.
-                    self._world_path.write_text(setup.world)
+                with suppress(OSError, ValueError):  # Only the next one misses it.
+                    self._world_path.write_text(setup.world, "utf-8")
             self._told_setup = setup
             self._send(setup)
         for event in self._station.new_events():
@@ -289,8 +299,13 @@ class GroundProcess:
             writer.write(to_line(Report(problem=str(error))))
             return
         self._station.set_time(time.monotonic(), time.time())
-        running = self._commands.begin(request)
-        self._step()
+        try:
+            running = self._commands.begin(request)
+            self._step()
+        except Exception as error:
+            self._survive("command", error)
+            writer.write(to_line(Report(problem=DEFECT)))
+            return
         left = asyncio.create_task(reader.read(1))
         try:
             while True:

@@ -17,7 +17,7 @@ import contextlib
 import dataclasses
 import signal
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -96,7 +96,8 @@ class Recording:
         self._state: GroundState | None = None
         # Of each robot: boot nonce and sequence of the newest status.
         self._statuses: dict[str, tuple[int, int]] = {}
-        self._events: set[Event] = set()
+        # The ground repeats its last 200 to a new client.
+        self._events: deque[Event] = deque(maxlen=400)
         self._explored: dict[str, str] = {}
         self._cost_at_s = 0.0
         self._whereabouts = Whereabouts()
@@ -113,7 +114,7 @@ class Recording:
             case Picture():
                 self._take_picture(told)
             case Event() if told not in self._events:
-                self._events.add(told)
+                self._events.append(told)
                 self._record("event", told.unix_time_s, dataclasses.asdict(told))
             case Explored(robot, cells) if self._explored.get(robot) != cells:
                 self._explored[robot] = cells
@@ -252,7 +253,7 @@ async def _follow(
                 if shown_at_s is None or now_s - shown_at_s >= _SHOW_PERIOD_S:
                     shown_at_s = now_s
                     show(_line(told, cost))
-        except GroundError as error:
+        except (GroundError, ValueError) as error:
             if hears is not False:
                 hears = False
                 say(f"{error}; waiting for it")

@@ -1,5 +1,6 @@
 """A flight's logs as the paper's figures, one HTML page, and numbers."""
 
+import contextlib
 import json
 import math
 import re
@@ -117,7 +118,8 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
     (out / SUMMARY).write_text(json.dumps(examined.summary(), indent=2) + "\n")
     names = ", ".join(trial.name for trial in examined.trials[:3])
     names += ", …" if len(drawn) > 3 else ""
-    (out / PAGE).write_text(page(f"Flight report: {names}", drawn, repeatability, examined.notes))
+    text = page(f"Flight report: {names}", drawn, repeatability, examined.notes)
+    (out / PAGE).write_bytes(text.encode(errors="backslashreplace"))
     return out / PAGE
 
 
@@ -149,7 +151,8 @@ class _Worlds:
         paths = [path for folder in folders for path in sorted(folder.rglob("*.env"))]
         paths += [Path(_policy(m.configuration).get("world", "")) for m in logs.metadata]
         for path in dict.fromkeys(paths):
-            if path.is_file():
+            # Not every .env file is a world.
+            with contextlib.suppress(OSError, UnicodeDecodeError):
                 text = path.read_text("utf-8-sig")
                 self._texts.setdefault(id_of(text), text)
         self._sizes = _sizes(logs, wanted.bundle, notes)

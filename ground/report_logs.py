@@ -163,6 +163,15 @@ class _Reader:
                 self._orders.append((program, time_s, message))
 
     def read_ground(self, path: Path) -> None:
+        try:
+            begun = self._read_ground(path)
+        except FlightLogError as error:
+            self._logs.notes.append(f"{error}: left out")
+            return
+        if not begun:
+            self._logs.notes.append(f"{path}: holds nothing")
+
+    def _read_ground(self, path: Path) -> bool:
         begun = False
         for topic, _, message in read(path, "setup", "status", "event"):
             begun = True
@@ -179,8 +188,7 @@ class _Reader:
                     self._events.add(from_mapping(Event, message, str(path)))
             except ConfigError as error:
                 self._logs.notes.append(f"{error}: left out")
-        if not begun:
-            self._logs.notes.append(f"{path}: holds nothing")
+        return begun
 
     def _take_status(self, path: Path, program: Program, status: Mapping[str, Any]) -> None:
         statuses = self._statuses[program]

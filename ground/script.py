@@ -367,7 +367,9 @@ class Flight:
 
     def hold(self) -> str:
         """Hold whoever flies; what came of it, and what to do next, in words."""
-        if all(map(is_down, self._statuses(self._lookout.picture).values())):
+        # Who is not heard just now may well be.
+        last = [r.status for r in self._lookout.picture.robots if r.name in self.robots]
+        if all(status is None or is_down(status) for status in last):
             return "nobody is in the air"
         report = self._command(Calm("hold", self._script.robots))
         told = "the fleet is told to hold"
@@ -517,7 +519,7 @@ class Flight:
                 before[name] = status.state
                 if step.restart and name in left_alone and free_s > _START_TAKES_S:
                     self._start_again(name)
-            if statuses and all(map(is_down, statuses.values())):
+            if len(statuses) == len(self.robots) and all(map(is_down, statuses.values())):
                 raise ScriptError("nobody flies any more")
             self._lookout.wait_for(lambda _: False, max(0.0, min(free_s, _PERIOD_S)))
 

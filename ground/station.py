@@ -51,6 +51,7 @@ _LATELY_S = 10.0
 _EXPIRY_MARGIN_S = 0.5
 _LATER_S = 1e-3
 _EVENTS_KEPT = 200
+_RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
 # As a robot says it of a world whose text it has.
 _UNUSABLE_WORLD = "world cannot be used"
@@ -263,6 +264,8 @@ class Station:
     def _settle(self, result: OrderResult) -> None:
         del self._orders[result.order_id]
         self.results[result.order_id] = result
+        while len(self.results) > _RESULTS_KEPT:
+            del self.results[next(iter(self.results))]
 
     def _look_who_is_obeyed(self, status: RobotStatus) -> None:
         """A robot may obey what this station does not know of: its former life, or another one."""

@@ -70,6 +70,7 @@ const take = {
     missionTime = message.time_s;
     setText($("#absolute"), message.cost === null ? "–" : message.cost.toExponential(2).replace("+", ""));
     if (curve && message.share !== null && message.share !== undefined) {
+      if (curve.points.length >= 3000) curve.points = curve.points.filter((_, n) => n % 2 === 0);
       curve.points.push([message.time_s, message.share]);
       chart.set(curve.points, curve.bound);
     }

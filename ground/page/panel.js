@@ -16,7 +16,7 @@ export function setChip(element, robot) {
 }
 
 export function battery(share) {
-  return share === null || share === undefined ? "" : share < 0.2 ? "bad" : share < 0.35 ? "low" : "";
+  return share === null || share === undefined ? "" : share <= 0.15 ? "bad" : share <= 0.3 ? "low" : "";
 }
 
 // What a robot's row says beside its state: what is asked of it, or why it is as it is.

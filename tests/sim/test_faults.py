@@ -136,7 +136,7 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
                     boot_nonce=status.boot_nonce,
                     kind="takeoff",
                     expires_at_uptime_s=status.uptime_s + ORDER_LIFETIME_S / 2.0,
-                    operator="test",
+                    operator=status.operator,
                 )
                 session.put(f"lpac/{grounded.fleet.name}/ground/order", to_json(order))
             return all(
