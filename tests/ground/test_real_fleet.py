@@ -207,7 +207,7 @@ def test_a_robot_that_starts_later_is_told_origin_fence_and_world(fleet: Fleet) 
                 == (ORIGIN, fence, world_id(world))
             )  # fmt: skip
 
-        assert told(0) and told(1)
+        assert fleet.operator.wait_for(lambda _: told(0) and told(1), PATIENCE_S)
         before = fleet.operator.statuses()[1].boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
         fleet.robots[1].wait(10.0)
