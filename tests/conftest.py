@@ -4,11 +4,13 @@ import functools
 import os
 import platform
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from edge.runtime.bundle import Bundle, load_bundle
 from edge.runtime.policy import Policy
@@ -17,6 +19,15 @@ ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
 
 BuildImage = Callable[[str], Path]
+
+# A busy machine is slow now and then; and whatever fails is to fail again.
+settings.register_profile(
+    "project", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("project")
+
+# Tests that run in the background inherit that Ctrl-C is ignored; so would what they interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")

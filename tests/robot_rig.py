@@ -3,11 +3,13 @@
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,11 @@ SYSTEM_ID = 7
 # The mission's y axis does not point north, and the vehicle does not stand on its origin.
 ORIGIN = Origin(WorldOrigin().latitude_deg, WorldOrigin().longitude_deg, heading_deg=30.0)
 PAD_M = (12.0, 10.0)
+# Why a robot refuses for a moment: this machine held it up, or a command is still on its way.
+HELD_UP = re.compile(
+    r"the control loop was silent|checks are still running|the ground commands|"
+    r"not in offboard yet|position or height is not known|is not heard|was not answered|expired"
+)
 
 Changes = dict[str, dict[str, Any]]
 
@@ -92,36 +99,56 @@ class Rig:
     @property
     def status(self) -> RobotStatus:
         """The robot's newest."""
-        return self.operator.statuses()[self.config.robot_id]
+        return self.operator.history(self.config.robot_id)[-1].status
 
-    def wait(self, condition: Callable[[RobotStatus], object], timeout_s: float = 40.0) -> None:
-        """Until the robot says so."""
+    def wait(
+        self, condition: Callable[[RobotStatus], object], timeout_s: float = 180.0
+    ) -> RobotStatus:
+        """Until the robot says so; what it says then."""
         robot = self.config.robot_id
-        done = self.operator.wait_for(lambda s: robot in s and bool(condition(s[robot])), timeout_s)
-        assert done, self.operator.statuses().get(robot)
+        found: list[RobotStatus] = []
+
+        def is_so(statuses: Mapping[int, RobotStatus]) -> bool:
+            found[:] = [statuses[robot]] if robot in statuses else []
+            return bool(found and condition(found[0]))
+
+        assert self.operator.wait_for(is_so, timeout_s), found
+        return found[0]
 
     def wait_for_state(self, state: FlightState) -> None:
         self.wait(lambda status: status.state is state)
 
     def order(self, kind: Any, trial: str = "") -> None:
-        """Order it; it must be obeyed."""
-        assert self.refusal(kind, trial) == ""
+        """Order it; it must be obeyed, but for what lasts a moment."""
+        until_s = time.monotonic() + 60.0
+        while refusal := self.refusal(kind, trial):
+            assert HELD_UP.search(refusal) and time.monotonic() < until_s, refusal
 
     def refusal(self, kind: Any, trial: str = "") -> str:
         """Why an order is refused; "" if it is obeyed."""
-        result = self.operator.result(self.operator.order(kind, self.config.robot_id, trial), 15.0)
+        # Who is silent just now cannot be ordered anything.
+        self.wait(lambda _: True)
+        result = self.operator.result(self.operator.order(kind, self.config.robot_id, trial), 60.0)
         assert result is not None
         assert result.accepted is not bool(result.reason)
         return result.reason
 
     def take_off(self) -> None:
+        """Until it holds at its height; after a takeoff that this machine held up, once more."""
         self.operator.enable(ORIGIN)
         self.wait(lambda status: status.ready)
         self.order("takeoff")
-        self.wait_for_state(FlightState.HOLD)
+        self.wait(lambda status: status.ready or status.state is FlightState.HOLD)
+        held_up = self.status.reason.startswith("control was silent")
+        if held_up:
+            self.operator.calm("land")
+            self.wait_for_state(FlightState.LANDED)
+            self.operator.calm("none")
+        if held_up or self.status.ready:
+            self.take_off()
 
     def vehicle_is(
-        self, condition: Callable[[Px4Vehicle], object], timeout_s: float = 30.0
+        self, condition: Callable[[Px4Vehicle], object], timeout_s: float = 60.0
     ) -> bool:
         """Wait until the vehicle itself is so; whether it came to be."""
         return self.server.wait_for(lambda: bool(condition(self.vehicle)), timeout_s)
@@ -164,7 +191,7 @@ class Program:
     def end(self, number: signal.Signals) -> int:
         """Send the signal; the exit code."""
         self.process.send_signal(number)
-        return self.process.wait(20.0)
+        return self.process.wait(60.0)
 
 
 @contextmanager
@@ -185,7 +212,7 @@ def lpac_robot(*arguments: object) -> subprocess.CompletedProcess[str]:
     """`lpac robot ...` until it ends."""
     return subprocess.run(
         command(*map(str, arguments)), env=environment(),
-        capture_output=True, text=True, timeout=60.0, check=False,
+        capture_output=True, text=True, timeout=180.0, check=False,
     )  # fmt: skip
 
 

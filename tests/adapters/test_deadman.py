@@ -24,13 +24,15 @@ import ctypes, logging, sys, time
 import structlog
 from edge.adapters.deadman import Deadman
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
-from edge.core.vehicle import Action, Velocity
+from edge.core.vehicle import Action, Mode, Velocity
 
 structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
 port, system_id, way = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 
-def fly(velocity, until):
+def fly(velocity, until, action=None):
     while not until(autopilot.state()):
+        if action is not None:
+            autopilot.command(action)  # until it is so: a busy machine may have missed the answer
         autopilot.send(Velocity(velocity))
         deadman.feed(flying=True)
         time.sleep(0.1)
@@ -41,16 +43,15 @@ with (
 ):
     while not autopilot.state().armable:
         time.sleep(0.05)
-    autopilot.command(Action.ARM)
-    fly((0.0, 0.0, -2.0), lambda s: s.armed)
-    autopilot.command(Action.OFFBOARD)
+    fly((0.0, 0.0, -2.0), lambda s: s.armed, Action.ARM)
+    fly((0.0, 0.0, -2.0), lambda s: s.mode is Mode.OFFBOARD, Action.OFFBOARD)
     fly((0.0, 0.0, -2.0), lambda s: s.height_above_home_m > 1.5)
     fly((1.0, 0.0, 0.0), lambda s: s.velocity_local_m_s[0] > 0.9)
     print("flying", flush=True)
     if way == "interpreter":
-        ctypes.PyDLL(None).sleep(60)  # holds the GIL
+        ctypes.PyDLL(None).sleep(600)  # holds the GIL
     if way == "loop":
-        time.sleep(60)
+        time.sleep(600)
     fly((1.0, 0.0, 0.0), lambda _: False)
 """
 
@@ -68,13 +69,13 @@ def program(port: int, system_id: int, way: str) -> Iterator[subprocess.Popen[st
 def test_a_program_that_hangs_lets_the_vehicle_hold_and_one_that_dies_lets_it_land() -> None:
     ways = {"process": Mode.HOLD, "interpreter": Mode.HOLD, "loop": Mode.HOLD, "killed": Mode.LAND}
     ports = [free_port() for _ in ways]
-    vehicles, silent_since_s = [], []
+    vehicles = []
     for seed, _ in enumerate(ways, 1):
         vehicle = Px4Vehicle(seed=seed, ready_after_s=0.0)
         vehicle.parameters |= {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 4}
         vehicles.append(vehicle)
     instances = [
-        Instance(Px4Link(vehicle, system_id=number), free_port(), port)
+        Instance(Px4Link(vehicle, system_id=number), 0, port)
         for number, (vehicle, port) in enumerate(zip(vehicles, ports, strict=True), 1)
     ]
     with Px4Server(instances) as server, ExitStack() as stack:
@@ -89,10 +90,11 @@ def test_a_program_that_hangs_lets_the_vehicle_hold_and_one_that_dies_lets_it_la
         programs[3].kill()
         with server.stepped:
             stopped_s = vehicles[0].time_s
-            silent_since_s = [vehicle._setpoint_at_s for vehicle in vehicles]
-        assert server.wait_for(lambda: vehicles[0].time_s > stopped_s + 5.0, 30.0)
-        assert dict(zip(ways, (v.mode for v in vehicles), strict=True)) == ways
-    for way, vehicle, silent_s in zip(ways, vehicles, silent_since_s, strict=True):
+        assert server.wait_for(lambda: vehicles[0].time_s > stopped_s + 5.0, 60.0)
+    for (way, mode), vehicle in zip(ways.items(), vehicles, strict=True):
+        silent_s = vehicle._setpoint_at_s
+        later = next(truth for truth in vehicle.truth if truth.time_s > silent_s + 4.0)
+        assert later.mode is mode, way
         # Horizontally at rest 1.5 s after the last command, and then at rest altogether or landing.
         after = [truth for truth in vehicle.truth if truth.time_s > silent_s + 1.5]
         assert len(after) > 50
@@ -110,7 +112,7 @@ def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
     ):
         own.bind(("127.0.0.1", 0))
         autopilot.bind(("127.0.0.1", 0))
-        autopilot.settimeout(20.0)
+        autopilot.settimeout(60.0)
         autopilot.sendto(b"heartbeat", own.getsockname())
         yield own, autopilot
 
@@ -142,8 +144,12 @@ def test_a_robot_that_does_not_fly_may_be_silent(
     own, autopilot = sockets
     autopilot.settimeout(1.0)
     with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3) as deadman:
+        assert deadman._process is not None
+        # It hears both together, however slow this machine is.
+        deadman._process.send_signal(signal.SIGSTOP)
         deadman.feed(flying=True)
         deadman.feed(flying=False)
+        deadman._process.send_signal(signal.SIGCONT)
         with pytest.raises(TimeoutError):
             autopilot.recv(300)
 

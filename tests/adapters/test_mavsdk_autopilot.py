@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from edge.adapters.mavsdk_autopilot import AutopilotError, MavsdkAutopilot
+from edge.adapters.mavsdk_autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
 from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
 from sim.px4.link import Px4Link
@@ -31,6 +31,14 @@ ROOT = Path(__file__).parents[2]
 CLIMB = Velocity((0.0, 0.0, -2.0))
 STAY = Velocity((0.0, 0.0, 0.0))
 NORTH = Velocity((1.0, 0.0, 0.0))
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command is given up because this machine is slow."""
+    patient = {action: command._replace(wait_s=60.0) for action, command in _COMMANDS.items()}
+    monkeypatch.setattr("edge.adapters.mavsdk_autopilot._COMMANDS", patient)
+    monkeypatch.setattr("edge.adapters.mavsdk_autopilot._STALE_COMMAND_S", 60.0)
 
 
 def new_vehicle(seed: int = 1, **parameters: float) -> Px4Vehicle:
@@ -60,7 +68,7 @@ def record_setpoints(vehicle: Px4Vehicle) -> list[tuple[float, Px4Setpoint]]:
 
 @contextmanager
 def served(*links: Px4Link, port: int) -> Iterator[Px4Server]:
-    with Px4Server([Instance(link, free_port(), port) for link in links]) as server:
+    with Px4Server([Instance(link, 0, port) for link in links]) as server:
         yield server
 
 
@@ -79,7 +87,7 @@ def wait(
     autopilot: MavsdkAutopilot,
     condition: Callable[[VehicleState], object],
     setpoint: Setpoint | None = None,
-    timeout_s: float = 20.0,
+    timeout_s: float = 60.0,
 ) -> VehicleState:
     """Until the state is so; meanwhile a setpoint is streamed at 20 Hz."""
     deadline_s = time.monotonic() + timeout_s
@@ -194,7 +202,7 @@ def test_position_and_origin_belong_together_when_the_origin_jumps() -> None:
             assert state.origin_deg is not None
             return horizontal_m(state.origin_deg, origin_deg) > 7.0
 
-        deadline_s = time.monotonic() + 10.0
+        deadline_s = time.monotonic() + 60.0
         while not has_followed(autopilot.state()):
             assert time.monotonic() < deadline_s
 
@@ -218,7 +226,7 @@ def test_a_vehicle_that_appears_late_goes_and_comes_back() -> None:
         with served(restarted, port=port) as server:
             wait(autopilot, lambda s: s.connected and s.position_ok)
             assert carry_out(autopilot, Action.ARM) == ""
-            assert server.wait_for(lambda: restarted.vehicle.armed, 5.0)
+            assert server.wait_for(lambda: restarted.vehicle.armed, 60.0)
 
 
 def test_it_speaks_to_its_own_vehicle_alone() -> None:
@@ -315,8 +323,9 @@ def test_it_flies_velocities_and_positions() -> None:
     vehicle = new_vehicle()
     with connected(vehicle) as (autopilot, _):
         take_off(autopilot)
+        flies = (Mode.OFFBOARD, True, True)
+        wait(autopilot, lambda s: (s.mode, s.armed, s.in_air) == flies, NORTH)
         state = wait(autopilot, lambda s: known(s.velocity_local_m_s)[0] > 0.5, NORTH)
-        assert (state.mode, state.armed, state.in_air) == (Mode.OFFBOARD, True, True)
         north_m, east_m, down_m = known(state.position_local_m)
         goal = Position((north_m, east_m + 2.0, down_m - 1.0))
         goal_m = goal.position_local_m
@@ -334,8 +343,9 @@ def test_each_setpoint_is_sent_once_and_only_if_it_is_finite() -> None:
         position = Position((4.0, -5.0, -6.5))
         assert autopilot.send(NORTH) == NORTH
         assert autopilot.send(position) == position
-        sent_s = vehicle.time_s
-        assert server.wait_for(lambda: vehicle.time_s > sent_s + 0.5, 10.0)
+        assert server.wait_for(lambda: len(heard) >= 2, 60.0)
+        heard_s = vehicle.time_s
+        assert server.wait_for(lambda: vehicle.time_s > heard_s + 0.5, 60.0)
     (_, velocity), (_, place) = heard
     assert velocity.velocity_m_s.tolist() == [1.0, 0.0, 0.0]
     assert place.position_m.tolist() == [4.0, -5.0, -6.5]
@@ -375,15 +385,16 @@ def test_hold_land_and_disarm() -> None:
 
 def results_of(commands: list[Action], vehicle: Px4Vehicle) -> list[tuple[str, str]]:
     """What became of commands that were given while the vehicle did not answer."""
-    with connected(vehicle) as (autopilot, server), capture_logs() as logs:
+    first, *others = commands
+    with capture_logs() as logs, connected(vehicle) as (autopilot, server):
         wait(autopilot, lambda s: s.armable)
         with server.stepped:
-            for action in commands:
+            autopilot.command(first)
+            wait(autopilot, lambda _: autopilot._running is first)
+            for action in others:
                 autopilot.command(action)
-                time.sleep(0.05)
         wait(autopilot, lambda s: s.result and s.result.action is commands[-1])
-        assert server.wait_for(lambda: True, 1.0)
-        return [(log["action"], log["refusal"]) for log in logs if log["event"] == "command"]
+    return [(log["action"], log["refusal"]) for log in logs if log["event"] == "command"]
 
 
 @pytest.mark.parametrize("last", [Action.LAND, Action.HOLD])
@@ -410,9 +421,10 @@ def test_a_command_that_waits_is_not_queued_twice() -> None:
     assert results == [("disarm", ""), ("arm", "")]
 
 
-def test_a_start_that_waited_too_long_is_not_sent() -> None:
+def test_a_start_that_waited_too_long_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     vehicle = new_vehicle()
-    with connected(vehicle) as (autopilot, server), capture_logs() as logs, server.stepped:
+    with capture_logs() as logs, connected(vehicle) as (autopilot, server), server.stepped:
         autopilot.command(Action.DISARM)
         autopilot.command(Action.ARM)
         wait(autopilot, lambda s: s.result and s.result.action is Action.ARM)
@@ -423,7 +435,8 @@ def test_a_start_that_waited_too_long_is_not_sent() -> None:
     assert not any(truth.armed for truth in vehicle.truth)
 
 
-def test_an_unanswered_arm_is_sent_once() -> None:
+def test_an_unanswered_arm_is_sent_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
     vehicle = new_vehicle()
     with connected(vehicle) as (autopilot, server):
         armings: list[float] = []
@@ -446,8 +459,7 @@ def test_a_kill_drops_the_vehicle() -> None:
         take_off(autopilot)
         assert carry_out(autopilot, Action.KILL, CLIMB) == ""
         assert not vehicle.armed
-        state = wait(autopilot, lambda s: s.in_air is False)
-        assert state.armed is False
+        wait(autopilot, lambda s: s.in_air is False and s.armed is False)
 
 
 # Before flight
@@ -497,26 +509,27 @@ PILOT_PROGRAM = """
 import ctypes, logging, sys, time
 import structlog
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
-from edge.core.vehicle import Action, Velocity
+from edge.core.vehicle import Action, Mode, Velocity
 
 structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
 
-def fly(velocity, until):
+def fly(velocity, until, action=None):
     while not until(autopilot.state()):
+        if action is not None:
+            autopilot.command(action)  # until it is so: a busy machine may have missed the answer
         autopilot.send(Velocity(velocity))
         time.sleep(0.1)
 
 with MavsdkAutopilot(f"udpin://127.0.0.1:{sys.argv[1]}") as autopilot:
     while not autopilot.state().armable:
         time.sleep(0.05)
-    autopilot.command(Action.ARM)
-    fly((0.0, 0.0, -2.0), lambda s: s.armed)
-    autopilot.command(Action.OFFBOARD)
+    fly((0.0, 0.0, -2.0), lambda s: s.armed, Action.ARM)
+    fly((0.0, 0.0, -2.0), lambda s: s.mode is Mode.OFFBOARD, Action.OFFBOARD)
     fly((0.0, 0.0, -2.0), lambda s: s.height_above_home_m > 1.5)
     fly((1.0, 0.0, 0.0), lambda s: s.velocity_local_m_s[0] > 0.9)
     print("flying", flush=True)
     if sys.argv[2] == "interpreter":
-        ctypes.PyDLL(None).sleep(60)  # holds the GIL
+        ctypes.PyDLL(None).sleep(600)  # holds the GIL
     fly((1.0, 0.0, 0.0), lambda _: False)
 """
 
@@ -541,7 +554,7 @@ def test_a_program_that_stands_still_stops_the_vehicle() -> None:
     ]
     heard = [record_setpoints(vehicle) for vehicle in vehicles]
     instances = [
-        Instance(Px4Link(vehicle, system_id=7), free_port(), port)
+        Instance(Px4Link(vehicle, system_id=7), 0, port)
         for vehicle, port in zip(vehicles, ports, strict=True)
     ]
     with Px4Server(instances) as server, ExitStack() as stack:
@@ -553,15 +566,16 @@ def test_a_program_that_stands_still_stops_the_vehicle() -> None:
         programs[2].kill()
         have_waited = server.wait_for(
             lambda: all(v.time_s > h[-1][0] + 2.0 for v, h in zip(vehicles, heard, strict=True)),
-            20.0,
+            60.0,
         )
         assert have_waited
-        assert {vehicle.mode for vehicle in vehicles} == {Px4Mode.LAND}
     for vehicle, setpoints in zip(vehicles, heard, strict=True):
         last_s, last = setpoints[-1]
         assert last.velocity_m_s[0] == 1.0
         at_last = next(truth for truth in vehicle.truth if truth.time_s >= last_s)
         assert at_last.velocity_m_s[0] > 0.8
+        # Later it has landed, and is disarmed.
+        assert next(t for t in vehicle.truth if t.time_s > last_s + 1.9).mode is Px4Mode.LAND
         after = [truth for truth in vehicle.truth if truth.time_s > last_s + 1.3]
         assert after
         assert all(math.hypot(*truth.velocity_m_s[:2]) < 0.2 for truth in after)
@@ -580,7 +594,7 @@ with MavsdkAutopilot(f"udpin://127.0.0.1:{sys.argv[1]}") as autopilot:
     port = free_port()
     with served(Px4Link(new_vehicle(), system_id=7), port=port):
         arguments = [sys.executable, "-c", code, str(port), str(with_vehicle)]
-        assert subprocess.run(arguments, cwd=ROOT, timeout=30.0, check=False).returncode == 3
+        assert subprocess.run(arguments, cwd=ROOT, timeout=120.0, check=False).returncode == 3
 
 
 def test_closing_is_final_and_can_be_repeated() -> None:

@@ -78,7 +78,7 @@ def endpoint() -> str:
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
-def eventually(condition: Callable[[], object], timeout_s: float = 20.0) -> None:
+def eventually(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s
@@ -87,6 +87,10 @@ def eventually(condition: Callable[[], object], timeout_s: float = 20.0) -> None
 
 def is_present(link: ZenohLink, robot_ids: set[int]) -> bool:
     return link.present() == robot_ids
+
+
+def has_peers(link: ZenohLink, count: int) -> bool:
+    return link.peers() == count
 
 
 def eventually_hears(sender: ZenohLink, topic: str, data: bytes, key: str, *inboxes: Inbox) -> None:
@@ -171,7 +175,7 @@ def test_robots_that_know_one_peer_hear_all_others_and_not_themselves() -> None:
             others_ids = {0, 1, 2} - {robot_id}
             assert set(inbox.newest) == {f"robot/{other}/message" for other in others_ids}
             eventually(partial(is_present, link, others_ids))
-            assert link.peers() == 2
+            eventually(partial(has_peers, link, 2))
             assert not link.duplicate()
             assert not link.duplicates()
             assert link.failures() == 0
@@ -215,7 +219,7 @@ def test_clients_meet_at_the_router_and_find_it_again() -> None:
         ):
             eventually_hears(first, "message", b"before", "robot/1/message", heard)
             eventually(lambda: first.present() == {2} and second.present() == {1})
-            assert first.peers() == 1
+            eventually(lambda: first.peers() == 1)
             router.close()  # type: ignore[no-untyped-call]
             eventually(lambda: not first.present() and not second.present())
             router = zenoh.open(config)
@@ -319,7 +323,7 @@ def test_two_robots_of_one_id_are_seen_by_both_and_by_the_ground() -> None:
         )
         eventually(lambda: first.duplicate() and second.duplicate())
         eventually(lambda: ground.duplicates() == other.duplicates() == {3})
-        assert first.duplicates() == {3}
+        eventually(lambda: first.duplicates() == {3})
         assert not other.duplicate()
         assert not ground.duplicate()
         eventually(lambda: first.present() == {4})
@@ -362,7 +366,7 @@ def test_another_fleet_hears_nothing() -> None:
     ):
         eventually(lambda: stranger.peers() == 2)
         eventually_hears(sender, "message", b"ours", "robot/2/message", inbox)
-        assert link.present() == {2}
+        eventually(lambda: link.present() == {2})
         assert stranger.present() == frozenset()
         assert stranger_inbox.count == 0
 
@@ -388,8 +392,9 @@ def test_what_cannot_be_opened_is_said_in_one_line() -> None:
         assert taken in error(listen=[taken])
         assert "another program has this port" in error(listen=[taken])
     assert "no such address" in error(listen=["tcp/192.0.2.77:7447"])
-    nobody = error(mode="client", connect=[taken])
-    assert taken in nobody
+    free = endpoint()
+    nobody = error(mode="client", connect=[free])
+    assert free in nobody
     assert "no router answers" in nobody
 
 
@@ -434,7 +439,7 @@ with ZenohLink(fleet="test", robot_id=1, connect=["tcp/127.0.0.1:1"]):
     raise SystemExit(3)
 """
     assert (
-        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, timeout=30).returncode
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, timeout=120).returncode
         == 3
     )
 

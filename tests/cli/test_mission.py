@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 import pytest
 
 from cli.main import main
-from edge.core.mission import FlightState, Order, RobotStatus
-from ground.client import socket_path
+from edge.core.mission import FlightState, Order, OrderKind, RobotStatus
+from ground.protocol import Picture
 from tests.conftest import ROOT
+from tests.ground.conftest import wait_for_picture
 from tests.ground.pretend import ORIGIN, PretendedFleet, PretendedRobot, pretended
 
 _S = FlightState
@@ -83,6 +84,17 @@ class Field(NamedTuple):
         assert "Traceback" not in done.err
         return last.removeprefix("lpac: ")
 
+    def stand(self, places_m: Mapping[int, Sequence[float]]) -> None:
+        """Put robots there, and wait until the ground knows it."""
+        for robot, place_m in places_m.items():
+            self.robots[robot].position_m = (place_m[0], place_m[1], 0.0)
+
+        def knows(picture: Picture) -> bool:
+            said = [robot.status and robot.status.position_m for robot in picture.robots]
+            return said[: len(self.robots)] == [robot.position_m for robot in self.robots]
+
+        wait_for_picture(self.fleet.name, knows)
+
     @contextlib.contextmanager
     def running(self, *arguments: str | Path) -> Iterator["subprocess.Popen[str]"]:
         """The command, in a process of its own."""
@@ -129,8 +141,7 @@ def ground(folder: Path, fleet: PretendedFleet, name: str) -> Iterator[dict[str,
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_RUNTIME_DIR", str(folder))
-            path = socket_path(fleet.name)
-        until(lambda: path.exists() or process.poll() is not None)
+            wait_for_picture(fleet.name)
         yield environment
     finally:
         # The second Ctrl-C ends it also while robots fly.
@@ -154,15 +165,18 @@ def field(shared: Field, monkeypatch: pytest.MonkeyPatch) -> Iterator[Field]:
     """The fleet on the ground, with the origin set, and nothing asked of it."""
     for name in ("XDG_RUNTIME_DIR", "LPAC_FLEET"):
         monkeypatch.setenv(name, shared.environment[name])
-    for robot in shared.robots:
-        robot.position_m = (*robot.pad_m, 0.0)
     shared.do("mission", "origin", *AT)
+    stand_at_pads(shared)
     yield shared
     for robot in shared.robots:
         if robot.state is _S.PILOT:
             robot.state = _S.HOLD
     shared.do("mission", "land", "--wait")
     shared.do("mission", "resume")
+
+
+def stand_at_pads(field: Field) -> None:
+    field.stand({i: robot.pad_m for i, robot in enumerate(field.robots)})
 
 
 def states(field: Field) -> list[FlightState]:
@@ -259,7 +273,7 @@ def test_fleet_flies_as_it_is_told(field: Field) -> None:
     assert states(field) == [_S.LANDED] * 3
 
     field.do("mission", "again", "windy")
-    assert {robot.ground.trial for robot in field.robots if robot.ground} == {"windy"}
+    until(lambda: [robot.ground and robot.ground.trial for robot in field.robots] == ["windy"] * 3)
     field.do("mission", "disarm")
 
 
@@ -363,22 +377,20 @@ def test_world_is_parsed_and_sent(field: Field, tmp_path: Path) -> None:
 
 
 def test_robots_get_the_slots_of_the_pads_where_they_stand(field: Field) -> None:
-    first, second = field.robots[:2]
-    first.position_m, second.position_m = second.position_m, first.position_m
+    field.stand({0: field.robots[1].pad_m, 1: field.robots[0].pad_m})
     done = field.do("mission", "assign", "--seconds", "0.5", "--json")
     pads = {name: robot["pad"] for name, robot in done.robots.items()}
     assert pads == {"r0": 1, "r1": 0, "r2": 2}
     assert [robot.slot for robot in field.robots] == [1, 0, 2]
 
     def problem(robot: int, place_m: tuple[float, float]) -> str:
-        field.robots[robot].position_m = (*place_m, 0.0)
+        field.stand({robot: place_m})
         return field.refused("mission", "assign", "--seconds", "0.5")
 
     assert "r2 at (7.0, 9.0) m stands within 3 m of no pad" in problem(2, (7.0, 9.0))
     assert "r2 at (5.9, 2.0) m is ambiguous: pad 2 is 1.1 m" in problem(2, (5.9, 2.0))
     assert "r1 and r2 stand at one pad, 0" in problem(2, (1.5, 2.0))
-    for robot in field.robots:
-        robot.position_m = (*robot.pad_m, 0.0)
+    stand_at_pads(field)
     assert "r0 stands at pad 0, which r1 has: assign both at once" in field.refused(
         "mission", "assign", "--seconds", "0.5", "--robots", "r0"
     )
@@ -387,8 +399,7 @@ def test_robots_get_the_slots_of_the_pads_where_they_stand(field: Field) -> None
 
 
 def test_site_is_saved_and_used_again(field: Field) -> None:
-    for i, robot in enumerate(field.robots):
-        robot.position_m = (6.0 + 4.0 * i, 8.0, 0.0)
+    field.stand({i: (6.0 + 4.0 * i, 8.0) for i in range(3)})
     field.do("mission", "fence", "set", "0,0", "30,0", "30,30", "0,30")
     done = field.do("site", "save", "park", "--land-at-pads", "--seconds", "0.5", "--json")
     slots = json.loads(done.out)["slots"]
@@ -424,8 +435,7 @@ def test_site_is_saved_and_used_again(field: Field) -> None:
     field.do("mission", "takeoff", "--robots", "r0")
     assert "r0 is armed" in field.refused("site", "use", "yard")
     field.do("mission", "land", "--wait")
-    for robot in field.robots:
-        robot.position_m = (*robot.pad_m, 0.0)
+    stand_at_pads(field)
     field.do("mission", "fence", "on")
     field.do("mission", "origin", "10", "20", "30")  # so that no site is in use
     field.do("mission", "assign", "--seconds", "0.5")
@@ -476,24 +486,28 @@ def flown(field: Field, script: Path) -> Iterator["subprocess.Popen[str]"]:
 
 def test_example_script_is_flown(field: Field) -> None:
     assert "asks before the next trial takes off" in field.refused(
-        "mission", "run", write_script(field, 2.0)
+        "mission", "run", write_script(field, 6.0)
     )
     field.do("mission", "again", "paper-4")
-    done = field.do("mission", "run", write_script(field, 2.0), "--yes")
+    script = write_script(field, 6.0)
+    done = field.do("mission", "run", script, "--yes", "--json")
     assert "left the mission" not in done.err
     lines = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in done.err.splitlines()]
-    in_trial = ["reset maps", "preflight, 60 s", "takeoff", "start", "mission, 2 s",
+    in_trial = ["reset maps", "preflight, 60 s", "takeoff", "start", "mission, 6 s",
                 "r2 is given to a pilot", "r2 is back in the mission", "return"]  # fmt: skip
     steps = [line.partition(": ")[2] if line.startswith("trial") else line for line in lines]
     assert [step for step in steps if step in in_trial] == [*in_trial, *in_trial]
     assert steps[0] == "origin"
+    *ended, outcome = map(json.loads, done.out.splitlines())
+    assert ended[-1]["step"] == "trial 2 of 2: return" and ended[-1]["duration_s"] > 0.0
+    assert outcome == {"script": str(script), "done": True, "problem": None}
     assert lines[-1].endswith("script.toml: done")
     assert states(field) == [_S.LANDED] * 3
     assert {robot.trial for robot in field.robots} == {"paper-6"}
 
 
 def test_interrupted_script_holds_the_fleet(field: Field) -> None:
-    script = write_script(field, 600.0)
+    script = write_script(field, 600.0, **{"at_s = 1.5": "at_s = 599.5"})
     with field.running("mission", "run", script, "--yes") as process:
         until(lambda: states(field) == [_S.MISSION, _S.MISSION, _S.PILOT])
         process.send_signal(signal.SIGINT)
@@ -520,10 +534,19 @@ def test_script_starts_again_who_holds_by_itself_and_gives_way_to_people(field: 
     assert states(field) == [_S.HOLD] * 3
 
 
-def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Field) -> None:
-    script = write_script(field, 600.0)
-    with flown(field, script) as process:
-        field.robots[2].state = _S.PILOT
+def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = field.robots[2]
+    problem = robot._problem
+
+    def taken_by_a_pilot_just_before(order: Order) -> str:
+        if order.kind == "pilot":
+            robot.state = _S.PILOT
+        return problem(order)
+
+    monkeypatch.setattr(robot, "_problem", taken_by_a_pilot_just_before)
+    with flown(field, write_script(field, 600.0)) as process:
         _, why = process.communicate(timeout=60.0)
     assert process.returncode == 1
     assert "trial 1 of 2: mission (steps[2]): r2: pilot is not taken in pilot" in why
@@ -540,18 +563,17 @@ def test_script_ends_with_the_step_that_fails_and_holds_the_fleet(field: Field) 
 def test_hold_is_the_operators_also_while_the_script_starts_a_robot(
     field: Field, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    refused: list[Order] = []
+    kinds: list[OrderKind] = []
     problem = field.robots[2]._problem
 
-    def refuse_start(order: Order) -> str:
-        if order.kind != "start":
-            return problem(order)
-        refused.append(order)
-        return "robot 1 is too close, 1.2 m"
+    def refuse_to_start_again(order: Order) -> str:
+        kinds.append(order.kind)
+        again = order.kind == "start" and "rejoin" in kinds
+        return "robot 1 is too close, 1.2 m" if again else problem(order)
 
+    monkeypatch.setattr(field.robots[2], "_problem", refuse_to_start_again)
     with flown(field, write_script(field, 600.0)) as process:
-        monkeypatch.setattr(field.robots[2], "_problem", refuse_start)
-        until(lambda: bool(refused))
+        until(lambda: "rejoin" in kinds and kinds[-1] == "start")
         field.do("mission", "hold")
         _, err = process.communicate(timeout=60.0)
     assert process.returncode == 1
@@ -560,6 +582,10 @@ def test_hold_is_the_operators_also_while_the_script_starts_a_robot(
 
 
 def test_script_says_what_is_missing(field: Field) -> None:
+    field.do("mission", "enable")
+    wait_for_picture(
+        field.fleet.name, lambda p: all(r.status and r.status.ready for r in p.robots[:3])
+    )
     field.do("mission", "hold", "r1")
     script = write_script(field, 2.0, **{"# at_most_s = 60": "at_most_s = 1"})
     why = field.refused("mission", "run", script, "--yes")

@@ -9,8 +9,9 @@ from tests.robot_rig import SYSTEM_ID, lpac_robot, new_vehicle, rig
 
 def setup(url: str, system_id: int = SYSTEM_ID, *more: str) -> tuple[int, str, str]:
     done = lpac_robot(
-        "setup", "--url", url, "--system-id", system_id, "--rc", "none", "--ceiling", 20, *more
-    )
+        "setup", "--url", url, "--system-id", system_id, "--rc", "none", "--ceiling", 20,
+        "--wait", 60, *more,
+    )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 
 

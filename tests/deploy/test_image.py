@@ -155,7 +155,7 @@ def test_it_runs_without_a_user_and_a_place_to_write(
 
 def run_inside(tree: Path, release: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = inside(tree, release, "/usr/bin/lpac", *arguments)
-    return subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=False)
 
 
 class Builder:

@@ -29,7 +29,7 @@ def lpac_fleet(
     """`lpac fleet COMMAND --fleet FLEET ...` until it ends, where nobody can be asked."""
     return subprocess.run(
         _typed(fleet, command, options), env={**_environment(), **(environment or {})},
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120.0, check=False,
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300.0, check=False,
         start_new_session=True,
     )  # fmt: skip
 

@@ -45,7 +45,13 @@ class Laptop:
         return asyncio.run(one())
 
     def overview(self, index: int) -> dict[str, Any]:
-        return self.call(index, "overview", directory=self.config.directory)
+        """What the robot has; a busy machine may hold up for a moment what its program says."""
+        until_s = time.monotonic() + 60.0
+        while True:
+            found = self.call(index, "overview", directory=self.config.directory)
+            service = found["service"]
+            if service["fresh"] or service["active"] != "active" or time.monotonic() > until_s:
+                return found
 
     def changed(self) -> Common:
         """The same with another world file: a release that differs in one file, and versions."""

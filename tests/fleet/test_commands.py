@@ -56,6 +56,7 @@ def operator(hosts: RobotHosts) -> Operator:
 
 
 def test_status_tells_of_release_program_vehicle_and_clock(operator: Operator) -> None:
+    await_said(operator.hosts[0], '"armed":false')
     robots = operator.json("status")
     assert [robots[name]["slot"] for name in robots] == [0, 1, 2, None]
     for name, robot in robots.items():
@@ -224,7 +225,7 @@ def test_ctrl_c_ends_with_a_summary_of_who_has_what(operator: Operator) -> None:
             deploying.send_signal(signal.SIGINT)
             output, _ = deploying.communicate()
         # What it began it has ended.
-        assert select.select([ssh], [], [], 10.0)[0]
+        assert select.select([ssh], [], [], 60.0)[0]
         os.close(ssh)
     finally:
         hung.run("pkill -CONT -x sshd")

@@ -31,7 +31,7 @@ def laptop(hosts: RobotHosts, tmp_path_factory: pytest.TempPathFactory) -> Lapto
     return laptop
 
 
-def await_true(holds: Callable[[], bool], within_s: float = 60.0) -> None:
+def await_true(holds: Callable[[], bool], within_s: float = 120.0) -> None:
     until_s = time.monotonic() + within_s
     while not holds():
         assert time.monotonic() < until_s, "it did not come true"

@@ -70,7 +70,9 @@ def opened(
     if CHROMIUM is None:
         pytest.skip("needs: sudo apt install chromium")
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*_ARGUMENTS])
+        browser = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=[*_ARGUMENTS], timeout=PATIENCE_S * 1000.0
+        )
         try:
             context = browser.new_context(
                 viewport={"width": size[0], "height": size[1]}, color_scheme=theme

@@ -21,7 +21,36 @@ from ground.protocol import Picture, Progress, Report, Request, Setup, Told, to_
 from tests.conftest import ROOT
 
 # Nothing here takes so long unless it is broken.
-PATIENCE_S = 40.0
+PATIENCE_S = 60.0
+
+
+def all_heard(picture: Picture) -> bool:
+    return all(robot.fresh for robot in picture.robots)
+
+
+def wait_for_picture(
+    fleet: str,
+    condition: Callable[[Picture], object] = all_heard,
+    assert_runs: Callable[[], None] = lambda: None,
+) -> Picture:
+    """The first picture that is so, of the ground process that this environment has.
+
+    It may still have to start.
+    """
+    until_s = time.monotonic() + PATIENCE_S
+    last: Picture | None = None
+    while time.monotonic() < until_s:
+        assert_runs()
+        try:
+            with client.subscribe(fleet) as told:
+                for last in (t for t in told if isinstance(t, Picture)):
+                    if condition(last):
+                        return last
+                    if time.monotonic() > until_s:
+                        break
+        except client.GroundError:
+            time.sleep(0.02)
+    raise AssertionError(last)
 
 
 class GroundStation:
@@ -79,26 +108,17 @@ class GroundStation:
             return client.command(self.fleet, request, on_progress)
 
     def begin(self, request: Request) -> "Pending":
-        """A command that runs beside the test; it has been taken when this returns."""
+        """A command that runs beside the test; its first progress tells that it was taken."""
         return Pending(self, request)
 
     def wait_for(self, condition: Callable[[Picture], object]) -> Picture:
         """The first picture that is so. Waits for a socket, too."""
-        end_s = time.monotonic() + PATIENCE_S
-        last: Picture | None = None
-        while time.monotonic() < end_s:
-            assert self.process is not None
-            assert self.process.poll() is None, self.log.read_text()
-            try:
-                with self._here(), client.subscribe(self.fleet) as told:
-                    for last in (t for t in told if isinstance(t, Picture)):
-                        if condition(last):
-                            return last
-                        if time.monotonic() > end_s:
-                            break
-            except client.GroundError:
-                time.sleep(0.02)
-        raise AssertionError(f"{last}\n{self.log.read_text()}")
+        with self._here():
+            return wait_for_picture(self.fleet, condition, self._assert_runs)
+
+    def _assert_runs(self) -> None:
+        assert self.process is not None
+        assert self.process.poll() is None, self.log.read_text()
 
     def told(self) -> list[Told]:
         """What a new subscriber is told first, up to a picture."""

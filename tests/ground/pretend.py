@@ -136,21 +136,21 @@ class PretendedRobot:
         if problem:
             return
         if order.kind == "takeoff":
-            self._enter(_S.ARMING, "takeoff ordered")
+            self.enter(_S.ARMING, "takeoff ordered")
         elif order.kind == "start":
             if order.trial != self.trial:
                 self.explored[:] = False
             self.trial = order.trial
-            self._enter(_S.MISSION, "mission started")
+            self.enter(_S.MISSION, "mission started")
         elif order.kind == "pilot":
-            self._enter(_S.PILOT, "given to the pilot by the operator")
+            self.enter(_S.PILOT, "given to the pilot by the operator")
         elif order.kind == "rejoin":
-            self._enter(_S.HOLD, "taken back by the operator")
+            self.enter(_S.HOLD, "taken back by the operator")
         elif order.kind == "reset":
             self.explored[:] = False
             self.trial = ""
         elif order.kind == "kill":
-            self._enter(_S.FAULT, "killed by the operator")
+            self.enter(_S.FAULT, "killed by the operator")
 
     def _problem(self, order: Order) -> str:
         ground = self.ground
@@ -189,7 +189,7 @@ class PretendedRobot:
 
     # What it does
 
-    def _enter(self, state: FlightState, reason: str) -> None:
+    def enter(self, state: FlightState, reason: str) -> None:
         self.state, self.reason, self.since_s = state, reason, self.now_s
 
     def step(self, now_s: float, passed_s: float) -> None:  # noqa: PLR0912
@@ -203,33 +203,33 @@ class PretendedRobot:
         steered = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
         may_fly = heard and self._enabled() and self.origin is not None
         if state is _S.INIT:
-            self._enter(_S.IDLE, "autopilot and position found")
+            self.enter(_S.IDLE, "autopilot and position found")
         elif state is _S.IDLE and may_fly and age_s > 0.5:
-            self._enter(_S.PREFLIGHT, "enabled")
+            self.enter(_S.PREFLIGHT, "enabled")
         elif state is _S.PREFLIGHT and not may_fly:
-            self._enter(_S.IDLE, "not enabled" if heard else "ground lost")
+            self.enter(_S.IDLE, "not enabled" if heard else "ground lost")
         elif state is _S.LANDED and may_fly and calm == "none":
-            self._enter(_S.PREFLIGHT, "enabled")
+            self.enter(_S.PREFLIGHT, "enabled")
         elif state is _S.ARMING and (calm != "none" or not heard):
-            self._enter(_S.IDLE, f"ground commands {calm} while arming")
+            self.enter(_S.IDLE, f"ground commands {calm} while arming")
         elif state is _S.ARMING and age_s > 0.2:
-            self._enter(_S.TAKEOFF, "armed")
+            self.enter(_S.TAKEOFF, "armed")
         elif state in steered and calm == "land":
-            self._enter(_S.LAND, "ground commands land")
+            self.enter(_S.LAND, "ground commands land")
         elif state is _S.TAKEOFF and calm == "return":
-            self._enter(_S.LAND, "ground commands return during takeoff")
+            self.enter(_S.LAND, "ground commands return during takeoff")
         elif state in (_S.TAKEOFF, _S.MISSION, _S.RETURN, _S.LAND) and calm == "hold":
-            self._enter(_S.HOLD, "ground commands hold")
+            self.enter(_S.HOLD, "ground commands hold")
         elif state in (_S.HOLD, _S.MISSION) and calm == "return":
-            self._enter(_S.RETURN, "ground commands return")
+            self.enter(_S.RETURN, "ground commands return")
         elif state in (_S.MISSION, _S.RETURN) and not heard:
-            self._enter(_S.HOLD, "ground lost")
+            self.enter(_S.HOLD, "ground lost")
         elif state is _S.TAKEOFF and self.position_m[2] > self.slot_height_m - 0.1:
-            self._enter(_S.HOLD, f"at its height, {self.slot_height_m:g} m")
+            self.enter(_S.HOLD, f"at its height, {self.slot_height_m:g} m")
         elif state is _S.RETURN and self._away_m(self.landing_point_m) < 0.5:
-            self._enter(_S.LAND, "at the landing point")
+            self.enter(_S.LAND, "at the landing point")
         elif state is _S.LAND and self.position_m[2] <= 0.0:
-            self._enter(_S.LANDED, "disarmed")
+            self.enter(_S.LANDED, "disarmed")
         self._move(passed_s)
 
     def _take_up(self) -> None:
@@ -261,7 +261,7 @@ class PretendedRobot:
         climb_m_s = self.slot_height_m / self.takeoff_s
         if self.state is _S.TAKEOFF:
             after = x_m, y_m, min(self.slot_height_m, z_m + climb_m_s * passed_s)
-        elif self.state in (_S.LAND, _S.LANDED, _S.FAULT):
+        elif self.state in (_S.LAND, _S.FAULT):
             after = x_m, y_m, max(0.0, z_m - climb_m_s * passed_s)
         elif self.state is _S.MISSION:
             radius_m = 0.35 * WORLD_M
@@ -274,7 +274,9 @@ class PretendedRobot:
         elif self.state is _S.RETURN:
             after = (*self._towards_m(self.landing_point_m, passed_s), z_m)
         else:
-            after = self.position_m
+            # Tests may place it meanwhile.
+            self.velocity_m_s = (0.0, 0.0, 0.0)
+            return
         vx, vy, vz = (
             (b - a) / passed_s if passed_s > 0.0 else 0.0
             for a, b in zip(self.position_m, after, strict=True)

@@ -1,5 +1,6 @@
 """`lpac ground` as a real process, over real zenoh, with pretended robots."""
 
+import math
 import signal
 import socket
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ from ground.protocol import (
     Explored,
     Give,
     Picture,
+    Progress,
     Report,
     Result,
     Resume,
@@ -26,7 +28,7 @@ from ground.protocol import (
     Start,
     Takeoff,
 )
-from tests.ground.conftest import PATIENCE_S, GroundStation, NewStation
+from tests.ground.conftest import PATIENCE_S, GroundStation, NewStation, all_heard
 from tests.ground.pretend import ORIGIN, PretendedFleet, pretended
 
 _S = FlightState
@@ -53,6 +55,7 @@ def done(report: Report) -> Report:
 
 
 def make_ready(station: GroundStation) -> None:
+    station.wait_for(all_heard)
     done(station.command(SetOrigin(ORIGIN)))
     done(station.command(Enable()))
 
@@ -71,10 +74,11 @@ def test_a_whole_flight(fleet: PretendedFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     assert "no mission origin" in station.command(Takeoff()).problem
     make_ready(station)
-    progress: list[str] = []
-    report = station.command(Takeoff(interval_s=0.1), lambda p: progress.append(p.robot))
+    progress: list[Progress] = []
+    report = station.command(Takeoff(interval_s=0.1), progress.append)
     assert done(report).results[0] == Result("r0", True, "at its height, 4 m")
-    assert list(dict.fromkeys(progress)) == ["r2", "r1", "r0"], "the highest first"
+    began = [p.robot for p in progress if p.text == "takes off"]
+    assert began == ["r2", "r1", "r0"], "the highest first"
     done(station.command(Start()))
     done(station.command(Calm("hold")))
     done(station.command(Resume()))
@@ -96,6 +100,7 @@ def test_who_joins_late_has_the_state(tmp_path: Path, new_station: NewStation) -
     text = "CircularBND 100 100 20 5\n"
     with pretended(tmp_path, 3, absent=[2]) as fleet:
         station = new_station(fleet.fleet_toml)
+        station.wait_for(lambda p: all(robot.fresh for robot in p.robots[:2]))
         report = station.command(SetOrigin(ORIGIN))
         assert refusals(report) == {"r2": "not heard"}
         assert refusals(station.command(SetWorld(text, "w.env"))) == {"r2": "not heard"}
@@ -112,24 +117,25 @@ def test_a_station_that_was_killed_goes_on_where_it_was(
     fleet: PretendedFleet, new_station: NewStation
 ) -> None:
     text = "CircularBND 100 100 20 5\n"
-    for robot in fleet.robots:
-        robot.takeoff_s = 3.0
     station = new_station(fleet.fleet_toml)
     make_ready(station)
+    # It climbs for as long as the test has a use for it.
+    fleet.robots[2].takeoff_s = math.inf
     done(station.command(SetWorld(text, "w.env")))
     takeoff = station.begin(Takeoff(interval_s=60.0))
     takeoff.progress("r2")
     station.wait_for(lambda p: p.robots[2].status and p.robots[2].status.state is _S.TAKEOFF)
     station.kill()
     takeoff.leave()
+    fleet.robots[2].takeoff_s = 1.0
     station.start()
     picture = station.wait_for(lambda p: p.ground is not None)
     assert picture.ground is not None
     assert picture.ground.origin == ORIGIN
     assert picture.ground.enabled
     # Nothing half done: what had taken off comes to hold, and nothing else takes off.
-    station.wait_for(lambda p: p.robots[2].status and p.robots[2].status.state is _S.HOLD)
-    assert all(robot.state is _S.PREFLIGHT for robot in fleet.robots[:2])
+    states = [_S.PREFLIGHT, _S.PREFLIGHT, _S.HOLD]
+    station.wait_for(lambda p: [r.status and r.status.state for r in p.robots[:3]] == states)
     assert station.setup().world == text
     done(station.command(Takeoff(interval_s=0.0)))
     done(station.command(Start()))
@@ -152,7 +158,7 @@ def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
     alice = new_station(fleet.fleet_toml)
     fly(alice)
     bob = new_station(fleet.fleet_toml, "bob")
-    assert bob.wait_for(lambda p: p.ground is not None).commander == "alice"
+    assert bob.wait_for(lambda p: p.ground and all_heard(p)).commander == "alice"
     for request in (Calm("land"), Start(), Again(), Give("disarm", ("r0",))):
         assert bob.command(request).problem == (
             "alice commands the fleet: `lpac mission command` takes over"
@@ -216,7 +222,7 @@ def test_mistakes(fleet: PretendedFleet, new_station: NewStation) -> None:
     report = station.command(Takeoff(interval_s=0.0))
     assert refusals(report) == {"r1": "not ready: the battery is low: 20 %"}
     # A spare does not fly by default, but has the state.
-    assert fleet.robots[3].state is _S.PREFLIGHT
+    station.wait_for(lambda _: fleet.robots[3].state is _S.PREFLIGHT)
 
 
 def test_lines_that_are_no_commands(fleet: PretendedFleet, new_station: NewStation) -> None:
@@ -273,12 +279,18 @@ def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) ->
     assert station.end(signal.SIGINT) == 0
     assert not station.socket_path.exists()
     station.start()
-    station.wait_for(lambda p: p.ground is not None)
+    station.wait_for(lambda p: p.ground and all_heard(p))
     assert station.process is not None
     # Its terminal is closed, which is no reason to leave robots in the air alone.
     station.process.send_signal(signal.SIGHUP)
-    done(station.command(Calm("land", wait=True)))
+    # They are in the air for as long as it has something to say.
+    for robot in fleet.robots:
+        robot.takeoff_s = math.inf
+    done(station.command(Calm("land")))
+    for robot in fleet.robots:
+        robot.takeoff_s = 1.0
     assert station.process.wait(PATIENCE_S) == 0
+    assert {robot.state for robot in fleet.robots[:3]} == {_S.LANDED}
     station.start()
     assert station.end(signal.SIGTERM) == 0
     station.start()
@@ -303,6 +315,11 @@ def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
             late.sendall(b"subscribe\n")
             fly(station)
             done(station.command(Calm("hold")))
-        told = station.told()
-        assert {t.robot for t in told if isinstance(t, Explored)} == set(station.setup().robots)
-        assert any(isinstance(t, Event) and t.kind == "result" for t in told)
+        # Maps have no hurry on the radio.
+        station.wait_for(
+            lambda _: (
+                {t.robot for t in station.told() if isinstance(t, Explored)}
+                == set(station.setup().robots)
+            )
+        )
+        assert any(isinstance(t, Event) and t.kind == "result" for t in station.told())

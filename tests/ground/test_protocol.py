@@ -16,7 +16,7 @@ from edge.core.mission import (
     explored_to_bytes,
 )
 from edge.core.schema import ConfigError
-from edge.core.world import format_world, random_features
+from edge.core.world import MOST_FEATURES, format_world, random_features
 from ground.protocol import (
     Again,
     Calm,
@@ -63,7 +63,7 @@ def status_picture() -> RobotPicture:
 
 TOLD: tuple[Told, ...] = (
     Setup("demo", "me@here", {"r1": 1}, (Site(Place(0, (1.0, 2.0)), (1.0, 1.0), "r1"),), FENCE,
-          1.25, "Uniform 0 0\n", "abc", "bundle", 512, 64, 128.0, 16.0, 2.0, 1.0),
+          "Uniform 0 0\n", "abc", "bundle", 512, 64, 128.0, 16.0, 2.0, 1.0),
     Picture(1e9, "me", GroundState(4, "me", ORIGIN, robot_calm={"1": "hold"}),
             (status_picture(), RobotPicture("r2", 2)), ("takeoff",), 0.4),
     Event(1e9, "state", "r1", "hold: ground commands hold", "me", "t1"),
@@ -143,6 +143,12 @@ def test_mistakes(line: bytes, why: str) -> None:
 def test_a_world_that_is_too_long_for_the_radio() -> None:
     text = format_world(random_features(np.random.default_rng(0), 8000, 512))
     with pytest.raises(ValueError, match="must be 400000 at most"):
+        SetWorld(text, "w.env")
+
+
+def test_a_world_of_more_features_than_robots_take() -> None:
+    text = "CircularBND 1 1 1 1\n" * (MOST_FEATURES + 1)
+    with pytest.raises(ValueError, match=r"w\.env has 2001 features: must be 2000 at most"):
         SetWorld(text, "w.env")
 
 

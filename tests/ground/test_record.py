@@ -1,12 +1,14 @@
 """The ground's log: each thing once, and from the real ground process, which may start again."""
 
 import dataclasses
+import itertools
+import math
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from edge.core.coverage import coverage_cost
 from edge.core.mission import FlightState, GroundState, Origin, Place
 from edge.core.safety import Fence
 from edge.core.world import parse_world, rasterize
-from ground.client import GroundError, command, subscribe
+from ground.client import command
 from ground.protocol import (
     Calm,
     Enable,
@@ -34,6 +36,7 @@ from ground.protocol import (
 )
 from ground.record import Recording
 from tests.conftest import ROOT
+from tests.ground.conftest import PATIENCE_S, all_heard, wait_for_picture
 from tests.ground.pretend import ORIGIN, pretended
 from tests.ground.test_coverage import STATUS, model
 
@@ -41,13 +44,12 @@ S = FlightState
 FENCE = Fence(((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)), 0.5, 1.0, 20.0)
 WORLD = model()
 SETUP = Setup(
-    fleet="f", operator="ann", robots={"r0": 0, "r1": 1}, slots=(), fence=FENCE, max_speed_m_s=1.0,
+    fleet="f", operator="ann", robots={"r0": 0, "r1": 1}, slots=(), fence=FENCE,
     world=WORLD.world, world_id=WORLD.world_id, bundle_id="b", world_size=WORLD.world_size,
     sensor_size=16, communication_range=64.0, env_scale=WORLD.env_scale,
     truncation=WORLD.truncation, norm=WORLD.norm,
 )  # fmt: skip
 STATE = GroundState(3, "ann", Origin(47.0, 8.0, 0.0), places={"0": Place(0, (1.0, 2.0))})
-PATIENCE_S = 60.0
 
 
 class Kept:
@@ -181,22 +183,13 @@ def ground_process(fleet_toml: Path) -> "subprocess.Popen[bytes]":
     )  # fmt: skip
 
 
-def wait_until(fleet: str, true_of: Callable[[Picture], bool]) -> None:
-    """Until a picture of the ground is so; it may have to start first."""
-    gives_up = threading.Event()
-    watchdog = threading.Timer(PATIENCE_S, gives_up.set)
-    watchdog.start()
-    while not gives_up.is_set():
-        try:
-            with subscribe(fleet) as answers:
-                for told in answers:
-                    if isinstance(told, Picture) and true_of(told):
-                        watchdog.cancel()
-                        return
-                    assert not gives_up.is_set()
-        except GroundError:
-            gives_up.wait(0.1)
-    raise AssertionError("that was never so")
+def wait_until_all_are_told(fleet: str, state: S) -> None:
+    """Until all clients are told that every robot is so: a first picture is for one alone."""
+    shown = itertools.count()
+    wait_for_picture(
+        fleet,
+        lambda told: all(r.status and r.status.state is state for r in told.robots) and next(shown),
+    )
 
 
 def test_a_flight_is_recorded_also_when_the_ground_starts_again(
@@ -210,16 +203,30 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
             recorder.wait_for("waiting for it")
             processes.append(ground_process(fleet.fleet_toml))
             recorder.wait_for("hears the ground station")
-            wait_until(fleet.name, lambda told: all(robot.fresh for robot in told.robots))
-            for request in (SetOrigin(ORIGIN), Enable(), Takeoff(interval_s=0.1), Start()):
+            wait_for_picture(fleet.name)
+            for request, state in (
+                (SetOrigin(ORIGIN), S.IDLE), (Enable(), S.PREFLIGHT),
+                (Takeoff(interval_s=0.1), S.HOLD), (Start(), S.MISSION),
+            ):  # fmt: skip
                 assert command(fleet.name, request).done
+                wait_until_all_are_told(fleet.name, state)
             recorder.wait_for("trial t1 begins with 2 robots")
             processes[0].kill()
             recorder.wait_for("has ended")
             processes.append(ground_process(fleet.fleet_toml))
             recorder.wait_for("hears the ground station")
-            wait_until(fleet.name, lambda told: told.commander == "ann")
+            wait_for_picture(fleet.name, lambda told: told.commander == "ann" and all_heard(told))
+            # They sink for as long as the test has a use for it.
+            for robot in fleet.robots:
+                robot.takeoff_s = math.inf
+            assert command(fleet.name, Calm("land")).done
+            wait_until_all_are_told(fleet.name, S.LAND)
+            for robot in fleet.robots:
+                robot.takeoff_s = 1.0
             assert command(fleet.name, Calm("land", wait=True)).done
+            # By then it has read all that it was told.
+            processes[1].terminate()
+            recorder.wait_for("has ended")
             assert recorder.stop(signal.SIGTERM) == 0
         finally:
             processes += [recorder.process]

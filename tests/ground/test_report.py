@@ -152,7 +152,7 @@ class Writer:
         assert perception is not None
         setup = Setup(
             fleet="f", operator="ann", robots={"r0": 0, "r1": 1, "r2": 2}, slots=(), fence=FENCE,
-            max_speed_m_s=1.0, world=WORLD, world_id=id_of(WORLD), bundle_id="b",
+            world=WORLD, world_id=id_of(WORLD), bundle_id="b",
             world_size=perception.world_size, sensor_size=perception.sensor_size,
             communication_range=perception.communication_range, env_scale=SCALE, truncation=2.0,
             norm=1.0,

@@ -50,7 +50,6 @@ def setup(operator: str, n: int, spares: int = 0) -> Setup:
         robots={f"r{i}": i for i in range(n + spares)},
         slots=tuple(Site(Place(i, pad_m(i)), pad_m(i), f"r{i}") for i in range(n)),
         fence=FENCE,
-        max_speed_m_s=1.25,
         world=WORLD,
         world_id="configured",
         bundle_id="b",
@@ -260,6 +259,22 @@ def test_a_failure_keeps_the_others_on_the_ground_if_asked() -> None:
     report = field.do(Takeoff(interval_s=0.0))
     assert why_not(report) == {"r2": "not ready: GPS: 4 satellites"}
     assert report.results[3].text == "already in the air, in hold"
+
+
+def test_a_climb_that_is_held_up_is_no_takeoff() -> None:
+    field = a_field()
+    field.make_ready()
+    held_up = field.robots[1]
+    running = field.begin(Takeoff(interval_s=0.0))
+    field.until(lambda: held_up.state is _S.TAKEOFF, 10.0)
+    held_up.enter(_S.HOLD, "control was silent for 0.7 s")
+    field.until(lambda: running.report, 30.0)
+    assert running.report is not None
+    low = f"; below its height of {held_up.slot_height_m:g} m: land it, then take off"
+    assert why_not(running.report) == {"r1": f"control was silent for 0.7 s{low}"}
+    assert why_not(field.do(Takeoff())) == {"r1": f"already in the air, in hold{low}"}
+    field.done(Calm("land", robots=("r1",), wait=True))
+    field.done(Takeoff(robots=("r1",)))
 
 
 def test_who_is_in_the_air_keeps_what_it_has() -> None:

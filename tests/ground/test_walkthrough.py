@@ -20,6 +20,7 @@ from tests.conftest import ROOT
 ROBOTS = int(os.environ.get("LPAC_WALK_ROBOTS", "3"))
 ACTIVATE = ". .venv/bin/activate"
 SETTING = re.compile(r"\. \.venv/bin/activate && export (\w+)=([^\s`]+)")
+PATIENCE_S = 60.0
 # What a terminal shows beside its text.
 CONTROL = re.compile(r"\x1b(\[[0-?]*[ -/]*[@-~]|\][^\x07]*\x07|[@-Z\\-_])")
 
@@ -49,7 +50,7 @@ class Terminal:
     def wait_for(self, text: str) -> None:
         """Until it has shown this text."""
         with self._grown:
-            found = self._grown.wait_for(lambda: text in self.text or not self._open, 60.0)
+            found = self._grown.wait_for(lambda: text in self.text or not self._open, PATIENCE_S)
         assert found and text in self.text, (self.line, text, self.text[-2000:])
 
     def __enter__(self) -> Self:
@@ -63,7 +64,7 @@ class Terminal:
     ) -> None:
         try:
             os.write(self._controller, self._key)
-            code = self.process.wait(30.0)
+            code = self.process.wait(PATIENCE_S)
         finally:
             if self.process.poll() is None:
                 self.process.kill()
@@ -110,14 +111,17 @@ def walk(readme: str, folder: Path) -> None:
         simulation = terminals.enter_context(Terminal(simulate, folder, plain))
         simulation.wait_for(f"export {setting[1]}={setting[2]}")
         shown = {
-            "lpac ground": f"{ROBOTS} robots", "lpac record": "", "lpac watch": f"r{ROBOTS - 1} ",
-            "lpac map --operate": "http://127.0.0.1:",
-        }  # fmt: skip
+            "lpac ground": [f"r{robot}: idle: " for robot in range(ROBOTS)],
+            "lpac record": ["hears the ground station"],
+            "lpac watch": [f"r{ROBOTS - 1} "],
+            "lpac map --operate": ["http://127.0.0.1:"],
+        }
         for line in stations.splitlines():
             command = line.partition("#")[0].strip()
             key = b"q" if command == "lpac watch" else b"\x03"
             terminal = terminals.enter_context(Terminal(line, folder, environment, key))
-            terminal.wait_for(shown.pop(command))
+            for text in shown.pop(command):
+                terminal.wait_for(text)
         assert not shown
         said = [type_line(line, folder, environment) for line in commands]
     assert "see out/sim/report/" in said[-1]

@@ -49,11 +49,11 @@ from ground.watch_robot import detail, in_short
 from ground.watch_table import Row, columns, heading, in_order, table_row
 from ground.watch_text import all_of_it, few_alarms, header, outcome
 from tests.conftest import ROOT
+from tests.ground.conftest import PATIENCE_S, wait_for_picture
 from tests.ground.pictures import on_ground, picture, robot, setup, status
 from tests.ground.pretend import ORIGIN, PretendedFleet
 
 _S = FlightState
-PATIENCE_S = 40.0
 
 
 def width_of(line: Line) -> int:
@@ -228,11 +228,7 @@ def ground(fleet: PretendedFleet) -> Iterator[subprocess.Popen[bytes]]:
         env=environment(), stdout=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        until_s = time.monotonic() + PATIENCE_S
-        while not socket_path(fleet.name).exists():
-            assert process.poll() is None
-            assert time.monotonic() < until_s
-            time.sleep(0.05)
+        wait_for_picture(fleet.name)
         yield process
     finally:
         process.kill()
@@ -256,26 +252,30 @@ def test_an_operator_watches_holds_and_lands(tmp_path: Path) -> None:
         async with watching(fleet.name) as seen:
             await seen.until(lambda: seen.text("body").count(" mission ") == 3)
             await seen.until(lambda: "alice commands" in seen.text("header"))
+            await seen.press("c", "y")
+            await seen.until(lambda: "take command: r0 r1 r2: obeys alice" in seen.text("message"))
             # One key, also while something is asked, and in every view.
             await seen.press("?", "l")
-            assert "Land the WHOLE FLEET" in seen.text("message")
+            await seen.until(lambda: "Land the WHOLE FLEET" in seen.text("message"))
             await seen.press("h")
             await seen.until(lambda: states(fleet) == {_S.HOLD})
             await seen.until(lambda: "hold the fleet: r0 r1 r2: hold" in seen.text("message"))
             await seen.press("escape")
             await seen.until(lambda: seen.text("body").count(" hold ") == 3)
-            assert "HOLD by alice" in seen.text("header")
+            await seen.until(lambda: "HOLD by alice" in seen.text("header"))
             # One robot alone, in its own view.
             await seen.press("j", "enter")
-            assert seen.text("heading").startswith("r1 (robot 1)  hold: ground commands hold")
+            r1 = "r1 (robot 1)  hold: ground commands hold"
+            await seen.until(lambda: seen.text("heading").startswith(r1))
             await seen.press("L")
-            assert "Land r1 where it is?" in seen.text("message")
+            await seen.until(lambda: "Land r1 where it is?" in seen.text("message"))
             await seen.press("y")
             await seen.until(lambda: fleet.robots[1].state is _S.LANDED)
+            await seen.until(lambda: "land r1: r1: " in seen.text("message"))
             assert fleet.robots[0].state is _S.HOLD
             # Anything but y is no; caps lock does not make a key of the fleet a robot's.
             await seen.press("escape", "L", "x")
-            assert "nothing done" in seen.text("message")
+            await seen.until(lambda: "nothing done" in seen.text("message"))
             await seen.press("l", "y")
             await seen.until(lambda: states(fleet) == {_S.LANDED})
             await seen.press("q")
@@ -385,15 +385,16 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
             assert more.startswith(" fence margin 6.0 m   bundle 79929121   world c64e4b1b ")
             assert seen.text("body").count("\n") == 10
             await seen.press("enter")
-            assert seen.text("heading").startswith("r28 (robot 28)  mission: mission started")
+            r28 = "r28 (robot 28)  mission: mission started"
+            await seen.until(lambda: seen.text("heading").startswith(r28))
             # Who was selected stays so, wherever his row goes.
             pictures[0] = picture(*odd, *flying[:-1], heard(28, battery=0.1), late)
             await seen.press("escape")
             await seen.until(lambda: "battery critical: 10%" in seen.text("alarms"))
             await seen.press("home", "enter")
-            assert seen.text("heading").startswith("r28 (robot 28)")
+            await seen.until(lambda: seen.text("heading").startswith("r28 (robot 28)"))
             await seen.press("a")
-            assert "position lost" in seen.text("body")
+            await seen.until(lambda: "position lost" in seen.text("body"))
 
     asyncio.run(use())
 

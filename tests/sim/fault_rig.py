@@ -30,6 +30,7 @@ from sim.operator import Heard, Script, Statuses
 from sim.px4.server import STEP_S
 from sim.px4.vehicle import Px4Vehicle, Truth
 from tests.conftest import ROOT
+from tests.robot_rig import HELD_UP
 
 _S = FlightState
 
@@ -41,6 +42,11 @@ _BY_ITSELF = re.compile(
     r"control was silent|the policy has no fresh answer|left offboard for hold|only .* m to robot|"
     r"taken back"
 )
+
+
+def flies_on(status: RobotStatus) -> bool:
+    """Whether it flies its mission, or left it for what it rightly leaves it for."""
+    return status.state is _S.MISSION or _BY_ITSELF.search(status.reason) is not None
 
 
 class FaultyRobot(RobotProcess):
@@ -92,15 +98,18 @@ class FaultRig:
         step = next(step for step in script.steps if step.name == name)
         script.began_s[name] = time.monotonic()
         while not self.operator.wait_for(step.done, 0.2):
-            late = time.monotonic() - script.began_s[name] > 2.0 * step.at_most_s
+            late = time.monotonic() - script.began_s[name] > 4.0 * step.at_most_s
             assert not late, (name, self.told(), self.operator.refusals[-5:])
             step.act()
 
     def order(self, kind: OrderKind, robot: int) -> OrderResult:
-        """Order something, and wait for the answer."""
-        result = self.operator.result(self.operator.order(kind, robot, "faults"), 30.0)
-        assert result is not None, self.told()
-        return result
+        """Order something, and wait for the answer; again if it is one that holds for a moment."""
+        until_s = time.monotonic() + 60.0
+        while True:
+            result = self.operator.result(self.operator.order(kind, robot, "faults"), 60.0)
+            assert result is not None, self.told()
+            if not HELD_UP.search(result.reason) or time.monotonic() > until_s:
+                return result
 
     def told(self) -> dict[int, tuple[str, str, str | None, tuple[str, ...]]]:
         """What the robots say of themselves, for whoever reads a failure."""
@@ -109,29 +118,39 @@ class FaultRig:
 
     def status(self, robot: int) -> RobotStatus:
         """Its newest status."""
-        return self.operator.statuses()[robot]
+        return self.operator.history(robot)[-1].status
 
-    def wait_state(self, robot: int, state: FlightState, timeout_s: float = 30.0) -> RobotStatus:
+    def wait_status(self, robot: int, holds: Callable[[RobotStatus], object]) -> RobotStatus:
+        """Wait for a status of which something holds; returns that one."""
+        found: list[RobotStatus] = []
+
+        def is_found(statuses: Statuses) -> bool:
+            if robot in statuses and holds(statuses[robot]):
+                found.append(statuses[robot])
+            return bool(found)
+
+        assert self.operator.wait_for(is_found, 60.0), self.told()
+        return found[0]
+
+    def wait_state(self, robot: int, state: FlightState) -> RobotStatus:
         """Wait until the robot says that it is in this state; returns what it says."""
-        assert self.operator.wait_for(
-            lambda statuses: robot in statuses and statuses[robot].state is state, timeout_s
-        ), self.told()
-        return self.status(robot)
+        return self.wait_status(robot, lambda status: status.state is state)
 
     def is_heard(self, robot: int) -> bool:
         """Whether all others that fly have fresh messages of the robot, soon."""
-        return self.operator.wait_for(
-            lambda statuses: all(str(robot) in s.neighbour_ages_s for s in self._flying(statuses)),
-            10.0,
-        )
+        return self._others_say(lambda status: str(robot) in status.neighbour_ages_s)
 
     def is_forgotten(self, robot: int) -> bool:
-        """Whether no other that flies has a fresh message of the robot."""
-        statuses = self._flying(self.operator.statuses())
-        return not any(str(robot) in status.neighbour_ages_s for status in statuses)
+        """Whether no other that flies has a fresh message of the robot, soon."""
+        return self._others_say(lambda status: str(robot) not in status.neighbour_ages_s)
 
-    def _flying(self, statuses: Statuses) -> list[RobotStatus]:
-        return [statuses[other] for other in self.flying]
+    def _others_say(self, holds: Callable[[RobotStatus], bool]) -> bool:
+        return self.operator.wait_for(
+            lambda statuses: (
+                self.flying <= statuses.keys() and all(holds(statuses[r]) for r in self.flying)
+            ),
+            60.0,
+        )
 
     @contextmanager
     def others_go_on(self, robot: int, *, lost: bool = False) -> Iterator[None]:
@@ -144,8 +163,7 @@ class FaultRig:
         self.script("start")
         for other in others:
             for _, status in self.heard(other, began_s):
-                goes_on = status.state is _S.MISSION or _BY_ITSELF.search(status.reason)
-                assert goes_on, (other, status.state, status.reason)
+                assert flies_on(status), (other, status.state, status.reason)
         if not lost:
             self.flying.add(robot)
             self.script("start")
@@ -172,31 +190,36 @@ class FaultRig:
                 setattr(self.vehicle(robot), name, value)
             return self.vehicle(robot).time_s
 
-    def wait_vehicle(
-        self, robot: int, holds: Callable[[Px4Vehicle], bool], timeout_s: float = 60.0
-    ) -> None:
+    def wait_vehicle(self, robot: int, holds: Callable[[Px4Vehicle], bool]) -> None:
         """Wait until something holds of the vehicle."""
+        assert self._vehicle_is(robot, holds, 120.0), (
+            robot, self.told(), self.vehicle(robot).truth[-1],
+        )  # fmt: skip
+
+    def _vehicle_is(
+        self, robot: int, holds: Callable[[Px4Vehicle], bool], timeout_s: float
+    ) -> bool:
         vehicle = self.vehicle(robot)
         with self.simulated.stepped:
-            assert self.simulated.stepped.wait_for(lambda: holds(vehicle), timeout_s), (
-                robot, self.told(), vehicle.truth[-1],
-            )  # fmt: skip
+            return self.simulated.stepped.wait_for(lambda: holds(vehicle), timeout_s)
 
     def wait_time(self, robot: int, until_s: float) -> None:
         """Wait for a time of the vehicle."""
         self.wait_vehicle(robot, lambda vehicle: vehicle.time_s >= until_s)
 
     def wait_moving(self, robot: int) -> None:
-        """Wait until the vehicle flies fast enough for a stop to be one."""
-        self.wait_vehicle(robot, lambda vehicle: speed_m_s(vehicle.velocity_m_s, 2) > 0.3)
+        """Wait until the vehicle flies its mission fast enough for a stop to be one."""
+        until_s = time.monotonic() + 120.0
+        while not self._vehicle_is(robot, lambda v: speed_m_s(v.velocity_m_s, 2) > 0.3, 5.0):
+            assert time.monotonic() < until_s, self.told()
+            # It may have come to hold by itself.
+            self.script("start")
 
     def wait_landed(self, robot: int) -> None:
         """Wait until the vehicle stands on the ground, disarmed, and its robot says so."""
-        self.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed, 90.0)
+        self.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed)
         # LANDED lasts no longer than a tick if the ground lets the robot fly again.
-        assert self.operator.wait_for(
-            lambda statuses: statuses[robot].state in (_S.LANDED, _S.PREFLIGHT), 30.0
-        ), self.told()
+        self.wait_status(robot, lambda status: status.state in (_S.LANDED, _S.PREFLIGHT))
 
     def last_setpoint_s(self, robot: int) -> float:
         """When the last setpoint reached the vehicle."""

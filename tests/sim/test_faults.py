@@ -21,9 +21,9 @@ from edge.core.wire import Rejection, decode, encode
 from sim.fleet import ORIGIN, Fleet, FleetScenario
 from sim.operator import Statuses
 from sim.px4.modes import Mode
-from sim.px4.vehicle import Px4Vehicle
+from sim.px4.vehicle import DEAD_RECKONING_S, Px4Vehicle
 from tests.conftest import SHIPPED
-from tests.sim.fault_rig import FaultRig, FaultyRobot
+from tests.sim.fault_rig import FaultRig, FaultyRobot, flies_on
 
 KILLED, NO_GPS, EMPTY, LOW, MANY_FAULTS, FAULTY, STOPPED = range(7)
 # Another vehicle, whose program says that it is robot STOPPED.
@@ -57,7 +57,7 @@ def rig(grounded: FaultRig) -> FaultRig:
     """All but the twin fly their mission."""
     twin = grounded.fleet.robots[TWIN]
     twin.send_signal(signal.SIGTERM)
-    assert twin.wait(10.0) == 0
+    assert twin.wait(60.0) == 0
     for step in ("preflight", "takeoff", "start"):
         grounded.script(step)
     return grounded
@@ -90,9 +90,24 @@ def is_at_rest(vehicle: Px4Vehicle) -> bool:
 
 
 def nothing_is_sent(rig: FaultRig, robot: int) -> None:
+    # What was under way arrives first.
+    rig.wait_time(robot, rig.now_s(robot) + 0.1)
     sent_s = rig.last_setpoint_s(robot)
     rig.wait_time(robot, rig.now_s(robot) + 2.0)
     assert rig.last_setpoint_s(robot) == sent_s
+
+
+def longest_without_setpoint_s(rig: FaultRig, robot: int, until_s: float) -> float:
+    """How long no setpoint came, at most, from now on."""
+    longest_s = 0.0
+
+    def is_over(vehicle: Px4Vehicle) -> bool:
+        nonlocal longest_s
+        longest_s = max(longest_s, vehicle.time_s - vehicle._setpoint_at_s)
+        return vehicle.time_s >= until_s
+
+    rig.wait_vehicle(robot, is_over)
+    return longest_s
 
 
 def comes_straight_down(rig: FaultRig, robot: int, since_s: float, within_m: float = 2.0) -> float:
@@ -123,7 +138,7 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
             for status in told
         )
 
-    assert operator.wait_for(both_say_so, 60.0), grounded.told()
+    assert operator.wait_for(both_say_so, 120.0), grounded.told()
     with rogue(grounded.fleet) as session:
 
         def both_refuse(_: Statuses) -> bool:
@@ -149,7 +164,7 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
                 for status in told
             )
 
-        assert operator.wait_for(both_refuse, 30.0), grounded.told()
+        assert operator.wait_for(both_refuse, 60.0), grounded.told()
     for robot in (STOPPED, TWIN):
         assert not any(entry.armed for entry in grounded.truth(robot, 0.0))
 
@@ -182,7 +197,7 @@ def test_a_program_is_killed(rig: FaultRig) -> None:
     with rig.others_go_on(robot, lost=True):
         began_s = rig.now_s(robot)
         program.send_signal(signal.SIGKILL)
-        assert program.wait(10.0) == -signal.SIGKILL
+        assert program.wait(60.0) == -signal.SIGKILL
         rig.wait_vehicle(robot, is_down)
         assert rig.is_forgotten(robot)
     assert comes_straight_down(rig, robot, began_s) < rig.last_setpoint_s(robot) + 1.2
@@ -237,22 +252,25 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
         def all_are_counted(statuses: Statuses) -> bool:
             for data in wrong.values():
                 session.put(key, data)
-            return all(
+            return before.keys() <= statuses.keys() and all(
                 statuses[other].message_counts[kind] > counts[kind] + 5
                 for other, counts in before.items()
                 for kind in wrong
             )
 
-        assert rig.operator.wait_for(all_are_counted, 30.0), rig.told()
+        assert rig.operator.wait_for(all_are_counted, 60.0), rig.told()
         assert rig.operator.wait_for(
-            lambda statuses: all(
-                statuses[other].message_counts["accepted"] > counts["accepted"] + 5
-                for other, counts in before.items()
+            lambda statuses: (
+                before.keys() <= statuses.keys()
+                and all(
+                    statuses[other].message_counts["accepted"] > counts["accepted"] + 5
+                    for other, counts in before.items()
+                )
             ),
-            30.0,
+            60.0,
         )
         assert rig.is_heard(robot)
-        assert rig.status(robot).state is _S.MISSION
+        assert flies_on(rig.status(robot))
 
 
 @pytest.mark.parametrize("state", [_S.MISSION, _S.HOLD])
@@ -263,16 +281,25 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
             rig.operator.calm("hold", robot)
             rig.wait_state(robot, _S.HOLD)
             rig.wait_time(robot, rig.now_s(robot) + 2.5)
-        with rig.simulated.stepped:
-            vehicle = rig.vehicle(robot)
-            vehicle.jump_estimator_origin(5.6, -4.2)
-            began_s, began_m = vehicle.time_s, vehicle.position_m.copy()
-        rig.wait_time(robot, began_s + 3.0)
+        vehicle, north_m = rig.vehicle(robot), 5.6
+        # Until its next setpoint the vehicle follows the last one, which is another place now: a
+        # jump in which the robot was held up tells nothing. Ten such in a row count all the same.
+        for _ in range(10):
+            with rig.simulated.stepped:
+                vehicle.jump_estimator_origin(north_m, -0.75 * north_m)
+                began_s, began_m = vehicle.time_s, vehicle.position_m.copy()
+            if longest_without_setpoint_s(rig, robot, began_s + 3.0) < 0.2:
+                break
+            north_m = -north_m
         status = rig.status(robot)
-        assert status.state is state and status.position_m is not None
+        assert status.state is state or (state is _S.MISSION and flies_on(status))
+
         # The mission position follows, but for the age of a status; the vehicle does not dash.
-        off_m = math.dist(status.position_m[:2], rig.estimate_m(robot)[:2])
-        assert off_m < 1.5
+        def is_where_it_says(status: RobotStatus) -> bool:
+            position_m, truly_m = status.position_m, rig.estimate_m(robot)
+            return position_m is not None and math.dist(position_m[:2], truly_m[:2]) < 1.5
+
+        rig.wait_status(robot, is_where_it_says)
         fastest_m_s = 0.5 if state is _S.HOLD else rig.fleet.max_speed_m_s
         assert rig.max_speed_m_s(robot, began_s, axes=2) < fastest_m_s + 0.5
         moved_m = math.dist(rig.truth(robot, began_s)[-1].position_m[:2], began_m[:2])
@@ -311,7 +338,7 @@ def test_wind_carries_a_robot_over_the_fence(rig: FaultRig) -> None:
         rig.wait_vehicle(robot, is_back)
         assert -PX4_FENCE_M < least_m < 0.0
         for _, status in rig.heard(robot, heard_s):
-            assert status.state is _S.MISSION, (status.state, status.reason)
+            assert flies_on(status), (status.state, status.reason)
 
 
 def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig) -> None:
@@ -325,7 +352,8 @@ def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig)
         nothing_is_sent(rig, robot)
         # Messages and perception go on.
         assert rig.is_heard(robot)
-        assert rig.status(robot).loops["perception"].ticks > status.loops["perception"].ticks
+        ticks = status.loops["perception"].ticks
+        rig.wait_status(robot, lambda status: status.loops["perception"].ticks > ticks)
         refusal = rig.order("rejoin", robot)
         assert not refusal.accepted and refusal.reason.startswith("outside the fence")
         rig.fly_by_hand(robot, place_m + np.array([0.0, 0.0, 3.0]))
@@ -351,7 +379,9 @@ def test_gps_is_lost(rig: FaultRig) -> None:
         landing = [h.status for h in rig.heard(robot, heard_s) if h.status.state is _S.LAND]
         assert {status.reason for status in landing} == {"position lost"}
         # Its estimate drifts by metres on the way.
-        assert comes_straight_down(rig, robot, began_s, within_m=6.0) < began_s + 3.0
+        # Sooner than PX4 would land it by itself.
+        landed_s = comes_straight_down(rig, robot, began_s, within_m=6.0)
+        assert landed_s < began_s + DEAD_RECKONING_S
 
 
 def test_the_battery_is_critical(rig: FaultRig) -> None:
@@ -367,15 +397,15 @@ def test_the_battery_is_critical(rig: FaultRig) -> None:
 def test_the_battery_is_low(rig: FaultRig) -> None:
     robot = LOW
     with rig.others_go_on(robot, lost=True):
-        assert rig.status(robot).state is _S.MISSION
         heard_s = time.monotonic()
         rig.change(robot, battery_remaining=0.245)
         status = rig.wait_state(robot, _S.RETURN)
         assert status.reason == status.alarms[0] and "battery low" in status.reason
         rig.wait_landed(robot)
-        states = dict.fromkeys(heard.status.state for heard in rig.heard(robot, heard_s))
+        told = [heard.status for heard in rig.heard(robot, heard_s)]
         # Whether it still says "mission" once is a matter of the instant.
-        assert [state for state in states if state is not _S.MISSION][:2] == [_S.RETURN, _S.LAND]
+        states = dict.fromkeys(status.state for status in told if not flies_on(status))
+        assert [*states][:2] == [_S.RETURN, _S.LAND]
         landed_m = rig.fleet.true_positions_m()[robot]
         assert math.dist(landed_m[:2], rig.fleet.pads_m[robot]) < 1.5
 
@@ -402,10 +432,20 @@ def test_the_ground_disappears(rig: FaultRig) -> None:
     began_s = {robot: rig.now_s(robot) for robot in rig.flying}
     rig.operator.silent = True
     for robot in rig.flying:
-        assert "ground lost" in rig.wait_state(robot, _S.HOLD).alarms
+        rig.wait_status(robot, lambda s: s.state is _S.HOLD and "ground lost" in s.alarms)
     for robot in rig.flying:
         rig.wait_landed(robot)
-        states = dict.fromkeys(heard.status.state for heard in rig.heard(robot, heard_s))
-        assert [*states] == [_S.MISSION, _S.HOLD, _S.LAND, _S.LANDED]
-        # 3 s and 10 s from the last word, which is 0.2 s old at most, and not sooner.
-        assert 12.5 < comes_straight_down(rig, robot, began_s[robot]) - began_s[robot] < 16.0
+        told = [heard.status for heard in rig.heard(robot, heard_s)]
+        assert [*dict.fromkeys(status.state for status in told)] == [
+            _S.MISSION, _S.HOLD, _S.LAND, _S.LANDED
+        ]  # fmt: skip
+        comes_straight_down(rig, robot, began_s[robot])
+        # 3 s and 10 s from the last word, and not sooner.
+        for state, least_s, most_s in ((_S.HOLD, 3.0, 16.0), (_S.LAND, 13.0, math.inf)):
+            # The first may have been made while the state changed.
+            _, *silent_s = (
+                status.ground_age_s or 0.0
+                for status in told
+                if status.state is state and "ground lost" in status.reason
+            )
+            assert all(least_s < age_s < most_s for age_s in silent_s), (robot, silent_s)

@@ -5,6 +5,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from unittest.mock import patch
 
 import pytest
 
@@ -59,7 +60,7 @@ class Talker:
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
         with self._changed:
-            assert self._changed.wait_for(condition, 10.0), (self.states, self.orders)
+            assert self._changed.wait_for(condition, 60.0), (self.states, self.orders)
 
     def _on_state(self, _: str, data: bytes) -> None:
         with self._changed:
@@ -78,24 +79,42 @@ class Talker:
 
 
 @contextmanager
-def talking(robots: int = 1) -> Iterator[tuple[Operator, list[Talker]]]:
-    """An operator that hears the robots' first statuses."""
+def talking(
+    robots: int = 1, *, lifetime_s: float = 600.0
+) -> Iterator[tuple[Operator, list[Talker]]]:
+    """An operator that hears the robots' first statuses, which count for `lifetime_s`."""
     with free_ports(robots, socket.SOCK_STREAM) as ports:
         endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
     talkers = [Talker(endpoint, robot) for robot, endpoint in enumerate(endpoints)]
     try:
-        with Operator(fleet="test", connect=endpoints) as operator:
+        with (
+            patch("sim.operator.STATUS_LIFETIME_S", lifetime_s),
+            Operator(fleet="test", connect=endpoints) as operator,
+        ):
 
             def heard(statuses: object) -> bool:
                 for talker in talkers:
                     talker.say()
                 return len(operator.statuses()) == robots
 
-            assert operator.wait_for(heard, 10.0)
+            assert operator.wait_for(heard, 60.0)
             yield operator, talkers
     finally:
         for talker in talkers:
             talker.link.close()
+
+
+def answered(operator: Operator, robot: Talker, order_id: str, **answer: object) -> OrderResult:
+    """What becomes of an order that the robot answers, as often as it takes."""
+
+    def settled(_: object) -> bool:
+        robot.say(**answer)
+        return operator.result(order_id) is not None
+
+    assert operator.wait_for(settled, 60.0)
+    result = operator.result(order_id)
+    assert result is not None
+    return result
 
 
 def test_an_order_is_repeated_until_it_is_answered() -> None:
@@ -107,8 +126,8 @@ def test_an_order_is_repeated_until_it_is_answered() -> None:
         assert (order.order_id, order.robot_id, order.boot_nonce) == (order_id, 0, 7)
         assert (order.kind, order.trial, order.expires_at_uptime_s) == ("start", "trial", 110.0)
         assert operator.ordered(0) and operator.result(order_id) is None
-        robot.say(orders=(OrderResult(order_id, True),))
-        assert operator.result(order_id, 10.0) == OrderResult(order_id, True)
+        accepted = OrderResult(order_id, True)
+        assert answered(operator, robot, order_id, orders=(accepted,)) == accepted
         assert not operator.ordered(0) and operator.refusals == []
 
 
@@ -126,9 +145,11 @@ def test_what_becomes_of_an_order_that_is_not_taken(answer: dict[str, object], r
         order_id = operator.order("takeoff", 0)
         if "orders" in answer:
             answer = {"orders": (OrderResult(order_id, False, reason),)}
-        robot.say(**answer)
-        assert operator.result(order_id, 10.0) == OrderResult(order_id, False, reason)
-        assert operator.refusals == [f"robot 0 refuses takeoff: {reason}"]
+        result = answered(operator, robot, order_id, **answer)
+        assert result == OrderResult(order_id, False, reason)
+        refusals = [f"robot 0 refuses takeoff: {reason}"]
+        # Kept a moment after the result.
+        assert operator.wait_for(lambda _: operator.refusals == refusals, 60.0)
 
 
 def test_nobody_orders_a_robot_that_is_not_heard() -> None:
@@ -165,7 +186,7 @@ def test_what_flights_go_by_is_said_and_the_world_sent_while_somebody_lacks_it()
             robot.say()
             return len(robot.worlds) >= 2
 
-        assert operator.wait_for(lambda _: sent(), 15.0)
+        assert operator.wait_for(lambda _: sent(), 60.0)
         state = robot.states[-1]
         assert (state.fence, state.places, state.world_id) == (fence, {"0": place}, world_id(world))
         assert set(robot.worlds) == {world}
@@ -175,12 +196,12 @@ def test_what_flights_go_by_is_said_and_the_world_sent_while_somebody_lacks_it()
 
 
 def test_a_silent_robot_is_no_longer_among_the_statuses() -> None:
-    with talking(2) as (operator, [_, other]):
+    with talking(2, lifetime_s=2.0) as (operator, [_, other]):
 
         def only_the_other(statuses: object) -> bool:
             other.say()
             return set(operator.statuses()) == {1}
 
-        assert operator.wait_for(only_the_other, 15.0)
+        assert operator.wait_for(only_the_other, 60.0)
         assert len(operator.history(0)) >= 1
         assert not operator.wait_for(lambda statuses: 0 in statuses, 0.1)

@@ -109,16 +109,15 @@ def test_the_start_is_told_in_the_unit_of_that_px4(
         parameters = {"parameters": [{"name": "SIH_LOC_LAT0", "type": kind}]}
         (build / "parameters.json").write_text(json.dumps(parameters))
     program = build / "bin" / "px4"
-    program.write_text("#!/bin/sh\nenv > environment\nexec sleep 60\n")
+    environment = tmp_path / "environment"
+    os.mkfifo(environment)
+    program.write_text(f"#!/bin/sh\nenv > {environment}\nexec sleep 60\n")
     world = WorldOrigin(latitude_deg=40.0, longitude_deg=-75.0, altitude_m=12.0)
-    folder = tmp_path / "px4"
-    px4 = Px4Build(build, [(0.0, 0.0)], world, folder)
-    with px4:
-        environment = folder / "0" / "environment"
-        subprocess.run(  # wait for the file, which the program writes at once
-            ["sh", "-c", f'until grep -q PX4_HOME_ALT "{environment}" 2>/dev/null; do :; done'],
-            check=True, timeout=20,
-        )  # fmt: skip
-        lines = environment.read_text().split("\n")
+    with Px4Build(build, [(0.0, 0.0)], world, tmp_path / "px4"):
+        # All of it, once the program has written it.
+        told = subprocess.run(
+            ["cat", environment], capture_output=True, text=True, check=True, timeout=60
+        )
+    lines = told.stdout.split("\n")
     assert f"PX4_HOME_LAT={latitude}" in lines and "PX4_HOME_ALT=12.00" in lines
     assert os.environ.get("PX4_HOME_LAT") is None

@@ -8,17 +8,18 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from edge.core.mission import FlightState, RobotStatus
+from edge.core.mission import FlightState
 from fleet.config import FleetConfig, load_fleet
 from sim.fleet import ORIGIN
 from sim.host_base import NoHostsError
 from sim.hosts import RobotHost, RobotHosts
-from sim.operator import Operator
+from sim.operator import Operator, Statuses
 from sim.px4.modes import Mode
 from tests.conftest import ROOT, SHIPPED
 
@@ -110,11 +111,26 @@ def status(host: RobotHost) -> dict[str, Any]:
     return told
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+def wait_until(condition: Callable[[], object], timeout_s: float = 180.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.05)
+
+
+def journal(host: RobotHost, options: str = "") -> str:
+    """What is in the unit's journal so far: it is written a moment later."""
+    return host.run(f"journalctl --unit lpac-robot --output cat {options}")
+
+
+def is_in_journal(host: RobotHost, text: str) -> bool:
+    return text in journal(host)
+
+
+def events(host: RobotHost) -> list[str]:
+    """What the program has logged so far."""
+    lines = journal(host, "--identifier lpac-robot").splitlines()
+    return [json.loads(line)["event"] for line in lines if line.startswith("{")]
 
 
 def processes(host: RobotHost, pid: str) -> list[str]:
@@ -137,6 +153,7 @@ def test_a_spare_has_nothing_to_start(host: RobotHost, config: FleetConfig) -> N
 def test_it_starts_says_how_it_is_and_ends(host: RobotHost) -> None:
     # It returns once each loop has ticked.
     host.run("systemctl start lpac-robot")
+    wait_until(lambda: status(host))
     first = status(host)
     assert first["robot_id"] == 1 and first["link"]
     assert set(first["loops"]) == {"control", "perception", "policy"}
@@ -151,9 +168,7 @@ def test_it_starts_says_how_it_is_and_ends(host: RobotHost) -> None:
     assert "lpac robot run" in program and "deadman" in watchdog
     look_at_the_sandbox(host, pid)
     assert any((host.root / "var/lib/lpac/logs").glob("*.mcap"))
-    journal = host.run("journalctl --unit lpac-robot --identifier lpac-robot --output cat")
-    lines = [json.loads(line) for line in journal.splitlines() if line.startswith("{")]
-    assert "robot runs" in [line["event"] for line in lines]
+    wait_until(lambda: "robot runs" in events(host))
     assert not re.search(r"lpac-robot\.service:\d+: ", host.run("journalctl --boot"))
 
     host.run("systemctl stop lpac-robot")
@@ -195,29 +210,27 @@ def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_h
         hung = shown(host, "MainPID")["MainPID"]
         host.run(f"kill -STOP {hung}")
         with host.stepped:
-            assert host.stepped.wait_for(lambda: host.vehicle.mode is Mode.HOLD, 10.0)
+            assert host.stepped.wait_for(lambda: host.vehicle.mode is Mode.HOLD, 60.0)
         wait_until(lambda: shown(host, "NRestarts")["NRestarts"] == "1")
         wait_until(lambda: status(host).get("state") == "pilot")
         assert status(host)["armed"]
         with host.stepped:
             assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
-    journal = host.run("journalctl --unit lpac-robot --output cat")
-    assert "Failed with result 'watchdog'" in journal
+    wait_until(partial(is_in_journal, host, "Failed with result 'watchdog'"))
     host.run("systemctl stop lpac-robot")
     with host.stepped:
         assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
 
 
 def take_off(operator: Operator) -> None:
-    def robot_is(condition: Callable[[RobotStatus], bool]) -> None:
-        done = operator.wait_for(lambda heard: 1 in heard and condition(heard[1]), 60.0)
-        assert done, operator.statuses()
+    def is_up(heard: Statuses) -> bool:
+        """If not, it takes off when it is ready, also for another time if it was held up."""
+        if 1 in heard and heard[1].ready and not operator.ordered(1):
+            operator.order("takeoff", 1)
+        return 1 in heard and heard[1].state is FlightState.HOLD
 
     operator.enable(ORIGIN)
-    robot_is(lambda status: status.ready)
-    result = operator.result(operator.order("takeoff", 1), 15.0)
-    assert result is not None and result.accepted, result
-    robot_is(lambda status: status.state is FlightState.HOLD)
+    assert operator.wait_for(is_up, 180.0), (operator.statuses(), operator.refusals)
 
 
 def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_says(
@@ -241,10 +254,9 @@ def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_say
     (host.root / "data/lpac/current/robot.toml").write_text("fleet = 3\n")
     host.run("systemctl reset-failed lpac-robot; systemctl start lpac-robot || true")
     wait_until(lambda: shown(host, "ActiveState")["ActiveState"] == "failed")
-    journal = host.run("journalctl --unit lpac-robot --output cat")
-    assert "Start request repeated too quickly" in journal
-    assert "lpac: /release/robot.toml: fleet = 3" in journal
-    assert "Traceback" not in journal
+    for line in ("Start request repeated too quickly", "lpac: /release/robot.toml: fleet = 3"):
+        wait_until(partial(is_in_journal, host, line))
+    assert "Traceback" not in journal(host)
 
 
 def test_nothing_was_added_to_the_release(host: RobotHost, amd64_image: Path) -> None:
