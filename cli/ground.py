@@ -53,6 +53,10 @@ def ground(
 
 
 async def _run(process: "GroundProcess", on_listening: Callable[[], None]) -> None:
+    from ground.alarms import FLIGHT
+
+    hold_s = FLIGHT.ground_timeout_s
+    land_s = hold_s + FLIGHT.ground_lost_land_s
     loop = asyncio.get_running_loop()
     running = asyncio.create_task(process.run(on_listening))
     asked_s: list[float] = []
@@ -64,8 +68,8 @@ async def _run(process: "GroundProcess", on_listening: Callable[[], None]) -> No
             return
         asked_s.append(now_s)
         typer.echo(
-            "robots are in the air: without a ground station they hold after 3 s and land after "
-            "13 s: Ctrl-C again ends it",
+            f"robots are in the air: without a ground station they hold after {hold_s:g} s and "
+            f"land after {land_s:g} s: Ctrl-C again ends it",
             err=True,
         )
 
@@ -123,7 +127,6 @@ def load_setup(path: Path, operator: str) -> "GroundConfig":
                 for slot in config.slots
             ),
             fence=robot.fence,
-            max_speed_m_s=robot.limits.max_speed_m_s,
             world=world,
             world_id=world_id(world),
             bundle_id=bundle.id,

@@ -1,5 +1,6 @@
 """`lpac mission`: command the fleet."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -19,6 +20,7 @@ from cli.mission_run import run
 from cli.rehearse import rehearse
 
 if TYPE_CHECKING:
+    from ground.protocol import Request
     from ground.site import Point, Standing
 
 app = typer.Typer(
@@ -249,32 +251,43 @@ def assign(
 # Flying
 
 
-@app.command()
-def enable(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+def _of_robots(request: Callable[[Addressed], "Request"]) -> None:
+    """Add the command of this name, for robots by name or by --robots; else for all."""
+    name = request.__name__
+
+    def command(
+        names: Names = None,
+        fleet: Fleet = DEFAULT_FLEET,
+        robots: Robots = None,
+        as_json: AsJson = False,
+    ) -> None:
+        to = _named(names, fleet, robots)
+        ask(to, request(to), name, as_json=as_json)
+
+    app.command(name, help=request.__doc__)(command)
+
+
+def _named(names: list[str] | None, fleet: Path, robots: str | None) -> Addressed:
+    """Whom a command addresses that takes robots' names as well as --robots."""
+    if names and robots is not None:
+        raise ValueError("give the robots' names, or --robots, not both")
+    return address(fleet, ",".join(names) if names else robots)
+
+
+@_of_robots
+def enable(to: Addressed) -> "Request":
     """Let the robots run their checks, and fly."""
     from ground.protocol import Enable
 
-    to = _named(names, fleet, robots)
-    ask(to, Enable(True, to.robots), "enable", as_json=as_json)
+    return Enable(True, to.robots)
 
 
-@app.command()
-def disable(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def disable(to: Addressed) -> "Request":
     """Nothing is to fly: what is in the air holds."""
     from ground.protocol import Enable
 
-    to = _named(names, fleet, robots)
-    ask(to, Enable(False, to.robots), "disable", as_json=as_json)
+    return Enable(False, to.robots)
 
 
 @app.command()
@@ -297,43 +310,28 @@ def takeoff(
     ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=as_json)
 
 
-@app.command()
-def start(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def start(to: Addressed) -> "Request":
     """Fly the mission, from hold."""
     from ground.protocol import Start
 
-    to = _named(names, fleet, robots)
-    ask(to, Start(to.robots), "start", as_json=as_json)
+    return Start(to.robots)
 
 
-@app.command()
-def hold(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def hold(to: Addressed) -> "Request":
     """Stay where they are. Anybody may command it."""
-    _calm("hold", _named(names, fleet, robots), wait=False, as_json=as_json)
+    from ground.protocol import Calm
+
+    return Calm("hold", to.robots)
 
 
-@app.command()
-def resume(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def resume(to: Addressed) -> "Request":
     """Withdraw hold, return or land; who flew the mission flies it again."""
     from ground.protocol import Resume
 
-    to = _named(names, fleet, robots)
-    ask(to, Resume(to.robots), "resume", as_json=as_json)
+    return Resume(to.robots)
 
 
 @app.command()
@@ -345,7 +343,7 @@ def land(
     as_json: AsJson = False,
 ) -> None:
     """Land where they are."""
-    _calm("land", _named(names, fleet, robots), wait=wait, as_json=as_json)
+    _bring_down("land", _named(names, fleet, robots), wait=wait, as_json=as_json)
 
 
 @app.command("return")
@@ -357,11 +355,11 @@ def return_(
     as_json: AsJson = False,
 ) -> None:
     """Fly to the landing points at their own heights, and land there, the lowest first."""
-    _calm("return", _named(names, fleet, robots), wait=wait, as_json=as_json)
+    _bring_down("return", _named(names, fleet, robots), wait=wait, as_json=as_json)
 
 
-def _calm(
-    calm: Literal["hold", "return", "land"], to: Addressed, *, wait: bool, as_json: bool
+def _bring_down(
+    calm: Literal["return", "land"], to: Addressed, *, wait: bool, as_json: bool
 ) -> None:
     from ground.protocol import Calm
 
@@ -371,37 +369,22 @@ def _calm(
 # One robot at a time
 
 
-@app.command()
-def pilot(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def pilot(to: Addressed) -> "Request":
     """Hand robots to human pilots: the program commands nothing until `rejoin`."""
-    _give("pilot", _named(names, fleet, robots), as_json=as_json)
+    return _give("pilot", to)
 
 
-@app.command()
-def rejoin(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def rejoin(to: Addressed) -> "Request":
     """Take robots back from their pilots: they hold; then `start`."""
-    _give("rejoin", _named(names, fleet, robots), as_json=as_json)
+    return _give("rejoin", to)
 
 
-@app.command()
-def disarm(
-    names: Names = None,
-    fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
-    as_json: AsJson = False,
-) -> None:
+@_of_robots
+def disarm(to: Addressed) -> "Request":
     """Stop the motors on the ground. A robot in the air refuses."""
-    _give("disarm", _named(names, fleet, robots), as_json=as_json)
+    return _give("disarm", to)
 
 
 @app.command()
@@ -415,32 +398,26 @@ def kill(
     as_json: AsJson = False,
 ) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
+    from ground.protocol import Give
+
     to = _named(names, fleet, robots)
     if not to.robots:
         raise ValueError(
             "kill: name the robots, such as `lpac mission kill r3`: it is never for all"
         )
     confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
-    _give("kill", to, as_json=as_json)
+    ask(to, Give("kill", to.robots), "kill", as_json=as_json)
 
 
-def _give(
-    kind: Literal["pilot", "rejoin", "disarm", "kill"], to: Addressed, *, as_json: bool
-) -> None:
+def _give(kind: Literal["pilot", "rejoin", "disarm"], to: Addressed) -> "Request":
+    """Orders need names."""
     from ground.lookout import addressed
     from ground.protocol import Give
 
-    if not to.robots:
-        with looking(to) as lookout:
-            to = to._replace(robots=addressed(lookout.setup, ()))
-    ask(to, Give(kind, to.robots), kind, as_json=as_json)
-
-
-def _named(names: list[str] | None, fleet: Path, robots: str | None) -> Addressed:
-    """Whom a command addresses that takes robots' names as well as --robots."""
-    if names and robots is not None:
-        raise ValueError("give the robots' names, or --robots, not both")
-    return address(fleet, ",".join(names) if names else robots)
+    if to.robots:
+        return Give(kind, to.robots)
+    with looking(to) as lookout:
+        return Give(kind, addressed(lookout.setup, ()))
 
 
 # Trials, and who commands

@@ -1,5 +1,6 @@
 """`lpac mission run`: fly a script, and show how far it is."""
 
+import json
 import signal
 import sys
 import time
@@ -30,6 +31,13 @@ def run(
         bool, typer.Option("--yes", help="Do not ask before the next trial takes off.")
     ] = False,
     fleet: Fleet = DEFAULT_FLEET,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print one JSON object a line: each step when it is done, then the outcome.",
+        ),
+    ] = False,
 ) -> None:
     """Fly a script: origin, world, and trials from preflight to landing.
 
@@ -51,26 +59,29 @@ def run(
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
     with looking(to) as lookout:
-        view = _View(lookout, yes)
+        view = _View(lookout, yes, as_json)
         flight = Flight(loaded, sites, lookout, view)
         view.robots = flight.robots
         try:
             with view.shown():
                 flight.fly()
+                view.end_step()
         except ScriptError as error:
             then = f"; {flight.hold()}" if error.hold else ""
-            raise ValueError(f"{script}: {error}{then}") from None
+            problem, code = f"{error}{then}", 1
         except GroundError as error:
-            raise ValueError(
-                f"{script}: {error}; robots in the air hold by themselves, and then land"
-            ) from None
+            problem, code = f"{error}; robots in the air hold by themselves, and then land", 1
         except (KeyboardInterrupt, OSError, SystemExit) as error:
             # A terminal that is gone cannot be written to; rich exits when its pipe breaks.
-            then = flight.hold()
             why = str(error) if isinstance(error, OSError) else "interrupted"
-            typer.echo(f"lpac: {script}: {why}; {then}", err=True)
-            raise typer.Exit(130) from None
-    typer.echo(f"{script}: done", err=True)
+            problem, code = f"{why}; {flight.hold()}", 130
+        else:
+            problem, code = "", 0
+    typer.echo(f"lpac: {script}: {problem}" if problem else f"{script}: done", err=True)
+    if as_json:
+        outcome = {"script": str(script), "done": not problem, "problem": problem or None}
+        typer.echo(json.dumps(outcome))
+    raise typer.Exit(code)
 
 
 @dataclass(slots=True)
@@ -79,8 +90,9 @@ class _View:
 
     lookout: "Lookout"
     yes: bool
+    as_json: bool
     robots: tuple[str, ...] = ()
-    _step: str = "script"
+    _step: str = ""
     _step_began_s: float = field(default_factory=time.monotonic)
     _at_most_s: float | None = None
     _began_s: float = field(default_factory=time.monotonic)
@@ -95,34 +107,46 @@ class _View:
         self._live = Live(get_renderable=self._render, console=self._console, transient=True)
 
     def step(self, name: str, at_most_s: float | None) -> None:
-        """A step begins."""
+        """A step begins, and the one before is done."""
+        self.end_step()
         self._step, self._at_most_s = name, at_most_s
         self._step_began_s = time.monotonic()
         self.line(name if at_most_s is None else f"{name}, {at_most_s:g} s")
+
+    def end_step(self) -> None:
+        """The step is done, if there is one."""
+        if self.as_json and self._step:
+            duration_s = round(time.monotonic() - self._step_began_s, 3)
+            typer.echo(json.dumps({"step": self._step, "duration_s": duration_s}))
+        self._step = ""
 
     def line(self, text: str) -> None:
         """Something is worth a line, which stays."""
         self._console.print(f"{time.monotonic() - self._began_s:7.1f} s  {text}", soft_wrap=True)
 
     def may(self, question: str) -> bool:
-        """Ask the person at the terminal."""
+        """Ask the person at the terminal, between two trials."""
+        self.end_step()
         if self.yes:
             return True
         self._live.stop()
         answer = typer.confirm(question, err=True)
-        if self._console.is_terminal:
-            self._live.start()
+        self._start_live()
         return answer
 
     @contextmanager
     def shown(self) -> Iterator[None]:
         """The live part, as long as this context lasts and if there is a terminal."""
-        if self._console.is_terminal:
-            self._live.start()
+        self._start_live()
         try:
             yield
         finally:
             self._live.stop()
+
+    def _start_live(self) -> None:
+        # It would take what is printed to stdout to itself.
+        if self._console.is_terminal and not self.as_json:
+            self._live.start()
 
     def _render(self) -> "Group":
         from rich.console import Group
@@ -150,4 +174,4 @@ class _View:
                 styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
                 styled(status.reason, FAINT),
             )
-        return Group(Text(f"{self._step}: {clock}", "bold"), rows)
+        return Group(Text(f"{self._step or 'script'}: {clock}", "bold"), rows)

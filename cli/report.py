@@ -56,9 +56,7 @@ def report(
     """Make figures and one HTML page of a flight's logs; of several trials, how they repeat."""
     from ground.report import Wanted, examine, write
 
-    wanted = Wanted(
-        trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle
-    )  # fmt: skip
+    wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
     with _Bar() as bar:
         examined = examine(folders, wanted, bar.show)
         page = write(examined, out or folders[0] / "report", wanted.times_s, bar.show)

@@ -1,6 +1,7 @@
 """`lpac robot`: fly one robot, or check whether it could fly."""
 
 import json
+import os
 import signal
 import sys
 import threading
@@ -31,6 +32,18 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
 
     A vehicle that is flying then holds, or lands if the configuration says so.
     """
+    # There is nothing to leave in order while all this is loaded.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: os._exit(0))
+    # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    # structlog would load it to draw tracebacks: 5 MB that no robot has a use for.
+    sys.modules["rich"] = None  # type: ignore[assignment]
+    from edge.robot import run as run_robot
+    from edge.runtime.config import load_config
+
+    loaded = load_config(config)
     stop = threading.Event()
 
     def on_signal(*_: object) -> None:
@@ -41,15 +54,7 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)
-    # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-
-    # structlog would load it to draw tracebacks: 5 MB that no robot has a use for.
-    sys.modules["rich"] = None  # type: ignore[assignment]
-    from edge.robot import run as run_robot
-    from edge.runtime.config import load_config
-
-    run_robot(load_config(config), stop)
+    run_robot(loaded, stop)
 
 
 @app.command()

@@ -1,5 +1,6 @@
 """`lpac site`: save where a fleet flies, and fly there again."""
 
+import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -145,6 +146,4 @@ def _print_slots(site: "SavedSite") -> None:
 
 
 def _described(site: "SavedSite") -> dict[str, object]:
-    import dataclasses
-
     return dataclasses.asdict(site)

@@ -36,7 +36,7 @@ from edge.adapters.zenoh_link import ZenohLink
 from edge.core.mission import FlightState, RobotStatus, explored_to_bytes, to_json, world_id
 from edge.core.vehicle import Action
 from edge.core.wire import Rejection, decode
-from edge.core.world import parse_world, rasterize
+from edge.core.world import MOST_FEATURES, parse_world, rasterize
 from edge.runtime.bundle import Manifest, load_bundle
 from edge.runtime.config import RobotConfig
 from edge.runtime.control import FlightControl, GroundWorld
@@ -51,8 +51,6 @@ from edge.runtime.verify import verify
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
 _EXPLORED_PERIOD_S = 1.0
-# To make a raster of more takes minutes.
-_MOST_FEATURES = 2000
 # A control loop without a tick for longer hangs: the vehicle was told to hold before that.
 _CONTROL_FRESH_S = 1.0
 # On leaving: for the autopilot's answer, and for a loop that hangs.
@@ -108,8 +106,8 @@ def _sensor(text: str, source: str, manifest: Manifest) -> IdfSensor:
     perception, training = manifest.perception, manifest.training
     assert perception is not None  # Without it no robot is loaded.
     features = parse_world(text, source)
-    if len(features) > _MOST_FEATURES:
-        raise ValueError(f"{source}: has {len(features)} features, at most {_MOST_FEATURES} may be")
+    if len(features) > MOST_FEATURES:
+        raise ValueError(f"{source}: has {len(features)} features, at most {MOST_FEATURES} may be")
     truncation, norm = training.idf_truncation, training.idf_norm
     importance = rasterize(features, perception.world_size, truncation, norm)
     return IdfSensor(importance, perception.sensor_size)

@@ -1,7 +1,7 @@
 """What an operator must see now, of all that the ground knows; nothing here has a clock."""
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Literal, NamedTuple, TypeVar
 
@@ -9,18 +9,18 @@ from edge.core.flight import FlightParameters
 from edge.core.mission import AIRBORNE, FlightState, RobotStatus
 from edge.core.preflight import PreflightLimits
 from ground.protocol import Picture, RobotPicture, Setup
+from ground.station import COMMANDER_SILENT_S
 
 Severity = Literal["critical", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("critical", "warning", "note")
 
 # How long ago the picture before should be.
-BEFORE_S = 2.0
-# What was heard longer ago is no longer heard.
-_FRESH_S = 2.0
+_BEFORE_S = 2.0
 
 _S = FlightState
-_LIMITS = PreflightLimits()
-_FLIGHT = FlightParameters(slot=0, landing_point_m=(0.0, 0.0))
+# Of robots, unless their own files say otherwise.
+LIMITS = PreflightLimits()
+FLIGHT = FlightParameters(slot=0, landing_point_m=(0.0, 0.0))
 # Above the share at which a robot returns by itself: somebody may still decide.
 BATTERY_LOW = 0.3
 # A robot has heard a state by then, and said so.
@@ -49,8 +49,8 @@ class Alarm(NamedTuple):
 def alarms(setup: Setup, picture: Picture, before: Picture | None = None) -> tuple[Alarm, ...]:
     """The alarms of a picture, the gravest first, each robot's of one kind once.
 
-    `before` is a picture of `BEFORE_S` ago, or a little more; without it nothing is told that needs
-    two looks: that the ground's state is not obeyed, that loops miss ticks.
+    `before` is what `Before` gives; without it nothing is told that needs two looks: that the
+    ground's state is not obeyed, that loops miss ticks.
     """
     fleet = _Fleet(setup, picture, before)
     found = [Alarm(severity, "", text) for severity, text in _of_fleet(fleet)]
@@ -61,6 +61,21 @@ def alarms(setup: Setup, picture: Picture, before: Picture | None = None) -> tup
         if (alarm := check(fleet, seen)) is not None
     ]
     return tuple(sorted(found, key=lambda alarm: SEVERITIES.index(alarm.severity)))
+
+
+class Before:
+    """Keeps the pictures of the last 2 s, as they come."""
+
+    def __init__(self) -> None:
+        self._pictures: deque[tuple[float, Picture]] = deque()
+
+    def take(self, picture: Picture, now_s: float) -> Picture | None:
+        """The picture of 2 s before this one, or a little more; None if there is none."""
+        self._pictures.append((now_s, picture))
+        while len(self._pictures) > 1 and now_s - self._pictures[1][0] >= _BEFORE_S:
+            self._pictures.popleft()
+        at_s, before = self._pictures[0]
+        return before if now_s - at_s >= _BEFORE_S else None
 
 
 def is_flying(status: RobotStatus) -> bool:
@@ -126,7 +141,7 @@ def _most_common(values: Iterable[T]) -> T | None:
 def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, str]]:
     ground = fleet.ground
     flying = sum(is_flying(seen.status) for seen in fleet.seen)
-    silent = fleet.picture.commander_age_s > _FRESH_S
+    silent = fleet.picture.commander_age_s > COMMANDER_SILENT_S
     if flying and not fleet.picture.commander:
         yield "critical", f"nobody commands the fleet, and {flying} fly: hold or land them"
     if fleet.picture.commander and silent:
@@ -177,7 +192,7 @@ def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
     said, status = fleet.ground_before, seen.status
     if said is None or fleet.ground is None:
         return None
-    if seen.robot.age_s is None or seen.robot.age_s > BEFORE_S - _OBEYED_WITHIN_S:
+    if seen.robot.age_s is None or seen.robot.age_s > _BEFORE_S - _OBEYED_WITHIN_S:
         return None
     severity: Severity = "critical" if is_flying(status) else "warning"
     if status.obeyed_sequence < said.sequence:
@@ -194,7 +209,7 @@ def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
         return None
     if not is_flying(seen.status):
         return "note", f"battery low: {battery:.0%}"
-    if battery <= _FLIGHT.battery_critical:
+    if battery <= FLIGHT.battery_critical:
         return "critical", f"battery critical: {battery:.0%}"
     return "warning", f"battery low: {battery:.0%}"
 
@@ -239,9 +254,9 @@ def _gps(fleet: _Fleet, seen: _Seen) -> _Found:
     satellites, hdop = seen.status.satellites, seen.status.hdop
     if not is_flying(seen.status):
         return None
-    if satellites is not None and satellites < _LIMITS.min_satellites:
+    if satellites is not None and satellites < LIMITS.min_satellites:
         return "warning", f"GPS sees {satellites} satellites"
-    if hdop is not None and not hdop <= _LIMITS.max_hdop:
+    if hdop is not None and not hdop <= LIMITS.max_hdop:
         return "warning", f"GPS precision (HDOP) is {hdop:.1f}"
     return None
 
@@ -292,7 +307,7 @@ def _loops(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _clock(fleet: _Fleet, seen: _Seen) -> _Found:
     offset_s = seen.robot.clock_offset_s
-    if offset_s is None or abs(offset_s) <= _LIMITS.max_clock_difference_s:
+    if offset_s is None or abs(offset_s) <= LIMITS.max_clock_difference_s:
         return None
     return "warning", f"its clock is {abs(offset_s):.0f} s {'ahead' if offset_s > 0 else 'behind'}"
 

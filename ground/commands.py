@@ -7,7 +7,7 @@ and yields whenever it has to wait for what comes next.
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
-from edge.core.mission import FlightState, OrderKind, RobotStatus
+from edge.core.mission import FlightState, OrderKind, RobotStatus, is_too_low
 from ground.protocol import (
     Again,
     Calm,
@@ -462,7 +462,7 @@ class Running:
     def _settle_who_does_not_take_off(self) -> None:
         for name, status in self._heard().items():
             if status.state in (_S.HOLD, _S.MISSION):
-                self._settle(name, f"already in the air, in {status.state}")
+                self._settle_up(name, status, f"already in the air, in {status.state}")
             elif not self._is_enabled(name):
                 self._fail([name], "not enabled: `lpac mission enable`")
             elif status.state in _NOT_STEERED:
@@ -510,9 +510,17 @@ class Running:
         elif status is None:
             self._fail([name], "not heard")
         elif late or (answer is not None and status.state not in _CLIMBING):
-            above = status.state in (_S.HOLD, _S.MISSION)
-            text = status.reason if above else f"{status.state}: {status.reason}"
-            self._settle(name, text, done=above)
+            if status.state in (_S.HOLD, _S.MISSION):
+                self._settle_up(name, status, status.reason)
+            else:
+                self._fail([name], f"{status.state}: {status.reason}")
+
+    def _settle_up(self, name: str, status: RobotStatus, text: str) -> None:
+        """Settle who has taken off; who was held up on its way is too low for a mission."""
+        low = status.state is _S.HOLD and is_too_low(status)
+        if low:
+            text += f"; below its height of {status.slot_height_m:g} m: land it, then take off"
+        self._settle(name, text, done=not low)
 
     def _start(self, _: Start) -> Waits:
         for name, why in self._calmed().items():

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from edge.core.mission import RobotStatus
-from ground.protocol import RobotPicture
+from ground.protocol import FRESH_S, RobotPicture
 
-FRESH_S = 2.0
 # Two statuses of one program are at most so far apart, unless it has ended.
 _STATUS_GAP_S = 0.6
 _RATE_WINDOW_S = 3.0
@@ -152,7 +151,7 @@ class HeardRobots:
         robot.duplicate = duplicate
 
     def status(self, robot_id: int, now_s: float) -> RobotStatus | None:
-        """The robot's newest, if it was heard within 2 s."""
+        """The robot's newest, if it was heard within `FRESH_S`."""
         return self._robots[robot_id].fresh(now_s)
 
     def last(self, robot_id: int, now_s: float) -> tuple[RobotStatus, float] | None:
@@ -161,11 +160,11 @@ class HeardRobots:
         return None if program is None else (program.newest.status, now_s - program.newest.at_s)
 
     def others(self, robot_id: int, now_s: float) -> list[tuple[RobotStatus, float]]:
-        """The same of each other program that says it is this robot, if it was heard within 2 s."""
+        """The same of each other program that says it is this robot, if it is still heard."""
         return self._robots[robot_id].others(now_s)
 
     def statuses(self, now_s: float) -> dict[int, RobotStatus]:
-        """The newest of each robot that was heard within 2 s, by robot id."""
+        """The newest of each robot that was heard within `FRESH_S`, by robot id."""
         fresh = ((id_, robot.fresh(now_s)) for id_, robot in self._robots.items())
         return {robot_id: status for robot_id, status in fresh if status is not None}
 

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import json
 import signal
+import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from aiohttp import WSMsgType, web
 
 from edge.core import F64
-from ground.alarms import BEFORE_S, Alarm, alarms
+from ground.alarms import Alarm, Before, alarms
 from ground.client import listen, send
 from ground.coverage import Coverage
 from ground.live_map_access import Access, reached_at
@@ -31,6 +32,7 @@ from ground.live_map_view import (
 )
 from ground.protocol import (
     Calm,
+    Command,
     Enable,
     Event,
     Explored,
@@ -80,6 +82,7 @@ _ACTIONS: dict[str, Callable[[tuple[str, ...]], Request]] = {
     "resume": lambda robots: Resume(robots=robots),
     "return": lambda robots: Calm("return", robots=robots),
     "land": lambda robots: Calm("land", robots=robots),
+    "command": lambda _: Command(),
 }
 
 
@@ -131,7 +134,7 @@ class LiveMap:
         # Of the robots that count for the cost, in this picture, m.
         self._places_m: dict[str, tuple[float, float]] = {}
         self._alarms: tuple[Alarm, ...] = ()
-        self._before: deque[Picture] = deque()
+        self._before = Before()
         self._explored: dict[str, Explored] = {}
         self._events: deque[Event] = deque(maxlen=_MAX_EVENTS)
         self._missions = Missions()
@@ -157,6 +160,7 @@ class LiveMap:
             except (OSError, ValueError) as error:
                 self._problem = str(error)
                 self._missions.interrupt()
+                self._before = Before()
                 self._put(self._ground_view())
             await asyncio.sleep(_RETRY_S)
 
@@ -187,11 +191,7 @@ class LiveMap:
         if self._setup is None:
             return
         self._picture = picture
-        self._before.append(picture)
-        earliest_s = picture.unix_time_s - BEFORE_S
-        while len(self._before) > 1 and self._before[1].unix_time_s <= earliest_s:
-            self._before.popleft()
-        before = self._before[0] if self._before[0].unix_time_s <= earliest_s else None
+        before = self._before.take(picture, time.monotonic())
         self._alarms = alarms(self._setup, picture, before)
         self._places_m = self._missions.take(picture)
         self._new_picture.set()

@@ -10,11 +10,12 @@ import ipaddress
 import secrets
 import socket
 import struct
+import sys
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
-# Linux: an interface's first address; see netdevice(7).
-_SIOCGIFADDR = 0x8915
+# An interface's first address: netintro(4) of macOS, netdevice(7) of Linux.
+_SIOCGIFADDR = 0xC0206921 if sys.platform == "darwin" else 0x8915
 
 
 def is_loopback(host: str) -> bool:

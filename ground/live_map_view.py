@@ -32,9 +32,6 @@ def setup_view(setup: Setup, coverage: Coverage) -> Json:
     """What does not change."""
     return {
         "kind": "setup",
-        "fleet": setup.fleet,
-        "operator": setup.operator,
-        "robots": list(setup.robots),
         "slots": [
             {
                 "robot": site.robot,
@@ -46,7 +43,6 @@ def setup_view(setup: Setup, coverage: Coverage) -> Json:
         "side_m": coverage.size_m,
         "range_m": setup.communication_range / setup.env_scale,
         "sensor_m": setup.sensor_size / setup.env_scale,
-        "world_id": setup.world_id,
         "density": {
             "cells": DENSITY_CELLS,
             "levels": base64.b64encode(coverage.density(DENSITY_CELLS).tobytes()).decode(),
@@ -100,7 +96,6 @@ def _robot_view(
         "ready": status.ready,
         "failed_checks": list(status.failed_checks),
         "in_air": in_air(status),
-        "armed": status.armed,
         "position_m": _rounded(status.position_m),
         "yaw_rad": _yaw_rad(status, heading_deg),
         "wanted_m_s": _rounded(status.policy_velocity_m_s),

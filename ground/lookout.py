@@ -8,10 +8,8 @@ from typing import Self
 
 from edge.core.mission import RobotStatus
 from ground.client import GroundError, subscribe
-from ground.protocol import Picture, Setup
+from ground.protocol import FRESH_S, Picture, Setup
 
-# Who was not heard for so long is silent.
-FRESH_S = 2.0
 _PATIENCE_S = 5.0
 
 

@@ -19,9 +19,11 @@ from typing import Literal, TypeVar
 from edge.core.mission import GroundState, Origin, Place, RobotStatus
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.world import parse_world
+from edge.core.world import MOST_FEATURES, parse_world
 
 PICTURE_PERIOD_S = 0.2
+# A robot that said nothing for longer is not heard any more.
+FRESH_S = 2.0
 SUBSCRIBE = b"subscribe\n"
 # What the radio takes at once.
 LARGEST_WORLD = 400_000
@@ -66,7 +68,11 @@ class SetWorld:
             raise ValueError(
                 f"{self.name} has {len(self.text)} characters: must be {LARGEST_WORLD} at most"
             )
-        parse_world(self.text, self.name)
+        features = parse_world(self.text, self.name)
+        if len(features) > MOST_FEATURES:
+            raise ValueError(
+                f"{self.name} has {len(features)} features: must be {MOST_FEATURES} at most"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +229,7 @@ class Setup:
     policy's world is `world_size` cells wide, `env_scale` of them per m, from the mission origin
     on; its sensor sees `sensor_size` cells. `world` is the text of the robots' world file, called
     `world_id`; `truncation` and `norm` are what `rasterize` needs for it. `fence` is the configured
-    one, `max_speed_m_s` the fleet's speed limit. A slot's height is `base_height_m` + its number x
-    `slot_spacing_m`.
+    one. A slot's height is `base_height_m` + its number x `slot_spacing_m`.
     """
 
     fleet: str
@@ -232,7 +237,6 @@ class Setup:
     robots: dict[str, int]
     slots: tuple[Site, ...]
     fence: Fence
-    max_speed_m_s: float
     world: str
     world_id: str
     bundle_id: str
@@ -265,8 +269,8 @@ class RobotPicture:
 
     @property
     def fresh(self) -> bool:
-        """Whether it was heard within the last 2 s."""
-        return self.age_s is not None and self.age_s <= 2.0
+        """Whether it is heard."""
+        return self.age_s is not None and self.age_s <= FRESH_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,6 +290,9 @@ class Picture:
     commander_age_s: float = 0.0
 
 
+EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]
+
+
 @dataclass(frozen=True, slots=True)
 class Event:
     """Something happened: a command and each of its results, a robot's new state, a new commander.
@@ -295,7 +302,7 @@ class Event:
     """
 
     unix_time_s: float
-    kind: Literal["command", "result", "refusal", "state", "commander", "presence"]
+    kind: EventKind
     robot: str
     text: str
     operator: str = ""

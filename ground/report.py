@@ -70,10 +70,7 @@ class Examined(NamedTuple):
 
     def summary(self) -> dict[str, Any]:
         """What is to be said of them, as JSON values."""
-        return {
-            "trials": [_values(trial) for trial in self.trials],
-            "notes": list(self.notes),
-        }  # fmt: skip
+        return {"trials": [_values(trial) for trial in self.trials], "notes": list(self.notes)}
 
 
 def examine(folders: Sequence[Path], wanted: Wanted, progress: Progress) -> Examined:

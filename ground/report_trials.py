@@ -19,11 +19,10 @@ from edge.core.mission import ON_GROUND, FlightState
 from edge.core.perception import part_in_world, window_corner
 from edge.core.safety import Fence
 from ground.coverage import Coverage, in_air
+from ground.protocol import FRESH_S
 from ground.report_logs import Logs, Received, Said
 from ground.under_way import UnderWay
 
-# Who says nothing for so long does not count, as in the live cost.
-FRESH_S = 2.0
 LOOPS = ("perception", "policy", "control")
 _COST_PERIOD_S = 0.5
 _MOST_COSTS = 600
@@ -452,9 +451,7 @@ def _missing(received: Received, own: npt.NDArray[np.bool_]) -> F64:
     return np.where(steps > 0.0, steps - 1.0, 0.0)
 
 
-def _lateness(
-    tracks: tuple[Track, ...], duration_s: float
-) -> dict[str, dict[str, Lateness]]:  # fmt: skip
+def _lateness(tracks: tuple[Track, ...], duration_s: float) -> dict[str, dict[str, Lateness]]:
     """Loop -> robot's name -> lateness; robots that said nothing in the mission are left out."""
     found: dict[str, dict[str, Lateness]] = {loop: {} for loop in LOOPS}
     for track in tracks:

@@ -218,7 +218,7 @@ class Script:
 
 
 def load_script(path: Path, sites: Sites) -> Script:
-    """Raises ConfigError, one line that names the file, the step, the key and what is allowed.
+    """Raises ValueError, one line that names the file, the step, the key and what is allowed.
 
     Looks into the worlds and sites that the script will need, too.
     """
@@ -232,7 +232,7 @@ def load_script(path: Path, sites: Sites) -> Script:
     before = _steps(table.before, _BEFORE, f"{path}: before")
     for step in before:
         if isinstance(step, WorldStep):
-            read_world(path.parent / step.file)
+            _set_world(path, step)
         elif isinstance(step, SiteStep):
             sites.load(step.name)
     steps = _steps(table.steps, _STEPS, f"{path}: steps")
@@ -251,6 +251,11 @@ def read_world(path: Path) -> str:
     if not parse_world(text, str(path)):
         raise ConfigError(f"{path}: holds no features")
     return text
+
+
+def _set_world(script: Path, step: WorldStep, robots: tuple[str, ...] = ()) -> SetWorld:
+    file = script.parent / step.file
+    return SetWorld(read_world(file), file.name, robots)
 
 
 def _steps(
@@ -403,8 +408,7 @@ class Flight:
                 _require(take_site(self._lookout.fleet, site, self._lookout.setup, self.robots))
                 self._sites.use(step.name)
             case WorldStep():
-                text = read_world(self._script.path.parent / step.file)
-                self._require(SetWorld(text, Path(step.file).name, robots))
+                self._require(_set_world(self._script.path, step, robots))
             case PreflightStep():
                 self._prepare(step)
             case TakeoffStep():
@@ -435,8 +439,7 @@ class Flight:
     def _set_origin(self, step: OriginStep) -> None:
         origin = step.given()
         if origin is None:
-            names = [name for name in (step.from_robot, step.toward_robot) if name]
-            heard = self._lookout.gather(names, step.average_s)
+            heard = self._lookout.gather(_names(step), step.average_s)
             stands = [standing(name, statuses) for name, statuses in heard.items()]
             origin = origin_at(stands[0], stands[1] if len(stands) > 1 else None)
         self._teller.line(

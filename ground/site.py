@@ -111,11 +111,7 @@ def standing(robot: str, statuses: Sequence[RobotStatus]) -> Standing:
         raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
     middle = average_position(places)
     spread_m = max(distance_m(middle, place) for place in places)
-    if not spread_m <= MAX_SPREAD_M:
-        raise ValueError(
-            f"{robot}: its position moved by {spread_m:.1f} m, allowed are {MAX_SPREAD_M:g} m: let "
-            "it stand still until its GPS has settled"
-        )
+    _require_still(robot, spread_m)
     headings = [math.degrees(s.heading_rad) for s in statuses if s.heading_rad is not None]
     return Standing(robot, middle, spread_m, circular_mean_deg(headings) if headings else None)
 
@@ -257,12 +253,7 @@ def place_now_m(robot: str, statuses: Sequence[RobotStatus], origin: Origin) -> 
     if not points:
         raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
     x_m, y_m = (math.fsum(axis) / len(points) for axis in zip(*points, strict=True))
-    spread_m = max(math.dist((x_m, y_m), point) for point in points)
-    if not spread_m <= MAX_SPREAD_M:
-        raise ValueError(
-            f"{robot}: its position moved by {spread_m:.1f} m, allowed are {MAX_SPREAD_M:g} m: let "
-            "it stand still until its GPS has settled"
-        )
+    _require_still(robot, max(math.dist((x_m, y_m), point) for point in points))
     return x_m, y_m
 
 
@@ -472,6 +463,14 @@ def _require_disarmed(robot: str, statuses: Sequence[RobotStatus]) -> None:
         raise ValueError(f"{robot} is not heard")
     if statuses[-1].armed:
         raise ValueError(f"{robot} is armed: land first")
+
+
+def _require_still(robot: str, spread_m: float) -> None:
+    if not spread_m <= MAX_SPREAD_M:
+        raise ValueError(
+            f"{robot}: its position moved by {spread_m:.1f} m, allowed are {MAX_SPREAD_M:g} m: let "
+            "it stand still until its GPS has settled"
+        )
 
 
 def _require_inside(robot: str, place: Point, fence: Fence, *, lands: bool) -> None:

@@ -13,7 +13,7 @@ import re
 from collections import Counter, deque
 from collections.abc import Collection, Iterable
 from dataclasses import replace
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 from edge.core.mission import (
     ON_GROUND,
@@ -31,7 +31,7 @@ from edge.core.mission import (
     world_id,
 )
 from ground.heard import HeardRobots
-from ground.protocol import Event, Picture, Setup
+from ground.protocol import Event, EventKind, Picture, Setup
 
 # Before it says anything, a station listens: who commands, whom do the robots obey?
 LISTEN_S = 0.7
@@ -55,8 +55,6 @@ _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
 # As a robot says it of a world whose text it has.
 _UNUSABLE_WORLD = "world cannot be used"
-
-EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]
 
 _S = FlightState
 T = TypeVar("T")
@@ -191,11 +189,11 @@ class Station:
         return tuple(slot.robot for slot in self.setup.slots if slot.robot)
 
     def statuses(self) -> dict[int, RobotStatus]:
-        """The newest of each robot that was heard within 2 s, by robot id."""
+        """The newest of each robot that was heard within `FRESH_S`, by robot id."""
         return self._robots.statuses(self._now_s)
 
     def status(self, name: str) -> RobotStatus | None:
-        """The robot's newest, if it was heard within 2 s."""
+        """The robot's newest, if it was heard within `FRESH_S`."""
         return self._robots.status(self._setup.robots[name], self._now_s)
 
     def lately(self, name: str) -> RobotStatus | None:

@@ -4,7 +4,6 @@ from typing import NamedTuple, Protocol
 
 from edge.core.mission import ON_GROUND, FlightState
 
-# Who was heard no more for so long does not keep a mission going by itself.
 _SILENT_S = 10.0
 
 
@@ -33,10 +32,12 @@ class UnderWay:
     """Follows what robots say, in the order of time.
 
     A robot has part in a mission from when it flies it until it is on the ground, disarmed, or
-    begins another trial, or its trial is reset. The mission ends when nobody has part in it.
+    begins another trial, or its trial is reset. The mission ends when nobody has part in it. Who
+    was heard no more for `silent_s` does not keep it going by itself.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, silent_s: float = _SILENT_S) -> None:
+        self._silent_s = silent_s
         self._flown: dict[int, _Flown] = {}
 
     @property
@@ -52,7 +53,7 @@ class UnderWay:
         if said.state is FlightState.MISSION:
             others = [flown for flown in self._flown.values() if flown.trial == said.trial]
             self._flown[robot_id] = now
-            return not goes_on and all(heard_s - o.heard_s > _SILENT_S for o in others)
+            return not goes_on and all(heard_s - o.heard_s > self._silent_s for o in others)
         if goes_on and (said.state not in ON_GROUND or said.armed):
             self._flown[robot_id] = now
         return False

@@ -5,8 +5,8 @@ send the same commands as anybody's. Who quits it changes nothing in the field.
 """
 
 import asyncio
+import math
 import time
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple, get_args
@@ -21,12 +21,12 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 from textual.theme import Theme
 
-from edge.core.mission import ON_GROUND, FlightState
-from ground.alarms import BEFORE_S, Alarm, Severity, alarms, is_flying
+from edge.core.mission import FlightState
+from ground.alarms import Alarm, Before, Severity, alarms, is_flying
 from ground.client import listen, send
 from ground.protocol import (
-    PICTURE_PERIOD_S,
     Calm,
+    Command,
     Event,
     Picture,
     Request,
@@ -34,6 +34,7 @@ from ground.protocol import (
     Setup,
     Told,
 )
+from ground.under_way import UnderWay
 from ground.watch_lines import Line, Span, TextStyle, line
 from ground.watch_robot import detail, in_short
 from ground.watch_table import Row, columns, gravest, heading, in_order, table_row
@@ -124,6 +125,16 @@ class _Question(NamedTuple):
     request: Request
 
 
+class _Entered(NamedTuple):
+    """What an event of a robot's new state tells of it."""
+
+    state: FlightState
+    trial: str
+    # Events do not tell.
+    boot_nonce: int = 0
+    armed: bool | None = None
+
+
 class Watch(App[str]):
     """The view. `screenshot`: quit after the first few pictures, and give it as SVG."""
 
@@ -151,13 +162,13 @@ class Watch(App[str]):
         self._fleet = fleet
         self._ends_by_screenshot = screenshot
         self._setup: Setup | None = None
-        # Of the last few seconds, by when they came.
-        self._pictures: deque[tuple[float, Picture]] = deque()
-        self._began_s = time.monotonic()
+        self._picture: Picture | None = None
+        self._before = Before()
+        self._began_s = self._heard_at_s = time.monotonic()
         self._problem = "connecting"
-        # Who is in the air, by its events; and when each trial's mission began.
-        self._aloft: set[str] = set()
-        self._mission_began_s: dict[str, float] = {}
+        self._under_way = _of_events()
+        # The mission that began last: its trial, and when, Unix time.
+        self._mission = "", 0.0
         self._up_until_s: dict[str, tuple[Severity, float]] = {}
         self._rows: list[Row] = []
         self._alarms: tuple[Alarm, ...] = ()
@@ -209,47 +220,36 @@ class Watch(App[str]):
         now_s = time.monotonic()
         if isinstance(told, Setup):
             self._setup = told
-        elif isinstance(told, Event):
-            self._take_event(told)
+        elif isinstance(told, Event) and self._setup is not None:
+            self._take_event(told, self._setup)
         elif isinstance(told, Picture) and self._setup is not None:
             if self._problem:
-                self._pictures.clear()
+                self._before = Before()
             self._problem = ""
-            self._pictures.append((now_s, told))
-            while now_s - self._pictures[0][0] > BEFORE_S + 2.0 * PICTURE_PERIOD_S:
-                self._pictures.popleft()
-            self._look_at(told, now_s)
+            self._picture, self._heard_at_s = told, now_s
+            self._look_at(told, self._setup, now_s)
             self._draw()
             if self._ends_by_screenshot and now_s - self._began_s > _SCREENSHOT_AFTER_S:
                 self.exit(self.export_screenshot())
 
-    def _take_event(self, event: Event) -> None:
-        """Some are older than this view: what was flown before all landed is over."""
-        if event.kind != "state":
+    def _take_event(self, event: Event, setup: Setup) -> None:
+        """Some are older than this view. A ground that has just started knows of no trial yet."""
+        if event.kind != "state" or not event.trial:
             return
-        state = event.text.partition(":")[0]
-        if state not in ON_GROUND:
-            self._aloft.add(event.robot)
-        else:
-            self._aloft.discard(event.robot)
-            if not self._aloft:
-                self._mission_began_s.clear()
-        if state == FlightState.MISSION:
-            self._mission_began_s.setdefault(event.trial, event.unix_time_s)
+        entered = _Entered(FlightState(event.text.partition(":")[0]), event.trial)
+        if self._under_way.begins(setup.robots[event.robot], entered, event.unix_time_s):
+            self._mission = event.trial, event.unix_time_s
 
-    def _look_at(self, picture: Picture, now_s: float) -> None:
-        assert self._setup is not None
-        at_s, before = self._pictures[0]
-        self._alarms = alarms(self._setup, picture, before if now_s - at_s >= BEFORE_S else None)
+    def _look_at(self, picture: Picture, setup: Setup, now_s: float) -> None:
+        self._alarms = alarms(setup, picture, self._before.take(picture, now_s))
         for robot, severity in gravest(self._alarms).items():
             if severity != "note":
                 self._up_until_s[robot] = severity, now_s + _STAYS_UP_S
         lasting = {r: sev for r, (sev, until_s) in self._up_until_s.items() if now_s < until_s}
-        self._rows = in_order(self._setup, picture, self._alarms, lasting)
+        self._rows = in_order(setup, picture, self._alarms, lasting)
         if not _flying(picture):
-            self._aloft.clear()
-            self._mission_began_s.clear()
-        if self._selected not in self._setup.robots and self._rows:
+            self._under_way = _of_events()
+        if self._selected not in setup.robots and self._rows:
             self._selected = self._rows[0].robot.name
 
     def _look(self) -> None:
@@ -260,13 +260,12 @@ class Watch(App[str]):
         if self._problem:
             self._draw()
 
-    @property
-    def _heard_at_s(self) -> float:
-        return self._pictures[-1][0] if self._pictures else self._began_s
-
     # What is seen
 
     def _draw(self) -> None:
+        # While it ends its parts are gone, and a picture may still come.
+        if not self.is_running:
+            return
         now_s = time.monotonic()
         width = self.size.width
         banner = self.query_one("#banner", Lines)
@@ -277,16 +276,15 @@ class Watch(App[str]):
             banner.show(lost(self._problem, lost_s, width))
         self._show("message", [line(width, Span(" "), self._bottom())])
         self._show("keys", [line(width, *KEYS)])
-        if self._setup is None or not self._pictures:
+        setup, picture = self._setup, self._picture
+        if setup is None or picture is None:
             return
-        _, picture = self._pictures[-1]
-        self._show("header", header(self._setup, picture, self._mission_s(picture), width))
+        self._show("header", header(setup, picture, self._mission_s(picture), width))
         alarms_height = self.query_one("#alarms").size.height
         self._show("alarms", few_alarms(self._alarms, width, alarms_height))
-        self._draw_body(picture, lost_s if self._problem else 0.0)
+        self._draw_body(setup, picture, lost_s if self._problem else 0.0)
 
-    def _draw_body(self, picture: Picture, lost_s: float) -> None:
-        assert self._setup is not None
+    def _draw_body(self, setup: Setup, picture: Picture, lost_s: float) -> None:
         # One column is the scroll bar's.
         width = self.size.width - 1
         rows = [
@@ -301,7 +299,7 @@ class Watch(App[str]):
         if self._view == "table":
             if rows:
                 self._show("selected", in_short(rows[at], width))
-            shown = columns(self._setup, width)
+            shown = columns(setup, width)
             self._show("heading", heading(shown))
             self._show("body", [table_row(shown, row) for row in rows], at)
             return
@@ -327,10 +325,11 @@ class Watch(App[str]):
         return self._message if self._question is None else _asked(self._question)
 
     def _mission_s(self, picture: Picture) -> float | None:
-        """Since the first robot of this trial began its mission; None once all have landed."""
-        trial = "" if picture.ground is None else picture.ground.trial
-        began_s = self._mission_began_s.get(trial)
-        return None if began_s is None else picture.unix_time_s - began_s
+        """Since this trial's mission began; None once nobody has part in it."""
+        trial, began_s = self._mission
+        if not self._under_way.robots or picture.ground is None or picture.ground.trial != trial:
+            return None
+        return picture.unix_time_s - began_s
 
     # Keys
 
@@ -359,10 +358,10 @@ class Watch(App[str]):
             )
         elif key == "r":
             self._question = _Question(
-                "Withdraw hold, return and land; who was in the mission flies on?",
-                "resume",
-                Resume(),
+                "Withdraw hold, return and land, and fly on?", "resume", Resume()
             )
+        elif key in ("c", "C"):
+            self._question = _Question("Take the command of the fleet?", "take command", Command())
         elif key == "q":
             self.exit()
         elif key == "t":
@@ -411,6 +410,11 @@ class Watch(App[str]):
 
 def _flying(picture: Picture) -> bool:
     return any(r.status is not None and is_flying(r.status) for r in picture.robots)
+
+
+def _of_events() -> UnderWay:
+    """Who flies on says nothing there."""
+    return UnderWay(silent_s=math.inf)
 
 
 def _only(robot: str) -> tuple[str, ...]:

@@ -10,11 +10,18 @@ from typing import NamedTuple
 
 from rich.cells import cell_len
 
-from edge.core.flight import FlightParameters
 from edge.core.mission import FlightState, RobotStatus
-from edge.core.preflight import PreflightLimits
 from edge.core.safety import Fence
-from ground.alarms import BATTERY_LOW, FEATURE_AGE_S, LATE_MS, SEVERITIES, Alarm, Severity
+from ground.alarms import (
+    BATTERY_LOW,
+    FEATURE_AGE_S,
+    FLIGHT,
+    LATE_MS,
+    LIMITS,
+    SEVERITIES,
+    Alarm,
+    Severity,
+)
 from ground.protocol import Picture, RobotPicture, Setup
 from ground.watch_lines import Line, Span, TextStyle, age, fit, line, number
 
@@ -22,8 +29,6 @@ from ground.watch_lines import Line, Span, TextStyle, age, fit, line, number
 ID = 8
 
 _S = FlightState
-_FLIGHT = FlightParameters(slot=0, landing_point_m=(0.0, 0.0))
-_LIMITS = PreflightLimits()
 _NARROWEST_NAME, _WIDEST_NAME = 4, 12
 _NARROWEST_REASON = 19
 
@@ -144,7 +149,7 @@ def _battery(status: RobotStatus) -> Span:
     if status.battery is None:
         return Span("-")
     style: TextStyle = "warning" if status.battery <= BATTERY_LOW else ""
-    if status.battery <= _FLIGHT.battery_critical:
+    if status.battery <= FLIGHT.battery_critical:
         style = "critical"
     return Span(number(100.0 * status.battery, 3, 0), style)
 
@@ -152,7 +157,7 @@ def _battery(status: RobotStatus) -> Span:
 def _satellites(status: RobotStatus) -> Span:
     if status.satellites is None:
         return Span("-")
-    few = status.satellites < _LIMITS.min_satellites
+    few = status.satellites < LIMITS.min_satellites
     return Span(number(status.satellites, 3, 0), "warning" if few else "")
 
 

@@ -2,14 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 
-from edge.core.flight import FlightParameters
 from edge.core.mission import GroundState
-from ground.alarms import Alarm, Severity
+from ground.alarms import FLIGHT, Alarm, Severity
 from ground.protocol import Picture, Report, Setup
 from ground.watch_lines import Line, Span, duration, fit, line, plain, some
 from ground.watch_table import ID, MARKS, columns, fence_size, heading, in_order, table_row
-
-_FLIGHT = FlightParameters(slot=0, landing_point_m=(0.0, 0.0))
 
 _OTHER_KEYS = {
     "l": "land", "r": "resume", "Enter": "robot", "a": "alarms", "?": "help", "q": "quit",
@@ -27,6 +24,7 @@ HELP = (
     "h      HOLD the whole fleet, at once, in every view",
     "l      land the whole fleet where it is (asks; y is yes)",
     "r      resume: withdraw hold, return and land, and fly on (asks; y is yes)",
+    "c      take the command of the fleet from another station (asks; y is yes)",
     "j k    next and previous robot, as the arrows",
     "Enter  everything about the robot; again, or Esc: back",
     "H L    there: hold it at once, land it (asks); elsewhere as h and l",
@@ -151,8 +149,8 @@ def few_alarms(alarms: Sequence[Alarm], width: int, height: int) -> list[Line]:
 
 def lost(text: str, lost_s: float, width: int) -> list[Line]:
     """Above what was known last, when there is no ground process; `text` is why."""
-    hold_s = _FLIGHT.ground_timeout_s
-    land_s = hold_s + _FLIGHT.ground_lost_land_s
+    hold_s = FLIGHT.ground_timeout_s
+    land_s = hold_s + FLIGHT.ground_lost_land_s
     texts = (
         f"NO GROUND STATION for {duration(lost_s)}",
         f"{text[:1].upper()}{text[1:]}.",

@@ -195,7 +195,7 @@ def fly(
 
 
 class _Moment(NamedTuple):
-    """What everybody says and has used at one time."""
+    """What everybody said last and has used at one time."""
 
     time_s: float
     statuses: Mapping[int, RobotStatus]
@@ -206,7 +206,11 @@ class _Moment(NamedTuple):
     def of(cls, fleet: Fleet) -> "_Moment":
         return cls(
             time.monotonic(),
-            fleet.operator.statuses(),
+            {
+                robot: heard[-1].status
+                for robot in range(fleet.scenario.robots)
+                if (heard := fleet.operator.history(robot))
+            },
             tuple(robot.usage() for robot in fleet.robots),
             process_usage(os.getpid()),
         )

@@ -31,6 +31,7 @@ from edge.core.mission import (
     RobotStatus,
     from_json,
     is_over_landing_point,
+    is_too_low,
     to_json,
     waiting_to_land,
     world_id,
@@ -266,10 +267,11 @@ class Operator:
         with self._changed:
             self._open.pop(result.order_id, None)
             self._results[result.order_id] = result
+            refusal = "" if result.accepted else f"robot {robot} refuses {kind}: {result.reason}"
+            if refusal:
+                self.refusals.append(refusal)
             self._changed.notify_all()
-        if not result.accepted:
-            refusal = f"robot {robot} refuses {kind}: {result.reason}"
-            self.refusals.append(refusal)
+        if refusal:
             self._say(refusal)
 
     def _publish(self) -> None:
@@ -344,7 +346,7 @@ class Script:
         self.steps = (
             Step("assemble", 30.0 + 3.0 * n, lambda: None, self._all_heard, "were not heard"),
             Step("preflight", 60.0, self._enable, self._all_ready, "are not ready"),
-            Step("takeoff", 45.0 + 3.0 * n, self._order_takeoff, self._all_in(_S.HOLD),
+            Step("takeoff", 45.0 + 3.0 * n, self._order_takeoff, self._all_up,
                  "did not come to hold at their heights"),
             Step("start", 20.0, self._order_start, self._all_in(_S.MISSION), "did not start"),
             Step("mission", mission_s, self._order_start, self._all_down, ""),
@@ -419,6 +421,9 @@ class Script:
     def _all_in(self, state: FlightState) -> Callable[[Statuses], bool]:
         return lambda statuses: self._all(statuses, lambda s: s.state is state)
 
+    def _all_up(self, statuses: Statuses) -> bool:
+        return self._all(statuses, lambda s: s.state is _S.HOLD and not is_too_low(s))
+
     def _all_down(self, statuses: Statuses) -> bool:
         """A robot that is not heard any more cannot be waited for."""
         return all(s.state in ON_GROUND and not s.armed for s in statuses.values())
@@ -433,8 +438,13 @@ class Script:
                     self._say_once(f"robot {robot} is not ready: {check}")
 
     def _order_takeoff(self) -> None:
-        """The highest first: it climbs past nobody."""
+        """The highest first: it climbs past nobody.
+
+        Who came to hold on its way up is too low for a mission: it lands and takes off again.
+        """
         statuses = self._operator.statuses().values()
+        low = [s for s in statuses if s.state is _S.LAND or (s.state is _S.HOLD and is_too_low(s))]
+        self._operator.calm_each("none", {status.robot_id: "land" for status in low})
         for status in sorted(statuses, key=lambda s: s.slot_height_m, reverse=True):
             if time.monotonic() - self._last_takeoff_s < _TAKEOFF_STAGGER_S:
                 return

@@ -16,6 +16,7 @@ from edge.core import F64
 from edge.core.mailbox import Neighbour
 from edge.core.mission import (
     AIRBORNE,
+    AT_SLOT_M,
     MAX_SLOT,
     ON_GROUND,
     ORDER_LIFETIME_S,
@@ -43,7 +44,6 @@ _OFFBOARD_TIMEOUT_S = 4.0
 _STALE_TELEMETRY_S = 2.0
 _LAPSE_SHARE = 0.9
 _AT_HEIGHT_M = 0.5
-_AT_SLOT_M = 1.0
 _AT_LANDING_POINT_M = 0.5
 _AT_REST_M_S = 0.4
 _LANDED_DISARM_S = 3.0
@@ -884,8 +884,8 @@ def _not_in_place(t: _Tick) -> str | None:
     if not (vehicle.armed and vehicle.in_air):
         return "the vehicle is not in the air"
     slot_height_m = t.robot.parameters.slot_height_m
-    if abs(height - slot_height_m) > _AT_SLOT_M:
-        return f"at {height:.1f} m; its height is {slot_height_m:g} m (within {_AT_SLOT_M:g} m)"
+    if abs(height - slot_height_m) > AT_SLOT_M:
+        return f"at {height:.1f} m; its height is {slot_height_m:g} m (within {AT_SLOT_M:g} m)"
     x_m, y_m, _ = odometry.position_m
     if t.robot.fence.distance_m(x_m, y_m) <= 0.0:
         return f"outside the fence, at ({x_m:.1f}, {y_m:.1f}) m"

@@ -28,6 +28,8 @@ from edge.core.vehicle import Vector
 ORDER_LIFETIME_S = 10.0
 EXPLORED_CELLS = 64
 MAX_SLOT = 1000
+# A mission starts within this distance of the robot's own height.
+AT_SLOT_M = 1.0
 _OVER_LANDING_POINT_M = 1.5
 
 Bools = npt.NDArray[np.bool_]
@@ -248,6 +250,13 @@ def is_over_landing_point(status: RobotStatus) -> bool:
     if status.position_m is None:
         return False
     return math.dist(status.position_m[:2], status.landing_point_m) < _OVER_LANDING_POINT_M
+
+
+def is_too_low(status: RobotStatus) -> bool:
+    """Whether the robot is so far below its own height that it cannot start a mission there."""
+    if status.position_m is None:
+        return False
+    return status.slot_height_m - status.position_m[2] > AT_SLOT_M
 
 
 def waiting_to_land(statuses: Mapping[int, RobotStatus], arrived: Collection[int]) -> set[int]:

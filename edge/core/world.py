@@ -19,6 +19,8 @@ import numpy.typing as npt
 
 from edge.core import F32, F64
 
+# To make a raster of more takes a robot minutes.
+MOST_FEATURES = 2000
 # What the library's C++ streams read as one number; Python's own float() takes more, such as 1_0.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COUNT = re.compile(r"\+?\d+", re.ASCII)

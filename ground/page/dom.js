@@ -70,7 +70,7 @@ export const age = (seconds) =>
     : `${Math.floor(seconds / 60)} min`;
 
 // The letter that stands for a state beside its colour.
-export const LETTERS = {
+const LETTERS = {
   init: "I", idle: "–", preflight: "C", arming: "A", takeoff: "T", hold: "H", mission: "M",
   return: "R", land: "L", landed: "D", pilot: "P", fault: "F",
 };

@@ -21,7 +21,7 @@ export class Drawer {
     const head = make("div", "head", this.chip, this.name, close);
     this.acts = make("div", "group");
     for (const [action, text] of [["hold", "Hold"], ["land", "Land"]]) {
-      const button = make("button", action);
+      const button = make("button");
       button.dataset.robotDo = action;
       button.addEventListener("click", () => onAct(action, this.robot));
       button.label = text;

@@ -39,7 +39,6 @@ const take = {
     setText($("#fleet"), fleet);
     $("#bar").hidden = !operate;
     $("#observing").hidden = operate;
-    document.body.classList.toggle("operate", operate);
     $("#events ol").replaceChildren();
     if (selected) tell({ select: selected });
   },
@@ -119,7 +118,7 @@ function tell(message) {
 
 const TITLES = {
   enable: "Enable", takeoff: "Take off", start: "Start", hold: "Hold", resume: "Resume",
-  return: "Return", land: "Land",
+  return: "Return", land: "Land", command: "Take command",
 };
 
 function act(action, robots = []) {
@@ -149,6 +148,9 @@ function ask(action, robots = []) {
     };
     for (const [reason, some] of groups(others, why)) lines.push(`Not ready: ${list(some)}: ${reason}`);
     lines.push("Motors start, one robot after another.");
+  } else if (action === "command") {
+    setText($("#ask-title"), `Take the command from ${picture?.commander}?`);
+    lines.push("Their commands that still run end, but for a kill. From then on they only observe, and hold.");
   } else {
     const flying = addressed.filter(({ in_air: is }) => is);
     const what = robots.length ? robots.join(", ") : `all ${flying.length} robots in the air`;
@@ -203,8 +205,10 @@ function showHead() {
   const ours = robots.filter(({ name }) => sitting.has(name));
   const enabled = ours.filter((robot) => robot.enabled).length;
   setText($("#commander"), commander || "nobody yet");
-  setClass($("#commander"), commander && !own ? "other" : "");
-  $("#commander").title = commander && !own ? `${commander} commands, not this station` : commander;
+  const observes = commander && !own;
+  setClass($("#commander"), observes ? "other" : "");
+  $("#commander").title = observes ? `${commander} commands, not this station` : commander;
+  $("#command").hidden = !observes;
   setText($("#trial"), trial || "–");
   setText($("#enabled"), ours.length ? `${enabled} of ${ours.length}` : "–");
   setText($("#flying"), `${robots.filter((r) => r.in_air).length}`);
