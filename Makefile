@@ -57,7 +57,7 @@ start: .venv/fleet ## start the robots' programs
 stop: .venv/fleet ## stop the robots' programs; a robot in flight refuses
 status: .venv/fleet ## what each robot has, and how it is
 deploy start stop status:
-	@.venv/bin/lpac fleet $@ --fleet $(FLEET)
+	@.venv/bin/lpac fleet $@ --fleet '$(FLEET)'
 
 fleet-demo: .venv/sim .venv/fleet ## three robot computers on this machine to try it on, until Ctrl-C (root)
 	@mkdir -p out

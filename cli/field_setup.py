@@ -38,8 +38,14 @@ def enroll(
         ),
     ] = None,
     fleet: Fleet = DEFAULT_FLEET,
-    user: Annotated[str, typer.Option(help="Who logs in; root, or who may use sudo.")] = "root",
+    user: Annotated[
+        str | None, typer.Option(help="Who logs in: root, as by default, or who may use sudo.")
+    ] = None,
     port: Annotated[int | None, typer.Option(help="Its ssh port, if not ssh's own.")] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(help="Its IPv4 address for the other robots, if HOST's is not that."),
+    ] = None,
     robot_id: Annotated[
         int | None,
         typer.Option(help="Its id in the fleet; of a new robot the number in its name otherwise."),
@@ -68,8 +74,8 @@ def enroll(
 
     asyncio.run(
         enroll_robot(
-            fleet, name, host, user=user, port=port, robot_id=robot_id, rename=yes,
-            on_step=on_step, say=_say,
+            fleet, name, host, user=user, port=port, address=address, robot_id=robot_id,
+            rename=yes, on_step=on_step, say=_say,
         )
     )  # fmt: skip
     if left:
@@ -117,9 +123,15 @@ def swap(
         f"pad {list(slot.pad_m)} m, height {slot.height}, landing point "
         f"{list(slot.landing_point_m)} m"
     )
+    others = ", ".join(swapped.callers)
     typer.echo(
-        f"{'':6} put it on that pad; no other robot needs a deploy, since {spare} calls those with "
-        "smaller ids, and is in the list of those with larger ones"
+        f"{'':6} put it on that pad; "
+        + (
+            f"{others} may not know {spare}, if deployed before it was in the file: `lpac fleet "
+            "status` marks what needs a deploy"
+            if others
+            else f"no other robot needs a deploy, since {spare} calls them all"
+        )
     )
 
 

@@ -2,9 +2,11 @@
 
 import json
 import shlex
+import signal
 import tempfile
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
@@ -125,6 +127,7 @@ def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJso
     from fleet.deploy import rollback as roll_back
 
     config, chosen = open_fleet(fleet, robots)
+    chosen = _without_spares(config, chosen, "rolled back")
 
     async def one(robot: "RobotHost", report: "Report") -> str:
         return await roll_back(config, robot, report)
@@ -154,7 +157,7 @@ class _Controlled(NamedTuple):
 def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Start the robots' programs, now and at every boot. Nothing takes off by that."""
     config, chosen = open_fleet(fleet, robots)
-    chosen = _without_spares(config, chosen)
+    chosen = _without_spares(config, chosen, "started")
     outcomes = _control(config, chosen, "start", lambda _: {"directory": config.directory})
     _print_controlled(config, outcomes, "started on", as_json)
 
@@ -189,7 +192,7 @@ def restart(
 ) -> None:
     """Stop the robots' programs and start them again. A robot in flight refuses."""
     config, chosen = open_fleet(fleet, robots)
-    chosen = _without_spares(config, chosen)
+    chosen = _without_spares(config, chosen, "restarted")
     outcomes = _control(
         config, chosen, "restart",
         lambda robot: {
@@ -235,16 +238,28 @@ def _print_controlled(
     require_all(outcomes, done)
 
 
-def _without_spares(config: "FleetConfig", robots: list["RobotHost"]) -> list["RobotHost"]:
+def _without_spares(
+    config: "FleetConfig", robots: list["RobotHost"], done: str
+) -> list["RobotHost"]:
     spares = [robot.name for robot in robots if config.slot_of(robot.name) is None]
     if len(spares) == len(robots):
-        raise ValueError(f"nothing to start: {', '.join(spares)} has no slot, as a spare")
+        raise ValueError(f"a spare is not {done}, it has no slot: {', '.join(spares)}")
     if spares:
-        typer.echo(f"left out, since a spare is not started: {', '.join(spares)}", err=True)
+        typer.echo(f"left out, since a spare is not {done}: {', '.join(spares)}", err=True)
     return [robot for robot in robots if robot.name not in spares]
 
 
 # Looking
+
+
+@contextmanager
+def _while_somebody_reads() -> Iterator[None]:
+    """End as other programs do when `head` or `grep -m1` has read enough, after all sessions."""
+    try:
+        yield
+    except* BrokenPipeError:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGPIPE)
 
 
 @app.command()
@@ -264,6 +279,7 @@ def status(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson 
 
 
 @app.command()
+@_while_somebody_reads()
 def logs(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -313,6 +329,7 @@ def logs(
 
 
 @app.command("exec", context_settings={"allow_interspersed_args": False})
+@_while_somebody_reads()
 def execute_on_all(
     command: Annotated[
         list[str],

@@ -29,17 +29,20 @@ class State(NamedTuple):
     """A robot's `overview`, and how far its clock is ahead of ours.
 
     `slot` is its slot's place in the list, None for a spare. `last_words` are those of a program
-    that has failed, None if it has not.
+    that has failed, None if it has not. `is_configured` tells whether its configuration is what
+    fleet.toml gives now, None without a release.
     """
 
     overview: dict[str, Any]
     slot: int | None
     clock_offset_s: float
     last_words: str | None
+    is_configured: bool | None = None
 
 
 async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
     """Ask the robot; nothing of it is held or changed. Raises FleetError."""
+    from fleet.doctor import is_configured
     from fleet.hold import visit
 
     async with visit(config, robot) as (session, overview):
@@ -47,7 +50,8 @@ async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
         words = None
         if _failed(overview["service"]):
             words = (await session.call("last_words"))["text"]
-    return State(overview, _slot(config, robot.name), clock_offset_s, words)
+    configured = None if overview["current"] is None else is_configured(config, robot, overview)
+    return State(overview, _slot(config, robot.name), clock_offset_s, words, configured)
 
 
 def describe(state: State) -> dict[str, object]:
@@ -57,6 +61,7 @@ def describe(state: State) -> dict[str, object]:
         "slot": state.slot,
         "clock_offset_s": round(state.clock_offset_s, 3),
         "last_words": state.last_words,
+        "is_configured": state.is_configured,
     }
 
 
@@ -82,6 +87,12 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
             notes += [(outcome.robot.name, note) for note in _notes(outcome.value)]
         if outcome.robot.name in odd:
             notes.append((outcome.robot.name, styled(f"* {odd[outcome.robot.name]}", NOTABLE)))
+        if outcome.value is not None and outcome.value.is_configured is False:
+            note = (
+                f"* its configuration is not the one of {config.path.name}: lpac fleet deploy "
+                f"--robots {outcome.robot.name}"
+            )
+            notes.append((outcome.robot.name, styled(note, NOTABLE)))
     if most is not None:
         notes.append(("others" if odd else "all", most))
     print_notes(notes)
@@ -108,7 +119,9 @@ def flight(service: Mapping[str, Any]) -> str:
 def _cells(state: State, odd: bool) -> list["str | Text"]:
     overview, service = state.overview, state.overview["service"]
     said = service["status"] if service["fresh"] else {}
-    marks = ("*" if odd else "") + ("?" if overview["pending"] else "")
+    marks = ("*" if odd or state.is_configured is False else "") + (
+        "?" if overview["pending"] else ""
+    )
     armed = said.get("armed")
     failed_checks = len(said.get("failed_checks", ()))
     clock_well = abs(state.clock_offset_s) <= _CLOCK_WITHIN_S
@@ -131,8 +144,8 @@ def _notes(state: State) -> list["str | Text"]:
     if pending:
         notes.append(
             styled(
-                f"? a switch to {pending['release'][:SHORT]} was interrupted: the next deploy, "
-                "start or stop settles it",
+                f"? a switch to {pending['release'][:SHORT]} is not confirmed yet: it is under "
+                "way, or was interrupted; then the next deploy, start or stop settles it",
                 NOTABLE,
             )
         )

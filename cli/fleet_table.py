@@ -225,8 +225,9 @@ class _Progress:
         from rich.text import Text
 
         table = _new_table(narrow=False, heading=False)
-        names = max(len(row.name) for row in self.rows.values())
-        hosts = max(len(row.host) for row in self.rows.values())
+        # Of no robots, as after none has come up, there is a table too.
+        names = max((len(row.name) for row in self.rows.values()), default=0)
+        hosts = max((len(row.host) for row in self.rows.values()), default=0)
         # Of one width all the time, whatever the present steps are; outcomes have the rest.
         for width in (names, hosts, _STEP_WIDTH, _BAR_WIDTH, None):
             table.add_column(no_wrap=True, min_width=width)

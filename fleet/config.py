@@ -1,8 +1,8 @@
 """fleet.toml: which robots there are, how to reach them, and who flies where.
 
 A robot is a computer with a vehicle; a slot is a place in the flight: pad, height, landing point.
-A robot without a slot is a spare. Relative paths are meant from the file's own folder. Every
-mistake is one line that names the file, the key, the robot and what is allowed.
+A robot without a slot is a spare. Relative paths are meant from the file's own folder, "~" is the
+user's. Every mistake is one line that names the file, the key, the robot and what is allowed.
 """
 
 import fcntl
@@ -379,16 +379,23 @@ def _fleet(path: Path, text: str) -> FleetConfig:
     table = from_mapping(_FleetTable, mapping, str(path))
     _check_keys(table.robot, _ELSEWHERE, f"{path}: robot")
     folder = path.resolve().parent
+
+    def place(text: str) -> Path:
+        try:
+            return folder / Path(text).expanduser()
+        except RuntimeError:
+            raise ConfigError(f"{path}: {text!r}: whose home folder that is is not known") from None
+
     config = FleetConfig(
         path=path,
         fleet=table.fleet,
-        image=folder / table.image,
-        bundle=folder / table.bundle,
-        world=folder / table.world,
+        image=place(table.image),
+        bundle=place(table.bundle),
+        world=place(table.world),
         directory=table.directory,
         predecessors=table.predecessors,
         ssh=SshConfig(
-            str(folder / table.ssh.config) if table.ssh.config else "",
+            str(place(table.ssh.config)) if table.ssh.config else "",
             table.ssh.connect_timeout_s,
         ),
         robots={

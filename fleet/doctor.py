@@ -1,5 +1,6 @@
 """What a robot needs before a flight: looked at over SSH, judged here, each fault with its fix."""
 
+import hashlib
 import re
 import shlex
 import time
@@ -101,7 +102,9 @@ def diagnose(config: FleetConfig, outcomes: Sequence[Outcome[Examination]]) -> l
     """Judge all that was found; a robot that did not answer has but one check, which failed."""
     found = {o.robot.name: o.value for o in outcomes if o.value is not None}
     return [
-        Diagnosis(o.robot.name, (Check("reach", "FAILED", o.problem or "", _reach_fix(o.robot)),))
+        Diagnosis(
+            o.robot.name, (Check("reach", "FAILED", o.problem or "", _reach_fix(config, o.robot)),)
+        )
         if o.value is None
         else Diagnosis(o.robot.name, tuple(judge(config, o.robot, found)))
         for o in outcomes
@@ -227,13 +230,21 @@ def judge(
     yield from _vehicle(robot, facts, found.vehicle)
 
 
-def on(robot: RobotHost, command: str) -> str:
-    """How a person runs a command on the robot."""
-    return f"lpac fleet exec --robots {robot.name} {shlex.quote(command)}"
+def on(robot: RobotHost, *commands: str) -> str:
+    """How a person runs commands on the robot as root, one after another while they succeed."""
+    sudo = "" if robot.user == "root" else "sudo "
+    text = " && ".join(sudo + command for command in commands)
+    return f"lpac fleet exec --robots {robot.name} {shlex.quote(text)}"
 
 
-def _reach_fix(robot: RobotHost) -> str:
-    return f"switch {robot.name} on, look at its Wi-Fi, then try: ssh {robot.host}"
+def _reach_fix(config: FleetConfig, robot: RobotHost) -> str:
+    ssh = ["ssh"]
+    if config.ssh.config:
+        ssh += ["-F", config.ssh.config]
+    if robot.port is not None:
+        ssh += ["-p", str(robot.port)]
+    ssh.append(f"{robot.user}@{robot.host}")
+    return f"switch {robot.name} on, look at its Wi-Fi, then try: {shlex.join(ssh)}"
 
 
 def _enroll(robot: RobotHost) -> str:
@@ -279,7 +290,21 @@ def _release(config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Facts]) 
             name, "FAILED", f"its {part} is {own[:12]}, another one than that of {others}",
             "lpac fleet deploy",
         )  # fmt: skip
+    if not is_configured(config, robot, facts):
+        found = f"its configuration is not the one of {config.path.name}"
+        return Check(name, "FAILED", found, _deploy(robot))
     return Check(name, "ok", f"{facts['current']}")
+
+
+def is_configured(config: FleetConfig, robot: RobotHost, overview: Facts) -> bool:
+    """Whether the robot's release has the robot.toml that fleet.toml gives now.
+
+    Whatever a spare has does not count: its program does not run.
+    """
+    if config.slot_of(robot.name) is None:
+        return True
+    text = config.robot_toml(robot.name)
+    return bool(overview["robot_toml"] == hashlib.sha256(text.encode()).hexdigest())
 
 
 def _program(config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Examination]) -> Check:
@@ -329,7 +354,10 @@ def _disk(facts: Facts) -> Check:
     least = min(facts["disks"], key=lambda disk: float(disk["free_bytes"]))
     free_mb, total_mb = least["free_bytes"] / _MB, least["total_bytes"] / _MB
     found = f"{free_mb:.0f} of {total_mb:.0f} MB free at {least['path']}"
-    fix = "lpac fleet pull, then remove old logs (/var/lib/lpac/logs, /data/px4/log) on the robot"
+    fix = (
+        "lpac fleet pull, then remove old logs on the robot (/var/lib/lpac/logs, /data/px4/log), "
+        "but not the newest, from which their numbers go on"
+    )
     if free_mb < _LEAST_DISK_MB:
         return Check("disk", "FAILED", found, fix)
     if free_mb < _GOOD_DISK_MB:
@@ -525,7 +553,7 @@ def _containers(config: FleetConfig, robot: RobotHost, containers: Sequence[Fact
             name,
             "FAILED",
             found,
-            on(robot, f"docker update --restart=no {names} && docker stop {names}"),
+            on(robot, f"docker update --restart=no {names}", f"docker stop {names}"),
         )
     running = sum(bool(container["running"]) for container in containers)
     return Check(name, "ok", f"{running} run, none that could command the vehicle")

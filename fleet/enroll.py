@@ -49,8 +49,9 @@ async def enroll(
     name: str,
     host: str | None,
     *,
-    user: str,
+    user: str | None,
     port: int | None,
+    address: str | None,
     robot_id: int | None,
     rename: bool,
     on_step: OnStep,
@@ -58,14 +59,15 @@ async def enroll(
 ) -> None:
     """Enroll the computer at `host` in the fleet of the file; a robot that is new is a spare.
 
-    Of a robot that the file has, `host` and `robot_id` follow from it. A new robot without a
+    Of a robot that the file has, all about it follows from the file. A new robot without a `user`
+    is root's, without an `address` has the one that its host name has here, and without a
     `robot_id` has the number in its name.
 
     `on_step` hears of every step, `say` what is being done. `rename` lets a robot that is enrolled
     as another one become this one. Raises ConfigError or FleetError at the first step that fails.
     """
     config = load_fleet(path)
-    robot = _robot(config, name, host, user, port, robot_id)
+    robot = _robot(config, name, host, user, port, address, robot_id)
     on_step(_key(config, robot))
     async with connect(config, robot, say) as session:
         found = (await session.call("overview", directory=config.directory))["identity"]
@@ -77,7 +79,7 @@ async def enroll(
         was_there = name in config.robots
         if not was_there:
             add_robot(
-                path, name, robot.host, robot.robot_id, user=user, port=port,
+                path, name, robot.host, robot.robot_id, user=robot.user, port=port,
                 address=robot.address if robot.address != robot.host else None,
             )  # fmt: skip
             config = load_fleet(path)
@@ -119,18 +121,23 @@ def _robot(
     config: FleetConfig,
     name: str,
     host: str | None,
-    user: str,
+    user: str | None,
     port: int | None,
+    address: str | None,
     robot_id: int | None,
 ) -> RobotHost:
     """The robot of the file, or one that it does not have yet."""
     known = config.robots.get(name)
     if known is not None:
-        if host not in (None, known.host) or robot_id not in (None, known.robot_id):
-            raise ConfigError(
-                f"{config.path}: robots.{name}: has host = {known.host!r} and robot_id = "
-                f"{known.robot_id}: change it in the file, or enroll it with these"
-            )
+        given = {"host": host, "user": user, "port": port, "address": address, "robot_id": robot_id}
+        for key, value in given.items():
+            has = getattr(known, key)
+            if value not in (None, has):
+                stands = f"{key} = {has!r}" if has is not None else f"no {key}"
+                raise ConfigError(
+                    f"{config.path}: robots.{name}: has {stands}: change it there, or leave "
+                    f"{value!r} out"
+                )
         return known
     if host is None:
         raise ConfigError(f"{config.path}: robots.{name}: is not there: give its address")
@@ -142,14 +149,19 @@ def _robot(
     # A file without it is refused when the robot is added.
     url = config.shared.get("autopilot", {}).get("url", _VOXL2_URL)
     robot = RobotHost(
-        name=name, host=host, user=user, port=port, address=host, robot_id=robot_id, zenoh_port=0,
-        system_id=robot_id, mavlink_url=url, cpus=(), overrides={},
+        name=name, host=host, user=user or "root", port=port, address=address or host,
+        robot_id=robot_id, zenoh_port=0, system_id=robot_id, mavlink_url=url, cpus=(), overrides={},
     )  # fmt: skip
+    if address is not None:
+        return robot
     (named,) = _ssh_options(config, robot)["hostname"]
     try:
         return replace(robot, address=socket.gethostbyname(named))
     except OSError:
-        raise UnreachableError(f"{host}: its host name is not known") from None
+        raise UnreachableError(
+            f"{named}: has no IPv4 address here: give the one that the other robots know with "
+            "--address"
+        ) from None
 
 
 # The key
@@ -264,6 +276,12 @@ def _vision_hub_step(result: Mapping[str, Any]) -> Step:
 
 def _predecessors_step(result: Mapping[str, Any]) -> Step:
     notes = (*(f"stopped {what}" for what in result["stopped"]), *result["suspects"])
+    if not result["saw_containers"]:
+        note = (
+            "docker does not answer, so its containers may command the vehicle: look at "
+            "`systemctl status docker` on the robot, then enroll again"
+        )
+        return Step("predecessors", "left to do", (*notes, note))
     return Step("predecessors", *_done(bool(result["stopped"]), notes))
 
 

@@ -24,7 +24,7 @@ async def execute(
 ) -> int:
     """Run `command` in the login shell; its exit code. Each line of stdout and stderr is handed on.
 
-    Raises UnreachableError, ValueError for a line that is endless.
+    Raises UnreachableError, ValueError for a line that is endless, and what `on_output` raises.
     """
     process = await asyncio.create_subprocess_exec(
         *ssh_command(config, robot), command,
@@ -43,8 +43,8 @@ async def execute(
             group.create_task(_read(process.stdout, on_output))
             group.create_task(_read(process.stderr, on_complaint))
         exit_code = await process.wait()
-    except* ValueError:
-        raise ValueError(f"a line of its output is longer than {_MOST_BYTES} bytes") from None
+    except* ValueError as errors:
+        raise errors.exceptions[0] from None
     finally:
         with suppress(ProcessLookupError):
             process.kill()
@@ -55,5 +55,11 @@ async def execute(
 
 
 async def _read(stream: asyncio.StreamReader, on_line: OnLine) -> None:
-    while line := await stream.readline():
+    while True:
+        try:
+            line = await stream.readline()
+        except ValueError:
+            raise ValueError(f"a line of its output is longer than {_MOST_BYTES} bytes") from None
+        if not line:
+            return
         on_line(line.decode(errors="replace").rstrip("\r\n"))

@@ -2,6 +2,7 @@
 
 import contextlib
 import getpass
+import os
 import socket
 from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple
@@ -62,11 +63,18 @@ async def lock(session: Session, config: FleetConfig, robot: RobotHost) -> str |
     locked = await session.call(
         "lock",
         directory=config.directory,
-        who=f"{getpass.getuser()}@{socket.gethostname()}",
+        who=f"{_user()}@{socket.gethostname()}",
         mavlink_port=robot.mavlink_port,
     )
     recovered: str | None = locked["recovered"]
     return recovered
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # its uid has no name, as in a container
+        return f"uid {os.getuid()}"
 
 
 def check_identity(

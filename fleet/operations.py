@@ -33,4 +33,7 @@ async def for_each(
         on_outcome(outcome)
         return outcome
 
-    return list(await asyncio.gather(*(one(robot) for robot in robots)))
+    # Not gather, which on Ctrl-C waits for the first session alone to be ended in order.
+    async with asyncio.TaskGroup() as group:
+        tasks = [group.create_task(one(robot)) for robot in robots]
+    return [task.result() for task in tasks]

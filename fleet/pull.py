@@ -3,12 +3,13 @@
 import asyncio
 import contextlib
 import hashlib
+import itertools
 from pathlib import Path
 from typing import NamedTuple
 
 from fleet.config import FleetConfig, RobotHost
 from fleet.hold import Report, visit
-from fleet.session import RemoteError, UnreachableError, rsync
+from fleet.session import RemoteError, Session, UnreachableError, rsync
 
 SUMS = "SHA256SUMS"
 
@@ -29,8 +30,9 @@ async def pull(
     """Fetch flight logs, PX4's logs and parameters, journal, configuration and versions.
 
     To `out`/TRIAL/ROBOT; without a trial, whatever is newer than what is there, to `out`/all/ROBOT.
-    `SHA256SUMS` there is what the robot said, and `sha256sum -c` understands it. Raises FleetError,
-    also if the robot has nothing of the trial.
+    `SHA256SUMS` there is what the robot said, and `sha256sum -c` understands it. Files of earlier
+    pulls are never lost: robots number their logs from 1 again once those are removed. Raises
+    FleetError, also if the robot has nothing of the trial.
     """
     folder = out.resolve() / ("all" if trial is None else trial.replace("/", "_")) / robot.name
     async with visit(config, robot, report) as (session, found):
@@ -41,7 +43,10 @@ async def pull(
         if collected["folder"] is None:
             return _nothing(config, robot, trial, folder, collected)
         folder.mkdir(parents=True, exist_ok=True)
+        sums: dict[str, str] = collected["files"]
         try:
+            report("compare", None)
+            kept = await _keep_others(session, collected["folder"], folder, sums)
             sent_bytes = await rsync(
                 config, robot, [f":{collected['folder']}/"], f"{folder}/",
                 options=["--copy-links", "--partial"], sudo=found["sudo"],
@@ -52,12 +57,53 @@ async def pull(
             with contextlib.suppress(UnreachableError):
                 await session.call("fetched", folder=collected["folder"])
     report("check", None)
-    sums: dict[str, str] = collected["files"]
     await asyncio.to_thread(_check, folder, sums)
-    _write_sums(folder, sums)
+    _write_sums(folder, _read_sums(folder) | sums)
     size_bytes = sum((folder / name).stat().st_size for name in sums)
     summary = "whole" if sent_bytes else "was here already"
+    if kept is not None:
+        summary += f"; files of the same names that were here are in {kept}"
     return Pulled(str(folder), len(sums), size_bytes, sent_bytes, summary)
+
+
+async def _keep_others(
+    session: Session, remote: str, folder: Path, sums: dict[str, str]
+) -> str | None:
+    """Move what the transfer would overwrite, but for files that it continues or mends.
+
+    Returns the folder in `folder` that has them now, None if there are none.
+    """
+    known = _read_sums(folder)
+    here = {
+        name: folder / name
+        for name, digest in sums.items()
+        if known.get(name) != digest and (folder / name).is_file()
+    }
+    if not here:
+        return None
+    beginnings = await session.call(
+        "beginnings",
+        folder=remote,
+        sizes={name: path.stat().st_size for name, path in here.items()},
+    )
+    others = [
+        name
+        for name, path in here.items()
+        if await asyncio.to_thread(_sha256, path) != beginnings[name]
+    ]
+    if not others:
+        return None
+    kept = next(
+        name for n in itertools.count(1) if not (folder / (name := f"earlier-{n}")).exists()
+    )
+    for name in others:
+        target = folder / kept / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).rename(target)
+        if name in known:
+            known[f"{kept}/{name}"] = known.pop(name)
+    _write_sums(folder, known)
+    return kept
 
 
 def _nothing(
@@ -90,9 +136,13 @@ def _newest_s(folder: Path) -> float:
 def _check(folder: Path, sums: dict[str, str]) -> None:
     """Raises RemoteError if a file here is not what the robot has."""
     for name, wanted in sums.items():
-        with (folder / name).open("rb") as file:
-            if hashlib.file_digest(file, "sha256").hexdigest() != wanted:
-                raise RemoteError(f"{name} did not come whole: pull again")
+        if _sha256(folder / name) != wanted:
+            raise RemoteError(f"{name} did not come whole: pull again")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _read_sums(folder: Path) -> dict[str, str]:
@@ -105,6 +155,5 @@ def _read_sums(folder: Path) -> dict[str, str]:
 
 
 def _write_sums(folder: Path, sums: dict[str, str]) -> None:
-    known = _read_sums(folder) | sums
-    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(known.items()))
+    text = "".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items()))
     (folder / SUMS).write_text(text)

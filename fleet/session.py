@@ -39,10 +39,12 @@ sys.modules["fleet.on_robot.calls"].serve()
 """
 # What ssh and rsync say of a robot, and what that means for a person.
 _ADVICE = (
-    (r"No .* host key is known", "its host key is not known: log in once with ssh"),
-    (r"Host key verification failed|REMOTE HOST IDENTIFICATION HAS CHANGED",
+    (r"REMOTE HOST IDENTIFICATION HAS CHANGED",
      "its host key is not the known one: another computer answers, or it was set up anew; "
      "only in that case run `ssh-keygen -R HOST`, and log in once with ssh"),
+    # Where it may not ask, ssh says but this of a key that it has never seen.
+    (r"No .* host key is known|Host key verification failed",
+     "its host key is not known here: log in once with ssh to accept it"),
     (r"Permission denied", "it refuses the login: run `lpac fleet enroll`, or look at your key"),
     (r"Could not resolve", "its host name is not known"),
     (r"Connection refused", "nothing listens on its ssh port"),
@@ -50,7 +52,8 @@ _ADVICE = (
      r"Connection reset|Broken pipe|connection unexpectedly closed|timeout in data send/receive",
      "it does not answer: it is off, or out of reach"),
     (r"No space left", "its disk is full"),
-    (r"python3: (command )?not found|python3: No such", "python3 is missing on the robot"),
+    # env quotes the name.
+    (r"python3\W?: ((command )?not found|No such)", "python3 is missing on the robot"),
     (r"rsync: (command )?not found", "rsync is missing on the robot"),
     (r"a password is required|sudo: ", "its user may not use sudo without a password"),
 )  # fmt: skip
@@ -117,14 +120,15 @@ class Session:
             async with asyncio.timeout(_CALL_S):
                 await self._write.drain()
                 while line := await self._read.readline():
-                    answer = json.loads(line)
-                    if "progress" in answer:
-                        self._say(answer["progress"])
-                    elif "error" in answer:
-                        raise RemoteError(answer["error"])
-                    else:
-                        result: dict[str, Any] = answer["result"]
-                        return result
+                    match json.loads(line):
+                        case {"progress": str(text)}:
+                            self._say(text)
+                        case {"error": str(text)}:
+                            raise RemoteError(text)
+                        case {"result": dict(result)}:
+                            return result
+                        case _:
+                            raise ValueError
         except TimeoutError:
             raise UnreachableError(f"it has not answered within {_CALL_S:g} s") from None
         except ConnectionError:
@@ -140,11 +144,13 @@ class Session:
         self._pings.cancel()
         self._write.close()
         try:
-            async with asyncio.timeout(2.0):
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(2.0):
+                    await self._process.wait()
+        finally:  # also if Ctrl-C comes again
+            if self._process.returncode is None:
+                self._process.kill()
                 await self._process.wait()
-        except TimeoutError:
-            self._process.kill()
-            await self._process.wait()
         await self._all_complaints()
 
     async def _ping(self) -> None:

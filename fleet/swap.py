@@ -16,13 +16,15 @@ class Swapped(NamedTuple):
     """The slot's number in the file, counted from 0, and what runs on the spare now.
 
     `changed` tells whether the slot was the failed robot's until now. `silent` is why that one
-    could not be stopped, None if it was.
+    could not be stopped, None if it was. `callers` are the flying robots that call the spare by
+    their own configuration; it calls all others.
     """
 
     slot: int
     changed: bool
     deployed: Deployed
     silent: str | None
+    callers: tuple[str, ...]
 
 
 async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
@@ -48,7 +50,7 @@ async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
     with tempfile.TemporaryDirectory(prefix="lpac-swap-") as folder:
         release = make_release(config, robot, common, Path(folder))
         deployed = await deploy(config, robot, release, report)
-    return Swapped(index, changed, deployed, silent)
+    return Swapped(index, changed, deployed, silent, _callers(config, robot))
 
 
 def _slot(config: FleetConfig, failed: str, spare: str) -> int:
@@ -60,6 +62,12 @@ def _slot(config: FleetConfig, failed: str, spare: str) -> int:
     if failed not in slots and spare not in slots:
         raise ConfigError(f"{config.path}: {failed} has no slot that {spare} could take")
     return slots[failed if failed in slots else spare]
+
+
+def _callers(config: FleetConfig, robot: RobotHost) -> tuple[str, ...]:
+    """Of two robots the one with the larger id calls the other."""
+    flying = (config.robots[slot.robot] for slot in config.slots if slot.robot is not None)
+    return tuple(other.name for other in flying if other.robot_id > robot.robot_id)
 
 
 async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:

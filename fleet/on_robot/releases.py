@@ -44,6 +44,7 @@ def overview(directory: str) -> Dict[str, Any]:
         "pending": _pending(directory),
         "releases": _releases(directory),
         "versions": versions,
+        "robot_toml": _configuration(directory),
         "service": service.service(),
         "unix_time_s": time.time(),
     }
@@ -116,8 +117,9 @@ def prepare(
         free = shutil.disk_usage(directory).free
         if free < needed:
             raise Refused(
-                "the disk has %d MB free, and the release needs %d MB: remove old logs "
-                "(`lpac fleet pull`, then `lpac fleet exec`)" % (free // 1e6, needed // 1e6)
+                "the disk has %d MB free, and the release needs %d MB: remove old logs, "
+                "but not the newest (`lpac fleet pull`, then `lpac fleet exec`)"
+                % (free // 1e6, needed // 1e6)
             )
     return answer
 
@@ -331,13 +333,16 @@ def _entry(path: str) -> List[str]:
     return [oct(stat.S_IMODE(info.st_mode)), sha256(path)]
 
 
-def sha256(path: str) -> str:
-    """Of a file's content, in hexadecimal."""
+def sha256(path: str, size_bytes: float = float("inf")) -> str:
+    """Of a file's content, or as much of it from its beginning, in hexadecimal."""
     digest = hashlib.sha256()
     with open(path, "rb") as file:
-        for block in iter(lambda: file.read(1 << 20), b""):
+        while True:
+            block = file.read(int(min(size_bytes, 1 << 20)))
+            if not block:
+                return digest.hexdigest()
             digest.update(block)
-    return digest.hexdigest()
+            size_bytes -= len(block)
 
 
 def run_inside(release: str, command: List[str], state: str = "") -> Any:
@@ -383,6 +388,14 @@ def _versions(directory: str, release: Optional[str]) -> Optional[Dict[str, Any]
     except (OSError, ValueError):
         return None
     return versions if isinstance(versions, dict) else None
+
+
+def _configuration(directory: str) -> Optional[str]:
+    """The sha256 of the current release's robot.toml; None if it has none, as a spare's."""
+    try:
+        return sha256(os.path.join(directory, "current", "robot.toml"))
+    except FileNotFoundError:
+        return None
 
 
 def _pending(directory: str) -> Optional[Dict[str, Any]]:

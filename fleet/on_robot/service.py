@@ -63,12 +63,13 @@ def refuse_in_flight(mavlink_port: int, doing: str) -> None:
 def armed(mavlink_port: int) -> bool:
     """Whether the vehicle's motors may turn, by the robot's program or else by the vehicle itself.
 
-    A program that runs but has fallen silent may have an armed vehicle: its last word counts.
+    A program that runs but has fallen silent may have an armed vehicle: its last word counts,
+    unless it had lost the vehicle by then.
     """
     state = service()
     if state["active"] in ("active", "reloading", "deactivating"):
         status = state["status"] or {}
-        if status.get("armed") is not None:
+        if status.get("autopilot") and status.get("armed") is not None:
             return bool(status["armed"])
     heartbeat = hear_heartbeat(mavlink_port)
     return heartbeat is not None and bool(heartbeat["armed"])

@@ -1,8 +1,12 @@
 """`lpac fleet` as a user types it, as far as no robot has to answer; and what tables look like."""
 
 import json
+import os
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -68,9 +72,13 @@ def test_deploy_needs_an_image_before_it_asks_any_robot(nobody: Path) -> None:
     assert line.endswith("no image: no image is there: run `make image`")
 
 
-def test_a_spare_is_not_started(nobody: Path) -> None:
-    line = error_line(lpac("fleet", "start", "--fleet", nobody, "--robots", "r3"))
+@pytest.mark.parametrize("command", ["start", "restart", "rollback"])
+def test_a_spare_is_left_out(nobody: Path, command: str) -> None:
+    line = error_line(lpac("fleet", command, "--fleet", nobody, "--robots", "r3"))
     assert "r3" in line and "spare" in line
+    result = lpac("fleet", command, "--fleet", nobody)
+    assert result.stderr.startswith("left out, since a spare is not ")
+    assert result.stderr.endswith("0 of 2 robots; failed: r1, r2\n")
 
 
 @needs_ssh
@@ -113,6 +121,85 @@ def test_logs_of_a_robot_that_does_not_answer(nobody: Path, follow: list[str]) -
         "r2  nothing listens on its ssh port",
         "lpac: read the journal of 0 of 1 robot; failed: r2",
     ]
+
+
+@needs_ssh
+def test_up_on_a_terminal_has_a_board_though_no_robot_has_come_up(
+    nobody: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal, to rich
+    result = lpac("fleet", "up", "--fleet", nobody, "--timeout", "0")
+    assert result.stdout.count("nothing listens on its ssh port") >= 2
+    assert result.stderr.endswith("lpac: NO-GO: r1, r2\n")
+
+
+@pytest.fixture
+def here(nobody: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A fleet whose robots are this machine's shell, which says GREETING at every login."""
+    ssh = tmp_path / "bin" / "ssh"
+    ssh.parent.mkdir()
+    ssh.write_text('#!/bin/sh\nprintf "$GREETING"\nfor last; do :; done\nexec sh -c "$last"\n')
+    ssh.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{ssh.parent}:{os.environ['PATH']}")
+    return nobody
+
+
+def is_there(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
+
+
+@pytest.mark.parametrize("greeting", ["Welcome!", "1", "[]", "{}", '"progress"'])
+def test_a_login_shell_that_prints_is_named(
+    here: Path, monkeypatch: pytest.MonkeyPatch, greeting: str
+) -> None:
+    monkeypatch.setenv("GREETING", greeting + "\\n")
+    result = lpac("fleet", "status", "--fleet", here, "--robots", "r1")
+    assert error_line(result) == "lpac: reached 0 of 1 robot; failed: r1"
+    assert "its login shell prints" in result.stdout and greeting in result.stdout
+    result = lpac("fleet", "logs", "--fleet", here, "--robots", "r1")
+    assert result.stderr.startswith(f"r1  journalctl printed {greeting!r}")
+
+
+def test_exec_ends_quietly_when_nobody_reads_on(here: Path) -> None:
+    # One talks without end; the others would stay for long.
+    first = f"mkdir '{here.parent / 'first'}' 2> /dev/null && exec seq 1 9999999"
+    command = f"{first}; echo process $$; exec sleep 1000"
+    with subprocess.Popen(
+        [sys.executable, "-m", "cli.main", "fleet", "exec", "--fleet", str(here), command],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as program:  # fmt: skip
+        assert program.stdout is not None and program.stderr is not None
+        silent: list[int] = []
+        while len(silent) < 2:
+            if "process" in (line := program.stdout.readline()):
+                silent.append(int(line.split()[-1]))
+        program.stdout.close()
+        assert program.stderr.read() == ""
+    assert program.returncode == -signal.SIGPIPE
+    assert not any(map(is_there, silent))
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_ctrl_c_ends_all_sessions_in_order(here: Path, times: int) -> None:
+    came = here.parent / "came"
+    os.mkfifo(came)
+    ssh = here.parent / "bin" / "ssh"
+    ssh.write_text(f"#!/bin/sh\necho $$ > '{came}'\nexec sleep 1000\n")
+    with subprocess.Popen(
+        [sys.executable, "-m", "cli.main", "fleet", "stop", "--fleet", str(here)], cwd=ROOT,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as program:  # fmt: skip
+        # Open for writing too: one that comes late finds somebody who reads.
+        with open(os.open(came, os.O_RDWR)) as arrivals:  # noqa: PTH123
+            begun = [int(arrivals.readline()) for _ in range(3)]
+        for _ in range(times):
+            program.send_signal(signal.SIGINT)
+        output, complaints = program.communicate()
+    assert program.returncode == 1
+    assert output.count("interrupted at connect") == 3
+    assert "Traceback" not in complaints and "Exception" not in complaints
+    assert complaints.endswith("lpac: stopped on 0 of 3 robots; failed: r1, r2, r3\n")
+    assert not any(map(is_there, begun))
 
 
 def entry(text: object) -> Entry:
@@ -235,7 +322,23 @@ def test_what_is_not_as_it_should_be_is_noted(
     assert rows[3][2:] == ["01234567", "failed", "+0.0"]
     assert rows[4][2:] == ["none", "none", "+0.0"]
     assert [line.split()[0] for line in notes] == ["r2", "r3", "r4", "r4", "others"]
-    assert "fedcba98 was interrupted" in notes[0]
+    assert "fedcba98 is not confirmed yet" in notes[0]
     assert notes[1].split("*")[1].strip() == "image 11111111, bundle 22222222, world 44444444"
     assert notes[2].endswith("lpac: no such file")
     assert "restarted 5 times" in notes[3]
+
+
+def test_a_configuration_that_was_not_deployed_is_marked(
+    fleet: FleetConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    states: list[State | None] = [
+        State(overview(), n, 0.0, None, is_configured=n > 0) for n in range(2)
+    ]
+    table, notes = printed(fleet, states, capsys)
+    assert [line.split()[2] for line in table[2:]] == ["01234567*", "01234567"]
+    assert [line.split()[0] for line in notes] == ["r1", "all"]
+    assert (
+        "its configuration is not the one of fleet.toml: lpac fleet deploy --robots r1"
+        in (notes[0])
+    )

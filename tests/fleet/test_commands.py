@@ -223,13 +223,14 @@ def test_ctrl_c_ends_with_a_summary_of_who_has_what(operator: Operator) -> None:
                     waiting.remove(name)
             (ssh,) = map(os.pidfd_open, children(deploying.pid))
             deploying.send_signal(signal.SIGINT)
-            output, _ = deploying.communicate()
+            output, complaints = deploying.communicate()
         # What it began it has ended.
         assert select.select([ssh], [], [], 60.0)[0]
         os.close(ssh)
     finally:
         hung.run("pkill -CONT -x sshd")
     assert deploying.returncode == 1
+    assert complaints.splitlines()[-1] == "lpac: deployed on 3 of 4 robots; failed: r2"
     table, notes = output.split("\n\n")
     assert [line.split()[-1] for line in table.splitlines()[1:]] == [
         "unchanged", "failed", "unchanged", "unchanged",

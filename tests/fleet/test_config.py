@@ -115,6 +115,14 @@ def test_relative_paths_are_meant_from_the_files_folder(
     assert config.ssh.config == str(tmp_path / "near")
 
 
+def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    config = load_fleet(fleet_file(tmp_path, example('"../out/image/arm64"', '"~/image"')))
+    assert config.image == Path("/home/me/image")
+    message = refusal(fleet_file(tmp_path, example('"../out/image/arm64"', '"~no-one/image"')))
+    assert "'~no-one/image'" in message
+
+
 @pytest.mark.parametrize(
     ("text", "cpus"), [("4-6", (4, 5, 6)), ("7, 4,5", (4, 5, 7)), ("0,2-3,3", (0, 2, 3)), ("", ())]
 )

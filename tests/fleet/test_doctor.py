@@ -4,7 +4,10 @@ facts that those here cannot have."""
 import asyncio
 import contextlib
 import copy
+import dataclasses
+import hashlib
 import json
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from fleet.config import FleetConfig, RobotHost, load_fleet
+from fleet.config import FleetConfig, RobotHost, SshConfig, load_fleet
 from fleet.deploy import deploy
 from fleet.doctor import (
     Check,
@@ -21,7 +24,9 @@ from fleet.doctor import (
     Examination,
     diagnose,
     examine,
+    is_configured,
     judge,
+    on,
 )
 from fleet.laptop import iptables_blocks, nft_blocks, rsync_version
 from fleet.operations import Outcome, for_each
@@ -220,6 +225,16 @@ def test_up_starts_what_was_switched_off_and_says_go(enrolled: RobotHosts, tmp_p
     assert found["go"]
     assert found["checks"][0]["found"] == "its program was started"
 
+    # What is changed and not deployed is seen.
+    text = enrolled.fleet_toml.read_text()
+    for fleet_toml, as_deployed in ((re.sub("ceiling_m = .*", "ceiling_m = 20", text), False),
+                                    (text, True)):  # fmt: skip
+        enrolled.fleet_toml.write_text(fleet_toml)
+        shown = lpac_fleet(enrolled.fleet_toml, "status", "--robots", host.name, "--json")
+        assert json.loads(shown.stdout)["robots"][host.name]["is_configured"] is as_deployed
+        checks = run_doctor(enrolled, host.name)[host.name]
+        assert (checks["release"].verdict == "ok") is as_deployed
+
     # One that was stopped on purpose stays so.
     host.run("systemctl disable --now lpac-robot")
     assert asyncio.run(bring_up(config, robot, time.monotonic(), unwatched)) == ((), ())
@@ -273,6 +288,7 @@ def well(config: FleetConfig, name: str) -> Examination:
         "identity": {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id},
         "current": "0123456789abcdef", "pending": None,
         "versions": {"image": "i1", "bundle": "b1", "world": "w1"},
+        "robot_toml": hashlib.sha256(config.robot_toml(name).encode()).hexdigest(),
         "service": {
             "active": "active", "result": "success", "fresh": True, "enabled": True,
             "restarts": 0, "status": status,
@@ -349,6 +365,7 @@ def container(**about: object) -> list[dict[str, object]]:
         (put("identity.robot", "r2"), "enrolled", "FAILED", "answers r2 of fleet demo"),
         (put("pending", {"release": "a"}), "release", "FAILED", "interrupted"),
         (put("versions.bundle", "b2"), "release", "FAILED", "that of r2, r3"),
+        (put("robot_toml", "0" * 64), "release", "FAILED", "is not the one of fleet.toml"),
         (put("service.active", "failed"), "program", "FAILED", "it is failed"),
         (put("service.fresh", False), "program", "FAILED", "says nothing"),
         (put("service.restarts", 2), "program", "warning", "restarted 2 times"),
@@ -414,6 +431,29 @@ def test_each_fault_is_named_with_its_fix(
     assert one.verdict == verdict
     assert found in one.found
     assert bool(one.fix) == (verdict in ("FAILED", "warning"))
+
+
+def test_what_was_changed_and_not_deployed_is_no_go(config: FleetConfig) -> None:
+    """A lower ceiling; two robots that were given each other's names. A spare needs none."""
+    text = config.path.read_text()
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    exchanged = re.sub(r"robots\.r([12])", lambda found: f"robots.r{3 - int(found[1])}", text)
+    for changed in (text.replace("ceiling_m = 30.0", "ceiling_m = 29.0"), exchanged):
+        config.path.write_text(changed)
+        now = load_fleet(config.path)
+        checks = {check.name: check for check in judge(now, now.robots["r1"], fleet)}
+        assert checks["release"].verdict == "FAILED"
+        assert checks["release"].fix == "lpac fleet deploy --robots r1"
+    assert is_configured(config, config.robots["r11"], {"robot_toml": None})
+
+
+def test_fixes_are_roots_and_reach_the_robot_as_the_fleet_does(config: FleetConfig) -> None:
+    user = dataclasses.replace(config.robots["r1"], user="voxl", port=2222)
+    assert on(user, "a b", "c") == "lpac fleet exec --robots r1 'sudo a b && sudo c'"
+    ssh = dataclasses.replace(config, ssh=SshConfig("/lab/ssh_config"))
+    silent: list[Outcome[Examination]] = [Outcome(user, None, SILENT)]
+    ((check,),) = (diagnosis.checks for diagnosis in diagnose(ssh, silent))
+    assert check.fix.endswith("try: ssh -F /lab/ssh_config -p 2222 voxl@192.168.8.11")
 
 
 @pytest.mark.parametrize(

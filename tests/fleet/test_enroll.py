@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 
 from fleet.config import load_fleet
+from fleet.enroll import _robot
 from sim.hosts import RobotHost, RobotHosts
+from tests.conftest import ROOT
 from tests.fleet.field import armed, lpac_fleet
 
+EXAMPLE = ROOT / "docs" / "fleet.toml"
 PASSWORD = "voxl-password"
 STEPS = (
     "key", "enroll.toml", "robot id", "vision-hub", "predecessors", "release", "PX4",
@@ -222,4 +225,29 @@ def test_a_robot_is_not_renamed_nor_touched_in_flight_nor_let_in_unseen(
     hub = (new.root / "etc/modalai/voxl-vision-hub.conf").read_text()
     assert "figure_eight" in hub
     done = lpac_fleet(fleet_file, "enroll", "r4", "10.0.0.1")
-    assert f"robots.r4: has host = '{new.address}' and robot_id = 4" in done.stderr
+    assert f"robots.r4: has host = '{new.address}': change it there" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("r1", "--user", "voxl"), "r1: has user = 'root': change it there, or leave 'voxl' out"),
+        (("r1", "--port", "2222"), "robots.r1: has no port: change it there, or leave 2222 out"),
+        (("r12", "fd00::12"), "fd00::12: has no IPv4 address here: give the one that the other"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_anything_is(
+    arguments: tuple[str, ...], why: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text(EXAMPLE.read_text())
+    done = lpac_fleet(path, "enroll", *arguments)
+    assert done.returncode == 1
+    assert why in done.stderr
+    assert path.read_text() == EXAMPLE.read_text()
+
+
+def test_a_host_that_only_ssh_knows_has_its_address_told() -> None:
+    config = load_fleet(EXAMPLE)
+    robot = _robot(config, "r12", "fd00::12", None, None, "192.168.8.22", None)
+    assert (robot.host, robot.address, robot.user) == ("fd00::12", "192.168.8.22", "root")

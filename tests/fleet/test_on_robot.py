@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 
-from fleet.on_robot import releases, service
+from fleet.enroll import _predecessors_step
+from fleet.on_robot import enrolment, probes, releases, service
 from fleet.on_robot.calls import Refused
 from fleet.release import _entry
 
@@ -152,3 +153,50 @@ def test_no_datagram_breaks_the_listener(data: bytes) -> None:
 @needs_root
 def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
     assert service.hear_heartbeat(datagrams[0], wait_s=0.2) is None
+
+
+@pytest.mark.parametrize(
+    ("status", "heard", "armed"),
+    [
+        ({"armed": True, "autopilot": True}, False, True),
+        ({"armed": False, "autopilot": True}, True, False),
+        # The program's last word from before it lost the vehicle.
+        ({"armed": True, "autopilot": False}, False, False),
+        ({"armed": True, "autopilot": False}, None, False),
+        ({"armed": False, "autopilot": False}, True, True),
+        ({"armed": None, "autopilot": False}, True, True),
+        (None, True, True),
+    ],
+)
+def test_the_programs_word_counts_while_it_has_the_vehicle(
+    status: dict[str, bool | None] | None,
+    heard: bool | None,
+    armed: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    heartbeat = None if heard is None else {"armed": heard}
+    monkeypatch.setattr(service, "service", lambda: {"active": "active", "status": status})
+    monkeypatch.setattr(service, "hear_heartbeat", lambda _: heartbeat)
+    assert service.armed(14551) is armed
+
+
+def test_a_container_engine_that_is_silent_keeps_nobody_from_being_enrolled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    idle = {"there": False, "active": False, "enabled": False}
+    monkeypatch.setattr(probes, "known_containers", lambda: None)
+    monkeypatch.setattr(enrolment, "_unit", lambda _: idle)
+    step = _predecessors_step(enrolment.retire(["old_stack"], 14551))
+    assert step.outcome == "left to do"
+    assert "docker does not answer" in step.notes[0]
+
+
+@given(data=st.binary(max_size=50), size_bytes=st.integers(0, 60))
+def test_the_checksum_of_a_beginning(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, size_bytes: int
+) -> None:
+    path = tmp_path_factory.mktemp("file") / "log"
+    path.write_bytes(data)
+    wanted = hashlib.sha256(data[:size_bytes]).hexdigest()
+    assert releases.sha256(str(path), size_bytes) == wanted
+    assert releases.sha256(str(path)) == hashlib.sha256(data).hexdigest()

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import os
+import shutil
 import subprocess
 import time
 from collections.abc import Coroutine
@@ -181,6 +182,41 @@ def test_a_log_that_grows_comes_as_far_as_it_is(flown: RobotHosts, tmp_path: Pat
     finally:
         host.run("systemctl stop lpac-robot")
         log.unlink()
+
+
+def test_another_file_of_the_same_name_takes_nobodys_place(
+    flown: RobotHosts, tmp_path: Path
+) -> None:
+    """Once its logs are removed, or its board is flashed anew, a robot numbers from 1 again."""
+    host = flown[0]
+    logs, aside = host.root / LOGS, host.root / "var/tmp/aside"
+    write_ulog(host, "sess003", FIRST_S + 112.0, b"of B")
+    fetch(flown, None, tmp_path)
+    folder = tmp_path / "all" / "r1"
+    first = {name: (folder / name).read_bytes() for name in names(folder) if "journal" not in name}
+    logs.rename(aside)
+    try:
+        logs.mkdir()
+        write_logs(logs, 1, [("D", FIRST_S + 300.0)])
+        write_ulog(host, "sess003", FIRST_S + 312.0, b"of B, continued")
+        write_ulog(host, "sess002", FIRST_S + 311.0, b"of D")
+        done = fetch(flown, None, tmp_path)
+        assert done.summary == "whole; files of the same names that were here are in earlier-1"
+        kept = {"logs/robot-1-0001.mcap", "px4/sess002/log100.ulg"}
+        assert names(folder / "earlier-1") == kept
+        for name in kept:
+            assert (folder / "earlier-1" / name).read_bytes() == first[name]
+            assert (folder / name).read_bytes() != first[name]
+        assert (folder / "px4/sess003/log100.ulg").read_bytes() == b"of B, continued"
+        subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
+        # Nothing is kept twice.
+        assert "earlier" not in fetch(flown, None, tmp_path).summary
+    finally:
+        host.run("rm -r /data/px4/log/sess002 /data/px4/log/sess003")
+        shutil.rmtree(logs)
+        aside.rename(logs)
+        write_ulog(host, "sess002", FIRST_S + 12.0, b"of A")
+        write_ulog(host, "sess003", FIRST_S + 112.0, b"of B")
 
 
 def test_a_robot_in_flight_is_left_alone(flown: RobotHosts, tmp_path: Path) -> None:

@@ -1,11 +1,14 @@
 """`lpac fleet swap` between real robot computers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from fleet.config import assign, load_fleet
+from fleet.swap import _callers
 from sim.hosts import RobotHost, RobotHosts
+from tests.conftest import ROOT
 from tests.fleet.field import SILENT, armed, await_said, lpac_fleet
 
 
@@ -47,6 +50,12 @@ def test_nothing_is_touched_where_there_is_nothing_to_swap(
         hosts[3].heal()
     assert runs(hosts[2]) == ("active", "enabled")
     assert fleet_file.read_text() == hosts.fleet_toml.read_text()
+
+
+def test_robots_with_larger_ids_may_not_know_a_spare() -> None:
+    config = load_fleet(ROOT / "docs" / "fleet.toml")
+    assert _callers(config, config.robots["r11"]) == ()
+    assert _callers(config, replace(config.robots["r11"], robot_id=0)) == ("r1", "r2", "r3")
 
 
 def test_a_spare_flies_instead_of_a_robot_that_answers(hosts: RobotHosts, fleet_file: Path) -> None:

@@ -1,0 +1,60 @@
+"""What the laptop makes of ssh's last words, and how it leaves robots when it is interrupted."""
+
+import asyncio
+
+import pytest
+
+from fleet.config import RobotHost, load_fleet
+from fleet.operations import for_each
+from fleet.session import explain
+from tests.conftest import ROOT
+
+
+@pytest.mark.parametrize(
+    ("words", "meaning"),
+    [
+        ("Host key verification failed.", "its host key is not known here"),
+        (
+            "No ED25519 host key is known for r1 and you have requested strict checking.\n"
+            "Host key verification failed.",
+            "its host key is not known here",
+        ),
+        (
+            "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.",
+            "only in that case run `ssh-keygen -R r1.field`",
+        ),
+        ("env: 'python3': No such file or directory", "python3 is missing"),
+        ("env: \u2018python3\u2019: No such file or directory", "python3 is missing"),
+        ("sh: 1: python3: not found", "python3 is missing"),
+        ("bash: line 1: rsync: command not found", "rsync is missing"),
+        ("this and\n that\n", "that"),
+        ("", "it does not answer any more"),
+    ],
+)
+def test_last_words_mean_something(words: str, meaning: str) -> None:
+    assert meaning in explain(words, "r1.field")
+
+
+def test_every_robot_is_left_in_order_however_long_that_takes() -> None:
+    robots = list(load_fleet(ROOT / "docs" / "fleet.toml").robots.values())
+    begun, left = [], []
+
+    async def task(robot: RobotHost) -> None:
+        begun.append(robot.name)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            for _ in range(100 * begun.index(robot.name)):
+                await asyncio.sleep(0)
+            left.append(robot.name)
+
+    async def interrupted() -> None:
+        running = asyncio.create_task(for_each(robots, task))
+        while len(begun) < len(robots):
+            await asyncio.sleep(0)
+        running.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await running
+        assert sorted(left) == sorted(begun)
+
+    asyncio.run(interrupted())
