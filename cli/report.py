@@ -1,5 +1,6 @@
 """`lpac record` and `lpac report`: what happened, kept and shown."""
 
+import contextlib
 import json
 import sys
 from datetime import datetime
@@ -24,9 +25,14 @@ def record(
     name = load_fleet(fleet).fleet
     directory = (fleet.parent / "logs") if out is None else out
     if sys.stdout.isatty():
-        record_to(name, directory, typer.echo, typer.echo)
+        record_to(name, directory, _say, _say)
     else:
-        record_to(name, directory, typer.echo)
+        record_to(name, directory, _say)
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError):  # Nobody reads it: no reason to record no more.
+        typer.echo(text)
 
 
 def report(

@@ -15,6 +15,7 @@ They are flight logs (see `edge.adapters.flight_log`) with these topics, in this
 import asyncio
 import contextlib
 import dataclasses
+import os
 import signal
 import time
 from collections import Counter, deque
@@ -30,7 +31,7 @@ from edge.adapters.flight_log import FlightLog, topic
 from edge.core import F64
 from edge.core.mission import FlightState, GroundState, RobotStatus
 from ground.client import GroundError, listen
-from ground.coverage import Coverage, Whereabouts
+from ground.coverage import Coverage, Whereabouts, in_air
 from ground.protocol import Event, Explored, Picture, Setup, Told
 from ground.under_way import UnderWay
 
@@ -38,6 +39,7 @@ COST_PERIOD_S = 0.5
 _SETUP_PERIOD_S = 60.0
 _SHOW_PERIOD_S = 5.0
 _RETRY_S = 0.5
+_LOOK_AGAIN_S = 0.5
 _MAX_TOTAL_BYTES = 2**34
 
 
@@ -82,7 +84,10 @@ class GroundMetadata:
 
 
 class Recording:
-    """Sorts what the ground tells into topics, each thing once. `cost` is the newest."""
+    """Sorts what the ground tells into topics, each thing once.
+
+    `cost` is the newest. `flying` is whether a robot was in the air in the last picture.
+    """
 
     def __init__(self, record: Callable[[str, float, Mapping[str, object]], None]) -> None:
         """`record` gets topic, Unix time in s, and message."""
@@ -105,6 +110,7 @@ class Recording:
         # J at the begin of each trial's last mission.
         self._initial: dict[str, float] = {}
         self.cost: Cost | None = None
+        self.flying = False
 
     def take(self, told: Told, unix_now_s: float) -> None:
         """Record what is new in it."""
@@ -135,6 +141,7 @@ class Recording:
 
     def _take_picture(self, picture: Picture) -> None:
         now_s = picture.unix_time_s
+        self.flying = any(r.fresh and r.status and in_air(r.status) for r in picture.robots)
         if self._setup is not None and abs(now_s - self._setup_at_s) >= _SETUP_PERIOD_S:
             self._take_setup(self._setup, now_s)
         state = picture.ground and dataclasses.replace(picture.ground, unix_time_s=None)
@@ -202,24 +209,43 @@ def record(
 ) -> None:
     """Record what the ground process of `fleet` tells, until SIGINT or SIGTERM.
 
-    It waits for the ground process, also for the next when one ends. `say` gets what a person is to
-    know; `show` where things stand, every few seconds. Raises OSError if nothing (more) can be
-    written.
+    It waits for the ground process, also for the next when one ends. When its terminal is closed
+    (SIGHUP) it ends as `lpac ground` does: once nobody that is heard is in the air. `say` gets what
+    a person is to know; `show` where things stand, every few seconds. Raises OSError if nothing
+    (more) can be written.
     """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"{directory}: cannot be made: {error.strerror}") from None
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise OSError(f"{directory}: nothing can be written there")
     metadata = GroundMetadata(fleet, version("lpac-edge"))
     log = FlightLog(directory, metadata, TOPICS, max_total_bytes=_MAX_TOTAL_BYTES)
     recording = Recording(log.record)
     with contextlib.closing(recording), contextlib.closing(log):
         _require(log, directory)
         say(f"recording to {directory}; Ctrl-C ends it")
-        asyncio.run(_until_stopped(_follow(fleet, log, directory, recording, say, show)))
+        following = _follow(fleet, log, directory, recording, say, show)
+        asyncio.run(_until_stopped(following, recording))
     say(f"recorded to {directory}")
 
 
-async def _until_stopped(following: Coroutine[None, None, None]) -> None:
+async def _until_stopped(following: Coroutine[None, None, None], recording: Recording) -> None:
+    loop = asyncio.get_running_loop()
     task = asyncio.create_task(following)
+
+    def hang_up() -> None:
+        if recording.flying:
+            loop.call_later(_LOOK_AGAIN_S, hang_up)
+        else:
+            task.cancel()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+        loop.add_signal_handler(number, task.cancel)
+    # With nohup it goes on whatever becomes of the terminal.
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        loop.add_signal_handler(signal.SIGHUP, hang_up)
     with contextlib.suppress(asyncio.CancelledError):
         await task
 
@@ -257,6 +283,7 @@ async def _follow(
             if hears is not False:
                 hears = False
                 say(f"{error}; waiting for it")
+            recording.flying = False  # as far as is known
             log.flush()
             await asyncio.sleep(_RETRY_S)
 

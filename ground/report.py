@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from edge.core.mission import world_id as id_of
-from edge.runtime.bundle import BundleError, load_bundle
+from edge.runtime.bundle import Bundle, BundleError, load_bundle
 from ground import report_figures as figures
 from ground.coverage import Coverage
 from ground.report_logs import Logs, Progress, configured_fence, read_logs
@@ -20,6 +20,7 @@ from ground.report_trials import LOOPS, Mission, Trial, find_missions, trial_of
 PAGE = "report.html"
 SUMMARY = "report.json"
 _SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a trial's duration
+_MOST_NOTES = 3  # in one line
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ def examine(folders: Sequence[Path], wanted: Wanted, progress: Progress) -> Exam
         progress(f"examining {mission.name}", index / len(chosen))
         trial = trial_of(
             logs, mission, [other for other in missions if other is not mission],
-            worlds.of(logs, mission), worlds.sensor_size, fences.get(mission.robots[0]),
+            *worlds.of(mission), fences.get(mission.robots[0]),
         )  # fmt: skip
         notes += _notes(logs, trial, wanted)
         trials.append(trial)
@@ -105,7 +106,7 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
         progress(f"drawing {trial.name}", index / len(examined.trials))
         drawn.append(Drawn(trial, _draw(trial, out / _slug(trial.name, slugs), times_s)))
     repeatability = None
-    with_cost = [trial for trial in examined.trials if len(trial.cost)]
+    with_cost = [trial for trial in examined.trials if len(trial.normalized)]
     if len(with_cost) > 1:
         progress("drawing all trials", 1.0)
         pictures = figures.Pictures(out)
@@ -124,7 +125,10 @@ def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission
     """Raises ValueError that says what there is."""
     if not missions:
         robots = len(logs.statuses)
-        raise ValueError(f"no mission was flown in these logs, of {robots} robots")
+        left_out = "".join(f"; {note}" for note in logs.notes[:_MOST_NOTES])
+        more = len(logs.notes) - _MOST_NOTES
+        left_out += f"; and {more} more such notes" if more > 0 else ""
+        raise ValueError(f"no mission was flown in these logs, of {robots} robots{left_out}")
     if not wanted.trials:
         return missions
     names = [mission.name for mission in missions]
@@ -137,14 +141,14 @@ def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission
 class _Worlds:
     """The worlds that can be found, by what they are called."""
 
-    sensor_size: int
-
     def __init__(
         self, logs: Logs, folders: Iterable[Path], wanted: Wanted, notes: list[str]
     ) -> None:
+        self._logs = logs
+        self._bundle = wanted.bundle
         self._notes = notes
         self._given = None if wanted.world is None else wanted.world.read_text("utf-8-sig")
-        self._texts = {setup.world_id: setup.world for setup in logs.setups if setup.world}
+        self._texts = {setup.world_id: setup.world for _, setup in logs.setups if setup.world}
         paths = [path for folder in folders for path in sorted(folder.rglob("*.env"))]
         paths += [Path(_policy(m.configuration).get("world", "")) for m in logs.metadata]
         for path in dict.fromkeys(paths):
@@ -152,20 +156,24 @@ class _Worlds:
             with contextlib.suppress(OSError, UnicodeDecodeError):
                 text = path.read_text("utf-8-sig")
                 self._texts.setdefault(id_of(text), text)
-        self._sizes = _sizes(logs, wanted.bundle, notes)
-        self.sensor_size = self._sizes.sensor_size
-        self._coverages: dict[str, Coverage] = {}
+        self._coverages: dict[tuple[str, _Sizes], Coverage] = {}
 
-    def of(self, logs: Logs, mission: Mission) -> Coverage | None:
-        """The world that the mission's robots flew over; None, with a note, if it is not known."""
-        flown = sorted(
-            {
-                said.world_id
-                for robot in mission.robots
-                for said in logs.statuses[robot]
-                if mission.begin_s <= said.time_s <= mission.end_s
-            }
-        )
+    def of(self, mission: Mission) -> tuple[Coverage | None, int]:
+        """The world that the mission's robots flew over; None, with a note, if it is not known.
+
+        And how many cells of it a robot's sensor saw. Raises BundleError for a given bundle that
+        cannot be loaded, or has no perception.
+        """
+        said = [
+            said
+            for robot in mission.robots
+            for said in self._logs.statuses[robot]
+            if mission.begin_s <= said.time_s <= mission.end_s
+        ]
+        sizes = self._sizes(mission, {s.bundle_id for s in said})
+        return self._coverage(mission, sorted({s.world_id for s in said}), sizes), sizes.sensor_size
+
+    def _coverage(self, mission: Mission, flown: list[str], sizes: _Sizes) -> Coverage | None:
         if len(flown) > 1:
             self._notes.append(
                 f"{mission.name}: the robots flew over several worlds: {', '.join(flown)}"
@@ -184,48 +192,51 @@ class _Worlds:
             )
             return None
         name = id_of(text)
-        if name not in self._coverages:
-            sizes = self._sizes
-            self._coverages[name] = Coverage(
+        if (name, sizes) not in self._coverages:
+            self._coverages[name, sizes] = Coverage(
                 _World(text, name, sizes.world_size, sizes.env_scale, sizes.truncation, sizes.norm)
             )
-        return self._coverages[name]
+        return self._coverages[name, sizes]
 
-
-def _sizes(logs: Logs, bundle: Path | None, notes: list[str]) -> _Sizes:
-    """From the ground's log, else from the policy's bundle.
-
-    Raises BundleError for a given bundle that cannot be loaded, or has no perception.
-    """
-    if logs.setups and bundle is None:
-        setup = logs.setups[-1]
-        return _Sizes(
-            setup.world_size, setup.sensor_size, setup.env_scale, setup.truncation, setup.norm
-        )
-    env_scale = 16.0
-    for metadata in logs.metadata:
-        env_scale = float(_policy(metadata.configuration).get("env_scale", env_scale))
-    places = [bundle] if bundle else [Path(metadata.bundle_path) for metadata in logs.metadata]
-    for place in dict.fromkeys(places):
-        try:
-            manifest = load_bundle(place).manifest
-        except (BundleError, OSError):
-            if bundle:
-                raise
-            continue
-        if manifest.perception is not None:
+    def _sizes(self, mission: Mission, bundle_ids: set[str]) -> _Sizes:
+        """From the ground's log of the policies that were flown, else from a policy's bundle."""
+        setups = [told for told in self._logs.setups if told[1].bundle_id in bundle_ids]
+        if setups and self._bundle is None:
+            before = [setup for at_s, setup in setups if at_s <= mission.end_s]
+            setup = before[-1] if before else setups[0][1]
             return _Sizes(
-                manifest.perception.world_size, manifest.perception.sensor_size, env_scale,
-                manifest.training.idf_truncation, manifest.training.idf_norm,
-            )  # fmt: skip
-    if bundle:
-        raise BundleError(f"{bundle}: the bundle has no perception")
-    sizes = _Sizes(512, 64, env_scale, 2.0, 1.0)
-    notes.append(
-        "the policy's bundle is not here (give it with --bundle): taken for granted are a world of "
-        f"{sizes.world_size} cells and a sensor of {sizes.sensor_size}"
-    )
-    return sizes
+                setup.world_size, setup.sensor_size, setup.env_scale, setup.truncation, setup.norm
+            )
+        env_scale = 16.0
+        places = []
+        for metadata in self._logs.metadata:
+            if metadata.bundle_id in bundle_ids:
+                env_scale = float(_policy(metadata.configuration).get("env_scale", env_scale))
+                places.append(Path(metadata.bundle_path))
+        if self._bundle is not None:
+            return _sizes_of(self._bundle, load_bundle(self._bundle), env_scale)
+        for place in dict.fromkeys(places):
+            with contextlib.suppress(BundleError, OSError):
+                bundle = load_bundle(place)
+                if bundle.id in bundle_ids:  # There may be another one by now.
+                    return _sizes_of(place, bundle, env_scale)
+        sizes = _Sizes(512, 64, env_scale, 2.0, 1.0)
+        self._notes.append(
+            f"{mission.name}: the policy's bundle is not here (give it with --bundle): taken for "
+            f"granted are a world of {sizes.world_size} cells and a sensor of {sizes.sensor_size}"
+        )
+        return sizes
+
+
+def _sizes_of(place: Path, bundle: Bundle, env_scale: float) -> _Sizes:
+    """Raises BundleError if the bundle has no perception."""
+    perception, training = bundle.manifest.perception, bundle.manifest.training
+    if perception is None:
+        raise BundleError(f"{place}: the bundle has no perception")
+    return _Sizes(
+        perception.world_size, perception.sensor_size, env_scale, training.idf_truncation,
+        training.idf_norm,
+    )  # fmt: skip
 
 
 def _policy(configuration: str) -> dict[str, Any]:
@@ -240,6 +251,8 @@ def _notes(logs: Logs, trial: Trial, wanted: Wanted) -> Iterable[str]:
     late_s = [f"{time_s:g}" for time_s in wanted.times_s if time_s > trial.duration_s]
     if late_s:
         yield f"{trial.name}: lasted {trial.duration_s:.1f} s: no snapshot at {', '.join(late_s)} s"
+    if len(trial.cost) and not len(trial.normalized):
+        yield f"{trial.name}: the world holds no importance: no normalised cost"
     silent = [
         track.name
         for track in trial.tracks
@@ -280,7 +293,7 @@ def _draw(trial: Trial, folder: Path, times_s: Sequence[float]) -> dict[str, byt
     shown_s = shown_s or [share * trial.duration_s for share in _SNAPSHOTS]
     pictures.save("snapshots", figures.snapshots(trial, shown_s))
     pictures.save("start-and-end", figures.start_and_end(trial))
-    if len(trial.cost):
+    if len(trial.normalized):
         pictures.save("cost", figures.costs([trial]))
     pictures.save("states", figures.states(trial))
     if trial.messages is not None and len(trial.messages.heard_at_s):
@@ -305,7 +318,7 @@ def _values(trial: Trial) -> dict[str, Any]:
             "normalized": _first(trial.normalized, -1),
             "bound": _number(trial.bound),
             "normalized_bound": _number(trial.normalized_bound),
-            "time_s": trial.cost_time_s.round(3).tolist(),
+            "time_s": trial.cost_time_s[: len(trial.normalized)].round(3).tolist(),
             "curve": trial.normalized.round(6).tolist(),
         },
         "separation": None if trial.separation is None else trial.separation._asdict(),

@@ -195,7 +195,7 @@ def repeatability(trials: Sequence[Trial]) -> Figure:
             columnspacing=1.0, borderaxespad=0.2,
         )  # fmt: skip
         _draw_cost_axes(left, max(trial.duration_s for trial in trials))
-        if len({trial.world_ids for trial in trials}) == 1:
+        if all(trial.coverage is trials[0].coverage for trial in trials):
             _draw_world(right, trials[0])
         for trial, colour in zip(trials, _trial_colours(len(trials)), strict=True):
             places_m = np.array(list(trial.places_at(trial.duration_s).values())).reshape(-1, 2)

@@ -9,9 +9,10 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -19,19 +20,25 @@ from edge.adapters.flight_log import FlightLogError, FlightMetadata, read, read_
 from edge.core import F64
 from edge.core.mission import FlightState, LoopStatus
 from edge.core.safety import Fence
-from edge.core.schema import ConfigError, from_mapping
+from edge.core.schema import from_mapping
 from ground.protocol import Event, Setup
 
 # Of the times from saying to hearing, the share that may be shorter than the one that is believed.
 _EARLY = 0.1
+_LATENESS = ("lateness_p50_ms", "lateness_p99_ms", "lateness_max_ms")
 
 Progress = Callable[[str, float], None]
 Program = tuple[int, int]  # robot id, boot nonce
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What the report needs of a status; `time_s` is Unix time of the common clock."""
+    """What the report needs of a status; `time_s` is Unix time of the common clock.
+
+    Loops whose lateness it did not know are left out; the landing point is NaN if it was.
+    """
 
     time_s: float
     boot_nonce: int
@@ -44,6 +51,7 @@ class Said:
     fence: Fence | None
     battery: float | None
     landing_point_m: tuple[float, float]
+    bundle_id: str
     world_id: str
 
 
@@ -79,7 +87,8 @@ class Logs:
     """All that was found. `names` are the robots' by id, `statuses` and `received` by robot id.
 
     `clocks_known` are the programs that a ground heard; of the others' clocks nothing is known.
-    `programs_logged` are those whose own logs were found. `notes` are for the reader.
+    `programs_logged` are those whose own logs were found. `setups` are in the order of the times,
+    Unix s, at which they were told. `notes` are for the reader.
     """
 
     names: dict[int, str] = field(default_factory=dict)
@@ -88,7 +97,7 @@ class Logs:
     clocks_known: set[Program] = field(default_factory=set)
     programs_logged: set[Program] = field(default_factory=set)
     metadata: list[FlightMetadata] = field(default_factory=list)
-    setups: list[Setup] = field(default_factory=list)
+    setups: list[tuple[float, Setup]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
     orders: list[Ordered] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -107,7 +116,8 @@ def read_logs(folders: Sequence[Path], progress: Progress) -> Logs:
     for folder in folders:
         if not folder.is_dir():
             raise ValueError(f"{folder}: is not a folder")
-        paths += sorted(folder.rglob("robot-*.mcap")) + sorted(folder.rglob("ground-*.mcap"))
+        for name in ("robot-*.mcap", "ground-*.mcap"):
+            paths += sorted(path for path in folder.rglob(name) if path.is_file())
     if not paths:
         where = ", ".join(map(str, folders))
         raise ValueError(
@@ -117,10 +127,7 @@ def read_logs(folders: Sequence[Path], progress: Progress) -> Logs:
     paths = list(dict.fromkeys(path.resolve() for path in paths))
     for index, path in enumerate(paths):
         progress(f"reading {path.name}", index / len(paths))
-        if path.name.startswith("ground-"):
-            reader.read_ground(path)
-        else:
-            reader.read_robot(path)
+        reader.read(path)
     return reader.logs()
 
 
@@ -136,92 +143,126 @@ class _Reader:
         self._fences: dict[str, Fence] = {}
         # program -> when the ground heard it, less its uptime
         self._heard: dict[Program, list[float]] = defaultdict(list)
-        # program -> (robot's clock, message)
-        self._received: dict[Program, list[tuple[float, dict[str, Any]]]] = defaultdict(list)
-        self._orders: list[tuple[Program, float, dict[str, Any]]] = []
+        # program -> as the columns of `Received`, in the robot's clock
+        self._received: dict[Program, list[tuple[float, int, int, float, bool]]] = defaultdict(list)
+        self._orders: list[tuple[Program, Ordered]] = []  # in the robot's clock
         self._events: set[Event] = set()
 
-    def read_robot(self, path: Path) -> None:
+    def read(self, path: Path) -> None:
+        """Take what is understood of a file; a note tells of the rest."""
+        notes = self._logs.notes
+        # topic -> why each message was not understood
+        odd: dict[str, list[str]] = defaultdict(list)
+        begun = False
         try:
-            metadata = read_metadata(path)
+            if path.name.startswith("ground-"):
+                take, topics = self._take_from_ground, ("setup", "status", "event")
+            else:
+                take = partial(self._take_from_robot, self._begin_robot(path))
+                topics = ("status", "received", "order")
+            for topic, time_s, message in read(path, *topics):
+                begun = True
+                try:
+                    take(topic, time_s, message)
+                except KeyError as error:
+                    odd[topic].append(f"{error} is missing")
+                except (AttributeError, OverflowError, TypeError, ValueError) as error:
+                    odd[topic].append(str(error))
+            if not begun:
+                notes.append(f"{path}: holds nothing, or broke off at its begin")
         except FlightLogError as error:
-            self._logs.notes.append(f"{error}: left out")
-            return
-        logs = self._logs
+            notes.append(f"{error}: left out")
+        except ValueError as error:  # a message that is not even JSON
+            notes.append(f"{path}: {error}: left out from there")
+        notes += [
+            f"{path}: {why[0]}: left out: {len(why)} of topic {topic}" for topic, why in odd.items()
+        ]
+
+    def _begin_robot(self, path: Path) -> Program:
+        metadata = read_metadata(path)
         program = (metadata.robot_id, metadata.boot_nonce)
-        logs.metadata.append(metadata)
-        logs.programs_logged.add(program)
+        self._logs.metadata.append(metadata)
+        self._logs.programs_logged.add(program)
         if path.parent.name == "logs" and not path.parts[-3].isdigit():
             # As `lpac fleet pull` calls the robots' folders.
-            logs.names.setdefault(metadata.robot_id, path.parts[-3])
-        for topic, time_s, message in read(path, "status", "received", "order"):
-            if topic == "status":
-                self._take_status(path, program, message)
-            elif topic == "received":
-                self._received[program].append((time_s, message))
-            else:
-                self._orders.append((program, time_s, message))
+            self._logs.names.setdefault(metadata.robot_id, path.parts[-3])
+        return program
 
-    def read_ground(self, path: Path) -> None:
-        try:
-            begun = self._read_ground(path)
-        except FlightLogError as error:
-            self._logs.notes.append(f"{error}: left out")
+    def _take_from_robot(
+        self, program: Program, topic: str, time_s: float, message: Mapping[str, Any]
+    ) -> None:
+        if topic == "status":
+            self._take_status(program, message)
+        elif topic == "received":
+            age_s, sequence = message["age_s"], message["sequence"]
+            self._received[program].append(
+                (
+                    time_s,
+                    int(message["sender"]),
+                    -1 if sequence is None else int(sequence),
+                    math.nan if age_s is None else float(age_s),
+                    message["rejection"] is None,
+                )
+            )
+        else:
+            answer = message["answer"]
+            order = Ordered(
+                time_s, program[0], message["kind"], message["operator"], message["trial"],
+                answer["accepted"], answer["reason"],
+            )  # fmt: skip
+            self._orders.append((program, order))
+
+    def _take_from_ground(self, topic: str, time_s: float, message: Mapping[str, Any]) -> None:
+        if topic == "setup":
+            self._logs.setups.append((time_s, _known(Setup, message, "setup")))
+        elif topic == "event":
+            self._events.add(_known(Event, message, "event"))
+        else:
+            program = (message["robot_id"], message["boot_nonce"])
+            name = message["name"]
+            heard_s = _time_s(message, "heard_at_unix_s") - _time_s(message, "uptime_s")
+            self._take_status(program, message)
+            self._logs.names[program[0]] = name
+            self._heard[program].append(heard_s)
+
+    def _take_status(self, program: Program, status: Mapping[str, Any]) -> None:
+        sequence = status["sequence"]
+        if program in self._statuses and sequence in self._statuses[program]:
             return
-        if not begun:
-            self._logs.notes.append(f"{path}: holds nothing")
+        own_start_s = _time_s(status, "unix_time_s") - _time_s(status, "uptime_s")
+        self._statuses[program][sequence] = self._said(status)
+        self._own_starts_s[program].append(own_start_s)
 
-    def _read_ground(self, path: Path) -> bool:
-        begun = False
-        for topic, _, message in read(path, "setup", "status", "event"):
-            begun = True
-            if topic == "status":
-                program = (message["robot_id"], message["boot_nonce"])
-                self._logs.names[message["robot_id"]] = message["name"]
-                self._heard[program].append(message["heard_at_unix_s"] - message["uptime_s"])
-                self._take_status(path, program, message)
-                continue
-            try:
-                if topic == "setup":
-                    self._logs.setups.append(from_mapping(Setup, message, str(path)))
-                else:
-                    self._events.add(from_mapping(Event, message, str(path)))
-            except ConfigError as error:
-                self._logs.notes.append(f"{error}: left out")
-        return begun
-
-    def _take_status(self, path: Path, program: Program, status: Mapping[str, Any]) -> None:
-        statuses = self._statuses[program]
-        if status["sequence"] not in statuses:
-            statuses[status["sequence"]] = self._said(path, status)
-            self._own_starts_s[program].append(status["unix_time_s"] - status["uptime_s"])
-
-    def _said(self, path: Path, status: Mapping[str, Any]) -> Said:
-        position = status["position_m"]
-        known = position is not None and all(math.isfinite(float(value)) for value in position)
+    def _said(self, status: Mapping[str, Any]) -> Said:
+        position_m = status["position_m"]
+        if position_m is not None:
+            x_m, y_m, z_m = map(float, position_m)
+            position_m = (x_m, y_m, z_m) if math.isfinite(x_m + y_m + z_m) else None
         fence = status.get("fence")
         if fence is not None:
             # They are all the same, and there are very many.
             text = json.dumps(fence)
             if text not in self._fences:
-                self._fences[text] = from_mapping(Fence, fence, f"{path}: fence")
+                self._fences[text] = _known(Fence, fence, "fence")
             fence = self._fences[text]
-        x_m, y_m = status["landing_point_m"]
+        landing_x_m, landing_y_m = map(float, status["landing_point_m"])
         return Said(
-            time_s=status["uptime_s"],
+            time_s=_time_s(status, "uptime_s"),
             boot_nonce=status["boot_nonce"],
             state=FlightState(status["state"]),
             trial=status["trial"],
             armed=status["armed"],
-            position_m=tuple(position) if known else None,
+            position_m=position_m,
             alarms=tuple(status["alarms"]),
             loops={
-                name: from_mapping(LoopStatus, loop, f"{path}: {name}")
+                name: _known(LoopStatus, loop, name)
                 for name, loop in status["loops"].items()
+                if None not in [_finite(loop[key]) for key in _LATENESS]
             },
             fence=fence,
-            battery=status["battery"],
-            landing_point_m=(x_m, y_m),
+            battery=_finite(status["battery"]),
+            landing_point_m=(landing_x_m, landing_y_m),
+            bundle_id=status["bundle_id"],
             world_id=status["world_id"],
         )
 
@@ -243,14 +284,12 @@ class _Reader:
             robot_statuses.sort(key=lambda said: said.time_s)
         self._sort_received(starts_s, ahead_s)
         logs.orders = sorted(
-            Ordered(
-                at_s - ahead_s.get(program, 0.0), program[0], message["kind"], message["operator"],
-                message["trial"], message["answer"]["accepted"], message["answer"]["reason"],
-            )
-            for program, at_s, message in self._orders
-        )  # fmt: skip
+            order._replace(time_s=order.time_s - ahead_s.get(program, 0.0))
+            for program, order in self._orders
+        )
         logs.events = sorted(self._events, key=lambda event: event.unix_time_s)
-        for setup in logs.setups:
+        logs.setups.sort(key=lambda told: told[0])
+        for _, setup in logs.setups:
             logs.names.update({robot_id: name for name, robot_id in setup.robots.items()})
         return logs
 
@@ -264,15 +303,11 @@ class _Reader:
         columns: dict[int, list[tuple[float, ...]]] = defaultdict(list)
         for program, messages in self._received.items():
             own_s = ahead_s.get(program, 0.0)
-            for at_s, message in messages:
-                time_s, age_s, sender = at_s - own_s, math.nan, message["sender"]
-                if message["age_s"] is not None:
-                    senders = [a for start_s, a in began[sender] if start_s <= time_s]
-                    age_s = float(message["age_s"]) - own_s + (senders[-1] if senders else 0.0)
-                sequence = -1 if message["sequence"] is None else message["sequence"]
-                columns[program[0]].append(
-                    (time_s, sender, sequence, age_s, message["rejection"] is None)
-                )
+            for at_s, sender, sequence, own_age_s, accepted in messages:
+                time_s = at_s - own_s
+                senders = [a for start_s, a in began[sender] if start_s <= time_s]
+                age_s = own_age_s - own_s + (senders[-1] if senders else 0.0)
+                columns[program[0]].append((time_s, sender, sequence, age_s, accepted))
         for robot_id, rows in columns.items():
             ordered = np.array(sorted(rows), np.float64).T
             self._logs.received[robot_id] = Received(*ordered)
@@ -284,3 +319,22 @@ def configured_fence(metadata: FlightMetadata) -> Fence | None:
         return from_mapping(Fence, json.loads(metadata.configuration)["fence"], "fence")
     except (ValueError, KeyError, TypeError):
         return None
+
+
+def _known(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+    """As `from_mapping`, but of another version's keys, which this one does not know, all go."""
+    names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
+    known = {key: value for key, value in mapping.items() if key in names}
+    return from_mapping(cls, known, where)
+
+
+def _finite(value: Any) -> float | None:
+    number = math.nan if value is None else float(value)
+    return number if math.isfinite(number) else None
+
+
+def _time_s(message: Mapping[str, Any], key: str) -> float:
+    value = _finite(message[key])
+    if value is None:
+        raise ValueError(f"{key} = {message[key]}")
+    return value

@@ -71,7 +71,10 @@ def page(
         parts.append(f'<h2 id="trial-{number}">{_text(trial.name)}</h2>')
         parts.append(_about(trial))
         for name, png in figures.items():
-            parts.append(_figure(png, _CAPTIONS[name], narrow=name == "start-and-end"))
+            caption = _CAPTIONS[name]
+            if name == "messages" and trial.clocks_known:
+                caption += " Clocks are corrected, to a few ms."
+            parts.append(_figure(png, caption, narrow=name == "start-and-end"))
         parts.append(_robots(trial))
         parts.append(_alarms(trial))
         parts.append(_commands(trial))
@@ -96,7 +99,7 @@ def _summary(trials: Sequence[Trial]) -> str:
                 str(len(trial.tracks)),
                 f"{cost[0]:.3g}" if len(cost) else "",
                 f"{cost[-1]:.3g}" if len(cost) else "",
-                f"{trial.normalized[-1]:.2f}" if len(cost) else "",
+                f"{trial.normalized[-1]:.2f}" if len(trial.normalized) else "",
                 _number(trial.normalized_bound, "{:.2f}"),
                 "" if separation is None else f"{separation.distance_m:.2f} m",
                 _marked(f"{trial.fence_margin_m:.2f} m", trial.fence_margin_m < 0.0)

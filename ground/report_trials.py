@@ -194,8 +194,8 @@ class Trial:
 
     @property
     def normalized(self) -> F64:
-        """J over the first; empty without a world, 0 over a world without importance."""
-        return self.cost / self.cost[0] if len(self.cost) and self.cost[0] else self.cost * 0.0
+        """J over the first; empty without a world, and over a world without importance."""
+        return self.cost / self.cost[0] if len(self.cost) and self.cost[0] else np.zeros(0)
 
     @property
     def normalized_bound(self) -> float:
@@ -289,6 +289,7 @@ def trial_of(
     fences = [said.fence for track in tracks for said in track.said if said.fence is not None]
     fence = fences[-1] if fences else configured_fence
     programs = {(track.robot_id, said.boot_nonce) for track in tracks for said in track.said}
+    clocks_known = programs <= logs.clocks_known
     return Trial(
         name=mission.name,
         begin_s=begin_s,
@@ -307,10 +308,10 @@ def trial_of(
         restarts={t.name: n - 1 for t in tracks if (n := len({s.boot_nonce for s in t.said})) > 1},
         alarms=_alarms(tracks),
         commands=_commands(logs, mission, from_s, to_s),
-        messages=_messages(logs, mission),
+        messages=_messages(logs, mission, clocks_known),
         lateness=_lateness(tracks, duration_s),
         world_ids=tuple(sorted({said.world_id for track in tracks for said in track.said})),
-        clocks_known=programs <= logs.clocks_known,
+        clocks_known=clocks_known,
     )
 
 
@@ -413,7 +414,7 @@ def _commands(logs: Logs, mission: Mission, from_s: float, to_s: float) -> tuple
     return tuple(command for command in told if from_s <= command.time_s <= to_s)
 
 
-def _messages(logs: Logs, mission: Mission) -> Messages | None:
+def _messages(logs: Logs, mission: Mission, clocks_known: bool) -> Messages | None:
     robots = mission.robots
     if not any(robot in logs.received for robot in robots):
         return None
@@ -430,10 +431,12 @@ def _messages(logs: Logs, mission: Mission) -> Messages | None:
             if not own.any():
                 continue
             times_s = received.time_s[own] - mission.begin_s
+            # Clocks are corrected to a few ms, and no message comes before it was sent.
+            ages_s = received.age_s[own].clip(min=0.0 if clocks_known else -math.inf)
             missing = _missing(received, own)
-            heard.append(np.stack([times_s, received.age_s[own]], axis=1))
+            heard.append(np.stack([times_s, ages_s], axis=1))
             gaps.append(np.stack([times_s[1:], missing], axis=1)[missing > 0])
-            age_s[row, column] = np.median(received.age_s[own])
+            age_s[row, column] = np.median(ages_s)
             loss[row, column] = missing.sum() / (missing.sum() + own.sum())
     all_heard = np.concatenate([np.zeros((0, 2)), *heard])
     return Messages(

@@ -41,6 +41,7 @@ from tests.ground.pretend import ORIGIN, pretended
 from tests.ground.test_coverage import STATUS, model
 
 S = FlightState
+MAGIC = b"\x89MCAP0\r\n"  # at the end of a log that was closed
 FENCE = Fence(((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)), 0.5, 1.0, 20.0)
 WORLD = model()
 SETUP = Setup(
@@ -153,11 +154,14 @@ class Recorder:
     """`lpac record` as a process, and the lines that it prints."""
 
     def __init__(self, fleet_toml: Path) -> None:
+        # As from a terminal, also if these tests have none to lose.
+        before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet_toml)],
             cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
+        signal.signal(signal.SIGHUP, before)
         assert self.process.stdout is not None
         self._output = self.process.stdout
 
@@ -170,9 +174,8 @@ class Recorder:
                 return
         raise AssertionError(f"it ended, and never said {text!r}")
 
-    def stop(self, number: signal.Signals) -> int:
-        self.process.send_signal(number)
-        self._output.read()
+    def end(self) -> int:
+        self.wait_for("recorded to")
         return self.process.wait(PATIENCE_S)
 
 
@@ -221,13 +224,12 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
                 robot.takeoff_s = math.inf
             assert command(fleet.name, Calm("land")).done
             wait_until_all_are_told(fleet.name, S.LAND)
+            # Its terminal is closed: it goes on until all have landed.
+            recorder.process.send_signal(signal.SIGHUP)
             for robot in fleet.robots:
                 robot.takeoff_s = 1.0
             assert command(fleet.name, Calm("land", wait=True)).done
-            # By then it has read all that it was told.
-            processes[1].terminate()
-            recorder.wait_for("has ended")
-            assert recorder.stop(signal.SIGTERM) == 0
+            assert recorder.end() == 0
         finally:
             processes += [recorder.process]
             for process in processes:
@@ -235,6 +237,7 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
                     process.kill()
     (path,) = (tmp_path / "logs").iterdir()
     assert path.name == "ground-0001.mcap"
+    assert path.read_bytes().endswith(MAGIC)
     entries = list(read(path))
     by_topic: dict[str, list[dict[str, Any]]] = {}
     for topic, _, message in entries:
@@ -273,14 +276,30 @@ def assert_costs_are_of_the_last_statuses(entries: list[tuple[str, float, dict[s
     assert compared > 0
 
 
-def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "logs").write_text("")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
+    with pretended(tmp_path, 1) as fleet:
+        recorder = Recorder(fleet.fleet_toml)
+        with recorder.process:
+            recorder.wait_for("waiting for it")
+            recorder.process.send_signal(number)
+            assert recorder.end() == 0
+    (path,) = (tmp_path / "logs").iterdir()
+    assert path.read_bytes().endswith(MAGIC)
+
+
+@pytest.mark.parametrize(("below", "why"), [("", "File exists"), ("more/logs", "Not a directory")])
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, below: str, why: str) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
     with pretended(tmp_path, 1) as fleet:
         done = subprocess.run(
-            [sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet.fleet_toml)],
+            [
+                sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet.fleet_toml),
+                "--out", str(file / below),
+            ],
             cwd=ROOT, capture_output=True, text=True, check=False,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
-    assert done.returncode == 1
-    assert "nothing more can be written there" in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"lpac: {file / below}: cannot be made: {why}\n"

@@ -29,12 +29,14 @@ from ground.protocol import Event, Setup
 from ground.record import TOPICS, GroundMetadata
 from ground.report import Examined, Wanted, examine, write
 from ground.report_logs import read_logs
+from ground.report_page import Drawn, page
 from ground.report_trials import find_missions
 from tests.conftest import SHIPPED
 from tests.ground.pretend import FENCE
 from tests.ground.test_coverage import STATUS
 
 S = FlightState
+NAN = math.nan
 BEGAN_S = 1.7e9
 PERIOD_S = 0.25
 HEARD_AFTER_S = 0.01
@@ -42,6 +44,7 @@ AGE_S = 0.02
 SCALE = 16.0
 WORLD = format_world(random_features(np.random.default_rng(3), 8, 512))
 IMPORTANCE = rasterize(parse_world(WORLD), 512, 2.0, 1.0)
+BUNDLE = load_bundle(SHIPPED)
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,12 @@ class Writer:
         self.flights = flights
         self.ahead_s = ahead_s
         self.nonce = nonce
+        self.world = WORLD
+        self.bundle_id = BUNDLE.id
+        self.age_s = AGE_S
+        # Other values of the ground's setup, and what becomes of each status in the files.
+        self.setup: dict[str, Any] = {}
+        self.written: Callable[[dict[str, Any]], dict[str, Any]] = lambda status: status
         self.change: Callable[[RobotStatus, float], RobotStatus] = lambda status, _: status
 
     def _times_s(self) -> Iterator[tuple[float, Flown]]:
@@ -108,8 +117,8 @@ class Writer:
                 uptime_s=at_s, unix_time_s=BEGAN_S + at_s + self.ahead_s[robot], state=state,
                 armed=state in (S.TAKEOFF, S.HOLD, S.MISSION, S.LAND), trial=flight.trial,
                 position_m=(*flight.place_m(robot, at_s), 4.0 + 2.0 * robot), fence=FENCE,
-                world_id=id_of(WORLD), loops={"control": loop, "policy": loop, "perception": loop},
-                battery=0.8,
+                bundle_id=self.bundle_id, world_id=id_of(self.world), battery=0.8,
+                loops={"control": loop, "policy": loop, "perception": loop},
             )  # fmt: skip
             yield at_s, self.change(status, at_s)
 
@@ -120,12 +129,13 @@ class Writer:
         )
         for robot in range(3):
             metadata = FlightMetadata(
-                robot, self.nonce + robot, "b", str(SHIPPED), configuration, "0"
+                robot, self.nonce + robot, self.bundle_id, str(SHIPPED), configuration, "0"
             )
             log = FlightLog(folder / "robots" / str(robot) / "logs", metadata)
             with contextlib.closing(log):
                 for at_s, status in self._statuses(robot):
-                    log.record("status", status.unix_time_s, dataclasses.asdict(status))
+                    said = self.written(dataclasses.asdict(status))
+                    log.record("status", status.unix_time_s, said)
                     self._receive(log, robot, status.sequence, at_s)
                     log.flush()
                 order = Order("a", robot, self.nonce, "takeoff", 1.0, "ann", "")
@@ -140,7 +150,7 @@ class Writer:
             if sender == robot or (robot == 1 and sender == 0 and sequence % 10 == 5):
                 continue
             heard_s = BEGAN_S + at_s + AGE_S + self.ahead_s[robot]
-            age_s = AGE_S + self.ahead_s[robot] - self.ahead_s[sender]
+            age_s = self.age_s + self.ahead_s[robot] - self.ahead_s[sender]
             log.record(
                 "received", heard_s,
                 {"sender": sender, "sequence": sequence, "age_s": age_s, "rejection": None},
@@ -148,18 +158,19 @@ class Writer:
 
     def ground(self, folder: Path) -> None:
         """The ground's log, FOLDER/ground-0001.mcap."""
-        perception = load_bundle(SHIPPED).manifest.perception
+        perception = BUNDLE.manifest.perception
         assert perception is not None
         setup = Setup(
             fleet="f", operator="ann", robots={"r0": 0, "r1": 1, "r2": 2}, slots=(), fence=FENCE,
-            world=WORLD, world_id=id_of(WORLD), bundle_id="b",
+            world=self.world, world_id=id_of(self.world), bundle_id=self.bundle_id,
             world_size=perception.world_size, sensor_size=perception.sensor_size,
             communication_range=perception.communication_range, env_scale=SCALE, truncation=2.0,
             norm=1.0,
         )  # fmt: skip
         log = FlightLog(folder, GroundMetadata("f", "0"), TOPICS)
         with contextlib.closing(log):
-            log.record("setup", BEGAN_S, dataclasses.asdict(setup))
+            told_s = BEGAN_S + self.flights[0].begin_s - 6.0
+            log.record("setup", told_s, {**dataclasses.asdict(setup), **self.setup})
             for flight in self.flights:
                 event = Event(
                     BEGAN_S + flight.begin_s, "command", "", "start <b>now</b>", "ann", flight.trial
@@ -169,7 +180,7 @@ class Writer:
                 for at_s, status in self._statuses(robot):
                     heard_s = BEGAN_S + at_s + HEARD_AFTER_S
                     heard = {
-                        **dataclasses.asdict(status), "name": f"r{robot}",
+                        **self.written(dataclasses.asdict(status)), "name": f"r{robot}",
                         "heard_at_unix_s": heard_s, "clock_offset_s": self.ahead_s[robot],
                     }  # fmt: skip
                     log.record("status", heard_s, heard)
@@ -330,6 +341,45 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     assert [f"--world is {id_of(other.read_text())}" in note for note in given.notes] == [True]
 
 
+@pytest.mark.parametrize("bundle_id", [BUNDLE.id, "another"])
+def test_each_trial_has_the_sizes_of_its_own_policy(tmp_path: Path, bundle_id: str) -> None:
+    Writer((FIRST,)).ground(tmp_path / "a")
+    (alone,) = examined(tmp_path).trials
+    other = Writer((SECOND,), nonce=99)
+    other.bundle_id = bundle_id
+    other.setup = {"world_size": 1024, "env_scale": 32.0, "sensor_size": 128}
+    other.ground(tmp_path / "b")
+    first, second = examined(tmp_path).trials
+    assert first.cost.tolist() == alone.cost.tolist() and first.sensor_size == alone.sensor_size
+    assert second.coverage is not None and second.coverage.importance.shape == (1024, 1024)
+    assert second.sensor_size == 128
+
+
+def test_robots_logs_alone_have_the_sizes_of_the_bundle_they_flew(tmp_path: Path) -> None:
+    writer = Writer((FIRST,))
+    writer.bundle_id = "another"  # than the one that is at its place now
+    writer.robots(tmp_path)
+    (note,) = [note for note in examined(tmp_path).notes if "bundle" in note]
+    assert note.startswith("t1: the policy's bundle is not here (give it with --bundle)")
+    assert not [n for n in examined(tmp_path, bundle=SHIPPED).notes if "bundle" in n]
+
+
+def test_a_world_without_importance_has_no_normalised_cost(tmp_path: Path) -> None:
+    writer = Writer((FIRST, SECOND))
+    writer.world = "CircularBND 100 100 20 0\n"
+    writer.ground(tmp_path)
+    arguments = ["report", str(tmp_path), "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, arguments)
+    assert "cost" not in result.stdout.splitlines()[0] and "nan" not in result.stdout
+    assert "note: t1: the world holds no importance: no normalised cost" in result.stdout
+    cost = json.loads((tmp_path / "out/report.json").read_text())["trials"][0]["cost"]
+    assert cost["initial"] == 0.0 and cost["normalized"] is cost["normalized_bound"] is None
+    assert cost["curve"] == cost["time_s"] == []
+    assert "nan" not in Page((tmp_path / "out/report.html").read_text()).text
+    drawn = {path.name for path in (tmp_path / "out").rglob("*.png")}
+    assert "snapshots.png" in drawn and not drawn & {"cost.png", "costs.png", "repeatability.png"}
+
+
 def test_logs_that_break_off_and_robots_that_are_missing(tmp_path: Path, flown: Path) -> None:
     shutil.copytree(flown / "robots", tmp_path / "robots")
     shutil.copytree(flown / "logs", tmp_path / "logs")
@@ -467,6 +517,75 @@ def test_odd_flights_have_a_report_too(
         assert values["duration_s"] == 0.25
 
 
+@pytest.mark.parametrize(
+    ("odd", "why"),
+    [
+        ({}, "'landing_point_m' is missing"),
+        ({"landing_point_m": [1.0, 1.0], "state": "hovering"}, "'hovering' is not a valid"),
+        ({"landing_point_m": [1.0, 1.0], "uptime_s": NAN}, "uptime_s = NaN"),
+        ({"landing_point_m": [1.0, 1.0], "fence": {"vertices_m": 3}}, "fence: vertices_m = 3"),
+    ],
+)
+def test_what_is_not_understood_is_left_out_and_told(
+    tmp_path: Path, odd: dict[str, Any], why: str
+) -> None:
+    """As another version may have written it."""
+    writer = Writer((FIRST,))
+
+    def written(status: dict[str, Any]) -> dict[str, Any]:
+        if status["robot_id"] == 1:
+            del status["landing_point_m"]
+            status |= odd
+        return status | {"another": 1}
+
+    writer.written = written
+    writer.robots(tmp_path)
+    found = examined(tmp_path)
+    assert found.summary()["trials"][0]["robots"] == ["0", "2"]
+    told = [re.sub("^.*/", "", note) for note in found.notes]
+    assert told[0].startswith(f"robot-1-0001.mcap: {why}") and "left out: 88 of topic" in told[0]
+
+
+def test_numbers_that_are_not_finite_are_not_known(tmp_path: Path) -> None:
+    writer = Writer((FIRST,))
+
+    def written(status: dict[str, Any]) -> dict[str, Any]:
+        if status["robot_id"] == 1:
+            status |= {"battery": NAN, "landing_point_m": (NAN, 1.0)}
+            status["position_m"] = (NAN, 1.0, math.inf)
+            status["loops"]["control"]["lateness_p99_ms"] = NAN
+        return status
+
+    writer.written = written
+    writer.robots(tmp_path)
+    (tmp_path / "world.env").write_text(WORLD)
+    found = examined(tmp_path)
+    (values,) = found.summary()["trials"]
+    assert found.notes == () and values["robots"] == ["0", "1", "2"]
+    assert values["end_m"].keys() == {"0", "2"} and values["loops"]["control"]["p99_ms"] == 4.0
+    text = Page(write(found, tmp_path / "out", (), lambda *_: None).read_text()).text
+    assert "80 %" in text and "nan" not in text
+
+
+def test_a_setup_of_another_version_is_understood(tmp_path: Path) -> None:
+    writer = Writer((FIRST,))
+    writer.setup = {"max_speed_m_s": 2.0}
+    writer.ground(tmp_path)
+    assert examined(tmp_path).trials[0].cost[0] == pytest.approx(FIRST.cost(20.0))
+
+
+def test_no_message_comes_before_it_was_sent(tmp_path: Path) -> None:
+    writer = Writer((FIRST,), ahead_s=(0.0, 5.0, 0.0))
+    writer.age_s = -0.003
+    writer.robots(tmp_path)
+    writer.ground(tmp_path)
+    (trial,) = examined(tmp_path).trials
+    assert trial.messages is not None and trial.messages.age_quantile_s(0.5) == 0.0
+    assert np.nanmin(trial.messages.age_s) == 0.0
+    shown = page("", [Drawn(trial, {"messages": b""})], None, ())
+    assert "Clocks are corrected, to a few ms." in Page(shown).text
+
+
 def test_mistakes_are_one_line(tmp_path: Path, flown: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -474,10 +593,16 @@ def test_mistakes_are_one_line(tmp_path: Path, flown: Path) -> None:
     writer = Writer((FIRST,))
     writer.change = lambda status, _: dataclasses.replace(status, state=S.IDLE)
     writer.robots(grounded)
+    (grounded / "robot-9.mcap").mkdir()
+    cut = tmp_path / "cut"
+    cut.mkdir()
+    for number in range(5):
+        (cut / f"robot-1-000{number}.mcap").write_bytes(b"")
     for arguments, text in (
         ([empty], r"empty: holds no logs \(robot-\*\.mcap, ground-\*\.mcap\)"),
         ([tmp_path / "none"], r"none: is not a folder"),
-        ([grounded], r"no mission was flown in these logs, of 3 robots"),
+        ([grounded], r"no mission was flown in these logs, of 3 robots$"),
+        ([cut], r"of 0 robots; .*robot-1-0000\.mcap: .*: left out; .*; and 2 more such notes$"),
     ):
         with pytest.raises(ValueError, match=text):
             examined(*arguments)
