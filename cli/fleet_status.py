@@ -144,8 +144,8 @@ def _notes(state: State) -> list["str | Text"]:
     if pending:
         notes.append(
             styled(
-                f"? a switch to {pending['release'][:SHORT]} is not confirmed yet: it is under "
-                "way, or was interrupted; then the next deploy, start or stop settles it",
+                f"? a switch to {pending['release'][:SHORT]} is not confirmed yet: unless "
+                "somebody deploys, deploy again",
                 NOTABLE,
             )
         )

@@ -19,7 +19,7 @@ from cli.fleet import DEFAULT_FLEET, Fleet
 if TYPE_CHECKING:
     from ground.config import GroundConfig
     from ground.process import GroundProcess
-    from ground.protocol import Event
+    from ground.protocol import Event, Setup
 
 _AGAIN_S = 5.0
 _LOOK_AGAIN_S = 1.0
@@ -38,7 +38,7 @@ def ground(
     """
     from ground.process import GroundProcess
 
-    operator = name or f"{getpass.getuser()}@{socket.gethostname()}"
+    operator = name or _user_at_host()
     if not operator.isprintable() or len(operator) > _LONGEST_NAME:
         raise ValueError(f"--name {name!r}: must be at most {_LONGEST_NAME} printable characters")
     config = load_setup(fleet, operator)
@@ -49,14 +49,19 @@ def ground(
         f"ground station {operator} of fleet {config.setup.fleet}, {len(config.setup.robots)} "
         "robots: Ctrl-C ends it"
     )
-    asyncio.run(_run(process, lambda: typer.echo(started)))
+    asyncio.run(_run(process, config.setup, lambda: typer.echo(started)))
 
 
-async def _run(process: "GroundProcess", on_listening: Callable[[], None]) -> None:
-    from ground.alarms import FLIGHT
+def _user_at_host() -> str:
+    try:
+        return f"{getpass.getuser()}@{socket.gethostname()}"
+    except (KeyError, OSError):
+        raise ValueError("this user has no name: give the station one with --name") from None
 
-    hold_s = FLIGHT.ground_timeout_s
-    land_s = hold_s + FLIGHT.ground_lost_land_s
+
+async def _run(process: "GroundProcess", setup: "Setup", on_listening: Callable[[], None]) -> None:
+    hold_s = setup.ground_timeout_s
+    land_s = hold_s + setup.ground_lost_land_s
     loop = asyncio.get_running_loop()
     running = asyncio.create_task(process.run(on_listening))
     asked_s: list[float] = []
@@ -81,7 +86,8 @@ async def _run(process: "GroundProcess", on_listening: Callable[[], None]) -> No
             running.cancel()
 
     loop.add_signal_handler(signal.SIGINT, interrupt)
-    loop.add_signal_handler(signal.SIGHUP, hang_up)
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        loop.add_signal_handler(signal.SIGHUP, hang_up)
     loop.add_signal_handler(signal.SIGTERM, running.cancel)
     with contextlib.suppress(asyncio.CancelledError):
         await running
@@ -138,6 +144,9 @@ def load_setup(path: Path, operator: str) -> "GroundConfig":
             norm=training.idf_norm,
             base_height_m=robot.flight.base_height_m,
             slot_spacing_m=robot.flight.slot_spacing_m,
+            battery_critical=robot.flight.battery_critical,
+            ground_timeout_s=robot.flight.ground_timeout_s,
+            ground_lost_land_s=robot.flight.ground_lost_land_s,
         ),
         connect=tuple(f"tcp/{host.address}:{host.zenoh_port}" for host in config.robots.values()),
     )

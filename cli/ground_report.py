@@ -49,8 +49,10 @@ def ask(
     `details` are more columns, by robot and heading. Raises ValueError unless all did it.
     """
     from ground.client import command
+    from ground.protocol import Calm
 
-    with interruptible(name), _progress() as on_progress:
+    told = f"robots that were told to {name} go on with it" if isinstance(request, Calm) else ""
+    with interruptible(name, told), _progress() as on_progress:
         report = command(to.fleet, request, on_progress)
     show(to, report, name, as_json=as_json, details=details or {})
 
@@ -107,12 +109,13 @@ def measure(lookout: "Lookout", robots: Sequence[str], seconds: float) -> dict[s
 
 
 @contextmanager
-def interruptible(name: str) -> Iterator[None]:
-    """Ctrl-C ends the command in one line, and exit code 130."""
+def interruptible(name: str, left: str = "") -> Iterator[None]:
+    """Ctrl-C ends the command in one line, and exit code 130; `left` says what goes on."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo(f"lpac: {name}: interrupted: what was not ordered yet is not done", err=True)
+        text = left or "what was not ordered yet is not done"
+        typer.echo(f"lpac: {name}: interrupted: {text}", err=True)
         raise typer.Exit(130) from None
 
 

@@ -37,6 +37,9 @@ def live_map(
     config = load_fleet(fleet)
     if token is not None and re.fullmatch(r"[A-Za-z0-9_-]+", token) is None:
         raise ValueError("--token: must be letters, digits, '-' and '_'")
+    if host == "::":
+        # asyncio would serve IPv6 alone, of which a field's network has no address to open.
+        host = "0.0.0.0"
     local = is_loopback(host)
     if token is None and not local:
         token = secrets.token_urlsafe(16)

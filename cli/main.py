@@ -2,8 +2,10 @@
 
 import os
 import sys
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
 # field and field_setup add their commands to fleet's.
 from cli import (  # noqa: F401
@@ -35,8 +37,20 @@ _WORKSTATION = {
     "ground", "fleet",
 }  # fmt: skip
 
+
+class _Commands(TyperGroup):
+    def invoke(self, ctx: Any) -> Any:
+        """Ctrl-C, where a command has nothing to say about it, as while it starts."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            typer.echo("lpac: interrupted", err=True)
+            raise typer.Exit(130) from None
+
+
 app = typer.Typer(
     name="lpac",
+    cls=_Commands,
     help="Decentralised perception-action-communication policies on small drones.",
     no_args_is_help=True,
     add_completion=False,

@@ -371,20 +371,26 @@ def _bring_down(
 
 @_of_robots
 def pilot(to: Addressed) -> "Request":
-    """Hand robots to human pilots: the program commands nothing until `rejoin`."""
+    """Hand robots to human pilots, by name: the program commands nothing until `rejoin`."""
     return _give("pilot", to)
 
 
 @_of_robots
 def rejoin(to: Addressed) -> "Request":
-    """Take robots back from their pilots: they hold; then `start`."""
+    """Take robots back from their pilots, by name: they hold; then `start`."""
     return _give("rejoin", to)
 
 
 @_of_robots
 def disarm(to: Addressed) -> "Request":
     """Stop the motors on the ground. A robot in the air refuses."""
-    return _give("disarm", to)
+    from ground.lookout import addressed
+    from ground.protocol import Give
+
+    if to.robots:
+        return Give("disarm", to.robots)
+    with looking(to) as lookout:
+        return Give("disarm", addressed(lookout.setup, ()))
 
 
 @app.command()
@@ -398,26 +404,21 @@ def kill(
     as_json: AsJson = False,
 ) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
+    to = _named(names, fleet, robots)
+    request = _give("kill", to)
+    confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
+    ask(to, request, "kill", as_json=as_json)
+
+
+def _give(kind: Literal["pilot", "rejoin", "kill"], to: Addressed) -> "Request":
+    """Raises ValueError if nobody is named."""
     from ground.protocol import Give
 
-    to = _named(names, fleet, robots)
     if not to.robots:
         raise ValueError(
-            "kill: name the robots, such as `lpac mission kill r3`: it is never for all"
+            f"{kind}: name the robots, such as `lpac mission {kind} r3`: it is never for all"
         )
-    confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
-    ask(to, Give("kill", to.robots), "kill", as_json=as_json)
-
-
-def _give(kind: Literal["pilot", "rejoin", "disarm"], to: Addressed) -> "Request":
-    """Orders need names."""
-    from ground.lookout import addressed
-    from ground.protocol import Give
-
-    if to.robots:
-        return Give(kind, to.robots)
-    with looking(to) as lookout:
-        return Give(kind, addressed(lookout.setup, ()))
+    return Give(kind, to.robots)
 
 
 # Trials, and who commands

@@ -71,8 +71,9 @@ def run(
             problem, code = f"{error}{then}", 1
         except GroundError as error:
             problem, code = f"{error}; robots in the air hold by themselves, and then land", 1
-        except (KeyboardInterrupt, OSError, SystemExit) as error:
-            # A terminal that is gone cannot be written to; rich exits when its pipe breaks.
+        except (KeyboardInterrupt, typer.Abort, OSError, SystemExit) as error:
+            # A question is aborted. A terminal that is gone cannot be written to; rich exits when
+            # its pipe breaks.
             why = str(error) if isinstance(error, OSError) else "interrupted"
             problem, code = f"{why}; {flight.hold()}", 130
         else:
@@ -174,4 +175,5 @@ class _View:
                 styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
                 styled(status.reason, FAINT),
             )
-        return Group(Text(f"{self._step or 'script'}: {clock}", "bold"), rows)
+        first = Text(f"{self._step or 'script'}: {clock}", "bold")
+        return Group(first, Text("Ctrl-C holds the fleet", "bold red"), rows)

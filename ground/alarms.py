@@ -5,7 +5,6 @@ from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from typing import Literal, NamedTuple, TypeVar
 
-from edge.core.flight import FlightParameters
 from edge.core.mission import AIRBORNE, FlightState, RobotStatus
 from edge.core.preflight import PreflightLimits
 from ground.protocol import Picture, RobotPicture, Setup
@@ -20,7 +19,6 @@ _BEFORE_S = 2.0
 _S = FlightState
 # Of robots, unless their own files say otherwise.
 LIMITS = PreflightLimits()
-FLIGHT = FlightParameters(slot=0, landing_point_m=(0.0, 0.0))
 # Above the share at which a robot returns by itself: somebody may still decide.
 BATTERY_LOW = 0.3
 # A robot has heard a state by then, and said so.
@@ -152,6 +150,9 @@ def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, str]]:
         yield "warning", f"{ground.calm_by} asks {len(held)} robots to hold"
     if not fleet.picture.commander and not flying:
         yield "note", "nobody commands the fleet yet"
+    if not fleet.setup.world:
+        text = f"the robots' world {fleet.setup.world_id[:_ID]} is not here: no density, no cost"
+        yield "warning", f"{text}; `lpac mission world FILE`"
     if fleet.seen:
         slots = {site.robot for site in fleet.setup.slots}
         unheard = [r.name for r in fleet.picture.robots if r.status is None and r.name in slots]
@@ -209,7 +210,7 @@ def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
         return None
     if not is_flying(seen.status):
         return "note", f"battery low: {battery:.0%}"
-    if battery <= FLIGHT.battery_critical:
+    if battery <= fleet.setup.battery_critical:
         return "critical", f"battery critical: {battery:.0%}"
     return "warning", f"battery low: {battery:.0%}"
 

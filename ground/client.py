@@ -19,13 +19,15 @@ from ground.protocol import (
     told_from_line,
 )
 
+# The ground process says something at least once a second, unless it hangs.
+_PATIENCE_S = 5.0
 # Worlds are the longest lines.
 MAX_LINE = 1 << 26
 _MAX_PATH = 103  # macOS; Linux has a few more
 
 
 class GroundError(OSError):
-    """No ground process runs for the fleet, or it has ended; the text says what to do."""
+    """No ground process runs for the fleet, it has ended or hangs; the text says what to do."""
 
 
 def socket_path(fleet: str) -> Path:
@@ -51,7 +53,7 @@ def command(
         for told in answers:
             if isinstance(told, Report):
                 return told
-            if isinstance(told, Progress):
+            if isinstance(told, Progress) and told.text:
                 on_progress(told)
     raise AssertionError("it ends by a report or an error")
 
@@ -82,10 +84,13 @@ async def listen(fleet: str) -> AsyncIterator[Told]:
 @contextmanager
 def _connected(fleet: str, line: bytes) -> Iterator[Iterator[Told]]:
     with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(_PATIENCE_S)
         try:
             connection.connect(str(socket_path(fleet)))
         except (FileNotFoundError, ConnectionRefusedError):
             raise _not_running(fleet) from None
+        except (TimeoutError, BlockingIOError):  # More wait for it than it may have waiting.
+            raise no_answer(fleet) from None
         with connection.makefile("rb") as lines:
             yield _read(fleet, connection, line, lines.readline)
 
@@ -97,6 +102,8 @@ def _read(
         connection.sendall(line)
         while answer := readline():
             yield told_from_line(answer)
+    except TimeoutError:
+        raise no_answer(fleet) from None
     except ConnectionError:
         pass
     raise _ended(fleet)
@@ -109,9 +116,16 @@ async def _answers(fleet: str, line: bytes) -> AsyncGenerator[Told]:
         raise _not_running(fleet) from None
     try:
         writer.write(line)
-        await writer.drain()
-        while answer := await reader.readline():
+        async with asyncio.timeout(_PATIENCE_S):
+            await writer.drain()
+        while True:
+            async with asyncio.timeout(_PATIENCE_S):
+                answer = await reader.readline()
+            if not answer:
+                break
             yield told_from_line(answer)
+    except TimeoutError:
+        raise no_answer(fleet) from None
     except ConnectionError:
         pass
     finally:
@@ -126,6 +140,14 @@ def _own_folder() -> Path:
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise GroundError(f"{folder}: must be a folder of this user alone: remove it")
     return folder
+
+
+def no_answer(fleet: str) -> GroundError:
+    """It is there, and says nothing."""
+    return GroundError(
+        f"the ground station of fleet {fleet} does not answer: end it, and start `lpac ground` "
+        "again"
+    )
 
 
 def _not_running(fleet: str) -> GroundError:

@@ -7,7 +7,7 @@ and yields whenever it has to wait for what comes next.
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
-from edge.core.mission import FlightState, OrderKind, RobotStatus, is_too_low
+from edge.core.mission import FlightState, OrderKind, RobotStatus, is_too_low, world_id
 from ground.protocol import (
     Again,
     Calm,
@@ -113,17 +113,22 @@ class Running:
         for name in self.names:
             if name not in robots:
                 raise _ProblemError(f"robot {name!r} is unknown; known are {', '.join(robots)}")
-        everybodys = _is_everybodys(self.request)
-        while not station.listened or not (everybodys or self._are_gathered()):
+        urgent = _is_everybodys(self.request) and not isinstance(self.request, Command)
+        while not station.listened or not (urgent or self._are_gathered()):
             yield
         # Who sits in a slot is known only now.
         self.names = _addressed(station, self.request)
         if not self.names:
             raise _ProblemError("no robot is named, or sits in a slot")
-        self._refuse_observer()
         do, check = _DO[type(self.request)]
-        if check is not None:
-            check(self, self.request)
+        try:
+            self._refuse_observer()
+            if check is not None:
+                check(self, self.request)
+        except _ProblemError:
+            if not self._is_missing_world():
+                raise
+            do = Running._learn_world
         self._on_taken(self)
         station.tell("command", "", self.text, station.operator)
         yield from do(self, self.request)
@@ -255,13 +260,27 @@ class Running:
         yield from self._take_up(self._station.change(fence=request.fence), effect)
 
     def _world(self, request: SetWorld) -> Waits:
-        sequence = self._station.set_world(request.text)
-        wanted = self._station.setup.world_id
+        yield from self._have_world(self._station.set_world(request.text), request)
+
+    def _have_world(self, sequence: int, request: SetWorld) -> Waits:
+        wanted = world_id(request.text)
         yield from self._take_up(
             sequence,
             lambda status: f"has world {wanted}" if status.world_id == wanted else None,
             _WORLD_S,
         )
+
+    def _is_missing_world(self) -> bool:
+        """Whether it is the world that the fleet has, and this station lacks."""
+        setup, request = self._station.setup, self.request
+        if not isinstance(request, SetWorld) or setup.world:
+            return False
+        return world_id(request.text) == setup.world_id
+
+    def _learn_world(self, request: SetWorld) -> Waits:
+        """Of the fleet nothing changes."""
+        self._station.remember_world(request.text)
+        yield from self._have_world(0, request)
 
     def _places(self, request: SetPlaces) -> Waits:
         setup = self._station.setup

@@ -179,11 +179,15 @@ class LiveMap:
                 self._put(_explored_view(message), message.robot)
 
     async def _take_setup(self, setup: Setup) -> None:
-        coverage = self._coverage
-        if coverage is None or self._setup is None or self._setup.world != setup.world:
-            coverage = await asyncio.to_thread(Coverage, setup)
-        self._setup, self._coverage = setup, coverage
-        self._setup_text = _text(setup_view(setup, coverage))
+        if self._setup is None or self._setup.world != setup.world:
+            self._coverage = None
+            # Nothing else depends on a world that cannot be read, or is not known.
+            with contextlib.suppress(ValueError):
+                if setup.world:
+                    self._coverage = await asyncio.to_thread(Coverage, setup)
+            self._missions.change_world()
+        self._setup = setup
+        self._setup_text = _text(setup_view(setup, self._coverage))
         for page in self._pages:
             page.put(self._setup_text, "setup")
 
@@ -216,13 +220,13 @@ class LiveMap:
         while True:
             await self._new_picture.wait()
             self._new_picture.clear()
-            if self._picture is not None and self._coverage is not None:
+            if self._picture is not None:
                 await self._compute(self._picture, self._places_m, self._coverage)
 
     async def _compute(
-        self, picture: Picture, places_m: dict[str, tuple[float, float]], coverage: Coverage
+        self, picture: Picture, places_m: dict[str, tuple[float, float]], coverage: Coverage | None
     ) -> None:
-        if not places_m:
+        if coverage is None or not places_m:
             self._put({"kind": "coverage", "cost": None, "time_s": None, "cells": {}})
             return
         positions_m = np.array(list(places_m.values()))

@@ -28,8 +28,8 @@ _PATH_POINTS = 400
 _PATH_STEP_M = 0.15
 
 
-def setup_view(setup: Setup, coverage: Coverage) -> Json:
-    """What does not change."""
+def setup_view(setup: Setup, coverage: Coverage | None) -> Json:
+    """What seldom changes; no density without `coverage`, as of a world that is not known here."""
     return {
         "kind": "setup",
         "slots": [
@@ -40,10 +40,11 @@ def setup_view(setup: Setup, coverage: Coverage) -> Json:
             }
             for site in setup.slots
         ],
-        "side_m": coverage.size_m,
+        "side_m": setup.world_size / setup.env_scale,
         "range_m": setup.communication_range / setup.env_scale,
         "sensor_m": setup.sensor_size / setup.env_scale,
-        "density": {
+        "density": coverage
+        and {
             "cells": DENSITY_CELLS,
             "levels": base64.b64encode(coverage.density(DENSITY_CELLS).tobytes()).decode(),
         },
@@ -192,6 +193,11 @@ class Missions:
 
     def interrupt(self) -> None:
         """The ground is gone: who knows what begins meanwhile."""
+        self._seen_before = False
+
+    def change_world(self) -> None:
+        """No cost of before can be compared with those of now."""
+        self.curve = None
         self._seen_before = False
 
     def take(self, picture: Picture) -> dict[str, tuple[float, float]]:

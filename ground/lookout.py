@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Self
 
 from edge.core.mission import RobotStatus
-from ground.client import GroundError, subscribe
+from ground.client import no_answer, subscribe
 from ground.protocol import FRESH_S, Picture, Setup
 
 _PATIENCE_S = 5.0
@@ -33,7 +33,7 @@ class Lookout:
         self._thread.start()
         if not self.wait_for(lambda _: True, _PATIENCE_S):
             self._leaving = True
-            raise self._no_answer()
+            raise no_answer(self.fleet)
         return self
 
     def __exit__(
@@ -74,7 +74,7 @@ class Lookout:
         """The fleet as it is told from now on. Raises GroundError if nothing comes."""
         asked_unix_s = time.time()
         if not self.wait_for(lambda picture: picture.unix_time_s >= asked_unix_s, _PATIENCE_S):
-            raise self._no_answer()
+            raise no_answer(self.fleet)
         return self.picture
 
     def gather(self, robots: Collection[str], duration_s: float) -> dict[str, list[RobotStatus]]:
@@ -95,9 +95,6 @@ class Lookout:
 
         self.wait_for(take, duration_s + FRESH_S)
         return {robot: list(statuses.values()) for robot, statuses in heard.items()}
-
-    def _no_answer(self) -> GroundError:
-        return GroundError(f"the ground station of fleet {self.fleet} does not answer")
 
     def _run(self) -> None:
         try:

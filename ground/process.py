@@ -5,6 +5,7 @@ All of it runs in one asyncio loop; zenoh's threads only hand over what came.
 
 import asyncio
 import base64
+import math
 import socket
 import time
 import traceback
@@ -19,10 +20,12 @@ from ground.client import MAX_LINE, GroundError, socket_path
 from ground.commands import DEFECT, Commands
 from ground.config import GroundConfig
 from ground.protocol import (
+    LARGEST_WORLD,
     PICTURE_PERIOD_S,
     SUBSCRIBE,
     Event,
     Explored,
+    Progress,
     Report,
     Told,
     request_from_line,
@@ -31,6 +34,8 @@ from ground.protocol import (
 from ground.station import NameTakenError, Station, is_down
 
 _WORLD_PERIOD_S = 0.5
+# A client takes it from this that its ground does not hang.
+_WORD_PERIOD_S = 1.0
 # As robots do: what is longer would hold up everything else.
 _LONGEST_MESSAGE_BYTES = 65_536
 # A client that does not read misses pictures, and in the end is left alone.
@@ -99,6 +104,7 @@ class GroundProcess:
                 "robot/*/status": received,
                 "robot/*/explored": received,
                 "ground/state": received,
+                "ground/world": received,
             },
         ) as self._link:
             server = await asyncio.start_unix_server(self._serve, self._socket_path, limit=MAX_LINE)
@@ -144,12 +150,14 @@ class GroundProcess:
                 self._explored[name] = data
                 self._send(_explored(name, data))
             return
-        if len(data) > _LONGEST_MESSAGE_BYTES:
+        if len(data) > (LARGEST_WORLD if topic == "world" else _LONGEST_MESSAGE_BYTES):
             self._complain(f"long {key}", name or "", f"{topic} of {len(data)} bytes: not read")
             return
         try:
-            if key == "ground/state":
+            if topic == "state":
                 self._station.hear_state(_state(data))
+            elif topic == "world":
+                self._station.hear_world(data.decode(errors="replace"))
             else:
                 self._station.hear_status(from_json(RobotStatus, data))
         except ConfigError as error:
@@ -221,7 +229,7 @@ class GroundProcess:
         self._stepped.clear()
         setup = self._station.setup
         if setup != self._told_setup:
-            if setup.world != self._told_setup.world:
+            if setup.world not in ("", self._told_setup.world):
                 with suppress(OSError, ValueError):  # Only the next one misses it.
                     self._world_path.write_text(setup.world, "utf-8")
             self._told_setup = setup
@@ -307,9 +315,14 @@ class GroundProcess:
             writer.write(to_line(Report(problem=DEFECT)))
             return
         left = asyncio.create_task(reader.read(1))
+        said_s = -math.inf
         try:
             while True:
-                for progress in running.news():
+                news, now_s = running.news(), time.monotonic()
+                if not news and now_s - said_s >= _WORD_PERIOD_S:
+                    news = [Progress("", "")]
+                for progress in news:
+                    said_s = now_s
                     writer.write(to_line(progress))
                 if running.report is not None:
                     writer.write(to_line(running.report))

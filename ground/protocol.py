@@ -4,10 +4,11 @@ The ground process (`lpac ground`) alone speaks to the fleet. Its clients (comma
 connect to its Unix socket and send one line: a command, or `SUBSCRIBE`. Each line of the answer
 is one JSON object whose only key names its kind, such as {"picture": {...}}.
 
-A command is answered by any number of `Progress`, and then one `Report`. A client that leaves
-before abandons what is not ordered yet. A subscription is answered
-by a `Setup` (again whenever the world changes), what is known of each robot's `Explored`, the last
-`Event`s, and then a `Picture` at 5 Hz, and the rest as it happens, until the client leaves.
+A command is answered by any number of `Progress`, at least one a second, if only an empty one, and
+then one `Report`. A client that leaves before abandons what is not ordered yet. A subscription is
+answered by a `Setup` (again whenever the world changes), what is known of each robot's `Explored`,
+the last `Event`s, and then a `Picture` at 5 Hz or more, and the rest as it happens, until the
+client leaves.
 """
 
 import dataclasses
@@ -21,7 +22,8 @@ from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.world import MOST_FEATURES, parse_world
 
-PICTURE_PERIOD_S = 0.2
+# With a reserve: 5 Hz is promised.
+PICTURE_PERIOD_S = 0.18
 # A robot that said nothing for longer is not heard any more.
 FRESH_S = 2.0
 SUBSCRIBE = b"subscribe\n"
@@ -180,7 +182,8 @@ Request = (
 class Progress:
     """Something became known of one robot (its name) while a command runs; "" is the fleet.
 
-    Each robot's result is told so, too, as soon as it is known.
+    Each robot's result is told so, too, as soon as it is known. Without a text it tells only that
+    the ground process is there.
     """
 
     robot: str
@@ -228,8 +231,10 @@ class Setup:
     `operator` is this station's. `robots` are the robots' ids by name, in the fleet's order. The
     policy's world is `world_size` cells wide, `env_scale` of them per m, from the mission origin
     on; its sensor sees `sensor_size` cells. `world` is the text of the robots' world file, called
-    `world_id`; `truncation` and `norm` are what `rasterize` needs for it. `fence` is the configured
-    one. A slot's height is `base_height_m` + its number x `slot_spacing_m`.
+    `world_id`; "" if it is not known here. `truncation` and `norm` are what `rasterize` needs for
+    it. `fence` is the configured one. A slot's height is `base_height_m` + its number x
+    `slot_spacing_m`. Robots land at once with a battery of `battery_critical`, hold when they have
+    heard no ground for `ground_timeout_s`, and land `ground_lost_land_s` later.
     """
 
     fleet: str
@@ -248,6 +253,9 @@ class Setup:
     norm: float
     base_height_m: float = 4.0
     slot_spacing_m: float = 2.0
+    battery_critical: float = 0.15
+    ground_timeout_s: float = 3.0
+    ground_lost_land_s: float = 10.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,7 +109,10 @@ def standing(robot: str, statuses: Sequence[RobotStatus]) -> Standing:
     places = [(s.global_deg[0], s.global_deg[1]) for s in statuses if s.global_deg is not None]
     if not places:
         raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
-    middle = average_position(places)
+    try:
+        middle = average_position(places)
+    except ValueError as error:
+        raise ValueError(f"{robot}: {error}") from None
     spread_m = max(distance_m(middle, place) for place in places)
     _require_still(robot, spread_m)
     headings = [math.degrees(s.heading_rad) for s in statuses if s.heading_rad is not None]

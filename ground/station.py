@@ -87,6 +87,8 @@ class Station:
         self._now_s, self._unix_now_s = now_s, unix_now_s
         self._setup = setup
         self._worlds = {setup.world_id: setup.world}
+        # By robot id: what each said last.
+        self._worlds_of_robots: dict[int, str] = {}
         self._robots = HeardRobots(
             setup.robots,
             lambda robot, text: self.tell("presence", robot, text),
@@ -166,22 +168,32 @@ class Station:
         return min(told_s if told_s and self.state is None else [own_s, *told_s])
 
     @property
+    def world_id(self) -> str:
+        """The fleet's world: what it is told, or else what most robots have."""
+        told = None if self.state is None else self.state.world_id
+        return told or _commonest(self._worlds_of_robots.values()) or self._setup.world_id
+
+    @property
     def setup(self) -> Setup:
         """As it is now: the world, and who sits where, change."""
+        setup, world = self._setup, self.world_id
+        if world != setup.world_id:
+            # A wrong text would be shown as if it were the robots'.
+            setup = replace(setup, world=self._worlds.get(world, ""), world_id=world)
         places = {} if self.state is None else self.state.places
         if not places:
-            return self._setup
+            return setup
         names = self._robots.names
         seated = {place.slot: (names.get(int(r), ""), place) for r, place in places.items()}
         slots = []
-        for slot in self._setup.slots:
+        for slot in setup.slots:
             robot, place = slot.robot, slot.place
             if slot.place.slot in seated:
                 robot, place = seated[slot.place.slot]
-            elif robot and str(self._setup.robots[robot]) in places:
+            elif robot and str(setup.robots[robot]) in places:
                 robot = ""  # It was given another place.
             slots.append(replace(slot, place=place, robot=robot))
-        return replace(self._setup, slots=tuple(slots))
+        return replace(setup, slots=tuple(slots))
 
     @property
     def flying(self) -> tuple[str, ...]:
@@ -244,6 +256,7 @@ class Station:
     def hear_status(self, status: RobotStatus) -> None:
         """A robot's status came. One that is not of this fleet is nobody's."""
         if self._robots.hear(status, self._now_s, self._unix_now_s):
+            self._worlds_of_robots[status.robot_id] = status.world_id
             self._settle_orders(status)
             self._look_who_is_obeyed(status)
 
@@ -313,7 +326,6 @@ class Station:
             by = state.calm_by if _is_calmed(before, state) else ""
             self._tell_changes(before, state, by or state.operator)
         self.state, self.commands, self._heard_s = state, False, self._now_s
-        self._keep_world_of(state)
         if self._asked is not None and state.sequence >= self._asked.sequence:
             asked = _held(state, self._asked_of, self.operator)
             held = _holds(state, self._asked_of)
@@ -419,7 +431,6 @@ class Station:
         )
         self.commands = True
         self._asked = None
-        self._keep_world_of(self.state)
         self._tell_commander(self.operator)
 
     def _greatest_obeyed(self) -> int:
@@ -469,7 +480,7 @@ class Station:
             above_m = status.slot_height_m - setup.base_height_m
             try:
                 place = Place(max(0, round(above_m / setup.slot_spacing_m)), status.landing_point_m)
-            except (ValueError, OverflowError):  # It says what no place is.
+            except ValueError:  # It says what no place is.
                 continue
             known = configured.get(status.robot_id)
             if known is None or known.slot != place.slot or not _is_at(status, known):
@@ -559,14 +570,12 @@ class Station:
     def set_world(self, text: str) -> int:
         """Want that world of the robots; the sequence."""
         self.remember_world(text)
-        self._setup = replace(self._setup, world=text, world_id=world_id(text))
         return self.change(world_id=world_id(text))
 
-    def _keep_world_of(self, state: GroundState) -> None:
-        """The robots' world is what clients see, if its text is known here."""
-        text = None if state.world_id is None else self._worlds.get(state.world_id)
-        if text is not None and state.world_id is not None:
-            self._setup = replace(self._setup, world=text, world_id=state.world_id)
+    def hear_world(self, text: str) -> None:
+        """Another station sends it to the robots; what nobody flies over is not kept."""
+        if world_id(text) in (self.world_id, *self._worlds_of_robots.values()):
+            self.remember_world(text)
 
     def remember_world(self, text: str) -> None:
         """It may be the one that the robots have."""
@@ -626,7 +635,8 @@ class Station:
     def published_world(self) -> str | None:
         """The world's text, while a robot on the ground lacks it, and may have use for it."""
         wanted = self.state.world_id if self.commands and self.state else None
-        if wanted is None or wanted != self._setup.world_id:
+        text = None if wanted is None else self._worlds.get(wanted)
+        if text is None:
             return None
         lacking = any(
             s.world_id != wanted
@@ -634,7 +644,7 @@ class Station:
             and not any(_UNUSABLE_WORLD in why for why in s.not_taken)
             for s in self.statuses().values()
         )
-        return self._setup.world if lacking else None
+        return text if lacking else None
 
 
 def changes_in_words(before: GroundState, after: GroundState) -> list[str]:

@@ -31,9 +31,9 @@ class _Flown(NamedTuple):
 class UnderWay:
     """Follows what robots say, in the order of time.
 
-    A robot has part in a mission from when it flies it until it is on the ground, disarmed, or
-    begins another trial, or its trial is reset. The mission ends when nobody has part in it. Who
-    was heard no more for `silent_s` does not keep it going by itself.
+    A robot has part in a mission from when it flies it until it is on the ground, disarmed, is
+    killed, begins another trial, or its trial is reset. The mission ends when nobody has part in
+    it. Who was heard no more for `silent_s` does not keep it going by itself.
     """
 
     def __init__(self, silent_s: float = _SILENT_S) -> None:
@@ -54,6 +54,8 @@ class UnderWay:
             others = [flown for flown in self._flown.values() if flown.trial == said.trial]
             self._flown[robot_id] = now
             return not goes_on and all(heard_s - o.heard_s > self._silent_s for o in others)
-        if goes_on and (said.state not in ON_GROUND or said.armed):
+        # Who has lost its autopilot may get it back, and fly on.
+        killed = said.state is FlightState.FAULT and said.armed is False
+        if goes_on and not killed and (said.state not in ON_GROUND or said.armed):
             self._flown[robot_id] = now
         return False

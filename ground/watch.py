@@ -15,6 +15,7 @@ from rich.segment import Segment
 from rich.style import Style as RichStyle
 from textual import work
 from textual.app import App, ComposeResult
+from textual.containers import Vertical
 from textual.events import Key, Resize
 from textual.geometry import Region, Size
 from textual.scroll_view import ScrollView
@@ -45,10 +46,13 @@ _CONNECT_AGAIN_S = 0.5
 _SILENT_S = 2.0
 # A robot whose alarm is over stays on top for so long, so that no row jumps to and fro.
 _STAYS_UP_S = 5.0
-# From the top.
-_PARTS = ("banner", "header", "alarms", "heading", "body", "selected", "message", "keys")
+# From the top; the last two are in view however small the terminal is.
+_PARTS = ("banner", "header", "alarms", "heading", "body", "selected")
+_BOTTOM = ("message", "keys")
 # Of the height.
 _ALARMS_SHARE = 6
+# On fewer lines the table needs what other parts take.
+_SMALL_LINES = 16
 _SCREENSHOT_AFTER_S = 3.0
 _STEPS = {
     "up": -1, "k": -1, "down": 1, "j": 1, "pageup": -10, "pagedown": 10, "home": -999, "end": 999,
@@ -141,6 +145,7 @@ class Watch(App[str]):
     ENABLE_COMMAND_PALETTE = False
     TITLE = "lpac watch"
     CSS = """
+    Screen { overflow: hidden hidden; }
     Lines { overflow: hidden hidden; scrollbar-size-vertical: 1; }
     #banner { height: 4; display: none; }
     #header { height: 3; background: $panel; }
@@ -149,6 +154,7 @@ class Watch(App[str]):
         height: 1fr; overflow-y: auto; scrollbar-color: $faint; scrollbar-background: $panel;
     }
     #selected { height: 2; background: $panel; }
+    #bottom { dock: bottom; height: 2; }
     #message { height: 1; background: $panel; }
     #keys { height: 1; background: $panel; }
     """
@@ -180,6 +186,7 @@ class Watch(App[str]):
     def compose(self) -> ComposeResult:
         for name in _PARTS:
             yield Lines(name)
+        yield Vertical(*map(Lines, _BOTTOM), id="bottom")
 
     def on_mount(self) -> None:
         self.theme_changed_signal.subscribe(self, lambda _: self._take_theme())
@@ -188,7 +195,9 @@ class Watch(App[str]):
         self._listen()
 
     def on_resize(self, event: Resize) -> None:
-        self.query_one("#alarms").styles.height = max(3, event.size.height // _ALARMS_SHARE)
+        lines = event.size.height
+        least = 2 if lines < _SMALL_LINES else 3
+        self.query_one("#alarms").styles.height = max(least, lines // _ALARMS_SHARE)
         self.call_after_refresh(self._draw)
 
     def _take_theme(self) -> None:
@@ -273,7 +282,7 @@ class Watch(App[str]):
         # While it connects, which is at once if there is a ground process, nothing is wrong.
         banner.display = bool(self._problem) and lost_s > _CONNECT_AGAIN_S
         if banner.display:
-            banner.show(lost(self._problem, lost_s, width))
+            banner.show(lost(self._setup, self._problem, lost_s, width))
         self._show("message", [line(width, Span(" "), self._bottom())])
         self._show("keys", [line(width, *KEYS)])
         setup, picture = self._setup, self._picture
@@ -295,7 +304,9 @@ class Watch(App[str]):
         ]
         names = [row.robot.name for row in rows]
         at = names.index(self._selected) if self._selected in names else 0
-        self.query_one("#selected").display = self._view == "table"
+        self.query_one("#selected").display = (
+            self._view == "table" and self.size.height >= _SMALL_LINES
+        )
         if self._view == "table":
             if rows:
                 self._show("selected", in_short(rows[at], width))

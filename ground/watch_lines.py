@@ -65,6 +65,11 @@ def number(value: float | None, width: int, decimals: int = 1) -> str:
     return "#" * width
 
 
+def direction(heading_deg: float, decimals: int = 0) -> str:
+    """Below 360°, also rounded."""
+    return f"{round(heading_deg, decimals) % 360.0:.{decimals}f}°"
+
+
 def age(value_s: float | None) -> str:
     """Three characters: seconds, or with a unit minutes or hours."""
     if value_s is None or not math.isfinite(value_s):

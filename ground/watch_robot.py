@@ -9,7 +9,7 @@ from rich.cells import cell_len
 from edge.core.mission import ON_GROUND, RobotStatus
 from ground.alarms import LATE_MS, Alarm
 from ground.protocol import Picture, RobotPicture
-from ground.watch_lines import Line, Span, TextStyle, age, duration, fit, line, number
+from ground.watch_lines import Line, Span, TextStyle, age, direction, duration, fit, line, number
 from ground.watch_table import (
     ID,
     Row,
@@ -133,7 +133,7 @@ def _position(status: RobotStatus) -> str:
     return _listed(
         where,
         "" if status.velocity_m_s is None else f"{speed_m_s(status):.1f} m/s",
-        "" if heading_rad is None else f"heading {math.degrees(heading_rad) % 360.0:.0f}°",
+        "" if heading_rad is None else f"heading {direction(math.degrees(heading_rad))}",
     )
 
 
@@ -182,7 +182,8 @@ def _origin(status: RobotStatus) -> str:
     origin = status.origin
     if origin is None:
         return ""
-    return f"{origin.latitude_deg:.7f} {origin.longitude_deg:.7f} {origin.heading_deg:.1f}°"
+    where = f"{origin.latitude_deg:.7f} {origin.longitude_deg:.7f}"
+    return f"{where} {direction(origin.heading_deg, 1)}"
 
 
 def _program(row: Row, status: RobotStatus) -> str:

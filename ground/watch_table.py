@@ -15,7 +15,6 @@ from edge.core.safety import Fence
 from ground.alarms import (
     BATTERY_LOW,
     FEATURE_AGE_S,
-    FLIGHT,
     LATE_MS,
     LIMITS,
     SEVERITIES,
@@ -145,11 +144,12 @@ def _of_status(cell: Callable[[RobotStatus], Span]) -> Callable[[Row], Span]:
     return of_row
 
 
-def _battery(status: RobotStatus) -> Span:
-    if status.battery is None:
-        return Span("-")
+def _battery(row: Row) -> Span:
+    status = row.robot.status
+    if status is None or status.battery is None:
+        return Span("-", "" if status else "faint")
     style: TextStyle = "warning" if status.battery <= BATTERY_LOW else ""
-    if status.battery <= FLIGHT.battery_critical:
+    if status.battery <= row.setup.battery_critical:
         style = "critical"
     return Span(number(100.0 * status.battery, 3, 0), style)
 
@@ -235,7 +235,7 @@ def _reason(row: Row) -> Span:
 _COLUMNS = (
     Column(0, "", "", 1, _mark, left=True),
     Column(2, "state", "", 9, _state, left=True),
-    Column(4, "bat", "%", 3, _of_status(_battery)),
+    Column(4, "bat", "%", 3, _battery),
     Column(9, "GPS", "sat", 3, _of_status(_satellites)),
     Column(5, "mode", "", 8, _of_status(lambda s: Span(s.mode or "-")), left=True),
     Column(6, "x", "m", 5, _of_status(_coordinate(0, 5))),

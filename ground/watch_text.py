@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Sequence
 
 from edge.core.mission import GroundState
-from ground.alarms import FLIGHT, Alarm, Severity
+from ground.alarms import Alarm, Severity
 from ground.protocol import Picture, Report, Setup
-from ground.watch_lines import Line, Span, duration, fit, line, plain, some
+from ground.watch_lines import Line, Span, direction, duration, fit, line, plain, some
 from ground.watch_table import ID, MARKS, columns, fence_size, heading, in_order, table_row
 
 _OTHER_KEYS = {
@@ -107,7 +107,8 @@ def _field(setup: Setup, picture: Picture) -> Iterable[Span]:
         yield Span("no origin", "warning")
     else:
         yield Span(
-            f"origin {origin.latitude_deg:.5f} {origin.longitude_deg:.5f} {origin.heading_deg:.0f}°"
+            f"origin {origin.latitude_deg:.5f} {origin.longitude_deg:.5f} "
+            f"{direction(origin.heading_deg)}"
         )
     yield Span(f"bundle {setup.bundle_id[:ID]}")
     world = setup.world_id if ground is None or ground.world_id is None else ground.world_id
@@ -147,14 +148,17 @@ def few_alarms(alarms: Sequence[Alarm], width: int, height: int) -> list[Line]:
     return lines
 
 
-def lost(text: str, lost_s: float, width: int) -> list[Line]:
+def lost(setup: Setup | None, text: str, lost_s: float, width: int) -> list[Line]:
     """Above what was known last, when there is no ground process; `text` is why."""
-    hold_s = FLIGHT.ground_timeout_s
-    land_s = hold_s + FLIGHT.ground_lost_land_s
+    then = "hold, then land where they are."
+    if setup is not None:
+        hold_s = setup.ground_timeout_s
+        land_s = hold_s + setup.ground_lost_land_s
+        then = f"hold after {hold_s:g} s, land where they are after {land_s:g} s."
     texts = (
         f"NO GROUND STATION for {duration(lost_s)}",
         f"{text[:1].upper()}{text[1:]}.",
-        f"Robots that hear none: hold after {hold_s:g} s, land where they are after {land_s:g} s.",
+        f"Robots that hear none: {then}",
         "This view comes back by itself; it shows what was known last.",
     )
     return [line(width, Span(f" {fit(text, width - 1)}", "banner")) for text in texts]

@@ -193,6 +193,9 @@ class RobotStatus:
     for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
     `neighbour_messages` counts each neighbour's messages since the start. `ground_age_s` is how
     long ago the state that it obeys was heard, None if never.
+
+    What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
+    look. Raises ValueError for what must be there and is not finite.
     """
 
     robot_id: int
@@ -243,6 +246,24 @@ class RobotStatus:
             value = getattr(self, name)
             if value is not None and len(value) != size:
                 raise ValueError(f"{name} = {list(value)}: must be {size} numbers")
+            if value is not None and not all(map(math.isfinite, value)):
+                self._forget(name)
+        for name in (
+            "uptime_s", "unix_time_s", "slot_height_m", "heading_rad", "battery", "hdop",
+            "feature_age_s", "ground_age_s",
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not math.isfinite(value):
+                self._forget(name)
+        ages_s = self.neighbour_ages_s
+        if not all(map(math.isfinite, ages_s.values())):
+            heard = {robot: age_s for robot, age_s in ages_s.items() if math.isfinite(age_s)}
+            object.__setattr__(self, "neighbour_ages_s", heard)
+
+    def _forget(self, name: str) -> None:
+        if name in ("uptime_s", "unix_time_s", "slot_height_m", "landing_point_m"):
+            raise ValueError(f"{name} = {getattr(self, name)}: must be finite")
+        object.__setattr__(self, name, None)
 
 
 def is_over_landing_point(status: RobotStatus) -> bool:

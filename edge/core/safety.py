@@ -99,8 +99,17 @@ class Fence:
         return float(place[0]), float(place[1])
 
     def grown_m(self, margin_m: float) -> tuple[tuple[float, float], ...]:
-        """Corners (x, y) of the polygon whose every line lies `margin_m` further out."""
-        after = self._edges().inward
+        """Corners (x, y) of the polygon whose every line lies `margin_m` further out.
+
+        Inward, by at most `buffer_m`, an edge that is short may be gone.
+        """
+        edges = self._edges()
+        if margin_m < 0.0:
+            corners = np.array(self.vertices_m)
+            for inward, offset_m in zip(edges.inward, edges.offsets_m - margin_m, strict=True):
+                corners = _cut(corners, inward, offset_m)
+            return tuple((float(x_m), float(y_m)) for x_m, y_m in corners)
+        after = edges.inward
         before = np.roll(after, 1, axis=0)
         outward = (before + after) / (1.0 + (before * after).sum(axis=1, keepdims=True))
         corners = np.array(self.vertices_m) - margin_m * outward
@@ -390,6 +399,19 @@ def _keep_height(
 
 def _plausible(*vectors: Iterable[float]) -> bool:
     return all(abs(number) < _ABSURD for vector in vectors for number in vector)
+
+
+def _cut(corners: F64, inward: F64, offset_m: float) -> F64:
+    """What of a convex polygon (n, 2) lies on that side of a line."""
+    inside_m = corners @ inward - offset_m
+    kept = []
+    for k in range(len(corners)):
+        if inside_m[k - 1] * inside_m[k] < 0.0:
+            share = inside_m[k - 1] / (inside_m[k - 1] - inside_m[k])
+            kept.append(corners[k - 1] + share * (corners[k] - corners[k - 1]))
+        if inside_m[k] >= 0.0:
+            kept.append(corners[k])
+    return np.array(kept)
 
 
 def _area(corners: F64) -> float:

@@ -1,6 +1,6 @@
 // The map: the mission frame in metres, x to the right and y up.
 
-import { colour, look, number } from "./dom.js";
+import { colour, direction, look, number } from "./dom.js";
 
 const EXPLORED_CELLS = 64;
 // Robots send every 0.4 s, and forget what is older than 0.8 s.
@@ -59,6 +59,7 @@ export class MapCanvas {
     this.context = canvas.getContext("2d");
     this.layers = Object.fromEntries(Object.keys(LAYERS).map((name) => [name, true]));
     this.setup = null;
+    this.known = false;
     this.picture = null;
     this.cells = {};
     this.paths = new Map();
@@ -87,7 +88,9 @@ export class MapCanvas {
 
   setSetup(setup) {
     this.setup = setup;
-    this.levels = bytes(setup.density.levels);
+    this.levels = bytes(setup.density?.levels ?? "");
+    // Of a world that the ground does not have, nothing is known.
+    this.known = this.levels.some((level) => level > 0);
     this.paintDensity();
     this.paintVeil();
     if (this.fitted) this.fit();
@@ -249,7 +252,7 @@ export class MapCanvas {
 
   // The density, a pixel per cell; the first row is the highest y.
   paintDensity() {
-    if (!this.setup) return;
+    if (!this.known) return;
     const n = this.setup.density.cells;
     this.density ??= document.createElement("canvas");
     this.density.width = this.density.height = n;
@@ -327,7 +330,7 @@ export class MapCanvas {
     const { side_m: side } = this.setup;
     const [x0, y1] = this.toScreen([0, 0]);
     const [x1, y0] = this.toScreen([side, side]);
-    if (this.layers.density) {
+    if (this.layers.density && this.known) {
       c.imageSmoothingEnabled = true;
       c.drawImage(this.density, x0, y0, x1 - x0, y1 - y0);
     } else {
@@ -643,7 +646,7 @@ export class MapCanvas {
     c.fillText("N", 20 * Math.sin(turn), -20 * Math.cos(turn));
     c.fillStyle = this.ink.faint;
     c.font = "11px system-ui, sans-serif";
-    c.fillText(`up ${heading.toFixed(0)}°`, 0, 36);
+    c.fillText(`up ${direction(heading)}`, 0, 36);
     c.restore();
   }
 

@@ -58,6 +58,11 @@ export function number(value, digits = 0, unit = "") {
   return value === null || value === undefined ? "–" : value.toFixed(digits) + unit;
 }
 
+// Degrees, below 360 also rounded.
+export function direction(degrees) {
+  return `${((Math.round(degrees) % 360) + 360) % 360}°`;
+}
+
 export function clock(seconds) {
   const whole = Math.max(0, Math.floor(seconds));
   return `${Math.floor(whole / 60)}:${String(whole % 60).padStart(2, "0")}`;

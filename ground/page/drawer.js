@@ -1,6 +1,6 @@
 // Everything about one robot.
 
-import { age, clock, look, make, number, setClass, setText, sync } from "./dom.js";
+import { age, clock, direction, look, make, number, setClass, setText, sync } from "./dom.js";
 import { battery, chip, setChip } from "./panel.js";
 
 // Where checks count: in the air a robot is not ready to take off, and need not be.
@@ -78,7 +78,7 @@ export class Drawer {
       ["GPS", `${number(s.satellites)} satellites, hdop ${number(s.hdop, 1)}`],
       ["position", p ? `x ${number(p[0], 2)}  y ${number(p[1], 2)}  z ${number(p[2], 2)} m` : "–"],
       ["speed", v ? `${number(speed, 2)} m/s, climb ${number(v[2], 2)} m/s` : "–"],
-      ["heading", s.heading_rad === null ? "–" : `${((s.heading_rad * 180) / Math.PI).toFixed(0)}° true`],
+      ["heading", s.heading_rad === null ? "–" : `${direction((s.heading_rad * 180) / Math.PI)} true`],
       ["lat, lon", s.global_deg ? s.global_deg.map((d) => number(d, 7)).join(", ") : "–"],
     ]);
     this.fill("Flight", [

@@ -17,6 +17,7 @@ let picture = null;
 let pictureAt = 0;
 let problem = "connecting";
 let curve = null;
+let cost = null;
 let missionTime = null;
 let selected = null;
 
@@ -49,6 +50,9 @@ const take = {
   setup(message) {
     setup = message;
     map.setSetup(message);
+    $("#ramp").hidden = !map.known;
+    setText($("#importance"), map.known ? "importance" : "no importance known");
+    showCost();
   },
   paths(message) {
     map.paths = new Map(Object.entries(message.paths));
@@ -60,18 +64,16 @@ const take = {
   curve(message) {
     if (curve && curve.began_s !== message.began_s) map.paths.clear();
     curve = message;
-    chart.set(curve.points, curve.bound);
     showCost();
   },
   coverage(message) {
     map.cells = message.cells;
     map.draw();
     missionTime = message.time_s;
-    setText($("#absolute"), message.cost === null ? "–" : message.cost.toExponential(2).replace("+", ""));
+    cost = message.cost;
     if (curve && message.share !== null && message.share !== undefined) {
       if (curve.points.length >= 3000) curve.points = curve.points.filter((_, n) => n % 2 === 0);
       curve.points.push([message.time_s, message.share]);
-      chart.set(curve.points, curve.bound);
     }
     showCost();
   },
@@ -125,6 +127,12 @@ function act(action, robots = []) {
   if (!operate) return;
   if (tell({ do: action, robots })) return;
   toast(TITLES[action], "not sent", ["the map's own server is gone; `lpac mission " + action + "` in a terminal"], false);
+}
+
+// One key in every view; where it cannot hold, it says what can.
+function hold() {
+  if (operate) act("hold");
+  else toast("Hold", "not from this map, which only observes", ["`lpac mission hold` in a terminal, or h in `lpac watch`"], false);
 }
 
 // Asking first. It covers the map, never the bar: hold is in reach.
@@ -238,11 +246,14 @@ function showNext(ours, enabled, calm) {
 }
 
 function showCost() {
-  const last = curve?.points.at(-1);
-  setText($("#share"), number(last?.[1], 3));
-  setText($("#bound"), curve ? (curve.bound === null ? "…" : number(curve.bound, 3)) : "–");
-  $("#cost").title = curve && !curve.whole ? "The map was opened during the mission: J₀ is the first that it saw." : "";
-  $("#cost").classList.toggle("late", Boolean(curve && !curve.whole));
+  // Where nothing is known to be important, no cost means anything.
+  const shown = map.known ? curve : null;
+  chart.set(shown?.points ?? [], shown?.bound ?? null);
+  setText($("#share"), number(shown?.points.at(-1)?.[1], 3));
+  setText($("#bound"), shown ? (shown.bound === null ? "…" : number(shown.bound, 3)) : "–");
+  setText($("#absolute"), map.known && cost !== null ? cost.toExponential(2).replace("+", "") : "–");
+  $("#cost").title = shown && !shown.whole ? "The map was opened during the mission: J₀ is the first that it saw." : "";
+  $("#cost").classList.toggle("late", Boolean(shown && !shown.whole));
 }
 
 function showLink() {
@@ -324,7 +335,7 @@ $("#out").addEventListener("click", () => map.zoom(1 / 1.4));
 $("#fit").addEventListener("click", () => map.fit());
 
 const KEYS = {
-  h: () => act("hold"),
+  h: hold,
   f: () => map.fit(),
   t: toggleTheme,
   "+": () => map.zoom(1.4),

@@ -179,6 +179,23 @@ def test_what_is_not_installed_is_said_in_one_line() -> None:
     )
 
 
+def test_ctrl_c_while_a_program_starts_is_one_line() -> None:
+    code = """
+import sys
+import cli.main, fleet.config
+def stopped(_):
+    raise KeyboardInterrupt
+fleet.config.load_fleet = stopped
+sys.argv = ["lpac", "watch"]
+cli.main.main()
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (result.returncode, result.stdout) == (130, "")
+    assert error_line(result) == "lpac: interrupted"
+
+
 def test_a_bad_world_file_is_named(tmp_path: Path) -> None:
     world = tmp_path / "world.env"
     world.write_text("CircularBND 300 200 forty 6\n")

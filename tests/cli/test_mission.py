@@ -207,6 +207,8 @@ def test_operators_mistakes_are_one_line_each(field: Field, tmp_path: Path) -> N
     assert "--yes" in mission("mission", "kill", "r1")
     assert "--yes" in mission("mission", "kill", "--robots", "r1")
     assert "kill: name the robots" in mission("mission", "kill", "--yes")
+    for by_name in ("pilot", "rejoin"):
+        assert f"{by_name}: name the robots, such as" in mission("mission", by_name)
     assert "not both" in mission("mission", "pilot", "r1", "--robots", "r1")
     assert f"{bad}: record 1 (CircularBND): sigma is missing" in mission("mission", "world", bad)
     assert "cannot be read" in mission("mission", "world", tmp_path / "none.env")
@@ -275,6 +277,20 @@ def test_fleet_flies_as_it_is_told(field: Field) -> None:
     field.do("mission", "again", "windy")
     until(lambda: [robot.ground and robot.ground.trial for robot in field.robots] == ["windy"] * 3)
     field.do("mission", "disarm")
+
+
+def test_ctrl_c_withdraws_no_return(field: Field) -> None:
+    field.do("mission", "enable")
+    field.do("mission", "takeoff", "--interval", "0")
+    with field.running("mission", "return", "--wait") as process:
+        assert process.stderr is not None
+        assert "r" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60.0)
+    assert process.returncode == 130
+    last = err.splitlines()[-1]
+    assert last == "lpac: return: interrupted: robots that were told to return go on with it"
+    until(lambda: states(field) == [_S.LANDED] * 3)
 
 
 def test_kill_names_its_robots_and_asks(field: Field) -> None:

@@ -1,6 +1,8 @@
 """What ground and robots say to each other survives the way, and what is wrong is named."""
 
 import dataclasses
+import json
+import math
 import re
 
 import numpy as np
@@ -51,6 +53,32 @@ def test_messages_survive_the_way() -> None:
     order = Order("x", 3, 2**47, "start", 22.5, "anna", trial="t1")
     for message in (state, order, STATUS):
         assert from_json(type(message), to_json(message)) == message
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_is_not_known(number: float) -> None:
+    odd = {
+        "position_m": [1.0, number, 3.0], "velocity_m_s": [number, 0.0, 0.0],
+        "global_deg": [number, number], "policy_velocity_m_s": [0.0, number],
+        "heading_rad": number, "battery": number, "hdop": number, "feature_age_s": number,
+        "ground_age_s": number,
+    }  # fmt: skip
+    ages_s = {"neighbour_ages_s": {"2": number, "4": 0.2}}
+    data = json.dumps(dataclasses.asdict(STATUS) | odd | ages_s).encode()
+    known = dataclasses.replace(STATUS, **dict.fromkeys(odd), neighbour_ages_s={"4": 0.2})  # type: ignore[arg-type]
+    assert from_json(RobotStatus, data) == known
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [{"uptime_s": math.nan}, {"unix_time_s": math.inf}, {"slot_height_m": math.nan},
+     {"landing_point_m": [0.0, math.nan]}],
+    ids=str,
+)  # fmt: skip
+def test_a_status_has_a_time_and_a_place_to_go_to(odd: dict[str, object]) -> None:
+    data = json.dumps(dataclasses.asdict(STATUS) | odd).encode()
+    with pytest.raises(ConfigError, match=f"RobotStatus: {next(iter(odd))} = .*: must be finite"):
+        from_json(RobotStatus, data)
 
 
 def test_what_is_asked_of_one_robot_overrides_what_is_asked_of_all() -> None:

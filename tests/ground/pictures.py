@@ -17,7 +17,7 @@ def setup(n: int) -> Setup:
     return Setup(
         fleet="field", operator="alice", robots={f"r{i}": i for i in range(n)},
         slots=tuple(Site(Place(i, (2.0, 2.0)), (2.0, 2.0), f"r{i}") for i in range(n)),
-        fence=FENCE, world="", world_id="c64e4b1b0000",
+        fence=FENCE, world="CircularBND 256 256 40 8\n", world_id="c64e4b1b0000",
         bundle_id="7992912100000000", world_size=512, sensor_size=64, communication_range=128.0,
         env_scale=16.0, truncation=2.0, norm=1.0,
     )  # fmt: skip

@@ -66,7 +66,6 @@ OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
          "warning", "world c64e4b1b of the ground has not arrived: wait"),
         ({"satellites": 7}, "warning", "GPS sees 7 satellites"),
         ({"hdop": 2.5}, "warning", "GPS precision (HDOP) is 2.5"),
-        ({"hdop": float("nan")}, "warning", "GPS precision (HDOP) is nan"),
         ({"feature_age_s": 1.4}, "warning", "features are 1.4 s old"),
         ({"feature_age_s": 1.4, "state": _S.HOLD}, "note", "features are 1.4 s old"),
         ({"feature_age_s": None}, "warning", "has no features to ask the policy with"),
@@ -147,6 +146,21 @@ def test_nobody_commands_robots_in_the_air() -> None:
 def test_a_commander_that_fell_silent() -> None:
     (alarm,) = told(replace(fleet(), commander="bob", commander_age_s=2.5))
     assert alarm == ("critical", "", "bob commands, but is not heard: hold takes over")
+
+
+def test_a_fleet_whose_files_say_when_a_battery_is_critical() -> None:
+    seen = fleet(said={"battery": 0.22})
+    (alarm,) = alarms(replace(SETUP, battery_critical=0.25), seen)
+    assert alarm == ("critical", "r1", "battery critical: 22%")
+
+
+def test_a_world_that_is_not_here() -> None:
+    (alarm,) = alarms(replace(SETUP, world=""), fleet())
+    assert alarm == (
+        "warning",
+        "",
+        "the robots' world c64e4b1b is not here: no density, no cost; `lpac mission world FILE`",
+    )
 
 
 def test_hold_of_another_station() -> None:

@@ -20,7 +20,7 @@ from ground.protocol import (
     Takeoff,
 )
 from tests.ground.pretend import ORIGIN
-from tests.ground.test_station import OTHER_WORLD, Field, a_field, pad_m, why_not
+from tests.ground.test_station import OTHER_WORLD, WORLD, Field, a_field, pad_m, why_not
 
 _S = FlightState
 TAKEOFF = Takeoff(interval_s=0.0)
@@ -142,7 +142,29 @@ def test_a_killed_robot_is_not_in_the_others_way() -> None:
     field.done(SetWorld(OTHER_WORLD, "w", robots=("r1", "r2")))
 
 
+def test_the_fleets_world_is_made_known_at_any_time() -> None:
+    field = two_stations()
+    field.done(SetWorld(OTHER_WORLD, "w"))
+    field.leave("bob")
+    field.done(TAKEOFF)
+    bob = field.join("bob")
+    field.run(1.0)
+    assert not bob.setup.world
+    before = field.stations["alice"].state
+    assert "alice commands the fleet" in field.do(SetWorld(WORLD, "w"), "bob").problem
+    field.done(SetWorld(OTHER_WORLD, "w"), "bob")
+    assert bob.setup.world == OTHER_WORLD
+    assert field.stations["alice"].state == before
+
+
 # Whoever takes over has the fleet
+
+
+def test_who_takes_over_has_gathered_its_robots_first() -> None:
+    field = two_stations()
+    # It knows who commands before it has heard every robot.
+    field.join("carol")
+    field.done(Command(), "carol")
 
 
 def test_who_took_over_is_not_robbed_of_the_command() -> None:

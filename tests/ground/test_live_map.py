@@ -14,6 +14,7 @@ import aiohttp
 import pytest
 
 from edge.core.mission import ON_GROUND, FlightState, GroundState
+from edge.core.safety import Fence
 from ground.client import command, listen
 from ground.live_map import Outbox, serving
 from ground.live_map_access import Access, is_loopback, reached_at
@@ -133,7 +134,8 @@ def test_on_the_network_the_address_has_a_token(fleet: PretendedFleet) -> None:
             async with session.ws_connect(bare + "live", headers={"Origin": bare[:-1]}) as stream:
                 assert (await stream.receive_json())["kind"] == "hello"
 
-    with live_map(fleet.fleet_toml, "--host", "0.0.0.0") as address:
+    # It serves as at 0.0.0.0.
+    with live_map(fleet.fleet_toml, "--host", "::") as address:
         assert len(address.partition("?token=")[2]) >= 16
         name = urlsplit(address).hostname
         # One that a tablet can open, unless this machine is on no network.
@@ -313,6 +315,9 @@ def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     assert missions.time_s(picture_of(FlightState.HOLD, 160.0)) == 60.0
     assert missions.time_s(picture_of(FlightState.LAND, 160.0)) is None
     assert not missions.begins(picture_of(FlightState.MISSION, 170.0))
+    # What was seen of it over another world is nothing to compare with.
+    missions.change_world()
+    assert not missions.begin(picture_of(FlightState.MISSION, 180.0), 40.0).whole
 
 
 @pytest.mark.parametrize(
@@ -339,15 +344,41 @@ def test_a_mission_after_another_is_a_new_curve(between: Picture, trial: str, an
     assert missions.begins(again) == anew
 
 
+def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
+    async def ask(fleet: PretendedFleet) -> None:
+        async with (
+            asking(fleet.name) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            # It is not known before a robot says it.
+            await until(stream, lambda m: m["kind"] == "setup" and m["density"] is None)
+            told = await until(stream, of_kind("coverage"))
+            assert told["cost"] is None and not told["cells"]
+            picture = await until(stream, of_kind("picture"))
+            assert any("no density, no cost" in alarm["text"] for alarm in picture["alarms"])
+
+    with pretended(tmp_path, 1) as fleet:
+        fleet.robots[0].world_id = "0123456789ab"
+        with lpac("ground", "--fleet", str(fleet.fleet_toml), "--name", "alice"):
+            asyncio.run(ask(fleet))
+
+
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
     (robot,) = picture_of(FlightState.HOLD, 0.0).robots
     assert robot.status is not None
-    broken = replace(robot.status, velocity_m_s=(math.nan, math.inf, 0.0), hdop=math.nan)
+    late = replace(robot.status.loops["control"], lateness_p99_ms=math.nan)
+    broken = replace(robot.status, loops={"control": late}, hdop=math.nan)
     setup = Setup("f", "alice", {"r1": 1}, (), FENCE, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0)
     view = detail_view(setup, replace(robot, status=broken))
-    assert json.loads(json.dumps(view, allow_nan=False))["status"]["velocity_m_s"] == [
-        None, None, 0.0,
-    ]  # fmt: skip
+    shown = json.loads(json.dumps(view, allow_nan=False))["status"]
+    assert shown["loops"]["control"]["lateness_p99_ms"] is None and shown["hdop"] is None
+
+
+def test_a_buffers_line_does_not_cross_itself() -> None:
+    """Its short edges may be gone."""
+    corners = ((0.0, 0.0), (32.0, 0.0), (32.0, 31.9), (31.9, 32.0), (0.0, 32.0))
+    fence = Fence(corners, buffer_m=1.5, floor_m=2.0, ceiling_m=100.0)
+    assert set(fence.grown_m(-1.5)) == {(1.5, 1.5), (30.5, 1.5), (30.5, 30.5), (1.5, 30.5)}
 
 
 # A real browser
@@ -377,6 +408,12 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         page = seen.page
         wait_for_picture(few.name)
         assert command(few.name, SetOrigin(ORIGIN)).done
+        # On a tablet, upright, and on a phone hold is in reach.
+        for width, height in ((768, 1024), (400, 800), (1280, 800)):
+            page.set_viewport_size({"width": width, "height": height})
+            box = page.locator("#hold").bounding_box()
+            assert box is not None and box["x"] >= 0.0 and box["y"] >= 0.0
+            assert box["x"] + box["width"] <= width and box["y"] + box["height"] <= height
         seen.act("enable")
         seen.wait_for_states(dict.fromkeys(("r0", "r1", "r2"), "preflight"))
         # Takeoff asks first; who will not is named, in text.
@@ -451,6 +488,9 @@ def test_a_page_that_observes(few: PretendedFleet) -> None:
             assert page.is_hidden("#bar")
             assert "lpac mission hold" in page.inner_text("#observing")
             page.keyboard.press("h")
+            page.wait_for_selector("#toasts >> text=lpac mission hold")
+            below_360 = "async () => (await import('./dom.js')).direction(359.9)"
+            assert page.evaluate(below_360) == "0°"
             page.click("tr[data-robot=r1]")
             page.wait_for_selector("#drawer >> text=satellites")
             assert page.locator("[data-robot-do]:visible").count() == 0
@@ -461,4 +501,17 @@ def test_a_page_that_observes(few: PretendedFleet) -> None:
                 page.wait_for_selector("#banner", state="hidden")
                 page.wait_for_selector("#link >> text=ground live")
                 assert "HOLD" not in page.inner_text("#calm")
+                # Of a world that this laptop does not have.
+                assert command(few.name, SetOrigin(ORIGIN)).done
+                page.keyboard.press("Escape")
+                page.wait_for_selector("#absolute >> text=/e/")
+                known = [robot.world_id for robot in few.robots]
+                for robot in few.robots:
+                    robot.world_id = "feedbeef0000"
+                page.wait_for_selector("#importance >> text=no importance known")
+                costs = [page.inner_text(f"#{name}") for name in ("share", "bound", "absolute")]
+                assert costs == ["\N{EN DASH}"] * 3 and page.is_hidden("#ramp")
+                for robot, world_id in zip(few.robots, known, strict=True):
+                    robot.world_id = world_id
+                page.wait_for_selector("#importance >> text=/^importance/")
             check_innocence(seen)

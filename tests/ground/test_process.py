@@ -1,5 +1,6 @@
 """`lpac ground` as a real process, over real zenoh, with pretended robots."""
 
+import asyncio
 import math
 import signal
 import socket
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from cli.ground import load_setup
 from edge.core.mission import FlightState, world_id
 from ground import client
 from ground.protocol import (
@@ -183,6 +185,65 @@ def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
     alice.wait_for(lambda p: p.commander_age_s > 2.0)
     done(alice.command(Calm("hold", robots=("r1", "r2"))))
     alice.wait_for(lambda p: p.commander == "alice")
+
+
+def test_another_station_knows_the_world_that_one_sends(
+    fleet: PretendedFleet, new_station: NewStation
+) -> None:
+    text = "CircularBND 100 100 20 5\n"
+    alice = new_station(fleet.fleet_toml)
+    alice.wait_for(all_heard)
+    bob = new_station(fleet.fleet_toml, "bob")
+    done(alice.command(SetWorld(text, "w.env")))
+    bob.wait_for(lambda _: bob.setup().world == text)
+    carol = new_station(fleet.fleet_toml, "carol")
+    carol.wait_for(lambda _: not carol.setup().world)
+    assert carol.setup().world_id == world_id(text)
+    # On the same laptop it stays known.
+    bob.kill()
+    bob.start()
+    bob.wait_for(lambda p: p.ground)
+    assert bob.setup().world == text
+
+
+def test_a_ground_that_hangs(
+    fleet: PretendedFleet, new_station: NewStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    subscribed = station.subscribed()
+    next(subscribed)
+    # It is silent for longer than that, and yet a long command goes on.
+    fleet.robots[2].takeoff_s = math.inf
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    assert [takeoff.progress("").text for _ in range(2)] == ["", ""]
+    assert station.process is not None
+    station.process.send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(client, "_PATIENCE_S", 0.5)
+    with pytest.raises(client.GroundError, match="does not answer: end it, and start"):
+        station.command(Calm("hold"))
+    with pytest.raises(client.GroundError, match="does not answer"):
+        station.told()
+    with pytest.raises(client.GroundError, match="does not answer"):
+        list(subscribed)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(station.runtime))
+    with pytest.raises(client.GroundError, match="does not answer"):
+        asyncio.run(client.send(station.fleet, Calm("hold")))
+    monkeypatch.undo()
+    station.process.send_signal(signal.SIGCONT)
+    fleet.robots[2].takeoff_s = 1.0
+    # What it was told meanwhile it does.
+    station.wait_for(lambda p: p.ground and p.ground.calm == "hold")
+    takeoff.leave()
+
+
+def test_robots_land_when_their_files_say(fleet: PretendedFleet) -> None:
+    text = fleet.fleet_toml.read_text()
+    flight = "battery_critical = 0.2\nground_timeout_s = 4.0\nground_lost_land_s = 30.0\n"
+    fleet.fleet_toml.write_text(text.replace("[robot.flight]\n", f"[robot.flight]\n{flight}"))
+    setup = load_setup(fleet.fleet_toml, "alice").setup
+    assert setup.battery_critical == 0.2
+    assert (setup.ground_timeout_s, setup.ground_lost_land_s) == (4.0, 30.0)
 
 
 def test_two_stations_of_one_name(fleet: PretendedFleet, new_station: NewStation) -> None:

@@ -139,6 +139,8 @@ def test_robot_that_moves_or_knows_nothing_gives_no_origin() -> None:
         standing("r1", [replace(status(centre, 10.0), armed=True)])
     with pytest.raises(ValueError, match="r1 does not know its position yet"):
         standing("r1", [status(None, 10.0)])
+    with pytest.raises(ValueError, match="r1: the positions have no mean"):
+        standing("r1", [status((0.0, 0.0), 10.0), status((0.0, 180.0), 10.0)])
     carried = [status(centre, 10.0), status(moved(centre, 0.0, 12.0), 10.0)]
     with pytest.raises(ValueError, match=r"r1: its position moved by 6.0 m, allowed are 2 m"):
         standing("r1", carried)

@@ -4,7 +4,6 @@ Time is counted, nothing waits: a minute in the field takes a moment.
 """
 
 import itertools
-import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.core.mission import ORDER_LIFETIME_S, FlightState, Place
+from edge.core.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
 from ground.commands import Commands, Running
 from ground.protocol import (
     Again,
@@ -136,6 +135,8 @@ class Field:
         for other in [s for n, s in self.stations.items() if n != name]:
             if state is not None and self._arrives(name, other.operator):
                 other.hear_state(state)
+            if world is not None and self._arrives(name, other.operator):
+                other.hear_world(world)
         for robot in self.programs:
             here = f"r{robot.robot_id}"
             if state is not None and self._arrives(name, here):
@@ -453,6 +454,46 @@ def test_a_world_comes_with_its_text() -> None:
     assert field.stations["alice"].published_world() is None
 
 
+def test_a_world_that_another_station_sends_is_known() -> None:
+    field = a_field()
+    bob = field.join("bob")
+    field.done(SetWorld(OTHER_WORLD, "w.env"))
+    assert bob.setup.world == OTHER_WORLD
+    assert bob.setup.world_id == field.stations["alice"].setup.world_id
+    bob.hear_world("Uniform 3 1 0 0 9 0 9 9\n")
+    field.done(SetWorld(WORLD, "w.env"))
+    assert bob.setup.world == WORLD
+
+
+def test_a_world_that_is_not_known_is_not_shown_as_another() -> None:
+    field = a_field()
+    field.done(SetWorld(OTHER_WORLD, "w.env"))
+    # It comes when the robots have that world, and nobody sends it any more.
+    bob = field.join("bob")
+    assert (bob.setup.world, bob.setup.world_id) == (WORLD, "configured")
+    field.run(0.5)
+    assert (bob.setup.world, bob.setup.world_id) == ("", world_id(OTHER_WORLD))
+    # Nor does a commander send a world that it does not have.
+    field.done(Command(), "bob")
+    field.robots[1].world_id = "configured"
+    field.run(0.5)
+    assert bob.published_world() is None
+
+
+def test_nobody_said_a_world_and_the_robots_have_another_than_configured() -> None:
+    field = a_field()
+    for robot in field.robots:
+        robot.world_id = "older"
+    field.run(0.5)
+    alice = field.stations["alice"]
+    assert (alice.setup.world, alice.setup.world_id) == ("", "older")
+    field.robots[0].world_id = "configured"
+    field.make_ready()
+    assert alice.setup.world_id == "older", "what most have"
+    field.done(SetWorld(OTHER_WORLD, "w.env"))
+    assert alice.setup.world == OTHER_WORLD
+
+
 def test_a_world_that_cannot_be_used_is_not_sent_for_ever() -> None:
     field = a_field(1)
     station = field.stations["alice"]
@@ -756,18 +797,17 @@ def test_a_fence_that_one_robot_does_not_take_stays_the_others() -> None:
     assert field.robots[1].fence == site
 
 
-def test_numbers_that_are_none_end_nothing() -> None:
+def test_places_that_are_none_end_nothing() -> None:
     field = a_field(2)
     field.make_ready()
     field.leave("alice")
     robot = field.robots[0]
     robot.silent = True
-    for odd in ({"slot_height_m": math.nan}, {"slot_height_m": math.inf},
-                {"slot_height_m": 1e9}, {"landing_point_m": (math.nan, 0.0)}):  # fmt: skip
+    for height_m in (-1e300, 1e9, 1e300):
         again = field.join("alice")
         for _ in range(30):
             field.step()
-            again.hear_status(replace(robot.status(field.now_s), **odd))
+            again.hear_status(replace(robot.status(field.now_s), slot_height_m=height_m))
         assert again.commands
         assert again.state is not None
         assert not again.state.places

@@ -134,6 +134,16 @@ def test_header_says_who_commands_and_who_asked() -> None:
     assert "origin 47.39774 8.54559 30°  bundle 79929121  world c64e4b1b" in lines[2]
 
 
+def test_a_heading_is_below_360_degrees_however_it_is_rounded() -> None:
+    origin = replace(ORIGIN, heading_deg=359.96)
+    ground = GroundState(5, "alice", origin, enabled=True)
+    lines = header(setup(1), picture(robot(status(0)), ground=ground), None, 90)
+    assert " 0°  bundle" in "".join(span.text for span in lines[2])
+    row = Row(robot(status(0, origin=origin, heading_rad=math.radians(-0.1))), None, setup(1))
+    known = "\n".join("".join(s.text for s in line) for line in detail(row, picture(), (), 90))
+    assert "heading 0°" in known and " 0.0°" in known and "360" not in known
+
+
 def test_calm_of_single_robots() -> None:
     ground = GroundState(5, "alice", enabled=True, robot_calm={"1": "land", "0": "hold"})
     lines = header(setup(2), picture(ground=ground), None, 80)
@@ -290,7 +300,6 @@ def test_a_ground_process_that_ends_and_comes_back(tmp_path: Path) -> None:
         async with watching(fleet.name) as seen:
             await seen.until(lambda: "NO GROUND STATION" in seen.text("banner"))
             assert "start `lpac ground`" in seen.text("banner")
-            assert "hold after 3 s, land where they are after 13 s" in seen.text("banner")
             with ground(fleet) as process:
                 await seen.until(lambda: seen.text("body").count(" idle ") == 2)
                 assert not seen.text("banner")
@@ -299,6 +308,7 @@ def test_a_ground_process_that_ends_and_comes_back(tmp_path: Path) -> None:
                 process.send_signal(signal.SIGCONT)
                 await seen.until(lambda: not seen.text("banner"))
             await seen.until(lambda: "NO GROUND STATION" in seen.text("banner"))
+            assert "hold after 3 s, land where they are after 13 s" in seen.text("banner")
             assert seen.text("body").count(" idle ") == 2
             await seen.press("h")
             await seen.until(lambda: "hold the fleet NOT SENT" in seen.text("message"))
@@ -349,6 +359,24 @@ def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
         seen_last = picture(robot(status(0)), robot(status(1)), unix_time_s=1000.0)
         async with told(setup(2), lambda: seen_last, events), watching("field") as seen:
             await seen.until(lambda: "mission 01:00" in seen.text("header"))
+
+    asyncio.run(use())
+
+
+@pytest.mark.parametrize("size", [(40, 12), (40, 8)])
+def test_what_is_asked_is_seen_in_a_small_terminal(size: tuple[int, int]) -> None:
+    ill = picture(*(robot(status(i, alarms=(f"{i} is lost",))) for i in range(9)))
+
+    async def use() -> None:
+        async with told(setup(9), lambda: ill), watching("field", size) as seen:
+            await seen.until(lambda: "0 is lost" in seen.text("alarms"))
+            await seen.press("l")
+            await seen.until(lambda: "Land the WHOLE FLEET" in seen.text("message"))
+            assert "h HOLD" in seen.text("keys")
+            bottom = seen.app.query_one("#bottom").region
+            assert (bottom.y, bottom.height) == (size[1] - 2, 2)
+            # Nothing scrolls but the table.
+            assert seen.app.screen.scrollbars_enabled == (False, False)
 
     asyncio.run(use())
 
