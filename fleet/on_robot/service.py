@@ -63,16 +63,17 @@ def refuse_in_flight(mavlink_port: int, doing: str) -> None:
 def armed(mavlink_port: int) -> bool:
     """Whether the vehicle's motors may turn, by the robot's program or else by the vehicle itself.
 
-    A program that runs but has fallen silent may have an armed vehicle: its last word counts,
-    unless it had lost the vehicle by then.
+    A program that runs but has fallen silent may have an armed vehicle: its last word counts. If it
+    had lost the vehicle by then, the vehicle's own word counts first.
     """
     state = service()
+    status = {}  # type: Dict[str, Any]
     if state["active"] in ("active", "reloading", "deactivating"):
         status = state["status"] or {}
-        if status.get("autopilot") and status.get("armed") is not None:
-            return bool(status["armed"])
+    if status.get("autopilot") and status.get("armed") is not None:
+        return bool(status["armed"])
     heartbeat = hear_heartbeat(mavlink_port)
-    return heartbeat is not None and bool(heartbeat["armed"])
+    return bool((status if heartbeat is None else heartbeat).get("armed"))
 
 
 def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dict[str, Any]]:

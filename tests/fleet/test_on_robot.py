@@ -162,7 +162,7 @@ def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
         ({"armed": False, "autopilot": True}, True, False),
         # The program's last word from before it lost the vehicle.
         ({"armed": True, "autopilot": False}, False, False),
-        ({"armed": True, "autopilot": False}, None, False),
+        ({"armed": True, "autopilot": False}, None, True),
         ({"armed": False, "autopilot": False}, True, True),
         ({"armed": None, "autopilot": False}, True, True),
         (None, True, True),
