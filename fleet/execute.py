@@ -43,8 +43,11 @@ async def execute(
             group.create_task(_read(process.stdout, on_output))
             group.create_task(_read(process.stderr, on_complaint))
         exit_code = await process.wait()
-    except* ValueError as errors:
-        raise errors.exceptions[0] from None
+    except ExceptionGroup as errors:
+        # Not except*, which raises a group again before Python 3.11.4.
+        if isinstance(errors.exceptions[0], ValueError):
+            raise errors.exceptions[0] from None
+        raise
     finally:
         with suppress(ProcessLookupError):
             process.kill()

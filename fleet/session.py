@@ -151,6 +151,9 @@ class Session:
             if self._process.returncode is None:
                 self._process.kill()
                 await self._process.wait()
+            # Before Python 3.11.4 a broken pipe that nobody has asked about is printed.
+            with contextlib.suppress(OSError):
+                await asyncio.wait_for(self._write.wait_closed(), 2.0)
         await self._all_complaints()
 
     async def _ping(self) -> None:

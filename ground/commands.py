@@ -568,7 +568,8 @@ class Running:
                 if status.state is _S.MISSION and status.trial == trial:
                     self._settle(name, f"flies the mission, trial {trial}")
                 elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
-                    why = f"start is from hold: {status.state}: {status.reason}"
+                    rule = "" if status.state is _S.HOLD else "start is from hold: "
+                    why = f"{rule}{_why(status)}"
                     self._fail([name], refusals.get(name, why))
                 elif self._station.status(name) is None:
                     until_s = now_s + _START_S

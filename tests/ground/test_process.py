@@ -194,6 +194,9 @@ def test_another_station_knows_the_world_that_one_sends(
     alice = new_station(fleet.fleet_toml)
     alice.wait_for(all_heard)
     bob = new_station(fleet.fleet_toml, "bob")
+    # It is sent only until all robots have it: by then bob hears alice.
+    done(alice.command(SetOrigin(ORIGIN)))
+    bob.wait_for(lambda p: p.ground)
     done(alice.command(SetWorld(text, "w.env")))
     bob.wait_for(lambda _: bob.setup().world == text)
     carol = new_station(fleet.fleet_toml, "carol")

@@ -41,7 +41,10 @@ _S = FlightState
 NAMES = ("r0", "r1")
 PATIENCE_S = 90.0
 # Of a command that is given again: nothing is wrong, and a robot was out of reach or not ready yet.
-NOT_YET = ("not heard", "it did not answer", "does not hear this station", "not ready: ")
+NOT_YET = (
+    "not heard", "it did not answer", "does not hear this station", "not ready: ",
+    "hold: ground lost",
+)  # fmt: skip
 MOST_TRIES = 3
 
 
