@@ -15,8 +15,8 @@ help: ## show this list
 demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
 	.venv/bin/lpac demo --out out/demo
 
-fly: .venv/sim ## ten robot programs fly simulated PX4s for two minutes: out/fly/flight.png
-	.venv/bin/lpac sim --vehicle mavlink --duration 50 --out out/fly
+fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly simulated PX4s: out/fly/flight.png
+	.venv/bin/lpac sim --vehicle mavlink --robots auto --duration 50 --out out/fly
 
 setup: .venv/sim .venv/export .venv/fleet .venv/ground ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control
 

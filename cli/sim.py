@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sim.operator import Statuses
 
 DEFAULT_OUT = Path("out/sim")
+DEFAULT_ROBOTS = 10
 DEFAULT_BUNDLE = Path(__file__).resolve().parents[1] / "policies" / "lpac_l2_k3_n10_512"
 
 
@@ -63,7 +64,16 @@ def sim(
     ] = Vehicle.POINT,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
     controller: Annotated[Controller, typer.Option(help="Who flies.")] = Controller.LPAC,
-    robots: Annotated[int, typer.Option("--robots", "-n", help="Number of robots.")] = 10,
+    robots: Annotated[
+        str,
+        typer.Option(
+            "--robots",
+            "-n",
+            metavar="N|auto",
+            help=f"Number of robots; with mavlink and px4 also auto: as many, up to "
+            f"{DEFAULT_ROBOTS}, as this machine carries.",
+        ),
+    ] = str(DEFAULT_ROBOTS),
     seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 0,
     world: Annotated[
         Path | None, typer.Option(help="CoverageControl world file (.env) instead of a random one.")
@@ -103,31 +113,42 @@ def sim(
     from edge.core.world import parse_world
 
     _require_options_of(context, vehicle)
+    count = _robot_count(robots)
+    if count is None and vehicle is Vehicle.POINT:
+        raise ValueError("--robots auto does nothing with --vehicle point")
     world_features = parse_world(_text(world), str(world)) if world else None
     if vehicle is not Vehicle.POINT:
         from sim.fleet import FleetScenario
 
+        flown: Literal["mavlink", "px4"] = "mavlink" if vehicle is Vehicle.MAVLINK else "px4"
+        if flown == "px4" and px4 is None:
+            raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
         fleet_scenario = FleetScenario(
-            robots=robots,
+            robots=count or _as_many_as_carried(bundle, flown),
             seed=seed,
             duration_s=duration,
             features=world_features,
             random_feature_count=features,
             gps_bias=gps_bias,
         )
-        if vehicle is Vehicle.PX4 and px4 is None:
-            raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+
+        def prepared() -> None:
+            """What is wrong with the flight itself has been said by now."""
+            if count is not None:
+                _warn_of_too_many(count, bundle, flown)
+
         if not script:
-            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT)
+            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared)
             return
-        _launch(fleet_scenario, bundle, px4, as_json, out)
+        _launch(fleet_scenario, bundle, px4, as_json, out, prepared)
         return
     from edge.core.frames import ModelScale
     from sim.experiment import FIELD_SCALE, Scenario
 
+    assert count is not None
     scenario = Scenario(
         controller=controller.value,
-        robots=robots,
+        robots=count,
         seed=seed,
         duration_s=duration,
         features=world_features,
@@ -153,7 +174,7 @@ def sim(
         if flight.importance.any()
         else "the world has no importance anywhere, so that there was nothing to cover"
     )
-    typer.echo(f"{controller.value}, {robots} robots, seed {seed}: {result}")
+    typer.echo(f"{controller.value}, {count} robots, seed {seed}: {result}")
     if out:
         typer.echo(f"see {out / 'flight.png'}")
 
@@ -209,10 +230,51 @@ def _require_options_of(context: typer.Context, vehicle: Vehicle) -> None:
             )
 
 
+def _robot_count(text: str) -> int | None:
+    """None for auto."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"--robots {text!r}: must be a number, or auto") from None
+
+
+def _as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
+    """As many robots as this machine carries, from 1 to 10; says how many."""
+    from sim.load import robots_carried
+
+    carried = int(robots_carried(bundle, vehicle))
+    robots = max(1, min(DEFAULT_ROBOTS, carried))
+    typer.echo(f"{_carries(carried)}: flying {robots}", err=True)
+    return robots
+
+
+def _warn_of_too_many(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> None:
+    from sim.load import robots_carried
+
+    carried = int(robots_carried(bundle, vehicle))
+    if carried < robots:
+        advice = f"; fewer: -n {max(1, carried)}" if robots > 1 else ""
+        typer.echo(f"{_carries(carried)}, not {robots}: it may not keep up{advice}", err=True)
+
+
+def _carries(robots: int) -> str:
+    return f"this machine, as busy as it is now, carries about {robots} robots and their vehicles"
+
+
 def _launch(
-    scenario: "FleetScenario", bundle: Path, px4: Path | None, as_json: bool, out: Path | None
+    scenario: "FleetScenario",
+    bundle: Path,
+    px4: Path | None,
+    as_json: bool,
+    out: Path | None,
+    prepared: Callable[[], None],
 ) -> None:
-    """Run a fleet of processes; exit code 1 if its flight did not end as it should."""
+    """Run a fleet of processes; exit code 1 if its flight did not end as it should.
+
+    `prepared` is called before anything starts.
+    """
     from sim.fleet import Fleet
     from sim.fleet_flight import fly, summary_lines
 
@@ -220,6 +282,7 @@ def _launch(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
         fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
+        prepared()
         with fleet:
             flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
     if out:
@@ -237,7 +300,13 @@ def _launch(
         raise typer.Exit(1)
 
 
-def _serve(scenario: "FleetScenario", bundle: Path, px4: Path | None, out: Path) -> None:
+def _serve(
+    scenario: "FleetScenario",
+    bundle: Path,
+    px4: Path | None,
+    out: Path,
+    prepared: Callable[[], None],
+) -> None:
     """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
     from sim.fleet import Fleet
 
@@ -245,10 +314,12 @@ def _serve(scenario: "FleetScenario", bundle: Path, px4: Path | None, out: Path)
     try:
         with _live() as (show, say):
             fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say)
+            prepared()
             with fleet:
                 while not fleet.operator.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
                     fleet.require_running()
                     show("programs start", fleet.operator.statuses())
+                fleet.begin()
                 typer.echo(
                     f"{len(fleet.robots)} robots run until Ctrl-C; in a second terminal:\n\n"
                     f"  export LPAC_FLEET={shlex.quote(str(out / fleet.fleet_toml.name))}\n"
@@ -267,11 +338,20 @@ def _serve(scenario: "FleetScenario", bundle: Path, px4: Path | None, out: Path)
 def _watch_over(
     fleet: "Fleet", show: Callable[[str, "Statuses"], None], say: Callable[[str], None]
 ) -> None:
-    """Say once of each robot that its program has ended; raises FleetError if all have."""
-    from sim.fleet import FleetError
+    """Say once that this machine does not keep up, and of each robot that its program has ended.
 
-    running = list(fleet.robots)
+    Raises FleetError if all have.
+    """
+    from sim.fleet import FleetError, OverloadError
+
+    running, keeps_up = list(fleet.robots), True
     while running:
+        try:
+            fleet.require_keeping_up()
+        except OverloadError as error:
+            if keeps_up:
+                say(str(error))
+            keeps_up = False
         for robot in [robot for robot in running if not robot.running]:
             running.remove(robot)
             say(f"the program of {robot.name} has ended, {robot.ending()}")

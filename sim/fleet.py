@@ -23,6 +23,7 @@ from edge.core.mission import Origin
 from edge.core.safety import Fence
 from edge.core.world import Feature, format_world, random_features
 from edge.runtime.bundle import BundleError, load_bundle
+from edge.runtime.config import Rates
 from sim.experiment import FIELD_SCALE
 from sim.fleet_vehicles import Autopilot, SimulatedVehicles, Vehicles, free_ports
 from sim.operator import Operator, Say
@@ -33,6 +34,9 @@ from sim.px4_build import Px4Build
 MAX_ROBOTS = 20
 MIN_APART_M = 3.0
 STOP_WITHIN_S = 3.0
+# What robots say of themselves follows from the machine once it is so far behind real time.
+DOUBTFUL_S = 1.0
+OVERLOADED_S = 5.0
 
 # The field is the policy's world; its y axis does not point north, so that mistakes show.
 WORLD = WorldOrigin()
@@ -78,6 +82,29 @@ class FleetScenario:
 
 class FleetError(ValueError):
     """A robot's program has ended; the text says which, and its last words."""
+
+
+class Lateness(NamedTuple):
+    """How far a machine is behind real time, s.
+
+    `vehicles_s` is what the vehicles fell behind, `robots_s` the time of the control ticks that a
+    robot has left out, the median of all robots.
+    """
+
+    vehicles_s: float
+    robots_s: float
+
+
+class OverloadError(RuntimeError):
+    """This machine does not keep up; the text says how far it is behind, and what to do."""
+
+    def __init__(self, lateness: Lateness, robots: int) -> None:
+        advice = f"fly fewer: -n {robots // 2}" if robots > 1 else "end what else runs on it"
+        super().__init__(
+            f"this machine does not keep up with {robots} robots: the vehicles are "
+            f"{lateness.vehicles_s:.1f} s behind real time, the robots left out "
+            f"{lateness.robots_s:.1f} s of control; {advice}"
+        )
 
 
 class Usage(NamedTuple):
@@ -238,8 +265,11 @@ class Fleet:
             RobotProcess(robot, self.folder / "robots" / str(robot))
             for robot in range(scenario.robots)
         )
-        self.operator = Operator(fleet=self.name, connect=self.endpoints, say=say)
         self._say = say
+        self.operator = Operator(
+            fleet=self.name, connect=self.endpoints, say=self.say_unless_behind
+        )
+        self._late_before = Lateness(0.0, 0.0)
         self._stack = ExitStack()
         self._write_files()
 
@@ -269,6 +299,35 @@ class Fleet:
                 raise FleetError(
                     f"the program of robot {robot.robot_id} has ended, {robot.ending()}"
                 )
+
+    def begin(self) -> None:
+        """All programs run: from now on this machine has to keep up."""
+        self._late_before = self._lateness()
+
+    def lateness(self) -> "Lateness":
+        """How far this machine fell behind since `begin`."""
+        now, before = self._lateness(), self._late_before
+        return Lateness(now.vehicles_s - before.vehicles_s, now.robots_s - before.robots_s)
+
+    def require_keeping_up(self) -> None:
+        """Raises OverloadError if this machine is too far behind."""
+        lateness = self.lateness()
+        if max(lateness) > OVERLOADED_S:
+            raise OverloadError(lateness, self.scenario.robots)
+
+    def _lateness(self) -> "Lateness":
+        control_s = 1.0 / Rates().control_hz
+        left_out_s = [
+            control_s * status.loops["control"].overruns
+            for status in self.operator.statuses().values()
+            if "control" in status.loops
+        ]
+        return Lateness(self.vehicles.lost_s(), float(np.median(left_out_s or [0.0])))
+
+    def say_unless_behind(self, text: str) -> None:
+        """Say what robots do; nothing once it follows from a machine that is behind."""
+        if max(self.lateness()) < DOUBTFUL_S:
+            self._say(text)
 
     def forget(self) -> None:
         """Keep nothing of the past, which only grows, and which a flight's figures alone need."""

@@ -16,7 +16,7 @@ from edge.core.mission import AIRBORNE, ON_GROUND, FlightState, RobotStatus
 from edge.core.safety import Fence
 from edge.core.world import rasterize
 from sim.experiment import FIELD_SCALE
-from sim.fleet import ORIGIN, Fleet, FleetScenario, Usage, process_usage
+from sim.fleet import ORIGIN, Fleet, FleetScenario, Lateness, OverloadError, Usage, process_usage
 from sim.fleet_vehicles import Track
 from sim.operator import Heard, Say, Script, ScriptError
 
@@ -97,12 +97,23 @@ class FleetFlight:
     true_cost: F64
     separation: Separation | None
     launcher: tuple[float, float]
-    lost_s: float
+    lateness: Lateness
+    overloaded: bool
+
+    @property
+    def any_took_off(self) -> bool:
+        """Whether a robot says that it was in the air, or was."""
+        return any(robot.in_air.any() or robot.truth.airborne.any() for robot in self.robots)
+
+    @property
+    def flew_mission(self) -> bool:
+        """Whether there was a mission, in which somebody flew."""
+        return "mission" in self.began_s and any(r.mission_share > 0.0 for r in self.robots)
 
     @property
     def all_landed(self) -> bool:
-        """Whether every robot says that it is down and disarmed, and is, as far as is known."""
-        return all(
+        """Whether they flew, and each says that it is down and disarmed, and is, where known."""
+        return self.any_took_off and all(
             robot.changes
             and robot.changes[-1].state in ON_GROUND
             and not robot.truth.airborne[-1:].any()
@@ -152,7 +163,9 @@ class FleetFlight:
                 "truly_crossed": bool(true_margin_m < 0.0),
             },
             "launcher": {"cpu_share": self.launcher[0], "peak_memory_mb": self.launcher[1]},
-            "vehicles_lost_s": self.lost_s,
+            "took_off": self.any_took_off,
+            "overloaded": self.overloaded,
+            "behind_s": self.lateness._asdict(),
             "fleet": [_robot_summary(robot) for robot in self.robots],
         }
 
@@ -167,12 +180,13 @@ def fly(
 ) -> FleetFlight:
     """Fly the script with a fleet that runs; `watch` gets the step's name, some times a second.
 
-    Ctrl-C lands all. Raises FleetError if a robot's program ends before all are heard.
+    Ctrl-C lands all, and so does a machine that does not keep up. Raises FleetError if a robot's
+    program ends before all are heard.
     """
     scenario, operator = fleet.scenario, fleet.operator
     script = Script(
         operator, robots=range(scenario.robots), origin=ORIGIN, mission_s=scenario.duration_s,
-        trial=f"seed {scenario.seed}", say=say,
+        trial=f"seed {scenario.seed}", say=fleet.say_unless_behind,
     )  # fmt: skip
     moments: dict[str, _Moment] = {}
 
@@ -180,18 +194,23 @@ def fly(
         if step == "assemble":
             fleet.require_running()
         if step not in moments:
+            if step == "preflight":
+                fleet.begin()
+            say("landing all robots where they are" if step == "land" else step)
             moments[step] = _Moment.of(fleet)
+        if step not in ("assemble", "land"):
+            fleet.require_keeping_up()
         watch(step)
 
-    problem = None
+    problem, overloaded = None, False
     try:
         script.fly(look)
-    except ScriptError as error:
-        problem = str(error)
+    except (ScriptError, OverloadError) as error:
+        problem, overloaded = str(error), isinstance(error, OverloadError)
     except KeyboardInterrupt:
         problem = "stopped by Ctrl-C"
     moments["end"] = _Moment.of(fleet)
-    return _record(fleet, script, moments, problem)
+    return _record(fleet, script, moments, problem, overloaded)
 
 
 class _Moment(NamedTuple):
@@ -217,7 +236,11 @@ class _Moment(NamedTuple):
 
 
 def _record(
-    fleet: Fleet, script: Script, moments: Mapping[str, _Moment], problem: str | None
+    fleet: Fleet,
+    script: Script,
+    moments: Mapping[str, _Moment],
+    problem: str | None,
+    overloaded: bool,
 ) -> FleetFlight:
     scenario, manifest = fleet.scenario, fleet.bundle.manifest
     assert manifest.perception is not None and fleet.features is not None
@@ -274,7 +297,8 @@ def _record(
             _share(first, last, first.launcher, last.launcher),
             moments["end"].launcher.peak_memory_mb,
         ),
-        lost_s=fleet.vehicles.lost_s(),
+        lateness=fleet.lateness(),
+        overloaded=overloaded,
     )
 
 
@@ -431,14 +455,15 @@ def summary_lines(flight: FleetFlight) -> list[str]:
     """The flight for people, a line each."""
     scenario, robots = flight.scenario, flight.robots
     restarts = sum(robot.restarts for robot in robots)
-    landed = "all landed and disarmed" if flight.all_landed else "NOT ALL LANDED"
-    lines = [
-        f"{scenario.robots} robots, seed {scenario.seed}: mission of {scenario.duration_s:g} s in "
-        f"{flight.began_s['end']:.0f} s of flight; {landed}",
-    ]
+    lines = [f"{scenario.robots} robots, seed {scenario.seed}: {_outcome(flight)}"]
     if flight.problem is not None:
         lines.append(f"PROBLEM: {flight.problem}")
-    if flight.importance.any():
+    if flight.overloaded or not flight.any_took_off:
+        # All else that there is to tell follows from that.
+        return lines
+    if not flight.flew_mission:
+        lines.append("no mission was flown")
+    elif flight.importance.any():
         lines.append(
             f"coverage cost: {_shown(normalized(flight.cost)[-1])} of the initial cost for where "
             f"the robots take themselves to be, {_shown(normalized(flight.true_cost)[-1])} for "
@@ -471,10 +496,24 @@ def summary_lines(flight: FleetFlight) -> list[str]:
         f"{max(memory_mb):.0f} MB; operator and vehicles: {100.0 * flight.launcher[0]:.0f} %; all: "
         f"{(sum(cpu_shares) / 100.0 + flight.launcher[0]):.2f} cores"
     )
-    if flight.lost_s > 0.0:
-        lines.append(f"the vehicles fell {flight.lost_s:.1f} s behind real time")
+    if max(flight.lateness) > 0.0:
+        lines.append(
+            f"the vehicles fell {flight.lateness.vehicles_s:.1f} s behind real time, the robots "
+            f"left out {flight.lateness.robots_s:.1f} s of control"
+        )
     lines.append(f"{sum(len(robot.logs) for robot in robots)} flight logs")
     return lines
+
+
+def _outcome(flight: FleetFlight) -> str:
+    """What became of the robots, and of their mission."""
+    if not flight.any_took_off:
+        return "nobody took off"
+    landed = "all landed and disarmed" if flight.all_landed else "NOT ALL LANDED"
+    if not flight.flew_mission:
+        return f"no mission; {landed} after {flight.began_s['end']:.0f} s"
+    mission_s = flight.cost_time_s[-1]
+    return f"mission of {mission_s:.0f} s in {flight.began_s['end']:.0f} s of flight; {landed}"
 
 
 def _loop_lines(flight: FleetFlight) -> Iterator[str]:

@@ -331,6 +331,7 @@ class Script:
         trial: str,
         say: Say = lambda _: None,
     ) -> None:
+        """`say` is told what robots do that the script does not have."""
         self.began_s: dict[str, float] = {}
         self.restarts: Counter[int] = Counter()
         self._operator = operator
@@ -372,7 +373,6 @@ class Script:
         """Land all robots where they are, and wait for it; for a minute at most."""
         if not any(s.armed for s in self._operator.statuses().values()):
             return
-        self._say("landing all robots where they are")
         self._operator.calm("land")
         self.began_s["land"] = time.monotonic()
         end_s = time.monotonic() + 60.0
@@ -381,10 +381,9 @@ class Script:
 
     def _go(self, step: Step, watch: Callable[[str], None]) -> None:
         began_s = self.began_s[step.name] = time.monotonic()
-        self._say(step.name)
         while True:
-            step.act()
             watch(step.name)
+            step.act()
             left_s = began_s + step.at_most_s - time.monotonic()
             if self._operator.wait_for(step.done, min(PERIOD_S, max(0.0, left_s))):
                 return
