@@ -1,9 +1,9 @@
 """PX4's parameters that decide what it does when something fails, and what they must be here.
 
 What is said of PX4 holds for v1.14 and later. Its delay COM_FAIL_ACT_T, a hold before it acts,
-applies to a lost remote control or ground station, a critical battery, and a fence that it answers
-with a return or a landing. It does not apply to a lost offboard signal or position: those are acted
-on at once, and until they come back.
+applies to a lost remote control or ground station, a critical battery, a motor or propeller that
+fails, and a fence that it answers with a return or a landing. It does not apply to a lost offboard
+signal or position, nor to traffic: those are acted on at once.
 
 No parameter says what happens when the position is lost.
 """
@@ -54,8 +54,19 @@ _REMOTE_CONTROL = {
     2: "a ground station's sticks count when the remote control is silent",
     3: "whoever moves sticks first, remote control or ground station, counts until a reboot",
     4: "no sticks count",
+    5: "the remote control's sticks count, or a ground station's (the first before the second) "
+    "while it is silent",
+    6: "a ground station's sticks count (the first before the second), or the remote control's "
+    "while they are silent",
+    7: "the remote control's sticks count, or a ground station's (the second before the first) "
+    "while it is silent",
+    8: "a ground station's sticks count (the second before the first), or the remote control's "
+    "while they are silent",
 }
 _HEIGHT = {0: "barometer", 1: "GPS", 2: "range to what is below", 3: "vision"}
+_MOTOR_FAILURE = {0: "warn", 1: "hold", 2: "land", 3: _RETURN, 4: _STOP_MOTORS}
+_PROPELLER = {-1: "do nothing", 0: "warn", 1: _RETURN, 2: "land"}
+_TRAFFIC = {0: "do nothing", 1: "warn", 2: _RETURN, 3: "land", 4: "hold"}
 _REMAINING_TIME = {0: "do nothing", 1: "warn", 3: _RETURN}
 _OVERRIDE = {
     0: "sticks never take over by themselves",
@@ -226,6 +237,28 @@ def required(
             may_be_absent=True,
         ),
         Requirement(
+            "COM_ACT_FAIL_ACT",
+            2,
+            "with a motor that fails a robot must land where it is; robots that return meet",
+            values=(2, 1, 0),
+            means=_MOTOR_FAILURE,
+        ),
+        Requirement(
+            "COM_IMB_PROP_ACT",
+            0,
+            "what PX4 does when a propeller shakes the vehicle; returning robots would meet",
+            values=(0, 2, -1),
+            means=_PROPELLER,
+        ),
+        Requirement(
+            "NAV_TRAFF_AVOID",
+            1,
+            "what PX4 does when an ADS-B receiver tells of traffic; returning robots would meet",
+            values=(1, 0, 4, 3),
+            means=_TRAFFIC,
+            may_be_absent=True,
+        ),
+        Requirement(
             "COM_WIND_MAX_ACT",
             0,
             "what PX4 does in a strong wind; returning robots would meet",
@@ -361,6 +394,12 @@ def explain(parameters: Parameters) -> tuple[str, ...]:
         + look_up.delayed("NAV_DLL_ACT", _LINK_LOSS),
         f"if the battery runs low, PX4 will: {_on_battery(look_up)}",
         f"outside PX4's own fence, it will: {_on_fence(look_up)}",
+        "if a motor fails, and PX4 notices, it will: "
+        + look_up.delayed("COM_ACT_FAIL_ACT", _MOTOR_FAILURE),
+        "if a propeller shakes the vehicle, PX4 will: "
+        + look_up.delayed("COM_IMB_PROP_ACT", _PROPELLER),
+        "if traffic comes near, by an ADS-B receiver, PX4 will: "
+        + look_up.action("NAV_TRAFF_AVOID", _TRAFFIC),
         "if the position is lost, PX4 will: land, and drift with the wind while it does "
         "(no parameter changes that)",
         f"if the pilot moves the sticks: {_on_sticks(look_up)}",

@@ -13,6 +13,9 @@ PARAMETERS: dict[str, int | float] = {
     "COM_OBL_RC_ACT": 0,  # 0-2 a manual mode, 3 return, 4 land, 5 hold, 6 terminate, 7 disarm
     "COM_FAIL_ACT_T": 5.0,
     "COM_POS_LOW_ACT": 3,  # not acted on
+    "COM_ACT_FAIL_ACT": 0,  # not acted on
+    "COM_IMB_PROP_ACT": 0,  # not acted on
+    "NAV_TRAFF_AVOID": 1,  # not acted on
     "COM_WIND_MAX_ACT": 0,  # not acted on
     "COM_FLTT_LOW_ACT": 1,  # not acted on
     "COM_FLT_TIME_MAX": -1,  # not acted on

@@ -65,6 +65,14 @@ def test_what_is_required_can_be_set_and_is_read(rc: RemoteControl) -> None:
         ("COM_LOW_BAT_ACT", 3, "COM_LOW_BAT_ACT = 3 (RETURN"),
         ("BAT_CRIT_THR", 0.2, "PX4 would warn after it acts"),
         ("COM_FLTT_LOW_ACT", 3, "COM_FLTT_LOW_ACT = 3 (RETURN"),
+        ("COM_ACT_FAIL_ACT", 3, "COM_ACT_FAIL_ACT = 3 (RETURN"),
+        ("COM_ACT_FAIL_ACT", 4, "COM_ACT_FAIL_ACT = 4 (STOP ITS MOTORS"),
+        ("COM_IMB_PROP_ACT", 1, "COM_IMB_PROP_ACT = 1 (RETURN"),
+        ("NAV_TRAFF_AVOID", 2, "NAV_TRAFF_AVOID = 2 (RETURN"),
+        ("COM_RC_IN_MODE", 5, "COM_RC_IN_MODE = 5 (the remote control's sticks count, or a"),
+        ("COM_RC_IN_MODE", 6, "COM_RC_IN_MODE = 6 (a ground station's sticks count (the first"),
+        ("COM_RC_IN_MODE", 7, "COM_RC_IN_MODE = 7 (the remote control's sticks count, or a"),
+        ("COM_RC_IN_MODE", 8, "COM_RC_IN_MODE = 8 (a ground station's sticks count (the second"),
         ("COM_FLT_TIME_MAX", 600, "COM_FLT_TIME_MAX = 600; wanted is -1 (never)"),
         ("COM_DISARM_LAND", 0.0, "COM_DISARM_LAND = 0"),
         ("COM_DISARM_PRFLT", -1.0, "COM_DISARM_PRFLT = -1"),
@@ -97,7 +105,7 @@ def test_a_parameter_that_the_vehicle_does_not_have_is_a_problem_unless_it_is_ne
     problems = check(requirements, {})
     optional = {
         "COM_POS_LOW_ACT", "COM_WIND_MAX_ACT", "COM_FLTT_LOW_ACT", "COM_FLT_TIME_MAX",
-        "COM_ARM_ON_BOOT",
+        "COM_ARM_ON_BOOT", "NAV_TRAFF_AVOID",
     }  # fmt: skip
     assert {text.split(" ")[0] for text in problems} == set(PARAMETERS) - optional
     assert all("is not known" in text for text in problems)
@@ -168,6 +176,9 @@ def test_what_else_is_dangerous_is_said_where_it_applies() -> None:
         "COM_FLT_TIME_MAX": (600, "after 600 s of flight, PX4 will: RETURN"),
         "COM_ARM_ON_BOOT": (1, "ARM BY ITSELF"),
         "COM_FLTT_LOW_ACT": (3, "RETURN"),
+        "COM_ACT_FAIL_ACT": (3, "and PX4 notices, it will: hold for 5 s, then RETURN"),
+        "COM_IMB_PROP_ACT": (1, "shakes the vehicle, PX4 will: hold for 5 s, then RETURN"),
+        "NAV_TRAFF_AVOID": (2, "by an ADS-B receiver, PX4 will: RETURN"),
         "GF_MAX_VER_DIST": (30.0, "the same 30 m above"),
         "GF_MAX_HOR_DIST": (40.0, "the same 40 m away from"),
     }
