@@ -145,7 +145,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             )
         )
         # 5. What the robot knows: its place, its radio mail, its map and messages.
-        navigation = Navigation(autopilot, time.monotonic)
+        navigation = Navigation(autopilot, time.monotonic, config.position)
         inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         pac = Pac(
             robot_id=config.robot_id,
@@ -353,6 +353,7 @@ class _Program:
             now_s,
             time.time(),
             assignment=assignment,
+            position=self._navigation.position,
             odometry=self._navigation.odometry(),
             peers=peers,
             not_understood=self._inbox.not_understood,
@@ -452,6 +453,9 @@ class _Program:
             feature_age_s=self._pac.feature_age_s(now_s),
             neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
+            position_quality=self._navigation.position.quality,
+            position_cause=self._navigation.position.cause,
+            gps_accuracy_m=None if gps is None else gps.accuracy_m,
         )
 
     def _alarms(self) -> tuple[str, ...]:
@@ -491,7 +495,15 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
         autopilot = parts.enter_context(
             MavsdkAutopilot(config.autopilot.url, system_id=config.autopilot.system_id)
         )
-        navigation = Navigation(autopilot, time.monotonic)
+        navigation = Navigation(autopilot, time.monotonic, config.position)
+        # Of its own, since the checks wait for the vehicle; it looks as often as a flight does.
+        look = Loop(
+            "position",
+            1.0 / config.rates.control_hz,
+            lambda: navigation.look(autopilot.state(), time.monotonic()),
+        )
+        look.start()
+        parts.callback(look.stop, _JOIN_S)
         inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         readiness = _readiness(config, loaded, autopilot)
         # Not as the robot itself: its program is not running.
@@ -514,6 +526,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
                 now_s,
                 time.time(),
                 assignment=assignment,
+                position=navigation.position,
                 odometry=navigation.odometry(),
                 peers=inbox.peers(now_s),
                 not_understood=inbox.not_understood,

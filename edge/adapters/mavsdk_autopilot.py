@@ -31,14 +31,14 @@ from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velo
 
 _log = structlog.get_logger(__name__)
 
-# Message -> how often PX4 shall send it, Hz. Where it refuses, its own rate is good enough.
+# Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
 _RATES_HZ = {
-    0: 5.0,  # HEARTBEAT
     1: 2.0,  # SYS_STATUS
-    24: 2.0,  # GPS_RAW_INT
+    24: 5.0,  # GPS_RAW_INT
     32: 20.0,  # LOCAL_POSITION_NED
     33: 5.0,  # GLOBAL_POSITION_INT
     49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
+    230: 2.0,  # ESTIMATOR_STATUS
     245: 5.0,  # EXTENDED_SYS_STATE
 }
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245

@@ -11,14 +11,12 @@ from dataclasses import replace
 from threading import Lock
 from typing import Any
 
-from edge.core.vehicle import Gps, Mode, Vector, VehicleState
+from edge.core.vehicle import Estimator, GlobalOrigin, Gps, Mode, Vector, VehicleState
 
 Fields = Mapping[str, Any]
 
 # PX4 sends a heartbeat at least every second.
 _CONNECTED_WITHIN_S = 2.5
-# PX4 sends no position while its estimator vouches for none.
-_POSITION_WITHIN_S = 1.0
 _TEXT_KEPT_S = 15.0
 
 # A position is taken for a jump if it lies further from where motion led than this, plus as much
@@ -26,12 +24,17 @@ _TEXT_KEPT_S = 15.0
 _JUMP_M, _JUMP_M_S = 1.0, 1.0
 _ORIGIN_ANSWER_S = 0.5
 
-_SENSOR_GPS, _SENSOR_RC, _PREARM_CHECK = 1 << 5, 1 << 16, 1 << 28
+# Present says which sensors there are; of PREARM_CHECK PX4 tells in health alone.
+_SENSOR_RC, _PREARM_CHECK = 1 << 16, 1 << 28
+_VELOCITY_HORIZ, _POS_HORIZ_ABS, _GPS_GLITCH = 1 << 1, 1 << 4, 1 << 10
 _SAFETY_ARMED = 1 << 7
+_CRITICAL, _EMERGENCY = 5, 6  # MAV_STATE
 _AUTOPILOT_INVALID = 8
 _WARNING = 4
 _ON_GROUND = 1
 _UNKNOWN_UINT16 = 0xFFFF
+_FIX_3D = 3
+_M_PER_DEG = 111_195.0  # of latitude: a sphere is good enough for differences of metres
 _AUTO = 4
 _MAIN_MODES = {
     1: Mode.MANUAL,
@@ -63,10 +66,9 @@ class Px4Telemetry:
         self._state = VehicleState()
         self._clock = _VehicleClock()
         self._twin = _TwinWatch()
-        self._satellite_position_ok = False
-        self._global_position_at_s = -math.inf
+        self._gps_time_us: int | None = None
         self._jump_at_s: float | None = None
-        self._origin_deg: tuple[float, float] | None = None
+        self._origin: GlobalOrigin | None = None
         self._origin_at_s = -math.inf
         self._texts: deque[tuple[float, str]] = deque(maxlen=16)
         self._handlers = {
@@ -76,6 +78,7 @@ class Px4Telemetry:
             "LOCAL_POSITION_NED": self._on_local_position_ned,
             "GLOBAL_POSITION_INT": self._on_global_position_int,
             "GPS_GLOBAL_ORIGIN": self._on_gps_global_origin,
+            "ESTIMATOR_STATUS": self._on_estimator_status,
             "EXTENDED_SYS_STATE": self._on_extended_sys_state,
             "STATUSTEXT": self._on_statustext,
             "AUTOPILOT_VERSION": self._on_autopilot_version,
@@ -99,13 +102,9 @@ class Px4Telemetry:
         with self._lock:
             state = self._state
             texts = {text: None for at_s, text in self._texts if now_s - at_s < _TEXT_KEPT_S}
-            fresh_from_s = now_s - _POSITION_WITHIN_S
             return replace(
                 state,
                 connected=now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S,
-                position_ok=self._satellite_position_ok
-                and state.position_at_s > fresh_from_s
-                and self._global_position_at_s > fresh_from_s,
                 problems=() if state.armable or state.armed else tuple(texts),
             )
 
@@ -140,42 +139,78 @@ class Px4Telemetry:
         self._change(
             mode=modes.get(key, Mode.OTHER),
             armed=bool(fields["base_mode"] & _SAFETY_ARMED),
+            failsafe=fields["system_status"] in (_CRITICAL, _EMERGENCY),
             heartbeat_at_s=now_s - self._clock.delay_s,
         )
 
     def _on_sys_status(self, fields: Fields, _: float) -> None:
         present = fields["onboard_control_sensors_present"]
         healthy = fields["onboard_control_sensors_health"]
-        percent = fields["battery_remaining"]
-        self._satellite_position_ok = bool(present & healthy & _SENSOR_GPS)
+        percent, millivolts = fields["battery_remaining"], fields["voltage_battery"]
         self._change(
-            armable=bool(healthy & _PREARM_CHECK) if present & _PREARM_CHECK else None,
+            armable=bool(healthy & _PREARM_CHECK),
             battery=percent / 100.0 if percent >= 0 else None,
+            voltage_v=None if millivolts == _UNKNOWN_UINT16 else millivolts / 1e3,
             remote_control=bool(present & healthy & _SENSOR_RC),
         )
 
-    def _on_gps_raw_int(self, fields: Fields, _: float) -> None:
-        hundredths = fields["eph"]
-        hdop = math.inf if hundredths == _UNKNOWN_UINT16 else hundredths / 100.0
-        satellites = fields["satellites_visible"]
-        self._change(gps=Gps(fields["fix_type"], 0 if satellites == 0xFF else satellites, hdop))
+    def _on_gps_raw_int(self, fields: Fields, now_s: float) -> None:
+        hundredths, satellites = fields["eph"], fields["satellites_visible"]
+        accuracy_mm, has_fix = fields["h_acc"], fields["fix_type"] >= _FIX_3D
+        at_s = -math.inf if self._state.gps is None else self._state.gps.at_s
+        if fields["time_usec"] != self._gps_time_us:
+            # PX4 goes on telling of a receiver from which nothing comes any more.
+            self._gps_time_us, at_s = fields["time_usec"], now_s - self._clock.delay_s
+        offset_m = None
+        if has_fix:
+            place = GlobalOrigin(fields["lat"] / 1e7, fields["lon"] / 1e7, 0.0)
+            offset_m = self._offset_m(place)
+        self._change(
+            gps=Gps(
+                fix=fields["fix_type"],
+                satellites=0 if satellites == 0xFF else satellites,
+                hdop=math.inf if hundredths == _UNKNOWN_UINT16 else hundredths / 100.0,
+                accuracy_m=accuracy_mm / 1e3 if accuracy_mm and has_fix else None,
+                offset_m=offset_m,
+                at_s=at_s,
+            )
+        )
 
-    def _on_global_position_int(self, fields: Fields, now_s: float) -> None:
+    def _offset_m(self, place: GlobalOrigin) -> float | None:
+        """How far in the plane a place is from the newest position."""
+        origin, position_m = self._state.origin, self._state.position_local_m
+        if origin is None or position_m is None:
+            return None
+        north_m, east_m, _ = _shift_m(origin, place)
+        return math.hypot(north_m - position_m[0], east_m - position_m[1])
+
+    def _on_estimator_status(self, fields: Fields, now_s: float) -> None:
+        flags, wanted = fields["flags"], _VELOCITY_HORIZ | _POS_HORIZ_ABS
+        self._change(
+            estimator=Estimator(
+                horizontal=flags & wanted == wanted,
+                glitch=bool(flags & _GPS_GLITCH),
+                at_s=now_s - self._clock.delay_s,
+            )
+        )
+
+    def _on_global_position_int(self, fields: Fields, _: float) -> None:
         changes: dict[str, float] = {"height_above_home_m": fields["relative_alt"] / 1e3}
         if fields["hdg"] != _UNKNOWN_UINT16:
             changes["heading_rad"] = math.radians(fields["hdg"] / 100.0 % 360.0)
         self._change(**changes)
-        self._global_position_at_s = now_s - self._clock.delay_s
 
     def _on_extended_sys_state(self, fields: Fields, _: float) -> None:
         state = fields["landed_state"]
         self._change(in_air=state > _ON_GROUND if state else None)
 
     def _on_gps_global_origin(self, fields: Fields, now_s: float) -> None:
-        self._origin_deg = (fields["latitude"] / 1e7, fields["longitude"] / 1e7)
+        self._origin = GlobalOrigin(
+            fields["latitude"] / 1e7, fields["longitude"] / 1e7, fields["altitude"] / 1e3
+        )
         self._origin_at_s = now_s
         if self._state.position_local_m is None:
-            self._change(origin_deg=self._origin_deg)
+            self._change(origin=self._origin)
 
     def _on_local_position_ned(self, fields: Fields, now_s: float) -> None:
         position_m = _vector(fields, "x", "y", "z")
@@ -185,32 +220,45 @@ class Px4Telemetry:
         at_s = now_s - self._clock.hear(boot_s, now_s)
         if self._is_held_back(position_m, at_s, now_s):
             return
+        state = self._state
+        changed = (position_m, velocity_m_s) != (state.position_local_m, state.velocity_local_m_s)
+        jumped = self._jumped(position_m, at_s, self._origin)
         self._change(
             position_local_m=position_m,
             velocity_local_m_s=velocity_m_s,
             position_at_s=at_s,
-            origin_deg=self._origin_deg,
+            position_changed_at_s=at_s if changed else state.position_changed_at_s,
+            jumped_at_s=at_s if jumped else state.jumped_at_s,
+            origin=self._origin,
         )
 
     def _is_held_back(self, position_m: Vector, at_s: float, now_s: float) -> bool:
         """Whether the position may belong to another origin than the one that is known."""
-        if self._origin_deg != self._state.origin_deg:
+        if self._origin != self._state.origin:
             self._jump_at_s = None
         elif self._jump_at_s is not None:
             answered = self._origin_at_s > self._jump_at_s
             if answered or now_s - self._jump_at_s > _ORIGIN_ANSWER_S:
                 self._jump_at_s = None
-        elif self._jumped(position_m, at_s):
+        elif self._jumped(position_m, at_s, self._state.origin):
             self._jump_at_s = now_s
         return self._jump_at_s is not None
 
-    def _jumped(self, position_m: Vector, at_s: float) -> bool:
+    def _jumped(self, position_m: Vector, at_s: float, origin: GlobalOrigin | None) -> bool:
+        """Whether a position from that origin is not where motion led from the last one."""
         last_m, velocity_m_s = self._state.position_local_m, self._state.velocity_local_m_s
+        last_origin = self._state.origin
         if last_m is None or velocity_m_s is None:
             return False
+        shift_m = (0.0, 0.0, 0.0)
+        if origin is not None and last_origin is not None:
+            shift_m = _shift_m(last_origin, origin)
         between_s = max(at_s - self._state.position_at_s, 0.0)
         off_m = math.hypot(
-            *(position_m[i] - last_m[i] - velocity_m_s[i] * between_s for i in (0, 1))
+            *(
+                position_m[i] + shift_m[i] - last_m[i] - velocity_m_s[i] * between_s
+                for i in range(3)
+            )
         )
         return off_m > _JUMP_M + _JUMP_M_S * between_s
 
@@ -224,6 +272,8 @@ class Px4Telemetry:
 
     def _on_autopilot_version(self, fields: Fields, now_s: float) -> None:
         self._twin.hardware((fields["uid"], *fields["uid2"]), now_s)
+        version = fields["flight_sw_version"]
+        self._change(version=".".join(str(version >> bits & 0xFF) for bits in (24, 16, 8)))
 
 
 class _VehicleClock:
@@ -294,3 +344,13 @@ def _vector(fields: Fields, *names: str) -> Vector:
     """Raises TypeError if one is not finite: then it has no value in the message."""
     x, y, z = (float(fields[name]) for name in names)
     return x, y, z
+
+
+def _shift_m(start: GlobalOrigin, end: GlobalOrigin) -> Vector:
+    """North, east and down, m, from one place to another that is near."""
+    east_deg = math.remainder(end.longitude_deg - start.longitude_deg, 360.0)
+    return (
+        (end.latitude_deg - start.latitude_deg) * _M_PER_DEG,
+        east_deg * _M_PER_DEG * math.cos(math.radians(start.latitude_deg)),
+        start.altitude_m - end.altitude_m,
+    )

@@ -30,6 +30,7 @@ from edge.core.mission import (
     Place,
 )
 from edge.core.ports import Odometry
+from edge.core.position import Judgement, Quality
 from edge.core.safety import Closest, Fence, MotionLimits
 from edge.core.vehicle import PILOTED, Action, Mode, Vector, VehicleState
 
@@ -69,7 +70,6 @@ class FlightParameters:
     battery_low: float = 0.25
     battery_critical: float = 0.15
     command_timeout_s: float = 0.5
-    position_timeout_s: float = 1.0
     ground_timeout_s: float = 3.0
     ground_lost_land_s: float = 10.0
     takeoff_timeout_s: float = 15.0
@@ -81,7 +81,7 @@ class FlightParameters:
             raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
         for name in (
             "base_height_m", "slot_spacing_m", "min_separation_m", "command_timeout_s",
-            "position_timeout_s", "ground_timeout_s", "ground_lost_land_s", "takeoff_timeout_s",
+            "ground_timeout_s", "ground_lost_land_s", "takeoff_timeout_s",
         ):  # fmt: skip
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
@@ -127,7 +127,6 @@ class Flight:
     asked_at_s: float = -math.inf
     armed_asked: bool = False
     landed_since_s: float | None = None
-    position_ok_at_s: float = math.inf
     land_by: Literal["ground", "return", "safety"] = "safety"
     killed: bool = False
     trial: str = ""
@@ -139,16 +138,17 @@ class Flight:
 class FlightInputs:
     """What one control tick knows.
 
-    `odometry` is in the mission frame, its z up from the estimator's origin; None when the
-    autopilot's position is old, or there is no mission origin. `policy_velocity_m_s` (2,) is None
-    when the policy has no fresh answer. `closest` is the nearest neighbour. `busy_neighbours` say
-    of themselves that they arm or take off. `failed_checks` are preflight's; None before the first.
-    `not_taken` is what of the ground's state the robot does not fly by, in words. `order` is new in
-    this tick.
+    `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
+    above sea level; None when the position is lost or old, or there is no mission origin.
+    `policy_velocity_m_s` (2,) is None when the policy has no fresh answer. `closest` is the nearest
+    neighbour. `busy_neighbours` say of themselves that they arm or take off. `failed_checks` are
+    preflight's; None before the first. `not_taken` is what of the ground's state the robot does not
+    fly by, in words. `order` is new in this tick.
     """
 
     now_s: float
     vehicle: VehicleState
+    position: Judgement
     odometry: Odometry | None
     policy_velocity_m_s: F64 | None
     neighbours: tuple[Neighbour, ...]
@@ -267,6 +267,11 @@ class _Tick:
         return height_m(self.flight, self.inputs.odometry)
 
     @property
+    def knows_place(self) -> bool:
+        """Whether the position is good to fly by."""
+        return self.inputs.position.quality is Quality.GOOD
+
+    @property
     def lapse_s(self) -> float:
         """How long the control loop was silent; 0 if it was not, or has just begun."""
         silence_s = self.inputs.now_s - self.flight.tick_at_s
@@ -375,9 +380,14 @@ def _offboard_refused(t: _Tick) -> str | None:
 
 
 def _position_lost(t: _Tick) -> str | None:
-    lost_s = t.inputs.now_s - max(t.flight.position_ok_at_s, t.flight.silent_until_s)
-    timeout_s = t.robot.parameters.position_timeout_s
-    return _if(t.inputs.odometry is None and lost_s >= timeout_s, "position lost")
+    position = t.inputs.position
+    lost = position.quality is Quality.LOST and not t.silent
+    return _if(lost, f"position lost: {position.text}")
+
+
+def _position_not_good(t: _Tick) -> str | None:
+    position = t.inputs.position
+    return _if(not t.knows_place, f"position {position.quality}: {position.text}")
 
 
 def _on_ground(t: _Tick) -> str | None:
@@ -456,8 +466,8 @@ def _policy_stale(t: _Tick) -> str | None:
 
 def _found(t: _Tick) -> str | None:
     vehicle = t.inputs.vehicle
-    found = vehicle.connected and vehicle.armed is False and vehicle.position_ok
-    return _if(found and vehicle.origin_deg is not None, "autopilot and position found")
+    found = vehicle.connected and vehicle.armed is False and t.knows_place
+    return _if(found, "autopilot and position found")
 
 
 def _enabled(t: _Tick) -> str | None:
@@ -489,6 +499,8 @@ def _arming_called_off(t: _Tick) -> str | None:
         return "ground lost while arming"
     if t.calm != "none":
         return f"ground commands {t.calm} while arming"
+    if not t.knows_place and not t.silent:
+        return f"{_position_not_good(t)}, while arming"
     left = t.flight.reached and t.mode is not Mode.OFFBOARD
     return _lapse(t) or _if(left, f"the vehicle left offboard for {t.mode} while arming")
 
@@ -683,8 +695,6 @@ def _look(t: _Tick) -> Flight:
         flight = replace(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
     if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
         flight = replace(flight, silent_until_s=-math.inf)
-    if inputs.odometry is not None:
-        flight = replace(flight, position_ok_at_s=now_s)
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
     down = flight.state is _S.LAND and vehicle.in_air is False
     flight = replace(flight, landed_since_s=landed_since_s if down else None)
@@ -753,11 +763,17 @@ def _target_m(t: _Tick) -> Vector | None:
     odometry, height, state = t.inputs.odometry, t.height_m, t.flight.state
     if state not in (_S.TAKEOFF, _S.HOLD):
         return None
-    if odometry is None or height is None or (t.flight.target_m is not None and not t.silent):
-        return t.flight.target_m
+    target_m = t.flight.target_m
+    if odometry is None or height is None:
+        return target_m
+    if target_m is not None and not t.silent and t.knows_place:
+        return target_m
     fence = t.robot.fence
+    # While the position is in doubt, numbers that were good before may be another place now.
     x_m, y_m = fence.moved_inside_m(*odometry.position_m[:2], fence.buffer_m / 2.0)
-    return x_m, y_m, t.robot.parameters.slot_height_m if state is _S.TAKEOFF else height
+    if state is _S.TAKEOFF:
+        return x_m, y_m, t.robot.parameters.slot_height_m
+    return x_m, y_m, height if target_m is None or t.silent else target_m[2]
 
 
 def _ask(t: _Tick) -> tuple[Action, ...]:
@@ -879,6 +895,8 @@ def _not_in_place(t: _Tick) -> str | None:
     """Why the mission cannot be flown from here."""
     odometry, height = t.inputs.odometry, t.height_m
     vehicle = t.inputs.vehicle
+    if not t.knows_place:
+        return _position_not_good(t)
     if odometry is None or height is None:
         return "position or height is not known"
     if not (vehicle.armed and vehicle.in_air):
@@ -909,6 +927,6 @@ def _alarms(t: _Tick) -> tuple[str, ...]:
     """What the operator must see, the gravest first."""
     alarms = [t.flight.reason] if t.flight.alarming else []
     if t.flight.state in (*AIRBORNE, _S.PILOT):
-        checks = (_position_lost, _too_close, _outside, _battery_low, _ground_lost)
+        checks = (_position_not_good, _too_close, _outside, _battery_low, _ground_lost)
         alarms += [text for check in checks if (text := check(t)) is not None]
     return tuple(dict.fromkeys(alarms))

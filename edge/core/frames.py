@@ -63,9 +63,15 @@ class MissionFrame:
         return place["lat2"], place["lon2"]
 
     def relative_to(
-        self, local_origin_latitude_deg: float, local_origin_longitude_deg: float
+        self,
+        local_origin_latitude_deg: float,
+        local_origin_longitude_deg: float,
+        local_origin_altitude_m: float = 0.0,
     ) -> "LocalTransform":
         """The transform for one local origin, which is good until that origin jumps.
+
+        Mission z counts from where the origin's altitude does: so heights, too, stay what they are
+        when it jumps.
 
         R = [[-sin theta, cos theta, 0], [cos theta, sin theta, 0], [0, 0, -1]], and the geodesic of
         length d and azimuth alpha leads from the mission origin to the local one. North at the two
@@ -84,7 +90,11 @@ class MissionFrame:
         d_m, alpha_rad = geodesic["s12"], math.radians(geodesic["azi1"])
         sin, cos = math.sin(self.heading_rad), math.cos(self.heading_rad)
         rotation = np.array([[-sin, cos, 0.0], [cos, sin, 0.0], [0.0, 0.0, -1.0]])
-        local_origin_m = rotation @ (d_m * math.cos(alpha_rad), d_m * math.sin(alpha_rad), 0.0)
+        local_origin_m = rotation @ (
+            d_m * math.cos(alpha_rad),
+            d_m * math.sin(alpha_rad),
+            -local_origin_altitude_m,
+        )
         rotation.setflags(write=False)
         local_origin_m.setflags(write=False)
         return LocalTransform(rotation, local_origin_m)
@@ -102,11 +112,11 @@ class LocalTransform:
     local_origin_m: F64
 
     def local_to_mission(self, position_local_m: F64) -> F64:
-        """p_M = R (p_L + d (cos alpha, sin alpha, 0)), m."""
+        """p_M = R (p_L + (d cos alpha, d sin alpha, -altitude)), m."""
         return self.rotation @ position_local_m + self.local_origin_m
 
     def mission_to_local(self, position_mission_m: F64) -> F64:
-        """p_L = R p_M - d (cos alpha, sin alpha, 0), m."""
+        """p_L = R p_M - (d cos alpha, d sin alpha, -altitude), m."""
         return self.rotation @ (position_mission_m - self.local_origin_m)
 
     def velocity_to_mission(self, velocity_local_m_s: F64) -> F64:

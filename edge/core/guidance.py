@@ -3,7 +3,7 @@
 Heights are above the robot's own takeoff point. HOLD, TAKEOFF and RETURN are flown as positions a
 short way ahead of the estimate, which PX4 stops at much sooner than at a velocity of 0, and which
 never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity. Neighbours and
-the fence limit RETURN and MISSION.
+the fence limit RETURN and MISSION. While the position is in doubt, all of them stand still.
 """
 
 import math
@@ -15,6 +15,7 @@ import numpy as np
 from edge.core import F64
 from edge.core.flight import Flight, FlightInputs, Robot, height_m, is_silent
 from edge.core.mission import STEERED, FlightState
+from edge.core.position import Quality
 from edge.core.safety import (
     MotionLimits,
     approach_speed,
@@ -79,6 +80,8 @@ def guide(
     position_m = np.array([*inputs.odometry.position_m[:2], height])
     if not np.isfinite(position_m).all():
         return _STOP, Guidance()
+    if inputs.position.quality is not Quality.GOOD:
+        return _stay(robot, flight, height), Guidance()
     if state in (FlightState.TAKEOFF, FlightState.HOLD):
         highest_m = math.inf
         if state is FlightState.TAKEOFF:
@@ -112,6 +115,17 @@ def guide(
     if state is FlightState.RETURN:
         return MissionPosition(_vector(position_m + safe_m_s * _AHEAD_S)), remembered
     return MissionVelocity(_vector(safe_m_s)), remembered
+
+
+def _stay(robot: Robot, flight: Flight, height_m: float) -> MissionVelocity:
+    """Stand still at one height, by the estimate of motion alone."""
+    wanted_m = robot.parameters.slot_height_m
+    if flight.state is FlightState.TAKEOFF:
+        wanted_m = height_m
+    elif flight.target_m is not None:
+        wanted_m = flight.target_m[2]
+    climb_m_s = hold_height(height_m, wanted_m, robot.limits.max_climb_m_s)
+    return MissionVelocity((0.0, 0.0, climb_m_s))
 
 
 def _towards(

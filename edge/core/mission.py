@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core.frames import MissionFrame
+from edge.core.position import Cause, Quality
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.vehicle import Vector
@@ -192,7 +193,9 @@ class RobotStatus:
     `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
     for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
     `neighbour_messages` counts each neighbour's messages since the start. `ground_age_s` is how
-    long ago the state that it obeys was heard, None if never.
+    long ago the state that it obeys was heard, None if never. `position_quality` is what its
+    position is worth, `position_cause` what speaks against it; `gps_accuracy_m` is the receiver's
+    own figure.
 
     What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
     look. Raises ValueError for what must be there and is not finite.
@@ -237,6 +240,9 @@ class RobotStatus:
     feature_age_s: float | None = None
     neighbour_messages: dict[str, int] = field(default_factory=dict)
     ground_age_s: float | None = None
+    position_quality: Quality | None = None
+    position_cause: Cause | None = None
+    gps_accuracy_m: float | None = None
 
     def __post_init__(self) -> None:
         for name, size in (
@@ -250,7 +256,7 @@ class RobotStatus:
                 self._forget(name)
         for name in (
             "uptime_s", "unix_time_s", "slot_height_m", "heading_rad", "battery", "hdop",
-            "feature_age_s", "ground_age_s",
+            "feature_age_s", "ground_age_s", "gps_accuracy_m",
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):

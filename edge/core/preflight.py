@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from edge.core.failsafe import RemoteControl
 from edge.core.mission import Origin, RobotStatus
+from edge.core.position import Judgement, Quality
 from edge.core.safety import Fence
 from edge.core.vehicle import Gps, VehicleState
 
@@ -59,12 +60,12 @@ class PreflightInputs:
     """What the checks look at.
 
     `bundle_problem` is why the bundle was not verified on this CPU, None if it was.
-    `system_id` is the configured one. `position_m` (3,) and `landing_point_m` (2,) are in the
-    mission frame; the slot's height is above the takeoff point. `failsafe_problems` come from
-    `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
-    robots that were heard lately, `not_understood` those who said what cannot be read.
-    `ground_age_s` is how long ago the ground was heard, None if never; `ground_clock_offset_s` is
-    its wall clock minus this one, None if it is not known.
+    `system_id` is the configured one. `position` is what the position is worth; `position_m` (3,)
+    and `landing_point_m` (2,) are in the mission frame; the slot's height is above the takeoff
+    point. `failsafe_problems` come from `failsafe.check`, None until the vehicle's parameters were
+    read. `neighbours` are the other robots that were heard lately, `not_understood` those who said
+    what cannot be read. `ground_age_s` is how long ago the ground was heard, None if never;
+    `ground_clock_offset_s` is its wall clock minus this one, None if it is not known.
     """
 
     now_s: float
@@ -80,6 +81,7 @@ class PreflightInputs:
     fence: Fence
     fence_uploaded: bool
     origin: Origin | None
+    position: Judgement
     position_m: Sequence[float] | None
     slot_height_m: float
     landing_point_m: Sequence[float]
@@ -141,7 +143,7 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
     if vehicle.armed is not False:
         state = "armed" if vehicle.armed else "not known to be disarmed"
         yield f"vehicle is {state}: disarm it"
-    yield from _estimate(vehicle, inputs.now_s, limits)
+    yield from _estimate(vehicle, inputs, limits)
     yield from _gps(vehicle.gps, limits)
     if vehicle.battery is None:
         yield "battery is not known: check the power module"
@@ -161,15 +163,20 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
         yield "autopilot does not have the fence: wait for the upload, or check the link"
 
 
-def _estimate(vehicle: VehicleState, now_s: float, limits: PreflightLimits) -> Iterator[str]:
-    age_s = now_s - vehicle.position_at_s
+def _estimate(
+    vehicle: VehicleState, inputs: PreflightInputs, limits: PreflightLimits
+) -> Iterator[str]:
+    age_s = inputs.now_s - vehicle.position_at_s
     if vehicle.position_local_m is None:
         yield "position is not known: wait for the autopilot's estimate"
     elif not age_s <= limits.max_position_age_s:
         yield f"position is {age_s:.1f} s old: check the link to the autopilot"
-    elif not vehicle.position_ok:
-        yield "position is not trusted by the autopilot: wait, or move to open sky"
-    if vehicle.origin_deg is None:
+    elif inputs.position.quality is not Quality.GOOD:
+        yield (
+            f"position is {inputs.position.quality} ({inputs.position.text}): wait, or move to "
+            "open sky"
+        )
+    if vehicle.origin is None:
         yield "estimator's origin is not known: wait for a GPS fix"
     if vehicle.heading_rad is None:
         yield "heading is not known: check the compass"

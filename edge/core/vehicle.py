@@ -53,24 +53,54 @@ class ActionResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """The receiver's own view: `fix` is MAVLink's GPS_FIX_TYPE (3 is 3-D), `hdop` without unit."""
+    """The receiver's own view: `fix` is MAVLink's GPS_FIX_TYPE (3 is 3-D), `hdop` without unit.
+
+    `accuracy_m` is the horizontal accuracy that it claims for itself, None if it claims none.
+    `offset_m` is how far in the plane its fix lies from the estimator's position, None if one of
+    them is not known. `at_s` is when its last new measurement was received.
+    """
 
     fix: int
     satellites: int
     hdop: float
+    accuracy_m: float | None = None
+    offset_m: float | None = None
+    at_s: float = float("-inf")
+
+
+class Estimator(NamedTuple):
+    """What the autopilot's estimator says of itself.
+
+    `horizontal` is whether it vouches for a position and a velocity in the plane, `glitch` whether
+    it takes the GPS for wrong; heard at `at_s`.
+    """
+
+    horizontal: bool
+    glitch: bool
+    at_s: float
+
+
+class GlobalOrigin(NamedTuple):
+    """Where the estimator's local frame starts: WGS84 degrees, and m above mean sea level."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleState:
     """Everything that was heard of the vehicle, the newest of each; None is not heard yet.
 
-    `position_local_m` and `velocity_local_m_s` were received together, at `position_at_s`;
-    `mode`, `armed` come with the autopilot's heartbeat, 1 to 5 times a second, last at
-    `heartbeat_at_s`.
-    `origin_deg` is the estimator's origin: latitude and longitude. `height_above_home_m` is above
-    where the vehicle was armed, up positive. `battery` is the remaining share, 0 to 1. `problems`
-    are the autopilot's reasons why it would not arm, in its own words. `remote_control` tells
-    whether it hears one.
+    `position_local_m` and `velocity_local_m_s` were received together, at `position_at_s`; their
+    values last changed at `position_changed_at_s`, and jumped, in another way than `origin`
+    explains, at `jumped_at_s`. Whether to trust them is for `position.judge` to say.
+    `mode`, `armed` and `failsafe` (the autopilot acts on a failure by itself) come with its
+    heartbeat, once a second, last at `heartbeat_at_s`.
+    `origin` is the estimator's. `height_above_home_m` is above where the vehicle was armed, up
+    positive. `battery` is the remaining share, 0 to 1, `voltage_v` the pack's. `problems` are the
+    autopilot's reasons why it would not arm, in its own words. `remote_control` tells whether it
+    hears one. `version` is its firmware's, such as "1.17.0".
     `result` is the outcome of the last command that ended.
     """
 
@@ -80,19 +110,24 @@ class VehicleState:
     position_local_m: Vector | None = None
     velocity_local_m_s: Vector | None = None
     position_at_s: float = float("-inf")
-    position_ok: bool = False
+    position_changed_at_s: float = float("-inf")
+    jumped_at_s: float = float("-inf")
     heading_rad: float | None = None
-    origin_deg: tuple[float, float] | None = None
+    origin: GlobalOrigin | None = None
     height_above_home_m: float | None = None
     mode: Mode | None = None
     armed: bool | None = None
     in_air: bool | None = None
+    failsafe: bool | None = None
     heartbeat_at_s: float = float("-inf")
     battery: float | None = None
+    voltage_v: float | None = None
     gps: Gps | None = None
+    estimator: Estimator | None = None
     armable: bool | None = None
     problems: tuple[str, ...] = ()
     remote_control: bool | None = None
+    version: str | None = None
     result: ActionResult | None = None
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 from edge.core.failsafe import required
 from edge.core.flight import FlightParameters, Robot
 from edge.core.frames import ModelScale
+from edge.core.position import PositionLimits
 from edge.core.preflight import PreflightLimits
 from edge.core.safety import Fence, MotionLimits
 from edge.core.schema import ConfigError, from_mapping
@@ -145,6 +146,7 @@ class RobotConfig:
     failsafe: FailsafeConfig
     rates: Rates = field(default_factory=Rates)
     preflight: PreflightLimits = field(default_factory=PreflightLimits)
+    position: PositionLimits = field(default_factory=PositionLimits)
     log: LogConfig = field(default_factory=LogConfig)
     on_stop: Literal["hold", "land"] = "hold"
 

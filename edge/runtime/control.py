@@ -88,11 +88,13 @@ class FlightControl:
                 self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
             self._take_up(ground, vehicle.armed)
+        self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
         neighbours = self._neighbours(now_s)
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
+            position=self._navigation.position,
             odometry=odometry,
             policy_velocity_m_s=self._pac.control(now_s),
             neighbours=neighbours,
@@ -253,6 +255,8 @@ class FlightControl:
             {
                 "state": self.flight.state,
                 "reason": self.flight.reason,
+                "position_quality": inputs.position.quality,
+                "position_cause": inputs.position.cause,
                 "height_m": height_m(self.flight, odometry),
                 "position_m": odometry and odometry.position_m,
                 "velocity_m_s": odometry and odometry.velocity_m_s,

@@ -9,7 +9,15 @@ from edge.core import F64
 from edge.core.frames import LocalTransform, MissionFrame
 from edge.core.guidance import MissionPosition, MissionSetpoint
 from edge.core.ports import Autopilot, Odometry
-from edge.core.vehicle import Position, Setpoint, Vector, VehicleState, Velocity
+from edge.core.position import Judgement, PositionLimits, Quality, judge
+from edge.core.vehicle import (
+    GlobalOrigin,
+    Position,
+    Setpoint,
+    Vector,
+    VehicleState,
+    Velocity,
+)
 
 # At 20 Hz, a dozen positions that did not come.
 MAX_POSITION_AGE_S = 0.6
@@ -21,24 +29,32 @@ class _Fixed:
     """A transform, and the two origins that it holds for."""
 
     frame: MissionFrame
-    local_origin_deg: tuple[float, float]
+    local_origin: GlobalOrigin
     transform: LocalTransform
 
 
 class Navigation:
     """Knows where the robot is (an OdometrySource). Every method may be called from any thread.
 
-    `frame` and `datum_m` are replaced whole by the control thread: where the mission frame lies,
-    and the mission z of the robot's takeoff point.
+    `frame`, `datum_m` and `position` are replaced whole by the control thread: where the mission
+    frame lies, the altitude of the robot's takeoff point, and what the position is worth.
     """
 
-    def __init__(self, autopilot: Autopilot, clock_s: Callable[[], float]) -> None:
+    def __init__(
+        self, autopilot: Autopilot, clock_s: Callable[[], float], limits: PositionLimits
+    ) -> None:
         """`clock_s` is the monotonic clock of the autopilot's times, s."""
         self._autopilot = autopilot
         self._clock_s = clock_s
+        self._limits = limits
         self._fixed: _Fixed | None = None
+        self.position = Judgement()
         self.frame: MissionFrame | None = None
         self.datum_m: float | None = None
+
+    def look(self, vehicle: VehicleState, now_s: float) -> None:
+        """Judge the position anew, a few times a second. Called from the control thread alone."""
+        self.position = judge(self.position, vehicle, self._limits, now_s)
 
     def odometry(self) -> Odometry | None:
         """Position and velocity, z being the height above the takeoff point; 0 before takeoff.
@@ -54,12 +70,12 @@ class Navigation:
         return Odometry((x_m, y_m, height_m), estimate.velocity_m_s)
 
     def estimate(self, vehicle: VehicleState) -> Odometry | None:
-        """The same with z up from the estimator's origin; None when unknown or too old."""
+        """The same with z being the altitude above sea level; None when lost or too old."""
         transform = self._transform(vehicle)
         position_m, velocity_m_s = vehicle.position_local_m, vehicle.velocity_local_m_s
         if transform is None or position_m is None or velocity_m_s is None:
             return None
-        if not self._is_fresh(vehicle):
+        if not self._is_known(vehicle):
             return None
         return Odometry(
             _vector(transform.local_to_mission(np.array(position_m))),
@@ -67,13 +83,14 @@ class Navigation:
         )
 
     def global_deg(self, vehicle: VehicleState) -> tuple[float, float] | None:
-        """Latitude and longitude, also without a mission frame; None when unknown or too old."""
-        origin_deg, position_m = vehicle.origin_deg, vehicle.position_local_m
-        if origin_deg is None or position_m is None or not self._is_fresh(vehicle):
+        """Latitude and longitude, also without a mission frame; None when lost or too old."""
+        origin, position_m = vehicle.origin, vehicle.position_local_m
+        if origin is None or position_m is None or not self._is_known(vehicle):
             return None
         north_m, east_m, _ = position_m
         # A mission that points north has x to the east.
-        return MissionFrame(*origin_deg, heading_rad=0.0).to_global_deg(east_m, north_m)
+        pointing_north = MissionFrame(origin.latitude_deg, origin.longitude_deg, heading_rad=0.0)
+        return pointing_north.to_global_deg(east_m, north_m)
 
     def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
         """The setpoint in the vehicle's local frame; None when there is no telling.
@@ -94,16 +111,16 @@ class Navigation:
             return Position(_vector(transform.mission_to_local(place_m)))
         return Velocity(_vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
 
-    def _is_fresh(self, vehicle: VehicleState) -> bool:
+    def _is_known(self, vehicle: VehicleState) -> bool:
         age_s = self._clock_s() - vehicle.position_at_s
-        return vehicle.position_ok and age_s <= MAX_POSITION_AGE_S
+        return self.position.quality is not Quality.LOST and age_s <= MAX_POSITION_AGE_S
 
     def _transform(self, vehicle: VehicleState) -> LocalTransform | None:
-        frame, origin_deg, fixed = self.frame, vehicle.origin_deg, self._fixed
-        if frame is None or origin_deg is None:
+        frame, origin, fixed = self.frame, vehicle.origin, self._fixed
+        if frame is None or origin is None:
             return None
-        if fixed is None or fixed.frame is not frame or fixed.local_origin_deg != origin_deg:
-            fixed = _Fixed(frame, origin_deg, frame.relative_to(*origin_deg))
+        if fixed is None or fixed.frame is not frame or fixed.local_origin != origin:
+            fixed = _Fixed(frame, origin, frame.relative_to(*origin))
             self._fixed = fixed
         return fixed.transform
 

@@ -15,6 +15,7 @@ from edge.core.failsafe import check as check_parameters
 from edge.core.flight import Robot
 from edge.core.mission import Origin
 from edge.core.ports import Autopilot, AutopilotSetup, Odometry
+from edge.core.position import Judgement
 from edge.core.preflight import HeardStatus, PreflightInputs, failed_checks
 from edge.core.safety import Fence
 from edge.runtime.config import RobotConfig
@@ -102,6 +103,7 @@ class Readiness:
         unix_now_s: float,
         *,
         assignment: Assignment,
+        position: Judgement,
         odometry: Odometry | None,
         peers: Sequence[HeardStatus],
         not_understood: Sequence[str],
@@ -127,6 +129,7 @@ class Readiness:
             fence=robot.fence,
             fence_uploaded=origin is not None and self._uploaded == (origin, robot.fence),
             origin=origin,
+            position=position,
             position_m=None if odometry is None else odometry.position_m,
             slot_height_m=robot.parameters.slot_height_m,
             landing_point_m=robot.parameters.landing_point_m,

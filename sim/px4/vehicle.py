@@ -312,9 +312,9 @@ class Px4Vehicle:
         if self.mode not in PILOTED and override and self.rc_connected and self._sticks_m_s.any():
             self.set_mode(Mode.POSCTL)
 
-    def jump_estimator_origin(self, north_m: float, east_m: float) -> None:
+    def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
         """The estimator starts over from another origin: local positions jump, global ones stay."""
-        self.estimator_origin_m = self.estimator_origin_m + np.array([north_m, east_m, 0.0])
+        self.estimator_origin_m = self.estimator_origin_m + np.array([north_m, east_m, down_m])
 
     # Time
 

@@ -32,7 +32,7 @@ from edge.adapters.flight_log import (
 )
 from edge.core.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
 from edge.core.safety import Fence
-from edge.core.vehicle import Action, ActionResult, VehicleState, Velocity
+from edge.core.vehicle import Action, ActionResult, GlobalOrigin, VehicleState, Velocity
 from tests.conftest import ROOT
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", '{"robot": {"id": 3}}', "0.1.0")
@@ -144,7 +144,9 @@ def test_metadata_says_who_flew_what(tmp_path: Path) -> None:
 def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> None:
     """What Foxglove needs: an index, a schema for each channel, the well-known names."""
     order = Order("a", 3, 77, "takeoff", 12.0, "me")
-    state = VehicleState(result=ActionResult(Action.ARM, True, "", 1.0), origin_deg=(47.0, 8.0))
+    state = VehicleState(
+        result=ActionResult(Action.ARM, True, "", 1.0), origin=GlobalOrigin(47.0, 8.0, 400.0)
+    )
     messages: dict[str, dict[str, Any]] = {
         "perception": {"features": np.zeros(34, np.float32)},
         "policy": {"message": b"abc", "payloads": (np.zeros(3, np.float16),), "senders": (1,)},

@@ -79,7 +79,10 @@ def connected(vehicle: Px4Vehicle) -> Iterator[tuple[MavsdkAutopilot, Px4Server]
         MavsdkAutopilot(f"udpin://127.0.0.1:{port}", system_id=7) as autopilot,
         served(Px4Link(vehicle, system_id=7), port=port) as server,
     ):
-        wait(autopilot, lambda s: s.connected and s.position_ok and s.in_air is not None)
+        wait(
+            autopilot,
+            lambda s: s.connected and s.origin and s.position_local_m and s.in_air is not None,
+        )
         yield autopilot, server
 
 
@@ -132,11 +135,17 @@ def known(vector: Vector | None) -> Vector:
 
 def implied_place(state: VehicleState) -> tuple[float, float]:
     """Where origin and position together say that the vehicle is: latitude, longitude, deg."""
-    assert state.origin_deg is not None
+    assert state.origin is not None
     north_m, east_m, _ = known(state.position_local_m)
     azimuth_deg = math.degrees(math.atan2(east_m, north_m))
-    place = Geodesic.WGS84.Direct(*state.origin_deg, azimuth_deg, math.hypot(north_m, east_m))
+    place = Geodesic.WGS84.Direct(*state.origin[:2], azimuth_deg, math.hypot(north_m, east_m))
     return place["lat2"], place["lon2"]
+
+
+def implied_altitude_m(state: VehicleState) -> float:
+    """How high they say that it is, above sea level."""
+    assert state.origin is not None
+    return state.origin.altitude_m - known(state.position_local_m)[2]
 
 
 # Telemetry
@@ -162,7 +171,7 @@ def test_the_whole_state_is_known() -> None:
         assert (state.gps.fix, state.gps.satellites, state.gps.hdop) == (3, 14, 0.8)
         assert state.problems == ()
         vehicle.gps_lost = True
-        state = wait(autopilot, lambda s: not s.position_ok and s.gps and s.gps.fix < 3)
+        state = wait(autopilot, lambda s: s.gps and s.gps.fix < 3)
         assert state.connected
 
 
@@ -183,7 +192,12 @@ def test_the_whole_state_is_known() -> None:
 def test_modes(px4: Px4Mode, mode: Mode) -> None:
     telemetry = Px4Telemetry()
     main, sub = px4.value
-    heartbeat = {"autopilot": 12, "base_mode": 0, "custom_mode": main << 16 | sub << 24}
+    heartbeat = {
+        "autopilot": 12,
+        "base_mode": 0,
+        "custom_mode": main << 16 | sub << 24,
+        "system_status": 3,
+    }
     telemetry.hear("HEARTBEAT", heartbeat, 0.0)
     assert telemetry.state(0.0).mode is mode
 
@@ -192,19 +206,22 @@ def test_position_and_origin_belong_together_when_the_origin_jumps() -> None:
     vehicle = new_vehicle()
     with connected(vehicle) as (autopilot, server):
         take_off(autopilot)
-        origin_deg = autopilot.state().origin_deg
-        assert origin_deg is not None
+        origin = autopilot.state().origin
+        assert origin is not None
         with server.stepped:
-            vehicle.jump_estimator_origin(7.0, -3.0)
+            vehicle.jump_estimator_origin(7.0, -3.0, 6.0)
 
         def has_followed(state: VehicleState) -> bool:
             assert horizontal_m(implied_place(state), vehicle.global_position[:2]) < 1.0
-            assert state.origin_deg is not None
-            return horizontal_m(state.origin_deg, origin_deg) > 7.0
+            assert abs(implied_altitude_m(state) - vehicle.global_position[2]) < 1.0
+            assert state.origin is not None
+            followed = horizontal_m(state.origin[:2], origin[:2]) > 7.0
+            return followed and state.origin.altitude_m < origin.altitude_m - 5.0
 
         deadline_s = time.monotonic() + 60.0
         while not has_followed(autopilot.state()):
             assert time.monotonic() < deadline_s
+        assert autopilot.state().jumped_at_s == -math.inf
 
 
 def test_a_vehicle_that_appears_late_goes_and_comes_back() -> None:
@@ -217,14 +234,13 @@ def test_a_vehicle_that_appears_late_goes_and_comes_back() -> None:
         with pytest.raises(AutopilotError, match="no vehicle"):
             autopilot.read_parameters(["COM_OF_LOSS_T"])
         with served(link, port=port):
-            wait(autopilot, lambda s: s.connected and s.position_ok)
+            wait(autopilot, lambda s: s.connected and s.origin and s.position_local_m)
         gone = wait(autopilot, lambda s: not s.connected)
         assert gone.system_id == 7
-        assert not gone.position_ok
         assert carry_out(autopilot, Action.ARM) == "no vehicle"
         restarted = Px4Link(new_vehicle(2), system_id=7)
         with served(restarted, port=port) as server:
-            wait(autopilot, lambda s: s.connected and s.position_ok)
+            wait(autopilot, lambda s: s.connected and s.origin and s.position_local_m)
             assert carry_out(autopilot, Action.ARM) == ""
             assert server.wait_for(lambda: restarted.vehicle.armed, 60.0)
 

@@ -32,8 +32,10 @@ from edge.core.flight import (
 from edge.core.guidance import Guidance, MissionPosition, MissionSetpoint, guide
 from edge.core.mission import Calm, FlightState, GroundState, Order, OrderKind, OrderResult, Origin
 from edge.core.ports import Odometry
+from edge.core.position import Judgement, PositionLimits, Quality, judge
 from edge.core.safety import Closest, Fence, MotionLimits
-from edge.core.vehicle import Action, ActionResult, Mode, VehicleState
+from edge.core.vehicle import Action, ActionResult, GlobalOrigin, Gps, Mode, VehicleState
+from edge.runtime.navigation import MAX_POSITION_AGE_S
 
 TICK_S = 0.1
 PERIOD_S = 1.0
@@ -85,14 +87,15 @@ class World:
         self.setpoint_at_s = -math.inf
         self.commands: list[Action] = []
         self.refuses: dict[Action, str] = {}
-        self.heavy = False
+        self.heavy = self.stuck = False
         self.watchdog = True
         # What is heard of it.
         self.telemetry = True
         self.position_known = True
+        self.accuracy_m = 0.9
         self.battery = 0.9
         self.beats: list[tuple[float, Mode, bool, bool]] = []
-        self.heard = VehicleState(origin_deg=(47.0, 8.0), position_ok=True, height_above_home_m=0)
+        self.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0), height_above_home_m=0)
         # The rest of the inputs.
         self.ground: GroundState | None = None
         self.ground_on = True
@@ -114,7 +117,7 @@ class World:
 
     def restart(self) -> None:
         """The robot's program starts anew."""
-        self.flight, self.guidance = Flight(), Guidance()
+        self.flight, self.guidance, self.position = Flight(), Guidance(), Judgement()
         self.started_s = self.now_s
 
     # Time
@@ -137,7 +140,6 @@ class World:
     def stop(self, seconds: float) -> None:
         """The process is stopped and continued: its first ticks know nothing new."""
         before = self._hear()
-        known, self.position_known = self.position_known, False
         ground_on, self.ground_on = self.ground_on, False
         for _ in range(round(seconds / TICK_S)):
             self._pass(TICK_S)
@@ -147,7 +149,7 @@ class World:
         self._decide(replace(before, connected=connected))
         self._pass(TICK_S)
         self._decide(replace(before, connected=connected))
-        self.position_known, self.ground_on = known, ground_on
+        self.ground_on = ground_on
 
     # The ground
 
@@ -240,7 +242,7 @@ class World:
                 return "no setpoints"
             self.mode = self.intended = Mode.OFFBOARD
         elif action is Action.ARM:
-            self.armed = True
+            self.armed = not self.stuck
         elif action is Action.HOLD:
             self.mode = self.intended = Mode.HOLD
         elif action is Action.LAND:
@@ -290,19 +292,25 @@ class World:
             self.heard,
             connected=silence_s < 2.5,
             battery=self.battery,
-            position_ok=self.position_known,
+            position_local_m=(0.0, 0.0, 0.0),
+            position_at_s=self.now_s,
+            position_changed_at_s=self.now_s,
+            gps=Gps(3 if self.position_known else 0, 12, 0.8, self.accuracy_m, at_s=self.now_s),
             height_above_home_m=self.height_m,
         )
 
     def _decide(self, vehicle: VehicleState) -> Decision:
+        self.position = judge(self.position, vehicle, PositionLimits(), self.now_s)
         odometry = None
-        if self.position_known:
+        fresh = self.now_s - vehicle.position_at_s <= MAX_POSITION_AGE_S
+        if fresh and self.position.quality is not Quality.LOST:
             x_m, y_m, height_m = self.position_m.tolist()
             vx, vy, vz = self.velocity_m_s.tolist()
             odometry = Odometry((x_m, y_m, height_m + ZERO_M), (vx, vy, vz))
         inputs = FlightInputs(
             now_s=self.now_s,
             vehicle=vehicle,
+            position=self.position,
             odometry=odometry,
             policy_velocity_m_s=self.policy_m_s,
             neighbours=(),
@@ -432,7 +440,7 @@ def test_a_battery_swap_in_somebodys_hands_does_not_arm(world: World) -> None:
     world.ready()
     takeoff = world.new_order("takeoff")
     world.restart()
-    world.heard = VehicleState(origin_deg=(47.0, 8.0))
+    world.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0))
     world.until(FlightState.PREFLIGHT, 8.0)
     answer = world.give(replace(takeoff, boot_nonce=76))
     assert answer == OrderResult("o1", False, "meant for another start of this robot's program")
@@ -457,7 +465,7 @@ def test_a_late_gps_fix_does_not_arm(world: World) -> None:
     assert world.state() is FlightState.INIT
     assert "INIT" in world.refuse("takeoff").upper()
     world.position_known = True
-    world.until(FlightState.PREFLIGHT, 5.0)
+    world.until(FlightState.PREFLIGHT, 8.0)
     world.run(10.0)
     assert world.actions == []
 
@@ -693,7 +701,7 @@ def test_arming_is_called_off(world: World) -> None:
 
 def test_a_vehicle_that_does_not_arm_is_left_alone(world: World) -> None:
     world.ready()
-    world.position_known = False  # Armed, but where?
+    world.stuck = True
     world.obey("takeoff")
     world.until(FlightState.IDLE, 7.0)
     assert world.flight.reason == "the autopilot does not arm"
@@ -929,14 +937,68 @@ def test_battery_low_returns_and_critical_lands(world: World) -> None:
     world.until(FlightState.LANDED, 20.0)
 
 
-def test_position_lost_lands_after_a_second(world: World) -> None:
+def test_a_lost_position_stops_and_then_lands(world: World) -> None:
     world.fly()
     world.position_known = False
-    world.run(0.9)
+    world.run(0.6)
+    assert "position doubtful: GPS has no fix" in world.tick().alarms
+    world.run(1.0)
     assert world.state() is FlightState.MISSION
-    world.run(0.2)
+    assert world.speed_m_s < 0.1
+    world.run(0.5)
     assert world.state() is FlightState.LAND
-    assert "position lost" in world.tick().alarms
+    assert "position lost: GPS has no fix" in world.tick().alarms
+    world.position_known = True
+    world.until(FlightState.LANDED, 30.0)
+
+
+def test_a_glitch_stops_and_the_mission_goes_on(world: World) -> None:
+    world.fly()
+    world.position_known = False
+    world.run(1.5)
+    world.position_known = True
+    world.run(2.9)
+    assert world.state() is FlightState.MISSION and world.speed_m_s < 0.1
+    world.run(2.0)
+    assert world.state() is FlightState.MISSION and world.speed_m_s > 0.5
+    assert world.tick().alarms == ()
+
+
+@pytest.mark.parametrize("state", [FlightState.HOLD, FlightState.TAKEOFF, FlightState.RETURN])
+def test_a_position_in_doubt_is_stood_still_by(world: World, state: FlightState) -> None:
+    if state is FlightState.TAKEOFF:
+        world.ready()
+        world.obey("takeoff")
+        world.until(FlightState.TAKEOFF, 5.0)
+        world.run(3.0)
+    else:
+        world.fly()
+        world.enable(calm="hold" if state is FlightState.HOLD else "return")
+        world.run(3.0)
+    assert world.state() is state
+    world.accuracy_m = 7.0
+    world.run(3.0)
+    assert world.state() is state
+    assert world.speed_m_s < 0.1
+    assert "position doubtful: GPS is accurate to 7.0 m only" in world.tick().alarms
+    # The numbers may be another place's now: it is not flown to.
+    place_m = world.position_m.copy()
+    world.position_m[0] += 5.0
+    world.run(1.0)
+    world.accuracy_m = 0.9
+    world.run(5.0)
+    if state is FlightState.HOLD:
+        assert math.dist(world.position_m[:2], (place_m[0] + 5.0, place_m[1])) < 0.5
+    if state is FlightState.TAKEOFF:
+        world.until(FlightState.HOLD, 20.0)
+
+
+def test_a_position_that_stays_in_doubt_lands(world: World) -> None:
+    world.fly()
+    world.accuracy_m = 7.0
+    world.run(59.0)
+    assert world.state() is FlightState.MISSION
+    world.until(FlightState.LAND, 3.0)
     world.until(FlightState.LANDED, 20.0)
 
 

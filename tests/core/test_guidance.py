@@ -20,6 +20,7 @@ from edge.core.guidance import (
 from edge.core.mailbox import Neighbour
 from edge.core.mission import FlightState
 from edge.core.ports import Odometry
+from edge.core.position import Judgement, Quality
 from edge.core.safety import Fence, MotionLimits
 from edge.core.vehicle import Vector, VehicleState
 
@@ -46,6 +47,7 @@ def inputs(
     velocity_m_s: Vector = STILL,
     policy_m_s: F64 | None = None,
     neighbours: tuple[Neighbour, ...] = (),
+    quality: Quality = Quality.GOOD,
 ) -> FlightInputs:
     odometry = None
     if position_m is not None:
@@ -54,6 +56,7 @@ def inputs(
     return FlightInputs(
         now_s=100.0,
         vehicle=VehicleState(),
+        position=Judgement(quality=quality, cause=None),
         odometry=odometry,
         policy_velocity_m_s=policy_m_s,
         neighbours=neighbours,

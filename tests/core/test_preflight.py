@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from edge.core.mission import FlightState, Origin, RobotStatus
+from edge.core.position import Judgement, Quality
 from edge.core.preflight import (
     HeardStatus,
     PreflightInputs,
@@ -15,7 +16,7 @@ from edge.core.preflight import (
 )
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.vehicle import Gps, Mode, VehicleState
+from edge.core.vehicle import GlobalOrigin, Gps, Mode, VehicleState
 
 UNIX_S = 1_790_000_000.0
 ORIGIN = Origin(47.4, 8.5, 90.0)
@@ -26,9 +27,8 @@ VEHICLE = VehicleState(
     position_local_m=(1.0, 2.0, 0.0),
     velocity_local_m_s=(0.0, 0.0, 0.0),
     position_at_s=99.9,
-    position_ok=True,
     heading_rad=1.0,
-    origin_deg=(47.4, 8.5),
+    origin=GlobalOrigin(47.4, 8.5, 400.0),
     mode=Mode.HOLD,
     armed=False,
     in_air=False,
@@ -83,6 +83,7 @@ READY = PreflightInputs(
     fence=Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 3.0, 25.0),
     fence_uploaded=True,
     origin=ORIGIN,
+    position=Judgement(Quality.GOOD, None),
     position_m=(8.0, 8.0, 0.0),
     slot_height_m=5.0,
     landing_point_m=(8.0, 8.0),
@@ -135,8 +136,7 @@ VEHICLES: list[tuple[dict[str, Any], str]] = [
     ({"armed": None}, "vehicle is not known to be disarmed: disarm it"),
     ({"position_local_m": None}, "position is not known: wait"),
     ({"position_at_s": 99.0}, "position is 1.0 s old: check the link"),
-    ({"position_ok": False}, "position is not trusted by the autopilot: wait"),
-    ({"origin_deg": None}, "estimator's origin is not known: wait for a GPS fix"),
+    ({"origin": None}, "estimator's origin is not known: wait for a GPS fix"),
     ({"heading_rad": None}, "heading is not known: check the compass"),
     ({"gps": None}, "GPS is not heard: check the receiver"),
     ({"gps": Gps(2, 14, 0.8)}, "GPS has no 3-D fix: wait"),

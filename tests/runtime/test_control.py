@@ -23,7 +23,18 @@ from edge.core.mission import (
 )
 from edge.core.preflight import HeardStatus
 from edge.core.safety import Fence
-from edge.core.vehicle import Action, ActionResult, Mode, Setpoint, Vector, VehicleState, Velocity
+from edge.core.vehicle import (
+    Action,
+    ActionResult,
+    Estimator,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    Setpoint,
+    Vector,
+    VehicleState,
+    Velocity,
+)
 from edge.core.world import random_features, rasterize
 from edge.runtime.config import load_config
 from edge.runtime.control import FlightControl, GroundWorld
@@ -68,9 +79,11 @@ class DirectAutopilot:
             position_local_m=vector(vehicle.local_position_m),
             velocity_local_m_s=vector(vehicle.velocity_m_s),
             position_at_s=vehicle.time_s,
-            position_ok=vehicle.position_valid,
+            position_changed_at_s=vehicle.time_s,
             heading_rad=vehicle.heading_rad,
-            origin_deg=vehicle.global_origin[:2],
+            origin=GlobalOrigin(*vehicle.global_origin),
+            gps=Gps(0 if vehicle.gps_lost else 3, 14, 0.8, at_s=vehicle.time_s),
+            estimator=Estimator(vehicle.position_valid, False, vehicle.time_s),
             height_above_home_m=float(-vehicle.position_m[2]),
             mode=MODES[vehicle.mode],
             armed=vehicle.armed,
@@ -111,7 +124,7 @@ class Flown:
         self.vehicle = new_vehicle(COM_OBL_RC_ACT=4)
         self.autopilot = DirectAutopilot(self.vehicle)
         self.records: list[tuple[str, Mapping[str, object]]] = []
-        self.navigation = Navigation(self.autopilot, lambda: self.now_s)
+        self.navigation = Navigation(self.autopilot, lambda: self.now_s, config.position)
         self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         world = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
         self.pac = Pac(

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from edge.core.frames import MissionFrame
 from edge.core.guidance import MissionPosition, MissionVelocity
-from edge.core.vehicle import Action, Position, Setpoint, VehicleState, Velocity
+from edge.core.position import Judgement, PositionLimits, Quality
+from edge.core.vehicle import (
+    Action,
+    GlobalOrigin,
+    Position,
+    Setpoint,
+    VehicleState,
+    Velocity,
+)
 from edge.runtime.navigation import MAX_POSITION_AGE_S, Navigation
 
 FRAME = MissionFrame(39.95, -75.16, math.radians(30.0))
@@ -19,8 +27,7 @@ VEHICLE = VehicleState(
     position_local_m=(3.0, 4.0, -5.0),
     velocity_local_m_s=(1.0, 0.0, -0.5),
     position_at_s=100.0,
-    position_ok=True,
-    origin_deg=(39.95, -75.16),
+    origin=GlobalOrigin(39.95, -75.16, 12.0),
 )
 
 
@@ -41,8 +48,8 @@ class Standing:
 
 
 def navigation(vehicle: VehicleState = VEHICLE, now_s: float = 100.1) -> Navigation:
-    made = Navigation(Standing(vehicle), lambda: now_s)
-    made.frame = FRAME
+    made = Navigation(Standing(vehicle), lambda: now_s, PositionLimits())
+    made.frame, made.position = FRAME, Judgement(quality=Quality.GOOD, cause=None)
     return made
 
 
@@ -56,9 +63,9 @@ def test_the_position_is_the_mission_frames_and_its_height_the_takeoff_points() 
     np.testing.assert_allclose(odometry.velocity_m_s, (-sin, cos, 0.5), atol=1e-9)
     made.datum_m = 2.0
     above = made.odometry()
-    assert above is not None and above.position_m[2] == pytest.approx(3.0)
+    assert above is not None and above.position_m[2] == pytest.approx(15.0)
     estimate = made.estimate(VEHICLE)
-    assert estimate is not None and estimate.position_m[2] == pytest.approx(5.0)
+    assert estimate is not None and estimate.position_m[2] == pytest.approx(17.0)
 
 
 @pytest.mark.parametrize(
@@ -66,8 +73,7 @@ def test_the_position_is_the_mission_frames_and_its_height_the_takeoff_points() 
     [
         {"position_local_m": None},
         {"velocity_local_m_s": None},
-        {"position_ok": False},
-        {"origin_deg": None},
+        {"origin": None},
         {"position_at_s": 100.1 - MAX_POSITION_AGE_S - 0.01},
     ],
 )
@@ -103,7 +109,9 @@ def test_a_setpoint_at_the_robots_own_place_is_where_the_vehicle_is(
 ) -> None:
     """Also where the estimator's origin is away from the mission's."""
     vehicle = dataclasses.replace(
-        VEHICLE, position_local_m=position_local_m, origin_deg=(39.951, -75.162)
+        VEHICLE,
+        position_local_m=position_local_m,
+        origin=GlobalOrigin(39.951, -75.162, 30.0),
     )
     made = navigation(vehicle)
     made.datum_m = datum_m
@@ -118,37 +126,42 @@ def test_a_setpoint_at_the_robots_own_place_is_where_the_vehicle_is(
 
 
 def test_when_the_estimators_origin_moves_the_position_stays() -> None:
-    """The same place on earth, told from another origin."""
+    """The same place on earth, and the same height, told from another origin."""
     made = navigation()
+    made.datum_m = 2.0
     before = made.odometry()
     moved_deg = FRAME.to_global_deg(0.0, 7.0)
     north_m, east_m = 7.0 * math.cos(FRAME.heading_rad), 7.0 * math.sin(FRAME.heading_rad)
     moved = dataclasses.replace(
-        VEHICLE, origin_deg=moved_deg, position_local_m=(3.0 - north_m, 4.0 - east_m, -5.0)
+        VEHICLE,
+        origin=GlobalOrigin(*moved_deg, 18.0),
+        position_local_m=(3.0 - north_m, 4.0 - east_m, 1.0),
     )
-    after = navigation(moved).odometry()
+    made = navigation(moved)
+    made.datum_m = 2.0
+    after = made.odometry()
     assert before is not None and after is not None
     np.testing.assert_allclose(after.position_m, before.position_m, atol=1e-4)
 
 
 def test_latitude_and_longitude_need_no_mission() -> None:
-    made = Navigation(Standing(VEHICLE), lambda: 100.1)
+    made = navigation()
+    made.frame = None
     place_deg = made.global_deg(VEHICLE)
     assert place_deg is not None
     # Seen from a mission that starts there, the estimator's origin is as far away.
-    back = MissionFrame(*place_deg, 0.0).relative_to(*VEHICLE.origin_deg or (0.0, 0.0))
+    back = MissionFrame(*place_deg, 0.0).relative_to(39.95, -75.16)
     np.testing.assert_allclose(back.local_origin_m, (-4.0, -3.0, 0.0), atol=1e-5)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"origin_deg": None},
+        {"origin": None},
         {"position_local_m": None},
-        {"position_ok": False},
         {"position_at_s": 100.1 - MAX_POSITION_AGE_S - 0.01},
     ],
 )
 def test_without_a_fresh_position_there_is_no_latitude(change: dict[str, object]) -> None:
     vehicle = dataclasses.replace(VEHICLE, **change)  # type: ignore[arg-type]
-    assert Navigation(Standing(vehicle), lambda: 100.1).global_deg(vehicle) is None
+    assert navigation(vehicle).global_deg(vehicle) is None

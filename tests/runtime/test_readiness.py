@@ -13,6 +13,7 @@ import pytest
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
 from edge.core.failsafe import PARAMETERS
 from edge.core.mission import GroundState, Origin
+from edge.core.position import Judgement
 from edge.core.safety import Fence
 from edge.runtime.config import load_config
 from edge.runtime.readiness import Assignment, Checks, Readiness
@@ -48,6 +49,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
     now_s = time.monotonic()
     known: dict[str, Any] = {
         "assignment": assignment(asked, origin),
+        "position": Judgement(),
         "odometry": None,
         "peers": (),
         "not_understood": (),

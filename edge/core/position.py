@@ -1,0 +1,226 @@
+"""Whether the robot may trust its position: one judgement for preflight, flight and status.
+
+What is heard of the vehicle -> what speaks against its position (`Cause`) -> `Quality`, with
+hysteresis: one glitch must not land a drone, and nothing may be flown blind. Nothing here has a
+clock.
+
+What one receiver cannot notice, such as a bias that walks, is margin: see docs/safety.md.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import NamedTuple
+
+from edge.core.vehicle import VehicleState
+
+_FIX_3D = 3
+# Asked for at 5 and 20 Hz. An autopilot may keep sending what its estimator made up long before, so
+# that silence is only one way to lose a position.
+_GPS_SILENT_S = 1.5
+_POSITION_OLD_S = 0.6
+# An estimate of a vehicle's sensors is never twice the same.
+_FROZEN_S = 1.0
+# Sent once a second; what is older says nothing about now.
+_ESTIMATOR_HEARD_S = 2.5
+# As long as a jump counts as one: longer than any `doubtful_after_s` that makes sense.
+_JUMP_S = 1.0
+# Whoever did not look for so long begins anew to count.
+_NOT_LOOKED_S = 0.5
+# An accuracy so much worse than allowed is no position.
+_HOPELESS = 2.0
+
+
+class Quality(StrEnum):
+    """GOOD: fly by it. DOUBTFUL: stay where you are. LOST: land."""
+
+    GOOD = "good"
+    DOUBTFUL = "doubtful"
+    LOST = "lost"
+
+
+class Cause(StrEnum):
+    """What speaks against a position, the gravest first."""
+
+    UNKNOWN = "unknown"
+    OLD = "old"
+    FROZEN = "frozen"
+    GPS_SILENT = "gps_silent"
+    NO_FIX = "no_fix"
+    NOT_ESTIMATED = "not_estimated"
+    INACCURATE = "inaccurate"
+    DISAGREES = "disagrees"
+    GLITCH = "glitch"
+    JUMPED = "jumped"
+    FEW_SATELLITES = "few_satellites"
+
+
+_WORDS = {
+    Cause.UNKNOWN: "it is not known",
+    Cause.OLD: "it does not come any more",
+    Cause.FROZEN: "it stands still, as no estimate does",
+    Cause.GPS_SILENT: "nothing new comes from the GPS receiver",
+    Cause.NO_FIX: "GPS has no fix",
+    Cause.NOT_ESTIMATED: "the autopilot's estimator does not vouch for it",
+    Cause.INACCURATE: "GPS is accurate to {value:.1f} m only",
+    Cause.DISAGREES: "the GPS fix is {value:.1f} m away from the estimate",
+    Cause.GLITCH: "the autopilot's estimator takes the GPS for wrong",
+    Cause.JUMPED: "it jumped",
+    Cause.FEW_SATELLITES: "GPS sees {value:.0f} satellites only",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PositionLimits:
+    """How good is good enough in flight, and for how long it must not be.
+
+    `max_accuracy_m` is the receiver's own figure, `max_offset_m` the distance of its fix from the
+    estimate. A position is doubtful once something spoke against it for `doubtful_after_s`; lost
+    once there was none for `lost_after_s`, or it stayed doubtful for `doubtful_lost_after_s`; and
+    good again once nothing spoke against it for `good_after_s`.
+
+    Raises ValueError if a number is not finite or out of its range.
+    """
+
+    min_satellites: int = 6
+    max_accuracy_m: float = 5.0
+    max_offset_m: float = 5.0
+    doubtful_after_s: float = 0.4
+    lost_after_s: float = 2.0
+    doubtful_lost_after_s: float = 60.0
+    good_after_s: float = 3.0
+
+    def __post_init__(self) -> None:
+        if self.min_satellites < 4:
+            raise ValueError(f"min_satellites = {self.min_satellites}: must be at least 4")
+        for name in ("max_accuracy_m", "max_offset_m", "good_after_s"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
+        if not 0.0 < self.doubtful_after_s < _JUMP_S:
+            raise ValueError(
+                f"doubtful_after_s = {self.doubtful_after_s}: must be above 0 and below {_JUMP_S:g}"
+            )
+        if not self.doubtful_after_s < self.lost_after_s < self.doubtful_lost_after_s < math.inf:
+            raise ValueError(
+                f"lost_after_s = {self.lost_after_s}, doubtful_lost_after_s = "
+                f"{self.doubtful_lost_after_s}: must be doubtful_after_s < lost_after_s < "
+                "doubtful_lost_after_s"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What the position is worth, since `since_s`; `cause` is what speaks against it now, or spoke.
+
+    `value` is what was measured where the cause has a number. From `bad_since_s` on something
+    spoke against it, from `none_since_s` on there was no position; None if it is not so now.
+    """
+
+    quality: Quality = Quality.LOST
+    cause: Cause | None = Cause.UNKNOWN
+    value: float = math.nan
+    since_s: float = -math.inf
+    bad_since_s: float | None = None
+    none_since_s: float | None = None
+    good_since_s: float | None = None
+    looked_from_s: float = math.inf
+    looked_at_s: float = -math.inf
+
+    @property
+    def text(self) -> str:
+        """For people: why the position is not good; "" if it is."""
+        return "" if self.cause is None else _WORDS[self.cause].format(value=self.value)
+
+
+class _Finding(NamedTuple):
+    cause: Cause
+    is_none: bool
+    since_s: float
+    value: float = math.nan
+
+
+def judge(
+    before: Judgement, vehicle: VehicleState, limits: PositionLimits, now_s: float
+) -> Judgement:
+    """What the position is worth now. To be called a few times a second."""
+    looked_from_s = before.looked_from_s
+    if not now_s - before.looked_at_s <= _NOT_LOOKED_S:
+        # Nobody knows what was in between: all counts from now on.
+        looked_from_s = now_s
+        before = replace(before, bad_since_s=None, none_since_s=None, good_since_s=None)
+    findings = tuple(_findings(vehicle, limits, now_s))
+    bad_since_s = _since(before.bad_since_s, findings, looked_from_s)
+    without = tuple(finding for finding in findings if finding.is_none)
+    none_since_s = _since(before.none_since_s, without, looked_from_s)
+    good_since_s = None
+    if not findings:
+        good_since_s = now_s if before.good_since_s is None else before.good_since_s
+    quality = before.quality
+    doubtful_s = now_s - before.since_s if quality is Quality.DOUBTFUL else 0.0
+    if (
+        none_since_s is not None and now_s - none_since_s >= limits.lost_after_s
+    ) or doubtful_s >= limits.doubtful_lost_after_s:
+        quality = Quality.LOST
+    elif bad_since_s is not None and now_s - bad_since_s >= limits.doubtful_after_s:
+        quality = Quality.DOUBTFUL if quality is Quality.GOOD else quality
+    elif good_since_s is not None and now_s - good_since_s >= limits.good_after_s:
+        quality = Quality.GOOD
+    if findings:
+        cause, value = findings[0].cause, findings[0].value
+    elif quality is Quality.GOOD:
+        cause, value = None, math.nan
+    else:
+        cause, value = before.cause, before.value
+    return Judgement(
+        quality=quality,
+        cause=cause,
+        value=value,
+        since_s=before.since_s if quality is before.quality else now_s,
+        bad_since_s=bad_since_s,
+        none_since_s=none_since_s,
+        good_since_s=good_since_s,
+        looked_from_s=looked_from_s,
+        looked_at_s=now_s,
+    )
+
+
+def _since(
+    before_s: float | None, findings: tuple[_Finding, ...], looked_from_s: float
+) -> float | None:
+    if not findings:
+        return None
+    first_s = max(min(finding.since_s for finding in findings), looked_from_s)
+    return first_s if before_s is None else min(before_s, first_s)
+
+
+def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> Iterator[_Finding]:
+    """All that speaks against the position now, the gravest first."""
+    if vehicle.position_local_m is None or vehicle.origin is None:
+        yield _Finding(Cause.UNKNOWN, True, now_s)
+    elif now_s - vehicle.position_at_s > _POSITION_OLD_S:
+        yield _Finding(Cause.OLD, True, vehicle.position_at_s)
+    elif now_s - vehicle.position_changed_at_s > _FROZEN_S:
+        yield _Finding(Cause.FROZEN, True, vehicle.position_changed_at_s)
+    gps = vehicle.gps
+    if gps is None or now_s - gps.at_s > _GPS_SILENT_S:
+        yield _Finding(Cause.GPS_SILENT, True, now_s if gps is None else gps.at_s)
+    elif gps.fix < _FIX_3D:
+        yield _Finding(Cause.NO_FIX, True, now_s)
+    estimator = vehicle.estimator
+    known = estimator is not None and now_s - estimator.at_s <= _ESTIMATOR_HEARD_S
+    if estimator is not None and known and not estimator.horizontal:
+        yield _Finding(Cause.NOT_ESTIMATED, True, now_s)
+    if gps is not None and gps.fix >= _FIX_3D:
+        accuracy_m, offset_m = gps.accuracy_m, gps.offset_m
+        if accuracy_m is not None and not accuracy_m <= limits.max_accuracy_m:
+            hopeless = not accuracy_m <= _HOPELESS * limits.max_accuracy_m
+            yield _Finding(Cause.INACCURATE, hopeless, now_s, accuracy_m)
+        if offset_m is not None and not offset_m <= limits.max_offset_m:
+            yield _Finding(Cause.DISAGREES, False, now_s, offset_m)
+    if estimator is not None and known and estimator.glitch:
+        yield _Finding(Cause.GLITCH, False, now_s)
+    if now_s - vehicle.jumped_at_s <= _JUMP_S:
+        yield _Finding(Cause.JUMPED, False, vehicle.jumped_at_s)
+    if gps is not None and gps.fix >= _FIX_3D and gps.satellites < limits.min_satellites:
+        yield _Finding(Cause.FEW_SATELLITES, False, now_s, gps.satellites)
