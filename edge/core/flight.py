@@ -73,6 +73,7 @@ class FlightParameters:
     ground_timeout_s: float = 3.0
     ground_lost_land_s: float = 10.0
     takeoff_timeout_s: float = 15.0
+    hover_land_s: float = 60.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.slot <= MAX_SLOT:
@@ -81,7 +82,7 @@ class FlightParameters:
             raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
         for name in (
             "base_height_m", "slot_spacing_m", "min_separation_m", "command_timeout_s",
-            "ground_timeout_s", "ground_lost_land_s", "takeoff_timeout_s",
+            "ground_timeout_s", "ground_lost_land_s", "takeoff_timeout_s", "hover_land_s",
         ):  # fmt: skip
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
@@ -110,8 +111,10 @@ class Flight:
     `reached`: since the state was entered the vehicle was seen as the state needs it: in offboard,
     in LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`.
     After a lapse of the control loop nothing is sent before `silent_until_s`, which stays set until
-    the vehicle is in offboard again. `obeyed_expiry_s` is the last obeyed order's, `trial` the
-    mission that was started last.
+    the vehicle is in offboard again. `failsafe_at_s` is when the autopilot's own failsafe was last
+    seen to act. `alone_since_s` is set while the vehicle hovers for no reason that anybody gave:
+    since when nobody has answered. `armed_by` is whose takeoff order this program armed it by.
+    `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
     """
 
     state: FlightState = FlightState.INIT
@@ -123,9 +126,12 @@ class Flight:
     target_m: Vector | None = None
     reached: bool = False
     silent_until_s: float = -math.inf
+    failsafe_at_s: float = -math.inf
+    alone_since_s: float | None = None
     rejoined_at_s: float = -math.inf
     asked_at_s: float = -math.inf
     armed_asked: bool = False
+    armed_by: str = ""
     landed_since_s: float | None = None
     land_by: Literal["ground", "return", "safety"] = "safety"
     killed: bool = False
@@ -285,9 +291,18 @@ class _Tick:
         return max(self.flight.since_s, self.flight.silent_until_s)
 
     @property
+    def could_follow_s(self) -> float:
+        """For how long the autopilot has been able to go to offboard."""
+        return self.inputs.now_s - max(self.acts_from_s, self.flight.failsafe_at_s)
+
+    @property
     def overdue(self) -> bool:
         """Whether the autopilot had its time to go to offboard."""
-        return self.inputs.now_s - self.acts_from_s > _OFFBOARD_TIMEOUT_S
+        return self.could_follow_s > _OFFBOARD_TIMEOUT_S
+
+    @property
+    def failsafe_acts(self) -> bool:
+        return failsafe_acts(self.inputs.vehicle)
 
 
 def height_m(flight: Flight, odometry: Odometry | None) -> float | None:
@@ -295,6 +310,14 @@ def height_m(flight: Flight, odometry: Odometry | None) -> float | None:
     if odometry is None or flight.datum_m is None:
         return None
     return odometry.position_m[2] - flight.datum_m
+
+
+def failsafe_acts(vehicle: VehicleState) -> bool:
+    """Whether the autopilot's own failsafe has the vehicle: who asks for another mode ends it.
+
+    PX4 v1.14 calls a warning a failsafe, too: then it still does what it is told in offboard.
+    """
+    return vehicle.failsafe is True and vehicle.mode not in (Mode.OFFBOARD, *PILOTED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,8 +360,13 @@ def _disarmed_again(t: _Tick) -> str | None:
 def _armed_by_others(t: _Tick) -> str | None:
     if not t.inputs.vehicle.armed or t.flight.armed_asked:
         return None
-    already = "was already" if t.flight.state is _S.INIT else "is"
-    return f"the vehicle {already} armed, without an order: only observing"
+    if t.flight.armed_by and t.flight.state is not _S.ARMING:
+        whose = f"armed by this program, on {t.flight.armed_by}'s takeoff order"
+    elif t.flight.state is _S.INIT:
+        whose = "the vehicle was already armed when this program found it"
+    else:
+        return "the vehicle is armed, without an order: only observing"
+    return f"{whose}: only observing; rejoin it, or a pilot lands it"
 
 
 def _armed_again(t: _Tick) -> str | None:
@@ -356,11 +384,20 @@ def _pilot(t: _Tick) -> str | None:
 
 def _left_offboard(t: _Tick) -> str | None:
     left = t.flight.reached and t.mode not in (Mode.OFFBOARD, Mode.LAND)
-    return _if(left, f"the vehicle left offboard for {t.mode}")
+    return _if(left and not t.failsafe_acts, f"the vehicle left offboard for {t.mode}")
 
 
 def _left_land(t: _Tick) -> str | None:
     return _if(t.flight.reached and t.mode is not Mode.LAND, f"the vehicle left land for {t.mode}")
+
+
+def _failsafe(t: _Tick) -> str | None:
+    return _if(t.failsafe_acts, f"the autopilot's own failsafe acts: {t.mode}")
+
+
+def _failsafe_takes(t: _Tick) -> str | None:
+    known = t.flight.reached or t.heard_since_entry
+    return _failsafe(t) if known and t.mode is not Mode.LAND else None
 
 
 def _lapse(t: _Tick) -> str | None:
@@ -370,7 +407,7 @@ def _lapse(t: _Tick) -> str | None:
 def _autopilot_lands(t: _Tick) -> str | None:
     # Else it lands because it was told to, before this state.
     lapsed = t.flight.silent_until_s > -math.inf and not t.silent
-    by_itself = t.flight.reached or t.overdue or lapsed
+    by_itself = t.flight.reached or t.overdue or lapsed or t.failsafe_acts
     return _if(t.mode is Mode.LAND and by_itself, "the autopilot lands by itself")
 
 
@@ -421,11 +458,12 @@ def _ground_holds(t: _Tick) -> str | None:
 
 
 def _ground_holds_landing(t: _Tick) -> str | None:
-    return _ground_holds(t) if t.flight.land_by != "safety" else None
+    emergency = t.flight.land_by == "safety" or t.failsafe_acts
+    return None if emergency else _ground_holds(t)
 
 
 def _ground_returns(t: _Tick) -> str | None:
-    return _if(t.calm == "return", "ground commands return")
+    return _if(t.calm == "return" and not t.failsafe_acts, "ground commands return")
 
 
 def _ground_returns_landing(t: _Tick) -> str | None:
@@ -457,7 +495,21 @@ def _ground_long_lost(t: _Tick) -> str | None:
 
 
 def _battery_low_in_hold(t: _Tick) -> str | None:
-    return _battery_low(t) if t.calm == "none" and t.ground_heard else None
+    free = t.calm == "none" and t.ground_heard and not t.failsafe_acts
+    return _battery_low(t) if free else None
+
+
+def _left_alone(t: _Tick) -> str | None:
+    since_s, limit_s = t.flight.alone_since_s, t.robot.parameters.hover_land_s
+    if since_s is None or t.silent or t.inputs.vehicle.in_air is not True:
+        return None
+    return _if(t.inputs.now_s - since_s > limit_s, f"nobody answered for {limit_s:g} s")
+
+
+def _hovers_alone(t: _Tick) -> str | None:
+    limit_s = t.robot.parameters.hover_land_s
+    text = f"hovers, and lands if nobody orders or holds it within {limit_s:g} s"
+    return _if(t.flight.alone_since_s is not None, text)
 
 
 def _policy_stale(t: _Tick) -> str | None:
@@ -587,6 +639,9 @@ TRANSITIONS: tuple[Transition, ...] = (
     # A pilot, and the autopilot's own failsafe.
     Transition(AIRBORNE, _S.PILOT, "a pilot's mode is on", _pilot, alarm=True),
     Transition(STEERED, _S.HOLD, "the control loop was silent", _lapse, alarm=True),
+    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD,
+               "the autopilot's own failsafe holds or moves the vehicle", _failsafe_takes,
+               alarm=True),
     Transition(STEERED, _S.PILOT, "the vehicle left offboard", _left_offboard, alarm=True),
     Transition((_S.LAND,), _S.PILOT, "the vehicle left land", _left_land, alarm=True),
     Transition(STEERED, _S.LAND, "the autopilot lands by itself", _autopilot_lands, alarm=True),
@@ -619,6 +674,9 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.MISSION,), _S.HOLD, "a neighbour is too close", _too_close, alarm=True),
     Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", _ground_lost, alarm=True),
     Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, "the ground stays lost", _ground_long_lost,
+               alarm=True),
+    Transition((_S.HOLD, _S.PILOT), _S.LAND,
+               "it hovers for no reason that anybody gave, and nobody answers", _left_alone,
                alarm=True),
     Transition((_S.MISSION,), _S.RETURN, "the battery is low", _battery_low, alarm=True),
     Transition((_S.HOLD,), _S.RETURN, "the battery is low, and the ground commands nothing",
@@ -664,6 +722,8 @@ def step(robot: Robot, flight: Flight, inputs: FlightInputs) -> Decision:
         flight, actions = _enter(row, reason, tick), row.actions
     if order is not None:
         flight = _answer(flight, order, refusal)
+    if obeyed is not None and obeyed.kind == "takeoff":
+        flight = replace(flight, armed_by=obeyed.operator)
     new_trial = False
     if obeyed is not None and obeyed.kind in ("start", "reset"):
         new_trial = obeyed.kind == "reset" or obeyed.trial != flight.trial
@@ -698,9 +758,25 @@ def _look(t: _Tick) -> Flight:
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
     down = flight.state is _S.LAND and vehicle.in_air is False
     flight = replace(flight, landed_since_s=landed_since_s if down else None)
+    if failsafe_acts(vehicle):
+        flight = replace(flight, failsafe_at_s=now_s)
+        if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
+            # PX4 goes on landing by itself; if it does not, it is asked again.
+            flight = replace(flight, reached=False, asked_at_s=now_s)
+    flight = replace(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > _STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
     return flight
+
+
+def _alone_since_s(t: _Tick) -> float | None:
+    flight, now_s, order = t.flight, t.inputs.now_s, t.inputs.order
+    ordered = order is not None and order.robot_id == t.robot.robot_id
+    taken = flight.state is _S.PILOT and t.mode is not Mode.HOLD
+    if ordered or t.calm == "hold" or taken:
+        return None
+    begins = flight.state is _S.HOLD and t.failsafe_acts
+    return now_s if begins and flight.alone_since_s is None else flight.alone_since_s
 
 
 def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
@@ -723,6 +799,11 @@ def _enter(row: Transition, reason: str, t: _Tick) -> Flight:
     flight, now_s = t.flight, t.inputs.now_s
     from_offboard = flight.state in (_S.ARMING, *STEERED)
     stays_offboard = from_offboard and row.target in STEERED and row.why is not _lapse
+    # Found in hold, or left there: nobody who has it is known.
+    found = row.target is _S.PILOT and flight.state in (_S.INIT, _S.FAULT)
+    left = (found or row.why is _offboard_refused) and t.mode is Mode.HOLD
+    alone = left or row.why in (_lapse, _failsafe_takes)
+    alone_since_s = now_s if flight.alone_since_s is None else flight.alone_since_s
     return replace(
         flight,
         state=row.target,
@@ -735,10 +816,17 @@ def _enter(row: Transition, reason: str, t: _Tick) -> Flight:
         rejoined_at_s=now_s if row.why is _rejoin else flight.rejoined_at_s,
         asked_at_s=-math.inf,
         armed_asked=False,
+        armed_by=_armed_by(row.target, flight),
+        alone_since_s=alone_since_s if alone else None,
         landed_since_s=None,
         land_by=row.land_by,
         killed=flight.killed or row.why is _killed,
     )
+
+
+def _armed_by(target: FlightState, flight: Flight) -> str:
+    called_off = flight.state is _S.ARMING and not flight.armed_asked
+    return "" if called_off or target in (_S.PREFLIGHT, _S.LANDED) else flight.armed_by
 
 
 def _datum_m(target: FlightState, t: _Tick) -> float | None:
@@ -766,25 +854,30 @@ def _target_m(t: _Tick) -> Vector | None:
     target_m = t.flight.target_m
     if odometry is None or height is None:
         return target_m
-    if target_m is not None and not t.silent and t.knows_place:
+    # Nobody, or PX4's own failsafe, steered it meanwhile.
+    led_away = t.silent or t.failsafe_acts
+    if target_m is not None and t.knows_place and not led_away:
         return target_m
     fence = t.robot.fence
     # While the position is in doubt, numbers that were good before may be another place now.
     x_m, y_m = fence.moved_inside_m(*odometry.position_m[:2], fence.buffer_m / 2.0)
     if state is _S.TAKEOFF:
         return x_m, y_m, t.robot.parameters.slot_height_m
-    return x_m, y_m, height if target_m is None or t.silent else target_m[2]
+    return x_m, y_m, height if target_m is None or led_away else target_m[2]
 
 
 def _ask(t: _Tick) -> tuple[Action, ...]:
     """What the state needs from the autopilot, asked again until it is so; ARM is asked once."""
     flight, now_s = t.flight, t.inputs.now_s
-    streamed = now_s - t.acts_from_s >= _STREAM_S
+    streamed = t.could_follow_s >= _STREAM_S
     if flight.state is _S.LAND:
         since_s = flight.landed_since_s
         if since_s is not None and now_s - since_s > _LANDED_DISARM_S:
             return _again(t, Action.DISARM)
-        return () if flight.reached else _again(t, Action.LAND)
+        asked_lately = now_s - flight.asked_at_s < t.robot.parameters.hover_land_s
+        if flight.reached or (t.failsafe_acts and (t.mode is Mode.LAND or asked_lately)):
+            return ()
+        return _again(t, Action.LAND)
     if flight.state is _S.FAULT:
         return _again(t, Action.KILL) if flight.killed and not flight.reached else ()
     if flight.state is _S.ARMING and flight.reached:
@@ -901,6 +994,8 @@ def _not_in_place(t: _Tick) -> str | None:
         return "position or height is not known"
     if not (vehicle.armed and vehicle.in_air):
         return "the vehicle is not in the air"
+    if t.failsafe_acts:
+        return _failsafe(t)
     slot_height_m = t.robot.parameters.slot_height_m
     if abs(height - slot_height_m) > AT_SLOT_M:
         return f"at {height:.1f} m; its height is {slot_height_m:g} m (within {AT_SLOT_M:g} m)"
@@ -927,6 +1022,9 @@ def _alarms(t: _Tick) -> tuple[str, ...]:
     """What the operator must see, the gravest first."""
     alarms = [t.flight.reason] if t.flight.alarming else []
     if t.flight.state in (*AIRBORNE, _S.PILOT):
-        checks = (_position_not_good, _too_close, _outside, _battery_low, _ground_lost)
+        checks = (
+            _failsafe, _hovers_alone, _position_not_good, _too_close, _outside, _battery_low,
+            _ground_lost,
+        )  # fmt: skip
         alarms += [text for check in checks if (text := check(t)) is not None]
     return tuple(dict.fromkeys(alarms))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import structlog
 
-from edge.core.flight import Flight, FlightInputs, Robot, height_m, step
+from edge.core.flight import Flight, FlightInputs, Robot, failsafe_acts, height_m, step
 from edge.core.guidance import Guidance, MissionSetpoint, guide
 from edge.core.mailbox import Neighbour
 from edge.core.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
@@ -80,7 +80,10 @@ class FlightControl:
         self.operator = ""
 
     def tick(self, now_s: float) -> bool:
-        """One tick: reads the newest of everything, sends at most one setpoint; whether it did."""
+        """One tick: reads the newest of everything, sends at most one setpoint.
+
+        Whether the vehicle flies by it: one that PX4's own failsafe has is not to be held.
+        """
         vehicle = self._autopilot.state()
         ground, ground_age_s = self._inbox.ground(now_s)
         if ground is not None:
@@ -127,7 +130,7 @@ class FlightControl:
             flight = decision.flight
             _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
         self._record(inputs, setpoint, sent, decision.actions)
-        return sent is not None
+        return sent is not None and not failsafe_acts(vehicle)
 
     def failed_checks(self, now_s: float) -> tuple[str, ...] | None:
         """What keeps the robot on the ground; None if nobody looked lately. From any thread."""
@@ -146,7 +149,8 @@ class FlightControl:
         """
         if self.flight.state is FlightState.ARMING:
             return Action.DISARM
-        obeys = self._autopilot.state().mode in (Mode.OFFBOARD, Mode.HOLD)
+        vehicle = self._autopilot.state()
+        obeys = vehicle.mode in (Mode.OFFBOARD, Mode.HOLD) and not failsafe_acts(vehicle)
         return on_stop if self.flight.state in STEERED and obeys else None
 
     def _take_up(self, ground: GroundState, armed: bool | None) -> None:

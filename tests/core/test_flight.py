@@ -34,7 +34,15 @@ from edge.core.mission import Calm, FlightState, GroundState, Order, OrderKind, 
 from edge.core.ports import Odometry
 from edge.core.position import Judgement, PositionLimits, Quality, judge
 from edge.core.safety import Closest, Fence, MotionLimits
-from edge.core.vehicle import Action, ActionResult, GlobalOrigin, Gps, Mode, VehicleState
+from edge.core.vehicle import (
+    PILOTED,
+    Action,
+    ActionResult,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    VehicleState,
+)
 from edge.runtime.navigation import MAX_POSITION_AGE_S
 
 TICK_S = 0.1
@@ -82,6 +90,8 @@ class World:
         self.position_m = np.array([16.0, 14.0, 0.0])
         self.velocity_m_s = np.zeros(3)
         self.sticks_m_s = np.zeros(3)
+        # What PX4's own failsafe does now, until another mode is asked for.
+        self.failsafe: Mode | None = None
         self.landed_at_s: float | None = self.now_s
         self.setpoint: MissionSetpoint | None = None
         self.setpoint_at_s = -math.inf
@@ -94,7 +104,7 @@ class World:
         self.position_known = True
         self.accuracy_m = 0.9
         self.battery = 0.9
-        self.beats: list[tuple[float, Mode, bool, bool]] = []
+        self.beats: list[tuple[float, Mode, bool, bool, bool]] = []
         self.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0), height_above_home_m=0)
         # The rest of the inputs.
         self.ground: GroundState | None = None
@@ -116,8 +126,9 @@ class World:
         self.takeoffs = 0
 
     def restart(self) -> None:
-        """The robot's program starts anew."""
+        """The robot's program starts anew, and has heard nothing yet."""
         self.flight, self.guidance, self.position = Flight(), Guidance(), Judgement()
+        self.heard, self.beats = replace(self.heard, mode=None, armed=None, in_air=None), []
         self.started_s = self.now_s
 
     # Time
@@ -194,7 +205,12 @@ class World:
         assert self.flight.state is FlightState.MISSION
         self.run(1.0)
 
+    def end_failsafe(self) -> None:
+        """What made PX4's own failsafe act is over: the vehicle's mode is again what was asked."""
+        self.failsafe, self.mode = None, self.intended
+
     def pilot(self, *sticks_m_s: float) -> None:
+        self.failsafe = None
         self.mode = self.intended = Mode.POSITION
         self.sticks_m_s = np.array(sticks_m_s or (0.0, 0.0, 0.0))
 
@@ -225,9 +241,13 @@ class World:
         if self.armed and self.intended is Mode.OFFBOARD:
             # PX4's failsafe, which ends when setpoints come again.
             self.mode = Mode.OFFBOARD if self._silence_s <= 1.0 else Mode.LAND
+        if self.armed and self.failsafe is not None:
+            self.mode = self.failsafe
         self._move(dt_s)
         if self.now_s >= self.next_beat_s:
-            beat = (self.next_beat_s, self.mode, self.armed, self.armed and self.height_m > 0.1)
+            in_air = self.armed and self.height_m > 0.1
+            failsafe = self.armed and self.failsafe is not None
+            beat = (self.next_beat_s, self.mode, self.armed, in_air, failsafe)
             self.next_beat_s += PERIOD_S
             if self.telemetry:
                 self.beats.append(beat)
@@ -237,6 +257,8 @@ class World:
     def _carry_out(self, action: Action) -> str:
         if action in self.refuses:
             return self.refuses[action]
+        if action in (Action.OFFBOARD, Action.HOLD, Action.LAND):
+            self.failsafe = None
         if action is Action.OFFBOARD:
             if self._silence_s > 0.5:
                 return "no setpoints"
@@ -283,9 +305,14 @@ class World:
 
     def _hear(self) -> VehicleState:
         while self.beats and self.beats[0][0] + self.latency_s <= self.now_s:
-            at_s, mode, armed, in_air = self.beats.pop(0)
+            at_s, mode, armed, in_air, failsafe = self.beats.pop(0)
             self.heard = replace(
-                self.heard, mode=mode, armed=armed, in_air=in_air, heartbeat_at_s=at_s
+                self.heard,
+                mode=mode,
+                armed=armed,
+                in_air=in_air,
+                failsafe=failsafe,
+                heartbeat_at_s=at_s,
             )
         silence_s = self.now_s - self.heard.heartbeat_at_s
         return replace(
@@ -361,6 +388,8 @@ class World:
                 given: dict[OrderKind, Action] = {"pilot": Action.HOLD, "disarm": Action.DISARM}
                 allowed |= {action for kind, action in given.items() if kind == self.order.kind}
         assert set(decision.actions) <= allowed
+        if vehicle.mode in PILOTED and before.reached and before.state in AIRBORNE:
+            assert setpoint is None, "a pilot flies it"
         if setpoint is not None:
             assert all(math.isfinite(value) for value in setpoint[0])
         if state is FlightState.ARMING and before.state is not FlightState.ARMING:
@@ -719,6 +748,27 @@ def test_the_link_is_lost_while_arming(world: World) -> None:
     assert world.actions[-1][1] is Action.DISARM
 
 
+def test_a_vehicle_that_was_armed_as_the_link_was_lost_is_not_said_to_be_somebodys(
+    world: World,
+) -> None:
+    world.ready()
+    world.obey("takeoff")
+    while not world.flight.armed_asked:
+        world.tick()
+    world.refuses = {Action.DISARM: "did not hear"}
+    world.telemetry, world.beats = False, []
+    world.until(FlightState.INIT, 4.0)
+    world.telemetry = True
+    world.until(FlightState.PILOT, 4.0)
+    assert world.flight.reason.startswith("armed by this program, on op's takeoff order")
+    world.armed = False
+    world.until(FlightState.LANDED, 2.5)
+    world.ready()
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.until(FlightState.PILOT, 2.5)
+    assert world.flight.reason == "the vehicle is armed, without an order: only observing"
+
+
 def test_somebody_else_arms_meanwhile(world: World) -> None:
     world.ready()
     world.obey("takeoff")
@@ -1050,6 +1100,7 @@ def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
     world.run(3.0)
     world.telemetry = True
     world.until(FlightState.PILOT, 4.0)
+    assert world.flight.reason.startswith("armed by this program, on op's takeoff order")
     world.run(3.0)
     world.telemetry = False
     world.until(FlightState.FAULT, 6.0)
@@ -1072,6 +1123,219 @@ def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
     world.obey("rejoin")
     world.until(FlightState.PILOT, 6.0)
     assert world.flight.reason == "offboard refused: sticks"
+
+
+# The autopilot's own failsafe
+
+
+def test_a_landing_that_the_autopilots_failsafe_interrupts_goes_on(world: World) -> None:
+    # As PX4 v1.17 does with a critical battery: 5.5 s of hold, then it lands.
+    world.hover()
+    world.enable(calm="land")
+    world.run(4.0)
+    asked = len(world.actions)
+    world.failsafe = Mode.HOLD
+    world.run(5.5)
+    assert "the autopilot's own failsafe acts: hold" in world.tick().alarms
+    assert world.state() is FlightState.LAND
+    world.enable(calm="hold")
+    world.run(0.5)
+    world.failsafe = Mode.LAND
+    world.until(FlightState.LANDED, 20.0)
+    assert len(world.actions) == asked
+
+
+def test_a_landing_is_resumed_when_the_autopilots_failsafe_ends_without_one(world: World) -> None:
+    world.hover()
+    world.enable(calm="land")
+    world.run(4.0)
+    world.intended = world.failsafe = Mode.HOLD
+    world.run(4.0)
+    asked, height_m = world.asked(Action.LAND), world.height_m
+    world.end_failsafe()
+    world.run(3.0)
+    assert world.asked(Action.LAND) == asked + 1
+    assert world.height_m < height_m
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_pilot_wins_over_the_autopilots_failsafe(world: World) -> None:
+    calms: tuple[Calm, ...] = ("hold", "land")
+    for calm in calms:
+        world.hover()
+        world.enable(calm=calm)
+        world.run(3.0)
+        world.failsafe = Mode.HOLD
+        world.run(3.0)
+        world.pilot()
+        world.until(FlightState.PILOT, 2.5)
+        world.run(4.0)
+        assert world.mode is Mode.POSITION
+        world.pilot(0.0, 0.0, -1.0)
+        while world.height_m > 0.0:
+            world.tick()
+        world.armed = False
+        world.until(FlightState.LANDED, 2.5)
+
+
+def test_the_autopilots_failsafe_in_a_mission_holds_and_then_lands(world: World) -> None:
+    world.fly()
+    asked = len(world.actions)
+    world.failsafe = Mode.HOLD
+    world.until(FlightState.HOLD, 2.5)
+    assert world.flight.alarming
+    world.run(3.0)
+    # The ground comes after it.
+    world.enable(calm="return")
+    world.run(3.0)
+    assert world.state() is FlightState.HOLD
+    assert world.refuse("start") == "the ground commands return"
+    world.enable()
+    assert world.refuse("start") == "the autopilot's own failsafe acts: hold"
+    world.failsafe = Mode.LAND
+    world.until(FlightState.LAND, 2.5)
+    world.until(FlightState.LANDED, 20.0)
+    assert len(world.actions) == asked
+
+
+def test_after_the_autopilots_failsafe_the_robot_holds_or_returns_home(world: World) -> None:
+    world.fly()
+    world.failsafe = Mode.HOLD
+    world.run(4.0)
+    world.position_m[0] += 2.0  # Where it stands then counts.
+    world.run(1.5)
+    at_m = world.position_m.copy()
+    world.end_failsafe()
+    world.run(5.0)
+    assert world.state() is FlightState.HOLD
+    assert world.mode is Mode.OFFBOARD
+    assert world.position_m == pytest.approx(at_m, abs=0.3)
+    world.enable(calm="return")
+    world.run(1.5)
+    world.failsafe = Mode.HOLD
+    world.until(FlightState.HOLD, 2.5)
+    world.end_failsafe()
+    world.until(FlightState.RETURN, 2.5)
+    world.until(FlightState.LANDED, 40.0)
+
+
+# Nobody is left hovering
+
+
+def test_a_vehicle_that_the_autopilots_failsafe_holds_for_a_minute_is_landed(world: World) -> None:
+    world.hover()
+    world.failsafe = Mode.HOLD
+    world.run(55.0)
+    assert world.state() is FlightState.HOLD
+    world.until(FlightState.LAND, 8.0)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_landing_that_the_autopilots_failsafe_holds_for_a_minute_is_asked_for_again(
+    world: World,
+) -> None:
+    world.hover()
+    world.enable(calm="land")
+    world.run(4.0)
+    world.failsafe = Mode.HOLD
+    world.run(50.0)
+    assert world.mode is Mode.HOLD
+    world.until(FlightState.LANDED, 30.0)
+
+
+def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
+    world.fly()
+    world.stop(3.0)
+    began_s = world.now_s
+    world.run(30.0)
+    world.stop(1.0)  # Another one is no answer.
+    assert world.flight.alarming
+    assert any("lands if nobody" in alarm for alarm in world.tick().alarms)
+    world.until(FlightState.LAND, 35.0)
+    assert world.now_s - began_s == pytest.approx(60.0, abs=1.0)
+    assert world.flight.reason == "nobody answered for 60 s"
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_after_a_lapse_that_somebody_answers_it_stays(world: World) -> None:
+    def hold() -> None:
+        world.enable(calm="hold")
+        world.run(0.5)
+        world.enable()
+
+    for answer in (hold, lambda: world.obey("reset"), lambda: world.refuse("rejoin")):
+        world.fly()
+        world.stop(3.0)
+        world.run(30.0)
+        answer()
+        world.run(65.0)
+        assert world.state() is FlightState.HOLD
+        world.enable(calm="land")
+        world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_hold_for_which_somebody_gave_a_reason_lasts(world: World) -> None:
+    world.hover()
+    world.run(65.0)
+    assert world.state() is FlightState.HOLD
+    world.obey("start", "first")
+    world.run(1.0)
+    world.obey("pilot")
+    world.run(65.0)
+    assert (world.state(), world.mode) == (FlightState.PILOT, Mode.HOLD)
+
+
+def test_a_program_that_finds_its_vehicle_in_hold_lands_it_if_nobody_answers(world: World) -> None:
+    world.fly()
+    world.mode = world.intended = Mode.HOLD  # The watchdog's.
+    world.restart()
+    world.until(FlightState.PILOT, 2.5)
+    began_s, actions = world.now_s, list(world.actions)
+    world.run(58.0)
+    assert world.actions == actions
+    world.until(FlightState.LAND, 3.0)
+    assert world.now_s - began_s == pytest.approx(60.0, abs=0.3)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_vehicle_in_hold_that_somebody_has_is_left_to_him(world: World) -> None:
+    def fly_a_little() -> None:
+        world.pilot()
+        world.run(2.5)
+        world.mode = world.intended = Mode.HOLD
+
+    def hold() -> None:
+        world.enable(calm="hold")
+        world.run(0.5)
+
+    for answer in (fly_a_little, hold, lambda: world.refuse("takeoff")):
+        world.fly()
+        world.mode = world.intended = Mode.HOLD
+        world.restart()
+        world.until(FlightState.PILOT, 2.5)
+        world.run(30.0)
+        answer()
+        world.run(65.0)
+        assert (world.state(), world.mode) == (FlightState.PILOT, Mode.HOLD)
+        world.mode = world.intended = Mode.LAND
+        world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_vehicle_that_was_armed_in_hold_on_the_ground_is_not_landed(world: World) -> None:
+    world.armed, world.mode, world.intended = True, Mode.HOLD, Mode.HOLD
+    world.until(FlightState.PILOT, 2.5)
+    world.run(65.0)
+    assert world.state() is FlightState.PILOT
+    assert world.actions == []
+
+
+def test_offboard_that_is_refused_after_a_lapse_leaves_nobody_hovering(world: World) -> None:
+    world.fly()
+    world.refuses = {Action.OFFBOARD: "not now"}
+    world.stop(3.0)
+    world.until(FlightState.PILOT, 9.0)
+    world.until(FlightState.LAND, 61.0)
+    world.until(FlightState.LANDED, 20.0)
 
 
 # A lapse of the control loop
@@ -1235,7 +1499,7 @@ def test_a_program_that_starts_in_flight_only_observes_until_rejoin(world: World
     actions = list(world.actions)
     world.restart()
     world.until(FlightState.PILOT, 2.0)
-    assert "was already armed" in world.flight.reason
+    assert "already armed when this program found it" in world.flight.reason
     for calm in ("none", "hold", "land", "return", "none"):
         world.enable(calm=calm)
         world.run(2.0)
@@ -1411,6 +1675,7 @@ def _order(world: World, draw: random.Random) -> None:
 
 def _mode(world: World, draw: random.Random) -> None:
     world.mode = world.intended = draw.choice(list(Mode))
+    world.failsafe = draw.choice((None, None, Mode.HOLD, Mode.LAND, Mode.RETURN))
 
 
 def _arm(world: World, draw: random.Random) -> None:
