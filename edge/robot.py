@@ -142,6 +142,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
                 config.autopilot.port,
                 config.autopilot.system_id,
                 config.flight.command_timeout_s,
+                config.flight.hover_land_s,
             )
         )
         # 5. What the robot knows: its place, its radio mail, its map and messages.

@@ -13,6 +13,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from edge.adapters import raw_mavlink
 from fleet.config import FleetConfig, RobotHost
 
 Say = Callable[[str], None]
@@ -21,7 +22,7 @@ _PING_S = 3.0
 # Of one call: the longest is the policy's verification on a slow CPU.
 _CALL_S = 400.0
 # In the order in which they are loaded.
-_MODULES = ("calls", "service", "releases", "probes", "enrolment", "collection")
+_MODULES = ("calls", "service", "releases", "probes", "enrolment", "collection", "landing")
 # Reads the modules' sources, makes them modules, and serves. The login shell sees but this.
 _BOOTSTRAP = """
 import json, os, sys, types
@@ -181,7 +182,8 @@ async def connect(
 ) -> AsyncIterator[Session]:
     """A session; `say` hears how far calls are. Raises UnreachableError."""
     folder = Path(__file__).parent / "on_robot"
-    sources = [("fleet", ""), ("fleet.on_robot", "")]
+    sources = [(name, "") for name in ("edge", "edge.adapters", "fleet", "fleet.on_robot")]
+    sources.append((raw_mavlink.__name__, Path(raw_mavlink.__file__).read_text("utf-8")))
     sources += [
         (f"fleet.on_robot.{name}", (folder / f"{name}.py").read_text("utf-8")) for name in _MODULES
     ]

@@ -2,15 +2,15 @@
 
 Whatever hangs in the robot's program, a loop, the interpreter or the whole process, this one does
 not hang with it. When it ends itself, or both do, PX4's own failsafe lands the vehicle a moment
-later. It starts with the standard library alone, so that it weighs little, and speaks the one
-MAVLink message that it needs, through the same socket that the robot's program talks to PX4 with.
+later. A vehicle that it let hold, and that nobody has taken since, it lands. It starts with the
+standard library alone, so that it weighs little, and speaks the two MAVLink messages that it needs
+through the same socket that the robot's program talks to PX4 with.
 """
 
 import os
 import select
 import socket
 import stat
-import struct
 import subprocess
 import sys
 import time
@@ -18,14 +18,23 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
+from edge.adapters.left_alone import land_if_left, say
+from edge.adapters.raw_mavlink import hold_command
+
 _FLYING, _IDLE = b"\1", b"\0"
 _TIMES, _APART_S = 3, 0.1
 _DATAGRAM_BYTES = 1
 
-# COMMAND_LONG: message id, CRC seed, and DO_SET_MODE to PX4's main mode AUTO, sub mode LOITER.
-_COMMAND_LONG, _CRC_EXTRA = 76, 152
-_HOLD = (176, (1.0, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0))
-_AUTOPILOT, _WATCHDOG = 1, 197  # component ids
+_WATCHDOG = 197  # component id
+# A program that is back sooner has missed nothing that it was told.
+_LEAVE_S = 3.0
+# The package's folder is on no path of an isolated interpreter.
+_PROGRAM = """
+import sys
+sys.path.append(sys.argv.pop(1))
+from edge.adapters.deadman import main
+main()
+"""
 
 
 class DeadmanError(OSError):
@@ -35,14 +44,16 @@ class DeadmanError(OSError):
 class Deadman:
     """Starts and feeds the watchdog, as a context. `feed` belongs to the control thread.
 
-    The vehicle holds `timeout_s` after the last `feed(flying=True)` that none followed.
+    The vehicle holds `timeout_s` after the last `feed(flying=True)` that none followed, and lands
+    `hover_land_s` later, unless `feed` was called or anybody gave it another mode.
     """
 
-    def __init__(self, port: int, system_id: int, timeout_s: float) -> None:
+    def __init__(self, port: int, system_id: int, timeout_s: float, hover_land_s: float) -> None:
         """`port` is the UDP port that this process receives the vehicle's datagrams on."""
         self._port = port
         self._system_id = system_id
         self._timeout_s = timeout_s
+        self._hover_land_s = hover_land_s
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe = -1
 
@@ -52,9 +63,10 @@ class Deadman:
         reader, self._pipe = os.pipe()
         # A watchdog that hangs must not hang the control loop with it.
         os.set_blocking(self._pipe, False)
-        arguments = [str(x) for x in (reader, udp, self._system_id, self._timeout_s)]
+        numbers = (reader, udp, self._system_id, self._timeout_s, self._hover_land_s)
+        root = str(Path(__file__).resolve().parents[2])
         self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", str(Path(__file__).resolve()), *arguments],
+            [sys.executable, "-I", "-S", "-c", _PROGRAM, root, *map(str, numbers)],
             stdin=subprocess.DEVNULL,
             pass_fds=(reader, udp),
             # It ends when the robot does, not by the terminal's signals.
@@ -100,24 +112,39 @@ def _socket_on(port: int) -> int:
     raise DeadmanError(f"no UDP socket on port {port} to guard: is the autopilot's url right?")
 
 
-def _watch(pipe: int, udp: socket.socket, system_id: int, timeout_s: float) -> None:
-    """Until the pipe ends: hold the vehicle whenever the robot that flies it falls silent."""
+def _watch(
+    pipe: int, udp: socket.socket, system_id: int, timeout_s: float, hover_land_s: float
+) -> None:
+    """Hold the vehicle whenever the robot that flies it falls silent, and land what is left so.
+
+    Ends with the pipe, but not before a vehicle that holds has somebody or has landed.
+    """
     peer: tuple[str, int] | None = None
-    flying = False
+    flying = held = False
+    fed_s = time.monotonic()
     while True:
         # The peer is told by datagrams that the robot's program has not read yet.
         waited = [pipe] if peer else [pipe, udp.fileno()]
         readable, _, _ = select.select(waited, [], [], timeout_s)
         peer = _peer(udp) or peer
-        if pipe in readable:
-            fed = os.read(pipe, 4096)
-            if not fed:
-                return
-            flying = fed[-1:] == _FLYING
-        elif flying and not readable and peer is not None:
+        if flying and not readable and peer is not None:
             _hold(udp, peer, system_id)
-            _say(f"control loop silent for {timeout_s} s: hold")
-            flying = False
+            say(f"control loop silent for {timeout_s} s: hold")
+            held = True
+            if not select.select([pipe], [], [], _LEAVE_S)[0]:
+                # What is read there the robot's program misses: it would be old by then.
+                left_s = fed_s + hover_land_s - time.monotonic()
+                held = not land_if_left(udp, system_id, left_s, pipe)
+        elif pipe not in readable:
+            continue
+        fed = os.read(pipe, 4096)
+        if not fed:
+            break
+        fed_s = time.monotonic()
+        flying = fed[-1:] == _FLYING
+        held = held and not flying
+    if held:
+        land_if_left(udp, system_id, fed_s + hover_land_s - time.monotonic())
 
 
 def _peer(udp: socket.socket) -> tuple[str, int] | None:
@@ -132,40 +159,16 @@ def _peer(udp: socket.socket) -> tuple[str, int] | None:
 def _hold(udp: socket.socket, peer: tuple[str, int], system_id: int) -> None:
     for sequence in range(_TIMES):
         try:
-            udp.sendto(_hold_command(sequence, system_id), peer)
+            udp.sendto(hold_command(sequence, system_id, _WATCHDOG), peer)
         except OSError as error:
-            _say(f"hold not sent: {error}")
+            say(f"hold not sent: {error}")
         time.sleep(_APART_S)
 
 
-def _say(text: str) -> None:
-    # Nobody may be left to read it.
-    with suppress(OSError):
-        print(f"lpac: {text}", file=sys.stderr, flush=True)
-
-
-def _hold_command(sequence: int, system_id: int) -> bytes:
-    """The MAVLink 2 frame that sets PX4's hold mode."""
-    command, parameters = _HOLD
-    payload = struct.pack("<7fH3B", *parameters, command, system_id, _AUTOPILOT, 0)
-    header = struct.pack(
-        "<6B3s", len(payload), 0, 0, sequence, system_id, _WATCHDOG,
-        _COMMAND_LONG.to_bytes(3, "little"),
+def main() -> None:
+    """The watchdog's own process."""
+    pipe, udp, system_id, timeout_s, hover_land_s = sys.argv[1:]
+    _watch(
+        int(pipe), socket.socket(fileno=int(udp)), int(system_id), float(timeout_s),
+        float(hover_land_s),
     )  # fmt: skip
-    checksum = _crc(header + payload + bytes([_CRC_EXTRA]))
-    return b"\xfd" + header + payload + struct.pack("<H", checksum)
-
-
-def _crc(data: bytes) -> int:
-    """CRC-16/MCRF4XX, as MAVLink has it."""
-    crc = 0xFFFF
-    for byte in data:
-        mixed = byte ^ (crc & 0xFF)
-        mixed ^= (mixed << 4) & 0xFF
-        crc = (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4)
-    return crc
-
-
-if __name__ == "__main__":
-    pipe_fd, udp_fd, vehicle, silence_s = sys.argv[1:]
-    _watch(int(pipe_fd), socket.socket(fileno=int(udp_fd)), int(vehicle), float(silence_s))

@@ -6,8 +6,9 @@ import os
 import socket
 import struct
 import time
-from typing import Any, Dict, Optional
+from typing import Any, Dict, Optional, Tuple
 
+from edge.adapters.raw_mavlink import heartbeat
 from fleet.on_robot.calls import Refused, call, must, run, say, write_whole
 
 UNIT = "lpac-robot.service"
@@ -79,7 +80,7 @@ def armed(mavlink_port: int) -> bool:
 def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dict[str, Any]]:
     """The first heartbeat of an autopilot that comes to the UDP port of this host, None if none.
 
-    It listens beside whoever has the port, of which that one notices nothing.
+    `sender` is the address and the port that it came from. Whoever has the port notices nothing.
     """
     kind = socket.SOCK_DGRAM  # IP packets, without the frames around them
     with contextlib.closing(socket.socket(socket.AF_PACKET, kind, socket.htons(_IP))) as packets:
@@ -93,9 +94,9 @@ def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dic
                 packet = packets.recv(65535)
             except socket.timeout:
                 return None
-            heartbeat = _heartbeat(_datagram(packet, port))
-            if heartbeat is not None:
-                return heartbeat
+            beat = heartbeat(_datagram(packet, port))
+            if beat is not None:
+                return dict(beat._asdict(), sender=_sender(packet))
 
 
 def _datagram(packet: bytes, port: int) -> bytes:
@@ -107,33 +108,9 @@ def _datagram(packet: bytes, port: int) -> bytes:
     return packet[header + 8 :] if destination == port else b""
 
 
-def _heartbeat(data: bytes) -> Optional[Dict[str, Any]]:
-    """An autopilot's HEARTBEAT among the MAVLink messages of a datagram, None if there is none."""
-    while len(data) >= 12:
-        if data[0] == 0xFD:  # MAVLink 2
-            size, header = data[1], 10
-            system, component = data[5], data[6]
-            message = data[7] | data[8] << 8 | data[9] << 16
-            total = header + size + 2 + (13 if data[2] & 1 else 0)
-        elif data[0] == 0xFE:  # MAVLink 1
-            size, header = data[1], 6
-            system, component, message = data[3], data[4], data[5]
-            total = header + size + 2
-        else:
-            return None
-        if len(data) < total:
-            return None
-        if message == 0 and component == 1:
-            # Trailing zeros are left out of a MAVLink 2 payload.
-            payload = data[header : header + size].ljust(9, b"\0")
-            _, _, autopilot, base_mode, _, _ = struct.unpack("<IBBBBB", payload[:9])
-            return {
-                "system_id": system,
-                "autopilot": autopilot,
-                "armed": bool(base_mode & 0x80),
-            }
-        data = data[total:]
-    return None
+def _sender(packet: bytes) -> Tuple[str, int]:
+    (port,) = struct.unpack_from("!H", packet, 4 * (packet[0] & 0x0F))
+    return socket.inet_ntoa(packet[12:16]), port
 
 
 @call

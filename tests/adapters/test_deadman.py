@@ -1,4 +1,5 @@
-"""The watchdog: a vehicle whose program hangs holds, and one whose program died lands."""
+"""The watchdog: a vehicle whose program hangs holds, and lands if nobody takes it; one whose
+program died lands at once."""
 
 import math
 import signal
@@ -9,9 +10,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from edge.adapters.deadman import Deadman, DeadmanError, _hold_command
+from edge.adapters import left_alone
+from edge.adapters.deadman import Deadman, DeadmanError
+from edge.adapters.raw_mavlink import Heartbeat, heartbeat, hold_command, land_command
 from sim.px4.link import Px4Link
 from sim.px4.modes import Mode
 from sim.px4.server import Instance, Px4Server
@@ -39,7 +44,7 @@ def fly(velocity, until, action=None):
 
 with (
     MavsdkAutopilot(f"udpin://127.0.0.1:{port}", system_id=system_id) as autopilot,
-    Deadman(port, system_id, 0.5) as deadman,
+    Deadman(port, system_id, 0.5, float(sys.argv[4])) as deadman,
 ):
     while not autopilot.state().armable:
         time.sleep(0.05)
@@ -56,9 +61,15 @@ with (
 """
 
 
+HOVER_LAND_S = 8.0
+
+
 @contextmanager
-def program(port: int, system_id: int, way: str) -> Iterator[subprocess.Popen[str]]:
-    arguments = [sys.executable, "-c", PROGRAM, str(port), str(system_id), way]
+def program(
+    port: int, system_id: int, way: str, hover_land_s: float
+) -> Iterator[subprocess.Popen[str]]:
+    """Flies, and then hangs in this way; it has said so on its output."""
+    arguments = [sys.executable, "-c", PROGRAM, str(port), str(system_id), way, str(hover_land_s)]
     with subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.PIPE, text=True) as running:
         try:
             yield running
@@ -66,37 +77,55 @@ def program(port: int, system_id: int, way: str) -> Iterator[subprocess.Popen[st
             running.kill()
 
 
-def test_a_program_that_hangs_lets_the_vehicle_hold_and_one_that_dies_lets_it_land() -> None:
-    ways = {"process": Mode.HOLD, "interpreter": Mode.HOLD, "loop": Mode.HOLD, "killed": Mode.LAND}
+def test_a_program_that_hangs_or_dies_leaves_nobody_flying_or_hovering() -> None:
+    hangs = ("process", "interpreter", "loop")
+    ways = (*hangs, "killed", "stopped, then killed", "continued", "taken", "taken and left")
     ports = [free_port() for _ in ways]
-    vehicles = []
-    for seed, _ in enumerate(ways, 1):
-        vehicle = Px4Vehicle(seed=seed, ready_after_s=0.0)
-        vehicle.parameters |= {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 4}
-        vehicles.append(vehicle)
+    vehicles = {}
+    for seed, way in enumerate(ways, 1):
+        vehicles[way] = Px4Vehicle(seed=seed, ready_after_s=0.0)
+        vehicles[way].parameters |= {"COM_OF_LOSS_T": 1.0, "COM_OBL_RC_ACT": 4}
     instances = [
         Instance(Px4Link(vehicle, system_id=number), 0, port)
-        for number, (vehicle, port) in enumerate(zip(vehicles, ports, strict=True), 1)
+        for number, (vehicle, port) in enumerate(zip(vehicles.values(), ports, strict=True), 1)
     ]
+    killed, continued, taken, left = (vehicles[way] for way in ways[3:] if way != ways[4])
+    hang = [vehicle for vehicle in vehicles.values() if vehicle is not killed]
+    landed = [vehicles[way] for way in (*hangs, "stopped, then killed")]
     with Px4Server(instances) as server, ExitStack() as stack:
-        programs = [
-            stack.enter_context(program(port, number, way))
+        programs = {
+            way: stack.enter_context(program(port, number, way, HOVER_LAND_S))
             for number, (port, way) in enumerate(zip(ports, ways, strict=True), 1)
-        ]
-        for each in programs:
+        }
+        for each in programs.values():
             assert each.stdout is not None
             assert each.stdout.readline() == "flying\n"
-        programs[0].send_signal(signal.SIGSTOP)
-        programs[3].kill()
+        for way in ("process", *ways[4:]):
+            programs[way].send_signal(signal.SIGSTOP)
+        programs["killed"].kill()
+        assert server.wait_for(lambda: all(v.mode is Mode.HOLD for v in hang), 60.0)
         with server.stepped:
-            stopped_s = vehicles[0].time_s
-        assert server.wait_for(lambda: vehicles[0].time_s > stopped_s + 5.0, 60.0)
-    for (way, mode), vehicle in zip(ways.items(), vehicles, strict=True):
+            began_s = taken.time_s
+        # The watchdog says it three times.
+        assert server.wait_for(lambda: taken.time_s > began_s + 1.0, 60.0)
+        programs["stopped, then killed"].kill()
+        programs["continued"].send_signal(signal.SIGCONT)
+        with server.stepped:
+            taken.pilot()
+            left.pilot()
+        # Long enough to be told.
+        assert server.wait_for(lambda: taken.time_s > began_s + 7.0, 60.0)
+        with server.stepped:
+            left.set_mode(Mode.HOLD)
+        assert server.wait_for(lambda: all(v.landed and not v.armed for v in landed), 120.0)
+    assert (continued.mode, left.mode, taken.mode) == (Mode.HOLD, Mode.HOLD, Mode.POSCTL)
+    for way, mode in {**dict.fromkeys(hangs, Mode.HOLD), "killed": Mode.LAND}.items():
+        vehicle = vehicles[way]
         silent_s = vehicle._setpoint_at_s
         later = next(truth for truth in vehicle.truth if truth.time_s > silent_s + 4.0)
         assert later.mode is mode, way
         # Horizontally at rest 1.5 s after the last command, and then at rest altogether or landing.
-        after = [truth for truth in vehicle.truth if truth.time_s > silent_s + 1.5]
+        after = [t for t in vehicle.truth if silent_s + 1.5 < t.time_s < silent_s + HOVER_LAND_S]
         assert len(after) > 50
         for truth in after:
             axes = 2 if way == "killed" else 3
@@ -121,7 +150,7 @@ def test_silence_after_flying_is_answered_once_with_hold(
     sockets: tuple[socket.socket, socket.socket],
 ) -> None:
     own, autopilot = sockets
-    with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3) as deadman:
+    with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0) as deadman:
         assert deadman.alive()
         deadman.feed(flying=True)
         frames = [autopilot.recv(300) for _ in range(3)]
@@ -143,7 +172,7 @@ def test_a_robot_that_does_not_fly_may_be_silent(
 ) -> None:
     own, autopilot = sockets
     autopilot.settimeout(1.0)
-    with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3) as deadman:
+    with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0) as deadman:
         assert deadman._process is not None
         # It hears both together, however slow this machine is.
         deadman._process.send_signal(signal.SIGSTOP)
@@ -158,7 +187,7 @@ def test_feeding_a_watchdog_that_was_killed_does_not_raise(
     sockets: tuple[socket.socket, socket.socket],
 ) -> None:
     own, _ = sockets
-    with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3) as deadman:
+    with Deadman(own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0) as deadman:
         assert deadman._process is not None
         deadman._process.kill()
         deadman._process.wait()
@@ -169,14 +198,81 @@ def test_feeding_a_watchdog_that_was_killed_does_not_raise(
 def test_a_port_that_is_not_open_is_named() -> None:
     with (
         pytest.raises(DeadmanError, match=r"^no UDP socket on port 9 to guard"),
-        Deadman(9, system_id=7, timeout_s=0.5),
+        Deadman(9, system_id=7, timeout_s=0.5, hover_land_s=60.0),
     ):
         pass
 
 
 @pytest.mark.parametrize("system_id", [1, 7, 255])
 def test_frames_are_mavlink(system_id: int) -> None:
-    frame = _hold_command(sequence=3, system_id=system_id)
-    (message,) = mavlink.MAVLink(None).parse_buffer(frame)
-    assert message.get_msgbuf() == frame
-    assert message.get_srcSystem() == message.target_system == system_id
+    for command, frame in (
+        (mavlink.MAV_CMD_DO_SET_MODE, hold_command(3, system_id, 197)),
+        (mavlink.MAV_CMD_NAV_LAND, land_command(259, system_id, 197)),
+    ):
+        (message,) = mavlink.MAVLink(None).parse_buffer(frame)
+        assert message.get_msgbuf() == frame
+        assert (message.command, message.get_seq()) == (command, 3)
+        assert message.get_srcSystem() == message.target_system == system_id
+
+
+def beat(system_id: int, custom_mode: int, armed: bool = True, component: int = 1) -> bytes:
+    """A heartbeat of PX4, as a frame."""
+    sender = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component)
+    base_mode = 0x1D | (0x80 if armed else 0)
+    return sender.heartbeat_encode(2, 12, base_mode, custom_mode, 4).pack(sender)
+
+
+HOLD, LAND, OFFBOARD, POSITION = 0x3040000, 0x6040000, 0x60000, 0x30000
+
+
+def test_the_autopilots_heartbeat_is_found_in_a_datagram() -> None:
+    assert heartbeat(beat(7, HOLD, component=191) + beat(7, HOLD)) == Heartbeat(7, 12, True, "hold")
+    # Trailing zeros are not sent.
+    sender = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    assert heartbeat(sender.heartbeat_encode(0, 0, 0, 0, 0, 0).pack(sender)) == Heartbeat(
+        7, 0, False, "other"
+    )
+
+
+@given(st.binary(max_size=300))
+def test_no_datagram_breaks_it(data: bytes) -> None:
+    for start in (b"", b"\xfd", b"\xfe"):
+        heartbeat(start + data)
+
+
+@pytest.mark.parametrize(
+    ("told", "lands"),
+    [
+        ((OFFBOARD, HOLD), True),
+        ((HOLD,), True),
+        # PX4 ends it by itself.
+        ((OFFBOARD,), False),
+        ((LAND,), False),
+        ((HOLD, POSITION, HOLD), False),
+        ((HOLD, OFFBOARD, HOLD), False),
+        ((), False),
+    ],
+)
+def test_only_a_vehicle_that_hovers_and_that_nobody_took_is_landed(
+    told: tuple[int, ...],
+    lands: bool,
+    sockets: tuple[socket.socket, socket.socket],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    own, autopilot = sockets
+    monkeypatch.setattr(left_alone, "_FRESH_S", 0.3)
+    address = own.getsockname()
+    for custom_mode in told:
+        # Of another vehicle on the same link nothing counts.
+        autopilot.sendto(beat(8, POSITION), address)
+        autopilot.sendto(beat(7, custom_mode), address)
+    left_alone.land_if_left(own, 7, 0.0)
+    autopilot.settimeout(0.01)
+    try:
+        message = mavlink.MAVLink(None).parse_char(autopilot.recv(300))
+    except TimeoutError:
+        assert not lands
+    else:
+        assert lands
+        assert message.command == mavlink.MAV_CMD_NAV_LAND
+        assert message.target_system == 7
