@@ -368,9 +368,10 @@ class MavsdkAutopilot:
     def _on_telemetry(self, name: str) -> Callable[[dict[str, Any]], None]:
         def on_telemetry(fields: dict[str, Any]) -> None:
             self._telemetry.hear(name, fields, time.monotonic())
-            if name == "STATUSTEXT" or self._telemetry.needs_origin():
+            needs_origin = self._telemetry.needs_origin()
+            if needs_origin or name in ("STATUSTEXT", "EVENT"):
                 with self._wake:
-                    self._next_s = 0.0
+                    self._next_s = 0.0 if needs_origin else self._next_s
                     self._wake.notify_all()
 
         return on_telemetry
@@ -460,14 +461,14 @@ class MavsdkAutopilot:
             return self._answer
 
     def _explain(self, answer: int, since_s: float) -> str:
-        """PX4 says in texts why it refused, soon before or after the answer."""
+        """PX4 says why it refused soon before or after the answer."""
         word = _REFUSALS.get(answer, f"result {answer}")
         with self._wake:
             self._wake.wait_for(
-                lambda: bool(self._telemetry.warnings_since(since_s)) or self._overridden,
+                lambda: bool(self._telemetry.refusal_reasons(since_s)) or self._overridden,
                 _REASON_S,
             )
-        reasons = "; ".join(self._telemetry.warnings_since(since_s))
+        reasons = "; ".join(reason.text for reason in self._telemetry.refusal_reasons(since_s))
         return f"{word}: {reasons}" if reasons else word
 
     def _keep_up(self, now_s: float) -> None:
@@ -484,6 +485,9 @@ class MavsdkAutopilot:
             self._ask_for_streams()
         if self._telemetry.needs_origin():
             self._request(_GPS_GLOBAL_ORIGIN)
+        missing = self._telemetry.missing_events()
+        if missing is not None:
+            self._send("REQUEST_EVENT", first_sequence=missing[0], last_sequence=missing[1])
         if now_s >= self._next_renewal_s:
             self._next_renewal_s = now_s + _RENEW_S
             self._request(_GPS_GLOBAL_ORIGIN)

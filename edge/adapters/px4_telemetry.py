@@ -11,13 +11,25 @@ from dataclasses import replace
 from threading import Lock
 from typing import Any
 
-from edge.core.vehicle import Estimator, GlobalOrigin, Gps, Mode, Vector, VehicleState
+from edge.adapters.px4_events import Px4Events, without_repetition
+from edge.core.vehicle import (
+    Estimator,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    Reason,
+    Vector,
+    VehicleState,
+)
 
 Fields = Mapping[str, Any]
 
 # PX4 sends a heartbeat at least every second.
 _CONNECTED_WITHIN_S = 2.5
-_TEXT_KEPT_S = 15.0
+# What is told once counts for so long, and as long as a failsafe lasts.
+_TOLD_FOR_S = 15.0
+# The reason for a failsafe comes up to a heartbeat before its state.
+_FAILSAFE_LATE_S = 2.5
 
 # A position is taken for a jump if it lies further from where motion led than this, plus as much
 # for every second between.
@@ -71,6 +83,8 @@ class Px4Telemetry:
         self._origin: GlobalOrigin | None = None
         self._origin_at_s = -math.inf
         self._texts: deque[tuple[float, str]] = deque(maxlen=16)
+        self._events = Px4Events()
+        self._failsafe_at_s = -math.inf
         self._handlers = {
             "HEARTBEAT": self._on_heartbeat,
             "SYS_STATUS": self._on_sys_status,
@@ -81,6 +95,8 @@ class Px4Telemetry:
             "ESTIMATOR_STATUS": self._on_estimator_status,
             "EXTENDED_SYS_STATE": self._on_extended_sys_state,
             "STATUSTEXT": self._on_statustext,
+            "EVENT": self._events.hear,
+            "CURRENT_EVENT_SEQUENCE": self._events.hear_sequence,
             "AUTOPILOT_VERSION": self._on_autopilot_version,
         }
 
@@ -101,11 +117,18 @@ class Px4Telemetry:
         """All fields but those of the link: system ids and command results are not known here."""
         with self._lock:
             state = self._state
-            texts = {text: None for at_s, text in self._texts if now_s - at_s < _TEXT_KEPT_S}
+            problems: tuple[Reason, ...] = ()
+            warnings: tuple[Reason, ...] = ()
+            if state.armed:
+                told = self._events.told(self._told_since_s(now_s))
+                warnings = without_repetition((*told, *self._events.wrong(state.mode)))
+            elif not state.armable:
+                problems = self._why_not_armed(now_s - _TOLD_FOR_S)
             return replace(
                 state,
                 connected=now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S,
-                problems=() if state.armable or state.armed else tuple(texts),
+                problems=problems,
+                warnings=warnings,
             )
 
     def needs_origin(self) -> bool:
@@ -123,10 +146,31 @@ class Px4Telemetry:
         with self._lock:
             return self._clock.restarts
 
-    def warnings_since(self, since_s: float) -> tuple[str, ...]:
-        """The reasons for a refusal that were heard since then, without the words of refusal."""
+    def missing_events(self) -> tuple[int, int] | None:
+        """The first and last sequence number of events that were lost and are to be asked for."""
         with self._lock:
-            return tuple({text: None for at_s, text in self._texts if at_s >= since_s})
+            return self._events.missing()
+
+    def refusal_reasons(self, since_s: float) -> tuple[Reason, ...]:
+        """Why a command that was sent then was refused: what was told since, and is wrong now."""
+        with self._lock:
+            told = self._events.told(since_s)
+            return without_repetition((*told, *self._why_not_armed(since_s)))
+
+    def _told_since_s(self, now_s: float) -> float:
+        """When what is told once must have been told to count now."""
+        since_s = now_s - _TOLD_FOR_S
+        return (
+            min(since_s, self._failsafe_at_s - _FAILSAFE_LATE_S)
+            if self._state.failsafe
+            else since_s
+        )
+
+    def _why_not_armed(self, since_s: float) -> tuple[Reason, ...]:
+        """By PX4's checks; a vehicle that does not tell them may have said it in a text."""
+        texts = {text: None for at_s, text in self._texts if at_s >= since_s}
+        said = tuple(Reason("text", (), text) for text in texts)
+        return self._events.why_not_armed(self._state.mode) or said
 
     def _change(self, **changes: Any) -> None:
         self._state = replace(self._state, **changes)
@@ -135,11 +179,14 @@ class Px4Telemetry:
         if fields["autopilot"] == _AUTOPILOT_INVALID:
             return
         main, sub = fields["custom_mode"] >> 16 & 0xFF, fields["custom_mode"] >> 24 & 0xFF
+        failsafe = fields["system_status"] in (_CRITICAL, _EMERGENCY)
+        if failsafe and not self._state.failsafe:
+            self._failsafe_at_s = now_s
         modes, key = (_AUTO_MODES, sub) if main == _AUTO else (_MAIN_MODES, main)
         self._change(
             mode=modes.get(key, Mode.OTHER),
             armed=bool(fields["base_mode"] & _SAFETY_ARMED),
-            failsafe=fields["system_status"] in (_CRITICAL, _EMERGENCY),
+            failsafe=failsafe,
             heartbeat_at_s=now_s - self._clock.delay_s,
         )
 

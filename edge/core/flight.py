@@ -1027,4 +1027,5 @@ def _alarms(t: _Tick) -> tuple[str, ...]:
             _ground_lost,
         )  # fmt: skip
         alarms += [text for check in checks if (text := check(t)) is not None]
+        alarms += [f"PX4: {warning.text}" for warning in t.inputs.vehicle.warnings]
     return tuple(dict.fromkeys(alarms))

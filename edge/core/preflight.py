@@ -153,7 +153,7 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
             f"{100.0 * limits.min_battery:.0f} %: charge or change it"
         )
     if not vehicle.armable:
-        reasons = "; ".join(vehicle.problems) or "it does not say why"
+        reasons = "; ".join(problem.text for problem in vehicle.problems) or "it does not say why"
         yield f"autopilot would not arm ({reasons}): mend what it names"
     if inputs.failsafe_problems is None:
         yield "autopilot's failsafe parameters were not read: wait, or check the link"

@@ -51,6 +51,17 @@ class ActionResult(NamedTuple):
     at_s: float
 
 
+class Reason(NamedTuple):
+    """Why the autopilot refuses or does something: `code` is its own name for it, `text` in words.
+
+    `arguments` are the numbers in it, such as which sensor.
+    """
+
+    code: str
+    arguments: tuple[float, ...]
+    text: str
+
+
 @dataclass(frozen=True, slots=True)
 class Gps:
     """The receiver's own view: `fix` is MAVLink's GPS_FIX_TYPE (3 is 3-D), `hdop` without unit.
@@ -99,8 +110,9 @@ class VehicleState:
     heartbeat, once a second, last at `heartbeat_at_s`.
     `origin` is the estimator's. `height_above_home_m` is above where the vehicle was armed, up
     positive. `battery` is the remaining share, 0 to 1, `voltage_v` the pack's. `problems` are the
-    autopilot's reasons why it would not arm, in its own words. `remote_control` tells whether it
-    hears one. `version` is its firmware's, such as "1.17.0".
+    autopilot's reasons why it would not arm, `warnings` what it finds wrong while it is armed, and
+    why it takes over; the gravest come first. `remote_control` tells whether it hears one.
+    `version` is its firmware's, such as "1.17.0".
     `result` is the outcome of the last command that ended.
     """
 
@@ -125,7 +137,8 @@ class VehicleState:
     gps: Gps | None = None
     estimator: Estimator | None = None
     armable: bool | None = None
-    problems: tuple[str, ...] = ()
+    problems: tuple[Reason, ...] = ()
+    warnings: tuple[Reason, ...] = ()
     remote_control: bool | None = None
     version: str | None = None
     result: ActionResult | None = None

@@ -328,7 +328,8 @@ def test_a_long_text_comes_in_pieces() -> None:
     for piece, text in enumerate(("Preflight Fail: Compass needs calibration be", "fore flight\t")):
         fields = {"severity": 2, "text": text, "id": 9, "chunk_seq": piece}
         telemetry.hear("STATUSTEXT", fields, 1.0)
-    assert telemetry.state(2.0).problems == ("Compass needs calibration before flight",)
+    (problem,) = telemetry.state(2.0).problems
+    assert problem.text == "Compass needs calibration before flight"
     assert telemetry.state(60.0).problems == ()
 
 
@@ -378,7 +379,7 @@ def test_arming_is_refused_with_px4s_reason() -> None:
     with connected(vehicle) as (autopilot, _):
         assert carry_out(autopilot, Action.ARM) == "denied: low battery"
         state = wait(autopilot, lambda s: s.armable is False)
-        assert state.problems == ("low battery",)
+        assert [problem.text for problem in state.problems] == ["low battery"]
         assert carry_out(autopilot, Action.OFFBOARD) == "denied: no setpoints"
         vehicle.battery_remaining = 1.0
         assert wait(autopilot, lambda s: s.armable).problems == ()

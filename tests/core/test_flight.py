@@ -41,6 +41,7 @@ from edge.core.vehicle import (
     GlobalOrigin,
     Gps,
     Mode,
+    Reason,
     VehicleState,
 )
 from edge.runtime.navigation import MAX_POSITION_AGE_S
@@ -1050,6 +1051,16 @@ def test_a_position_that_stays_in_doubt_lands(world: World) -> None:
     assert world.state() is FlightState.MISSION
     world.until(FlightState.LAND, 3.0)
     world.until(FlightState.LANDED, 20.0)
+
+
+def test_what_px4_warns_of_in_flight_is_an_alarm(world: World) -> None:
+    warning = Reason("commander_failsafe_enter", (0, 7, 4), "failsafe, battery critical: PX4 lands")
+    world.heard = replace(world.heard, warnings=(warning,))
+    world.enable()
+    world.run(1.0)
+    assert world.tick().alarms == ()
+    world.fly()
+    assert world.tick().alarms == ("PX4: failsafe, battery critical: PX4 lands",)
 
 
 def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:

@@ -16,7 +16,7 @@ from edge.core.preflight import (
 )
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.vehicle import GlobalOrigin, Gps, Mode, VehicleState
+from edge.core.vehicle import GlobalOrigin, Gps, Mode, Reason, VehicleState
 
 UNIX_S = 1_790_000_000.0
 ORIGIN = Origin(47.4, 8.5, 90.0)
@@ -144,7 +144,10 @@ VEHICLES: list[tuple[dict[str, Any], str]] = [
     ({"gps": Gps(3, 14, math.nan)}, "GPS precision (HDOP) is nan, must be at most 2"),
     ({"battery": None}, "battery is not known: check the power module"),
     ({"battery": 0.3}, "battery has 30 %, must have 50 %: charge or change it"),
-    ({"armable": False, "problems": ("no mag",)}, "autopilot would not arm (no mag): mend"),
+    (
+        {"armable": False, "problems": (Reason("check_mag_missing", (0,), "no mag"),)},
+        "autopilot would not arm (no mag): mend",
+    ),
     ({"armable": None}, "autopilot would not arm (it does not say why)"),
 ]
 

@@ -1,0 +1,51 @@
+"""Recordings of what a real PX4 and a robot's program said to each other (../shared/data)."""
+
+import gzip
+import struct
+from functools import cache
+from typing import Any, NamedTuple
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from tests.conftest import ROOT
+
+FOLDER = ROOT.parent / "shared" / "data" / "px4_v1.17"
+RECORDINGS = (
+    "normal", "gps", "kill", "stop", "pilot", "battery", "battery_fast", "refused", "sensors_die",
+)  # fmt: skip
+
+_TIME_BYTES, _FRAME_BYTES, _SIGNATURE_BYTES = 8, 12, 13
+_SIGNED = 1
+
+
+class Recorded(NamedTuple):
+    """One message of the dialect, and when it was on the link: s from the first."""
+
+    time_s: float
+    message: Any
+
+    @property
+    def is_px4(self) -> bool:
+        """Whether the autopilot sent it, and not the robot's program or a ground station."""
+        return bool(self.message.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1)
+
+
+@cache
+def recorded(name: str) -> tuple[Recorded, ...]:
+    """Everything in one recording, in order; or a skip where there is none."""
+    path = FOLDER / f"{name}.tlog.gz"
+    if not path.exists():
+        pytest.skip(f"needs the recording {path.name} of a real PX4 in ../shared/data/px4_v1.17")
+    data, at, messages = gzip.decompress(path.read_bytes()), 0, []
+    parser = mavlink.MAVLink(None)
+    first_us = struct.unpack_from(">Q", data)[0]
+    while at < len(data):
+        time_us = struct.unpack_from(">Q", data, at)[0]
+        at += _TIME_BYTES
+        signature_bytes = _SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0
+        end = at + _FRAME_BYTES + data[at + 1] + signature_bytes
+        found = parser.parse_buffer(data[at:end])
+        messages += [Recorded((time_us - first_us) / 1e6, message) for message in found or ()]
+        at = end
+    return tuple(messages)
