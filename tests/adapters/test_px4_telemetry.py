@@ -1,0 +1,144 @@
+"""What the robot concludes, second by second, from the bytes that a real PX4 v1.17 sent."""
+
+from typing import NamedTuple
+
+import pytest
+
+from edge.adapters.px4_telemetry import Px4Telemetry
+from edge.core.position import Cause, Judgement, PositionLimits, Quality, judge
+from edge.core.vehicle import Mode, VehicleState
+from tests.px4_recordings import RECORDINGS, recorded
+
+TICK_S = 0.1
+
+_Q, _M = Quality, Mode
+
+
+class Conclusion(NamedTuple):
+    """What a control tick knows; s from the recording's first message."""
+
+    time_s: float
+    vehicle: VehicleState
+    judgement: Judgement
+
+
+def conclusions(name: str) -> list[Conclusion]:
+    """One ten times a second."""
+    telemetry, judgement = Px4Telemetry(), Judgement()
+    found: list[Conclusion] = []
+    for heard_s, message in (r for r in recorded(name) if r.is_px4):
+        while (now_s := len(found) * TICK_S) <= heard_s:
+            vehicle = telemetry.state(now_s)
+            judgement = judge(judgement, vehicle, PositionLimits(), now_s)
+            found.append(Conclusion(now_s, vehicle, judgement))
+        if message.get_type() in telemetry.messages:
+            telemetry.hear(message.get_type(), message.to_dict(), heard_s)
+    return found
+
+
+def changes(name: str, *fields: str) -> list[tuple[float, ...]]:
+    """When the fields changed, and to what: all but the time in the order asked for."""
+    told: list[tuple[float, ...]] = []
+    for time_s, vehicle, judgement in conclusions(name):
+        values = tuple(
+            getattr(judgement if field in ("quality", "cause") else vehicle, field)
+            for field in fields
+        )
+        if not told or told[-1][1:] != values:
+            told.append((round(time_s, 1), *values))
+    return told
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_real_px4_is_found_ready_to_arm_and_its_position_good(name: str) -> None:
+    """Its prearm check is told in health alone, and its version in a word of four bytes."""
+    found = conclusions(name)
+    ready = [c for c in found if c.vehicle.armable and c.judgement.quality is _Q.GOOD]
+    assert ready and ready[0].time_s < 13.0
+    assert ready[0].vehicle.version == "1.17.0"
+    assert ready[0].vehicle.voltage_v == pytest.approx(16.2, abs=0.1)
+    gps = ready[0].vehicle.gps
+    assert gps is not None and gps.accuracy_m == pytest.approx(0.9)
+    # In the first second, before its first health report, PX4 says that all is well.
+    assert not any(c.vehicle.armable for c in found if c.time_s < 3.0)
+
+
+def test_a_normal_flight() -> None:
+    assert changes("normal", "mode", "armed", "failsafe", "in_air")[2:] == [
+        (1.1, _M.HOLD, False, False, False),
+        (9.5, _M.OFFBOARD, True, False, False),
+        (11.8, _M.OFFBOARD, True, False, True),
+        (53.1, _M.LAND, True, False, True),
+        (62.7, _M.LAND, True, False, False),
+        (64.8, _M.OFFBOARD, False, False, False),
+        (66.8, _M.HOLD, False, False, False),
+    ]
+    assert changes("normal", "quality") == [(0.0, _Q.LOST), (7.9, _Q.GOOD)]
+
+
+def test_gps_lost_in_the_mission() -> None:
+    """At 26.9 s; PX4 itself acts at 34.4 s. It is back at 58.2 s, with a jump of 24 m."""
+    assert changes("gps", "quality") == [
+        (0.0, _Q.LOST),
+        (6.2, _Q.GOOD),
+        (27.7, _Q.DOUBTFUL),
+        (29.2, _Q.LOST),
+        (63.6, _Q.GOOD),
+    ]
+    causes = [c.judgement.cause for c in conclusions("gps") if 27.2 < c.time_s < 58.0]
+    # The machine stood still for a moment at 29.3 s.
+    assert set(causes) == {Cause.NO_FIX, Cause.OLD}
+    assert Cause.JUMPED in {c.judgement.cause for c in conclusions("gps") if c.time_s > 59.0}
+    assert changes("gps", "failsafe")[2:] == [(34.4, True), (53.9, False)]
+
+
+def test_all_sensors_die_after_takeoff() -> None:
+    """Just after 8 s. PX4 goes on to tell of a receiver from which nothing comes."""
+    assert changes("sensors_die", "quality", "cause")[-4:] == [
+        (9.0, _Q.GOOD, Cause.NO_FIX),
+        (9.4, _Q.DOUBTFUL, Cause.NO_FIX),
+        (10.5, _Q.DOUBTFUL, Cause.GPS_SILENT),
+        (11.0, _Q.LOST, Cause.GPS_SILENT),
+    ]
+
+
+def test_battery_critical_while_landing_is_px4s_own_failsafe() -> None:
+    assert changes("battery_fast", "mode", "failsafe")[-6:] == [
+        (14.0, _M.OFFBOARD, False),
+        (34.9, _M.LAND, False),
+        (36.1, _M.HOLD, True),
+        (41.6, _M.LAND, True),
+        (55.9, _M.OFFBOARD, False),
+        (58.2, _M.HOLD, False),
+    ]
+
+
+def test_a_pilot_is_none_of_its_failsafes() -> None:
+    assert changes("pilot", "mode", "failsafe", "remote_control")[4:11] == [
+        (23.8, _M.OFFBOARD, False, True),
+        (24.3, _M.HOLD, False, True),
+        (32.7, _M.OFFBOARD, False, True),
+        (43.2, _M.POSITION, False, True),
+        (51.4, _M.OFFBOARD, False, True),
+        (56.2, _M.LAND, False, True),
+        (75.6, _M.OFFBOARD, False, True),
+    ]
+
+
+def test_a_driver_that_died_takes_the_readiness() -> None:
+    """The barometer's is stopped at 9.3 s."""
+    assert changes("refused", "armable")[1:4] == [(0.3, False), (7.3, True), (10.7, False)]
+
+
+# The vehicle flies until here; later in `kill` the machine stood still for seconds.
+FLOWN_UNTIL_S = {"gps": 26.8, "sensors_die": 8.5, "kill": 30.0}
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_no_recording_has_a_false_loss(name: str) -> None:
+    """A stall of the machine that recorded them makes a robot stop, but not land."""
+    until_s = FLOWN_UNTIL_S.get(name, 1e9)
+    flown = [c for c in conclusions(name) if c.vehicle.armed and c.time_s < until_s]
+    assert not any(c.judgement.quality is _Q.LOST for c in flown)
+    assert {c.judgement.cause for c in flown} <= {None, Cause.OLD, Cause.GPS_SILENT}
+    assert all(c.vehicle.jumped_at_s == float("-inf") for c in flown)
