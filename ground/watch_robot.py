@@ -120,6 +120,7 @@ def _gps(status: RobotStatus) -> str:
     return _listed(
         "" if status.satellites is None else f"{status.satellites} satellites",
         "" if status.hdop is None else f"HDOP {status.hdop:.1f}",
+        "" if status.gps_accuracy_m is None else f"accurate to {status.gps_accuracy_m:.1f} m",
         "" if status.global_deg is None else "at {:.6f} {:.6f}".format(*status.global_deg),
     )
 
@@ -132,6 +133,7 @@ def _position(status: RobotStatus) -> str:
     heading_rad = status.heading_rad
     return _listed(
         where,
+        "" if status.position_quality is None else f"position {status.position_quality}",
         "" if status.velocity_m_s is None else f"{speed_m_s(status):.1f} m/s",
         "" if heading_rad is None else f"heading {direction(math.degrees(heading_rad))}",
     )
