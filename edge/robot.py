@@ -454,6 +454,7 @@ class _Program:
             feature_age_s=self._pac.feature_age_s(now_s),
             neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
+            remote_control=vehicle.remote_control if self._config.failsafe.rc == "pilot" else None,
             position_quality=self._navigation.position.quality,
             position_cause=self._navigation.position.cause,
             gps_accuracy_m=None if gps is None else gps.accuracy_m,

@@ -183,8 +183,9 @@ def _own(fleet: _Fleet, seen: _Seen) -> _Found:
     status = seen.status
     if not status.alarms:
         return None
-    # What a pilot flies is in his hands.
-    grave = is_flying(status) and status.state is not _S.PILOT
+    # What a pilot flies is in his hands, if they still move it.
+    has_pilot = status.state is _S.PILOT and status.remote_control is not False
+    grave = is_flying(status) and not has_pilot
     return ("critical" if grave else "warning"), "; ".join(status.alarms)
 
 

@@ -41,6 +41,8 @@ _STREAM_S = 0.5
 _ASK_AGAIN_S = 1.0
 _ARMING_TIMEOUT_S = 6.0
 _OFFBOARD_TIMEOUT_S = 4.0
+# One message of silence is no loss: PX4 tells twice a second.
+_REMOTE_CONTROL_LOST_S = 1.0
 # What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
 _STALE_TELEMETRY_S = 2.0
 _LAPSE_SHARE = 0.9
@@ -112,8 +114,9 @@ class Flight:
     in LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`.
     After a lapse of the control loop nothing is sent before `silent_until_s`, which stays set until
     the vehicle is in offboard again. `failsafe_at_s` is when the autopilot's own failsafe was last
-    seen to act. `alone_since_s` is set while the vehicle hovers for no reason that anybody gave:
-    since when nobody has answered. `armed_by` is whose takeoff order this program armed it by.
+    seen to act, `remote_control_at_s` when the remote control was last heard. `alone_since_s` is
+    set while the vehicle hovers for no reason that anybody gave: since when nobody has answered.
+    `armed_by` is whose takeoff order this program armed it by.
     `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
     """
 
@@ -127,6 +130,7 @@ class Flight:
     reached: bool = False
     silent_until_s: float = -math.inf
     failsafe_at_s: float = -math.inf
+    remote_control_at_s: float = -math.inf
     alone_since_s: float | None = None
     rejoined_at_s: float = -math.inf
     asked_at_s: float = -math.inf
@@ -168,9 +172,14 @@ class FlightInputs:
     uptime_s: float
 
 
+RemoteControlLost = Literal["alarm", "hold", "land"]
+
+
 @dataclass(frozen=True, slots=True)
 class Robot:
     """Who flies: what does not change during a flight.
+
+    `on_remote_control_lost`: what a lost remote control does in flight; None if there is none.
 
     Raises ValueError if the fence leaves no way to the robot's height or to its landing point.
     """
@@ -180,6 +189,7 @@ class Robot:
     parameters: FlightParameters
     fence: Fence
     limits: MotionLimits
+    on_remote_control_lost: RemoteControlLost | None = None
 
     def __post_init__(self) -> None:
         fence, height_m = self.fence, self.parameters.slot_height_m
@@ -483,6 +493,20 @@ def _outside(t: _Tick) -> str | None:
     return _if(bool(outside), "outside the fence")
 
 
+def _remote_control_lost(t: _Tick) -> str | None:
+    lost_s = t.inputs.now_s - t.flight.remote_control_at_s
+    lost = t.inputs.vehicle.remote_control is False and lost_s > _REMOTE_CONTROL_LOST_S
+    return _if(lost and t.robot.on_remote_control_lost is not None, "remote control lost")
+
+
+def _holds_without_remote_control(t: _Tick) -> str | None:
+    return _remote_control_lost(t) if t.robot.on_remote_control_lost == "hold" else None
+
+
+def _lands_without_remote_control(t: _Tick) -> str | None:
+    return _remote_control_lost(t) if t.robot.on_remote_control_lost == "land" else None
+
+
 def _ground_lost(t: _Tick) -> str | None:
     return _if(not t.ground_heard, "ground lost")
 
@@ -672,6 +696,12 @@ TRANSITIONS: tuple[Transition, ...] = (
                _ground_returns_landing),
     # What the robot notices by itself.
     Transition((_S.MISSION,), _S.HOLD, "a neighbour is too close", _too_close, alarm=True),
+    Transition((_S.TAKEOFF, _S.MISSION), _S.HOLD,
+               "the remote control is lost, and rc_lost = hold", _holds_without_remote_control,
+               alarm=True),
+    Transition((_S.TAKEOFF, _S.HOLD, _S.MISSION), _S.LAND,
+               "the remote control is lost, and rc_lost = land", _lands_without_remote_control,
+               alarm=True),
     Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", _ground_lost, alarm=True),
     Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, "the ground stays lost", _ground_long_lost,
                alarm=True),
@@ -763,6 +793,8 @@ def _look(t: _Tick) -> Flight:
         if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
             # PX4 goes on landing by itself; if it does not, it is asked again.
             flight = replace(flight, reached=False, asked_at_s=now_s)
+    if vehicle.remote_control:
+        flight = replace(flight, remote_control_at_s=now_s)
     flight = replace(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > _STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
@@ -1012,6 +1044,8 @@ def _cannot_start(t: _Tick) -> str | None:
         return "the policy has no fresh answer"
     if t.inputs.not_taken:
         return "; ".join(t.inputs.not_taken)
+    if t.robot.on_remote_control_lost in ("hold", "land") and (lost := _remote_control_lost(t)):
+        return lost
     if t.inputs.busy_neighbours:
         busy = ", ".join(map(str, t.inputs.busy_neighbours))
         return f"robots still taking off: {busy}"
@@ -1023,8 +1057,8 @@ def _alarms(t: _Tick) -> tuple[str, ...]:
     alarms = [t.flight.reason] if t.flight.alarming else []
     if t.flight.state in (*AIRBORNE, _S.PILOT):
         checks = (
-            _failsafe, _hovers_alone, _position_not_good, _too_close, _outside, _battery_low,
-            _ground_lost,
+            _failsafe, _hovers_alone, _remote_control_lost, _position_not_good, _too_close,
+            _outside, _battery_low, _ground_lost,
         )  # fmt: skip
         alarms += [text for check in checks if (text := check(t)) is not None]
         alarms += [f"PX4: {warning.text}" for warning in t.inputs.vehicle.warnings]

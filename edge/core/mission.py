@@ -195,7 +195,7 @@ class RobotStatus:
     `neighbour_messages` counts each neighbour's messages since the start. `ground_age_s` is how
     long ago the state that it obeys was heard, None if never. `position_quality` is what its
     position is worth, `position_cause` what speaks against it; `gps_accuracy_m` is the receiver's
-    own figure.
+    own figure. `remote_control` tells whether its pilot's is heard, None where there is none.
 
     What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
     look. Raises ValueError for what must be there and is not finite.
@@ -243,6 +243,7 @@ class RobotStatus:
     position_quality: Quality | None = None
     position_cause: Cause | None = None
     gps_accuracy_m: float | None = None
+    remote_control: bool | None = None
 
     def __post_init__(self) -> None:
         for name, size in (

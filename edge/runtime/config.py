@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from edge.core.failsafe import required
-from edge.core.flight import FlightParameters, Robot
+from edge.core.flight import FlightParameters, RemoteControlLost, Robot
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
 from edge.core.preflight import PreflightLimits
@@ -107,10 +107,12 @@ class FailsafeConfig:
     """What PX4 does when something fails: for an RC pilot, or for none.
 
     `parameters`: whether wrong PX4 parameters are set before flight, or arming is refused.
-    `fence_margin_m`: how far outside our fence PX4's own is.
+    `fence_margin_m`: how far outside our fence PX4's own is. `rc_lost`: what a robot does whose
+    pilot's remote control is lost in flight.
     """
 
     rc: Literal["pilot", "none"]
+    rc_lost: RemoteControlLost = "alarm"
     parameters: Literal["set", "refuse"] = "refuse"
     fence_margin_m: float = 5.0
 
@@ -168,7 +170,8 @@ class RobotConfig:
 
     def robot(self, boot_nonce: int) -> Robot:
         """Who flies, in this start of its program."""
-        return Robot(self.robot_id, boot_nonce, self.flight, self.fence, self.limits)
+        rc_lost = None if self.failsafe.rc == "none" else self.failsafe.rc_lost
+        return Robot(self.robot_id, boot_nonce, self.flight, self.fence, self.limits, rc_lost)
 
     @property
     def pac(self) -> PacParameters:

@@ -25,6 +25,7 @@ from edge.core.flight import (
     Flight,
     FlightInputs,
     FlightParameters,
+    RemoteControlLost,
     Robot,
     Transition,
     step,
@@ -82,6 +83,7 @@ class World:
     """One robot's decisions, a crude PX4, and a ground; `heartbeats` come `latency_s` late."""
 
     def __init__(self, phase_s: float = 0.35, latency_s: float = 0.1) -> None:
+        self.robot = ROBOT
         self.now_s = 100.0
         self.latency_s = latency_s
         self.next_beat_s = self.now_s + phase_s
@@ -105,6 +107,7 @@ class World:
         self.position_known = True
         self.accuracy_m = 0.9
         self.battery = 0.9
+        self.remote_control: bool | None = True
         self.beats: list[tuple[float, Mode, bool, bool, bool]] = []
         self.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0), height_above_home_m=0)
         # The rest of the inputs.
@@ -325,6 +328,7 @@ class World:
             position_changed_at_s=self.now_s,
             gps=Gps(3 if self.position_known else 0, 12, 0.8, self.accuracy_m, at_s=self.now_s),
             height_above_home_m=self.height_m,
+            remote_control=self.remote_control,
         )
 
     def _decide(self, vehicle: VehicleState) -> Decision:
@@ -352,9 +356,9 @@ class World:
             uptime_s=self.now_s - self.started_s,
         )
         before = self.flight
-        decision = step(ROBOT, before, inputs)
+        decision = step(self.robot, before, inputs)
         self.flight = decision.flight
-        setpoint, self.guidance = guide(ROBOT, self.flight, inputs, self.guidance, TICK_S)
+        setpoint, self.guidance = guide(self.robot, self.flight, inputs, self.guidance, TICK_S)
         self._check(before, vehicle, decision, setpoint)
         self.commands += decision.actions
         self.actions += [(self.now_s, action) for action in decision.actions]
@@ -1075,6 +1079,33 @@ def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
     assert world.state() is FlightState.RETURN
 
 
+def test_a_lost_remote_control_is_an_alarm_and_what_is_configured(world: World) -> None:
+    reactions: tuple[tuple[RemoteControlLost | None, FlightState], ...] = (
+        (None, FlightState.MISSION),
+        ("alarm", FlightState.MISSION),
+        ("hold", FlightState.HOLD),
+        ("land", FlightState.LAND),
+    )
+    for reaction, state in reactions:
+        world.robot = replace(ROBOT, on_remote_control_lost=reaction)
+        world.fly()
+        world.remote_control = False
+        world.run(0.8)
+        world.remote_control = True  # That was no loss.
+        world.run(0.8)
+        assert world.state() is FlightState.MISSION
+        world.remote_control = False
+        world.run(1.5)
+        assert world.state() is state
+        assert ("remote control lost" in world.tick().alarms) is (reaction is not None)
+        if reaction == "hold":
+            assert world.refuse("start") == "remote control lost"
+        # On its way home it goes on.
+        world.enable(calm="none" if reaction == "land" else "return")
+        world.until(FlightState.LANDED, 40.0)
+        world.remote_control = True
+
+
 def test_a_stale_policy_holds(world: World) -> None:
     world.fly()
     world.policy_m_s = None
@@ -1700,6 +1731,8 @@ def _ground(world: World, draw: random.Random) -> None:
 
 
 def _surroundings(world: World, draw: random.Random) -> None:
+    world.remote_control = draw.random() < 0.8
+    world.robot = replace(ROBOT, on_remote_control_lost=draw.choice(("alarm", "hold", "land")))
     world.policy_m_s = draw.choice((None, np.array([draw.uniform(-3, 3), draw.uniform(-3, 3)])))
     world.closest = draw.choice((None, None, Closest(4, draw.uniform(0.0, 3.0))))
     world.busy = draw.choice(((), (), (5,)))

@@ -322,6 +322,17 @@ def test_a_vehicle_leaves_offboard(rig: FaultRig) -> None:
         rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Mode.OFFBOARD)
 
 
+def test_a_remote_control_is_lost_and_comes_back(rig: FaultRig) -> None:
+    robot = STOPPED
+    with rig.others_go_on(robot):
+        rig.change(robot, rc_connected=False)
+        status = rig.wait_status(robot, lambda status: "remote control lost" in status.alarms)
+        assert status.remote_control is False
+        assert rig.vehicle(robot).mode is Mode.OFFBOARD
+        rig.change(robot, rc_connected=True)
+        rig.wait_status(robot, lambda status: "remote control lost" not in status.alarms)
+
+
 def test_wind_carries_a_robot_over_the_fence(rig: FaultRig) -> None:
     robot, fence = MANY_FAULTS, rig.fleet.fence
     with rig.others_go_on(robot):
