@@ -63,7 +63,7 @@ def check(
     wait: Annotated[float, typer.Option(help="How long the robot may take to be ready, s.")] = 15.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Say what PX4 would do when something fails, and what still keeps the robot from flying.
+    """Say which PX4 it is, what it would do when something fails, and what keeps it from flying.
 
     With parameters = "set" in the configuration, unsafe PX4 parameters are set.
     """
@@ -74,6 +74,7 @@ def check(
     if as_json:
         typer.echo(json.dumps(report._asdict(), indent=2))
     else:
+        typer.echo(report.version)
         for line in report.explanations:
             typer.echo(line)
         for line in report.changes:

@@ -34,6 +34,7 @@ from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
 from edge.adapters.service_manager import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.adapters.zenoh_link import ZenohLink
 from edge.core.mission import FlightState, RobotStatus, explored_to_bytes, to_json, world_id
+from edge.core.px4_version import in_words
 from edge.core.vehicle import Action
 from edge.core.wire import Rejection, decode
 from edge.core.world import MOST_FEATURES, parse_world, rasterize
@@ -478,8 +479,12 @@ def _take_alone(config: RobotConfig, parts: ExitStack) -> None:
 
 
 class CheckReport(NamedTuple):
-    """What `check` found: what PX4 would do, what was set, and what keeps the robot from flying."""
+    """What `check` found: what PX4 would do, what was set, and what keeps the robot from flying.
 
+    `version` is PX4's, and how far it was tried.
+    """
+
+    version: str
     explanations: tuple[str, ...]
     changes: tuple[str, ...]
     failed: tuple[str, ...]
@@ -539,7 +544,8 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             )
             failed = (*checks.failed, unfit) if unfit else checks.failed
             if not failed or now_s > until_s:
-                return CheckReport(readiness.explanations, readiness.changes, failed)
+                version = in_words(autopilot.state().version)
+                return CheckReport(version, readiness.explanations, readiness.changes, failed)
             time.sleep(_PERIOD_S)
 
 

@@ -320,7 +320,8 @@ class Px4Telemetry:
     def _on_autopilot_version(self, fields: Fields, now_s: float) -> None:
         self._twin.hardware((fields["uid"], *fields["uid2"]), now_s)
         version = fields["flight_sw_version"]
-        self._change(version=".".join(str(version >> bits & 0xFF) for bits in (24, 16, 8)))
+        if version:
+            self._change(version=".".join(str(version >> bits & 0xFF) for bits in (24, 16, 8)))
 
 
 class _VehicleClock:

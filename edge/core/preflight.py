@@ -8,6 +8,7 @@ from typing import NamedTuple
 from edge.core.failsafe import RemoteControl
 from edge.core.mission import Origin, RobotStatus
 from edge.core.position import Judgement, Quality
+from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.safety import Fence
 from edge.core.vehicle import Gps, VehicleState
 
@@ -135,6 +136,9 @@ def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
             f"autopilot has system id {_or_unknown(vehicle.system_id)}, configured is "
             f"{inputs.system_id}: check which vehicle this is, set MAV_SYS_ID or the config"
         )
+    if is_too_old(vehicle.version):
+        oldest = ".".join(map(str, OLDEST))
+        yield f"autopilot has PX4 {vehicle.version}, must have {oldest} or newer: update it"
     if vehicle.other_system_ids:
         others = ", ".join(map(str, vehicle.other_system_ids))
         yield f"other vehicles are on this link (system id {others}): give each its own port"

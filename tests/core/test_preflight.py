@@ -14,6 +14,7 @@ from edge.core.preflight import (
     PreflightLimits,
     failed_checks,
 )
+from edge.core.px4_version import in_words
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.vehicle import GlobalOrigin, Gps, Mode, Reason, VehicleState
@@ -132,6 +133,7 @@ VEHICLES: list[tuple[dict[str, Any], str]] = [
     ({"connected": False}, "autopilot is not connected: check its power"),
     ({"system_id": None}, "autopilot has system id not known, configured is 1"),
     ({"other_system_ids": (4, 6)}, "other vehicles are on this link (system id 4, 6)"),
+    ({"version": "1.13.3"}, "autopilot has PX4 1.13.3, must have 1.14 or newer: update it"),
     ({"armed": True}, "vehicle is armed: disarm it"),
     ({"armed": None}, "vehicle is not known to be disarmed: disarm it"),
     ({"position_local_m": None}, "position is not known: wait"),
@@ -225,3 +227,22 @@ def test_limits_that_make_no_sense_are_refused_by_name(
     assert from_mapping(PreflightLimits, {}, "robot.toml: preflight") == LIMITS
     with pytest.raises(ConfigError, match=said):
         from_mapping(PreflightLimits, change, "robot.toml: preflight")
+
+
+@pytest.mark.parametrize(
+    ("version", "words"),
+    [
+        ("1.14.0", "PX4 1.14.0 (read in its sources, never tried)"),
+        ("1.16.2", "PX4 1.16.2 (read in its sources, never tried)"),
+        ("1.17.0", "PX4 1.17.0 (tested: PX4 SITL)"),
+        ("1.18.0", "PX4 1.18.0 (not tested: newer than 1.17)"),
+        ("2.0.0", "PX4 2.0.0 (not tested: newer than 1.17)"),
+        (None, "PX4 did not tell its version"),
+    ],
+)
+def test_a_version_is_told_with_how_far_it_was_tried_and_not_refused(
+    version: str | None, words: str
+) -> None:
+    vehicle = dataclasses.replace(READY.vehicle, version=version)
+    assert failed_checks(dataclasses.replace(READY, vehicle=vehicle), LIMITS) == ()
+    assert in_words(version) == words

@@ -1,0 +1,34 @@
+"""Which PX4 versions this program is made for, and how far each of them was tried.
+
+docs/px4.md lists what it relies on in them.
+"""
+
+OLDEST = (1, 14)
+
+# What was done with a version. "Read" is that all of what is relied on was read in its sources.
+EVIDENCE = {
+    (1, 14): "read in its sources, never tried",
+    (1, 15): "read in its sources, never tried",
+    (1, 16): "read in its sources, never tried",
+    (1, 17): "tested: PX4 SITL",
+}
+
+
+def in_words(version: str | None) -> str:
+    """A vehicle's version, such as "1.17.0", and how far it was tried."""
+    if version is None:
+        return "PX4 did not tell its version"
+    number = _number(version)
+    newest = ".".join(map(str, max(EVIDENCE)))
+    unknown = "too old" if number < OLDEST else f"not tested: newer than {newest}"
+    return f"PX4 {version} ({EVIDENCE.get(number, unknown)})"
+
+
+def is_too_old(version: str | None) -> bool:
+    """Whether it is known to lack what this program relies on."""
+    return version is not None and _number(version) < OLDEST
+
+
+def _number(version: str) -> tuple[int, int]:
+    major, minor, *_ = version.split(".")
+    return int(major), int(minor)
