@@ -34,7 +34,9 @@ PAD_M = (12.0, 10.0)
 # Why a robot refuses for a moment: this machine held it up, or a command is still on its way.
 HELD_UP = re.compile(
     r"the control loop was silent|checks are still running|the ground commands|"
-    r"not in offboard yet|position or height is not known|is not heard|was not answered|expired"
+    r"not in offboard yet|position or height is not known|is not heard|was not answered|expired|"
+    # A program that has just begun has not listened for long enough.
+    r"nothing new comes from the GPS receiver"
 )
 
 Changes = dict[str, dict[str, Any]]

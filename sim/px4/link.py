@@ -1,11 +1,13 @@
 """MAVLink 2 for one simulated vehicle: datagrams in, datagrams out; no socket and no clock.
 
-Rates and protocol details are PX4's: the mode is told once a second, parameters travel with their
-bytes in the float, an unknown parameter gets no answer, a fence is uploaded as a mission.
+What is told, when and in which bits is PX4 v1.17's: tests/sim/test_px4_recordings.py holds it to
+recordings of a real one, on its link to a companion computer. Parameters travel with their bytes in
+the float, an unknown parameter gets no answer, a fence is uploaded as a mission.
 """
 
 import math
 import struct
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -13,30 +15,92 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
-from sim.px4.modes import PILOTED, Action, Mode, Result
-from sim.px4.vehicle import GRAVITY_M_S2, Px4Vehicle, Setpoint
+from sim.px4.checks import Component, Event
+from sim.px4.modes import CUSTOM_MODES, PILOTED, Mode, Result
+from sim.px4.vehicle import GRAVITY_M_S2, Px4Vehicle, Sensor, Setpoint
 from sim.px4.world import FencePolygon
 
 FORCE = 21196.0  # MAV_CMD_COMPONENT_ARM_DISARM: param 2 that skips the checks
 FIRMWARE_VERSION = 1 << 24 | 17 << 16 | 0 << 8 | 255  # 1.17.0, release
 PARAMETERS_AT_ONCE = 10
 MAX_DATAGRAM_BYTES = 1400
+# Texts go out only where a ground station was heard within this, and no older than that.
+GROUND_STATION_HEARD_S = 2.5
+TEXT_KEPT_S = 5.0
+TEXT_BYTES = 50
+GPS_SILENT_S = 1.0
+EVENTS_KEPT = 40
 
-_MODES = {mode.value: mode for mode in Mode}
-_SENSORS = (
-    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
-    | mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+# PX4 has no custom mode that only it can set.
+_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Mode.DESCEND}
+_HEARD_OF = {
+    Component.GYROSCOPE: mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO,
+    Component.ACCELEROMETER: mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL,
+    Component.COMPASS: mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG,
+    Component.BAROMETER: mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE,
+    Component.GPS: mavlink.MAV_SYS_STATUS_SENSOR_GPS,
+    Component.ATTITUDE_ESTIMATE: mavlink.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
+    | mavlink.MAV_SYS_STATUS_AHRS,
+    Component.LOCAL_POSITION_ESTIMATE: mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL,
+    Component.REMOTE_CONTROL: mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER,
+    Component.BATTERY: mavlink.MAV_SYS_STATUS_SENSOR_BATTERY,
+    Component.LOGGING: mavlink.MAV_SYS_STATUS_LOGGING,
+}
+# Nothing that could go wrong with these is simulated.
+_NEVER_ILL = (
+    mavlink.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE
     | mavlink.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
-    | mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
 )
+_FLAGS_AT_START = (
+    mavlink.ESTIMATOR_VELOCITY_VERT
+    | mavlink.ESTIMATOR_POS_VERT_ABS
+    | mavlink.ESTIMATOR_CONST_POS_MODE
+)
+_FLAGS_WITH_POSITION = (
+    mavlink.ESTIMATOR_VELOCITY_HORIZ
+    | mavlink.ESTIMATOR_POS_HORIZ_REL
+    | mavlink.ESTIMATOR_POS_HORIZ_ABS
+)
+_FLAGS_WITH_GPS = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
 _FENCE_VERTICES = {
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION: True,
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False,
 }
 _FENCE = mavlink.MAV_MISSION_TYPE_FENCE
 _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
+
+
+class _EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
+    """PX4's EVENT, which pymavlink does not have."""
+
+    id = 410
+    msgname = "EVENT"
+    crc_extra = 160
+
+    def __init__(self, event: Event, sequence: int, boot_ms: int) -> None:
+        super().__init__(self.id, self.msgname)
+        self.sequence = sequence
+        level = event.level << 4 | event.level
+        head = struct.pack("<IIHBBB", 1 << 24 | event.number, boot_ms, sequence, 0, 0, level)
+        self._payload = head + event.arguments.ljust(40, b"\0")
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
+        return self._pack(mav, self.crc_extra, self._payload, force_mavlink1=force_mavlink1)
+
+
+class _EventSequence(mavlink.MAVLink_message):  # type: ignore[misc]
+    """PX4's CURRENT_EVENT_SEQUENCE, which pymavlink does not have."""
+
+    id = 411
+    msgname = "CURRENT_EVENT_SEQUENCE"
+    crc_extra = 106
+
+    def __init__(self, sequence: int) -> None:
+        super().__init__(self.id, self.msgname)
+        self._payload = struct.pack("<HB", sequence, 0)
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
+        return self._pack(mav, self.crc_extra, self._payload, force_mavlink1=force_mavlink1)
 
 
 class Px4Link:
@@ -56,27 +120,38 @@ class Px4Link:
         self._parameters_to_send: list[str] = []
         self._upload: list[Any] = []
         self._upload_count = 0
+        self._ground_station_at_s = -math.inf
+        self._texts: deque[tuple[float, Event]] = deque()
+        self._text_id = 0
+        self._event_sequence = 0xFFF5
+        self._told: deque[_EventMessage] = deque(maxlen=EVENTS_KEPT)
+        self._origin_told: tuple[float, float, float] | None = None
         # Message id -> builder; PX4's default rates on the onboard link, Hz.
         streams: dict[int, tuple[float, Callable[[], Any]]] = {
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: (1.0, self._heartbeat),
-            mavlink.MAVLINK_MSG_ID_SYS_STATUS: (1.0, self._sys_status),
-            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: (1.0, self._extended_sys_state),
-            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: (1.0, self._gps_global_origin),
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS: (5.0, self._sys_status),
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: (5.0, self._extended_sys_state),
+            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: (1.0, self._moved_origin),
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: (0.5, self._battery_status),
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: (0.5, self._home_position),
-            mavlink.MAVLINK_MSG_ID_RC_CHANNELS: (1.0, self._rc_channels),
+            mavlink.MAVLINK_MSG_ID_RC_CHANNELS: (20.0, self._rc_channels),
+            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: (1.0, self._estimator_status),
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: (8.0, self._gps_raw_int),
             mavlink.MAVLINK_MSG_ID_ATTITUDE: (50.0, self._attitude),
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: (50.0, self._global_position_int),
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: (30.0, self._local_position_ned),
             mavlink.MAVLINK_MSG_ID_ODOMETRY: (30.0, self._odometry),
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: (0.0, self._autopilot_version),
+            _EventSequence.id: (0.33, self._current_event_sequence),
         }
         self._builders = {message: build for message, (_, build) in streams.items()}
+        # What a client that asks for it gets, where that is not what the stream sends.
+        self._on_request = {mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._gps_global_origin}
         self._default_rates_hz = {message: rate_hz for message, (rate_hz, _) in streams.items()}
         self._intervals_s: dict[int, float] = {}
-        self._due_s: dict[int, float] = {}
+        self._due_s = dict.fromkeys(streams, vehicle.time_s)
         for message, rate_hz in self._default_rates_hz.items():
+            self._intervals_s[message] = 0.0
             self._set_interval(message, 1.0 / rate_hz if rate_hz else math.inf)
         self._handlers: dict[str, Callable[[Any], None]] = {
             "HEARTBEAT": self._on_heartbeat,
@@ -92,11 +167,14 @@ class Px4Link:
             "MISSION_REQUEST_LIST": self._on_mission_request_list,
             "MISSION_REQUEST_INT": self._on_mission_request,
             "MISSION_CLEAR_ALL": self._on_mission_clear_all,
+            # REQUEST_EVENT, which pymavlink does not have.
+            "UNKNOWN_412": self._on_request_event,
         }
         self._commands: dict[int, Callable[[Any], Result]] = {
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_or_disarm,
             mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
             mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
+            mavlink.MAV_CMD_RUN_PREARM_CHECKS: lambda _: vehicle.run_prearm_checks(),
             mavlink.MAV_CMD_NAV_LAND: lambda _: vehicle.set_mode(Mode.LAND),
             mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: vehicle.set_mode(Mode.RETURN),
             mavlink.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
@@ -117,9 +195,11 @@ class Px4Link:
         """The datagrams to send now: answers first, then the streams whose time has come."""
         vehicle = self.vehicle
         for event in vehicle.take_events():
-            warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
-            severity = warning if event.is_warning else info
-            self._send(mavlink.MAVLink_statustext_message(severity, event.text.encode()[:50]))
+            self._event_sequence = (self._event_sequence + 1) % 0x10000
+            self._told.append(_EventMessage(event, self._event_sequence, self._boot_ms()))
+            self._send(self._told[-1])
+            self._texts.append((vehicle.time_s, event))
+        self._send_texts()
         for name in self._parameters_to_send[:PARAMETERS_AT_ONCE]:
             self._send_parameter(name)
         del self._parameters_to_send[:PARAMETERS_AT_ONCE]
@@ -142,16 +222,40 @@ class Px4Link:
         self._out.append(bytes(message.pack(self._mavlink)))
         self._mavlink.seq = (self._mavlink.seq + 1) % 256
 
-    def _send_now(self, message_id: int) -> bool:
+    def _send_now(self, message_id: int, build: Callable[[], Any] | None = None) -> bool:
         """Whether there was something to tell."""
-        message = self._builders[message_id]()
+        message = (build or self._builders[message_id])()
         if message is not None:
             self._send(message)
         return message is not None
 
+    def _send_texts(self) -> None:
+        """Only to a ground station, and nothing stale; in chunks where they are long."""
+        now_s = self.vehicle.time_s
+        if now_s - self._ground_station_at_s <= GROUND_STATION_HEARD_S:
+            for at_s, event in self._texts:
+                if not event.text or now_s - at_s >= TEXT_KEPT_S:
+                    continue
+                text = event.text.encode()
+                for chunk, start in enumerate(range(0, len(text), TEXT_BYTES)):
+                    part = text[start : start + TEXT_BYTES]
+                    self._send(
+                        mavlink.MAVLink_statustext_message(
+                            event.text_level, part, self._text_id, chunk
+                        )
+                    )
+                self._text_id = (self._text_id + 1) % 0x10000
+            self._texts.clear()
+        while self._texts and now_s - self._texts[0][0] >= TEXT_KEPT_S:
+            self._texts.popleft()
+
     def _set_interval(self, message_id: int, interval_s: float) -> None:
+        """It counts from the message that was sent last."""
+        last_s = self._due_s[message_id] - self._intervals_s[message_id]
+        if math.isnan(last_s):
+            last_s = self.vehicle.time_s
         self._intervals_s[message_id] = interval_s
-        self._due_s[message_id] = self.vehicle.time_s if interval_s < math.inf else math.inf
+        self._due_s[message_id] = last_s + interval_s
 
     # Streams
 
@@ -160,17 +264,18 @@ class Px4Link:
 
     def _heartbeat(self) -> Any:
         vehicle = self.vehicle
-        main, sub = vehicle.mode.value
+        main, sub = CUSTOM_MODES[vehicle.mode]
         flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
         if vehicle.mode in PILOTED:
             flags |= mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
-        else:
+        elif vehicle.mode is not Mode.OFFBOARD:
             flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED | mavlink.MAV_MODE_FLAG_AUTO_ENABLED
-        status = mavlink.MAV_STATE_STANDBY
         if vehicle.armed:
             flags |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-            in_failsafe = vehicle.failsafe >= Action.HOLD
+            in_failsafe = vehicle.failsafe.is_active
             status = mavlink.MAV_STATE_CRITICAL if in_failsafe else mavlink.MAV_STATE_ACTIVE
+        else:
+            status = mavlink.MAV_STATE_STANDBY if vehicle.armable else mavlink.MAV_STATE_UNINIT
         return mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_QUADROTOR,
             mavlink.MAV_AUTOPILOT_PX4,
@@ -181,24 +286,26 @@ class Px4Link:
         )
 
     def _sys_status(self) -> Any:
+        """PREARM_CHECK is told in health alone, of the mode that is set, by the last report."""
         vehicle = self.vehicle
-        present = _SENSORS | mavlink.MAV_SYS_STATUS_SENSOR_GPS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
-        healthy = _SENSORS
-        if vehicle.position_valid and not vehicle.gps_lost:
-            healthy |= mavlink.MAV_SYS_STATUS_SENSOR_GPS
-        if vehicle.armable:
+        report = vehicle.health
+        present, healthy = 0, _NEVER_ILL
+        for component, bits in _HEARD_OF.items():
+            if report is not None and component in report.present:
+                present |= bits
+            if report is None or component not in report.unhealthy:
+                healthy |= bits
+        enabled = present | sum(bits for bits in _HEARD_OF.values() if not healthy & bits)
+        if report is not None and report.can_arm(vehicle.mode):
             healthy |= mavlink.MAV_SYS_STATUS_PREARM_CHECK
-        if vehicle.rc_connected:
-            present |= mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-            healthy |= mavlink.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
         return mavlink.MAVLink_sys_status_message(
             present,
-            present,
+            enabled,
             healthy,
             300,
             self._battery_mv(),
             -1,
-            round(vehicle.battery_remaining * 100.0),
+            math.ceil(vehicle.battery_remaining * 100.0),
             *(0,) * 6,
         )
 
@@ -219,10 +326,34 @@ class Px4Link:
         return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
 
     def _gps_global_origin(self) -> Any:
-        if not self.vehicle.position_valid:
+        if not self.vehicle.estimator.has_origin:
             return None
+        self._origin_told = self.vehicle.global_origin
         return mavlink.MAVLink_gps_global_origin_message(
-            *_as_integers(self.vehicle.global_origin), self._boot_ms() * 1000
+            *_as_integers(self._origin_told), self._boot_ms() * 1000
+        )
+
+    def _moved_origin(self) -> Any:
+        """The stream tells of it only when it is another one."""
+        is_known = self._origin_told == self.vehicle.global_origin
+        return None if is_known else self._gps_global_origin()
+
+    def _current_event_sequence(self) -> Any:
+        return _EventSequence(self._event_sequence)
+
+    def _estimator_status(self) -> Any:
+        estimator = self.vehicle.estimator
+        flags = _FLAGS_AT_START
+        if estimator.has_attitude:
+            flags |= mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_POS_VERT_AGL
+        if not self.vehicle.at_rest:
+            flags &= ~mavlink.ESTIMATOR_CONST_POS_MODE
+        if estimator.uses_gps:
+            flags |= _FLAGS_WITH_GPS
+            if estimator.is_held:
+                flags |= _FLAGS_WITH_POSITION
+        return mavlink.MAVLink_estimator_status_message(
+            self._boot_ms() * 1000, flags, *(0.05,) * 4, 0.01, math.nan, *estimator.accuracy_m
         )
 
     def _battery_status(self) -> Any:
@@ -236,7 +367,9 @@ class Px4Link:
             -1,
             -1,
             -1,
-            round(self.vehicle.battery_remaining * 100.0),
+            int(self.vehicle.battery_remaining * 100.0),
+            0,
+            self.vehicle.battery_warning,
         )
 
     def _home_position(self) -> Any:
@@ -258,18 +391,29 @@ class Px4Link:
 
     def _gps_raw_int(self) -> Any:
         vehicle = self.vehicle
+        if vehicle.silent_s(Sensor.GPS) > GPS_SILENT_S:
+            # No driver: nothing is known, not even an accuracy.
+            unknown = 0xFFFF
+            return mavlink.MAVLink_gps_raw_int_message(
+                0, 0, 0, 0, 0, unknown, unknown, unknown, unknown, 0xFF
+            )
         speed_cm_s = round(100.0 * math.hypot(vehicle.velocity_m_s[0], vehicle.velocity_m_s[1]))
-        fix, satellites = (1, 0) if vehicle.gps_lost else (3, 14)
-        dilution = 9999 if vehicle.gps_lost else 80
+        place = _as_integers(vehicle.global_position)
+        if vehicle.gps_lost:
+            fix, satellites, dilutions, accuracies_m = 0, 0, (10000, 10000), (100.0,) * 3
+        else:
+            fix, satellites, dilutions = 3, 10, (70, 110)
+            accuracies_m = vehicle.gps_accuracy_m
         return mavlink.MAVLink_gps_raw_int_message(
             self._boot_ms() * 1000,
             fix,
-            *_as_integers(vehicle.global_position),
-            dilution,
-            dilution,
+            *place,
+            *dilutions,
             speed_cm_s,
             0xFFFF,
             satellites,
+            place[2],
+            *(round(accuracy_m * 1e3) for accuracy_m in accuracies_m),
         )
 
     def _attitude(self) -> Any:
@@ -291,8 +435,9 @@ class Px4Link:
         return math.atan2(right, GRAVITY_M_S2), math.atan2(-forward, GRAVITY_M_S2)
 
     def _global_position_int(self) -> Any:
+        """It begins with the use of GPS, and does not end: without GPS it is dead reckoned."""
         vehicle = self.vehicle
-        if not vehicle.position_valid:
+        if not vehicle.estimator.has_used_gps:
             return None
         latitude, longitude, altitude_mm = _as_integers(vehicle.global_position)
         home = vehicle.global_home
@@ -310,8 +455,7 @@ class Px4Link:
         )
 
     def _local_position_ned(self) -> Any:
-        if not self.vehicle.position_valid:
-            return None
+        """From the start, and whether the estimator vouches for it or not."""
         position_m, velocity_m_s = self.vehicle.local_position_m, self.vehicle.velocity_m_s
         return mavlink.MAVLink_local_position_ned_message(
             self._boot_ms(), *position_m.tolist(), *velocity_m_s.tolist()
@@ -319,8 +463,6 @@ class Px4Link:
 
     def _odometry(self) -> Any:
         vehicle = self.vehicle
-        if not vehicle.position_valid:
-            return None
         half_yaw_rad = vehicle.heading_rad / 2.0
         level = [math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad)]
         return mavlink.MAVLink_odometry_message(
@@ -366,23 +508,36 @@ class Px4Link:
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.type == mavlink.MAV_TYPE_GCS:
+            self._ground_station_at_s = self.vehicle.time_s
             self.vehicle.ground_station_heartbeat()
 
     def _on_command(self, message: Any) -> None:
         run = self._commands.get(message.command)
         result = Result.UNSUPPORTED if run is None else run(message)
-        self._send(
-            mavlink.MAVLink_command_ack_message(
-                message.command,
-                result,
-                target_system=message.get_srcSystem(),
-                target_component=message.get_srcComponent(),
+        # Two parts of PX4 take a mode, and both answer.
+        times = 2 if message.command == mavlink.MAV_CMD_DO_SET_MODE else 1
+        for _ in range(times):
+            self._send(
+                mavlink.MAVLink_command_ack_message(
+                    message.command,
+                    result,
+                    target_system=message.get_srcSystem(),
+                    target_component=message.get_srcComponent(),
+                )
             )
-        )
+
+    def _on_request_event(self, message: Any) -> None:
+        """Send again what was missed; of what is too long ago nothing is said."""
+        first, last = struct.unpack_from("<HH", bytes(message.data).ljust(4, b"\0"))
+        for told in self._told:
+            if (told.sequence - first) % 0x10000 <= (last - first) % 0x10000:
+                self._send(told)
 
     def _arm_or_disarm(self, message: Any) -> Result:
-        change = self.vehicle.arm if message.param1 > 0.5 else self.vehicle.disarm
-        return change(force=message.param2 == FORCE)
+        """By force only the motors stop: nobody arms past the checks from outside."""
+        if message.param1 > 0.5:
+            return self.vehicle.arm()
+        return self.vehicle.disarm(force=message.param2 == FORCE)
 
     def _set_mode(self, message: Any) -> Result:
         return self._enter(_to_int(message.param2), _to_int(message.param3))
@@ -392,7 +547,7 @@ class Px4Link:
 
     def _enter(self, main_mode: int, sub_mode: int) -> Result:
         mode = _MODES.get((main_mode, sub_mode))
-        return Result.DENIED if mode is None else self.vehicle.set_mode(mode)
+        return Result.TEMPORARILY_REJECTED if mode is None else self.vehicle.set_mode(mode)
 
     def _take_off(self, message: Any) -> Result:
         long = message.get_type() == "COMMAND_LONG"
@@ -402,10 +557,10 @@ class Px4Link:
         return self.vehicle.disarm(force=True) if message.param1 > 0.5 else Result.ACCEPTED
 
     def _set_message_interval(self, message: Any) -> Result:
-        """Interval in us; 0 is the default rate, below 0 is off."""
+        """Interval in us; 0 is the default rate, below 0 is off. FAILED for HEARTBEAT."""
         message_id, interval_us = _to_int(message.param1), message.param2
-        if message_id not in self._builders:
-            return Result.UNSUPPORTED
+        if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT or message_id not in self._builders:
+            return Result.FAILED
         if interval_us == 0.0:
             rate_hz = self._default_rates_hz[message_id]
             self._set_interval(message_id, 1.0 / rate_hz if rate_hz else math.inf)
@@ -416,9 +571,9 @@ class Px4Link:
     def _request_message(self, message: Any) -> Result:
         message_id = _to_int(message.param1)
         if message_id not in self._builders:
-            return Result.UNSUPPORTED
-        sent = self._send_now(message_id)
-        return Result.ACCEPTED if sent else Result.TEMPORARILY_REJECTED
+            return Result.DENIED
+        sent = self._send_now(message_id, self._on_request.get(message_id))
+        return Result.ACCEPTED if sent else Result.DENIED
 
     def _request_capabilities(self, _: Any) -> Result:
         self._send(self._autopilot_version())
@@ -469,11 +624,6 @@ class Px4Link:
         is_int = isinstance(parameters[name], int)
         kind = mavlink.MAV_PARAM_TYPE_INT32 if is_int else mavlink.MAV_PARAM_TYPE_REAL32
         if message.param_type != kind:
-            self._send(
-                mavlink.MAVLink_statustext_message(
-                    mavlink.MAV_SEVERITY_ERROR, f"[pm] param types mismatch: {name}".encode()
-                )
-            )
             return
         packed = struct.pack("<f", message.param_value)
         parameters[name] = struct.unpack("<i" if is_int else "<f", packed)[0]

@@ -1,4 +1,4 @@
-"""The PX4 parameters that the simulated vehicle has, with PX4's defaults; units as PX4's.
+"""The PX4 parameters that the simulated vehicle has, with the defaults of v1.17; units as PX4's.
 
 An `int` value is an INT32 parameter, a `float` value a REAL32 one.
 """
@@ -17,15 +17,15 @@ PARAMETERS: dict[str, int | float] = {
     "COM_IMB_PROP_ACT": 0,  # not acted on
     "NAV_TRAFF_AVOID": 1,  # not acted on
     "COM_WIND_MAX_ACT": 0,  # not acted on
-    "COM_FLTT_LOW_ACT": 1,  # not acted on
+    "COM_FLTT_LOW_ACT": 0,  # not acted on
     "COM_FLT_TIME_MAX": -1,  # not acted on
-    "COM_ARM_ON_BOOT": 0,  # not acted on
     "COM_RC_IN_MODE": 3,  # 4: no manual control at all
     "COM_RC_OVERRIDE": 1,  # bit 0: sticks leave automatic modes, bit 1: offboard
     "COM_RCL_EXCEPT": 0,  # bit 1 hold, bit 2 offboard
     "NAV_RCL_ACT": 2,  # 0 none, 1 hold, 2 return, 3 land, 5 terminate, 6 disarm
     "NAV_DLL_ACT": 0,  # 0 none, 1 hold, 2 return, 3 land, 5 terminate, 6 disarm
     "COM_DL_LOSS_T": 10,
+    "COM_RC_LOSS_T": 0.5,
     # Battery
     "COM_LOW_BAT_ACT": 0,  # 0 warn, 2 land when critical, 3 return when critical, then land
     "BAT_LOW_THR": 0.15,

@@ -3,18 +3,28 @@
 World frame: north, east, down from `WorldOrigin`, m; the ground is at down = 0. The vehicle knows
 its position with an error: a constant GPS bias and slow noise. Its local frame starts at the
 estimator's origin, which is neither the launch point nor its height.
+
+Times of the estimator, of checks and of failsafes are those that a real PX4 v1.17 was seen with, by
+its own clock: tests/sim/test_px4_recordings.py compares them.
 """
 
 import math
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
 from edge.core import F64
+from sim.px4 import checks
+from sim.px4.checks import Component, Event, Level, Problem, Report, Reporter
+from sim.px4.estimator import NOISE_M, Estimator
+from sim.px4.failsafe import Failsafe
 from sim.px4.modes import (
     ACTION_MODES,
     CAN_LEAVE_GROUND,
+    CUSTOM_MODES,
     FENCE_ACTIONS,
     LINK_LOSS_ACTIONS,
     NEED_POSITION,
@@ -22,6 +32,7 @@ from sim.px4.modes import (
     PILOTED,
     PREVENT_ARMING,
     Action,
+    Cause,
     Mode,
     Result,
 )
@@ -32,18 +43,25 @@ GRAVITY_M_S2 = 9.81
 # Share of the wind that its change pushes the vehicle with, 1/s, and how soon control makes up.
 DRAG_PER_S = 0.3
 WIND_COMPENSATION_S = 5.0
-GPS_NOISE_M = np.array([0.15, 0.15, 0.1])
-GPS_NOISE_TIME_S = 10.0
-DEAD_RECKONING_S = 5.0
-DEAD_RECKONING_DRIFT_M = 0.5  # per square root of a second
+CHECKS_PERIOD_S = 0.1
+SENSOR_TIMEOUT_S = 1.0
+BATTERY_TIMEOUT_S = 5.0
+# After disarming: the log ends, and the estimator finds that nothing moves. After arming: it finds
+# that something does.
+LOG_ENDS_S = 3.6
+AT_REST_AFTER_S = 2.3
+MOVES_AFTER_S = 0.5
 VERTICAL_DRIFT_M_S = 0.04
 VERTICAL_DRIFT_TIME_S = 20.0
 YAW_RATE_RAD_S = 1.0
 LANDED_AFTER_S = 1.0
+IN_AIR_AFTER_S = 0.9
 STOPPED_M_S = 0.15
 ARRIVED_M = 0.3
 SLOW_DESCENT_BELOW_M = 5.0
 TRUTH_PERIOD_S = 0.04
+# What the receiver of PX4's own simulator says of itself.
+GPS_ACCURACY_M, GPS_ACCURACY_M_S = (0.9, 1.78), 0.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,12 +90,33 @@ class Setpoint:
     yaw_rad: float = math.nan
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """One line for whoever operates the vehicle."""
+class Sensor(Enum):
+    """What a driver may die of."""
 
-    text: str
-    is_warning: bool
+    GPS = "gps"
+    BAROMETER = "barometer"
+    COMPASS = "compass"
+    BATTERY = "battery"
+
+
+_ARMED_BY, _DISARMED_BY = 9489139, 16017271
+_BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
+_ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
+_TAKEOFF_DETECTED, _LANDING_DETECTED, _LANDING_ORDERED = 4277609, 9844908, 3322590
+_FUSION_STOPPED, _FUSION_STARTED = 14699175, 15292483
+_FAILSAFE, _FAILSAFE_HOLDS, _POSITION_FAILSAFE = 9751178, 13704694, 12770418
+_FAILSAFE_WARNS, _TAKEN_OVER = 8557551, 961599
+_BATTERY_WARNINGS = {2: 12216659, 3: 2474944, 4: 51327}
+# PX4's numbers of actions and causes, in events.
+_ACTIONS = {
+    Action.POSCTL: 2,
+    Action.HOLD: 5,
+    Action.RETURN: 6,
+    Action.LAND: 7,
+    Action.DESCEND: 8,
+    Action.STOP_MOTORS: 10,
+}
+_CAUSES = {Cause.MANUAL_CONTROL_LOST: 1, Cause.GROUND_STATION_LOST: 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +135,8 @@ class Px4Vehicle:
     """One vehicle; deterministic for a seed, its steps and its commands.
 
     Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
-    deviation), `gps_bias_m`, `gps_lost`, `battery_remaining` (0 to 1), `rc_connected`.
+    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `dead_sensors`
+    (their drivers say nothing any more), `battery_remaining` (0 to 1), `rc_connected`.
     `truth` grows by one entry every 0.04 s.
     """
 
@@ -119,7 +159,6 @@ class Px4Vehicle:
         self._world = origin or WorldOrigin()
         self._airframe = airframe or Airframe()
         drawn_ready_s = float(self._rng.uniform(3.0, 6.0))
-        self._ready_after_s = drawn_ready_s if ready_after_s is None else ready_after_s
         bearing, length_m = self._rng.uniform(0.0, math.tau), self._rng.uniform(1.0, 5.0)
         self.gps_bias_m: F64 = np.array(
             [
@@ -134,21 +173,23 @@ class Px4Vehicle:
 
         self.time_s = 0.0
         self.position_m: F64 = np.array([*start_m, 0.0])
-        self.velocity_m_s: F64 = np.zeros(3)
-        self.acceleration_m_s2: F64 = np.zeros(3)
+        self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
         self.heading_rad = heading_rad
         self.yaw_rate_rad_s = 0.0
 
         self.wind_m_s: F64 = np.zeros(3)
         self.gust_m_s = 0.0
-        self._gust: F64 = np.zeros(3)
-        self._compensated_wind: F64 = np.zeros(3)
+        self._gust = self._compensated_wind = np.zeros(3)
         self.battery_remaining = 1.0
 
         self.gps_lost = False
-        self._gps_lost_since_s = math.inf
-        self._noise_m: F64 = GPS_NOISE_M * self._rng.standard_normal(3)
-        self._dead_reckoning_m: F64 = np.zeros(3)
+        self.dead_sensors: set[Sensor] = set()
+        self._dead_since_s: dict[Sensor, float] = {}
+        self._fusion_told = False
+        self.estimator = Estimator(
+            drawn_ready_s if ready_after_s is None else ready_after_s,
+            NOISE_M * self._rng.standard_normal(3),
+        )
         self._vertical_drift_m_s = 0.0
         self.estimator_origin_m: F64 = self.estimated_position_m + self._rng.normal(
             0.0, (1.0, 1.0, 0.5)
@@ -162,7 +203,7 @@ class Px4Vehicle:
         self._armed_at_s = 0.0
         self._took_off = False
         self._lift_began_s: float | None = None
-        self._on_ground_since_s = -math.inf
+        self._on_ground_since_s, self._off_ground_since_s = -math.inf, math.inf
         self._takeoff_down_m = 0.0
         self._hold_m: F64 | None = None
 
@@ -174,8 +215,10 @@ class Px4Vehicle:
         self._ground_station_at_s = -math.inf
         self._outside_fence = False
         self._fence_latch = -1
-        self.failsafe = Action.NONE
-        self._failsafe_since_s = 0.0
+        self.failsafe = Failsafe()
+        self._disarmed_at_s: float | None = None
+        self._reporter = Reporter()
+        self._checked_at_s = -math.inf
         self._events: list[Event] = []
 
     # What the vehicle believes
@@ -183,7 +226,7 @@ class Px4Vehicle:
     @property
     def estimated_position_m(self) -> F64:
         """(3,), world frame: where the vehicle takes itself to be."""
-        return self.position_m + self.gps_bias_m + self._noise_m + self._dead_reckoning_m
+        return self.position_m + self.gps_bias_m + self.estimator.error_m
 
     @property
     def local_position_m(self) -> F64:
@@ -194,6 +237,11 @@ class Px4Vehicle:
     def global_position(self) -> tuple[float, float, float]:
         """The estimate: latitude and longitude, deg, height above mean sea level, m."""
         return self._world.to_global(self.estimated_position_m)
+
+    @property
+    def gps_accuracy_m(self) -> tuple[float, float, float]:
+        """What the receiver says of its fix: horizontally and vertically, m, and m/s."""
+        return *GPS_ACCURACY_M, GPS_ACCURACY_M_S
 
     @property
     def global_origin(self) -> tuple[float, float, float]:
@@ -207,71 +255,105 @@ class Px4Vehicle:
 
     @property
     def position_valid(self) -> bool:
-        """Whether the estimator still vouches for its position."""
-        return (
-            self.time_s >= self._ready_after_s
-            and self.time_s - self._gps_lost_since_s < DEAD_RECKONING_S
-        )
+        """Whether the estimator vouches for its position."""
+        return self.estimator.position_valid
+
+    def silent_s(self, sensor: Sensor) -> float:
+        """For how long a driver has been dead; below 0 if it is not."""
+        return self.time_s - self._dead_since_s.get(sensor, math.inf)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the estimator holds its position since nothing moves."""
+        if self.armed:
+            return self.time_s - self._armed_at_s < MOVES_AFTER_S
+        return self._disarmed_at_s is None or self.time_s - self._disarmed_at_s > AT_REST_AFTER_S
+
+    @property
+    def health(self) -> Report | None:
+        """What PX4 found wrong when it reported last; None in the first seconds."""
+        return self._reporter.published
+
+    @property
+    def battery_warning(self) -> int:
+        """MAV_BATTERY_CHARGE_STATE: 1 is well, 2 low, 3 critical, 4 emergency."""
+        names = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
+        return 1 + sum(self.battery_remaining < self.parameters[name] for name in names)
 
     @property
     def armable(self) -> bool:
-        """Whether the checks before arming pass."""
-        return self._arming_refusal() is None
+        """Whether the checks before arming pass, in the mode that is set."""
+        return self._checks().can_arm(self.mode)
 
     def take_events(self) -> list[Event]:
         """What the vehicle has to say since the last call."""
         events, self._events = self._events, []
         return events
 
-    def _say(self, text: str, is_warning: bool = False) -> None:
-        self._events.append(Event(text, is_warning))
+    def _say(self, number: int, level: Level, text: str = "", arguments: bytes = b"") -> None:
+        self._events.append(Event(number, level, arguments, text, level))
 
     # What a client commands
 
     def arm(self, *, force: bool = False) -> Result:
-        """Arm; DENIED, with an event that says why, unless every check passes or by force."""
+        """Arm; TEMPORARILY_REJECTED unless every check passes or, as no client can, by force."""
         if self.armed:
             return Result.ACCEPTED
-        refusal = self._arming_refusal()
-        if refusal and not force:
-            self._say(f"Arming denied: {refusal}", True)
-            return Result.DENIED
+        self._run_checks()
+        if not (force or self._reporter.newest.can_arm(self.mode)):
+            text = "Arming denied: Resolve system health failures first\t"
+            self._say(_ARMING_DENIED, Level.CRITICAL, text)
+            return Result.TEMPORARILY_REJECTED
         self.armed = True
         self._armed_at_s = self.time_s
         self._took_off = False
         self._lift_began_s = None
         self._rc_at_arming = self.rc_connected
+        self.failsafe.reset()
         self.home_m = self.estimated_position_m
-        self._say("Armed")
+        text = "Armed by external command\t"
+        self._say(_ARMED_BY, Level.INFO, text, bytes([_BY_COMMAND]))
         return Result.ACCEPTED
 
-    def disarm(self, *, force: bool = False) -> Result:
-        """Disarm; DENIED in the air, unless by force: then the vehicle falls."""
+    def disarm(self, *, force: bool = False, reason: int = _BY_COMMAND) -> Result:
+        """Disarm; TEMPORARILY_REJECTED in the air, unless by force: then the vehicle falls."""
         if not self.armed:
             return Result.ACCEPTED
         if not self.landed and not force:
-            self._say("Disarming denied: not landed", True)
-            return Result.DENIED
+            self._say(_DISARMING_DENIED, Level.CRITICAL, "Disarming denied: not landed\t")
+            return Result.TEMPORARILY_REJECTED
         self.armed = False
-        self.failsafe = Action.NONE
+        self._disarmed_at_s = self.time_s
+        self.failsafe.reset()
         self._set_intended_mode(self._mode_after_disarm)
-        self._say("Disarmed")
+        self.mode = self.intended_mode
+        if not self.position_valid:
+            self.home_m = None
+        self._say(_DISARMED_BY, Level.INFO, "Disarmed\t", bytes([reason]))
         return Result.ACCEPTED
 
     def set_mode(self, mode: Mode) -> Result:
-        """Ask for a mode; DENIED where the vehicle lacks what the mode needs."""
-        if mode is Mode.OFFBOARD and not self._offboard_signal():
-            self._say("Offboard denied: no setpoints", True)
-            return Result.DENIED
-        if self.armed and mode in NEED_POSITION and not self.position_valid:
-            self._say(f"{mode.name} denied: no position", True)
-            return Result.DENIED
-        if self.armed and mode in PILOTED and not self.rc_connected:
-            self._say(f"{mode.name} denied: no manual control", True)
-            return Result.DENIED
+        """Ask for a mode: it is on after the next step.
+
+        TEMPORARILY_REJECTED in the air, where the vehicle lacks what the mode needs. LAND is always
+        taken: without a position the vehicle descends.
+        """
+        if self.armed and mode is not Mode.LAND:
+            self._run_checks()
+            if not self._reporter.newest.can_run(mode):
+                return Result.TEMPORARILY_REJECTED
         if mode is Mode.TAKEOFF:
             self._takeoff_down_m = self._home_down_m() - self.parameters["MIS_TAKEOFF_ALT"]
+        if mode is Mode.LAND:
+            self._say(_LANDING_ORDERED, Level.INFO, "Landing at current position\t")
+        if self.failsafe.take_over():
+            self._say(_TAKEN_OVER, Level.INFO)
         self._set_intended_mode(mode)
+        return Result.ACCEPTED
+
+    def run_prearm_checks(self) -> Result:
+        """Run the checks before arming and tell all that they find."""
+        self._run_checks(asked=True)
         return Result.ACCEPTED
 
     def take_off(self, altitude_m: float) -> Result:
@@ -321,14 +403,19 @@ class Px4Vehicle:
     def step(self, dt_s: float) -> None:
         """One step of time; 0.02 s suits the model."""
         self.time_s += dt_s
+        self._watch_sensors()
         self._estimate(dt_s)
-        if self.home_m is None and self.position_valid:
+        if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
             self.home_m = self.estimated_position_m
         if self.armed:
             self.battery_remaining = max(
                 0.0, self.battery_remaining - dt_s / self._airframe.endurance_s
             )
             self._apply_failsafes()
+        else:
+            self._enter(self.intended_mode)
+        if self.time_s - self._checked_at_s >= CHECKS_PERIOD_S - 1e-9:
+            self._run_checks()
         self._move(dt_s)
         self._watch_ground()
         if not self.truth or self.time_s - self.truth[-1].time_s >= TRUTH_PERIOD_S - 1e-9:
@@ -336,45 +423,92 @@ class Px4Vehicle:
 
     def _estimate(self, dt_s: float) -> None:
         draws = self._rng.standard_normal(10)
-        decay = dt_s / GPS_NOISE_TIME_S
-        self._noise_m = self._noise_m * (1.0 - decay) + GPS_NOISE_M * draws[:3] * math.sqrt(
-            2.0 * decay
-        )
+        has_gps = not self.gps_lost and Sensor.GPS not in self.dead_sensors
+        self.estimator.step(self.time_s, dt_s, has_gps, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
         self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + VERTICAL_DRIFT_M_S * float(
-            draws[3]
+            draws[6]
         ) * math.sqrt(2.0 * decay)
         decay = dt_s / WIND_COMPENSATION_S
-        self._gust = self._gust * (1.0 - decay) + self.gust_m_s * draws[4:7] * math.sqrt(
+        self._gust = self._gust * (1.0 - decay) + self.gust_m_s * draws[7:10] * math.sqrt(
             2.0 * decay
         )
-        if not self.gps_lost:
-            self._gps_lost_since_s = math.inf
-            self._dead_reckoning_m = np.zeros(3)
-            return
-        self._gps_lost_since_s = min(self._gps_lost_since_s, self.time_s)
-        step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
-        self._dead_reckoning_m = self._dead_reckoning_m + step_m * draws[7:10] * (1.0, 1.0, 0.0)
+
+    def _watch_sensors(self) -> None:
+        if self.dead_sensors or self._dead_since_s:
+            self._dead_since_s = {
+                sensor: self._dead_since_s.get(sensor, self.time_s) for sensor in self.dead_sensors
+            }
+
+    # Checks
+
+    def _run_checks(self, *, asked: bool = False) -> None:
+        self._checked_at_s = self.time_s
+        self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
+        uses_gps = self.estimator.uses_gps
+        if self.armed and uses_gps is not self._fusion_told:
+            number = _FUSION_STARTED if uses_gps else _FUSION_STOPPED
+            text = f"GNSS data fusion {'started' if uses_gps else 'stopped'}\t"
+            self._say(number, Level.INFO, text)
+        self._fusion_told = uses_gps
+
+    def _checks(self) -> Report:
+        """All that is wrong now, in PX4's order."""
+        parameters = self.parameters
+        is_there = {
+            Component.BAROMETER,
+            Component.BATTERY,
+            Component.LOCAL_POSITION_ESTIMATE,
+            Component.COMPASS,
+            Component.ACCELEROMETER,
+            Component.GYROSCOPE,
+        }
+        if self.estimator.uses_gps:
+            is_there.add(Component.GPS)
+        if (
+            self.armed
+            or self._disarmed_at_s is None
+            or self.time_s - self._disarmed_at_s < LOG_ENDS_S
+        ):
+            is_there.add(Component.LOGGING)
+        if self.rc_connected:
+            is_there.add(Component.REMOTE_CONTROL)
+        if not self._ground_station_lost():
+            is_there.add(Component.COMMUNICATION_LINKS)
+        disabled = int(parameters["COM_RC_IN_MODE"]) == 4
+        required = int(parameters["NAV_DLL_ACT"]) > 0
+        battery = (None, checks.BATTERY_LOW, checks.BATTERY_CRITICAL, checks.BATTERY_EMERGENCY)
+        found = (
+            (self.silent_s(Sensor.BAROMETER) > SENSOR_TIMEOUT_S, checks.NO_BAROMETER),
+            (self.silent_s(Sensor.COMPASS) > SENSOR_TIMEOUT_S, checks.NO_COMPASS),
+            (not self.estimator.has_gps and not self.armed, checks.GPS_FIX_TOO_LOW),
+            (self.mode in PREVENT_ARMING and not self.armed, checks.MODE_PREVENTS_ARMING),
+            (not self.estimator.has_attitude, checks.NO_ATTITUDE),
+            (not self.position_valid, checks.NO_LOCAL_POSITION),
+            (not self.position_valid, checks.NO_GLOBAL_POSITION),
+            (True, checks.NO_MISSION),
+            (not self._offboard_signal(), checks.NO_OFFBOARD_SIGNAL),
+            (self.home_m is None and self.estimator.is_ready, checks.NO_HOME),
+            (
+                not self.rc_connected,
+                checks.MANUAL_CONTROL_DISABLED if disabled else checks.NO_MANUAL_CONTROL,
+            ),
+            (True, battery[self.battery_warning - 1]),
+            (self.silent_s(Sensor.BATTERY) > BATTERY_TIMEOUT_S, checks.BATTERY_SILENT),
+            (
+                self._ground_station_lost(),
+                checks.GROUND_STATION_REQUIRED if required else checks.NO_GROUND_STATION,
+            ),
+        )
+        problems: tuple[Problem, ...] = tuple(p for is_so, p in found if is_so and p is not None)
+        return Report(problems, frozenset(is_there))
 
     # Modes
 
-    def _arming_refusal(self) -> str | None:
-        if not self.position_valid or self.gps_lost:
-            return "no global position"
-        if self.intended_mode in PREVENT_ARMING:
-            return f"mode {self.intended_mode.name}"
-        if self.intended_mode is Mode.OFFBOARD and not self._offboard_signal():
-            return "no offboard signal"
-        if self.intended_mode in PILOTED and not self.rc_connected:
-            return "no manual control"
-        if self.battery_remaining < self.parameters["BAT_LOW_THR"]:
-            return "low battery"
-        if self.parameters["NAV_DLL_ACT"] and self._ground_station_lost():
-            return "no connection to a ground station"
-        return None
-
     def _offboard_signal(self) -> bool:
-        return self.time_s - self._setpoint_at_s <= self.parameters["COM_OF_LOSS_T"]
+        """Whether setpoints come, and the vehicle knows what it needs to follow them."""
+        fresh = self.time_s - self._setpoint_at_s <= self.parameters["COM_OF_LOSS_T"]
+        return fresh and self.position_valid
 
     def _ground_station_lost(self) -> bool:
         return self.time_s - self._ground_station_at_s > self.parameters["COM_DL_LOSS_T"]
@@ -382,8 +516,7 @@ class Px4Vehicle:
     def _set_intended_mode(self, mode: Mode) -> None:
         self._mode_commands += 1
         self.intended_mode = mode
-        self._enter(mode)
-        if mode not in PREVENT_ARMING:
+        if mode not in PREVENT_ARMING and mode is not Mode.TAKEOFF:
             self._mode_after_disarm = mode
 
     def _enter(self, mode: Mode) -> None:
@@ -392,43 +525,59 @@ class Px4Vehicle:
             self._hold_m = None
 
     def _apply_failsafes(self) -> None:
-        cause, action = max(
-            (
-                ("offboard signal lost", self._on_offboard_loss()),
-                ("manual control lost", self._on_manual_control_loss()),
-                ("ground station lost", self._on_ground_station_loss()),
-                ("battery", self._on_battery()),
-                ("geofence", self._on_geofence()),
-                ("position lost", self._on_position_loss()),
-            ),
-            key=lambda entry: entry[1],
+        causes = {
+            Cause.OFFBOARD_LOST: self._on_offboard_loss(),
+            Cause.MANUAL_CONTROL_LOST: self._on_manual_control_loss(),
+            Cause.GROUND_STATION_LOST: self._on_ground_station_loss(),
+            Cause.BATTERY: self._on_battery(),
+            Cause.GEOFENCE: self._on_geofence(),
+            Cause.POSITION_LOST: self._on_position_loss(),
+        }
+        before = self.failsafe.action
+        cause = self.failsafe.decide(
+            causes,
+            self.time_s,
+            self.parameters["COM_FAIL_ACT_T"],
+            intended_mode=self.intended_mode,
+            position_valid=self.position_valid,
         )
-        if action is not self.failsafe:
-            if self.failsafe < Action.HOLD:
-                self._failsafe_since_s = self.time_s
-            self.failsafe = action
-            self._say(
-                f"Failsafe {action.name}: {cause}" if action else "Failsafe over", bool(action)
-            )
+        action = self.failsafe.action
+        if action > before:
+            self._tell_failsafe(cause, causes[cause], action)
         if action is Action.STOP_MOTORS:
-            self.disarm(force=True)
+            self.disarm(force=True, reason=_BY_FAILSAFE)
             return
-        # Time for a pilot to take over; a mode that lost what it needs is left at once.
-        waiting = self.time_s - self._failsafe_since_s < self.parameters["COM_FAIL_ACT_T"]
-        delayed = cause not in ("offboard signal lost", "position lost")
-        if waiting and delayed and action in (Action.RETURN, Action.LAND):
-            action = Action.HOLD
-        mode = ACTION_MODES.get(action, self.intended_mode)
-        # A landing or return that was asked for goes on under a milder failsafe.
-        if self.intended_mode is Mode.LAND or (
-            self.intended_mode is Mode.RETURN and mode is Mode.HOLD
-        ):
-            mode = self.intended_mode
-        self._enter(mode)
+        self._enter(ACTION_MODES.get(action, self.intended_mode))
+
+    def _tell_failsafe(self, cause: Cause, wanted: Action, action: Action) -> None:
+        self._events += self._reporter.before_failsafe(self.time_s)
+        main, sub = CUSTOM_MODES[self.intended_mode]
+        mode = struct.pack("<I", main << 16 | sub << 24)
+        told_cause = bytes(
+            [_CAUSES.get(cause, self.battery_warning + 1 if cause is Cause.BATTERY else 0)]
+        )
+        if action is Action.WARN:
+            if cause is Cause.BATTERY:
+                level = Level.WARNING if self.battery_warning == 2 else Level.CRITICAL
+                self._say(_BATTERY_WARNINGS[self.battery_warning], level)
+            else:
+                self._say(_FAILSAFE_WARNS, Level.WARNING, arguments=mode + told_cause)
+            return
+        if action is Action.HOLD and wanted is not Action.HOLD:
+            wait_s = round(self.parameters["COM_FAIL_ACT_T"])
+            text = f"Failsafe activated: entering Hold for {wait_s} seconds\t"
+            arguments = mode + struct.pack("<BH", _ACTIONS[wanted], wait_s) + told_cause
+            self._say(_FAILSAFE_HOLDS, Level.CRITICAL, text, arguments)
+            return
+        number = _POSITION_FAILSAFE if action is Action.DESCEND else _FAILSAFE
+        arguments = mode + bytes([_ACTIONS[action]]) + told_cause
+        self._say(number, Level.CRITICAL, "Failsafe activated\t", arguments)
 
     def _on_offboard_loss(self) -> Action:
         if self.intended_mode is not Mode.OFFBOARD or self._offboard_signal():
             return Action.NONE
+        if not self.position_valid:
+            return Action.DESCEND
         setting = int(self.parameters["COM_OBL_RC_ACT"])
         if setting in OFFBOARD_LOSS_ACTIONS:
             return OFFBOARD_LOSS_ACTIONS[setting]
@@ -453,14 +602,12 @@ class Px4Vehicle:
         return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_DLL_ACT"]), Action.NONE)
 
     def _on_battery(self) -> Action:
-        parameters, setting = self.parameters, int(self.parameters["COM_LOW_BAT_ACT"])
-        if self.battery_remaining >= parameters["BAT_LOW_THR"]:
+        setting, warning = int(self.parameters["COM_LOW_BAT_ACT"]), self.battery_warning
+        if warning == 1:
             return Action.NONE
-        if self.battery_remaining >= parameters["BAT_CRIT_THR"] or setting not in (2, 3):
+        if warning == 2 or setting not in (2, 3):
             return Action.WARN
-        if setting == 3 and self.battery_remaining >= parameters["BAT_EMERGEN_THR"]:
-            return Action.RETURN
-        return Action.LAND
+        return Action.RETURN if setting == 3 and warning == 3 else Action.LAND
 
     def _on_geofence(self) -> Action:
         """A breach acts until another mode is asked for; then not until the next breach."""
@@ -487,8 +634,8 @@ class Px4Vehicle:
         )
 
     def _on_position_loss(self) -> Action:
-        lost = self.mode in NEED_POSITION | {Mode.LAND} and not self.position_valid
-        return Action.LAND if lost else Action.NONE
+        lost = self.intended_mode in NEED_POSITION and not self.position_valid
+        return Action.DESCEND if lost else Action.NONE
 
     # Motion
 
@@ -574,7 +721,7 @@ class Px4Vehicle:
         lag_s = self._airframe.lag_s
         if self.landed and self.mode not in CAN_LEAVE_GROUND:
             return np.zeros(3), math.nan, lag_s
-        if not self.position_valid and self.mode not in PILOTED:
+        if self.mode is Mode.DESCEND:
             descent = [*self.wind_m_s[:2], self.parameters["MPC_LAND_SPEED"]]
             return np.array(descent), math.nan, lag_s
         if self.mode is Mode.OFFBOARD and self._setpoint is not None:
@@ -660,16 +807,22 @@ class Px4Vehicle:
     def _watch_ground(self) -> None:
         if self.position_m[2] < 0.0:
             self._on_ground_since_s = math.inf
+            self._off_ground_since_s = min(self._off_ground_since_s, self.time_s)
+            if self.time_s - self._off_ground_since_s < IN_AIR_AFTER_S:
+                return
+            if self.landed and self.armed:
+                self._say(_TAKEOFF_DETECTED, Level.INFO, "Takeoff detected\t")
             self._took_off = self._took_off or self.armed
             self.landed = False
             return
+        self._off_ground_since_s = math.inf
         if self._lift_began_s is not None and self.armed:
             return
         self._on_ground_since_s = min(self._on_ground_since_s, self.time_s)
         on_ground_s = self.time_s - self._on_ground_since_s
         if not self.landed and on_ground_s >= LANDED_AFTER_S:
             self.landed = True
-            self._say("Landing detected")
+            self._say(_LANDING_DETECTED, Level.INFO, "Landing detected\t")
         if self.armed and self.landed:
             self._disarm_when_idle(on_ground_s - LANDED_AFTER_S)
 
@@ -678,10 +831,10 @@ class Px4Vehicle:
         armed_s = self.time_s - self._armed_at_s
         after_landing = 0.0 < parameters["COM_DISARM_LAND"] <= landed_s
         preflight_s = parameters["COM_DISARM_PRFLT"]
-        if (self._took_off and after_landing) or (
-            not self._took_off and 0.0 < preflight_s <= armed_s - parameters["COM_SPOOLUP_TIME"]
-        ):
-            self.disarm()
+        if self._took_off and after_landing:
+            self.disarm(reason=_BY_LANDING)
+        elif not self._took_off and 0.0 < preflight_s <= armed_s - parameters["COM_SPOOLUP_TIME"]:
+            self.disarm(reason=_BEFORE_FLIGHT)
 
     def _record_truth(self) -> None:
         north_m, east_m, down_m = self.position_m.tolist()

@@ -20,6 +20,7 @@ from edge.adapters.mavsdk_autopilot import _COMMANDS, AutopilotError, MavsdkAuto
 from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
 from sim.px4.link import Px4Link
+from sim.px4.modes import CUSTOM_MODES
 from sim.px4.modes import Mode as Px4Mode
 from sim.px4.modes import Result
 from sim.px4.server import Instance, Px4Server
@@ -168,7 +169,7 @@ def test_the_whole_state_is_known() -> None:
         assert (state.mode, state.armed, state.in_air) == (Mode.HOLD, False, False)
         assert state.battery == pytest.approx(0.62, abs=0.01)
         assert state.gps is not None
-        assert (state.gps.fix, state.gps.satellites, state.gps.hdop) == (3, 14, 0.8)
+        assert (state.gps.fix, state.gps.satellites, state.gps.hdop) == (3, 10, 0.7)
         assert state.problems == ()
         vehicle.gps_lost = True
         state = wait(autopilot, lambda s: s.gps and s.gps.fix < 3)
@@ -185,13 +186,14 @@ def test_the_whole_state_is_known() -> None:
         (Px4Mode.HOLD, Mode.HOLD),
         (Px4Mode.RETURN, Mode.RETURN),
         (Px4Mode.LAND, Mode.LAND),
+        (Px4Mode.DESCEND, Mode.LAND),
         (Px4Mode.OFFBOARD, Mode.OFFBOARD),
         (Px4Mode.STABILIZED, Mode.STABILIZED),
     ],
 )
 def test_modes(px4: Px4Mode, mode: Mode) -> None:
     telemetry = Px4Telemetry()
-    main, sub = px4.value
+    main, sub = CUSTOM_MODES[px4]
     heartbeat = {
         "autopilot": 12,
         "base_mode": 0,
@@ -373,16 +375,16 @@ def test_each_setpoint_is_sent_once_and_only_if_it_is_finite() -> None:
 # Commands
 
 
-def test_arming_is_refused_with_px4s_reason() -> None:
+def test_arming_is_refused_where_px4s_checks_fail() -> None:
     vehicle = new_vehicle()
-    vehicle.battery_remaining = 0.1
+    vehicle.battery_remaining = 0.06
     with connected(vehicle) as (autopilot, _):
-        assert carry_out(autopilot, Action.ARM) == "denied: low battery"
-        state = wait(autopilot, lambda s: s.armable is False)
-        assert [problem.text for problem in state.problems] == ["low battery"]
-        assert carry_out(autopilot, Action.OFFBOARD) == "denied: no setpoints"
+        state = wait(autopilot, lambda s: s.armable is False and s.problems)
+        assert [problem.text for problem in state.problems] == ["the battery is critical"]
+        assert carry_out(autopilot, Action.ARM) == "not now"
         vehicle.battery_remaining = 1.0
         assert wait(autopilot, lambda s: s.armable).problems == ()
+        assert carry_out(autopilot, Action.ARM) == ""
 
 
 def test_hold_land_and_disarm() -> None:
@@ -391,7 +393,7 @@ def test_hold_land_and_disarm() -> None:
         take_off(autopilot)
         assert carry_out(autopilot, Action.HOLD) == ""
         wait(autopilot, lambda s: s.mode is Mode.HOLD)
-        assert carry_out(autopilot, Action.DISARM) == "denied: not landed"
+        assert carry_out(autopilot, Action.DISARM) == "not now"
         assert carry_out(autopilot, Action.LAND) == ""
         wait(autopilot, lambda s: s.mode is Mode.LAND)
         wait(autopilot, lambda s: s.in_air is False)

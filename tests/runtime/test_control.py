@@ -202,8 +202,9 @@ class Flown:
     def take_off_by_hand(self, height_m: float) -> None:
         """Somebody flies it, and leaves it to PX4 to hold."""
         self.vehicle.parameters["MIS_TAKEOFF_ALT"] = height_m
-        self.vehicle.arm(force=True)
-        self.vehicle.set_mode(Px4Mode.TAKEOFF)
+        self.vehicle.step(0.02)
+        assert self.vehicle.arm() is Result.ACCEPTED
+        assert self.vehicle.set_mode(Px4Mode.TAKEOFF) is Result.ACCEPTED
         for _ in range(150):
             self.tick()
         self.vehicle.set_mode(Px4Mode.HOLD)
@@ -474,8 +475,10 @@ def test_what_it_leaves_behind(flown: Flown, on_stop: Action) -> None:
     assert leave(on_stop) is on_stop
     # PX4 lands by itself, or a pilot came, and no tick has seen it yet.
     flown.vehicle.set_mode(Px4Mode.LAND)
+    flown.vehicle.step(0.02)
     assert leave(on_stop) is None
     flown.vehicle.pilot()
+    flown.vehicle.step(0.02)
     assert leave(on_stop) is None
     flown.until(FlightState.PILOT)
     assert leave(on_stop) is None

@@ -31,13 +31,16 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 from mavsdk.asyncio.plugins.telemetry import FlightMode, LandedState, TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
+from sim.px4 import checks
+from sim.px4.checks import Component
 from sim.px4.link import Px4Link
 from sim.px4.modes import Mode, Result
 from sim.px4.server import Instance, Px4Server
-from sim.px4.vehicle import Px4Vehicle, Setpoint
+from sim.px4.vehicle import Px4Vehicle, Sensor, Setpoint
 from sim.px4.world import FencePolygon, WorldOrigin
 
 STEP_S = 0.02
+DENIED = "Arming denied: Resolve system health failures first"
 NAN_3 = np.full(3, math.nan)
 
 
@@ -64,6 +67,7 @@ def hovering(seed: int = 1, altitude_m: float = 5.0, *, rc: bool = False) -> Px4
     vehicle.step(STEP_S)
     assert vehicle.arm() is Result.ACCEPTED
     assert vehicle.take_off(math.nan) is Result.ACCEPTED
+    run(vehicle, STEP_S)
     run_until(vehicle, lambda: vehicle.mode is Mode.HOLD, 20.0)
     run(vehicle, 2.0)
     return vehicle
@@ -90,7 +94,7 @@ def speed_m_s(vehicle: Px4Vehicle) -> float:
 
 
 def texts(vehicle: Px4Vehicle) -> list[str]:
-    return [event.text for event in vehicle.take_events()]
+    return [event.text.rstrip() for event in vehicle.take_events() if event.text]
 
 
 # Arming
@@ -99,29 +103,50 @@ def texts(vehicle: Px4Vehicle) -> list[str]:
 @pytest.mark.parametrize("seed", range(5))
 def test_arming_is_denied_until_health_is_good(seed: int) -> None:
     vehicle = Px4Vehicle(seed=seed)
-    assert vehicle.arm() is Result.DENIED
-    assert texts(vehicle) == ["Arming denied: no global position"]
+    assert vehicle.arm() is Result.TEMPORARILY_REJECTED
+    assert texts(vehicle) == [DENIED]
     assert 3.0 <= run_until(vehicle, lambda: vehicle.armable, 10.0) <= 6.1
     assert vehicle.arm() is Result.ACCEPTED
 
 
 @pytest.mark.parametrize(
-    ("spoil", "reason"),
+    ("spoil", "problem"),
     [
-        (lambda v: setattr(v, "gps_lost", True), "no global position"),
-        (lambda v: setattr(v, "battery_remaining", 0.1), "low battery"),
-        (lambda v: v.set_mode(Mode.LAND), "mode LAND"),
-        (lambda v: v.set_mode(Mode.POSCTL), "no manual control"),
-        (lambda v: v.parameters.update(NAV_DLL_ACT=2), "no connection to a ground station"),
+        (lambda v: setattr(v, "gps_lost", True), checks.NO_GLOBAL_POSITION),
+        (lambda v: setattr(v, "battery_remaining", 0.06), checks.BATTERY_CRITICAL),
+        (lambda v: v.dead_sensors.add(Sensor.BAROMETER), checks.NO_BAROMETER),
+        (lambda v: v.dead_sensors.add(Sensor.COMPASS), checks.NO_COMPASS),
+        (lambda v: v.dead_sensors.add(Sensor.BATTERY), checks.BATTERY_SILENT),
+        (lambda v: v.set_mode(Mode.LAND), checks.MODE_PREVENTS_ARMING),
+        (lambda v: v.set_mode(Mode.OFFBOARD), checks.NO_OFFBOARD_SIGNAL),
+        (lambda v: v.set_mode(Mode.POSCTL), checks.NO_MANUAL_CONTROL),
+        (lambda v: v.parameters.update(NAV_DLL_ACT=2), checks.GROUND_STATION_REQUIRED),
     ],
 )
-def test_arming_is_denied_with_a_reason(spoil: Callable[[Any], object], reason: str) -> None:
+def test_arming_is_denied_with_a_reason(
+    spoil: Callable[[Any], object], problem: checks.Problem
+) -> None:
     vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
     run(vehicle, 0.1)
+    assert vehicle.armable
     spoil(vehicle)
-    assert vehicle.arm() is Result.DENIED
-    assert texts(vehicle) == [f"Arming denied: {reason}"]
+    run(vehicle, 6.0)
+    assert not vehicle.armable
+    vehicle.take_events()
+    vehicle.run_prearm_checks()
+    assert problem.event() in vehicle.take_events()
+    assert vehicle.arm() is Result.TEMPORARILY_REJECTED
+    assert texts(vehicle) == [DENIED]
     assert vehicle.arm(force=True) is Result.ACCEPTED
+
+
+def test_a_low_battery_is_told_but_does_not_keep_from_arming() -> None:
+    vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
+    vehicle.battery_remaining = 0.12
+    run(vehicle, 2.1)
+    assert vehicle.health is not None and Component.BATTERY in vehicle.health.unhealthy
+    assert "Low battery" in texts(vehicle)
+    assert vehicle.arm() is Result.ACCEPTED
 
 
 def test_an_armed_vehicle_that_stays_on_the_ground_disarms_itself() -> None:
@@ -134,7 +159,7 @@ def test_an_armed_vehicle_that_stays_on_the_ground_disarms_itself() -> None:
 
 def test_disarming_in_the_air_is_denied_but_a_kill_drops_the_vehicle() -> None:
     vehicle = hovering()
-    assert vehicle.disarm() is Result.DENIED
+    assert vehicle.disarm() is Result.TEMPORARILY_REJECTED
     assert vehicle.armed
     assert vehicle.disarm(force=True) is Result.ACCEPTED
     assert run_until(vehicle, lambda: vehicle.landed, 5.0) < 2.5
@@ -149,11 +174,14 @@ def test_take_off_and_landing_take_as_long_as_measured() -> None:
     vehicle.parameters["MIS_TAKEOFF_ALT"] = 5.0
     vehicle.arm()
     vehicle.take_off(math.nan)
+    run(vehicle, STEP_S)
     assert 6.0 <= run_until(vehicle, lambda: vehicle.mode is Mode.HOLD, 20.0) <= 9.0
     assert vehicle.position_m[2] == pytest.approx(-5.0, abs=0.6)
     vehicle.set_mode(Mode.LAND)
     assert 8.0 <= run_until(vehicle, lambda: not vehicle.armed, 20.0) <= 19.0
     assert vehicle.landed
+    run(vehicle, STEP_S)
+    assert vehicle.mode is Mode.HOLD
     assert vehicle.arm() is Result.ACCEPTED
 
 
@@ -204,10 +232,10 @@ def test_return_climbs_flies_home_and_lands() -> None:
 
 def test_offboard_needs_a_stream() -> None:
     vehicle = hovering()
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.DENIED
+    assert vehicle.set_mode(Mode.OFFBOARD) is Result.TEMPORARILY_REJECTED
     vehicle.offboard(velocity(0.0))
     run(vehicle, 2.0)
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.DENIED
+    assert vehicle.set_mode(Mode.OFFBOARD) is Result.TEMPORARILY_REJECTED
 
 
 @pytest.mark.parametrize(
@@ -236,7 +264,7 @@ def test_what_a_lost_stream_leads_to(offboard_loss: int, manual_loss: int, then:
     if then is Mode.LAND:
         run_until(vehicle, lambda: not vehicle.armed, 30.0)
         assert vehicle.mode is Mode.OFFBOARD
-        assert vehicle.arm() is Result.DENIED
+        assert vehicle.arm() is Result.TEMPORARILY_REJECTED
 
 
 def test_a_lost_stream_gives_the_vehicle_to_a_pilot_who_is_there() -> None:
@@ -307,7 +335,7 @@ def test_a_lost_remote_control_counts_unless_excepted(excepted: int, mode: Mode)
 
 
 def test_manual_modes_need_a_remote_control() -> None:
-    assert hovering().set_mode(Mode.POSCTL) is Result.DENIED
+    assert hovering().set_mode(Mode.POSCTL) is Result.TEMPORARILY_REJECTED
 
 
 # Other failsafes
@@ -319,15 +347,58 @@ def test_without_gps_it_descends_where_the_wind_takes_it() -> None:
     run(vehicle, 4.5)
     assert vehicle.mode is Mode.HOLD
     run(vehicle, 1.0)
-    assert vehicle.mode is Mode.LAND
+    assert vehicle.mode is Mode.DESCEND
     vehicle.wind_m_s = np.array([0.0, 1.5, 0.0])
     east_m = vehicle.position_m[1]
     run_until(vehicle, lambda: not vehicle.armed, 30.0)
     assert vehicle.position_m[1] - east_m > 3.0
     assert not vehicle.armable
     vehicle.gps_lost = False
-    run(vehicle, 0.1)
+    run(vehicle, 1.0)
+    assert not vehicle.armable
+    run(vehicle, 0.5)
     assert vehicle.armable
+
+
+def test_a_short_gap_of_gps_passes_unnoticed() -> None:
+    vehicle = hovering()
+    vehicle.gps_lost = True
+    run(vehicle, 4.0)
+    vehicle.gps_lost = False
+    run(vehicle, 3.0)
+    assert vehicle.position_valid and vehicle.mode is Mode.HOLD
+
+
+def test_a_critical_battery_interrupts_a_landing() -> None:
+    """Time to take over, as before any other action: PX4 holds, and lands after that."""
+    vehicle = hovering()
+    vehicle.parameters["COM_LOW_BAT_ACT"] = 2
+    vehicle.set_mode(Mode.LAND)
+    run(vehicle, 1.0)
+    vehicle.battery_remaining = 0.06
+    run(vehicle, 0.1)
+    assert vehicle.mode is Mode.HOLD and vehicle.failsafe.is_active
+    run(vehicle, 4.8)
+    assert vehicle.mode is Mode.HOLD
+    run(vehicle, 0.2)
+    assert vehicle.mode is Mode.LAND and vehicle.failsafe.is_active
+
+
+def test_whoever_asks_for_a_mode_ends_a_failsafe_that_is_not_of_need() -> None:
+    vehicle = hovering()
+    vehicle.parameters["COM_LOW_BAT_ACT"] = 2
+    vehicle.battery_remaining = 0.06
+    run(vehicle, 6.0)
+    assert vehicle.mode is Mode.LAND
+    assert vehicle.set_mode(Mode.HOLD) is Result.ACCEPTED
+    run(vehicle, 1.0)
+    assert vehicle.mode is Mode.HOLD and not vehicle.failsafe.is_active
+    vehicle.gps_lost = True
+    run(vehicle, 5.2)
+    assert vehicle.mode is Mode.DESCEND
+    vehicle.set_mode(Mode.LAND)
+    run(vehicle, 1.0)
+    assert vehicle.mode is Mode.DESCEND and vehicle.failsafe.is_active
 
 
 @pytest.mark.parametrize(
@@ -347,7 +418,7 @@ def test_low_battery(setting: int, remaining: float, mode: Mode) -> None:
     run(vehicle, 5.2)
     assert vehicle.mode is mode
     assert vehicle.battery_remaining < remaining
-    assert any("battery" in text for text in texts(vehicle))
+    assert any("battery" in text.lower() for text in texts(vehicle))
 
 
 def test_a_silent_ground_station_counts_only_if_a_parameter_says_so() -> None:
@@ -429,6 +500,22 @@ def test_an_origin_jump_moves_local_positions_and_what_follows_them() -> None:
     vehicle.set_mode(Mode.OFFBOARD)
     run(vehicle, 10.0, setpoint)
     assert vehicle.position_m[0] - north_m == pytest.approx(7.0, abs=1.0)
+
+
+def test_an_origin_that_moves_in_height_lets_the_vehicle_climb_unseen() -> None:
+    vehicle = hovering()
+    here_m, height_m = vehicle.local_position_m, -vehicle.position_m[2]
+    vehicle.jump_estimator_origin(0.0, 0.0, -6.0)
+    assert vehicle.local_position_m - here_m == pytest.approx([0.0, 0.0, 6.0])
+    setpoint = Setpoint(here_m, NAN_3)
+    vehicle.offboard(setpoint)
+    vehicle.set_mode(Mode.OFFBOARD)
+    run(vehicle, 10.0, setpoint)
+    assert vehicle.local_position_m[2] == pytest.approx(here_m[2], abs=0.3)
+    assert -vehicle.position_m[2] == pytest.approx(height_m + 6.0, abs=0.7)
+    home = vehicle.global_home
+    assert home is not None
+    assert vehicle.global_position[2] - home[2] == pytest.approx(height_m + 6.0, abs=0.7)
 
 
 # MAVLink

@@ -1,0 +1,114 @@
+"""How well a vehicle knows where it is: when the estimator trusts its position, and how it errs.
+
+Times are those of a real PX4 v1.17, by its own clock.
+"""
+
+import math
+
+import numpy as np
+
+from edge.core import F64
+
+NOISE_M = np.array([0.15, 0.15, 0.1])
+NOISE_TIME_S = 10.0
+# After the start: when the origin is chosen, and how long before the position is good the attitude
+# is, and GPS is used.
+ORIGIN_AFTER_S = 0.64
+ATTITUDE_BEFORE_READY_S = 2.1
+FUSION_BEFORE_READY_S = 1.05
+# For so long the estimator vouches for a position that no GPS holds, and for so long it goes on
+# waiting for the GPS. One that comes back after that is used again `GPS_REGAIN_S` later.
+DEAD_RECKONING_S = 5.0
+GPS_FUSION_S = 7.0
+GPS_REGAIN_S = 1.2
+DEAD_RECKONING_DRIFT_M = 0.5  # per square root of a second
+
+
+class Estimator:
+    """A vehicle's knowledge of its position, as time passes."""
+
+    def __init__(self, ready_after_s: float, noise_m: F64) -> None:
+        """The position is good `ready_after_s` after the start; `noise_m` (3,) errs first."""
+        self._ready_after_s = ready_after_s
+        self._time_s = 0.0
+        self._noise_m = noise_m
+        self._drift_m: F64 = np.zeros(3)
+        # It has never been there.
+        self._gps_lost_since_s = -math.inf
+        self._gps_back_at_s = -math.inf
+
+    @property
+    def error_m(self) -> F64:
+        """(3,), north, east, down: noise, and what dead reckoning has gathered."""
+        return self._noise_m + self._drift_m
+
+    @property
+    def has_origin(self) -> bool:
+        """Whether the origin is chosen: by the first GPS fix."""
+        return self._time_s >= min(ORIGIN_AFTER_S, self._ready_after_s)
+
+    @property
+    def has_attitude(self) -> bool:
+        """Whether the attitude is known."""
+        return self._time_s >= self._ready_after_s - ATTITUDE_BEFORE_READY_S
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it has ever been long enough for a position."""
+        return self._time_s >= self._ready_after_s
+
+    @property
+    def has_gps(self) -> bool:
+        """Whether the receiver has a fix."""
+        return self._gps_lost_since_s == math.inf
+
+    @property
+    def has_used_gps(self) -> bool:
+        """Whether GPS was ever used."""
+        return self._time_s >= self._ready_after_s - FUSION_BEFORE_READY_S
+
+    @property
+    def is_held(self) -> bool:
+        """Whether GPS holds the position, or did so a moment ago."""
+        return self._is_held(DEAD_RECKONING_S)
+
+    @property
+    def accuracy_m(self) -> tuple[float, float]:
+        """What it takes its own errors for, horizontally and vertically."""
+        if not self.has_attitude:
+            return 14.1, 1.8
+        if not self.has_used_gps:
+            return 0.02, 0.08
+        without_gps_s = max(0.0, self._time_s - self._gps_lost_since_s)
+        return 0.29 + 0.06 * without_gps_s**2, 0.04
+
+    @property
+    def uses_gps(self) -> bool:
+        """Whether GPS is used, or waited for."""
+        return self.has_used_gps and self._is_held(GPS_FUSION_S)
+
+    @property
+    def position_valid(self) -> bool:
+        """Whether the estimator vouches for its position."""
+        return self.is_ready and self.is_held
+
+    def _is_held(self, without_gps_s: float) -> bool:
+        is_back = self._time_s >= self._gps_back_at_s
+        return is_back and self._time_s - self._gps_lost_since_s < without_gps_s
+
+    def step(self, time_s: float, dt_s: float, has_gps: bool, draws: F64) -> None:
+        """One step of time; `draws` (6,) are standard normal."""
+        self._time_s = time_s
+        if not has_gps:
+            self._gps_lost_since_s = min(self._gps_lost_since_s, time_s)
+        elif not self.has_gps:
+            if self._gps_lost_since_s > -math.inf and not self.position_valid:
+                self._gps_back_at_s = time_s + GPS_REGAIN_S
+            self._gps_lost_since_s = math.inf
+        decay = dt_s / NOISE_TIME_S
+        self._noise_m = self._noise_m * (1.0 - decay) + NOISE_M * draws[:3] * math.sqrt(2.0 * decay)
+        if self.has_gps:
+            self._drift_m = np.zeros(3)
+            return
+        step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
+        self._drift_m = self._drift_m + step_m * draws[3:6] * (1.0, 1.0, 0.0)
