@@ -20,9 +20,8 @@ from edge.adapters.mavsdk_autopilot import _COMMANDS, AutopilotError, MavsdkAuto
 from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
 from sim.px4.link import Px4Link
-from sim.px4.modes import CUSTOM_MODES
+from sim.px4.modes import CUSTOM_MODES, Result
 from sim.px4.modes import Mode as Px4Mode
-from sim.px4.modes import Result
 from sim.px4.server import Instance, Px4Server
 from sim.px4.vehicle import Px4Vehicle
 from sim.px4.vehicle import Setpoint as Px4Setpoint
@@ -380,8 +379,8 @@ def test_arming_is_refused_where_px4s_checks_fail() -> None:
     vehicle.battery_remaining = 0.06
     with connected(vehicle) as (autopilot, _):
         state = wait(autopilot, lambda s: s.armable is False and s.problems)
-        assert [problem.text for problem in state.problems] == ["the battery is critical"]
-        assert carry_out(autopilot, Action.ARM) == "not now"
+        assert [problem.text for problem in state.problems] == ["battery critical"]
+        assert carry_out(autopilot, Action.ARM) == "not now: battery critical"
         vehicle.battery_remaining = 1.0
         assert wait(autopilot, lambda s: s.armable).problems == ()
         assert carry_out(autopilot, Action.ARM) == ""
@@ -393,7 +392,7 @@ def test_hold_land_and_disarm() -> None:
         take_off(autopilot)
         assert carry_out(autopilot, Action.HOLD) == ""
         wait(autopilot, lambda s: s.mode is Mode.HOLD)
-        assert carry_out(autopilot, Action.DISARM) == "not now"
+        assert carry_out(autopilot, Action.DISARM) == "not now: it has not landed"
         assert carry_out(autopilot, Action.LAND) == ""
         wait(autopilot, lambda s: s.mode is Mode.LAND)
         wait(autopilot, lambda s: s.in_air is False)
