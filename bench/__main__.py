@@ -12,7 +12,7 @@ from bench import ROOT
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-BENCHES = ("policy", "footprint", "scaling", "closed_loop", "loops", "release")
+BENCHES = ("policy", "footprint", "scaling", "closed_loop", "loops", "release", "position")
 
 
 def main() -> None:

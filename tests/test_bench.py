@@ -7,7 +7,7 @@ from rich.console import Console
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
-from bench import closed_loop, footprint, policy, scaling
+from bench import closed_loop, footprint, policy, position, scaling
 from bench.report import Report
 
 
@@ -57,3 +57,10 @@ def test_closed_loop(tmp_path):
     costs = result["figures"]["normalized_cost"]
     assert set(costs) == {closed_loop.LPAC, closed_loop.LOSSY, *closed_loop.BASELINES}
     assert all(len(cost["by_world"]) == 2 for cost in costs.values())
+
+
+def test_position(tmp_path):
+    result = kept(position.measure(hours=0.02, flight_s=36.0), tmp_path)
+    check_frame(result, "position", targets=2)
+    assert result["figures"]["flights"] == 2
+    assert result["figures"]["hours_in_the_air"] == pytest.approx(0.02, rel=0.01)

@@ -32,7 +32,7 @@ from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velo
 _log = structlog.get_logger(__name__)
 
 # Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
-_RATES_HZ = {
+RATES_HZ = {
     1: 2.0,  # SYS_STATUS
     24: 5.0,  # GPS_RAW_INT
     32: 20.0,  # LOCAL_POSITION_NED
@@ -522,7 +522,7 @@ class MavsdkAutopilot:
         _log.info("autopilot found", system_id=system_id)
 
     def _ask_for_streams(self) -> None:
-        for message_id, rate_hz in _RATES_HZ.items():
+        for message_id, rate_hz in RATES_HZ.items():
             self._send_command(_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
 
     def _request(self, message_id: int) -> None:

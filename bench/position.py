@@ -1,0 +1,134 @@
+"""How often the judgement of position is wrong about one that is good: a day of simulated flights.
+
+Each flight is one vehicle with its receiver's, barometer's and compass's errors, which flies about
+and talks as PX4 does; what the robot's telemetry concludes is looked at ten times a second, as in
+flight. Nobody takes its position away, so that whatever is doubted or lost is a false alarm.
+"""
+
+import math
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+from rich.console import Console
+from rich.progress import track
+
+from bench.report import Report, Table, Target
+from edge.adapters.mavsdk_autopilot import RATES_HZ
+from edge.adapters.px4_telemetry import Px4Telemetry
+from edge.core.position import Judgement, PositionLimits, Quality, judge
+from sim.px4.link import Px4Link
+from sim.px4.modes import Mode
+from sim.px4.server import STEP_S
+from sim.px4.vehicle import Airframe, Px4Vehicle, Setpoint
+
+_CORES = 2
+_TICK_S = 0.1
+_SPEED_M_S = 1.25
+_HEIGHT_M = 8.0
+_TURN_S = 10.0
+_READY_S = 20.0
+
+
+class _Flight(NamedTuple):
+    """One flight: its time in the air, s, and how often its position was doubted and lost."""
+
+    flown_s: float
+    doubted: Counter[str]
+    lost: int
+    stopped_s: float
+
+
+def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
+    """Fly for so long in all, in flights of a battery's length."""
+    flights = math.ceil(3600.0 * hours / flight_s)
+    with ProcessPoolExecutor(_CORES, mp_context=get_context("spawn")) as processes:
+        flown = list(
+            track(
+                processes.map(_fly, range(flights), [flight_s] * flights),
+                "position: flights",
+                flights,
+                console=Console(stderr=True),
+            )
+        )
+    flown_h = sum(flight.flown_s for flight in flown) / 3600.0
+    doubted = sum((flight.doubted for flight in flown), Counter[str]())
+    lost = sum(flight.lost for flight in flown)
+    stopped_s = sum(flight.stopped_s for flight in flown)
+    figures: dict[str, Any] = {
+        "flights": flights,
+        "hours_in_the_air": flown_h,
+        "doubted": dict(doubted),
+        "stopped_s": stopped_s,
+        "lost": lost,
+    }
+    rows = [
+        ("hours in the air", f"{flown_h:.1f}"),
+        ("stops (position in doubt)", f"{doubted.total()}"),
+        *((f"  because of {cause}", f"{count}") for cause, count in doubted.most_common()),
+        ("seconds stood still", f"{stopped_s:.0f}"),
+        ("landings (position lost)", f"{lost}"),
+    ]
+    table = Table("false alarms of position, simulated vehicles", ("", "count"), rows)
+    targets = [
+        Target("landings because of a position that was good", lost, 0, at_least=False),
+        Target("stops per hour of flight", doubted.total() / flown_h, 0.1, at_least=False),
+    ]
+    return Report("position", figures, [table], targets)
+
+
+def _fly(seed: int, flight_s: float) -> _Flight:
+    rng = np.random.default_rng(seed)
+    vehicle = Px4Vehicle(seed=seed, airframe=Airframe(endurance_s=10.0 * flight_s))
+    link, telemetry = Px4Link(vehicle, system_id=1), Px4Telemetry()
+    parser: Any = mavlink.MAVLink(None)
+    parser.robust_parsing = True
+    _ask_for_streams(link)
+    judgement = before = Judgement()
+    doubted: Counter[str] = Counter()
+    lost, stopped_s, flown_s = 0, 0.0, 0.0
+    velocity_m_s = np.zeros(3)
+    while vehicle.time_s < _READY_S + flight_s:
+        for _ in range(round(_TICK_S / STEP_S)):
+            vehicle.step(STEP_S)
+            for datagram in link.due():
+                for message in parser.parse_buffer(datagram) or ():
+                    if message.get_type() in telemetry.messages:
+                        telemetry.hear(message.get_type(), message.to_dict(), vehicle.time_s)
+        now_s = vehicle.time_s
+        judgement = judge(before, telemetry.state(now_s), PositionLimits(), now_s)
+        if now_s >= _READY_S:
+            assert vehicle.armed, "the vehicle must fly"
+            flown_s += _TICK_S
+            stopped_s += _TICK_S if judgement.quality is not Quality.GOOD else 0.0
+            if judgement.quality is Quality.DOUBTFUL and before.quality is Quality.GOOD:
+                doubted[str(judgement.cause)] += 1
+            lost += judgement.quality is Quality.LOST and before.quality is not Quality.LOST
+        before = judgement
+        if now_s % _TURN_S < _TICK_S:
+            bearing = rng.uniform(0.0, math.tau)
+            velocity_m_s[:2] = _SPEED_M_S * np.array([math.cos(bearing), math.sin(bearing)])
+        height_m = -float(vehicle.local_position_m[2])
+        velocity_m_s[2] = -min(_HEIGHT_M - height_m, 1.5)
+        vehicle.offboard(Setpoint(np.full(3, np.nan), velocity_m_s.copy()))
+        if not vehicle.armed and vehicle.armable and now_s > _READY_S / 2.0:
+            vehicle.set_mode(Mode.OFFBOARD)
+            vehicle.arm()
+    return _Flight(flown_s, doubted, lost, stopped_s)
+
+
+def _ask_for_streams(link: Px4Link) -> None:
+    """As the robot does; what it does not listen to is switched off, which saves time."""
+    sender: Any = mavlink.MAVLink(None, srcSystem=1, srcComponent=195)
+    unheard = (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY)
+    for message, interval_us in (
+        *((message, 1e6 / rate_hz) for message, rate_hz in RATES_HZ.items()),
+        *((message, -1.0) for message in unheard),
+    ):
+        command = mavlink.MAVLink_command_long_message(
+            1, 1, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 0, message, interval_us, 0, 0, 0, 0, 0
+        )
+        link.receive(bytes(command.pack(sender)))
