@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fleet.doctor import Diagnosis, Examination, Round
     from fleet.hold import Report
     from fleet.operations import Outcome
-    from fleet.up import Arrival, Decision
+    from fleet.up import Arrival, Decision, Pack
 
 _STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}
 
@@ -135,13 +135,16 @@ def up(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     timeout: Annotated[float, typer.Option(help="How long robots are waited for, s.")] = 40.0,
+    trial: Annotated[
+        float, typer.Option(min=1.0, help="A trial's duration, s: how many is a pack good for?")
+    ] = 60.0,
     as_json: AsJson = False,
 ) -> None:
     """Wait for the robots, set their clocks, start their programs, look at all: go or no-go.
 
     Without --robots for all that have a slot. Nothing takes off.
     """
-    from fleet.up import board, bring_up, decide
+    from fleet.up import board, bring_up, decide, packs
 
     config, chosen = open_fleet(fleet, robots)
     if robots is None:
@@ -155,33 +158,44 @@ def up(
 
     arrivals = run_for_each(chosen, arrive)
     came = [outcome.robot for outcome in arrivals if outcome.value is not None]
-    diagnoses = board(config, arrivals, _examine(config, came))
+    examinations = _examine(config, came)
+    diagnoses = board(config, arrivals, examinations)
+    batteries = {pack.robot: pack for pack in packs(config, examinations, trial)}
     decisions = [decide(diagnosis) for diagnosis in diagnoses]
     if as_json:
         described = _described(diagnoses)
         for decision in decisions:
             described[decision.robot] |= {"go": decision.go, "reasons": decision.reasons}
+            if (pack := batteries.get(decision.robot)) is not None:
+                described[decision.robot]["pack"] = pack._asdict()
         _echo(config, described)
     else:
         _print_board(diagnoses)
         _print_findings(diagnoses)
-        _print_decisions(decisions)
+        _print_decisions(decisions, batteries)
+        typer.echo(f"trials: of {trial:g} s, before the battery is low; --trial for others")
     no_go = [decision.robot for decision in decisions if not decision.go]
     if no_go:
         raise ValueError(f"NO-GO: {', '.join(no_go)}")
 
 
-def _print_decisions(decisions: "Sequence[Decision]") -> None:
+def _print_decisions(decisions: "Sequence[Decision]", batteries: "Mapping[str, Pack]") -> None:
     rows: list[tuple[str | Text, ...]] = []
     for decision in decisions:
         word = styled("GO", GOOD) if decision.go else styled("NO-GO", BAD)
         reasons = decision.reasons or ("",)
-        rows.append((decision.robot, word, reasons[0]))
-        rows += [("", "", reason) for reason in reasons[1:]]
+        pack = batteries.get(decision.robot)
+        battery = "" if pack is None or pack.share is None else f"{pack.share:.0%}"
+        count = "" if pack is None or pack.trials is None else str(pack.trials)
+        rows.append((decision.robot, word, battery, count, reasons[0]))
+        rows += [("", "", "", "", reason) for reason in reasons[1:]]
     all_go = all(decision.go for decision in decisions)
-    rows.append(("fleet", styled("GO", GOOD) if all_go else styled("NO-GO", BAD), ""))
+    known = [p.trials for p in batteries.values() if p.trials is not None]
+    least = str(min(known)) if known else ""
+    go = styled("GO", GOOD) if all_go else styled("NO-GO", BAD)
+    rows.append(("fleet", go, "", least, ""))
     typer.echo()
-    print_table(("robot", "", "why"), rows)
+    print_table(("robot", "", "battery", "trials", "why"), rows, ("battery", "trials"))
 
 
 # ping

@@ -7,7 +7,6 @@ import signal
 import socket
 import sys
 import time
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -104,10 +103,8 @@ def _print_event(event: "Event") -> None:
 def load_setup(path: Path, operator: str) -> "GroundConfig":
     """What the ground station needs to know of the fleet. Raises ValueError or OSError."""
     from edge.core.mission import Place, world_id
-    from edge.core.schema import from_mapping
     from edge.core.world import parse_world
     from edge.runtime.bundle import load_bundle
-    from edge.runtime.config import RobotConfig
     from fleet.config import load_fleet
     from ground.config import GroundConfig
     from ground.protocol import Setup, Site
@@ -116,7 +113,7 @@ def load_setup(path: Path, operator: str) -> "GroundConfig":
     seated = next((slot.robot for slot in config.slots if slot.robot), None)
     if seated is None:
         raise ValueError(f"{path}: slots: no robot sits in one")
-    robot = from_mapping(RobotConfig, tomllib.loads(config.robot_toml(seated)), str(path))
+    robot = config.robot_config(seated)
     bundle = load_bundle(config.bundle)
     perception, training = bundle.manifest.perception, bundle.manifest.training
     if perception is None:

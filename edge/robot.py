@@ -249,6 +249,7 @@ class _Program:
             pac=pac,
             inbox=inbox,
             recorder=recorder,
+            energy=config.energy,
             unix_clock_s=time.time,
             started_s=self._started_s,
         )
@@ -413,6 +414,7 @@ class _Program:
         neighbours = self._pac.mailbox.neighbours(now_s)
         policy_velocity_m_s = self._pac.control(now_s)
         ground_age_s = self._inbox.ground_age_s(now_s)
+        energy = control.energy
         return RobotStatus(
             robot_id=robot.robot_id,
             boot_nonce=self._boot_nonce,
@@ -456,6 +458,9 @@ class _Program:
             neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             remote_control=vehicle.remote_control if self._config.failsafe.rc == "pilot" else None,
+            battery_lasts_s=None if energy is None else energy.lasts_s,
+            home_s=None if energy is None else energy.home_s,
+            endurance_s=control.endurance_s,
             position_quality=self._navigation.position.quality,
             position_cause=self._navigation.position.cause,
             gps_accuracy_m=None if gps is None else gps.accuracy_m,

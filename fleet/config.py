@@ -153,6 +153,10 @@ class FleetConfig:
         text = tomlkit.dumps(_robot_mapping(self, robot, slot), sort_keys=True)
         return f"# Generated from fleet.toml for robot {name}: changes belong there.\n{text}"
 
+    def robot_config(self, name: str) -> RobotConfig:
+        """What the robot flies by. Raises ConfigError for an unknown robot or a spare."""
+        return from_mapping(RobotConfig, tomllib.loads(self.robot_toml(name)), str(self.path))
+
     def drop_in(self, robot: RobotHost) -> str | None:
         """The text of lpac-robot.conf, what differs from lpac-robot.service; None if nothing."""
         unit, service = [], []

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from edge.core.energy import trials
 from fleet.config import FleetConfig, RobotHost
 from fleet.doctor import (
     GOOD_CLOCK_OFFSET_S,
@@ -34,6 +35,18 @@ class Decision(NamedTuple):
     robot: str
     go: bool
     reasons: tuple[str, ...]
+
+
+class Pack(NamedTuple):
+    """A robot's battery: its share, and how many trials it is good for; None if not known.
+
+    `endurance_s` is what a full one lasts, as measured in the last flight, or else as configured.
+    """
+
+    robot: str
+    share: float | None
+    endurance_s: float | None
+    trials: int | None
 
 
 async def bring_up(
@@ -116,6 +129,33 @@ def board(
         came = Check("up", "FAILED", problems) if problems else Check("up", "ok", done)
         diagnoses.append(Diagnosis(name, (came, *examined[name].checks)))
     return diagnoses
+
+
+def packs(
+    config: FleetConfig, examinations: Sequence[Outcome[Examination]], trial_s: float
+) -> list[Pack]:
+    """What the robots' batteries are good for, as their programs know them: the slots' robots."""
+    found = []
+    for outcome in examinations:
+        robot, examination = outcome.robot, outcome.value
+        if examination is None or config.slot_of(robot.name) is None:
+            continue
+        service = examination.facts["service"]
+        said = (service["status"] or {}) if service["fresh"] else {}
+        share, endurance_s = said.get("battery"), said.get("endurance_s")
+        count = None
+        if share is not None and endurance_s is not None:
+            flown = config.robot_config(robot.name)
+            count = trials(
+                share=share,
+                until_share=flown.flight.battery_low,
+                endurance_s=endurance_s,
+                trial_s=trial_s,
+                slot_height_m=flown.flight.slot_height_m,
+                max_climb_m_s=flown.limits.max_climb_m_s,
+            )
+        found.append(Pack(robot.name, share, endurance_s, count))
+    return found
 
 
 def decide(diagnosis: Diagnosis) -> Decision:

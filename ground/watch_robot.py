@@ -112,8 +112,16 @@ def _vehicle(status: RobotStatus) -> str:
         armed[status.armed],
         air[status.in_air],
         "" if status.battery is None else f"battery {status.battery:.0%}",
+        _lasts(status),
         "" if status.system_id is None else f"system id {status.system_id}",
     )
+
+
+def _lasts(status: RobotStatus) -> str:
+    if status.battery_lasts_s is None:
+        return ""
+    home = "" if status.home_s is None else f" of which home takes {status.home_s:.0f}"
+    return f"for {status.battery_lasts_s:.0f} s{home}"
 
 
 def _gps(status: RobotStatus) -> str:

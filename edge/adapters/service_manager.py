@@ -61,6 +61,7 @@ def status_text(
         "armed": status.armed,
         "mode": status.mode,
         "battery": _rounded(status.battery),
+        "endurance_s": _rounded(status.endurance_s),
         "satellites": status.satellites,
         "system_id": status.system_id,
         "autopilot": autopilot,

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from edge.core import F64
+from edge.core.energy import Energy
 from edge.core.mailbox import Neighbour
 from edge.core.mission import (
     AIRBORNE,
@@ -153,7 +154,7 @@ class FlightInputs:
     `policy_velocity_m_s` (2,) is None when the policy has no fresh answer. `closest` is the nearest
     neighbour. `busy_neighbours` say of themselves that they arm or take off. `failed_checks` are
     preflight's; None before the first. `not_taken` is what of the ground's state the robot does not
-    fly by, in words. `order` is new in this tick.
+    fly by, in words. `order` is new in this tick. `energy` is None when the battery is not known.
     """
 
     now_s: float
@@ -170,6 +171,7 @@ class FlightInputs:
     not_taken: tuple[str, ...]
     order: Order | None
     uptime_s: float
+    energy: Energy | None
 
 
 RemoteControlLost = Literal["alarm", "hold", "land"]
@@ -447,7 +449,9 @@ def _battery_critical(t: _Tick) -> str | None:
 
 
 def _battery_low(t: _Tick) -> str | None:
-    return _battery_below(t, t.robot.parameters.battery_low, "low")
+    energy = t.inputs.energy
+    below = _battery_below(t, t.robot.parameters.battery_low, "low")
+    return below or (None if energy is None else energy.shortage())
 
 
 def _battery_below(t: _Tick, share: float, word: str) -> str | None:
@@ -708,8 +712,10 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.HOLD, _S.PILOT), _S.LAND,
                "it hovers for no reason that anybody gave, and nobody answers", _left_alone,
                alarm=True),
-    Transition((_S.MISSION,), _S.RETURN, "the battery is low", _battery_low, alarm=True),
-    Transition((_S.HOLD,), _S.RETURN, "the battery is low, and the ground commands nothing",
+    Transition((_S.MISSION,), _S.RETURN, "the battery is low, or just lasts for the way home",
+               _battery_low, alarm=True),
+    Transition((_S.HOLD,), _S.RETURN,
+               "the same, and the ground commands nothing",
                _battery_low_in_hold, alarm=True),
     Transition((_S.MISSION,), _S.HOLD, "the policy has no fresh answer", _policy_stale,
                alarm=True),

@@ -196,6 +196,8 @@ class RobotStatus:
     long ago the state that it obeys was heard, None if never. `position_quality` is what its
     position is worth, `position_cause` what speaks against it; `gps_accuracy_m` is the receiver's
     own figure. `remote_control` tells whether its pilot's is heard, None where there is none.
+    `battery_lasts_s` is how long it flies until its battery is critical, `home_s` what it needs to
+    be landed with the reserve left, and `endurance_s` what a full battery would last.
 
     What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
     look. Raises ValueError for what must be there and is not finite.
@@ -244,6 +246,9 @@ class RobotStatus:
     position_cause: Cause | None = None
     gps_accuracy_m: float | None = None
     remote_control: bool | None = None
+    battery_lasts_s: float | None = None
+    home_s: float | None = None
+    endurance_s: float | None = None
 
     def __post_init__(self) -> None:
         for name, size in (
@@ -258,6 +263,7 @@ class RobotStatus:
         for name in (
             "uptime_s", "unix_time_s", "slot_height_m", "heading_rad", "battery", "hdop",
             "feature_age_s", "ground_age_s", "gps_accuracy_m",
+            "battery_lasts_s", "home_s", "endurance_s",
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from edge.core.energy import EnergyParameters
 from edge.core.failsafe import required
 from edge.core.flight import FlightParameters, RemoteControlLost, Robot
 from edge.core.frames import ModelScale
@@ -146,6 +147,7 @@ class RobotConfig:
     fence: Fence
     limits: MotionLimits
     failsafe: FailsafeConfig
+    energy: EnergyParameters = field(default_factory=EnergyParameters)
     rates: Rates = field(default_factory=Rates)
     preflight: PreflightLimits = field(default_factory=PreflightLimits)
     position: PositionLimits = field(default_factory=PositionLimits)

@@ -1,11 +1,13 @@
 """One control tick of a robot: what it knows -> flight state -> setpoint and commands."""
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import NamedTuple
 
 import structlog
 
+from edge.core.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.core.flight import Flight, FlightInputs, Robot, failsafe_acts, height_m, step
 from edge.core.guidance import Guidance, MissionSetpoint, guide
 from edge.core.mailbox import Neighbour
@@ -13,7 +15,7 @@ from edge.core.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundS
 from edge.core.ports import Autopilot, Odometry, Recorder, Sensor
 from edge.core.preflight import HeardStatus
 from edge.core.safety import Closest, nearest
-from edge.core.vehicle import Action, Mode, Setpoint
+from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.runtime.inbox import Inbox
 from edge.runtime.navigation import Navigation
 from edge.runtime.pac import Pac
@@ -41,7 +43,8 @@ class FlightControl:
 
     Another thread sets `checks`, `peers` (what the other robots say of themselves), and `world` for
     the `wanted_world_id`, whole. `obeyed_sequence` and `operator` are the last ground state's.
-    `assignment` is what is flown by, `not_taken` what of the ground's state it is not.
+    `assignment` is what is flown by, `not_taken` what of the ground's state it is not. `energy` is
+    how long the battery lasts, and the way home takes.
     """
 
     def __init__(
@@ -54,6 +57,7 @@ class FlightControl:
         pac: Pac,
         inbox: Inbox,
         recorder: Recorder,
+        energy: EnergyParameters,
         unix_clock_s: Callable[[], float],
         started_s: float,
     ) -> None:
@@ -68,6 +72,9 @@ class FlightControl:
         self._guidance = Guidance()
         self._last_tick_s: float | None = None
         self._has_flown = False
+        self._energy_parameters = energy
+        self._consumption = Consumption(energy)
+        self.energy: Energy | None = None
         self.flight = Flight()
         self.alarms: tuple[str, ...] = ()
         self.checks: Checks | None = None
@@ -111,7 +118,9 @@ class FlightControl:
             not_taken=self.not_taken,
             order=self._inbox.order(),
             uptime_s=now_s - self._started_s,
+            energy=self._energy(now_s, vehicle, odometry),
         )
+        self.energy = inputs.energy
         before, robot = self.flight, self.assignment.robot
         decision = step(robot, before, inputs)
         self.flight, self.alarms = decision.flight, decision.alarms
@@ -131,6 +140,11 @@ class FlightControl:
             _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
         self._record(inputs, setpoint, sent, decision.actions)
         return sent is not None and not failsafe_acts(vehicle)
+
+    @property
+    def endurance_s(self) -> float:
+        """How long a full battery lasts, as measured in flight, or else as configured."""
+        return self._consumption.endurance_s
 
     def failed_checks(self, now_s: float) -> tuple[str, ...] | None:
         """What keeps the robot on the ground; None if nobody looked lately. From any thread."""
@@ -244,6 +258,25 @@ class FlightControl:
         # What the robot itself tells of its height.
         height = height_m(self.flight, odometry) or 0.0
         return nearest((*odometry.position_m[:2], height), neighbours)
+
+    def _energy(
+        self, now_s: float, vehicle: VehicleState, odometry: Odometry | None
+    ) -> Energy | None:
+        self._consumption.hear(now_s, vehicle.armed, vehicle.battery, vehicle.voltage_v)
+        robot, way_s = self.assignment.robot, None
+        height = height_m(self.flight, odometry)
+        if odometry is not None and height is not None:
+            parameters, limits = robot.parameters, robot.limits
+            way_s = home_s(
+                self._energy_parameters,
+                away_m=math.dist(odometry.position_m[:2], parameters.landing_point_m),
+                height_m=height,
+                slot=parameters.slot,
+                slot_height_m=parameters.slot_height_m,
+                max_speed_m_s=limits.max_speed_m_s,
+                max_climb_m_s=limits.max_climb_m_s,
+            )
+        return self._consumption.energy(robot.parameters.battery_critical, way_s)
 
     def _record(
         self,

@@ -74,7 +74,7 @@ export class Drawer {
     this.fill("Vehicle", [
       ["mode", s.mode ?? "–"],
       ["armed", yes(s.armed) + (s.in_air ? ", in the air" : "")],
-      ["battery", s.battery === null ? "–" : `${(s.battery * 100).toFixed(0)} %`, battery(s.battery)],
+      ["battery", s.battery === null ? "–" : `${(s.battery * 100).toFixed(0)} %${lasts(s)}`, battery(s.battery)],
       ["GPS", `${number(s.satellites)} satellites, hdop ${number(s.hdop, 1)}, ±${number(s.gps_accuracy_m, 1)} m`],
       ["position is", s.position_quality ?? "–", ["good", null].includes(s.position_quality) ? "" : "bad"],
       ["position", p ? `x ${number(p[0], 2)}  y ${number(p[1], 2)}  z ${number(p[2], 2)} m` : "–"],
@@ -138,6 +138,7 @@ export class Drawer {
   }
 }
 
+const lasts = (s) => (s.battery_lasts_s == null ? "" : `, ${s.battery_lasts_s.toFixed(0)} s`);
 const yes = (value) => (value === null ? "–" : value ? "yes" : "no");
 const byName = (a, b) => a.localeCompare(b, undefined, { numeric: true });
 

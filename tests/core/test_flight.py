@@ -19,6 +19,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.core.energy import Energy
 from edge.core.flight import (
     TRANSITIONS,
     Decision,
@@ -108,6 +109,7 @@ class World:
         self.accuracy_m = 0.9
         self.battery = 0.9
         self.remote_control: bool | None = True
+        self.energy: Energy | None = None
         self.beats: list[tuple[float, Mode, bool, bool, bool]] = []
         self.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0), height_above_home_m=0)
         # The rest of the inputs.
@@ -354,6 +356,7 @@ class World:
             not_taken=self.not_taken,
             order=self.order,
             uptime_s=self.now_s - self.started_s,
+            energy=self.energy,
         )
         before = self.flight
         decision = step(self.robot, before, inputs)
@@ -1067,6 +1070,31 @@ def test_what_px4_warns_of_in_flight_is_an_alarm(world: World) -> None:
     assert world.tick().alarms == ("PX4: failsafe, battery critical: PX4 lands",)
 
 
+def test_a_battery_that_just_lasts_for_the_way_home_returns(world: World) -> None:
+    plenty = Energy(lasts_s=200.0, home_s=150.0, cell_v=3.7, low_cell_v=3.4)
+    for short, said in (
+        (
+            plenty._replace(lasts_s=149.0),
+            "battery lasts 140 s more, home and landing take 150 s",
+        ),
+        (plenty._replace(cell_v=3.31), "battery low under load: 3.31 V per cell"),
+    ):
+        world.energy = plenty
+        world.fly()
+        world.energy = short
+        decision = world.tick()
+        assert world.state() is FlightState.RETURN
+        assert decision.alarms == (said,)
+        world.enable(calm="hold")
+        world.run(1.0)
+        assert world.refuse("start") == "the ground commands hold"
+        world.enable()
+        world.run(0.2)
+        assert world.state() is FlightState.RETURN
+        world.until(FlightState.LANDED, 40.0)
+        world.energy = plenty._replace(home_s=None)
+
+
 def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
     world.fly()
     world.closest = Closest(9, 1.4)
@@ -1738,6 +1766,9 @@ def _surroundings(world: World, draw: random.Random) -> None:
     world.busy = draw.choice(((), (), (5,)))
     world.failed_checks = draw.choice(((), (), None, ("x",)))
     world.battery = draw.choice((0.9, 0.9, 0.2, 0.1))
+    world.energy = draw.choice(
+        (None, Energy(draw.uniform(0, 900), draw.uniform(0, 300), None, 3.4))
+    )
 
 
 def _vehicle(world: World, draw: random.Random) -> None:

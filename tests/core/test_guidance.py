@@ -68,6 +68,7 @@ def inputs(
         not_taken=(),
         order=None,
         uptime_s=50.0,
+        energy=None,
     )
 
 

@@ -31,7 +31,7 @@ from fleet.doctor import (
 from fleet.laptop import iptables_blocks, nft_blocks, rsync_version
 from fleet.operations import Outcome, for_each
 from fleet.release import load_common, make_release
-from fleet.up import bring_up, decide
+from fleet.up import bring_up, decide, packs
 from sim.hosts import RobotHost as Host
 from sim.hosts import RobotHosts
 from tests.conftest import ROOT
@@ -339,6 +339,29 @@ def test_a_robot_that_is_well_may_fly(config: FleetConfig) -> None:
     checks = judged(config)
     assert {check.verdict for check in checks.values()} == {"ok"}
     assert decide(Diagnosis("r1", tuple(checks.values()))) == ("r1", True, ())
+
+
+def test_up_says_how_many_trials_the_packs_are_good_for(config: FleetConfig) -> None:
+    def outcome(name: str, **said: object) -> Outcome[Examination]:
+        examination = well(config, name)
+        facts: dict[str, Any] = copy.deepcopy(dict(examination.facts))
+        facts["service"]["status"] |= said
+        return Outcome(config.robots[name], examination._replace(facts=facts), None)
+
+    full, weak, unknown = packs(
+        config,
+        [
+            outcome("r1", battery=0.95, endurance_s=1000.0),
+            outcome("r2", battery=0.95, endurance_s=400.0),
+            outcome("r3", battery=None, endurance_s=900.0),
+            Outcome(config.robots["r1"], None, "it does not answer"),
+        ],
+        trial_s=60.0,
+    )
+    assert (full.robot, full.share) == ("r1", 0.95)
+    assert full.trials is not None and weak.trials is not None
+    assert 0 < weak.trials < full.trials < 0.7 * 1000.0 / 60.0
+    assert unknown == ("r3", None, 900.0, None)
 
 
 @pytest.mark.parametrize(

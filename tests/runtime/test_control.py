@@ -139,6 +139,7 @@ class Flown:
             pac=self.pac,
             inbox=self.inbox,
             recorder=self,
+            energy=config.energy,
             unix_clock_s=lambda: self.now_s,
             started_s=0.0,
         )

@@ -1,0 +1,180 @@
+"""How long the battery lasts, and how long the way home takes; nothing here has a clock.
+
+A percentage alone does not tell: packs age, and the one whose slot is highest waits longest. The
+consumption of this flight is measured, so that a weak pack shows after a minute.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+# The voltage falls when the motors start, and PX4's estimate of the charge with it.
+_SETTLED_S = 15.0
+# A share comes in whole percents.
+_SAMPLE_S = 5.0
+_SAMPLES = 36
+_LEAST_MEASURED_S = 60.0
+# What is measured may say that a pack is worse than configured, but not that it lasts for ever.
+_AT_LEAST_DRAIN = 0.5
+# One message that is wrong is not believed.
+_MEDIAN_S = 5.0
+# Home is flown at less than full speed: there are corners, neighbours and wind.
+_SPEED_SHARE = 0.7
+# PX4's MPC_LAND_SPEED is 0.7 m/s; and what it takes to find the ground and stop the motors.
+_LANDING_M_S, _TOUCHDOWN_S = 0.5, 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class EnergyParameters:
+    """What a pack is worth; times in s.
+
+    `endurance_s` is a flight with a full pack until it is empty, for as long as none was measured.
+    `cells` in series, 0 if not known: then `low_cell_v`, V per cell under load, is not looked at.
+    `queue_s`: for each lower slot, how long that robot may keep this one from landing. `reserve_s`
+    is left when it has landed.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    endurance_s: float = 900.0
+    cells: int = 0
+    low_cell_v: float = 3.4
+    queue_s: float = 10.0
+    reserve_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 60.0 <= self.endurance_s <= 36_000.0:
+            raise ValueError(f"endurance_s = {self.endurance_s}: must be from 60 to 36000")
+        if not 0 <= self.cells <= 14:
+            raise ValueError(f"cells = {self.cells}: must be from 0 (not known) to 14")
+        if not 2.0 <= self.low_cell_v <= 4.2:
+            raise ValueError(f"low_cell_v = {self.low_cell_v}: must be from 2 to 4.2")
+        for name in ("queue_s", "reserve_s"):
+            if not 0.0 <= getattr(self, name) <= 3600.0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0 to 3600")
+
+
+class Energy(NamedTuple):
+    """What is left, and what is needed.
+
+    `lasts_s` is how long the robot flies until its battery is critical, by this flight's drain.
+    `home_s` is what it takes from here until the vehicle has landed, with the wait before and the
+    reserve after; None where that is not known. `cell_v` is a cell's voltage now, None if not
+    known; `low_cell_v` the limit.
+    """
+
+    lasts_s: float
+    home_s: float | None
+    cell_v: float | None
+    low_cell_v: float
+
+    def shortage(self) -> str | None:
+        """Why the robot must go home, in words; None if it need not."""
+        if self.home_s is not None and self.lasts_s < self.home_s:
+            # In steps, so that the same is told in the same words.
+            lasts_s, needs_s = math.floor(self.lasts_s / 10) * 10, math.ceil(self.home_s / 10) * 10
+            return f"battery lasts {lasts_s} s more, home and landing take {needs_s} s"
+        if self.cell_v is not None and self.cell_v < self.low_cell_v:
+            return f"battery low under load: {self.cell_v:.2f} V per cell"
+        return None
+
+
+class Consumption:
+    """What the battery gives, flight by flight. For one thread."""
+
+    def __init__(self, parameters: EnergyParameters) -> None:
+        self._parameters = parameters
+        self._armed_at_s: float | None = None
+        self._recent: deque[tuple[float, float | None, float | None]] = deque()
+        self._samples: deque[tuple[float, float]] = deque(maxlen=_SAMPLES)
+        self._endurance_s = parameters.endurance_s
+
+    @property
+    def endurance_s(self) -> float:
+        """How long a full pack lasts: by this flight's drain, else the last one's, else as said."""
+        return self._endurance_s
+
+    def hear(
+        self, now_s: float, armed: bool | None, share: float | None, voltage_v: float | None
+    ) -> None:
+        """What the autopilot says now of the battery: its remaining share, and its voltage."""
+        self._recent.append((now_s, share, voltage_v))
+        while now_s - self._recent[0][0] > _MEDIAN_S:
+            self._recent.popleft()
+        if not armed:
+            self._armed_at_s = None
+            self._samples.clear()
+            return
+        self._armed_at_s = now_s if self._armed_at_s is None else self._armed_at_s
+        due_s = self._samples[-1][0] + _SAMPLE_S if self._samples else -math.inf
+        smooth = self._median(1)
+        if smooth is None or now_s - self._armed_at_s < _SETTLED_S or now_s < due_s:
+            return
+        self._samples.append((now_s, smooth))
+        if now_s - self._samples[0][0] >= _LEAST_MEASURED_S:
+            least = _AT_LEAST_DRAIN / self._parameters.endurance_s
+            self._endurance_s = 1.0 / max(_drain(self._samples), least)
+
+    def energy(self, until_share: float, home_s: float | None) -> Energy | None:
+        """The estimate: `until_share` is when the battery is critical. None if nothing is heard."""
+        share, voltage_v = self._median(1), self._median(2)
+        if share is None:
+            return None
+        cells = self._parameters.cells
+        return Energy(
+            lasts_s=max(share - until_share, 0.0) * self._endurance_s,
+            home_s=home_s,
+            cell_v=voltage_v / cells if voltage_v is not None and cells else None,
+            low_cell_v=self._parameters.low_cell_v,
+        )
+
+    def _median(self, field: int) -> float | None:
+        values = [entry[field] for entry in self._recent]
+        known = [value for value in values if value is not None and math.isfinite(value)]
+        # A battery that is silent now is not known, whatever it said before.
+        return float(np.median(known)) if known and values[-1] is not None else None
+
+
+def _drain(samples: deque[tuple[float, float]]) -> float:
+    """Share per s: the median of the slopes between all pairs, which a jump hardly moves."""
+    times_s, shares = np.array(samples).T
+    i, j = np.triu_indices(len(times_s), 1)
+    return float(np.median((shares[i] - shares[j]) / (times_s[j] - times_s[i])))
+
+
+def home_s(
+    parameters: EnergyParameters,
+    *,
+    away_m: float,
+    height_m: float,
+    slot: int,
+    slot_height_m: float,
+    max_speed_m_s: float,
+    max_climb_m_s: float,
+) -> float:
+    """From `away_m` and `height_m` until the robot stands on its landing point, and the reserve."""
+    to_slot_s = abs(slot_height_m - height_m) / max_climb_m_s
+    flight_s = away_m / (_SPEED_SHARE * max_speed_m_s)
+    landing_s = slot_height_m / _LANDING_M_S + _TOUCHDOWN_S
+    queue_s = slot * parameters.queue_s
+    return to_slot_s + flight_s + queue_s + landing_s + parameters.reserve_s
+
+
+def trials(
+    *,
+    share: float,
+    until_share: float,
+    endurance_s: float,
+    trial_s: float,
+    slot_height_m: float,
+    max_climb_m_s: float,
+) -> int:
+    """How many trials a pack is good for, until `until_share` of it is left.
+
+    Each is `trial_s` of mission, a climb to the slot, a wait there for the others, and a landing.
+    """
+    each_s = trial_s + 2.0 * slot_height_m / max_climb_m_s + slot_height_m / _LANDING_M_S
+    return max(int((share - until_share) * endurance_s / (each_s + _TOUCHDOWN_S)), 0)
