@@ -124,7 +124,7 @@ def sim(
         if flown == "px4" and px4 is None:
             raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
         fleet_scenario = FleetScenario(
-            robots=count or _as_many_as_carried(bundle, flown),
+            robots=_as_many_as_carried(bundle, flown) if count is None else count,
             seed=seed,
             duration_s=duration,
             features=world_features,
@@ -260,7 +260,8 @@ def _warn_of_too_many(robots: int, bundle: Path, vehicle: Literal["mavlink", "px
 
 
 def _carries(robots: int) -> str:
-    return f"this machine, as busy as it is now, carries about {robots} robots and their vehicles"
+    count = f"about {robots}" if robots else "less than one"
+    return f"this machine, as busy as it is now, carries {count} of these robots and vehicles"
 
 
 def _launch(
@@ -283,8 +284,7 @@ def _launch(
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
         fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
         prepared()
-        with fleet:
-            flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
+        flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
     if out:
         from sim.fleet_report import write_fleet_flight
 
@@ -318,6 +318,7 @@ def _serve(
             with fleet:
                 while not fleet.operator.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
                     fleet.require_running()
+                    fleet.vehicles.require_running()
                     show("programs start", fleet.operator.statuses())
                 fleet.begin()
                 typer.echo(
@@ -340,12 +341,13 @@ def _watch_over(
 ) -> None:
     """Say once that this machine does not keep up, and of each robot that its program has ended.
 
-    Raises FleetError if all have.
+    Raises FleetError if all have, VehicleError if a vehicle has ended.
     """
     from sim.fleet import FleetError, OverloadError
 
     running, keeps_up = list(fleet.robots), True
     while running:
+        fleet.vehicles.require_running()
         try:
             fleet.require_keeping_up()
         except OverloadError as error:

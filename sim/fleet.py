@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -34,9 +35,11 @@ from sim.px4_build import Px4Build
 MAX_ROBOTS = 20
 MIN_APART_M = 3.0
 STOP_WITHIN_S = 3.0
-# What robots say of themselves follows from the machine once it is so far behind real time.
-DOUBTFUL_S = 1.0
+# Once a machine fell so far behind real time within a while, what robots say of themselves follows
+# from that; and then a flight is over.
+DOUBTFUL_S = 1.5
 OVERLOADED_S = 5.0
+_WHILE_S = 20.0
 
 # The field is the policy's world; its y axis does not point north, so that mistakes show.
 WORLD = WorldOrigin()
@@ -101,8 +104,8 @@ class OverloadError(RuntimeError):
     def __init__(self, lateness: Lateness, robots: int) -> None:
         advice = f"fly fewer: -n {robots // 2}" if robots > 1 else "end what else runs on it"
         super().__init__(
-            f"this machine does not keep up with {robots} robots: the vehicles are "
-            f"{lateness.vehicles_s:.1f} s behind real time, the robots left out "
+            f"this machine does not keep up with {robots} robots: within {_WHILE_S:g} s the "
+            f"vehicles fell {lateness.vehicles_s:.1f} s behind real time, the robots left out "
             f"{lateness.robots_s:.1f} s of control; {advice}"
         )
 
@@ -270,6 +273,7 @@ class Fleet:
             fleet=self.name, connect=self.endpoints, say=self.say_unless_behind
         )
         self._late_before = Lateness(0.0, 0.0)
+        self._latenesses = deque([(-math.inf, self._late_before)])
         self._stack = ExitStack()
         self._write_files()
 
@@ -303,6 +307,7 @@ class Fleet:
     def begin(self) -> None:
         """All programs run: from now on this machine has to keep up."""
         self._late_before = self._lateness()
+        self._latenesses = deque([(time.monotonic(), Lateness(0.0, 0.0))])
 
     def lateness(self) -> "Lateness":
         """How far this machine fell behind since `begin`."""
@@ -311,9 +316,9 @@ class Fleet:
 
     def require_keeping_up(self) -> None:
         """Raises OverloadError if this machine is too far behind."""
-        lateness = self.lateness()
-        if max(lateness) > OVERLOADED_S:
-            raise OverloadError(lateness, self.scenario.robots)
+        recent = self._recent_lateness()
+        if max(recent) > OVERLOADED_S:
+            raise OverloadError(recent, self.scenario.robots)
 
     def _lateness(self) -> "Lateness":
         control_s = 1.0 / Rates().control_hz
@@ -326,8 +331,17 @@ class Fleet:
 
     def say_unless_behind(self, text: str) -> None:
         """Say what robots do; nothing once it follows from a machine that is behind."""
-        if max(self.lateness()) < DOUBTFUL_S:
+        if max(self._recent_lateness()) < DOUBTFUL_S:
             self._say(text)
+
+    def _recent_lateness(self) -> "Lateness":
+        """How far this machine fell behind lately."""
+        now_s, now = time.monotonic(), self.lateness()
+        self._latenesses.append((now_s, now))
+        while self._latenesses[0][0] < now_s - _WHILE_S:
+            self._latenesses.popleft()
+        before = self._latenesses[0][1]
+        return Lateness(now.vehicles_s - before.vehicles_s, now.robots_s - before.robots_s)
 
     def forget(self) -> None:
         """Keep nothing of the past, which only grows, and which a flight's figures alone need."""

@@ -17,7 +17,7 @@ from edge.core.safety import Fence
 from edge.core.world import rasterize
 from sim.experiment import FIELD_SCALE
 from sim.fleet import ORIGIN, Fleet, FleetScenario, Lateness, OverloadError, Usage, process_usage
-from sim.fleet_vehicles import Track
+from sim.fleet_vehicles import Track, VehicleError
 from sim.operator import Heard, Say, Script, ScriptError
 
 COST_PERIOD_S = 1.0
@@ -102,8 +102,11 @@ class FleetFlight:
 
     @property
     def any_took_off(self) -> bool:
-        """Whether a robot says that it was in the air, or was."""
-        return any(robot.in_air.any() or robot.truth.airborne.any() for robot in self.robots)
+        """Whether a vehicle was in the air; where that is not known, whether its robot says so."""
+        return any(
+            (robot.truth.airborne if len(robot.truth.time_s) else robot.in_air).any()
+            for robot in self.robots
+        )
 
     @property
     def flew_mission(self) -> bool:
@@ -178,10 +181,11 @@ class FleetFlight:
 def fly(
     fleet: Fleet, say: Say = lambda _: None, watch: Callable[[str], None] = lambda _: None
 ) -> FleetFlight:
-    """Fly the script with a fleet that runs; `watch` gets the step's name, some times a second.
+    """Run a fleet and fly the script; `watch` gets the step's name, some times a second.
 
-    Ctrl-C lands all, and so does a machine that does not keep up. Raises FleetError if a robot's
-    program ends before all are heard.
+    Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
+    FleetError if a robot's program ends before all are heard; OSError, LinkError or VehicleError
+    if something cannot start.
     """
     scenario, operator = fleet.scenario, fleet.operator
     script = Script(
@@ -198,19 +202,24 @@ def fly(
                 fleet.begin()
             say("landing all robots where they are" if step == "land" else step)
             moments[step] = _Moment.of(fleet)
+        if step != "land":
+            fleet.vehicles.require_running()
         if step not in ("assemble", "land"):
             fleet.require_keeping_up()
         watch(step)
 
     problem, overloaded = None, False
-    try:
-        script.fly(look)
-    except (ScriptError, OverloadError) as error:
-        problem, overloaded = str(error), isinstance(error, OverloadError)
-    except KeyboardInterrupt:
-        problem = "stopped by Ctrl-C"
-    moments["end"] = _Moment.of(fleet)
-    return _record(fleet, script, moments, problem, overloaded)
+    with fleet:
+        try:
+            script.fly(look)
+        except (ScriptError, OverloadError, VehicleError) as error:
+            problem, overloaded = str(error), isinstance(error, OverloadError)
+        except KeyboardInterrupt:
+            problem = "stopped by Ctrl-C"
+        moments["end"] = _Moment.of(fleet)
+        lateness = fleet.lateness()
+    # The vehicles' own logs are whole once they have ended.
+    return _record(fleet, script, moments, problem, lateness, overloaded)
 
 
 class _Moment(NamedTuple):
@@ -240,6 +249,7 @@ def _record(
     script: Script,
     moments: Mapping[str, _Moment],
     problem: str | None,
+    lateness: Lateness,
     overloaded: bool,
 ) -> FleetFlight:
     scenario, manifest = fleet.scenario, fleet.bundle.manifest
@@ -297,7 +307,7 @@ def _record(
             _share(first, last, first.launcher, last.launcher),
             moments["end"].launcher.peak_memory_mb,
         ),
-        lateness=fleet.lateness(),
+        lateness=lateness,
         overloaded=overloaded,
     )
 

@@ -24,6 +24,10 @@ class Autopilot(NamedTuple):
     system_id: int
 
 
+class VehicleError(ValueError):
+    """A vehicle cannot start, or has ended; the text says which, why, and what to do."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """Where one vehicle really was: `time_s` (T,), ascending, is `time.monotonic()`.
@@ -49,6 +53,9 @@ class Vehicles(Protocol):
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None: ...
+
+    def require_running(self) -> None:
+        """Raises VehicleError if one has ended."""
 
     def tracks(self) -> tuple[Track, ...]:
         """What they did so far, each."""
@@ -98,6 +105,9 @@ class SimulatedVehicles:
         traceback: TracebackType | None,
     ) -> None:
         self._server.__exit__(kind, error, traceback)
+
+    def require_running(self) -> None:
+        """They end with this process."""
 
     def tracks(self) -> tuple[Track, ...]:
         """All of the same times."""

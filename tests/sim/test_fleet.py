@@ -167,10 +167,10 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
 
 
 @contextmanager
-def launched(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """`lpac sim --vehicle mavlink` in the background."""
+def launched(*arguments: object, vehicle: str = "mavlink") -> Iterator[subprocess.Popen[str]]:
+    """`lpac sim --vehicle ...` in the background."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "sim", "--vehicle", "mavlink", *map(str, arguments)],
+        [sys.executable, "-m", "cli.main", "sim", "--vehicle", vehicle, *map(str, arguments)],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "1000", "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
@@ -219,7 +219,7 @@ def test_without_the_script_it_waits_for_a_ground(tmp_path: Path) -> None:
             # It only listens: nobody commands.
             assert {operator.history(robot)[-1].status.operator for robot in (0, 1)} == {""}
             assert len(list((out / "robots" / "1" / "logs").glob("*.mcap"))) == 1
-            os.kill(pid_of_robot(out / "robots" / "1"), signal.SIGKILL)
+            os.kill(pid_of(str(out / "robots" / "1" / "robot.toml")), signal.SIGKILL)
             read_until(process.stderr, r"the program of r1 has ended, by SIGKILL$")
             assert operator.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
             process.send_signal(signal.SIGINT)
@@ -227,13 +227,12 @@ def test_without_the_script_it_waits_for_a_ground(tmp_path: Path) -> None:
             assert operator.wait_for(lambda statuses: not statuses, 60.0)
 
 
-def pid_of_robot(folder: Path) -> int:
-    """The process that runs with the folder's robot.toml."""
-    config = str(folder / "robot.toml").encode()
+def pid_of(arguments: str) -> int:
+    """The process that has these arguments, with a NUL between each two."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):  # It may end meanwhile.
-            found += [int(path.parent.name)] if config in path.read_bytes() else []
+            found += [int(path.parent.name)] if arguments.encode() in path.read_bytes() else []
     (pid,) = found
     return pid
 

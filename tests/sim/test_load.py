@@ -41,7 +41,11 @@ def test_who_asks_for_more_is_warned(
     assert capsys.readouterr().err == ""
     _warn_of_too_many(6, SHIPPED, "mavlink")
     (line,) = capsys.readouterr().err.splitlines()
-    assert "carries about 5 robots" in line and "not 6" in line and line.endswith("fewer: -n 5")
+    assert (
+        "carries about 5 of these robots" in line
+        and "not 6" in line
+        and line.endswith("fewer: -n 5")
+    )
 
 
 @pytest.mark.parametrize("in_the_air", [False, True])
@@ -64,15 +68,13 @@ def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
         return behind_s
 
     monkeypatch.setattr(fleet.simulated, "lost_s", lost_s)
-    with fleet:
-        flight = fly(fleet, said.append)
-        # What robots refuse meanwhile follows from it, and is not said.
-        refused = fleet.operator.result(fleet.operator.order("start", 0), 60.0)
-        assert refused is not None and not refused.accepted
+    flight = fly(fleet, said.append)
+    # What robots refuse follows from it, and is not said.
+    fleet.say_unless_behind("robot 0 refuses takeoff")
     assert flight.problem is not None and flight.overloaded
     lines = summary_lines(flight)
     assert lines[1:] == [f"PROBLEM: {flight.problem}"]
-    assert "the vehicles are 6.0 s behind real time" in lines[1] and lines[1].endswith("-n 1")
+    assert "the vehicles fell 6.0 s behind real time" in lines[1] and lines[1].endswith("-n 1")
     steps = ["assemble", "preflight"]
     if in_the_air:
         assert said == [*steps, "takeoff", "landing all robots where they are"]
