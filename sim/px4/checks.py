@@ -117,6 +117,7 @@ GPS_FIX_TOO_LOW = Problem(
     12369553, Component.GPS, Level.WARNING, told_modes=_LOCAL | _GLOBAL,
     text="Preflight: GPS fix too low", text_level=Level.WARNING,
 )  # fmt: skip
+FENCE_BREACHED = Problem(143019, Component.SYSTEM, _ERROR, _ALL)
 NO_GROUND_STATION = Problem(6801787, Component.COMMUNICATION_LINKS, _INFO)
 GROUND_STATION_REQUIRED = replace(
     NO_GROUND_STATION,
@@ -205,13 +206,13 @@ class Reporter:
     SYS_STATUS tells of the `published` report; there is none in the first seconds.
     """
 
-    _INTERVAL_S = 2.0
+    _INTERVAL_S, _FIRST_S = 2.0, 2.1
 
     def __init__(self) -> None:
         self.published: Report | None = None
         self.newest = Report()
         self._reported = Report()
-        self._reported_at_s = 0.0
+        self._reported_at_s = self._FIRST_S - self._INTERVAL_S
 
     def update(self, report: Report, now_s: float, *, asked: bool = False) -> list[Event]:
         """Take in the checks of now; returns what PX4 tells about them."""

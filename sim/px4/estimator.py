@@ -11,10 +11,11 @@ from edge.core import F64
 
 NOISE_M = np.array([0.15, 0.15, 0.1])
 NOISE_TIME_S = 10.0
-# After the start: when the origin is chosen, and how long before the position is good the attitude
-# is, and GPS is used.
+# After the start: when the origin is chosen and the attitude found; how long before the position is
+# good the attitude is trusted, and GPS is used.
 ORIGIN_AFTER_S = 0.64
-ATTITUDE_BEFORE_READY_S = 2.1
+ALIGNED_AFTER_S = 2.0
+ATTITUDE_BEFORE_READY_S = 2.0
 FUSION_BEFORE_READY_S = 1.05
 # For so long the estimator vouches for a position that no GPS holds, and for so long it goes on
 # waiting for the GPS. One that comes back after that is used again `GPS_REGAIN_S` later.
@@ -48,6 +49,11 @@ class Estimator:
         return self._time_s >= min(ORIGIN_AFTER_S, self._ready_after_s)
 
     @property
+    def is_aligned(self) -> bool:
+        """Whether it has found its attitude; it is trusted a little later."""
+        return self._time_s >= min(ALIGNED_AFTER_S, self._ready_after_s)
+
+    @property
     def has_attitude(self) -> bool:
         """Whether the attitude is known."""
         return self._time_s >= self._ready_after_s - ATTITUDE_BEFORE_READY_S
@@ -75,12 +81,17 @@ class Estimator:
     @property
     def accuracy_m(self) -> tuple[float, float]:
         """What it takes its own errors for, horizontally and vertically."""
-        if not self.has_attitude:
+        if not self.is_aligned:
             return 14.1, 1.8
         if not self.has_used_gps:
             return 0.02, 0.08
         without_gps_s = max(0.0, self._time_s - self._gps_lost_since_s)
         return 0.29 + 0.06 * without_gps_s**2, 0.04
+
+    @property
+    def doubts_gps(self) -> bool:
+        """Whether GPS is back, but not believed yet."""
+        return self.has_gps and self._time_s < self._gps_back_at_s
 
     @property
     def uses_gps(self) -> bool:

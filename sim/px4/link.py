@@ -125,6 +125,7 @@ class Px4Link:
         self._text_id = 0
         self._event_sequence = 0xFFF5
         self._told: deque[_EventMessage] = deque(maxlen=EVENTS_KEPT)
+        self._gps_told_at_s = -math.inf
         self._origin_told: tuple[float, float, float] | None = None
         # Message id -> builder; PX4's default rates on the onboard link, Hz.
         streams: dict[int, tuple[float, Callable[[], Any]]] = {
@@ -344,10 +345,12 @@ class Px4Link:
     def _estimator_status(self) -> Any:
         estimator = self.vehicle.estimator
         flags = _FLAGS_AT_START
-        if estimator.has_attitude:
+        if estimator.is_aligned:
             flags |= mavlink.ESTIMATOR_ATTITUDE | mavlink.ESTIMATOR_POS_VERT_AGL
         if not self.vehicle.at_rest:
             flags &= ~mavlink.ESTIMATOR_CONST_POS_MODE
+        if estimator.doubts_gps:
+            flags |= mavlink.ESTIMATOR_GPS_GLITCH
         if estimator.uses_gps:
             flags |= _FLAGS_WITH_GPS
             if estimator.is_held:
@@ -357,6 +360,8 @@ class Px4Link:
         )
 
     def _battery_status(self) -> Any:
+        if Sensor.BATTERY in self.vehicle.dead_sensors:
+            return None
         cell_mv = self._battery_mv() // 4
         return mavlink.MAVLink_battery_status_message(
             0,
@@ -391,12 +396,16 @@ class Px4Link:
 
     def _gps_raw_int(self) -> Any:
         vehicle = self.vehicle
-        if vehicle.silent_s(Sensor.GPS) > GPS_SILENT_S:
+        if vehicle.silent_s(Sensor.GPS) >= 0.0:
+            if vehicle.time_s - self._gps_told_at_s <= GPS_SILENT_S:
+                return None
             # No driver: nothing is known, not even an accuracy.
+            self._gps_told_at_s = vehicle.time_s
             unknown = 0xFFFF
             return mavlink.MAVLink_gps_raw_int_message(
                 0, 0, 0, 0, 0, unknown, unknown, unknown, unknown, 0xFF
             )
+        self._gps_told_at_s = vehicle.time_s
         speed_cm_s = round(100.0 * math.hypot(vehicle.velocity_m_s[0], vehicle.velocity_m_s[1]))
         place = _as_integers(vehicle.global_position)
         if vehicle.gps_lost:
@@ -528,7 +537,8 @@ class Px4Link:
 
     def _on_request_event(self, message: Any) -> None:
         """Send again what was missed; of what is too long ago nothing is said."""
-        first, last = struct.unpack_from("<HH", bytes(message.data).ljust(4, b"\0"))
+        frame = bytes(message.data)
+        first, last = struct.unpack("<HH", frame[10 : 10 + frame[1]].ljust(4, b"\0")[:4])
         for told in self._told:
             if (told.sequence - first) % 0x10000 <= (last - first) % 0x10000:
                 self._send(told)

@@ -69,6 +69,7 @@ class Cause(Enum):
     MANUAL_CONTROL_LOST = "manual control lost"
     GROUND_STATION_LOST = "ground station lost"
     BATTERY = "battery"
+    BATTERY_SILENT = "battery silent"
     GEOFENCE = "geofence"
     POSITION_LOST = "position lost"
 

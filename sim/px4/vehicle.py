@@ -48,7 +48,7 @@ SENSOR_TIMEOUT_S = 1.0
 BATTERY_TIMEOUT_S = 5.0
 # After disarming: the log ends, and the estimator finds that nothing moves. After arming: it finds
 # that something does.
-LOG_ENDS_S = 3.6
+LOG_ENDS_S = 3.4
 AT_REST_AFTER_S = 2.3
 MOVES_AFTER_S = 0.5
 VERTICAL_DRIFT_M_S = 0.04
@@ -104,8 +104,13 @@ _BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
 _ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
 _TAKEOFF_DETECTED, _LANDING_DETECTED, _LANDING_ORDERED = 4277609, 9844908, 3322590
 _FUSION_STOPPED, _FUSION_STARTED = 14699175, 15292483
-_FAILSAFE, _FAILSAFE_HOLDS, _POSITION_FAILSAFE = 9751178, 13704694, 12770418
-_FAILSAFE_WARNS, _TAKEN_OVER = 8557551, 961599
+# Each with a cause, and without.
+_FAILSAFE_ACTS, _FAILSAFE_HOLDS, _FAILSAFE_WARNS = (
+    (9751178, 14605264),
+    (13704694, 4502496),
+    (8557551, 13277401),
+)
+_POSITION_FAILSAFE, _TAKEN_OVER = 12770418, 961599
 _BATTERY_WARNINGS = {2: 12216659, 3: 2474944, 4: 51327}
 # PX4's numbers of actions and causes, in events.
 _ACTIONS = {
@@ -174,13 +179,13 @@ class Px4Vehicle:
         self.time_s = 0.0
         self.position_m: F64 = np.array([*start_m, 0.0])
         self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
-        self.heading_rad = heading_rad
-        self.yaw_rate_rad_s = 0.0
+        self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0
 
         self.wind_m_s: F64 = np.zeros(3)
         self.gust_m_s = 0.0
         self._gust = self._compensated_wind = np.zeros(3)
         self.battery_remaining = 1.0
+        self._battery_warning = 1
 
         self.gps_lost = False
         self.dead_sensors: set[Sensor] = set()
@@ -327,8 +332,6 @@ class Px4Vehicle:
         self.failsafe.reset()
         self._set_intended_mode(self._mode_after_disarm)
         self.mode = self.intended_mode
-        if not self.position_valid:
-            self.home_m = None
         self._say(_DISARMED_BY, Level.INFO, "Disarmed\t", bytes([reason]))
         return Result.ACCEPTED
 
@@ -445,6 +448,8 @@ class Px4Vehicle:
     def _run_checks(self, *, asked: bool = False) -> None:
         self._checked_at_s = self.time_s
         self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
+        if not self.armed and not self.estimator.has_gps and not self.position_valid:
+            self.home_m = None
         uses_gps = self.estimator.uses_gps
         if self.armed and uses_gps is not self._fusion_told:
             number = _FUSION_STARTED if uses_gps else _FUSION_STOPPED
@@ -477,6 +482,10 @@ class Px4Vehicle:
             is_there.add(Component.COMMUNICATION_LINKS)
         disabled = int(parameters["COM_RC_IN_MODE"]) == 4
         required = int(parameters["NAV_DLL_ACT"]) > 0
+        # In flight a battery does not get better.
+        self._battery_warning = max(
+            self.battery_warning, self._battery_warning if self.armed else 1
+        )
         battery = (None, checks.BATTERY_LOW, checks.BATTERY_CRITICAL, checks.BATTERY_EMERGENCY)
         found = (
             (self.silent_s(Sensor.BAROMETER) > SENSOR_TIMEOUT_S, checks.NO_BAROMETER),
@@ -493,8 +502,9 @@ class Px4Vehicle:
                 not self.rc_connected,
                 checks.MANUAL_CONTROL_DISABLED if disabled else checks.NO_MANUAL_CONTROL,
             ),
-            (True, battery[self.battery_warning - 1]),
+            (True, battery[self._battery_warning - 1]),
             (self.silent_s(Sensor.BATTERY) > BATTERY_TIMEOUT_S, checks.BATTERY_SILENT),
+            (parameters["GF_ACTION"] > 0 and self._is_outside_fence(), checks.FENCE_BREACHED),
             (
                 self._ground_station_lost(),
                 checks.GROUND_STATION_REQUIRED if required else checks.NO_GROUND_STATION,
@@ -530,6 +540,7 @@ class Px4Vehicle:
             Cause.MANUAL_CONTROL_LOST: self._on_manual_control_loss(),
             Cause.GROUND_STATION_LOST: self._on_ground_station_loss(),
             Cause.BATTERY: self._on_battery(),
+            Cause.BATTERY_SILENT: self._on_silent_battery(),
             Cause.GEOFENCE: self._on_geofence(),
             Cause.POSITION_LOST: self._on_position_loss(),
         }
@@ -550,28 +561,26 @@ class Px4Vehicle:
         self._enter(ACTION_MODES.get(action, self.intended_mode))
 
     def _tell_failsafe(self, cause: Cause, wanted: Action, action: Action) -> None:
+        self._run_checks()
         self._events += self._reporter.before_failsafe(self.time_s)
         main, sub = CUSTOM_MODES[self.intended_mode]
         mode = struct.pack("<I", main << 16 | sub << 24)
-        told_cause = bytes(
-            [_CAUSES.get(cause, self.battery_warning + 1 if cause is Cause.BATTERY else 0)]
-        )
-        if action is Action.WARN:
-            if cause is Cause.BATTERY:
-                level = Level.WARNING if self.battery_warning == 2 else Level.CRITICAL
-                self._say(_BATTERY_WARNINGS[self.battery_warning], level)
-            else:
-                self._say(_FAILSAFE_WARNS, Level.WARNING, arguments=mode + told_cause)
-            return
-        if action is Action.HOLD and wanted is not Action.HOLD:
+        told = self.battery_warning + 1 if cause is Cause.BATTERY else _CAUSES.get(cause, 0)
+        generic, told_cause = not told, bytes([told] if told else [])
+        if action is Action.WARN and cause is Cause.BATTERY:
+            level = Level.WARNING if self.battery_warning == 2 else Level.CRITICAL
+            self._say(_BATTERY_WARNINGS[self.battery_warning], level)
+        elif action is Action.WARN:
+            self._say(_FAILSAFE_WARNS[generic], Level.WARNING, arguments=mode + told_cause)
+        elif action is Action.HOLD and wanted is not Action.HOLD:
             wait_s = round(self.parameters["COM_FAIL_ACT_T"])
             text = f"Failsafe activated: entering Hold for {wait_s} seconds\t"
             arguments = mode + struct.pack("<BH", _ACTIONS[wanted], wait_s) + told_cause
-            self._say(_FAILSAFE_HOLDS, Level.CRITICAL, text, arguments)
-            return
-        number = _POSITION_FAILSAFE if action is Action.DESCEND else _FAILSAFE
-        arguments = mode + bytes([_ACTIONS[action]]) + told_cause
-        self._say(number, Level.CRITICAL, "Failsafe activated\t", arguments)
+            self._say(_FAILSAFE_HOLDS[generic], Level.CRITICAL, text, arguments)
+        else:
+            number = _FAILSAFE_ACTS[generic] if action is not Action.DESCEND else _POSITION_FAILSAFE
+            arguments = mode + bytes([_ACTIONS[action]]) + told_cause
+            self._say(number, Level.CRITICAL, "Failsafe activated\t", arguments)
 
     def _on_offboard_loss(self) -> Action:
         if self.intended_mode is not Mode.OFFBOARD or self._offboard_signal():
@@ -608,6 +617,10 @@ class Px4Vehicle:
         if warning == 2 or setting not in (2, 3):
             return Action.WARN
         return Action.RETURN if setting == 3 and warning == 3 else Action.LAND
+
+    def _on_silent_battery(self) -> Action:
+        is_silent = self.silent_s(Sensor.BATTERY) > BATTERY_TIMEOUT_S
+        return Action.WARN if is_silent else Action.NONE
 
     def _on_geofence(self) -> Action:
         """A breach acts until another mode is asked for; then not until the next breach."""

@@ -143,7 +143,7 @@ def test_arming_is_denied_with_a_reason(
 def test_a_low_battery_is_told_but_does_not_keep_from_arming() -> None:
     vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
     vehicle.battery_remaining = 0.12
-    run(vehicle, 2.1)
+    run(vehicle, 2.5)
     assert vehicle.health is not None and Component.BATTERY in vehicle.health.unhealthy
     assert "Low battery" in texts(vehicle)
     assert vehicle.arm() is Result.ACCEPTED
