@@ -61,6 +61,7 @@ def doctor(
     else:
         _print_board(diagnoses)
         _print_findings(diagnoses)
+        _print_free_ground(config)
     _require_none_failed(diagnoses)
 
 
@@ -108,6 +109,12 @@ def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
                 also = f"   (and so on {', '.join([*fixes][1:])})" if others else ""
                 notes.append(("", f"  → {first}{also}"))
     print_notes(notes)
+
+
+def _print_free_ground(config: "FleetConfig") -> None:
+    margin = config.free_ground()
+    if margin is not None:
+        typer.echo(f"\nkeep free: the fence and {margin.least_m:g} m around it ({margin.why})")
 
 
 def _described(diagnoses: "Sequence[Diagnosis]") -> dict[str, Any]:
@@ -172,6 +179,7 @@ def up(
     else:
         _print_board(diagnoses)
         _print_findings(diagnoses)
+        _print_free_ground(config)
         _print_decisions(decisions, batteries)
         typer.echo(f"trials: of {trial:g} s, before the battery is low; --trial for others")
     no_go = [decision.robot for decision in decisions if not decision.go]
@@ -263,5 +271,11 @@ def _way(found: "Mapping[str, Any] | None") -> "str | Text":
 
 
 def _echo(config: "FleetConfig", robots: dict[str, Any]) -> None:
-    ok = all(described["ok"] for described in robots.values())
-    typer.echo(json.dumps({"fleet": config.fleet, "ok": ok, "robots": robots}, indent=2))
+    margin = config.free_ground()
+    described = {
+        "fleet": config.fleet,
+        "ok": all(described["ok"] for described in robots.values()),
+        "free_ground_m": None if margin is None else margin.least_m,
+        "robots": robots,
+    }
+    typer.echo(json.dumps(described, indent=2))

@@ -141,6 +141,7 @@ def load_setup(path: Path, operator: str) -> "GroundConfig":
             norm=training.idf_norm,
             base_height_m=robot.flight.base_height_m,
             slot_spacing_m=robot.flight.slot_spacing_m,
+            errors=robot.errors,
             battery_critical=robot.flight.battery_critical,
             ground_timeout_s=robot.flight.ground_timeout_s,
             ground_lost_land_s=robot.flight.ground_lost_land_s,

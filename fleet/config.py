@@ -21,13 +21,12 @@ from typing import Any
 import tomlkit
 from tomlkit.items import InlineTable
 
+from edge.core.margins import Margin, places_apart
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.wire import MAX_ROBOT_ID
 from edge.runtime.config import AutopilotConfig, RobotConfig
 
 DEFAULT_DIRECTORY = "/opt/lpac"
-MIN_APART_M = 2.0
-_ROUNDING_M = 1e-6
 _MAX_CPU = 1023
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,31}")
@@ -140,6 +139,15 @@ class FleetConfig:
     def slot_of(self, name: str) -> Slot | None:
         """The robot's slot; None for a spare."""
         return next((slot for slot in self.slots if slot.robot == name), None)
+
+    def free_ground(self) -> Margin | None:
+        """How far around the fence nobody may be, whatever fails; None if no robot flies.
+
+        The greatest of all robots' margins, each from its own fence.
+        """
+        flying = [(i, self.robots[s.robot]) for i, s in enumerate(self.slots) if s.robot]
+        margins = [_robot_config(self, robot, i).free_ground for i, robot in flying]
+        return max(margins, default=None)
 
     def robot_toml(self, name: str) -> str:
         """The text of the robot's robot.toml, with the paths that its release has in the sandbox.
@@ -577,21 +585,25 @@ def _check_flights(config: FleetConfig) -> None:
                 f"buffer_m = {fence.buffer_m:g} from its line"
             )
         for j, (other, its) in enumerate(zip(config.slots[:i], flights[:i], strict=True)):
-            separation_m = max(flight.flight.min_separation_m, its.flight.min_separation_m)
             beside = f"slots[{j}]{_sitting(other)}"
-            for name in ("pad_m", "landing_point_m"):
-                apart_m = math.dist(getattr(slot, name), getattr(other, name))
-                least_m = max(MIN_APART_M, separation_m)
-                if not apart_m >= least_m - _ROUNDING_M:
+            separation_m = max(flight.flight.min_separation_m, its.flight.min_separation_m)
+            places = places_apart(flight.errors.position_m, its.errors.position_m)
+            places = places.or_at_least(separation_m, "min_separation_m")
+            # Who does not take off stands on his pad while the others land.
+            for name, beside_name in itertools.product(("pad_m", "landing_point_m"), repeat=2):
+                apart_m = math.dist(getattr(slot, name), getattr(other, beside_name))
+                if not places.holds(apart_m):
                     raise ConfigError(
                         f"{where}: {name} = {list(getattr(slot, name))}: is {apart_m:.1f} m from "
-                        f"that of {beside}, must be {least_m:g} m"
+                        f"{beside_name} of {beside}, {places}"
                     )
+            heights = max(flight.errors.slot_spacing, its.errors.slot_spacing)
+            heights = heights.or_at_least(separation_m, "min_separation_m")
             apart_m = abs(flight.flight.slot_height_m - its.flight.slot_height_m)
-            if not apart_m >= separation_m - _ROUNDING_M:
+            if not heights.holds(apart_m):
                 raise ConfigError(
                     f"{where}: height = {slot.height}: is {flight.flight.slot_height_m:g} m, "
-                    f"{apart_m:.1f} m from that of {beside}, must be {separation_m:g} m"
+                    f"{apart_m:.1f} m from that of {beside}, {heights}"
                 )
 
 

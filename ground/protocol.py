@@ -17,6 +17,7 @@ import re
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
+from edge.core.margins import ErrorBudget
 from edge.core.mission import GroundState, Origin, Place, RobotStatus
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
@@ -233,8 +234,9 @@ class Setup:
     on; its sensor sees `sensor_size` cells. `world` is the text of the robots' world file, called
     `world_id`; "" if it is not known here. `truncation` and `norm` are what `rasterize` needs for
     it. `fence` is the configured one. A slot's height is `base_height_m` + its number x
-    `slot_spacing_m`. Robots land at once with a battery of `battery_critical`, hold when they have
-    heard no ground for `ground_timeout_s`, and land `ground_lost_land_s` later.
+    `slot_spacing_m`; how far places must be apart follows from `errors`. Robots land at once with a
+    battery of `battery_critical`, hold when they have heard no ground for `ground_timeout_s`, and
+    land `ground_lost_land_s` later.
     """
 
     fleet: str
@@ -251,8 +253,9 @@ class Setup:
     env_scale: float
     truncation: float
     norm: float
-    base_height_m: float = 4.0
-    slot_spacing_m: float = 2.0
+    base_height_m: float = 5.0
+    slot_spacing_m: float = 4.0
+    errors: ErrorBudget = field(default_factory=ErrorBudget)
     battery_critical: float = 0.15
     ground_timeout_s: float = 3.0
     ground_lost_land_s: float = 10.0

@@ -4,6 +4,7 @@ A site is `sites/NAME.toml` beside fleet.toml, in the mission frame, m. Who stan
 from what robots say of themselves, averaged over their statuses.
 """
 
+import itertools
 import math
 import os
 import re
@@ -15,6 +16,7 @@ from typing import NamedTuple
 
 from geographiclib.geodesic import Geodesic
 
+from edge.core.margins import ErrorBudget, places_apart
 from edge.core.mission import GroundState, Origin, Place, RobotStatus
 from edge.core.safety import Fence
 from edge.core.schema import ConfigError, from_mapping
@@ -23,7 +25,7 @@ from ground.protocol import Picture, Setup
 # Beyond these a robot does not stand still, or does not know where it is.
 MAX_SPREAD_M = 2.0
 MAX_HEADING_SPREAD_DEG = 10.0
-# Closer together, two robots give no heading: pads are no closer either.
+# Closer together, two robots give no heading.
 MIN_BASELINE_M = 2.0
 # Who is further from the mission's origin is not where the mission is.
 FAR_M = 500.0
@@ -265,7 +267,8 @@ def assign_places(
 ) -> tuple[dict[str, OnPad], dict[str, Place]]:
     """`assign` to the slots' pads, and the places that follow.
 
-    Raises ValueError, too, if a robot stands at the pad of one that is left out.
+    Raises ValueError, too, if a robot stands at the pad of one that is left out, or the places are
+    too close to each other.
     """
     assigned = assign(places_m, {slot.height: (slot.pad_m[0], slot.pad_m[1]) for slot in slots})
     owners = {slot.place.slot: slot.robot for slot in setup.slots if slot.robot}
@@ -275,19 +278,22 @@ def assign_places(
             raise ValueError(
                 f"{robot} stands at pad {on_pad.height}, which {owner} has: assign both at once"
             )
-    landing_m = {slot.height: slot.landing_point_m for slot in slots}
+    by_height = {slot.height: slot for slot in slots}
+    its = {robot: by_height[on_pad.height] for robot, on_pad in assigned.items()}
+    require_apart(its.values(), setup.errors)
     return assigned, {
-        robot: Place(on_pad.height, landing_m[on_pad.height]) for robot, on_pad in assigned.items()
+        robot: Place(slot.height, slot.landing_point_m) for robot, slot in its.items()
     }
 
 
 def places_at(site: "SavedSite", setup: Setup, robots: Iterable[str]) -> dict[str, Place]:
     """Where these robots fly and land at the site: each in the slot with the height that it has.
 
-    Raises ValueError for a robot that sits in no slot, or in one that the site does not have.
+    Raises ValueError for a robot that sits in no slot, or in one that the site does not have, or if
+    the places are too close to each other.
     """
     heights = {slot.robot: slot.place.slot for slot in setup.slots if slot.robot}
-    places = {}
+    chosen = {}
     for robot in robots:
         height = heights.get(robot)
         if height is None:
@@ -296,8 +302,9 @@ def places_at(site: "SavedSite", setup: Setup, robots: Iterable[str]) -> dict[st
         if slot is None:
             known = ", ".join(str(slot.height) for slot in site.slots) or "none"
             raise ValueError(f"{robot} flies at height {height}: the site has {known}")
-        places[robot] = Place(height, slot.landing_point_m)
-    return places
+        chosen[robot] = slot
+    require_apart(chosen.values(), setup.errors)
+    return {robot: Place(slot.height, slot.landing_point_m) for robot, slot in chosen.items()}
 
 
 def wide_fence(configured: Fence) -> Fence:
@@ -352,17 +359,23 @@ class SavedSite:
             for other in self.slots[:i]:
                 if other.height == slot.height:
                     raise ValueError(f"height {slot.height}: two slots have it")
-                for name in ("pad_m", "landing_point_m"):
-                    apart_m = math.dist(getattr(slot, name), getattr(other, name))
-                    if not apart_m >= MIN_BASELINE_M - 1e-6:
-                        raise ValueError(
-                            f"height {slot.height}: {name} is {apart_m:.1f} m from that of height "
-                            f"{other.height}, must be {MIN_BASELINE_M:g} m"
-                        )
 
     def slot(self, height: int) -> SiteSlot | None:
         """The slot with that height."""
         return next((slot for slot in self.slots if slot.height == height), None)
+
+
+def require_apart(slots: Iterable[SiteSlot], errors: ErrorBudget) -> None:
+    """Raises ValueError if those who start or land at these slots could touch in truth."""
+    places = places_apart(errors.position_m, errors.position_m)
+    for slot, other in itertools.combinations(slots, 2):
+        for name, beside in itertools.product(("pad_m", "landing_point_m"), repeat=2):
+            apart_m = math.dist(getattr(slot, name), getattr(other, beside))
+            if not places.holds(apart_m):
+                raise ValueError(
+                    f"height {slot.height}: {name} = {_written(getattr(slot, name))}: is "
+                    f"{apart_m:.1f} m from {beside} of height {other.height}, {places}"
+                )
 
 
 def site_as_it_stands(
@@ -397,7 +410,9 @@ def site_as_it_stands(
         _require_inside(robot, (x_m, y_m), fence, lands=land_at_pads)
         landing_m = (x_m, y_m) if land_at_pads else seated[robot].landing_point_m
         slots.append(SiteSlot(seated[robot].slot, (x_m, y_m), landing_m))
-    return SavedSite(origin, fence, tuple(sorted(slots, key=lambda slot: slot.height)))
+    slots.sort(key=lambda slot: slot.height)
+    require_apart(slots, setup.errors)
+    return SavedSite(origin, fence, tuple(slots))
 
 
 class Sites:

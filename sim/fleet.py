@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.frames import LocalTransform
+from edge.core.margins import ErrorBudget, places_apart
 from edge.core.mission import Origin
 from edge.core.safety import Fence
 from edge.core.world import Feature, format_world, random_features
@@ -33,7 +34,6 @@ from sim.px4.world import WorldOrigin
 from sim.px4_build import Px4Build
 
 MAX_ROBOTS = 20
-MIN_APART_M = 3.0
 STOP_WITHIN_S = 3.0
 # Once a machine fell so far behind real time within a while, what robots say of themselves follows
 # from that; and then a flight is over.
@@ -45,13 +45,21 @@ _WHILE_S = 20.0
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
-_BASE_HEIGHT_M = 4.0
-_SLOT_SPACING_M = 2.0
+ERRORS = ErrorBudget()
+# Pads, which are landing points too.
+APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
+_BASE_HEIGHT_M = 5.0
+_SLOT_SPACING_M = ERRORS.slot_spacing.least_m
 # Robots stop half a metre outside the field, with the fence 1.5 m further out.
 _FENCE_BEYOND_FIELD_M = 2.0
 _FENCE_BUFFER_M = 1.5
-_PAD_INSIDE_FIELD_M = 2.0
-_PAD_TRIALS = 20_000
+# As far inside the field as there is room: what a robot takes its place to be walks.
+_PADS_INSIDE_FIELD_M = (2.0, 1.0, 0.0)
+# How often pads are drawn anew, and pushed apart, before there is no room for them.
+_PAD_DRAWS = 30
+_PAD_PUSHES = 300
+# What rounding and the last push may leave.
+_PAD_SLACK = 1e-3
 _ON_STOP = "land"
 
 
@@ -393,21 +401,19 @@ class Fleet:
     def _draw_pads(self, biases_m: F64) -> F64:
         """Pads (N, 2) apart from each other, both in truth and as the robots see them."""
         rng = np.random.default_rng([self.scenario.seed, 1])
-        lowest_m, highest_m = _PAD_INSIDE_FIELD_M, self.field_m - _PAD_INSIDE_FIELD_M
-        pads_m: list[F64] = []
-        seen_m: list[F64] = []
-        for _ in range(_PAD_TRIALS):
-            if len(pads_m) == len(biases_m):
-                return np.array(pads_m)
-            pad_m = rng.uniform(lowest_m, highest_m, 2)
-            pad_seen_m = pad_m + biases_m[len(pads_m)]
-            inside = (pad_seen_m > lowest_m).all() and (pad_seen_m < highest_m).all()
-            if inside and _apart(pad_m, pads_m) and _apart(pad_seen_m, seen_m):
-                pads_m.append(pad_m)
-                seen_m.append(pad_seen_m)
+        robots, field_m = len(biases_m), self.field_m
+        for inside_m in _PADS_INSIDE_FIELD_M:
+            pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, rng)
+            if pads_m is not None:
+                return pads_m
+        fit = next(
+            fewer
+            for fewer in range(robots - 1, 0, -1)
+            if _pads_apart(biases_m[:fewer], 0.0, field_m, rng) is not None
+        )
         raise ValueError(
-            f"robots = {len(biases_m)}: there is no room for their pads on {self.field_m:g} x "
-            f"{self.field_m:g} m"
+            f"robots = {robots}: {fit} fit on {field_m:g} x {field_m:g} m, with pads {APART_M:g} m "
+            "apart, which is twice the position error"
         )
 
     def _horizontal(self, vector_m: F64) -> F64:
@@ -527,8 +533,32 @@ def _fence(field_m: float, robots: int) -> Fence:
     )
 
 
-def _apart(place_m: F64, others_m: Sequence[F64]) -> bool:
-    return all(math.dist(place_m, other_m) >= MIN_APART_M for other_m in others_m)
+def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Generator) -> F64 | None:
+    """Places (N, 2) within a square, `APART_M` from each other, and so with the biases added.
+
+    Drawn in the cells of a grid, then pushed apart; None if they find no room.
+    """
+    robots = len(biases_m)
+    side = math.ceil(math.sqrt(robots))
+    lowest_m, highest_m = np.maximum(low_m, low_m - biases_m), np.minimum(high_m, high_m - biases_m)
+    truth_and_seen_m = np.stack([np.zeros_like(biases_m), biases_m])
+    wanted_m = APART_M * (1.0 + _PAD_SLACK)
+    for _ in range(_PAD_DRAWS):
+        cells = np.stack(np.divmod(rng.permutation(side * side)[:robots], side), axis=1)
+        jittered = cells + rng.uniform(0.0, 1.0, (robots, 2))
+        places_m = low_m + jittered * ((high_m - low_m) / side)
+        for _ in range(_PAD_PUSHES):
+            places_m = np.clip(places_m, lowest_m, highest_m)
+            all_m = truth_and_seen_m + places_m
+            offsets_m = all_m[:, :, None] - all_m[:, None]
+            distances_m = np.linalg.norm(offsets_m, axis=3)
+            distances_m[:, range(robots), range(robots)] = math.inf
+            if distances_m.min() >= APART_M * (1.0 + _PAD_SLACK / 2.0):
+                return places_m
+            shares = np.maximum(wanted_m - distances_m, 0.0) / np.maximum(distances_m, 1e-9)
+            # Less than half of what is missing for either of two: crowds come to rest so.
+            places_m = places_m + 0.35 * (offsets_m * shares[..., None]).sum(axis=(0, 2))
+    return None
 
 
 def _toml(config: Mapping[str, object]) -> str:

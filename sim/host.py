@@ -25,8 +25,8 @@ BOOT_WITHIN_S = 60.0
 RUN_WITHIN_S = 60.0
 MAVLINK_PORT = 14551
 
-_PADS_APART_M = 4.0
-_PADS_IN_ROW = 7
+_PADS_APART_M = 8.0
+_PADS_IN_ROW = 5
 _PX4_PORT = 14550
 _BOARD_UID = 0x4D30303534  # the same on all boards
 
@@ -63,8 +63,8 @@ class RobotHost:
         self.name = f"r{robot_id}"
         self.address = str(rack.network[10 + robot_id])
         self.pad_m = (
-            _PADS_APART_M * (1 + (robot_id - 1) % _PADS_IN_ROW),
-            _PADS_APART_M * (1 + (robot_id - 1) // _PADS_IN_ROW),
+            _PADS_APART_M * ((robot_id - 1) % _PADS_IN_ROW),
+            _PADS_APART_M * (0.5 + (robot_id - 1) // _PADS_IN_ROW),
         )
         self._rack = rack
         self._console = folder / f"{self.name}.console"

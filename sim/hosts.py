@@ -162,15 +162,11 @@ url = "udpin://127.0.0.1:{MAVLINK_PORT}"
 env_scale = {FIELD_SCALE.env_scale}
 velocity_scale = {FIELD_SCALE.velocity_scale}
 
-[robot.flight]
-base_height_m = 4.0
-slot_spacing_m = 2.0
-
 [robot.fence]
 vertices_m = [[{low_m}, {low_m}], [{high_m}, {low_m}], [{high_m}, {high_m}], [{low_m}, {high_m}]]
 buffer_m = 1.5
 floor_m = 2.0
-ceiling_m = {6.0 + 2.0 * len(flying)}
+ceiling_m = {7.0 + 4.0 * len(flying)}
 
 [robot.limits]
 max_speed_m_s = 1.25

@@ -61,7 +61,7 @@ def write_config(folder: Path, *, url: str, endpoint: str, changes: Changes | No
         "policy": {"bundle": str(SHIPPED), "world": "world.env"},
         "autopilot": {"url": url, "system_id": SYSTEM_ID},
         "link": {"listen": [endpoint]},
-        "flight": {"slot": 0, "base_height_m": 3.0, "landing_point_m": list(PAD_M)},
+        "flight": {"slot": 0, "base_height_m": 5.0, "landing_point_m": list(PAD_M)},
         "fence": {
             "vertices_m": [[-2.0, -2.0], [34.0, -2.0], [34.0, 34.0], [-2.0, 34.0]],
             "buffer_m": 1.5, "floor_m": 2.0, "ceiling_m": 20.0,

@@ -9,12 +9,13 @@ estimator's zero is not the pad.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 from edge.core import F64
 from edge.core.energy import Energy
 from edge.core.mailbox import Neighbour
+from edge.core.margins import ErrorBudget
 from edge.core.mission import (
     AIRBORNE,
     AT_SLOT_M,
@@ -67,8 +68,8 @@ class FlightParameters:
 
     slot: int
     landing_point_m: tuple[float, ...]
-    base_height_m: float = 4.0
-    slot_spacing_m: float = 2.0
+    base_height_m: float = 5.0
+    slot_spacing_m: float = 4.0
     min_separation_m: float = 1.5
     battery_low: float = 0.25
     battery_critical: float = 0.15
@@ -183,7 +184,8 @@ class Robot:
 
     `on_remote_control_lost`: what a lost remote control does in flight; None if there is none.
 
-    Raises ValueError if the fence leaves no way to the robot's height or to its landing point.
+    Raises ValueError if the fence leaves no way to the robot's height or to its landing point, or
+    less room for errors than the budget asks for.
     """
 
     robot_id: int
@@ -192,6 +194,7 @@ class Robot:
     fence: Fence
     limits: MotionLimits
     on_remote_control_lost: RemoteControlLost | None = None
+    errors: ErrorBudget = field(default_factory=ErrorBudget)
 
     def __post_init__(self) -> None:
         fence, height_m = self.fence, self.parameters.slot_height_m
@@ -206,6 +209,12 @@ class Robot:
                 f"landing_point_m = {[x_m, y_m]}: must be inside the fence, at least buffer_m = "
                 f"{fence.buffer_m:g} from its line"
             )
+        lowest = self.errors.lowest_height
+        if not lowest.holds(height_m):
+            raise ValueError(f"slot = {self.parameters.slot} flies at {height_m:g} m: {lowest}")
+        buffer = self.errors.fence_buffer(self.limits, self.parameters.command_timeout_s)
+        if not buffer.holds(fence.buffer_m):
+            raise ValueError(f"buffer_m = {fence.buffer_m:g}: {buffer}")
 
     @property
     def place(self) -> Place:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from edge.core.failsafe import RemoteControl
+from edge.core.margins import ErrorBudget, places_apart
 from edge.core.mission import Origin, RobotStatus
 from edge.core.position import Judgement, Quality
 from edge.core.px4_version import OLDEST, is_too_old
@@ -15,7 +16,6 @@ from edge.core.vehicle import Gps, VehicleState
 # 2026-01-01 UTC. A computer that lost its clock with its battery starts years before.
 _EARLIEST_UNIX_S = 1_767_225_600.0
 _FIX_3D = 3
-_ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +63,11 @@ class PreflightInputs:
     `bundle_problem` is why the bundle was not verified on this CPU, None if it was.
     `system_id` is the configured one. `position` is what the position is worth; `position_m` (3,)
     and `landing_point_m` (2,) are in the mission frame; the slot's height is above the takeoff
-    point. `failsafe_problems` come from `failsafe.check`, None until the vehicle's parameters were
-    read. `neighbours` are the other robots that were heard lately, `not_understood` those who said
-    what cannot be read. `ground_age_s` is how long ago the ground was heard, None if never;
-    `ground_clock_offset_s` is its wall clock minus this one, None if it is not known.
+    point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
+    `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
+    robots that were heard lately, `not_understood` those who said what cannot be read.
+    `ground_age_s` is how long ago the ground was heard, None if never; `ground_clock_offset_s` is
+    its wall clock minus this one, None if it is not known.
     """
 
     now_s: float
@@ -87,6 +88,7 @@ class PreflightInputs:
     slot_height_m: float
     landing_point_m: Sequence[float]
     min_separation_m: float
+    errors: ErrorBudget
     neighbours: Sequence[HeardStatus]
     not_understood: Sequence[str]
     rc: RemoteControl
@@ -248,21 +250,35 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
             yield f"{other} has another world: set one on the ground, or deploy it to all"
         if inputs.origin is not None and status.origin != inputs.origin:
             yield f"{other} has another mission origin: set it again on the ground"
-        apart_m = abs(status.slot_height_m - inputs.slot_height_m)
-        if not apart_m >= inputs.min_separation_m - _ROUNDING_M:
-            yield (
-                f"{other} flies {apart_m:.1f} m above or below, must be "
-                f"{inputs.min_separation_m:g} m: change the slots in the config, or on the ground"
-            )
-        apart_m = math.dist(status.landing_point_m, inputs.landing_point_m)
-        if not apart_m >= inputs.min_separation_m - _ROUNDING_M:
-            yield (
-                f"{other} lands {apart_m:.1f} m away, must be {inputs.min_separation_m:g} m: "
-                "change the landing points in the config, or on the ground"
-            )
+        yield from _apart(inputs, status, other)
         offset_s = status.unix_time_s - heard_at_unix_s
         if not abs(offset_s) <= limits.max_clock_difference_s:
             yield f"{other}'s clock differs by {offset_s:.1f} s: set the time of both"
+
+
+def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator[str]:
+    """Whether two robots stay apart in truth, above each other and where they land."""
+    errors, gps = inputs.errors, inputs.vehicle.gps
+    limit_m = inputs.min_separation_m
+    heights = errors.slot_spacing.or_at_least(limit_m, "min_separation_m")
+    apart_m = abs(status.slot_height_m - inputs.slot_height_m)
+    if not heights.holds(apart_m):
+        yield (
+            f"{other} flies {apart_m:.1f} m above or below, {heights}: "
+            "change the slots in the config, or on the ground"
+        )
+    places = places_apart(
+        errors.reported_position_m(None if gps is None else gps.accuracy_m),
+        errors.reported_position_m(status.gps_accuracy_m),
+    ).or_at_least(limit_m, "min_separation_m")
+    apart_m = math.dist(status.landing_point_m, inputs.landing_point_m)
+    if not places.holds(apart_m):
+        planned = places_apart(errors.position_m, errors.position_m)
+        mend = "wait for a better GPS accuracy, or " if planned.holds(apart_m) else ""
+        yield (
+            f"{other} lands {apart_m:.1f} m away, {places}: "
+            f"{mend}change the landing points in the config, or on the ground"
+        )
 
 
 def _where(depth_m: float) -> str:

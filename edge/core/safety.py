@@ -240,8 +240,13 @@ def leash(target_m: F64, position_m: F64, length_m: float) -> F64 | None:
     return target_m if distance_m <= length_m else position_m + offset_m * (length_m / distance_m)
 
 
+def stopping_m(speed_m_s: float, limits: MotionLimits) -> float:
+    """The way that it takes to stop from a speed of 0 or more, m: v lag + v^2 / 2a."""
+    return speed_m_s * (limits.lag_s + speed_m_s / (2.0 * limits.max_acceleration_m_s2))
+
+
 def approach_speed(distance_m: float, limits: MotionLimits) -> float:
-    """The largest speed v that `distance_m` is enough to stop from: v lag + v^2 / 2a; 0 if none."""
+    """The largest speed that `distance_m` is enough to stop from; 0 if none."""
     if not 0.0 < distance_m < _ABSURD:
         return 0.0
     lag_s, acceleration = limits.lag_s, limits.max_acceleration_m_s2
@@ -364,10 +369,8 @@ def _speed_towards(slack_m: float, speed_m_s: float, limits: MotionLimits) -> fl
     late. What the slack leaves after the way that it needs to stop falls by itself no faster than
     by what is commanded, and never below 0 if that is a small part of it.
     """
-    stopping_m = 0.0
-    if speed_m_s > 0.0:
-        stopping_m = speed_m_s * (limits.lag_s + speed_m_s / (2.0 * limits.max_acceleration_m_s2))
-    return min(approach_speed(slack_m, limits), max(slack_m - stopping_m, 0.0) / _SLACK_TIME_S)
+    left_m = slack_m - stopping_m(max(speed_m_s, 0.0), limits)
+    return min(approach_speed(slack_m, limits), max(left_m, 0.0) / _SLACK_TIME_S)
 
 
 def _limit_towards(velocity: F64, directions: Iterable[F64], caps: Sequence[float]) -> F64:

@@ -15,6 +15,7 @@ from edge.core.energy import EnergyParameters
 from edge.core.failsafe import required
 from edge.core.flight import FlightParameters, RemoteControlLost, Robot
 from edge.core.frames import ModelScale
+from edge.core.margins import ErrorBudget, Margin
 from edge.core.position import PositionLimits
 from edge.core.preflight import PreflightLimits
 from edge.core.safety import Fence, MotionLimits
@@ -148,6 +149,7 @@ class RobotConfig:
     limits: MotionLimits
     failsafe: FailsafeConfig
     energy: EnergyParameters = field(default_factory=EnergyParameters)
+    errors: ErrorBudget = field(default_factory=ErrorBudget)
     rates: Rates = field(default_factory=Rates)
     preflight: PreflightLimits = field(default_factory=PreflightLimits)
     position: PositionLimits = field(default_factory=PositionLimits)
@@ -167,13 +169,29 @@ class RobotConfig:
                 f"two periods of rates: control_hz = {self.rates.control_hz}"
             )
         # What only shows when the tables come together, before any of it is used.
-        self.robot(boot_nonce=0)
         required(self.failsafe.rc, self.fence.ceiling_m, self.flight.command_timeout_s)
+        self.robot(boot_nonce=0)
+        beyond = self.errors.px4_fence(self.limits)
+        if not beyond.holds(self.failsafe.fence_margin_m):
+            raise ValueError(f"failsafe: fence_margin_m = {self.failsafe.fence_margin_m}: {beyond}")
 
     def robot(self, boot_nonce: int) -> Robot:
         """Who flies, in this start of its program."""
-        rc_lost = None if self.failsafe.rc == "none" else self.failsafe.rc_lost
-        return Robot(self.robot_id, boot_nonce, self.flight, self.fence, self.limits, rc_lost)
+        return Robot(
+            self.robot_id,
+            boot_nonce,
+            self.flight,
+            self.fence,
+            self.limits,
+            None if self.failsafe.rc == "none" else self.failsafe.rc_lost,
+            self.errors,
+        )
+
+    @property
+    def free_ground(self) -> Margin:
+        """How far around its fence nobody may be, whatever fails."""
+        beyond_m, ceiling_m = self.failsafe.fence_margin_m, self.fence.ceiling_m
+        return self.errors.free_ground(self.limits, beyond_m, ceiling_m)
 
     @property
     def pac(self) -> PacParameters:

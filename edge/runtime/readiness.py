@@ -134,6 +134,7 @@ class Readiness:
             slot_height_m=robot.parameters.slot_height_m,
             landing_point_m=robot.parameters.landing_point_m,
             min_separation_m=robot.parameters.min_separation_m,
+            errors=robot.errors,
             neighbours=peers,
             not_understood=not_understood,
             rc=config.failsafe.rc,

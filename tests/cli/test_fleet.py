@@ -29,17 +29,20 @@ def write_fleet(folder: Path, port: int, flying: int = 2, spares: int = 1) -> Pa
     """Robots r1, r2, ... at one port of this machine's addresses, the last ones without a slot."""
     example = EXAMPLE.read_text()
     shared = example[example.index("[robot]") : example.index("# The robots:")]
+    shared = shared.replace("ceiling_m = 30.0", "ceiling_m = 60.0")
     path = folder / "fleet.toml"
+
+    def place(n: int) -> str:
+        at_m = [9 * (n % 4), 2 + 9 * (n // 4)]
+        return f"pad_m = {at_m}\nlanding_point_m = {at_m}\n"
+
     path.write_text(
         f'fleet = "test"\nimage = "no image"\nbundle = "{SHIPPED}"\nworld = "world.env"\n{shared}'
         + "".join(
             f'[robots.r{n}]\nhost = "127.0.0.{n}"\nport = {port}\nrobot_id = {n}\n'
             for n in range(1, flying + spares + 1)
         )
-        + "".join(
-            f'[[slots]]\nrobot = "r{n}"\npad_m = [{3 * n}, 2]\nlanding_point_m = [{3 * n}, 4]\n'
-            for n in range(1, flying + 1)
-        )
+        + "".join(f'[[slots]]\nrobot = "r{n}"\n{place(n)}' for n in range(1, flying + 1))
     )
     (folder / "world.env").write_text("CircularBND 100 100 10 1\n")
     return path

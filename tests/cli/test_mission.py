@@ -415,9 +415,12 @@ def test_robots_get_the_slots_of_the_pads_where_they_stand(field: Field) -> None
 
 
 def test_site_is_saved_and_used_again(field: Field) -> None:
+    park = ("site", "save", "park", "--land-at-pads", "--seconds", "0.5", "--json")
+    field.stand({0: (6.0, 8.0), 1: (8.0, 8.0), 2: (14.0, 8.0)})
+    assert "is 2.0 m from pad_m of height 1, must be 2.5 m" in field.refused(*park)
     field.stand({i: (6.0 + 4.0 * i, 8.0) for i in range(3)})
     field.do("mission", "fence", "set", "0,0", "30,0", "30,30", "0,30")
-    done = field.do("site", "save", "park", "--land-at-pads", "--seconds", "0.5", "--json")
+    done = field.do(*park)
     slots = json.loads(done.out)["slots"]
     assert [slot["pad_m"] for slot in slots] == [[6.0, 8.0], [10.0, 8.0], [14.0, 8.0]]
     assert "park.toml: is there already: add --force" in field.refused("site", "save", "park")

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from edge.core.margins import ErrorBudget
 from edge.core.mission import FlightState, Origin, RobotStatus
 from edge.core.position import Judgement, Quality
 from edge.core.preflight import (
@@ -35,7 +36,7 @@ VEHICLE = VehicleState(
     in_air=False,
     heartbeat_at_s=99.0,
     battery=0.9,
-    gps=Gps(3, 14, 0.8),
+    gps=Gps(3, 14, 0.8, accuracy_m=0.9),
     armable=True,
 )
 NEIGHBOUR = RobotStatus(
@@ -57,8 +58,8 @@ NEIGHBOUR = RobotStatus(
     trial="",
     origin=ORIGIN,
     system_id=2,
-    slot_height_m=7.0,
-    landing_point_m=(12.0, 8.0),
+    slot_height_m=9.0,
+    landing_point_m=(16.0, 8.0),
     position_m=(12.0, 8.0, 0.0),
     velocity_m_s=(0.0, 0.0, 0.0),
     heading_rad=1.0,
@@ -89,6 +90,7 @@ READY = PreflightInputs(
     slot_height_m=5.0,
     landing_point_m=(8.0, 8.0),
     min_separation_m=2.0,
+    errors=ErrorBudget(),
     neighbours=(HeardStatus(NEIGHBOUR, 99.8, UNIX_S + 0.2),),
     not_understood=(),
     rc="none",
@@ -122,8 +124,12 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
     ({"bundle_id": "c"}, "robot 2 has another bundle: deploy one to all"),
     ({"world_id": "v"}, "robot 2 has another world: set one on the ground"),
     ({"origin": Origin(47.4, 8.5, 91.0)}, "robot 2 has another mission origin"),
-    ({"slot_height_m": 6.0}, "robot 2 flies 1.0 m above or below, must be 2 m: change the slots"),
-    ({"landing_point_m": (12.0, 9.0)}, "robot 2 lands 1.0 m away, must be 2 m"),
+    ({"slot_height_m": 6.0}, "robot 2 flies 3.0 m above or below, must be 4 m (heights err by 2 m"),
+    (
+        {"landing_point_m": (8.1, 8.0)},
+        "robot 2 lands 7.9 m away, must be 8 m (positions err by 4 m and 4 m): change the landing",
+    ),
+    ({"min_separation_m": 4.5}, "robot 2 flies 4.0 m above or below, must be 4.5 m (min_separ"),
     (
         {"neighbours": (HeardStatus(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
         "robot 2's clock differs by 30.0 s: set the time of both",
@@ -201,12 +207,50 @@ def test_a_neighbour_without_an_origin_has_not_ours() -> None:
     assert failed.startswith("robot 2 has another mission origin")
 
 
-def test_slots_exactly_the_separation_apart_are_apart() -> None:
-    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, slot_height_m=5.1 + 2.1), 99.8, UNIX_S)
-    inputs = dataclasses.replace(
-        READY, neighbours=(neighbour,), slot_height_m=5.1, min_separation_m=2.1
+def lines(
+    own: Gps, its_accuracy_m: float | None, landing_x_m: float, errors: ErrorBudget
+) -> tuple[str, ...]:
+    """What fails if the robot lands at (8, 8), and its neighbour beside it."""
+    neighbour = dataclasses.replace(
+        NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
     )
-    assert failed_checks(inputs, LIMITS) == ()
+    heard = HeardStatus(neighbour, 99.8, UNIX_S)
+    vehicle = dataclasses.replace(VEHICLE, gps=own)
+    inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
+    return failed_checks(inputs, LIMITS)
+
+
+def test_a_receiver_that_reports_worse_than_the_budget_wants_more_room() -> None:
+    good, bad = Gps(3, 14, 0.8, accuracy_m=0.02), Gps(3, 14, 0.8, accuracy_m=2.0)
+    budget = ErrorBudget()
+    assert lines(good, 0.02, 16.0, budget) == ()
+    # A good report alone makes nothing legal.
+    (line,) = lines(good, 0.02, 15.9, budget)
+    assert "must be 8 m (positions err by 4 m and 4 m): change" in line
+    for own, its_accuracy_m in ((bad, 0.02), (good, 2.0)):
+        (line,) = lines(own, its_accuracy_m, 16.0, budget)
+        assert "must be 9 m (positions err by" in line
+        assert ": wait for a better GPS accuracy, or change the landing points" in line
+    assert failed_checks(
+        dataclasses.replace(
+            READY, vehicle=dataclasses.replace(VEHICLE, gps=bad), neighbours=()
+        ), LIMITS
+    ) == ()  # fmt: skip
+
+
+def test_receivers_with_corrections_stand_nearer_as_long_as_they_report_it() -> None:
+    rtk = ErrorBudget(gps_m=0.1)
+    fixed = Gps(6, 20, 0.6, accuracy_m=0.02)
+    assert lines(fixed, 0.02, 10.2, rtk) == ()
+    (line,) = lines(fixed, 0.02, 10.1, rtk)
+    assert "robot 2 lands 2.1 m away, must be 2.2 m" in line
+    for own, its_accuracy_m in (
+        (dataclasses.replace(fixed, accuracy_m=None), 0.02),
+        (fixed, None),
+        (dataclasses.replace(fixed, accuracy_m=0.4), 0.02),
+    ):
+        (line,) = lines(own, its_accuracy_m, 10.2, rtk)
+        assert ": wait for a better GPS accuracy" in line
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_the_example_says_who_is_where() -> None:
     )  # fmt: skip
     slot = config.slot_of("r2")
     assert slot is not None
-    assert (slot.height, slot.landing_point_m) == (1, (8.0, 4.0))
+    assert (slot.height, slot.landing_point_m) == (1, (11.0, 4.0))
     assert config.slot_of("r11") is None
 
 
@@ -148,7 +148,7 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert (first.link.listen, first.link.connect) == (("tcp/0.0.0.0:7",), ())
     assert third.link.listen == ("tcp/0.0.0.0:7447",)
     assert third.link.connect == ("tcp/10.0.0.1:7", "tcp/192.168.8.12:7447")
-    assert (third.flight.slot, third.flight.landing_point_m) == (2, (12.0, 4.0))
+    assert (third.flight.slot, third.flight.landing_point_m) == (2, (20.0, 4.0))
     assert third.policy.bundle == str(tmp_path / "bundle")
     assert third.policy.world == str(tmp_path / "world.env")
     assert third.log.folder == "/var/lib/lpac/logs"
@@ -165,12 +165,14 @@ def test_a_spare_and_a_stranger_get_none() -> None:
 
 
 POSITIVE = st.floats(0.1, 100.0)
+# A faster one would need more room within its fence, and up to PX4's.
+SPEEDS = st.floats(0.1, 1.25)
 TABLES = st.fixed_dictionaries(
     {},
     optional={
         "on_stop": st.sampled_from(["hold", "land"]),
         "limits": st.fixed_dictionaries(
-            {}, optional={"max_speed_m_s": POSITIVE, "lag_s": st.integers(0, 3)}
+            {}, optional={"max_speed_m_s": SPEEDS, "lag_s": st.integers(0, 3)}
         ),
         "rates": st.fixed_dictionaries(
             {}, optional={"policy_hz": POSITIVE, "perception_hz": POSITIVE}
@@ -318,25 +320,46 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('robot = "r2"', 'robot = "r1"', ["slots[1]: robot = 'r1': slots[0] has it too"]),
         ('robot = "r2"', "height = 0", ["slots[1]: height = 0: slots[0] (robot r1) has it too"]),
         ('robot = "r2"', 'robot = "r2"\nheight = -1', ["slots[1]: height = -1", "0 or above"]),
-        ('robot = "r2"', 'robot = "r2"\nheight = 40', ["robots.r2, in slots[1]: slot = 40", "84"]),
-        ("pad_m = [6.0, 2.0]", "", ["slots[1]: pad_m is missing"]),
-        ("[6.0, 2.0]", "[6.0]", ["slots[1]: pad_m = [6.0]", "[x, y]"]),
-        ("[8.0, 4.0]", "[nan, 4.0]", ["slots[1]: landing_point_m = [nan, 4.0]"]),
-        ("[6.0, 2.0]", "[2.0, 3.9]", ["slots[1] (robot r2): pad_m", "slots[0] (robot r1)", "2 m"]),
-        ("[8.0, 4.0]", "[5.0, 4.0]", ["slots[1] (robot r2): landing_point_m", "1.0 m", "slots[0]"]),
-        ("[6.0, 2.0]", "[6.0, -2.0]", ["slots[1] (robot r2): pad_m", "inside the fence"]),
-        ("[8.0, 4.0]", "[80.0, 4.0]", ["robots.r2, in slots[1]: landing_point_m", "fence"]),
-        ('robot = "r2"\npad_m = [6.0', 'pad_m = [60.0', ["slots[1]: pad_m = [60.0, 2.0]", "fence"]),
+        ('robot = "r2"', 'robot = "r2"\nheight = 40', ["robots.r2, in slots[1]: slot = 40", "165"]),
+        ("pad_m = [11.0, 2.0]", "", ["slots[1]: pad_m is missing"]),
+        ("[11.0, 2.0]", "[11.0]", ["slots[1]: pad_m = [11.0]", "[x, y]"]),
+        ("[11.0, 4.0]", "[nan, 4.0]", ["slots[1]: landing_point_m = [nan, 4.0]"]),
+        (
+            "[11.0, 2.0]",
+            "[9.9, 2.0]",
+            ["slots[1] (robot r2): pad_m = [9.9, 2.0]: is 7.9 m from pad_m of slots[0] (robot r1), "
+             "must be 8 m (positions err by 4 m and 4 m)"],
+        ),
+        (
+            "[11.0, 4.0]",
+            "[9.0, 6.0]",
+            ["slots[1] (robot r2): landing_point_m", "is 7.3 m from landing_point_m of slots[0]"],
+        ),
+        (
+            "[11.0, 4.0]",
+            "[12.5, 4.0]",
+            ["slots[2] (robot r3): pad_m", "is 7.8 m from landing_point_m of slots[1] (robot r2)"],
+        ),
+        ("[11.0, 2.0]", "[11.0, -2.0]", ["slots[1] (robot r2): pad_m", "inside the fence"]),
+        ("[11.0, 4.0]", "[80.0, 4.0]", ["robots.r2, in slots[1]: landing_point_m", "fence"]),
+        ('robot = "r2"\npad_m = [11.0', 'pad_m = [60.0', ["slots[1]: pad_m = [60.0", "fence"]),
         (
             "[robots.r2.robot.limits]",
-            "[robots.r2.robot]\nflight.base_height_m = 2.5\n[robots.r2.robot.limits]",
-            ["slots[1] (robot r2): height = 1: is 4.5 m, 0.5 m from that of slots[0]", "1.5 m"],
+            "[robots.r2.robot]\nflight.slot_spacing_m = 3.9\n[robots.r2.robot.limits]",
+            ["slots[1] (robot r2): height = 1: is 8.9 m, 3.9 m from that of slots[0] (robot r1), "
+             "must be 4 m (heights err by 2 m from each other"],
+        ),
+        (
+            "[robots.r2.robot.limits]",
+            "[robots.r2.robot]\nerrors.gps_m = 4.5\n[robots.r2.robot.limits]",
+            ["is 9.0 m from pad_m of slots[0] (robot r1), must be 9.5 m", "5.5 m and 4 m"],
         ),
         (
             '# on_stop = "hold"',
-            "flight = {min_separation_m = 4.5, slot_spacing_m = 5.0}",
-            ["slots[1] (robot r2): pad_m", "is 4.0 m", "must be 4.5 m"],
+            "flight = {min_separation_m = 9.5, slot_spacing_m = 10.0}",
+            ["slots[1] (robot r2): pad_m", "is 9.0 m", "must be 9.5 m (min_separation_m)"],
         ),
+        ("buffer_m = 1.5", "buffer_m = 1.0", ["robots.r1, in slots[0]: buffer_m = 1: must be 1.3"]),
         ("[robot]\n#", "[[robot]]\n#", ["robot = [{", "expected a table"]),
         ("[[slots]]\nrobot = \"r1\"", "[slots]", ["no TOML"]),
     ],

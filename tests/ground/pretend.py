@@ -484,6 +484,8 @@ class PretendedFleet:
                 "max_acceleration_m_s2": 2.0, "lag_s": 1.3,
             },
             "failsafe": {"rc": "none"},
+            # Thirty of them stand on one field: with corrections, on flat ground.
+            "errors": {"gps_m": 0.25, "height_apart_m": 0.2, "pads_height_m": 0.3},
         }  # fmt: skip
         lines = [
             f'fleet = "{self.name}"', 'image = "image"', f'bundle = "{SHIPPED}"',

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.core.margins import ErrorBudget
 from edge.core.mission import FlightState, Origin, RobotStatus
 from edge.core.safety import Fence
 from ground.site import (
@@ -25,6 +26,7 @@ from ground.site import (
     distance_m,
     origin_at,
     place_m,
+    require_apart,
     standing,
     turn_deg,
     wide_fence,
@@ -237,7 +239,6 @@ def test_site_is_read_as_it_was_saved(tmp_path: Path) -> None:
         ("height = 3", "height = 0", "height 0: two slots have it"),
         ("pad_m = [2.0, 2.0]", "pad_m = [2.0, 200.0]", "height 0: pad_m = .*inside the fence"),
         ("[4.0, 4.0]", "[-1.0, 4.0]", r"height 0: landing_point_m = .*at least buffer_m = 1.5"),
-        ("[8.0, 4.0]", "[5.0, 4.0]", r"height 3: landing_point_m is 1.0 m from that of height 0"),
         ("buffer_m = 1.5", "bufer_m = 1.5", "fence: unknown key 'bufer_m'"),
         ("[origin]", "[origin", "no TOML"),
     ],
@@ -252,6 +253,20 @@ def test_mistake_in_a_site_is_one_line(
         sites.load("park")
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_places_are_as_far_apart_as_positions_err() -> None:
+    budget, alone = ErrorBudget(), SiteSlot(0, (2.0, 2.0), (2.0, 2.0))
+    require_apart((alone,), budget)
+    require_apart((alone, SiteSlot(3, (10.0, 2.0), (10.0, 2.0))), budget)
+    near = (SiteSlot(0, (2.0, 2.0), (9.0, 4.0)), SiteSlot(3, (10.0, 2.0), (17.0, 4.0)))
+    with pytest.raises(
+        ValueError,
+        match=r"height 0: landing_point_m = \(9.0, 4.0\): is 2.2 m from "
+        r"pad_m of height 3, must be 8 m \(positions err by 4 m and 4 m\)",
+    ):
+        require_apart(near, budget)
+    require_apart(near, ErrorBudget(gps_m=0.1))
 
 
 def test_sites_names_are_names(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from edge.runtime.config import load_config
 from fleet.config import load_fleet
 from sim.experiment import Scenario
 from sim.experiment import fly as fly_in_process
-from sim.fleet import MIN_APART_M, Fleet, FleetError, FleetScenario
+from sim.fleet import APART_M, ERRORS, Fleet, FleetError, FleetScenario
 from sim.operator import Operator
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
@@ -38,7 +38,6 @@ ROBOTS = 5
 MISSION_S = 20.0
 # The end of the mission that the cost is taken from: the robots keep moving about their places.
 LAST_S = 5
-DRONE_M = 0.3
 
 ORDER_OF_STATES = [
     FlightState.PREFLIGHT, FlightState.ARMING, FlightState.TAKEOFF, FlightState.HOLD,
@@ -82,7 +81,9 @@ def test_all_robots_take_off_cover_and_land(flights: Flights) -> None:
 
 
 def test_robots_never_touch_in_truth(flights: Flights) -> None:
-    assert min(flight["separation"]["distance_m"] for flight, _ in flights.values()) > DRONE_M
+    assert (
+        min(flight["separation"]["distance_m"] for flight, _ in flights.values()) > ERRORS.drone_m
+    )
 
 
 def test_the_fence_is_never_crossed_by_the_estimate(flights: Flights) -> None:
@@ -123,17 +124,28 @@ def test_what_a_flight_leaves_behind(flights: Flights) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-@pytest.mark.parametrize("robots", [1, 10])
+@pytest.mark.parametrize("robots", [1, 10, 16])
 def test_where_a_fleet_stands(tmp_path: Path, seed: int, robots: int) -> None:
     fleet = Fleet(FleetScenario(robots=robots, seed=seed), tmp_path, SHIPPED)
     assert fleet.simulated is not None
     for places_m in (fleet.pads_m, fleet.landing_points_m):
         assert min(fleet.fence.distance_m(x, y) for x, y in places_m) > fleet.fence.buffer_m
         away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
-        assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= MIN_APART_M
+        assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= APART_M
     np.testing.assert_allclose(fleet.true_positions_m()[:, :2], fleet.pads_m, atol=1e-9)
     errors_m = np.linalg.norm(fleet.landing_points_m - fleet.pads_m, axis=1)
     assert np.all((errors_m >= 1.0) & (errors_m <= 5.0))
+
+
+def test_more_robots_than_fit_are_refused_with_how_many_do(tmp_path: Path) -> None:
+    with pytest.raises(
+        ValueError, match=r"robots = 20: (\d+) fit on 32 x 32 m, with pads 8 m apart"
+    ) as refused:
+        Fleet(FleetScenario(robots=20), tmp_path, SHIPPED)
+    (fit,) = re.findall(r": (\d+) fit", str(refused.value))
+    assert Fleet(FleetScenario(robots=int(fit)), tmp_path, SHIPPED).pads_m.shape == (int(fit), 2)
+    # Twenty that know where they are stand on the same field.
+    Fleet(FleetScenario(robots=20, gps_bias=False), tmp_path, SHIPPED)
 
 
 def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
@@ -237,7 +249,7 @@ def pid_of(arguments: str) -> int:
     return pid
 
 
-@pytest.mark.parametrize("robots", [1, 20])
+@pytest.mark.parametrize("robots", [1, 16])
 def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -> None:
     """The ground reads fleet.toml, the robots their robot.toml."""
     fleet = Fleet(FleetScenario(robots=robots, seed=robots), tmp_path, SHIPPED)
