@@ -7,10 +7,10 @@ OLDEST = (1, 14)
 
 # What was done with a version. "Read" is that all of what is relied on was read in its sources.
 EVIDENCE = {
-    (1, 14): "read in its sources, never tried",
+    (1, 14): "tested: PX4 SITL 1.14.4",
     (1, 15): "read in its sources, never tried",
     (1, 16): "read in its sources, never tried",
-    (1, 17): "tested: PX4 SITL",
+    (1, 17): "tested: PX4 SITL 1.17.0",
 }
 
 

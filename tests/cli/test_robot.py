@@ -77,7 +77,7 @@ def test_check_passes_a_good_vehicle_and_says_what_it_set(tmp_path: Path) -> Non
         result = lpac_robot("check", "--config", made.config_path, "--wait", 60)
         assert (result.returncode, result.stderr) == (0, "")
         lines = result.stdout.splitlines()
-        assert lines[0] == "PX4 1.17.0 (tested: PX4 SITL)"
+        assert lines[0] == "PX4 1.17.0 (tested: PX4 SITL 1.17.0)"
         assert lines[-1] == "ready to fly"
         assert "set: COM_OBL_RC_ACT from 0 to 4" in lines
         assert any("if this program dies" in line and "land" in line for line in lines)

@@ -276,9 +276,9 @@ def test_limits_that_make_no_sense_are_refused_by_name(
 @pytest.mark.parametrize(
     ("version", "words"),
     [
-        ("1.14.0", "PX4 1.14.0 (read in its sources, never tried)"),
+        ("1.14.0", "PX4 1.14.0 (tested: PX4 SITL 1.14.4)"),
         ("1.16.2", "PX4 1.16.2 (read in its sources, never tried)"),
-        ("1.17.0", "PX4 1.17.0 (tested: PX4 SITL)"),
+        ("1.17.0", "PX4 1.17.0 (tested: PX4 SITL 1.17.0)"),
         ("1.18.0", "PX4 1.18.0 (not tested: newer than 1.17)"),
         ("2.0.0", "PX4 2.0.0 (not tested: newer than 1.17)"),
         (None, "PX4 did not tell its version"),
