@@ -135,7 +135,7 @@ def sim(
         def prepared() -> None:
             """What is wrong with the flight itself has been said by now."""
             if count is not None:
-                _warn_of_too_many(count, bundle, flown)
+                _say_if_carried(count, bundle, flown)
 
         if not script:
             _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared)
@@ -250,13 +250,15 @@ def _as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int
     return robots
 
 
-def _warn_of_too_many(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> None:
+def _say_if_carried(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> None:
     from sim.load import robots_carried
 
     carried = int(robots_carried(bundle, vehicle))
-    if carried < robots:
-        advice = f"; fewer: -n {max(1, carried)}" if robots > 1 else ""
-        typer.echo(f"{_carries(carried)}, not {robots}: it may not keep up{advice}", err=True)
+    if carried >= robots:
+        typer.echo(_carries(carried), err=True)
+        return
+    advice = f"; fewer: -n {max(1, carried)}" if robots > 1 else ""
+    typer.echo(f"{_carries(carried)}, not {robots}: it may not keep up{advice}", err=True)
 
 
 def _carries(robots: int) -> str:

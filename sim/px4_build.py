@@ -34,7 +34,7 @@ from edge.core import F64
 from sim import ordinary
 from sim.fleet_vehicles import Autopilot, Track, VehicleError
 from sim.px4.world import WorldOrigin
-from sim.px4_log import read_truth
+from sim.px4_log import read_truth, setpoint_times_s
 
 MAX_INSTANCES = 10
 LISTEN_PORT = 14580
@@ -226,6 +226,13 @@ class Px4Build:
         ]
         return max(0.0, *lost_s, 0.0)
 
+    def last_setpoint_s(self, number: int) -> float:
+        """When the last setpoint had reached a PX4, by its log: `time.monotonic()`."""
+        instance = self._instances[number]
+        with self._heard_lock:
+            setpoints_s = setpoint_times_s(instance.logs())
+            return float(instance.to_monotonic_s(setpoints_s)[-1])
+
     def pid(self, number: int) -> int:
         """The process of a PX4."""
         process = self._instances[number].process
@@ -306,10 +313,10 @@ class Px4Build:
 
     def _take(self, instance: _Instance, datagram: bytes) -> None:
         now_s = time.monotonic()
-        for message_id, frame in _frames(datagram):
+        for message_id, frame in frames(datagram):
             if message_id == mavlink.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS:
                 # 200 times a second, and of it only PX4's time is of use, which comes first.
-                (time_us,) = struct.unpack_from("<Q", frame, _HEADER_BYTES)
+                (time_us,) = struct.unpack("<Q", payload(frame, 8))
                 with self._heard_lock:
                     if not instance.clock or now_s - instance.clock[-1][0] > _CLOCK_PERIOD_S:
                         instance.clock.append((now_s, time_us * 1e-6))
@@ -324,14 +331,18 @@ class Px4Build:
             instance.places.append(place)
 
 
-def _frames(datagram: bytes) -> Iterator[tuple[int, bytes]]:
-    """The MAVLink 2 messages of a datagram whose payload has 8 bytes or more, with their ids."""
+def frames(datagram: bytes) -> Iterator[tuple[int, bytes]]:
+    """The MAVLink 2 messages of a datagram, with their ids."""
     start = 0
     while start + _FRAME_BYTES <= len(datagram) and datagram[start] == _MAVLINK_2:
         end = start + _FRAME_BYTES + datagram[start + 1]
-        if datagram[start + 1] >= 8:
-            yield int.from_bytes(datagram[start + 7 : start + 10], "little"), datagram[start:end]
+        yield int.from_bytes(datagram[start + 7 : start + 10], "little"), datagram[start:end]
         start = end
+
+
+def payload(frame: bytes, size: int) -> bytes:
+    """The first bytes of a message's payload, of which zeros at its end are not sent."""
+    return frame[_HEADER_BYTES : _HEADER_BYTES + min(frame[1], size)].ljust(size, b"\0")
 
 
 def _build_fault(build: Path) -> str:

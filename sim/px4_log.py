@@ -17,6 +17,7 @@ from sim.px4.world import WorldOrigin
 _PLACE, _ATTITUDE, _STATUS = (
     "vehicle_local_position_groundtruth", "vehicle_attitude_groundtruth", "vehicle_status",
 )  # fmt: skip
+_SETPOINT = "offboard_control_mode"
 _ARMED = 2
 
 
@@ -43,7 +44,7 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
 
     A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes.
     """
-    logs = [_topics(path) for path in paths]
+    logs = [_topics(path, (_PLACE, _ATTITUDE, _STATUS)) for path in paths]
     places = [topics[_PLACE] for topics in logs if _PLACE in topics]
     if not places:
         return None
@@ -76,14 +77,20 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
     )
 
 
+def setpoint_times_s(paths: Sequence[Path]) -> F64:
+    """When setpoints came from outside, PX4's time; ascending."""
+    logs = [_topics(path, (_SETPOINT,)) for path in paths]
+    return np.sort(_joined([topics[_SETPOINT]["timestamp"] for topics in logs if topics])) * 1e-6
+
+
 Topic = dict[str, npt.NDArray[Any]]
 
 
-def _topics(path: Path) -> dict[str, Topic]:
-    """The topics that tell what was so, of their first instances."""
+def _topics(path: Path, names: Sequence[str]) -> dict[str, Topic]:
+    """Topics of these names, of their first instances."""
     try:
         with path.open("rb") as file:
-            log = ULog(file, [_PLACE, _ATTITUDE, _STATUS])
+            log = ULog(file, [*names])
     except (OSError, ULogException, struct.error):
         # Not even its beginning was written.
         return {}

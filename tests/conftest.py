@@ -30,6 +30,35 @@ settings.load_profile("project")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("vehicles")
+    group.addoption(
+        "--vehicle",
+        choices=("simulated", "px4"),
+        default="simulated",
+        help="what tests/sim/test_faults.py flies",
+    )
+    group.addoption(
+        "--px4", type=Path, metavar="DIR", help="PX4's build folder, as `make px4_sitl` fills it"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", "simulated_only(reason): not flown with --vehicle px4, and why"
+    )
+    if config.getoption("--vehicle") == "px4" and config.getoption("--px4") is None:
+        raise pytest.UsageError("--vehicle px4 needs --px4 with PX4's build folder")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--vehicle") != "px4":
+        return
+    for item in items:
+        for marker in item.iter_markers("simulated_only"):
+            item.add_marker(pytest.mark.skip(reason=marker.args[0]))
+
+
 @pytest.fixture(scope="session")
 def shipped_bundle() -> Bundle:
     return load_bundle(SHIPPED)

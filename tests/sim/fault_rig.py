@@ -26,11 +26,13 @@ from edge.core import F32, F64
 from edge.core.mission import FlightState, OrderKind, OrderResult, RobotStatus
 from edge.runtime.pac import Pac, PolicyTick
 from sim.fleet import ORIGIN, Fleet, RobotProcess
+from sim.fleet_vehicles import SimulatedVehicles
 from sim.operator import Heard, Script, Statuses
 from sim.px4.server import STEP_S
 from sim.px4.vehicle import Px4Vehicle, Truth
 from tests.conftest import ROOT
 from tests.robot_rig import HELD_UP
+from tests.sim.px4_rig import RealVehicle, RealVehicles
 
 _S = FlightState
 
@@ -78,15 +80,27 @@ class FaultyRobot(RobotProcess):
 class FaultRig:
     """A running fleet, and what tests do to it and ask of it; `flying` are the robots not lost yet.
 
-    Times are a vehicle's own, s. What the vehicle really did is `truth`.
+    Times are a vehicle's own, s. What the vehicle really did is `truth`. `at_rest_m_s` is what a
+    vehicle that holds its place does not exceed, `log_lag_s` how late its log tells of setpoints,
+    `drift_m` how far it comes down from where it was without GPS.
     """
 
-    def __init__(self, fleet: Fleet, robots: Sequence[int]) -> None:
-        assert fleet.simulated is not None
+    def __init__(
+        self, fleet: Fleet, robots: Sequence[int], vehicles: SimulatedVehicles | RealVehicles
+    ) -> None:
         self.fleet = fleet
         self.operator = fleet.operator
-        self.simulated = fleet.simulated
+        self.simulated = vehicles
         self.flying = set(robots)
+        # PX4's own vehicle model wanders up to 0.24 m/s in PX4's own hold.
+        self.at_rest_m_s = 0.35 if isinstance(vehicles, RealVehicles) else 0.2
+        # A real PX4 was seen 7.5 m away after it had landed without GPS.
+        self.drift_m = 10.0 if isinstance(vehicles, RealVehicles) else 6.0
+        self.log_lag_s = 1.5 if isinstance(vehicles, RealVehicles) else 0.1
+
+    def robot(self, role: int) -> int:
+        """Who takes a test's part: of real PX4s there are few, so the lowest that still flies."""
+        return min(self.flying) if isinstance(self.simulated, RealVehicles) else role
 
     # The operator's part
 
@@ -174,9 +188,35 @@ class FaultRig:
 
     # The vehicles' part
 
-    def vehicle(self, robot: int) -> Px4Vehicle:
+    def vehicle(self, robot: int) -> Px4Vehicle | RealVehicle:
         """The robot's vehicle."""
         return self.simulated.vehicles[robot]
+
+    def simulated_vehicle(self, robot: int) -> Px4Vehicle:
+        """The same, where it can be asked for all that is in it."""
+        vehicle = self.vehicle(robot)
+        assert isinstance(vehicle, Px4Vehicle)
+        return vehicle
+
+    def lose_gps(self, robot: int) -> float:
+        """Its receiver sees nothing from now on; returns the vehicle's time."""
+        with self.simulated.stepped:
+            vehicle = self.vehicle(robot)
+            if isinstance(vehicle, RealVehicle):
+                vehicle.lose_gps()
+            else:
+                vehicle.gps_lost = True
+            return vehicle.time_s
+
+    def drain(self, robot: int, remaining: float) -> float:
+        """Its battery falls to this share; returns the vehicle's time."""
+        with self.simulated.stepped:
+            vehicle = self.vehicle(robot)
+            if isinstance(vehicle, RealVehicle):
+                vehicle.drain(remaining)
+            else:
+                vehicle.battery_remaining = remaining
+            return vehicle.time_s
 
     def now_s(self, robot: int) -> float:
         """The vehicle's time."""
@@ -190,15 +230,13 @@ class FaultRig:
                 setattr(self.vehicle(robot), name, value)
             return self.vehicle(robot).time_s
 
-    def wait_vehicle(self, robot: int, holds: Callable[[Px4Vehicle], bool]) -> None:
+    def wait_vehicle(self, robot: int, holds: Callable[[Any], bool]) -> None:
         """Wait until something holds of the vehicle."""
         assert self._vehicle_is(robot, holds, 120.0), (
             robot, self.told(), self.vehicle(robot).truth[-1],
         )  # fmt: skip
 
-    def _vehicle_is(
-        self, robot: int, holds: Callable[[Px4Vehicle], bool], timeout_s: float
-    ) -> bool:
+    def _vehicle_is(self, robot: int, holds: Callable[[Any], bool], timeout_s: float) -> bool:
         vehicle = self.vehicle(robot)
         with self.simulated.stepped:
             return self.simulated.stepped.wait_for(lambda: holds(vehicle), timeout_s)
@@ -224,7 +262,10 @@ class FaultRig:
     def last_setpoint_s(self, robot: int) -> float:
         """When the last setpoint reached the vehicle."""
         with self.simulated.stepped:
-            return self.vehicle(robot)._setpoint_at_s
+            vehicle = self.vehicle(robot)
+            if isinstance(vehicle, RealVehicle):
+                return vehicle.last_setpoint_s()
+            return vehicle._setpoint_at_s
 
     def truth(self, robot: int, since_s: float) -> list[Truth]:
         """What was really so since then; it is never nothing."""
@@ -236,6 +277,18 @@ class FaultRig:
     def max_speed_m_s(self, robot: int, since_s: float, axes: int = 3) -> float:
         """The greatest true speed since then; with 2 axes the horizontal one."""
         return max(speed_m_s(entry.velocity_m_s, axes) for entry in self.truth(robot, since_s))
+
+    def jump_origin(self, robot: int, north_m: float, east_m: float) -> tuple[float, F64]:
+        """Its estimator starts over from another origin; its time then, and where it really was."""
+        with self.simulated.stepped:
+            vehicle = self.vehicle(robot)
+            vehicle.jump_estimator_origin(north_m, east_m)
+            return vehicle.time_s, vehicle.position_m.copy()
+
+    def true_position_m(self, robot: int) -> F64:
+        """Where the vehicle really is: the mission frame, (3,)."""
+        with self.simulated.stepped:
+            return self._to_mission_m(self.vehicle(robot).position_m)
 
     def estimate_m(self, robot: int) -> F64:
         """Where the vehicle takes itself to be: the mission frame, (3,)."""
@@ -270,10 +323,10 @@ class FaultRig:
             return away_m < 0.2
 
         with self.simulated.stepped:
-            self.vehicle(robot).pilot()
+            self.simulated_vehicle(robot).pilot()
         self.wait_vehicle(robot, is_there)
         with self.simulated.stepped:
-            self.vehicle(robot).move_sticks(())
+            self.simulated_vehicle(robot).move_sticks(())
 
     def push_over_the_fence(self, robot: int) -> None:
         """A gust carries it over the line; then the wind blows on as it is."""
@@ -286,7 +339,9 @@ class FaultRig:
 
         self.wait_vehicle(robot, is_over_the_line)
         with self.simulated.stepped:
-            self.vehicle(robot).wind_m_s = self.vehicle(robot)._compensated_wind.copy()
+            self.simulated_vehicle(robot).wind_m_s = self.simulated_vehicle(
+                robot
+            )._compensated_wind.copy()
 
 
 def speed_m_s(velocity_m_s: Sequence[float] | F64, axes: int) -> float:

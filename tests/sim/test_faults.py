@@ -2,6 +2,9 @@
 
 One fleet takes off once and flies its mission, and each test takes a robot of its own. Those that
 come down are the lowest first, so that nobody lands through another's height.
+
+With --vehicle px4 --px4 DIR the vehicles are real PX4s of that build, three at a time, and new ones
+once fewer than two still fly.
 """
 
 import json
@@ -9,8 +12,9 @@ import math
 import signal
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Literal
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Literal, Self
 
 import numpy as np
 import pytest
@@ -18,18 +22,23 @@ import zenoh
 
 from edge.core.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus, to_json
 from edge.core.wire import Rejection, decode, encode
-from sim.fleet import ORIGIN, Fleet, FleetScenario
+from sim.fleet import ORIGIN, WORLD, Fleet, FleetScenario
 from sim.operator import Statuses
+from sim.px4.estimator import DEAD_RECKONING_S
 from sim.px4.modes import Mode
-from sim.px4.vehicle import DEAD_RECKONING_S, Px4Vehicle
+from sim.px4.vehicle import Px4Vehicle
+from sim.px4_build import Px4Build
 from tests.conftest import SHIPPED
 from tests.sim.fault_rig import FaultRig, FaultyRobot, flies_on
+from tests.sim.px4_rig import RealVehicle, RealVehicles
 
 KILLED, NO_GPS, EMPTY, LOW, MANY_FAULTS, FAULTY, STOPPED = range(7)
 # Another vehicle, whose program says that it is robot STOPPED.
 TWIN = 7
 
-AT_REST_M_S = 0.2
+# As many as two cores carry.
+PX4S = 3
+
 PX4_FENCE_M = 5.0
 
 _S = FlightState
@@ -46,21 +55,80 @@ def grounded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     change_config(fleet, TWIN, f"robot_id = {TWIN}", f"robot_id = {STOPPED}")
     change_config(fleet, STOPPED, 'rc = "none"', 'rc = "pilot"')
     with fleet:
-        rig = FaultRig(fleet, range(TWIN))
+        assert fleet.simulated is not None
+        rig = FaultRig(fleet, range(TWIN), fleet.simulated)
         rig.change(STOPPED, rc_connected=True)
         rig.script("assemble")
         yield rig
 
 
 @pytest.fixture(scope="module")
-def rig(grounded: FaultRig) -> FaultRig:
+def simulated_rig(request: pytest.FixtureRequest) -> FaultRig:
     """All but the twin fly their mission."""
+    grounded: FaultRig = request.getfixturevalue("grounded")
     twin = grounded.fleet.robots[TWIN]
     twin.send_signal(signal.SIGTERM)
     assert twin.wait(60.0) == 0
     for step in ("preflight", "takeoff", "start"):
         grounded.script(step)
     return grounded
+
+
+class Px4Rigs:
+    """Fleets of real PX4s, one after the other; a context, in which the newest flies."""
+
+    def __init__(self, build: Path, folder: Path) -> None:
+        self._build, self._folder = build, folder
+        self._stack = ExitStack()
+        self._rig: FaultRig | None = None
+        self._fleets = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stack.close()
+
+    def flying(self) -> FaultRig:
+        """A fleet in its mission, of which one robot may be lost and another goes on."""
+        if self._rig is None or len(self._rig.flying) < 2:
+            self._stack.close()
+            self._rig = None
+            self._fleets += 1
+            self._rig = self._start(self._folder / str(self._fleets))
+        return self._rig
+
+    def _start(self, folder: Path) -> FaultRig:
+        fleet = Fleet(
+            FleetScenario(robots=PX4S, seed=self._fleets), folder, SHIPPED, px4_build=self._build
+        )
+        fleet.robots = tuple(FaultyRobot(r.robot_id, r.folder) for r in fleet.robots)
+        assert isinstance(fleet.vehicles, Px4Build)
+        vehicles = RealVehicles(fleet.vehicles, WORLD)
+        self._stack.enter_context(fleet)
+        self._stack.enter_context(vehicles)
+        rig = FaultRig(fleet, range(PX4S), vehicles)
+        for step in ("assemble", "preflight", "takeoff", "start"):
+            rig.script(step)
+        return rig
+
+
+@pytest.fixture(scope="module")
+def px4_rigs(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Px4Rigs]:
+    with Px4Rigs(request.config.getoption("--px4"), tmp_path_factory.mktemp("px4")) as rigs:
+        yield rigs
+
+
+@pytest.fixture
+def rig(request: pytest.FixtureRequest) -> FaultRig:
+    """A fleet in its mission."""
+    if request.config.getoption("--vehicle") == "px4":
+        rigs: Px4Rigs = request.getfixturevalue("px4_rigs")
+        return rigs.flying()
+    simulated: FaultRig = request.getfixturevalue("simulated_rig")
+    return simulated
 
 
 def change_config(fleet: Fleet, robot: int, before: str, after: str) -> None:
@@ -85,25 +153,22 @@ def is_down(vehicle: Px4Vehicle) -> bool:
     return vehicle.landed and not vehicle.armed
 
 
-def is_at_rest(vehicle: Px4Vehicle) -> bool:
-    return math.hypot(*vehicle.velocity_m_s) < AT_REST_M_S
-
-
 def nothing_is_sent(rig: FaultRig, robot: int) -> None:
-    # What was under way arrives first.
-    rig.wait_time(robot, rig.now_s(robot) + 0.1)
+    # What was under way arrives first, and a log is written.
+    rig.wait_time(robot, rig.now_s(robot) + rig.log_lag_s)
     sent_s = rig.last_setpoint_s(robot)
-    rig.wait_time(robot, rig.now_s(robot) + 2.0)
+    rig.wait_time(robot, rig.now_s(robot) + 2.0 + rig.log_lag_s)
     assert rig.last_setpoint_s(robot) == sent_s
 
 
 def longest_without_setpoint_s(rig: FaultRig, robot: int, until_s: float) -> float:
-    """How long no setpoint came, at most, from now on."""
+    """How long no setpoint came, at most, from now on; of a real PX4 that is not known live."""
     longest_s = 0.0
 
-    def is_over(vehicle: Px4Vehicle) -> bool:
+    def is_over(vehicle: Px4Vehicle | RealVehicle) -> bool:
         nonlocal longest_s
-        longest_s = max(longest_s, vehicle.time_s - vehicle._setpoint_at_s)
+        if isinstance(vehicle, Px4Vehicle):
+            longest_s = max(longest_s, vehicle.time_s - vehicle._setpoint_at_s)
         return vehicle.time_s >= until_s
 
     rig.wait_vehicle(robot, is_over)
@@ -120,6 +185,7 @@ def comes_straight_down(rig: FaultRig, robot: int, since_s: float, within_m: flo
     return began_s
 
 
+@pytest.mark.simulated_only("takes a vehicle more, and PX4 has no part in it")
 def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> None:
     operator = grounded.operator
     operator.enable(ORIGIN)
@@ -170,7 +236,8 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
 
 
 def test_a_program_is_stopped_and_continued(rig: FaultRig) -> None:
-    robot, program = STOPPED, rig.fleet.robots[STOPPED]
+    robot = rig.robot(STOPPED)
+    program = rig.fleet.robots[robot]
     rig.wait_moving(robot)
     with rig.others_go_on(robot):
         program.send_signal(signal.SIGSTOP)
@@ -186,13 +253,14 @@ def test_a_program_is_stopped_and_continued(rig: FaultRig) -> None:
         # Nothing but the operator's order makes it fly on.
         rig.wait_time(robot, rig.now_s(robot) + 5.0)
         assert rig.status(robot).state is _S.HOLD
-        assert rig.max_speed_m_s(robot, silent_s + 1.5) < AT_REST_M_S
+        assert rig.max_speed_m_s(robot, silent_s + 1.5) < rig.at_rest_m_s
         # Its messages have come back.
         assert rig.is_heard(robot)
 
 
 def test_a_program_is_killed(rig: FaultRig) -> None:
-    robot, program = KILLED, rig.fleet.robots[KILLED]
+    robot = rig.robot(KILLED)
+    program = rig.fleet.robots[robot]
     rig.wait_moving(robot)
     with rig.others_go_on(robot, lost=True):
         began_s = rig.now_s(robot)
@@ -202,14 +270,15 @@ def test_a_program_is_killed(rig: FaultRig) -> None:
         assert rig.is_forgotten(robot)
     assert comes_straight_down(rig, robot, began_s) < rig.last_setpoint_s(robot) + 1.2
     silent_s = rig.last_setpoint_s(robot)
-    assert rig.max_speed_m_s(robot, silent_s + 2.0, axes=2) < AT_REST_M_S
+    assert rig.max_speed_m_s(robot, silent_s + 2.0, axes=2) < rig.at_rest_m_s
 
 
 @pytest.mark.parametrize(("part", "within_s"), [("policy", 1.0), ("sensor", 2.0)])
 def test_the_policy_raises_and_the_sensor_sees_nothing(
     rig: FaultRig, part: Literal["policy", "sensor"], within_s: float
 ) -> None:
-    robot, program = FAULTY, rig.fleet.robots[FAULTY]
+    robot = rig.robot(FAULTY)
+    program = rig.fleet.robots[robot]
     assert isinstance(program, FaultyRobot)
     rig.wait_moving(robot)
     with rig.others_go_on(robot):
@@ -220,14 +289,14 @@ def test_the_policy_raises_and_the_sensor_sees_nothing(
         rig.wait_time(robot, began_s + within_s + 5.0)
         # It brakes, and flies back slowly to where it was told to stop.
         assert rig.max_speed_m_s(robot, began_s + within_s + 1.0) < 0.5
-        assert rig.max_speed_m_s(robot, began_s + within_s + 3.0) < AT_REST_M_S
+        assert rig.max_speed_m_s(robot, began_s + within_s + 3.0) < rig.at_rest_m_s
         refusal = rig.order("start", robot)
         assert not refusal.accepted and refusal.reason == "the policy has no fresh answer"
         program.mend()
 
 
 def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: FaultRig) -> None:
-    robot, bundle = STOPPED, rig.fleet.bundle
+    robot, bundle = rig.robot(STOPPED), rig.fleet.bundle
     with rig.others_go_on(robot), rogue(rig.fleet) as session:
         key = f"lpac/{rig.fleet.name}/robot/{robot}/message"
         with session.declare_subscriber(key) as subscriber:
@@ -275,19 +344,17 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
 
 @pytest.mark.parametrize("state", [_S.MISSION, _S.HOLD])
 def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
-    robot = MANY_FAULTS
+    robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot):
         if state is _S.HOLD:
             rig.operator.calm("hold", robot)
             rig.wait_state(robot, _S.HOLD)
             rig.wait_time(robot, rig.now_s(robot) + 2.5)
-        vehicle, north_m = rig.vehicle(robot), 5.6
+        north_m = 5.6
         # Until its next setpoint the vehicle follows the last one, which is another place now: a
         # jump in which the robot was held up tells nothing. Ten such in a row count all the same.
         for _ in range(10):
-            with rig.simulated.stepped:
-                vehicle.jump_estimator_origin(north_m, -0.75 * north_m)
-                began_s, began_m = vehicle.time_s, vehicle.position_m.copy()
+            began_s, began_m = rig.jump_origin(robot, north_m, -0.75 * north_m)
             if longest_without_setpoint_s(rig, robot, began_s + 3.0) < 0.2:
                 break
             north_m = -north_m
@@ -308,7 +375,7 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
 
 
 def test_a_vehicle_leaves_offboard(rig: FaultRig) -> None:
-    robot = MANY_FAULTS
+    robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot):
         with rig.simulated.stepped:
             rig.vehicle(robot).set_mode(Mode.HOLD)
@@ -322,6 +389,7 @@ def test_a_vehicle_leaves_offboard(rig: FaultRig) -> None:
         rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Mode.OFFBOARD)
 
 
+@pytest.mark.simulated_only("PX4's simulator has no remote control that can be taken away")
 def test_a_remote_control_is_lost_and_comes_back(rig: FaultRig) -> None:
     robot = STOPPED
     with rig.others_go_on(robot):
@@ -333,8 +401,9 @@ def test_a_remote_control_is_lost_and_comes_back(rig: FaultRig) -> None:
         rig.wait_status(robot, lambda status: "remote control lost" not in status.alarms)
 
 
+@pytest.mark.simulated_only("PX4's own vehicle model has no wind that can be set in flight")
 def test_wind_carries_a_robot_over_the_fence(rig: FaultRig) -> None:
-    robot, fence = MANY_FAULTS, rig.fleet.fence
+    robot, fence = rig.robot(MANY_FAULTS), rig.fleet.fence
     with rig.others_go_on(robot):
         heard_s = time.monotonic()
         rig.push_over_the_fence(robot)
@@ -352,6 +421,9 @@ def test_wind_carries_a_robot_over_the_fence(rig: FaultRig) -> None:
             assert flies_on(status), (status.state, status.reason)
 
 
+@pytest.mark.simulated_only(
+    "nobody flies a real PX4 by sticks here; a ground station's HOLD is flown"
+)
 def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig) -> None:
     robot = STOPPED
     with rig.others_go_on(robot):
@@ -371,7 +443,7 @@ def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig)
         refusal = rig.order("rejoin", robot)
         assert not refusal.accepted and "its height is 16 m" in refusal.reason
         rig.fly_by_hand(robot, place_m)
-        rig.wait_vehicle(robot, is_at_rest)
+        rig.wait_vehicle(robot, lambda v: math.hypot(*v.velocity_m_s) < rig.at_rest_m_s)
         assert rig.status(robot).state is _S.PILOT
         began_s = rig.now_s(robot)
         assert rig.order("rejoin", robot).accepted
@@ -379,26 +451,26 @@ def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig)
         # Nothing but the operator's order makes it fly on.
         rig.wait_time(robot, rig.now_s(robot) + 3.0)
         assert rig.status(robot).state is _S.HOLD
-        assert rig.max_speed_m_s(robot, began_s) < 2.0 * AT_REST_M_S
+        assert rig.max_speed_m_s(robot, began_s) < 2.0 * rig.at_rest_m_s
 
 
 def test_gps_is_lost(rig: FaultRig) -> None:
-    robot = NO_GPS
+    robot = rig.robot(NO_GPS)
     with rig.others_go_on(robot, lost=True):
-        heard_s, began_s = time.monotonic(), rig.change(robot, gps_lost=True)
+        heard_s, began_s = time.monotonic(), rig.lose_gps(robot)
         rig.wait_landed(robot)
         landing = [h.status for h in rig.heard(robot, heard_s) if h.status.state is _S.LAND]
-        assert {status.reason for status in landing} == {"position lost"}
+        assert {status.reason for status in landing} == {"position lost: GPS has no fix"}
         # Its estimate drifts by metres on the way.
         # Sooner than PX4 would land it by itself.
-        landed_s = comes_straight_down(rig, robot, began_s, within_m=6.0)
+        landed_s = comes_straight_down(rig, robot, began_s, within_m=rig.drift_m)
         assert landed_s < began_s + DEAD_RECKONING_S
 
 
 def test_the_battery_is_critical(rig: FaultRig) -> None:
-    robot = EMPTY
+    robot = rig.robot(EMPTY)
     with rig.others_go_on(robot, lost=True):
-        began_s = rig.change(robot, battery_remaining=0.145)
+        began_s = rig.drain(robot, 0.145)
         status = rig.wait_state(robot, _S.LAND)
         assert status.reason == status.alarms[0] and "battery critical" in status.reason
         rig.wait_landed(robot)
@@ -406,10 +478,10 @@ def test_the_battery_is_critical(rig: FaultRig) -> None:
 
 
 def test_the_battery_is_low(rig: FaultRig) -> None:
-    robot = LOW
+    robot = rig.robot(LOW)
     with rig.others_go_on(robot, lost=True):
         heard_s = time.monotonic()
-        rig.change(robot, battery_remaining=0.245)
+        rig.drain(robot, 0.245)
         status = rig.wait_state(robot, _S.RETURN)
         assert status.reason == status.alarms[0] and "battery low" in status.reason
         rig.wait_landed(robot)
@@ -417,12 +489,12 @@ def test_the_battery_is_low(rig: FaultRig) -> None:
         # Whether it still says "mission" once is a matter of the instant.
         states = dict.fromkeys(status.state for status in told if not flies_on(status))
         assert [*states][:2] == [_S.RETURN, _S.LAND]
-        landed_m = rig.fleet.true_positions_m()[robot]
+        landed_m = rig.true_position_m(robot)
         assert math.dist(landed_m[:2], rig.fleet.pads_m[robot]) < 1.5
 
 
 def test_a_robot_is_killed_by_the_operator(rig: FaultRig) -> None:
-    robot = MANY_FAULTS
+    robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot, lost=True):
         began_s = rig.now_s(robot)
         assert rig.order("kill", robot).accepted
@@ -430,7 +502,7 @@ def test_a_robot_is_killed_by_the_operator(rig: FaultRig) -> None:
         assert status.reason == status.alarms[0] == "killed by the operator"
         rig.wait_vehicle(robot, is_down)
         disarmed = next(entry for entry in rig.truth(robot, began_s) if not entry.armed)
-        assert disarmed.position_m[2] < -5.0
+        assert disarmed.position_m[2] < -0.5 * status.slot_height_m
         # It stays so.
         rig.wait_time(robot, rig.now_s(robot) + 2.0)
         refusal = rig.order("takeoff", robot)

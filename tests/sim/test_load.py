@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import sim.load
-from cli.sim import _as_many_as_carried, _warn_of_too_many
+from cli.sim import _as_many_as_carried, _say_if_carried
 from sim.fleet import OVERLOADED_S, Fleet, FleetScenario
 from sim.fleet_flight import fly, summary_lines
 from sim.load import robots_carried
@@ -37,9 +37,10 @@ def test_who_asks_for_more_is_warned(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sim.load, "_units_per_s", lambda _: FIVE_FLEW)
-    _warn_of_too_many(5, SHIPPED, "mavlink")
-    assert capsys.readouterr().err == ""
-    _warn_of_too_many(6, SHIPPED, "mavlink")
+    _say_if_carried(5, SHIPPED, "mavlink")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("carries about 5 of these robots and vehicles")
+    _say_if_carried(6, SHIPPED, "mavlink")
     (line,) = capsys.readouterr().err.splitlines()
     assert (
         "carries about 5 of these robots" in line

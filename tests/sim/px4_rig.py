@@ -1,0 +1,224 @@
+"""Real PX4s as the fault rig sees vehicles: what is done to them, and what they do.
+
+What is done to a PX4 comes from a ground station on its ground-station link; where the vehicle
+really is tells PX4's own vehicle model. The names are those of `sim.px4.vehicle.Px4Vehicle`.
+"""
+
+import math
+import socket
+import threading
+import time
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from edge.core import F64
+from sim.px4.modes import CUSTOM_MODES, Mode
+from sim.px4.vehicle import Truth
+from sim.px4.world import WorldOrigin
+from sim.px4_build import GROUND_PORT, Px4Build, frames, payload
+
+AIRBORNE_ABOVE_M = 0.15
+# PX4's DESCEND is told as LAND.
+_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Mode.DESCEND}
+_PERIOD_S = 0.02
+_HEARTBEAT_PERIOD_S = 0.5
+# Not in pymavlink's dialect: custom_mode comes first. PX4 has it since v1.15.
+CURRENT_MODE = 436
+_RATES_HZ = {
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20,
+    mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 25,
+    CURRENT_MODE: 20,
+}
+_HEARD = {
+    *_RATES_HZ, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+}  # fmt: skip
+
+
+class RealVehicle:
+    """One PX4, over its ground-station link; its fields are changed while `stepped` is held.
+
+    `time_s` is `time.monotonic()` of what was heard last. `truth` is all that was so.
+    """
+
+    def __init__(self, px4s: Px4Build, instance: int, world: WorldOrigin) -> None:
+        self.time_s = 0.0
+        self.mode = Mode.HOLD
+        self.armed = False
+        self.position_m: F64 = np.zeros(3)
+        self.velocity_m_s: F64 = np.zeros(3)
+        self.truth: list[Truth] = []
+        self._world = world
+        self._local_m: F64 = np.zeros(3)
+        self._origin_m: F64 = np.zeros(3)
+        self._ground_altitude_m = math.nan
+        self._heartbeat_due_s = 0.0
+        self._px4s, self._instance, self._system = px4s, instance, instance + 1
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.connect(("127.0.0.1", GROUND_PORT + instance))
+        self._udp.setblocking(False)
+        self._mav: Any = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._mav.robust_parsing = True
+
+    @property
+    def landed(self) -> bool:
+        """Whether it really stands on the ground."""
+        return bool(self.position_m[2] > -AIRBORNE_ABOVE_M)
+
+    @property
+    def estimated_position_m(self) -> F64:
+        """Where PX4 takes itself to be, in the world."""
+        return self._local_m + self._origin_m
+
+    # What is done to it
+
+    def set_mode(self, mode: Mode) -> None:
+        """A ground station asks for a mode."""
+        custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, *CUSTOM_MODES[mode])
+
+    def lose_gps(self) -> None:
+        """Its receiver sees no satellite from now on."""
+        self.set_parameter("SIM_GPS_USED", 0, mavlink.MAV_PARAM_TYPE_INT32)
+
+    def drain(self, remaining: float) -> None:
+        """The battery falls to this share within seconds."""
+        self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining, mavlink.MAV_PARAM_TYPE_REAL32)
+        self.set_parameter("SIM_BAT_DRAIN", 40.0, mavlink.MAV_PARAM_TYPE_REAL32)
+
+    def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
+        """A ground station moves the estimator's origin."""
+        moved_m = self._origin_m + np.array([north_m, east_m, down_m])
+        latitude, longitude, altitude_m = self._world.to_global(moved_m)
+        self._send(
+            mavlink.MAVLink_set_gps_global_origin_message(
+                self._system, round(latitude * 1e7), round(longitude * 1e7),
+                round(altitude_m * 1e3), 0,
+            )
+        )  # fmt: skip
+
+    def set_parameter(self, name: str, value: float, kind: int) -> None:
+        """Of PX4; an integer is sent by its bits."""
+        raw = value
+        if kind == mavlink.MAV_PARAM_TYPE_INT32:
+            raw = float(np.array([int(value)], np.int32).view(np.float32)[0])
+        self._send(mavlink.MAVLink_param_set_message(self._system, 1, name.encode(), raw, kind))
+
+    def _command(self, command: int, *parameters: float) -> None:
+        filled = [*parameters, *[0.0] * (7 - len(parameters))]
+        self._send(mavlink.MAVLink_command_long_message(self._system, 1, command, 0, *filled))
+
+    def _send(self, message: Any) -> None:
+        with suppress(ConnectionError):  # PX4 does not listen yet, or any more.
+            self._udp.send(message.pack(self._mav))
+
+    # What it does
+
+    def exchange(self) -> None:
+        """Say what is due, and take all that has come."""
+        now_s = time.monotonic()
+        if now_s >= self._heartbeat_due_s:
+            self._heartbeat_due_s = now_s + _HEARTBEAT_PERIOD_S
+            self._send(
+                mavlink.MAVLink_heartbeat_message(
+                    mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+                )
+            )
+            if not self.truth:
+                for message, rate_hz in _RATES_HZ.items():
+                    self._command(
+                        mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, round(1e6 / rate_hz)
+                    )
+        while datagram := self._receive():
+            for message_id, frame in frames(datagram):
+                if message_id == CURRENT_MODE:
+                    self._take_mode(int.from_bytes(payload(frame, 4), "little"))
+                elif message_id in _HEARD:
+                    for message in self._mav.parse_buffer(frame) or ():
+                        if (message.get_srcSystem(), message.get_srcComponent()) == (
+                            self._system, 1,
+                        ):  # fmt: skip
+                            self._hear(now_s, message)
+
+    def close(self) -> None:
+        """Say and hear nothing more."""
+        self._udp.close()
+
+    def last_setpoint_s(self) -> float:
+        """When the last setpoint reached it, by its log, some tenths of a second old."""
+        return self._px4s.last_setpoint_s(self._instance)
+
+    def _receive(self) -> bytes:
+        with suppress(ConnectionError, BlockingIOError):
+            return self._udp.recv(2048)
+        return b""
+
+    def _hear(self, now_s: float, message: Any) -> None:
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            self._take_mode(message.custom_mode)
+        elif kind == "LOCAL_POSITION_NED":
+            self._local_m = np.array([message.x, message.y, message.z])
+        elif kind == "GPS_GLOBAL_ORIGIN":
+            latitude, longitude = message.latitude * 1e-7, message.longitude * 1e-7
+            north_m, east_m = self._world.to_world(latitude, longitude)
+            down_m = self._world.altitude_m - message.altitude * 1e-3
+            self._origin_m = np.array([north_m, east_m, down_m])
+        elif kind == "HIL_STATE_QUATERNION":
+            self._take_truth(now_s, message)
+
+    def _take_mode(self, custom_mode: int) -> None:
+        self.mode = _MODES.get((custom_mode >> 16 & 0xFF, custom_mode >> 24), self.mode)
+
+    def _take_truth(self, now_s: float, message: Any) -> None:
+        if math.isnan(self._ground_altitude_m):
+            self._ground_altitude_m = message.alt * 1e-3
+        north_m, east_m = self._world.to_world(message.lat * 1e-7, message.lon * 1e-7)
+        self.time_s = now_s
+        self.position_m = np.array([north_m, east_m, self._ground_altitude_m - message.alt * 1e-3])
+        self.velocity_m_s = np.array([message.vx, message.vy, message.vz]) * 1e-2
+        north, east, down = self.position_m.tolist()
+        v_north, v_east, v_down = self.velocity_m_s.tolist()
+        self.truth.append(
+            Truth(
+                time_s=now_s, position_m=(north, east, down),
+                velocity_m_s=(v_north, v_east, v_down),
+                mode=self.mode, armed=self.armed, landed=self.landed,
+            )
+        )  # fmt: skip
+
+
+class RealVehicles:
+    """The PX4s of a build that runs; a context, in which a thread of this process hears them."""
+
+    def __init__(self, px4s: Px4Build, world: WorldOrigin) -> None:
+        self.stepped = threading.Condition()
+        self.vehicles = tuple(RealVehicle(px4s, i, world) for i in range(len(px4s.autopilots)))
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="ground-station")
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        for vehicle in self.vehicles:
+            vehicle.close()
+
+    def _run(self) -> None:
+        while not self._stop.wait(_PERIOD_S):
+            with self.stepped:
+                for vehicle in self.vehicles:
+                    vehicle.exchange()
+                self.stepped.notify_all()
