@@ -254,7 +254,7 @@ class Setup:
     truncation: float
     norm: float
     base_height_m: float = 5.0
-    slot_spacing_m: float = 4.0
+    slot_spacing_m: float = 4.5
     errors: ErrorBudget = field(default_factory=ErrorBudget)
     battery_critical: float = 0.15
     ground_timeout_s: float = 3.0

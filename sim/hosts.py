@@ -166,7 +166,7 @@ velocity_scale = {FIELD_SCALE.velocity_scale}
 vertices_m = [[{low_m}, {low_m}], [{high_m}, {low_m}], [{high_m}, {high_m}], [{low_m}, {high_m}]]
 buffer_m = 1.5
 floor_m = 2.0
-ceiling_m = {7.0 + 4.0 * len(flying)}
+ceiling_m = {7.0 + 4.5 * len(flying)}
 
 [robot.limits]
 max_speed_m_s = 1.25

@@ -116,12 +116,12 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
         made.operator.assign(fence=FENCE, places={3: PLACE}, world=WORLD)
         made.wait(lambda status: status.world_id == world_id(WORLD) and status.ready)
         assert made.status.fence == FENCE
-        assert (made.status.slot_height_m, made.status.landing_point_m) == (5.0, (14.0, 12.0))
+        assert (made.status.slot_height_m, made.status.landing_point_m) == (9.5, (14.0, 12.0))
         assert made.status.not_taken == ()
         # It was below the new ceiling.
         assert made.vehicle_is(lambda v: v.parameters["GF_MAX_VER_DIST"] == 0)
         made.take_off()
-        assert made.vehicle_is(lambda v: abs(-v.position_m[2] - 5.0) < 1.0)
+        assert made.vehicle_is(lambda v: abs(-v.position_m[2] - 9.5) < 1.0)
         keeps_what_it_has_in_flight(made)
 
         made.order("start", "a")
@@ -142,7 +142,7 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
 
         # Without a word of the ground's, the configured fence and place count again.
         made.operator.assign()
-        made.wait(lambda status: (status.fence, status.slot_height_m) == (made.config.fence, 3.0))
+        made.wait(lambda status: (status.fence, status.slot_height_m) == (made.config.fence, 5.0))
         assert made.status.world_id == world_id(WORLD)
         assert made.refusal("disarm") == "is not armed"
         with made.server.stepped:

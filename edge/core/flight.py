@@ -69,7 +69,7 @@ class FlightParameters:
     slot: int
     landing_point_m: tuple[float, ...]
     base_height_m: float = 5.0
-    slot_spacing_m: float = 4.0
+    slot_spacing_m: float = 4.5
     min_separation_m: float = 1.5
     battery_low: float = 0.25
     battery_critical: float = 0.15

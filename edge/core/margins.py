@@ -47,9 +47,10 @@ class ErrorBudget:
     `gps_m`: its estimate's horizontal error. `wind_m`: how far a gust, or control, carries it from
     where it wants to be, `wind_m_s` the greatest speed of a gust, m/s. `height_apart_m`: by how
     much two vehicles' estimated heights come to differ in truth in one flight, each above its own
-    pad; `height_common_m`: how far all heights walk together. `height_control_m`: how far from its
-    height it is held. `pads_height_m`: how much higher one pad may lie than another. `drone_m`: its
-    size, propellers and all.
+    pad; `height_common_m`: how far all heights walk together, `takeoffs_height_m` how far they do
+    from the first takeoff to the last, since each is 0 when its robot is armed. `height_control_m`:
+    how far from its height it is held. `pads_height_m`: how much higher one pad may lie than
+    another. `drone_m`: its size, propellers and all.
 
     Raises ValueError if one is not finite or below 0 (`drone_m`: not above 0).
     """
@@ -59,6 +60,7 @@ class ErrorBudget:
     wind_m_s: float = 8.0
     height_apart_m: float = 2.0
     height_common_m: float = 3.0
+    takeoffs_height_m: float = 0.5
     height_control_m: float = 0.5
     pads_height_m: float = 0.5
     drone_m: float = 0.5
@@ -88,12 +90,10 @@ class ErrorBudget:
     @property
     def slot_spacing(self) -> Margin:
         """From one robot's height to another's."""
-        least_m = (
-            self.height_apart_m + 2.0 * self.height_control_m + self.pads_height_m + self.drone_m
-        )
+        estimates_m = self.height_apart_m + self.takeoffs_height_m
         return Margin(
-            least_m,
-            f"heights err by {self.height_apart_m:g} m from each other, control by "
+            estimates_m + 2.0 * self.height_control_m + self.pads_height_m + self.drone_m,
+            f"heights err by {estimates_m:g} m from each other, control by "
             f"{self.height_control_m:g} m each, pads by {self.pads_height_m:g} m, and a drone has "
             f"{self.drone_m:g} m",
         )

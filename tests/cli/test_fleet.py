@@ -133,6 +133,7 @@ def test_up_on_a_terminal_has_a_board_though_no_robot_has_come_up(
     monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal, to rich
     result = lpac("fleet", "up", "--fleet", nobody, "--timeout", "0")
     assert result.stdout.count("nothing listens on its ssh port") >= 2
+    assert result.stdout.count("keep free: the fence and ") == 1
     assert result.stderr.endswith("lpac: NO-GO: r1, r2\n")
 
 

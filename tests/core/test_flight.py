@@ -577,7 +577,7 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
     world.position_m[0] = 33.0
     assert world.refuse("start").startswith("outside the fence")
     world.position_m[0], world.position_m[2] = 16.0, SLOT_M - 2.0
-    assert "its height is 9 m" in world.refuse("start")
+    assert "its height is 9.5 m" in world.refuse("start")
     world.position_m[2] = SLOT_M
     world.battery = 0.2
     assert world.refuse("start") == "battery low: 20%"
@@ -1522,7 +1522,7 @@ def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> N
     world.pilot(-1.0, 0.0, -0.3)
     while world.position_m[0] > 25.0:
         world.tick()
-    assert "its height is 9 m" in world.refuse("rejoin")
+    assert "its height is 9.5 m" in world.refuse("rejoin")
     world.position_m[2] = SLOT_M
     world.pilot()
     world.obey("rejoin")
@@ -1796,7 +1796,7 @@ CHANGES = (_order, _mode, _arm, _ground, _surroundings, _vehicle, _place, _stop)
         ({"landing_point_m": (1.0,)}, "landing_point_m"),
         ({"landing_point_m": (1.0, math.nan)}, "landing_point_m"),
         ({"takeoff_timeout_s": 0.0}, "takeoff_timeout_s = 0.0"),
-        ({"min_separation_m": 4.0}, "min_separation_m = 4.0"),
+        ({"min_separation_m": 4.5}, "min_separation_m = 4.5"),
         ({"battery_critical": 0.3}, "battery_critical = 0.3"),
         ({"slot": 20}, "slot = 20"),
         ({"landing_point_m": (1.0, 12.0)}, "buffer_m = 2"),

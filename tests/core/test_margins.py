@@ -57,10 +57,11 @@ def test_at_the_least_distance_two_that_land_do_not_touch(
     assert truly_m > (one.drone_m + other.drone_m) / 2.0 - 1e-9
 
 
-@given(budgets, *[shares] * 6)
+@given(budgets, *[shares] * 7)
 def test_at_the_least_spacing_two_above_each_other_do_not_touch(
     budget: ErrorBudget,
     common: float,
+    later: float,
     difference: float,
     held_one: float,
     held_other: float,
@@ -69,7 +70,7 @@ def test_at_the_least_spacing_two_above_each_other_do_not_touch(
 ) -> None:
     """What two vehicles' heights are wrong by may be split between them in any way."""
     together_m = common * budget.height_common_m
-    apart_m = difference * budget.height_apart_m
+    apart_m = difference * budget.height_apart_m + later * budget.takeoffs_height_m
     lower_m = together_m - apart_m * share + held_one * budget.height_control_m
     upper_m = budget.slot_spacing.least_m + together_m + apart_m * (1.0 - share)
     upper_m += held_other * budget.height_control_m + ground * budget.pads_height_m
@@ -82,7 +83,8 @@ def test_the_margins_are_no_padding(share: float) -> None:
     budget = DEFAULT
     towards_m = 2.0 * (budget.gps_m + budget.wind_m)
     beside_m = share * places_apart(budget.position_m, budget.position_m).least_m - towards_m
-    down_m = budget.height_apart_m + 2.0 * budget.height_control_m + budget.pads_height_m
+    down_m = budget.height_apart_m + budget.takeoffs_height_m + budget.pads_height_m
+    down_m += 2.0 * budget.height_control_m
     above_m = share * budget.slot_spacing.least_m - down_m
     for truly_m in (beside_m, above_m):
         assert (truly_m >= budget.drone_m) is (share == 1.0)
@@ -109,7 +111,7 @@ def test_a_day_of_flights_by_chance() -> None:
             rng.uniform(-size_m, size_m, n)
             for size_m in (
                 budget.height_apart_m, budget.height_control_m, budget.height_control_m,
-                budget.pads_height_m,
+                budget.takeoffs_height_m, budget.pads_height_m,
             )
         ),
         np.zeros(n),
@@ -128,7 +130,7 @@ def test_a_day_of_flights_by_chance() -> None:
 
 def test_what_ships_holds_exactly_what_the_default_budget_asks_for() -> None:
     parameters = FlightParameters(slot=0, landing_point_m=(0.0, 0.0))
-    assert DEFAULT.slot_spacing.least_m == parameters.slot_spacing_m == 4.0
+    assert DEFAULT.slot_spacing.least_m == parameters.slot_spacing_m == 4.5
     assert 2.0 * DEFAULT.position_m == places_apart(4.0, 4.0).least_m == 8.0
     assert DEFAULT.lowest_height.least_m == 4.75
     assert DEFAULT.lowest_height.holds(parameters.base_height_m)

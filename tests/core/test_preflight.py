@@ -58,7 +58,7 @@ NEIGHBOUR = RobotStatus(
     trial="",
     origin=ORIGIN,
     system_id=2,
-    slot_height_m=9.0,
+    slot_height_m=9.5,
     landing_point_m=(16.0, 8.0),
     position_m=(12.0, 8.0, 0.0),
     velocity_m_s=(0.0, 0.0, 0.0),
@@ -124,12 +124,12 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
     ({"bundle_id": "c"}, "robot 2 has another bundle: deploy one to all"),
     ({"world_id": "v"}, "robot 2 has another world: set one on the ground"),
     ({"origin": Origin(47.4, 8.5, 91.0)}, "robot 2 has another mission origin"),
-    ({"slot_height_m": 6.0}, "robot 2 flies 3.0 m above or below, must be 4 m (heights err by 2 m"),
+    ({"slot_height_m": 6.0}, "robot 2 flies 3.5 m above or below, must be 4.5 m (heights err by"),
     (
         {"landing_point_m": (8.1, 8.0)},
         "robot 2 lands 7.9 m away, must be 8 m (positions err by 4 m and 4 m): change the landing",
     ),
-    ({"min_separation_m": 4.5}, "robot 2 flies 4.0 m above or below, must be 4.5 m (min_separ"),
+    ({"min_separation_m": 5.0}, "robot 2 flies 4.5 m above or below, must be 5 m (min_separ"),
     (
         {"neighbours": (HeardStatus(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
         "robot 2's clock differs by 30.0 s: set the time of both",

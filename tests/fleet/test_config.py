@@ -326,7 +326,7 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('robot = "r2"', 'robot = "r1"', ["slots[1]: robot = 'r1': slots[0] has it too"]),
         ('robot = "r2"', "height = 0", ["slots[1]: height = 0: slots[0] (robot r1) has it too"]),
         ('robot = "r2"', 'robot = "r2"\nheight = -1', ["slots[1]: height = -1", "0 or above"]),
-        ('robot = "r2"', 'robot = "r2"\nheight = 40', ["robots.r2, in slots[1]: slot = 40", "165"]),
+        ('robot = "r2"', 'robot = "r2"\nheight = 40', ["robots.r2, in slots[1]: slot = 40", "185"]),
         ("pad_m = [11.0, 2.0]", "", ["slots[1]: pad_m is missing"]),
         ("[11.0, 2.0]", "[11.0]", ["slots[1]: pad_m = [11.0]", "[x, y]"]),
         ("[11.0, 4.0]", "[nan, 4.0]", ["slots[1]: landing_point_m = [nan, 4.0]"]),
@@ -351,9 +351,9 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('robot = "r2"\npad_m = [11.0', 'pad_m = [60.0', ["slots[1]: pad_m = [60.0", "fence"]),
         (
             "[robots.r2.robot.limits]",
-            "[robots.r2.robot]\nflight.slot_spacing_m = 3.9\n[robots.r2.robot.limits]",
-            ["slots[1] (robot r2): height = 1: is 8.9 m, 3.9 m from that of slots[0] (robot r1), "
-             "must be 4 m (heights err by 2 m from each other"],
+            "[robots.r2.robot]\nflight.slot_spacing_m = 4.4\n[robots.r2.robot.limits]",
+            ["slots[1] (robot r2): height = 1: is 9.4 m, 4.4 m from that of slots[0] (robot r1), "
+             "must be 4.5 m (heights err by 2.5 m from each other"],
         ),
         (
             "[robots.r2.robot.limits]",
@@ -376,6 +376,29 @@ def test_a_mistake_is_one_line_that_names_it(
     message = refusal(fleet_file(tmp_path, example(old, new)))
     for name in names:
         assert name in message
+
+
+def test_receivers_with_corrections_may_stand_nearer(tmp_path: Path) -> None:
+    near = example("[11.0, 2.0]", "[4.2, 2.0]").replace("[11.0, 4.0]", "[4.2, 2.0]")
+    near = near.replace("landing_point_m = [2.0, 4.0]", "landing_point_m = [2.0, 2.0]")
+    assert "must be 8 m" in refusal(fleet_file(tmp_path, near))
+    load_fleet(fleet_file(tmp_path, near.replace("# gps_m = 3.0", "gps_m = 0.1")))
+
+
+def test_the_ground_to_keep_free_is_that_of_the_robot_that_needs_most(tmp_path: Path) -> None:
+    """A higher ceiling, a faster robot: more. Nobody who flies: none."""
+    margin = load_fleet(EXAMPLE).free_ground()
+    assert margin is not None and margin.least_m == 45.0
+    limits = "[robots.r2.robot.limits]"
+    for old, new in (
+        (limits, f"[robots.r2.robot.fence]\nceiling_m = 60\n{limits}"),
+        ('rc = "pilot"', 'rc = "pilot"\nfence_margin_m = 6.0'),
+    ):
+        more = load_fleet(fleet_file(tmp_path, example(old, new))).free_ground()
+        assert more is not None and more.least_m > margin.least_m
+    text = example()
+    nobody = text[: text.index("# Who flies where")]
+    assert load_fleet(fleet_file(tmp_path, nobody)).free_ground() is None
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:

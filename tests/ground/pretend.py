@@ -485,7 +485,8 @@ class PretendedFleet:
             },
             "failsafe": {"rc": "none"},
             # Thirty of them stand on one field: with corrections, on flat ground.
-            "errors": {"gps_m": 0.25, "height_apart_m": 0.2, "pads_height_m": 0.3},
+            "errors": {"gps_m": 0.25, "height_apart_m": 0.2, "takeoffs_height_m": 0.1,
+                       "pads_height_m": 0.2},
         }  # fmt: skip
         lines = [
             f'fleet = "{self.name}"', 'image = "image"', f'bundle = "{SHIPPED}"',

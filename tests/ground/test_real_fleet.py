@@ -221,7 +221,7 @@ def test_a_robot_that_starts_later_is_told_origin_fence_and_world(fleet: Fleet) 
         setup_fence = fleet.fence
         fence = type(setup_fence)(
             vertices_m=((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)),
-            buffer_m=1.0, floor_m=setup_fence.floor_m, ceiling_m=setup_fence.ceiling_m,
+            buffer_m=1.4, floor_m=setup_fence.floor_m, ceiling_m=setup_fence.ceiling_m,
         )  # fmt: skip
         ground.do(SetOrigin(ORIGIN))
         ground.do(SetFence(fence))

@@ -85,7 +85,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
         ('["tcp/0.0.0.0:7447"]', "[]", ["link: listen, connect and scouting"]),
         ("connect = []", 'connect = []\nmode = "client"', ["link: mode = 'client'", "connect"]),
         ("connect = []", 'connect = []\nmode = "router"', ["link: mode = 'router'", "'peer'"]),
-        ("slot = 0", "slot = 40", ["slot = 40", "165 m", "ceiling_m = 30"]),
+        ("slot = 0", "slot = 40", ["slot = 40", "185 m", "ceiling_m = 30"]),
         ("[4.0, 4.0]", "[40.0, 4.0]", ["landing_point_m", "inside the fence"]),
         ("[4.0, 4.0]", "[4.0]", ["flight: landing_point_m = [4.0]", "[x, y]"]),
         ("[34.0, 34.0]", "[8.0, 8.0]", ["fence: vertices_m", "convex"]),

@@ -329,7 +329,7 @@ def test_fence_and_place_are_taken_up_together_on_the_ground_and_given_back(flow
     assert flown.order("takeoff").reason == "not ready: the checks are still running"
     assert flies_by(flown) == (FENCE, PLACE, "configured")
     flown.take_off()
-    assert abs(-flown.vehicle.position_m[2] - 9.0) < 0.8
+    assert abs(-flown.vehicle.position_m[2] - 9.5) < 0.8
     flown.say(fence=None, places={}, origin=ELSEWHERE, world_id="other")
     flown.tick()
     assert flies_by(flown) == (FENCE, PLACE, "configured")
@@ -349,7 +349,7 @@ def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(fl
     before = flies_by(flown)
     for place, problem in (
         (Place(1, (29.0, 12.0)), "landing_point_m = [29.0, 12.0]: must be inside the fence, at"),
-        (Place(30, (14.0, 12.0)), "slot = 30 flies at 125 m: must be from floor_m = 2 to"),
+        (Place(30, (14.0, 12.0)), "slot = 30 flies at 140 m: must be from floor_m = 2 to"),
     ):
         flown.say(fence=FENCE, places={"3": place})
         reason = flown.order("takeoff").reason
@@ -389,7 +389,7 @@ def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown
 def test_a_program_that_starts_in_flight_flies_on_by_what_the_ground_says(flown: Flown) -> None:
     """What it was configured for is not what its predecessor took off with."""
     flown.say(fence=FENCE, places={"3": PLACE}, world_id="flat")
-    flown.take_off_by_hand(9.0)
+    flown.take_off_by_hand(9.5)
     assert flies_by(flown) == (FENCE, PLACE, "configured")
     flown.control.world = GroundWorld("flat", IdfSensor(np.zeros((512, 512), np.float32), 64), "")
     flown.tick()

@@ -441,7 +441,7 @@ def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig)
         assert not refusal.accepted and refusal.reason.startswith("outside the fence")
         rig.fly_by_hand(robot, place_m + np.array([0.0, 0.0, 3.0]))
         refusal = rig.order("rejoin", robot)
-        assert not refusal.accepted and "its height is 16 m" in refusal.reason
+        assert not refusal.accepted and "its height is 32 m" in refusal.reason
         rig.fly_by_hand(robot, place_m)
         rig.wait_vehicle(robot, lambda v: math.hypot(*v.velocity_m_s) < rig.at_rest_m_s)
         assert rig.status(robot).state is _S.PILOT
