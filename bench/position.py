@@ -20,6 +20,7 @@ from bench.report import Report, Table, Target
 from edge.adapters.mavsdk_autopilot import RATES_HZ
 from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.position import Judgement, PositionLimits, Quality, judge
+from sim.px4.errors import Errors
 from sim.px4.link import Px4Link
 from sim.px4.modes import Mode
 from sim.px4.server import STEP_S
@@ -82,7 +83,11 @@ def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
 
 def _fly(seed: int, flight_s: float) -> _Flight:
     rng = np.random.default_rng(seed)
-    vehicle = Px4Vehicle(seed=seed, airframe=Airframe(endurance_s=10.0 * flight_s))
+    vehicle = Px4Vehicle(
+        seed=seed,
+        airframe=Airframe(endurance_s=10.0 * flight_s),
+        errors=Errors(seed, fleet_seed=seed),
+    )
     link, telemetry = Px4Link(vehicle, system_id=1), Px4Telemetry()
     parser: Any = mavlink.MAVLink(None)
     parser.robust_parsing = True

@@ -90,8 +90,9 @@ def sim(
     max_message_age: Annotated[
         float, typer.Option(help="Older messages are not used, s; 0: each is used once.")
     ] = 0.8,
-    gps_bias: Annotated[
-        bool, typer.Option(help="mavlink: each vehicle takes itself to be 1 to 5 m elsewhere.")
+    errors: Annotated[
+        bool,
+        typer.Option(help="mavlink: positions, heights, compasses and batteries err, gusts blow."),
     ] = True,
     px4: Annotated[
         Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
@@ -129,7 +130,7 @@ def sim(
             duration_s=duration,
             features=world_features,
             random_feature_count=features,
-            gps_bias=gps_bias,
+            errors=errors,
         )
 
         def prepared() -> None:
@@ -214,7 +215,7 @@ _ONLY_FOR = {
     "loss": (Vehicle.POINT,),
     "delay": (Vehicle.POINT,),
     "max_message_age": (Vehicle.POINT,),
-    "gps_bias": (Vehicle.MAVLINK,),
+    "errors": (Vehicle.MAVLINK,),
     "px4": (Vehicle.PX4,),
     "script": (Vehicle.MAVLINK, Vehicle.PX4),
 }

@@ -29,6 +29,7 @@ from edge.runtime.config import Rates
 from sim.experiment import FIELD_SCALE
 from sim.fleet_vehicles import Autopilot, SimulatedVehicles, Vehicles, free_ports
 from sim.operator import Operator, Say
+from sim.px4.errors import Errors
 from sim.px4.vehicle import Px4Vehicle
 from sim.px4.world import WorldOrigin
 from sim.px4_build import Px4Build
@@ -67,8 +68,8 @@ _ON_STOP = "land"
 class FleetScenario:
     """A flight of a fleet; everything random in it but the timing follows from `seed`.
 
-    The world is that of a `sim.experiment.Scenario` with the same seed. Without `gps_bias` the
-    simulated vehicles' estimates are off by noise alone.
+    The world is that of a `sim.experiment.Scenario` with the same seed. Without `errors` the
+    simulated vehicles' estimates are off by noise alone, and the air stands still.
 
     Raises ValueError that names what is impossible.
     """
@@ -78,7 +79,7 @@ class FleetScenario:
     duration_s: float = 60.0
     features: tuple[Feature, ...] | None = None
     random_feature_count: int = 10
-    gps_bias: bool = True
+    errors: bool = True
 
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS:
@@ -383,7 +384,7 @@ class Fleet:
         seeds = np.random.SeedSequence([self.scenario.seed, robots]).generate_state(robots).tolist()
         # Both places of a vehicle and its pad: a vehicle's bias is drawn before it has a place.
         biases_m = np.zeros((robots, 2))
-        if self.scenario.gps_bias:
+        if self.scenario.errors:
             biases_m = np.array([self._horizontal(Px4Vehicle(seed=s).gps_bias_m) for s in seeds])
         pads_m = self._draw_pads(biases_m)
         headings_rad = np.random.default_rng(seeds).uniform(0.0, math.tau, robots).tolist()
@@ -391,9 +392,10 @@ class Fleet:
         for seed, pad_m, heading_rad in zip(seeds, pads_m, headings_rad, strict=True):
             north_m, east_m = self._to_world_m(pad_m)
             vehicle = Px4Vehicle(
-                seed=seed, start_m=(north_m, east_m), heading_rad=heading_rad, origin=WORLD
-            )
-            if not self.scenario.gps_bias:
+                seed=seed, start_m=(north_m, east_m), heading_rad=heading_rad, origin=WORLD,
+                errors=Errors(seed, self.scenario.seed) if self.scenario.errors else None,
+            )  # fmt: skip
+            if not self.scenario.errors:
                 vehicle.gps_bias_m = np.zeros(3)
             vehicles.append(vehicle)
         return pads_m, pads_m + biases_m, vehicles

@@ -145,7 +145,7 @@ class FleetFlight:
             "robots": self.scenario.robots,
             "seed": self.scenario.seed,
             "duration_s": self.scenario.duration_s,
-            "gps_bias": self.scenario.gps_bias,
+            "errors": self.scenario.errors,
             "problem": self.problem,
             "all_landed": self.all_landed,
             "refusals": list(self.refusals),

@@ -5,6 +5,7 @@ is all of them at one time, and from it follow the bits of SYS_STATUS, whether a
 and the events and texts that PX4 sends.
 """
 
+import math
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -203,20 +204,22 @@ def _union(masks: Iterable[int]) -> int:
 class Reporter:
     """Says when PX4 reports: at most every two seconds what has changed, and at once if asked.
 
-    SYS_STATUS tells of the `published` report; there is none in the first seconds.
+    SYS_STATUS tells of the `published` report; there is none in the first seconds. `newest` is what
+    was found at `checked_at_s`.
     """
 
     _INTERVAL_S, _FIRST_S = 2.0, 2.1
 
     def __init__(self) -> None:
         self.published: Report | None = None
+        self.checked_at_s = -math.inf
         self.newest = Report()
         self._reported = Report()
         self._reported_at_s = self._FIRST_S - self._INTERVAL_S
 
     def update(self, report: Report, now_s: float, *, asked: bool = False) -> list[Event]:
         """Take in the checks of now; returns what PX4 tells about them."""
-        self.newest = report
+        self.newest, self.checked_at_s = report, now_s
         is_due = report != self._reported and now_s >= self._reported_at_s + self._INTERVAL_S
         if not (is_due or asked):
             return []

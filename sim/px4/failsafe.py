@@ -41,11 +41,14 @@ class Failsafe:
         intended_mode: Mode,
         position_valid: bool,
     ) -> Cause:
-        """Set `action`; returns whose it is.
+        """Set `action`; returns whose it is, any cause if there is none.
 
         `wanted` is what each cause calls for. `delay_s` is COM_FAIL_ACT_T: for so long the vehicle
         holds, for somebody to take it over.
         """
+        if not any(wanted.values()):
+            self._wanted, self.action = {}, Action.NONE
+            return next(iter(wanted))
         for cause, action in wanted.items():
             if action >= Action.HOLD > self._wanted.get(cause, Action.NONE):
                 self._taken_over = False

@@ -304,15 +304,11 @@ class Px4Link:
             enabled,
             healthy,
             300,
-            self._battery_mv(),
-            -1,
-            math.ceil(vehicle.battery_remaining * 100.0),
+            round(vehicle.voltage_v * 1e3),
+            round(vehicle.current_a * 100.0),
+            math.ceil(vehicle.battery_told * 100.0),
             *(0,) * 6,
         )
-
-    def _battery_mv(self) -> int:
-        """A battery of four cells: 3.5 V each when empty, 4.2 V when full."""
-        return round(14000.0 + 2800.0 * self.vehicle.battery_remaining)
 
     def _extended_sys_state(self) -> Any:
         vehicle = self.vehicle
@@ -362,19 +358,20 @@ class Px4Link:
     def _battery_status(self) -> Any:
         if Sensor.BATTERY in self.vehicle.dead_sensors:
             return None
-        cell_mv = self._battery_mv() // 4
+        vehicle = self.vehicle
+        cell_mv = round(vehicle.voltage_v * 250.0)
         return mavlink.MAVLink_battery_status_message(
             0,
             mavlink.MAV_BATTERY_FUNCTION_ALL,
             mavlink.MAV_BATTERY_TYPE_LIPO,
             2500,
             [cell_mv] * 4 + [0xFFFF] * 6,
+            round(vehicle.current_a * 100.0),
             -1,
             -1,
-            -1,
-            int(self.vehicle.battery_remaining * 100.0),
+            int(vehicle.battery_told * 100.0),
             0,
-            self.vehicle.battery_warning,
+            vehicle.battery_warning,
         )
 
     def _home_position(self) -> Any:
@@ -388,7 +385,7 @@ class Px4Link:
         )
 
     def _rc_channels(self) -> Any:
-        if not self.vehicle.rc_connected:
+        if not self.vehicle.rc_heard:
             return None
         return mavlink.MAVLink_rc_channels_message(
             self._boot_ms(), 8, *(1500,) * 8, *(0xFFFF,) * 10, 254
@@ -427,7 +424,7 @@ class Px4Link:
 
     def _attitude(self) -> Any:
         roll, pitch = self._tilt_rad()
-        yaw_rad = math.remainder(self.vehicle.heading_rad, math.tau)
+        yaw_rad = math.remainder(self.vehicle.estimated_heading_rad, math.tau)
         return mavlink.MAVLink_attitude_message(
             self._boot_ms(), roll, pitch, yaw_rad, 0.0, 0.0, self.vehicle.yaw_rate_rad_s
         )
@@ -435,7 +432,10 @@ class Px4Link:
     def _body(self, vector: F64) -> tuple[float, float, float]:
         """From the world frame to the level body frame: forward, right, down."""
         north, east, down = vector.tolist()
-        cos, sin = math.cos(self.vehicle.heading_rad), math.sin(self.vehicle.heading_rad)
+        cos, sin = (
+            math.cos(self.vehicle.estimated_heading_rad),
+            math.sin(self.vehicle.estimated_heading_rad),
+        )
         return cos * north + sin * east, cos * east - sin * north, down
 
     def _tilt_rad(self) -> tuple[float, float]:
@@ -452,7 +452,7 @@ class Px4Link:
         home = vehicle.global_home
         relative_mm = 0 if home is None else altitude_mm - round(home[2] * 1e3)
         velocity_cm_s = np.rint(vehicle.velocity_m_s * 100.0).astype(int).tolist()
-        heading_cdeg = round(math.degrees(vehicle.heading_rad) * 100.0) % 36000
+        heading_cdeg = round(math.degrees(vehicle.estimated_heading_rad) * 100.0) % 36000
         return mavlink.MAVLink_global_position_int_message(
             self._boot_ms(),
             latitude,
@@ -472,7 +472,7 @@ class Px4Link:
 
     def _odometry(self) -> Any:
         vehicle = self.vehicle
-        half_yaw_rad = vehicle.heading_rad / 2.0
+        half_yaw_rad = vehicle.estimated_heading_rad / 2.0
         level = [math.cos(half_yaw_rad), 0.0, 0.0, math.sin(half_yaw_rad)]
         return mavlink.MAVLink_odometry_message(
             self._boot_ms() * 1000,

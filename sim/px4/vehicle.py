@@ -1,8 +1,8 @@
 """A PX4-like multicopter: modes, refusals, failsafes and flight; no socket and no clock.
 
 World frame: north, east, down from `WorldOrigin`, m; the ground is at down = 0. The vehicle knows
-its position with an error: a constant GPS bias and slow noise. Its local frame starts at the
-estimator's origin, which is neither the launch point nor its height.
+its position with an error: a GPS bias and slow noise, and with `Errors` much more. Its local frame
+starts at the estimator's origin, which is neither the launch point nor its height.
 
 Times of the estimator, of checks and of failsafes are those that a real PX4 v1.17 was seen with, by
 its own clock: tests/sim/test_px4_recordings.py compares them.
@@ -19,6 +19,8 @@ import numpy as np
 from edge.core import F64
 from sim.px4 import checks
 from sim.px4.checks import Component, Event, Level, Problem, Report, Reporter
+from sim.px4.errors import GPS_ACCURACY_M as HONEST_ACCURACY_M
+from sim.px4.errors import Errors, draw_bias_m
 from sim.px4.estimator import NOISE_M, Estimator
 from sim.px4.failsafe import Failsafe
 from sim.px4.modes import (
@@ -60,6 +62,11 @@ STOPPED_M_S = 0.15
 ARRIVED_M = 0.3
 SLOW_DESCENT_BELOW_M = 5.0
 TRUTH_PERIOD_S = 0.04
+# Four cells: empty, and from there to full. What motors take, and all else.
+EMPTY_V, FULL_ABOVE_EMPTY_V = 14.0, 2.8
+HOVER_A, IDLE_A = 12.0, 0.5
+# What PX4 takes the pack's resistance for.
+ASSUMED_OHM = 0.02
 # What the receiver of PX4's own simulator says of itself.
 GPS_ACCURACY_M, GPS_ACCURACY_M_S = (0.9, 1.78), 0.4
 
@@ -154,24 +161,25 @@ class Px4Vehicle:
         origin: WorldOrigin | None = None,
         airframe: Airframe | None = None,
         ready_after_s: float | None = None,
+        errors: Errors | None = None,
     ) -> None:
         """`start_m` is north and east. Health becomes good `ready_after_s` after the start.
 
         It is drawn from 3 to 6 s unless given; so are the GPS bias, 1 to 5 m horizontally, and the
-        place of the estimator's origin.
+        place of the estimator's origin. Without `errors` the bias stays as it is, the compass is
+        right, the air stands still and a voltage does not sag.
         """
         self._rng = np.random.default_rng(seed)
         self._world = origin or WorldOrigin()
         self._airframe = airframe or Airframe()
         drawn_ready_s = float(self._rng.uniform(3.0, 6.0))
-        bearing, length_m = self._rng.uniform(0.0, math.tau), self._rng.uniform(1.0, 5.0)
+        bearing_rad, share = self._rng.uniform(0.0, math.tau), self._rng.uniform()
         self.gps_bias_m: F64 = np.array(
-            [
-                length_m * math.cos(bearing),
-                length_m * math.sin(bearing),
-                self._rng.uniform(-1.5, 1.5),
-            ]
+            [*draw_bias_m(share, bearing_rad), self._rng.uniform(-1.5, 1.5)]
         )
+        self._errors = errors
+        self._walk_m: F64 = np.zeros(3)
+        self._compass_rad = 0.0
         self.parameters: dict[str, int | float] = dict(PARAMETERS)
         self.fence: tuple[FencePolygon, ...] = ()
         self.truth: list[Truth] = []
@@ -183,14 +191,12 @@ class Px4Vehicle:
 
         self.wind_m_s: F64 = np.zeros(3)
         self.gust_m_s = 0.0
-        self._gust = self._compensated_wind = np.zeros(3)
-        self.battery_remaining = 1.0
-        self._battery_warning = 1
+        self._gust = self.air_m_s = self.compensated_wind_m_s = np.zeros(3)
+        self.battery_remaining, self._battery_warning = 1.0, 1
 
         self.gps_lost = False
         self.dead_sensors: set[Sensor] = set()
         self._dead_since_s: dict[Sensor, float] = {}
-        self._fusion_told = False
         self.estimator = Estimator(
             drawn_ready_s if ready_after_s is None else ready_after_s,
             NOISE_M * self._rng.standard_normal(3),
@@ -223,7 +229,6 @@ class Px4Vehicle:
         self.failsafe = Failsafe()
         self._disarmed_at_s: float | None = None
         self._reporter = Reporter()
-        self._checked_at_s = -math.inf
         self._events: list[Event] = []
 
     # What the vehicle believes
@@ -231,7 +236,12 @@ class Px4Vehicle:
     @property
     def estimated_position_m(self) -> F64:
         """(3,), world frame: where the vehicle takes itself to be."""
-        return self.position_m + self.gps_bias_m + self.estimator.error_m
+        return self.position_m + self.gps_bias_m + self._walk_m + self.estimator.error_m
+
+    @property
+    def estimated_heading_rad(self) -> float:
+        """Where the vehicle takes its nose to point."""
+        return self.heading_rad + self._compass_rad
 
     @property
     def local_position_m(self) -> F64:
@@ -246,7 +256,8 @@ class Px4Vehicle:
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
         """What the receiver says of its fix: horizontally and vertically, m, and m/s."""
-        return *GPS_ACCURACY_M, GPS_ACCURACY_M_S
+        accuracy_m = GPS_ACCURACY_M if self._errors is None else HONEST_ACCURACY_M
+        return *accuracy_m, GPS_ACCURACY_M_S
 
     @property
     def global_origin(self) -> tuple[float, float, float]:
@@ -280,10 +291,38 @@ class Px4Vehicle:
         return self._reporter.published
 
     @property
+    def current_a(self) -> float:
+        """What the battery gives."""
+        loss = 0.0 if self._errors is None else self._errors.thrust_loss
+        return IDLE_A + (HOVER_A * (1.0 + loss) if self.armed and not self.landed else 0.0)
+
+    @property
+    def voltage_v(self) -> float:
+        """Of the whole battery, as it is under its load."""
+        sag_v = 0.0 if self._errors is None else self.current_a * self._errors.resistance_ohm
+        return EMPTY_V + FULL_ABOVE_EMPTY_V * self.battery_remaining - sag_v
+
+    @property
+    def battery_told(self) -> float:
+        """What PX4 takes to be left, 0 to 1: by a voltage that sags more than it knows."""
+        if self._errors is None:
+            return self.battery_remaining
+        unknown_v = self.current_a * (self._errors.resistance_ohm - ASSUMED_OHM)
+        return max(0.0, self.battery_remaining - unknown_v / FULL_ABOVE_EMPTY_V)
+
+    @property
+    def rc_heard(self) -> bool:
+        """Whether somebody's remote control is on, and heard."""
+        is_stale = self._errors is not None and self._errors.is_remote_control_stale(self.time_s)
+        return self.rc_connected and not is_stale
+
+    @property
     def battery_warning(self) -> int:
         """MAV_BATTERY_CHARGE_STATE: 1 is well, 2 low, 3 critical, 4 emergency."""
-        names = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
-        return 1 + sum(self.battery_remaining < self.parameters[name] for name in names)
+        told, parameters = self.battery_told, self.parameters
+        if told >= parameters["BAT_LOW_THR"]:
+            return 1
+        return 2 + (told < parameters["BAT_CRIT_THR"]) + (told < parameters["BAT_EMERGEN_THR"])
 
     @property
     def armable(self) -> bool:
@@ -408,16 +447,23 @@ class Px4Vehicle:
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
+        self.air_m_s = self.wind_m_s + self._gust
+        if self._errors is not None:
+            self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m
+            self._compass_rad = self._errors.heading_rad(self.time_s)
+            self.air_m_s = self.air_m_s + self._errors.wind_m_s(self.time_s)
         if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
             self.home_m = self.estimated_position_m
         if self.armed:
+            drain = 1.0 if self._errors is None else self._errors.drain
+            drained = drain * self.current_a / (IDLE_A + HOVER_A) * dt_s
             self.battery_remaining = max(
-                0.0, self.battery_remaining - dt_s / self._airframe.endurance_s
+                0.0, self.battery_remaining - drained / self._airframe.endurance_s
             )
             self._apply_failsafes()
         else:
             self._enter(self.intended_mode)
-        if self.time_s - self._checked_at_s >= CHECKS_PERIOD_S - 1e-9:
+        if self.time_s - self._reporter.checked_at_s >= CHECKS_PERIOD_S - 1e-9:
             self._run_checks()
         self._move(dt_s)
         self._watch_ground()
@@ -446,16 +492,15 @@ class Px4Vehicle:
     # Checks
 
     def _run_checks(self, *, asked: bool = False) -> None:
-        self._checked_at_s = self.time_s
+        used_gps = Component.GPS in self._reporter.newest.present
         self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
         if not self.armed and not self.estimator.has_gps and not self.position_valid:
             self.home_m = None
         uses_gps = self.estimator.uses_gps
-        if self.armed and uses_gps is not self._fusion_told:
+        if self.armed and uses_gps is not used_gps:
             number = _FUSION_STARTED if uses_gps else _FUSION_STOPPED
             text = f"GNSS data fusion {'started' if uses_gps else 'stopped'}\t"
             self._say(number, Level.INFO, text)
-        self._fusion_told = uses_gps
 
     def _checks(self) -> Report:
         """All that is wrong now, in PX4's order."""
@@ -476,7 +521,7 @@ class Px4Vehicle:
             or self.time_s - self._disarmed_at_s < LOG_ENDS_S
         ):
             is_there.add(Component.LOGGING)
-        if self.rc_connected:
+        if self.rc_heard:
             is_there.add(Component.REMOTE_CONTROL)
         if not self._ground_station_lost():
             is_there.add(Component.COMMUNICATION_LINKS)
@@ -499,7 +544,7 @@ class Px4Vehicle:
             (not self._offboard_signal(), checks.NO_OFFBOARD_SIGNAL),
             (self.home_m is None and self.estimator.is_ready, checks.NO_HOME),
             (
-                not self.rc_connected,
+                not self.rc_heard,
                 checks.MANUAL_CONTROL_DISABLED if disabled else checks.NO_MANUAL_CONTROL,
             ),
             (True, battery[self._battery_warning - 1]),
@@ -598,7 +643,7 @@ class Px4Vehicle:
         excepted = {Mode.HOLD: 2, Mode.OFFBOARD: 4}.get(self.intended_mode, 0)
         if (
             not self._rc_at_arming
-            or self.rc_connected
+            or self.rc_heard
             or int(self.parameters["COM_RC_IN_MODE"]) == 4
             or int(self.parameters["COM_RCL_EXCEPT"]) & excepted
         ):
@@ -665,16 +710,24 @@ class Px4Vehicle:
         on_ground = self.position_m[2] >= 0.0
         if on_ground and velocity_m_s[2] >= 0.0:
             velocity_m_s = np.zeros(3)
-        wind_m_s = self.wind_m_s + self._gust
         acceleration = (velocity_m_s - self.velocity_m_s) / (lag_s, lag_s, self._airframe.lag_s)
         parameters = self.parameters
         acceleration[:2] = _shorten(acceleration[:2], parameters["MPC_ACC_HOR"])
+        if self._compass_rad:
+            # It takes its nose to be where it is not, and so pushes the wrong way.
+            cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
+            north, east = acceleration[:2].tolist()
+            acceleration[:2] = cos * north + sin * east, cos * east - sin * north
+        thrust = 1.0 if self._errors is None else 1.0 - self._errors.thrust_loss
         acceleration[2] = min(
-            max(acceleration[2], -parameters["MPC_ACC_UP_MAX"]), parameters["MPC_ACC_DOWN_MAX"]
+            max(acceleration[2], -thrust * parameters["MPC_ACC_UP_MAX"]),
+            parameters["MPC_ACC_DOWN_MAX"],
         )
+        unmet_m_s = self.air_m_s - self.compensated_wind_m_s
         if not on_ground:
-            acceleration += DRAG_PER_S * (wind_m_s - self._compensated_wind)
-        self._compensated_wind = self._compensated_wind + (wind_m_s - self._compensated_wind) * (
+            # However slowly it follows a command, it holds against a push as ever.
+            acceleration += unmet_m_s * (DRAG_PER_S * self._airframe.lag_s / lag_s)
+        self.compensated_wind_m_s = self.compensated_wind_m_s + unmet_m_s * (
             dt_s / WIND_COMPENSATION_S
         )
         self.acceleration_m_s2 = acceleration
@@ -701,7 +754,7 @@ class Px4Vehicle:
         if math.isnan(yaw_rad):
             self.yaw_rate_rad_s = 0.0
             return
-        error_rad = math.remainder(yaw_rad - self.heading_rad, math.tau)
+        error_rad = math.remainder(yaw_rad - self.estimated_heading_rad, math.tau)
         self.yaw_rate_rad_s = min(max(error_rad / dt_s, -YAW_RATE_RAD_S), YAW_RATE_RAD_S)
         self.heading_rad = (self.heading_rad + self.yaw_rate_rad_s * dt_s) % math.tau
 
@@ -709,7 +762,7 @@ class Px4Vehicle:
         """The vehicle's own speed limits, the ramp of a takeoff, and what the wind leaves."""
         parameters = self.parameters
         horizontal = _shorten(velocity_m_s[:2], parameters["MPC_XY_VEL_MAX"])
-        wind = self.wind_m_s[:2] + self._gust[:2]
+        wind = self.air_m_s[:2]
         horizontal = _shorten(horizontal - wind, self._airframe.max_airspeed_m_s) + wind
         down = max(velocity_m_s[2], -parameters["MPC_Z_VEL_MAX_UP"])
         down = down * self._ramp() if down < 0.0 else min(down, parameters["MPC_Z_VEL_MAX_DN"])
@@ -735,8 +788,9 @@ class Px4Vehicle:
         if self.landed and self.mode not in CAN_LEAVE_GROUND:
             return np.zeros(3), math.nan, lag_s
         if self.mode is Mode.DESCEND:
-            descent = [*self.wind_m_s[:2], self.parameters["MPC_LAND_SPEED"]]
-            return np.array(descent), math.nan, lag_s
+            descent = [*self.air_m_s[:2], self.parameters["MPC_LAND_SPEED"]]
+            # Level, it is carried along by the air as fast as that drags it.
+            return np.array(descent), math.nan, 1.0 / DRAG_PER_S
         if self.mode is Mode.OFFBOARD and self._setpoint is not None:
             return self._follow(self._setpoint)
         if self.mode is Mode.TAKEOFF:
@@ -748,7 +802,7 @@ class Px4Vehicle:
         if self.mode in PILOTED and self._sticks_m_s.any():
             return self._sticks_m_s, math.nan, lag_s
         if self.mode in PILOTED and self.mode is not Mode.POSCTL:
-            return np.array([*self.wind_m_s[:2], 0.0]), math.nan, lag_s
+            return np.array([*self.air_m_s[:2], 0.0]), math.nan, lag_s
         return self._hold(), math.nan, lag_s
 
     def _follow(self, setpoint: Setpoint) -> tuple[F64, float, float]:

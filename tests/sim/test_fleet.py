@@ -145,7 +145,7 @@ def test_more_robots_than_fit_are_refused_with_how_many_do(tmp_path: Path) -> No
     (fit,) = re.findall(r": (\d+) fit", str(refused.value))
     assert Fleet(FleetScenario(robots=int(fit)), tmp_path, SHIPPED).pads_m.shape == (int(fit), 2)
     # Twenty that know where they are stand on the same field.
-    Fleet(FleetScenario(robots=20, gps_bias=False), tmp_path, SHIPPED)
+    Fleet(FleetScenario(robots=20, errors=False), tmp_path, SHIPPED)
 
 
 def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(

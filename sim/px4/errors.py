@@ -1,0 +1,130 @@
+"""How the sensors, the battery and the air of a vehicle err: by its own seed and its fleet's.
+
+Everything is a smooth function of time, drawn once: no state, no step. What a vehicle takes itself
+to be follows from the truth and from this.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+
+# Of the whole horizontal error of a receiver: between these, most of it near the lower one, so that
+# two thirds lie within what the receiver says of itself.
+LEAST_BIAS_M, GREATEST_BIAS_M = 1.0, 5.0
+_BIAS_EXPONENT = 10.0
+GPS_ACCURACY_M = (1.5, 3.0)
+# How far it walks, in its length and across, either way.
+_WALK_M, _WALK_PERIODS_S = 0.4, (200.0, 700.0)
+
+# All heights of a fleet walk together: so much within a quarter of the period.
+COMMON_HEIGHT_M, COMMON_HEIGHT_PERIOD_S = 3.0, 1200.0
+# A barometer and the height of a GPS reference, for each vehicle: what they come to differ by since
+# any moment is four times that, between two vehicles eight times.
+OWN_HEIGHT_M, _OWN_HEIGHT_PERIODS_S = 0.25, (150.0, 600.0)
+
+COMPASS_RAD = math.radians(20.0)
+_YAW_RESET_SHARE, _YAW_RESETS_S = 0.3, (20.0, 180.0)
+
+# Wind and gusts together.
+GREATEST_WIND_M_S = 8.0
+_MEAN_WINDS_M_S, _GUST_PERIODS_S = (1.0, 4.0), (20.0, 45.0)
+
+_RESISTANCES_OHM = (0.02, 0.03)
+_DRAINS = (1.0, 1.25)
+_WEAK_MOTOR_SHARE, _THRUST_LOSSES = 0.15, (0.05, 0.2)
+# The remote control's receiver hears nothing for a while, again and again.
+_STALE_EVERY_S, _STALE_FOR_S = (90.0, 240.0), (0.3, 3.0)
+
+
+def draw_bias_m(share: float, bearing_rad: float) -> tuple[float, float]:
+    """North and east of a receiver's error at the start; `share` is uniform in 0 to 1."""
+    length_m = LEAST_BIAS_M + (GREATEST_BIAS_M - LEAST_BIAS_M) * share**_BIAS_EXPONENT
+    return length_m * math.cos(bearing_rad), length_m * math.sin(bearing_rad)
+
+
+class Wave(NamedTuple):
+    """Something that walks to and fro around where it was at time 0."""
+
+    amplitude: float
+    rate_rad_s: float
+    phase_rad: float
+
+    def at(self, time_s: float) -> float:
+        """How far it has walked since time 0."""
+        turn_rad = self.rate_rad_s * time_s + self.phase_rad
+        return self.amplitude * (math.sin(turn_rad) - math.sin(self.phase_rad))
+
+
+class Errors:
+    """How one vehicle errs. `fleet_seed` is the same for all that fly together.
+
+    `thrust_loss` is the share of its thrust that a weak motor costs it, 0 for most. `drain` is by
+    how much sooner its pack is empty than a new one, `resistance_ohm` what makes its voltage sag.
+    """
+
+    def __init__(self, seed: int, fleet_seed: int) -> None:
+        own, common = np.random.default_rng([seed, 1]), np.random.default_rng([fleet_seed, 2])
+        self._walk = [_draw_wave(own, _WALK_M, _WALK_PERIODS_S) for _ in range(2)]
+        self._height = [_draw_wave(own, OWN_HEIGHT_M, _OWN_HEIGHT_PERIODS_S) for _ in range(2)]
+        sign = 1.0 if common.uniform() < 0.5 else -1.0
+        self._height.append(
+            Wave(sign * COMMON_HEIGHT_M, math.tau / COMMON_HEIGHT_PERIOD_S, phase_rad=0.0)
+        )
+
+        self._heading_rad = float(own.uniform(-COMPASS_RAD, COMPASS_RAD))
+        self._heading_after_rad = self._heading_rad * float(own.uniform(0.0, 0.5))
+        resets = own.uniform() < _YAW_RESET_SHARE
+        self._yaw_reset_s = float(own.uniform(*_YAW_RESETS_S)) if resets else math.inf
+
+        direction_rad = float(common.uniform(0.0, math.tau))
+        self._wind_direction = np.array([math.cos(direction_rad), math.sin(direction_rad), 0.0])
+        self._mean_wind_m_s = float(common.uniform(*_MEAN_WINDS_M_S))
+        self._gust_rad_s = math.tau / float(common.uniform(*_GUST_PERIODS_S))
+
+        self.resistance_ohm = float(own.uniform(*_RESISTANCES_OHM))
+        self.drain = float(own.uniform(*_DRAINS))
+        is_weak = own.uniform() < _WEAK_MOTOR_SHARE
+        self.thrust_loss = float(own.uniform(*_THRUST_LOSSES)) if is_weak else 0.0
+        self._stale_every_s = float(own.uniform(*_STALE_EVERY_S))
+        self._stale_for_s = float(own.uniform(*_STALE_FOR_S))
+
+    def position_m(self, time_s: float, bias_m: F64) -> F64:
+        """(3,), north, east, down: what the estimate errs by, of a receiver that began with a bias.
+
+        `bias_m` is (3,); a receiver without any horizontal one does not walk.
+        """
+        north_m, east_m, down_m = bias_m.tolist()
+        if began_m := math.hypot(north_m, east_m):
+            length_m = min(max(began_m + self._walk[0].at(time_s), LEAST_BIAS_M), GREATEST_BIAS_M)
+            turn_rad = self._walk[1].at(time_s) / began_m
+            factor = length_m / began_m
+            cos, sin = factor * math.cos(turn_rad), factor * math.sin(turn_rad)
+            north_m, east_m = cos * north_m - sin * east_m, sin * north_m + cos * east_m
+        return np.array([north_m, east_m, down_m + self.height_m(time_s)])
+
+    def height_m(self, time_s: float) -> float:
+        """By how much lower than at the start the vehicle takes itself to be, where it is."""
+        return math.fsum(wave.at(time_s) for wave in self._height)
+
+    def heading_rad(self, time_s: float) -> float:
+        """By how much the compass is wrong; the estimator may notice in flight, in one go."""
+        return self._heading_rad if time_s < self._yaw_reset_s else self._heading_after_rad
+
+    def wind_m_s(self, time_s: float) -> F64:
+        """(3,): where the air goes, gusts and all; the same for the whole fleet."""
+        gust = max(0.0, math.sin(self._gust_rad_s * time_s)) ** 3
+        speed_m_s = self._mean_wind_m_s + (GREATEST_WIND_M_S - self._mean_wind_m_s) * gust
+        wind: F64 = speed_m_s * self._wind_direction
+        return wind
+
+    def is_remote_control_stale(self, time_s: float) -> bool:
+        """Whether the remote control's receiver hears nothing just now."""
+        return time_s % self._stale_every_s > self._stale_every_s - self._stale_for_s
+
+
+def _draw_wave(rng: np.random.Generator, amplitude: float, periods_s: tuple[float, float]) -> Wave:
+    rate_rad_s = math.tau / float(rng.uniform(*periods_s))
+    return Wave(amplitude, rate_rad_s, float(rng.uniform(0.0, math.tau)))
