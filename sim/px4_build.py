@@ -300,6 +300,11 @@ class Px4Build:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+        for instance in self._instances[: len(processes)]:
+            # PX4 leaves them, and in the way of another user.
+            for path in _own_files(instance.number):
+                with suppress(OSError):
+                    path.unlink()
         self._stop.set()
         self._thread.join()
 
@@ -390,11 +395,10 @@ def _machine(program: Path) -> str:
 
 def _require_alone(instance: int) -> None:
     """Raises VehicleError in words if a PX4 of that number runs, or has left what is in the way."""
-    for name in ("px4_lock", "px4-sock"):
-        path = Path(f"/tmp/{name}-{instance}")
+    lock, _ = files = _own_files(instance)
+    for path in files:
         if path.exists() and path.stat().st_uid != os.geteuid() and os.geteuid() != 0:
             raise VehicleError(f"{path} belongs to another user: remove it: sudo rm {path}")
-    lock = Path(f"/tmp/px4_lock-{instance}")
     if not lock.exists():
         return
     with lock.open("r+b") as file:
@@ -403,6 +407,11 @@ def _require_alone(instance: int) -> None:
     if kind != fcntl.F_UNLCK:
         end = f"end it: kill {pid}" if pid > 0 else "end it"
         raise VehicleError(f"another PX4 runs as instance {instance}, perhaps an old one: {end}")
+
+
+def _own_files(instance: int) -> tuple[Path, Path]:
+    """PX4's lock, and the socket of its commands."""
+    return Path(f"/tmp/px4_lock-{instance}"), Path(f"/tmp/px4-sock-{instance}")
 
 
 def _udp(port: int) -> socket.socket:
