@@ -203,6 +203,34 @@ def restart(
     _print_controlled(config, outcomes, "restarted on", as_json)
 
 
+@app.command()
+def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Land vehicles whose programs are gone, where they are: over SSH, by their PX4.
+
+    Where the program runs it refuses, `lpac mission land` is for that; and where a pilot flies.
+    """
+    from fleet.hold import visit
+
+    config, chosen = open_fleet(fleet, robots)
+
+    async def one(robot: "RobotHost", report: "Report") -> dict[str, Any]:
+        async with visit(config, robot, report) as (session, _):
+            return await session.call(
+                "land", mavlink_port=robot.mavlink_port, system_id=robot.system_id
+            )
+
+    outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, dict)
+    else:
+        _print_outcomes(
+            outcomes,
+            ("result",),
+            lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
+        )
+    require_all(outcomes, "landing:")
+
+
 def _control(
     config: "FleetConfig",
     robots: Sequence["RobotHost"],

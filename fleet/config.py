@@ -165,26 +165,34 @@ class FleetConfig:
         """What the robot flies by. Raises ConfigError for an unknown robot or a spare."""
         return from_mapping(RobotConfig, tomllib.loads(self.robot_toml(name)), str(self.path))
 
-    def drop_in(self, robot: RobotHost) -> str | None:
-        """The text of lpac-robot.conf, what differs from lpac-robot.service; None if nothing."""
-        unit, service = [], []
+    def drop_ins(self, robot: RobotHost) -> dict[str, str]:
+        """What differs from the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
+        unit, place = [], []
         if self.directory != DEFAULT_DIRECTORY:
             current = f"{self.directory}/current"
             unit = ["ConditionPathExists=", f"ConditionPathExists={current}/robot.toml"]
-            service = [
+            place = [
                 f"RootDirectory={self.directory}/sandbox",
                 # It empties BindPaths too.
                 "BindReadOnlyPaths=",
                 f"BindReadOnlyPaths={current}/root:/",
                 f"BindReadOnlyPaths={current}:/release",
+            ]
+        flies = list(place)
+        if place:
+            flies += [
                 "BindReadOnlyPaths=/run/systemd/notify",
                 "BindPaths=/var/lib/private/lpac:/var/lib/lpac",
             ]
         if robot.cpus:
-            service += ["CPUAffinity=", f"CPUAffinity={' '.join(map(str, robot.cpus))}"]
-        sections = {"[Unit]": unit, "[Service]": service}
-        written = ["\n".join([head, *lines, ""]) for head, lines in sections.items() if lines]
-        return "\n".join(written) or None
+            flies += ["CPUAffinity=", f"CPUAffinity={' '.join(map(str, robot.cpus))}"]
+        texts = {}
+        for name, service in (("lpac-robot.conf", flies), ("lpac-land.conf", place)):
+            sections = {"[Unit]": unit, "[Service]": service}
+            written = ["\n".join([head, *lines, ""]) for head, lines in sections.items() if lines]
+            if written:
+                texts[name] = "\n".join(written)
+        return texts
 
 
 def load_fleet(path: Path) -> FleetConfig:

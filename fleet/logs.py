@@ -16,6 +16,7 @@ def journal_command(lines: int, *, follow: bool) -> list[str]:
     """The robot's command that prints the unit's last entries, and with `follow` those to come."""
     return [
         "journalctl", "--quiet", "--no-pager", "--all", "--unit", "lpac-robot.service",
+        "--unit", "lpac-land.service",
         "--lines", str(lines), "--output", "json", *(["--follow"] if follow else []),
     ]  # fmt: skip
 

@@ -16,7 +16,10 @@ from edge.core.world import parse_world
 from edge.runtime.bundle import Bundle, load_bundle
 from fleet.config import FleetConfig, RobotHost
 
-_UNIT = Path(__file__).parents[1] / "systemd" / "lpac-robot.service"
+_UNITS = tuple(
+    Path(__file__).parents[1] / "systemd" / name
+    for name in ("lpac-robot.service", "lpac-land.service")
+)
 _IMAGE_VERSIONS = Path("usr/share/lpac/versions.json")
 
 Entry = tuple[str, str]
@@ -56,7 +59,7 @@ class Common(NamedTuple):
     image: Image
     bundle: Bundle
     world: bytes
-    unit: bytes
+    units: dict[str, bytes]
 
 
 def load_common(config: FleetConfig) -> Common:
@@ -66,7 +69,8 @@ def load_common(config: FleetConfig) -> Common:
     bundle = load_bundle(config.bundle)
     if bundle.manifest.perception is None:
         raise ReleaseError(f"{config.bundle}: the bundle has no perception: it cannot fly")
-    return Common(load_image(config.image), bundle, world, _UNIT.read_bytes())
+    units = {unit.name: unit.read_bytes() for unit in _UNITS}
+    return Common(load_image(config.image), bundle, world, units)
 
 
 def load_image(folder: Path) -> Image:
@@ -98,10 +102,8 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
     slot = config.slot_of(robot.name)
     files = {f"bundle/{name}": data for name, data in common.bundle.files.items()}
     files["world.env"] = common.world
-    files["lpac-robot.service"] = common.unit
-    drop_in = config.drop_in(robot)
-    if drop_in is not None:
-        files["lpac-robot.conf"] = drop_in.encode()
+    files |= common.units
+    files |= {name: text.encode() for name, text in config.drop_ins(robot).items()}
     if slot is not None:
         files["robot.toml"] = config.robot_toml(robot.name).encode()
     versions = {

@@ -48,8 +48,10 @@ _MODEL, _AIRFRAME = "sihsim_quadx", "10040"
 # All is logged, from the start to the end. And two calibrations are off that change their pace as
 # the vehicle is armed: on a computer with threads, PX4's list of timers loses its tail if that
 # happens in the wrong moment, and with it every simulated sensor, for good (seen with v1.17 in one
-# arming of four).
+# arming of four). And its battery lasts 20 minutes, as the simulated vehicle's: PX4's own is half
+# empty after half a minute, and a robot that measures that goes home.
 _PARAMETERS = {
+    "SIM_BAT_DRAIN": "1200",
     "SDLOG_MODE": "2",
     "SDLOG_PROFILE": "1",
     "IMU_GYRO_CAL_EN": "0",

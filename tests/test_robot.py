@@ -354,11 +354,11 @@ def test_a_control_loop_that_hangs_in_flight_lets_the_vehicle_hold_and_the_progr
         assert vehicle.mode is Mode.HOLD
 
 
-def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_hold(
+def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_hold_and_lands_it(
     tmp_path: Path,
 ) -> None:
     vehicle = new_vehicle()
-    with rig(tmp_path, vehicle) as made:
+    with rig(tmp_path, vehicle, changes={"flight": {"hover_land_s": 12.0}}) as made:
         with program(made) as hanging:
             made.take_off()
             hanging.process.send_signal(signal.SIGSTOP)
@@ -379,6 +379,10 @@ def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_ho
             assert vehicle.armed
             assert vehicle.mode is Mode.HOLD
             assert horizontal_speed_m_s(vehicle) < 0.2
+            # Nobody answers.
+            made.wait(lambda status: status.reason == "nobody answered for 12 s")
+            made.wait_for_state(FlightState.LANDED)
+            assert not vehicle.armed
 
 
 def test_ended_in_flight_it_lands_if_configured_to(tmp_path: Path) -> None:

@@ -8,16 +8,21 @@ import select
 import socket
 import sys
 import time
+import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 from edge.adapters.raw_mavlink import Heartbeat, heartbeat, land_command
 
 _COMPONENT = 197  # as the watchdog
 # PX4 sends heartbeats at 1 Hz.
 _FRESH_S = 2.5
+# Whoever else has the socket takes some of them; after so many it is another flight.
+_GAP_S = 10.0
 _AGAIN_S = 1.0
 _LOOK_S = 0.2
+_HOVER_LAND_S = 60.0  # where the configuration says nothing: its own default
 _DATAGRAM_BYTES = 2048
 
 
@@ -29,7 +34,7 @@ def land_if_left(
     False as soon as `pipe` can be read. `udp` hears the vehicle: its datagrams are read here, and
     nobody else gets them. Mode OFFBOARD is PX4's to end: without setpoints it lands by itself.
     """
-    begun_s = heard_s = time.monotonic()
+    heard_s = since_s = time.monotonic()
     asked_s, hovered, sequence = -_AGAIN_S, False, 0
     peer: tuple[str, int] | None = None
     while True:
@@ -41,6 +46,8 @@ def land_if_left(
         for beat, sender in _waiting(udp):
             if beat.system_id != system_id:
                 continue
+            if now_s - heard_s > _GAP_S:
+                since_s, hovered = now_s, False
             heard_s, peer = now_s, sender
             if not beat.armed or beat.mode == "land":
                 return _end("it lands" if beat.armed else "it is disarmed")
@@ -48,9 +55,9 @@ def land_if_left(
                 hovered = True
             elif hovered or beat.mode != "offboard":
                 return _end(f"somebody has it: {beat.mode}")
-        if now_s - heard_s > after_s + _FRESH_S:
+        if now_s - heard_s > max(after_s, _GAP_S) + _FRESH_S:
             return _end("it is not heard")
-        due = hovered and now_s - begun_s >= after_s and now_s - heard_s < _FRESH_S
+        due = hovered and now_s - since_s >= after_s and now_s - heard_s < _FRESH_S
         if due and peer is not None and now_s - asked_s >= _AGAIN_S:
             say("nobody has taken the vehicle: land")
             asked_s, sequence = now_s, sequence + 1
@@ -79,8 +86,22 @@ def say(text: str) -> None:
 
 
 def main() -> None:
-    """For the robot's unit, when its program cannot be started any more: port, system id, s."""
-    port, system_id, after_s = sys.argv[1:]
+    """For systemd, when it has given the robot's program up: `robot.toml` is the argument."""
+    (path,) = sys.argv[1:]
+    try:
+        config = tomllib.loads(Path(path).read_text("utf-8"))
+        port = int(config["autopilot"]["url"].rsplit(":", 1)[1])
+        system_id = int(config["autopilot"]["system_id"])
+        after_s = float(config.get("flight", {}).get("hover_land_s", _HOVER_LAND_S))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        say(f"{path}: the vehicle is not known: {error!r}")
+        sys.exit(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(("0.0.0.0", int(port)))
-        land_if_left(udp, int(system_id), float(after_s))
+        # A program that is started again has the datagrams, since it asks for the port later.
+        udp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        udp.bind(("0.0.0.0", port))
+        land_if_left(udp, system_id, after_s)
+
+
+if __name__ == "__main__":
+    main()

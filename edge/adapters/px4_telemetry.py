@@ -12,6 +12,7 @@ from threading import Lock
 from typing import Any
 
 from edge.adapters.px4_events import Px4Events, without_repetition
+from edge.adapters.raw_mavlink import mode_name
 from edge.core.vehicle import (
     Estimator,
     GlobalOrigin,
@@ -47,16 +48,6 @@ _ON_GROUND = 1
 _UNKNOWN_UINT16 = 0xFFFF
 _FIX_3D = 3
 _M_PER_DEG = 111_195.0  # of latitude: a sphere is good enough for differences of metres
-_AUTO = 4
-_MAIN_MODES = {
-    1: Mode.MANUAL,
-    2: Mode.ALTITUDE,
-    3: Mode.POSITION,
-    5: Mode.MANUAL,  # acro
-    6: Mode.OFFBOARD,
-    7: Mode.STABILIZED,
-}
-_AUTO_MODES = {2: Mode.TAKEOFF, 3: Mode.HOLD, 4: Mode.MISSION, 5: Mode.RETURN, 6: Mode.LAND}
 _REFUSAL = re.compile(r"^(?:\w+ denied|preflight fail)[:!]?\s*", re.IGNORECASE)
 
 
@@ -178,13 +169,11 @@ class Px4Telemetry:
     def _on_heartbeat(self, fields: Fields, now_s: float) -> None:
         if fields["autopilot"] == _AUTOPILOT_INVALID:
             return
-        main, sub = fields["custom_mode"] >> 16 & 0xFF, fields["custom_mode"] >> 24 & 0xFF
         failsafe = fields["system_status"] in (_CRITICAL, _EMERGENCY)
         if failsafe and not self._state.failsafe:
             self._failsafe_at_s = now_s
-        modes, key = (_AUTO_MODES, sub) if main == _AUTO else (_MAIN_MODES, main)
         self._change(
-            mode=modes.get(key, Mode.OTHER),
+            mode=Mode(mode_name(fields["custom_mode"])),
             armed=bool(fields["base_mode"] & _SAFETY_ARMED),
             failsafe=failsafe,
             heartbeat_at_s=now_s - self._clock.delay_s,

@@ -146,8 +146,9 @@ def _stage(folder: str, files: Dict[str, str]) -> None:
 
 
 def _journal(path: str, interval: Interval) -> None:
-    """The unit's journal of that time, one JSON object a line."""
-    command = ["journalctl", "-u", service.UNIT, "-o", "json", "--no-pager", "--quiet",
+    """The units' journal of that time, one JSON object a line."""
+    command = ["journalctl", "-u", service.UNIT, "-u", service.LAND_UNIT, "-o", "json",
+               "--no-pager", "--quiet",
                "--since", "@%d" % max(0, interval[0] - _MARGIN_S)]  # fmt: skip
     if interval[1] < float("inf"):
         command += ["--until", "@%d" % (interval[1] + _MARGIN_S)]

@@ -12,8 +12,9 @@ from edge.adapters.raw_mavlink import heartbeat
 from fleet.on_robot.calls import Refused, call, must, run, say, write_whole
 
 UNIT = "lpac-robot.service"
-UNIT_PATH = "/etc/systemd/system/" + UNIT
-DROP_IN_PATH = UNIT_PATH + ".d/lpac-robot.conf"
+# Lands a vehicle whose program systemd has given up.
+LAND_UNIT = "lpac-land.service"
+UNIT_PATH = "/etc/systemd/system/"
 
 # The program says how it is four times a second.
 _STATUS_FRESH_S = 2.0
@@ -222,17 +223,14 @@ def _reason() -> str:
 
 
 def install_unit(directory: str, release: str) -> None:
-    """Make the release's unit file, and its drop-in if it has one, systemd's."""
+    """Make the release's unit files, and their drop-ins if it has any, systemd's."""
     # The unit mounts the image over it.
     os.makedirs(os.path.join(directory, "sandbox"), mode=0o755, exist_ok=True)
-    changed = _copy(os.path.join(release, UNIT), UNIT_PATH)
-    drop_in = os.path.join(release, "lpac-robot.conf")
-    if os.path.exists(drop_in):
-        os.makedirs(os.path.dirname(DROP_IN_PATH), exist_ok=True)
-        changed = _copy(drop_in, DROP_IN_PATH) or changed
-    elif os.path.exists(DROP_IN_PATH):
-        os.unlink(DROP_IN_PATH)
-        changed = True
+    changed = False
+    for unit in (UNIT, LAND_UNIT):
+        conf = unit.replace(".service", ".conf")
+        for name, target in ((unit, unit), (conf, os.path.join(unit + ".d", conf))):
+            changed = _install(os.path.join(release, name), UNIT_PATH + target) or changed
     if changed:
         must(["systemctl", "daemon-reload"])
 
@@ -256,7 +254,14 @@ def halt() -> None:
     run(["systemctl", "disable", "--now", UNIT])
 
 
-def _copy(source: str, target: str) -> bool:
+def _install(source: str, target: str) -> bool:
+    """Copy the file, or remove what an earlier release had of it; whether that changed anything."""
+    if not os.path.exists(source):
+        if not os.path.exists(target):
+            return False
+        os.unlink(target)
+        return True
+    os.makedirs(os.path.dirname(target), exist_ok=True)
     with open(source, "rb") as file:
         data = file.read()
     if os.path.exists(target):

@@ -261,6 +261,7 @@ def test_only_a_vehicle_that_hovers_and_that_nobody_took_is_landed(
 ) -> None:
     own, autopilot = sockets
     monkeypatch.setattr(left_alone, "_FRESH_S", 0.3)
+    monkeypatch.setattr(left_alone, "_GAP_S", 0.3)
     address = own.getsockname()
     for custom_mode in told:
         # Of another vehicle on the same link nothing counts.

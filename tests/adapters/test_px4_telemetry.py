@@ -1,12 +1,17 @@
 """What the robot concludes, second by second, from the bytes that a real PX4 v1.17 sent."""
 
+import math
 from typing import NamedTuple
 
 import pytest
 
 from edge.adapters.px4_telemetry import Px4Telemetry
+from edge.core.flight import Flight, FlightInputs, step
+from edge.core.mission import FlightState
 from edge.core.position import Cause, Judgement, PositionLimits, Quality, judge
-from edge.core.vehicle import Mode, VehicleState
+from edge.core.vehicle import Action, Mode, VehicleState
+from edge.runtime.config import load_config
+from tests.conftest import ROOT
 from tests.px4_recordings import RECORDINGS, recorded
 
 TICK_S = 0.1
@@ -111,6 +116,35 @@ def test_battery_critical_while_landing_is_px4s_own_failsafe() -> None:
         (55.9, _M.OFFBOARD, False),
         (58.2, _M.HOLD, False),
     ]
+
+
+def test_a_landing_that_px4s_own_failsafe_interrupts_is_not_let_go_of() -> None:
+    """The program that was recorded let go: "the vehicle left land for hold"."""
+    robot = load_config(ROOT / "docs" / "robot.toml").robot(boot_nonce=1)
+    flight = Flight(FlightState.LAND, "at the landing point", since_s=33.4, land_by="return")
+    told: list[tuple[FlightState, tuple[Action, ...], tuple[str, ...]]] = []
+    for now_s, vehicle, judgement in conclusions("battery_fast"):
+        if now_s < flight.since_s or flight.state is FlightState.LANDED:
+            continue
+        inputs = FlightInputs(
+            now_s=now_s, vehicle=vehicle, position=judgement, odometry=None,
+            policy_velocity_m_s=None, neighbours=(), closest=None, busy_neighbours=(), ground=None,
+            ground_age_s=math.inf, failed_checks=None, not_taken=(), order=None, uptime_s=now_s,
+            energy=None,
+        )  # fmt: skip
+        flight, actions, alarms, _, _ = step(robot, flight, inputs)
+        told.append((flight.state, actions, alarms))
+    assert dict.fromkeys(state for state, _, _ in told).keys() == {
+        FlightState.LAND,
+        FlightState.LANDED,
+    }
+    # Asked for until PX4 was heard to land; then PX4 goes on by itself.
+    assert {action for _, actions, _ in told for action in actions} == {Action.LAND}
+    assert not any(actions for _, actions, _ in told[20:])
+    acting = [
+        alarms for _, _, alarms in told if "the autopilot's own failsafe acts: hold" in alarms
+    ]
+    assert 5.0 < TICK_S * len(acting) < 6.0
 
 
 def test_a_pilot_is_none_of_its_failsafes() -> None:

@@ -1,6 +1,7 @@
 """`lpac fleet` as an operator types it, with real robot computers on the other side."""
 
 import json
+import math
 import os
 import select
 import signal
@@ -11,6 +12,7 @@ import pytest
 
 from sim.host_rack import children
 from sim.hosts import RobotHosts
+from sim.px4.modes import Mode
 from tests.fleet.field import (
     SILENT,
     armed,
@@ -121,6 +123,39 @@ def test_a_robot_in_flight_refuses_unless_somebody_insists(operator: Operator) -
     robots = operator.json("status")
     assert robots["r1"]["service"]["enabled"]
     assert [of["service"]["active"] for of in robots.values()] == [*["active"] * 3, "inactive"]
+
+
+def test_a_vehicle_whose_program_is_gone_is_landed_over_ssh(operator: Operator) -> None:
+    r2 = operator.hosts[1]
+
+    def land(exit_code: int) -> dict[str, Any]:
+        (said,) = operator.json("land", "--robots", "r2", exit_code=exit_code).values()
+        assert isinstance(said, dict)
+        return said
+
+    await_said(r2, '"armed":false')
+    assert land(1)["problem"] == "its program runs: `lpac mission land` lands it"
+    operator.json("stop", "--robots", "r2")
+    assert land(1)["problem"] == "it is disarmed: nothing is to land"
+    with armed(r2):
+        with r2.stepped:
+            r2.vehicle.take_off(math.nan)
+            assert r2.stepped.wait_for(lambda: r2.vehicle.position_m[2] < -1.0, 120.0)
+            r2.vehicle.pilot()
+        assert land(1)["problem"] == "a pilot flies it (position): he lands it"
+        with r2.stepped:
+            assert r2.vehicle.mode is Mode.POSCTL
+            r2.vehicle.set_mode(Mode.HOLD)
+            assert r2.stepped.wait_for(lambda: r2.vehicle.mode is Mode.HOLD, 60.0)
+        both = operator("land", "--robots", "r1,r2")
+        assert both.returncode == 1
+        assert "it lands" in both.stdout
+        assert both.stderr.splitlines()[-1] == "lpac: landing: 1 of 2 robots; failed: r1"
+        with r2.stepped:
+            assert r2.vehicle.mode is Mode.LAND
+            assert r2.stepped.wait_for(lambda: not r2.vehicle.armed, 120.0)
+            r2.vehicle.rc_connected = False
+    operator.json("start", "--robots", "r2")
 
 
 def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -> None:

@@ -221,24 +221,30 @@ def _shuffled(table: dict[str, Any], data: st.DataObject) -> dict[str, Any]:
 
 def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
     config = load_fleet(EXAMPLE)
-    assert config.drop_in(config.robots["r1"]) is None
+    assert config.drop_ins(config.robots["r1"]) == {}
     text = example('# cpus = ""', 'cpus = "4-6"')
     config = load_fleet(fleet_file(tmp_path, text))
-    assert config.drop_in(config.robots["r1"]) == "[Service]\nCPUAffinity=\nCPUAffinity=4 5 6\n"
+    assert config.drop_ins(config.robots["r1"]) == {
+        "lpac-robot.conf": "[Service]\nCPUAffinity=\nCPUAffinity=4 5 6\n"
+    }
     text = text.replace('# directory = "/opt/lpac"', 'directory = "/data/lpac"')
     config = load_fleet(fleet_file(tmp_path, text))
-    # What must be repeated is what the unit says, with the other folder.
-    unit = (ROOT / "systemd" / "lpac-robot.service").read_text().replace("/opt/lpac", "/data/lpac")
-    assert unit.count("\nCondition") == 1
-    binds = "\n".join(re.findall(r"^Bind.*", unit, re.MULTILINE))
-    (condition,) = re.findall(r"^Condition.*", unit, re.MULTILINE)
-    (root,) = re.findall(r"^RootDirectory=.*", unit, re.MULTILINE)
-    head = (
-        f"[Unit]\nConditionPathExists=\n{condition}\n\n"
-        f"[Service]\n{root}\nBindReadOnlyPaths=\n{binds}\n"
-    )
-    assert config.drop_in(config.robots["r1"]) == head + "CPUAffinity=\nCPUAffinity=4 5 6\n"
-    assert config.drop_in(config.robots["r2"]) == head
+    first = config.drop_ins(config.robots["r1"])
+    second = config.drop_ins(config.robots["r2"])
+    for name, cpus in (("lpac-robot", "CPUAffinity=\nCPUAffinity=4 5 6\n"), ("lpac-land", "")):
+        # What must be repeated is what the unit says, with the other folder.
+        unit = (ROOT / "systemd" / f"{name}.service").read_text()
+        unit = unit.replace("/opt/lpac", "/data/lpac")
+        assert unit.count("\nCondition") == 1
+        binds = "\n".join(re.findall(r"^Bind.*", unit, re.MULTILINE))
+        (condition,) = re.findall(r"^Condition.*", unit, re.MULTILINE)
+        (root,) = re.findall(r"^RootDirectory=.*", unit, re.MULTILINE)
+        head = (
+            f"[Unit]\nConditionPathExists=\n{condition}\n\n"
+            f"[Service]\n{root}\nBindReadOnlyPaths=\n{binds}\n"
+        )
+        assert first[f"{name}.conf"] == head + cpus
+        assert second[f"{name}.conf"] == head
 
 
 # Mistakes

@@ -3,6 +3,7 @@
 import ast
 import hashlib
 import json
+import math
 import os
 import socket
 import threading
@@ -16,9 +17,14 @@ from pymavlink.dialects.v20 import common
 
 from edge.adapters import raw_mavlink
 from fleet.enroll import _predecessors_step
-from fleet.on_robot import enrolment, probes, releases, service
+from fleet.on_robot import enrolment, landing, probes, releases, service
 from fleet.on_robot.calls import Refused
 from fleet.release import _entry
+from sim.px4.link import Px4Link
+from sim.px4.modes import Mode
+from sim.px4.server import Instance, Px4Server
+from sim.px4.vehicle import Px4Vehicle
+from tests.sim.test_px4 import free_port
 
 ROOT = Path(__file__).parents[2]
 
@@ -159,6 +165,53 @@ def test_no_datagram_breaks_the_listener(data: bytes) -> None:
 @needs_root
 def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
     assert service.hear_heartbeat(datagrams[0], wait_s=0.2) is None
+
+
+@needs_root
+def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = {"fresh": True}
+    monkeypatch.setattr(service, "service", lambda: said)
+    vehicle, port = Px4Vehicle(seed=1, ready_after_s=0.0), free_port()
+
+    def refused(why: str, system_id: int = 7) -> None:
+        with pytest.raises(Refused, match=why):
+            landing.land(port, system_id)
+
+    def takes_off() -> bool:
+        if not vehicle.armed and vehicle.armable:
+            vehicle.arm()
+            vehicle.take_off(math.nan)
+        return bool(vehicle.position_m[2] < -1.0)
+
+    refused("^its program runs: `lpac mission land` lands it$")
+    said["fresh"] = False
+    with Px4Server([Instance(Px4Link(vehicle, system_id=7), 0, port)]) as server:
+        refused("^PX4 is system 7, not 8", system_id=8)
+        refused("^it is disarmed: nothing is to land$")
+        assert server.wait_for(takes_off, 60.0)
+        with server.stepped:
+            vehicle.pilot()
+        assert server.wait_for(lambda: vehicle.mode is Mode.POSCTL, 60.0)
+        # PX4 tells it within a second.
+        heard = {}
+        while heard.get("mode") != "position":
+            heard = service.hear_heartbeat(port) or {}
+        refused(r"^a pilot flies it \(position\): he lands it$")
+        with server.stepped:
+            vehicle.set_mode(Mode.HOLD)
+        while heard.get("mode") != "hold":
+            heard = service.hear_heartbeat(port) or {}
+        assert landing.land(port, 7) == {"mode": "land", "armed": True}
+        assert vehicle.mode is Mode.LAND
+        assert server.wait_for(lambda: vehicle.landed and not vehicle.armed, 60.0)
+
+
+@needs_root
+def test_where_nothing_is_heard_nothing_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service, "service", lambda: {"fresh": False})
+    port = free_port()
+    with pytest.raises(Refused, match=f"^nothing is heard of PX4 at UDP port {port}$"):
+        landing.land(port, 7)
 
 
 @pytest.mark.parametrize(

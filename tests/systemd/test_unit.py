@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tomlkit
 
 from edge.core.mission import FlightState
 from fleet.config import FleetConfig, load_fleet
@@ -24,6 +25,8 @@ from sim.px4.modes import Mode
 from tests.conftest import ROOT, SHIPPED
 
 UNIT = ROOT / "systemd" / "lpac-robot.service"
+LAND_UNIT = ROOT / "systemd" / "lpac-land.service"
+UNITS = (UNIT, LAND_UNIT)
 # Of systemd 252's scale, 10 the worst. What keeps it from less is what the robot is for, network,
 # and keys that a VOXL2's systemd does not know.
 EXPOSURE = 2.0
@@ -40,22 +43,26 @@ def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @needs_analyze
-def test_systemd_knows_every_line_of_the_unit(tmp_path: Path) -> None:
-    program = tmp_path / "usr/bin/lpac"
-    program.parent.mkdir(parents=True)
-    program.touch(0o755)
+def test_systemd_knows_every_line_of_the_units(tmp_path: Path) -> None:
+    for program in ("lpac", "python3.11"):
+        path = tmp_path / "usr/bin" / program
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch(0o755)
     known = Path("lib/systemd/system")
     shutil.copytree("/" / known, tmp_path / known, symlinks=True)
-    shutil.copy(UNIT, tmp_path / known)
-    result = analyze("verify", f"--root={tmp_path}", "--recursive-errors=yes", UNIT.name)
+    for unit in UNITS:
+        shutil.copy(unit, tmp_path / known)
+    names = [unit.name for unit in UNITS]
+    result = analyze("verify", f"--root={tmp_path}", "--recursive-errors=yes", *names)
     if "unrecognized option" in result.stderr:
         pytest.skip("this systemd-analyze is too old to verify below another root")
     assert (result.stdout, result.stderr, result.returncode) == ("", "", 0)
 
 
 @needs_analyze
-def test_the_unit_may_do_little() -> None:
-    result = analyze("security", "--offline=yes", str(UNIT))
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_the_units_may_do_little(unit: Path) -> None:
+    result = analyze("security", "--offline=yes", str(unit))
     if "unrecognized option" in result.stderr:
         pytest.skip("this systemd-analyze is too old to judge a file")
     score = re.search(r"exposure level for \S+: ([\d.]+)", result.stdout)
@@ -83,7 +90,8 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         (release / "robot.toml").write_text(config.robot_toml(host.name))
         (release.parents[1] / "current").symlink_to("releases/a")
         (release.parents[1] / "sandbox").mkdir()
-        shutil.copy(UNIT, host.root / "etc/systemd/system")
+        for unit in UNITS:
+            shutil.copy(unit, host.root / "etc/systemd/system")
         host.run("systemctl daemon-reload")
         yield running
 
@@ -222,6 +230,31 @@ def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_h
         assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
 
 
+def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
+    host: RobotHost, config: FleetConfig
+) -> None:
+    """In the air, in hold, as the test before left it."""
+    toml = host.root / config.directory.lstrip("/") / "current/robot.toml"
+    text = toml.read_text()
+    with host.stepped:
+        assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
+    changed = tomlkit.parse(text)
+    changed["flight"]["hover_land_s"] = 10.0  # type: ignore[index]
+    changed["policy"]["bundle"] = "nowhere"  # type: ignore[index]
+    toml.write_text(tomlkit.dumps(changed))
+    # An old systemd has started it for the hang before, with the former configuration.
+    host.run("systemctl stop lpac-land; systemctl reset-failed lpac-robot || true")
+    host.run("systemctl start lpac-robot || true")
+    wait_until(lambda: shown(host, "ActiveState")["ActiveState"] == "failed")
+    with host.stepped:
+        assert host.stepped.wait_for(lambda: not host.vehicle.armed, 120.0)
+        modes = [truth.mode for truth in host.vehicle.truth]
+    assert Mode.LAND in modes
+    said = "journalctl --unit lpac-land --output cat"
+    wait_until(lambda: "nobody has taken the vehicle: land" in host.run(said))
+    toml.write_text(text)
+
+
 def take_off(operator: Operator) -> None:
     def is_up(heard: Statuses) -> bool:
         """If not, it takes off when it is ready, also for another time if it was held up."""
@@ -237,11 +270,10 @@ def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_say
     host: RobotHost, config: FleetConfig
 ) -> None:
     elsewhere = dataclasses.replace(config, directory="/data/lpac")
-    drop_in = elsewhere.drop_in(config.robots[host.name])
-    assert drop_in is not None
-    folder = host.root / "etc/systemd/system/lpac-robot.service.d"
-    folder.mkdir()
-    (folder / "lpac-robot.conf").write_text(drop_in)
+    for name, text in elsewhere.drop_ins(config.robots[host.name]).items():
+        path = host.root / f"etc/systemd/system/{Path(name).stem}.service.d" / name
+        path.parent.mkdir()
+        path.write_text(text)
     host.run(f"mv {config.directory} {elsewhere.directory} && systemctl daemon-reload")
     host.run("systemctl start lpac-robot")
     wait_until(lambda: status(host).get("robot_id") == 1)
