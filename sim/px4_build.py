@@ -56,8 +56,6 @@ _PARAMETERS = {
     "SDLOG_PROFILE": "1",
     "IMU_GYRO_CAL_EN": "0",
     "SENS_MAG_AUTOCAL": "0",
-    # A pack of 20 minutes: robots return from one that the factory's setting empties in one.
-    "SIM_BAT_DRAIN": "1200",
 }
 # Sourced from PATH by v1.14; newer ones take PX4_PARAM_* from the environment.
 _PARAMETERS_SCRIPT = "px4-rc.params"
