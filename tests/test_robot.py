@@ -381,8 +381,7 @@ def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_ho
             assert horizontal_speed_m_s(vehicle) < 0.2
             # Nobody answers.
             made.wait(lambda status: status.reason == "nobody answered for 12 s")
-            made.wait_for_state(FlightState.LANDED)
-            assert not vehicle.armed
+            assert made.vehicle_is(lambda v: v.landed and not v.armed)
 
 
 def test_ended_in_flight_it_lands_if_configured_to(tmp_path: Path) -> None:
