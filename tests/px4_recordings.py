@@ -2,6 +2,7 @@
 
 import gzip
 import struct
+from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -31,21 +32,28 @@ class Recorded(NamedTuple):
         return bool(self.message.get_srcComponent() == mavlink.MAV_COMP_ID_AUTOPILOT1)
 
 
-@cache
-def recorded(name: str) -> tuple[Recorded, ...]:
-    """Everything in one recording, in order; or a skip where there is none."""
+def frames(name: str) -> Iterator[tuple[float, bytes]]:
+    """Each frame of one recording, both directions in order: s from the first; or a skip."""
     path = FOLDER / f"{name}.tlog.gz"
     if not path.exists():
         pytest.skip(f"needs the recording {path.name} of a real PX4 in ../shared/data/px4_v1.17")
-    data, at, messages = gzip.decompress(path.read_bytes()), 0, []
-    parser = mavlink.MAVLink(None)
+    data, at = gzip.decompress(path.read_bytes()), 0
     first_us = struct.unpack_from(">Q", data)[0]
     while at < len(data):
         time_us = struct.unpack_from(">Q", data, at)[0]
         at += _TIME_BYTES
         signature_bytes = _SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0
         end = at + _FRAME_BYTES + data[at + 1] + signature_bytes
-        found = parser.parse_buffer(data[at:end])
-        messages += [Recorded((time_us - first_us) / 1e6, message) for message in found or ()]
+        yield (time_us - first_us) / 1e6, data[at:end]
         at = end
-    return tuple(messages)
+
+
+@cache
+def recorded(name: str) -> tuple[Recorded, ...]:
+    """Everything in one recording, in order; or a skip where there is none."""
+    parser = mavlink.MAVLink(None)
+    return tuple(
+        Recorded(time_s, message)
+        for time_s, frame in frames(name)
+        for message in parser.parse_buffer(frame) or ()
+    )

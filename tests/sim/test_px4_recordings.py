@@ -10,11 +10,10 @@ may differ, and why.
 """
 
 import functools
-import gzip
 import itertools
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -25,9 +24,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from sim.px4.link import Px4Link
 from sim.px4.modes import Mode
 from sim.px4.vehicle import CHECKS_PERIOD_S, LANDED_AFTER_S, Px4Vehicle, Sensor
-from tests.conftest import ROOT
+from tests.px4_recordings import frames
 
-RECORDINGS = ROOT.parent / "shared" / "data" / "px4_v1.17"
 STEP_S = 0.02
 GROUND_STATION = 255
 EVENT = "EVENT"
@@ -231,19 +229,6 @@ class Replay:
     real: list[Said] = field(default_factory=list)
     simulated: list[Said] = field(default_factory=list)
     phases_s: tuple[float, ...] = ()
-
-
-def frames(name: str) -> Iterator[tuple[float, bytes]]:
-    """Of both directions: s since the first, and the frame."""
-    log = gzip.decompress((RECORDINGS / f"{name}.tlog.gz").read_bytes())
-    start = began_us = 0
-    while start < len(log):
-        (at_us,) = struct.unpack_from(">Q", log, start)
-        signed = log[start + 10] & 1
-        end = start + 8 + 12 + log[start + 9] + 13 * signed
-        began_us = began_us or at_us
-        yield (at_us - began_us) / 1e6, log[start + 8 : end]
-        start = end
 
 
 STREAM_COMMANDS = {mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE}
