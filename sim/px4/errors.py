@@ -11,10 +11,9 @@ import numpy as np
 
 from edge.core import F64
 
-# Of the whole horizontal error of a receiver: between these, most of it near the lower one, so that
-# two thirds lie within what the receiver says of itself.
+# Of the whole horizontal error of a receiver.
 LEAST_BIAS_M, GREATEST_BIAS_M = 1.0, 5.0
-_BIAS_EXPONENT = 10.0
+# What it says of itself: it knows its noise, and little of what biases it for minutes.
 GPS_ACCURACY_M = (1.5, 3.0)
 # How far it walks, in its length and across, either way.
 _WALK_M, _WALK_PERIODS_S = 0.4, (200.0, 700.0)
@@ -41,7 +40,7 @@ _STALE_EVERY_S, _STALE_FOR_S = (90.0, 240.0), (0.3, 3.0)
 
 def draw_bias_m(share: float, bearing_rad: float) -> tuple[float, float]:
     """North and east of a receiver's error at the start; `share` is uniform in 0 to 1."""
-    length_m = LEAST_BIAS_M + (GREATEST_BIAS_M - LEAST_BIAS_M) * share**_BIAS_EXPONENT
+    length_m = LEAST_BIAS_M + (GREATEST_BIAS_M - LEAST_BIAS_M) * share
     return length_m * math.cos(bearing_rad), length_m * math.sin(bearing_rad)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from edge.core import F64
 from sim.px4 import checks
 from sim.px4.checks import Component, Event, Level, Problem, Report, Reporter
-from sim.px4.errors import GPS_ACCURACY_M as HONEST_ACCURACY_M
+from sim.px4.errors import GPS_ACCURACY_M as BIASED_ACCURACY_M
 from sim.px4.errors import Errors, draw_bias_m
 from sim.px4.estimator import NOISE_M, Estimator
 from sim.px4.failsafe import Failsafe
@@ -256,7 +256,7 @@ class Px4Vehicle:
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
         """What the receiver says of its fix: horizontally and vertically, m, and m/s."""
-        accuracy_m = GPS_ACCURACY_M if self._errors is None else HONEST_ACCURACY_M
+        accuracy_m = GPS_ACCURACY_M if self._errors is None else BIASED_ACCURACY_M
         return *accuracy_m, GPS_ACCURACY_M_S
 
     @property
