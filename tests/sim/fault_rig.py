@@ -28,7 +28,7 @@ from edge.runtime.pac import Pac, PolicyTick
 from sim.fleet import ORIGIN, Fleet, RobotProcess
 from sim.fleet_vehicles import SimulatedVehicles
 from sim.operator import Heard, Script, Statuses
-from sim.px4.server import STEP_S
+from sim.px4.errors import GREATEST_WIND_M_S
 from sim.px4.vehicle import Px4Vehicle, Truth
 from tests.conftest import ROOT
 from tests.robot_rig import HELD_UP
@@ -37,7 +37,8 @@ from tests.sim.px4_rig import RealVehicle, RealVehicles
 _S = FlightState
 
 PILOT_M_S = 3.0
-GUST_M_S2 = 1.5
+# More than a vehicle flies against, and how fast it comes up.
+STORM_M_S, STORM_M_S2 = 16.0, 4.0
 # A robot that this machine kept waiting, or that passes another which lands, rightly leaves the
 # mission too.
 _BY_ITSELF = re.compile(
@@ -82,7 +83,8 @@ class FaultRig:
 
     Times are a vehicle's own, s. What the vehicle really did is `truth`. `at_rest_m_s` is what a
     vehicle that holds its place does not exceed, `log_lag_s` how late its log tells of setpoints,
-    `drift_m` how far it comes down from where it was without GPS.
+    `drift_m` how far it comes down from where it was without GPS, in still air; in that, without
+    control of its place, it is carried by a wind of `wind_m_s`.
     """
 
     def __init__(
@@ -93,10 +95,11 @@ class FaultRig:
         self.simulated = vehicles
         self.flying = set(robots)
         # PX4's own vehicle model wanders up to 0.24 m/s in PX4's own hold.
-        # The simulated ones have gusts of 8 m/s.
-        self.at_rest_m_s = 0.35 if isinstance(vehicles, RealVehicles) else 0.3
+        # PX4's own vehicle model wanders by itself, the simulated ones have gusts.
+        self.at_rest_m_s = 0.35
         # A real PX4 was seen 7.5 m away after it had landed without GPS.
         self.drift_m = 10.0 if isinstance(vehicles, RealVehicles) else 6.0
+        self.wind_m_s = 0.0 if isinstance(vehicles, RealVehicles) else GREATEST_WIND_M_S
         self.log_lag_s = 1.5 if isinstance(vehicles, RealVehicles) else 0.1
 
     def robot(self, role: int) -> int:
@@ -330,11 +333,13 @@ class FaultRig:
             self.simulated_vehicle(robot).move_sticks(())
 
     def push_over_the_fence(self, robot: int) -> None:
-        """A gust carries it over the line; then the wind blows on as it is."""
+        """A storm carries it over the line; then the wind blows on as it is used to."""
         outwards = self.fleet.to_mission.velocity_to_local(self.outwards(robot))
+        began_s = self.now_s(robot)
 
         def is_over_the_line(vehicle: Px4Vehicle) -> bool:
-            vehicle.wind_m_s = vehicle.wind_m_s + outwards * GUST_M_S2 * STEP_S
+            storm_m_s = min(STORM_M_S, STORM_M_S2 * (vehicle.time_s - began_s))
+            vehicle.wind_m_s = vehicle.wind_m_s + outwards * storm_m_s - vehicle.air_m_s
             x_m, y_m, _ = self._to_mission_m(vehicle.estimated_position_m)
             return self.fleet.fence.distance_m(x_m, y_m) < -0.3
 
