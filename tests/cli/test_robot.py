@@ -120,7 +120,7 @@ def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
         ({"policy": {"bundle": "nothing"}}, "nothing"),
         ({"policy": {"world": "nothing.env"}}, "nothing.env"),
         ({"policy": {"world": "broken.env"}}, "broken.env: record 1 (CircularBND)"),
-        ({"flight": {"slot": 99}}, "slot = 99 flies at 201 m"),
+        ({"flight": {"slot": 99}}, "slot = 99 flies at 450.5 m"),
         ({"link": {"listen": ["tcp/192.0.2.1:1"]}}, "this machine has no such address"),
         ({"link": {"listen": ["TAKEN"]}}, "another program has this port"),
     ],

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from fleet.on_robot.service import UNIT
 from fleet.session import RemoteError
 from sim.hosts import RobotHosts
 from tests.fleet.field import armed, lpac_fleet, name_robot
@@ -65,8 +66,9 @@ def test_a_rollback_to_a_damaged_release_leaves_the_present_one_running(laptop: 
 def test_nothing_is_taken_back_under_a_pilot(laptop: Laptop) -> None:
     host = laptop.hosts[0]
     # A program that ends at once: no release can be well with it.
-    unit = laptop.common.unit.replace(b"robot run --config", b"robot run --no-config")
-    release = laptop.release(0, laptop.changed()._replace(unit=unit))
+    units = dict(laptop.common.units)
+    unit = units[UNIT].replace(b"robot run --config", b"robot run --no-config")
+    release = laptop.release(0, laptop.changed()._replace(units=units | {UNIT: unit}))
     with ExitStack() as stack:
 
         def arm(step: str, _: float | None) -> None:
