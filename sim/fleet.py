@@ -4,7 +4,6 @@ import json
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -27,8 +26,9 @@ from edge.core.world import Feature, format_world, random_features
 from edge.runtime.bundle import BundleError, load_bundle
 from edge.runtime.config import Rates
 from sim.experiment import FIELD_SCALE
-from sim.fleet_vehicles import Autopilot, SimulatedVehicles, Vehicles, free_ports
+from sim.fleet_vehicles import Autopilot, SimulatedVehicles, Vehicles
 from sim.operator import Operator, Say
+from sim.ports import free_ports
 from sim.px4.errors import Errors
 from sim.px4.vehicle import Px4Vehicle
 from sim.px4.world import WorldOrigin
@@ -270,9 +270,9 @@ class Fleet:
                 px4_build, [self._to_world_m(pad_m) for pad_m in self.pads_m], WORLD,
                 self.folder / "px4",
             )  # fmt: skip
-        with free_ports(scenario.robots, socket.SOCK_STREAM) as ports:
-            self.endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
-            self.name = f"sim-{ports[0]}"
+        ports = free_ports(scenario.robots)
+        self.endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
+        self.name = f"sim-{ports[0]}"
         self.robots = tuple(
             RobotProcess(robot, self.folder / "robots" / str(robot))
             for robot in range(scenario.robots)

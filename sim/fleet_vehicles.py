@@ -1,9 +1,7 @@
 """The vehicles of a simulated fleet: where their robots reach them, and where they really were."""
 
-import contextlib
 import math
-import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import NamedTuple, Protocol, Self
@@ -12,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F64
+from sim.ports import free_ports
 from sim.px4.link import Px4Link
 from sim.px4.server import Instance, Px4Server
 from sim.px4.vehicle import Px4Vehicle
@@ -75,18 +74,13 @@ class SimulatedVehicles:
 
     def __init__(self, vehicles: Sequence[Px4Vehicle]) -> None:
         self.vehicles = tuple(vehicles)
-        with free_ports(2 * len(vehicles), socket.SOCK_DGRAM) as ports:
-            links = [Px4Link(v, system_id=i + 1) for i, v in enumerate(self.vehicles)]
-            self._server = Px4Server(
-                [
-                    Instance(link, listen_port, client_port)
-                    for link, listen_port, client_port in zip(
-                        links, ports[::2], ports[1::2], strict=True
-                    )
-                ]
-            )
+        ports = free_ports(len(self.vehicles))
+        links = [Px4Link(v, system_id=i + 1) for i, v in enumerate(self.vehicles)]
+        self._server = Px4Server(
+            [Instance(link, 0, port) for link, port in zip(links, ports, strict=True)]
+        )
         self.autopilots = tuple(
-            Autopilot(f"udpin://127.0.0.1:{port}", i + 1) for i, port in enumerate(ports[1::2])
+            Autopilot(f"udpin://127.0.0.1:{port}", i + 1) for i, port in enumerate(ports)
         )
         self.stepped = self._server.stepped
         self._began_s = math.nan
@@ -131,15 +125,3 @@ class SimulatedVehicles:
     def lost_s(self) -> float:
         """Time that this process was held up for, and that the vehicles left out."""
         return self._server.started_s - self._began_s
-
-
-@contextlib.contextmanager
-def free_ports(count: int, kind: socket.SocketKind) -> Iterator[tuple[int, ...]]:
-    """Ports of this machine that nobody else is given within the context."""
-    with contextlib.ExitStack() as sockets:
-        found = []
-        for _ in range(count):
-            bound = sockets.enter_context(socket.socket(socket.AF_INET, kind))
-            bound.bind(("127.0.0.1", 0))
-            found.append(bound.getsockname()[1])
-        yield tuple(found)

@@ -5,7 +5,6 @@ import math
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,8 +18,8 @@ import numpy as np
 from edge.core.mission import FlightState, Origin, RobotStatus
 from edge.core.world import format_world, random_features
 from edge.runtime.config import RobotConfig, load_config
-from sim.fleet_vehicles import free_ports
 from sim.operator import Operator
+from sim.ports import free_ports
 from sim.px4.link import Px4Link
 from sim.px4.server import Instance, Px4Server
 from sim.px4.vehicle import Px4Vehicle
@@ -162,18 +161,12 @@ def rig(
 ) -> Iterator[Rig]:
     """A rig in `folder`; `others` speak on the same link as the vehicle."""
     links = (Px4Link(vehicle, system_id=SYSTEM_ID), *others)
-    with free_ports(1 + len(links), socket.SOCK_DGRAM) as ports:
-        client_port, *listen_ports = ports
-    with free_ports(1, socket.SOCK_STREAM) as (port,):
-        endpoint = f"tcp/127.0.0.1:{port}"
+    client_port, port = free_ports(2)
+    endpoint = f"tcp/127.0.0.1:{port}"
     path = write_config(
         folder, url=f"udpin://127.0.0.1:{client_port}", endpoint=endpoint, changes=changes
     )
-    instances = [
-        Instance(link, listen, client_port)
-        for link, listen in zip(links, listen_ports, strict=True)
-    ]
-    with Px4Server(instances) as server:
+    with Px4Server([Instance(link, 0, client_port) for link in links]) as server:
         made = Rig(path, server, links)
         with made.operator:
             yield made

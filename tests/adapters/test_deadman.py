@@ -17,12 +17,12 @@ from pymavlink.dialects.v20 import common as mavlink
 from edge.adapters import left_alone
 from edge.adapters.deadman import Deadman, DeadmanError
 from edge.adapters.raw_mavlink import Heartbeat, heartbeat, hold_command, land_command
+from sim.ports import free_ports
 from sim.px4.link import Px4Link
 from sim.px4.modes import Mode
 from sim.px4.server import Instance, Px4Server
 from sim.px4.vehicle import Px4Vehicle
 from tests.conftest import ROOT
-from tests.sim.test_px4 import free_port
 
 PROGRAM = """
 import ctypes, logging, sys, time
@@ -80,7 +80,7 @@ def program(
 def test_a_program_that_hangs_or_dies_leaves_nobody_flying_or_hovering() -> None:
     hangs = ("process", "interpreter", "loop")
     ways = (*hangs, "killed", "stopped, then killed", "continued", "taken", "taken and left")
-    ports = [free_port() for _ in ways]
+    ports = free_ports(len(ways))
     vehicles = {}
     for seed, way in enumerate(ways, 1):
         vehicles[way] = Px4Vehicle(seed=seed, ready_after_s=0.0)

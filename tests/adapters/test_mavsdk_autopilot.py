@@ -19,13 +19,13 @@ from structlog.testing import capture_logs
 from edge.adapters.mavsdk_autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
 from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
+from sim.ports import free_ports
 from sim.px4.link import Px4Link
 from sim.px4.modes import CUSTOM_MODES, Result
 from sim.px4.modes import Mode as Px4Mode
 from sim.px4.server import Instance, Px4Server
 from sim.px4.vehicle import Px4Vehicle
 from sim.px4.vehicle import Setpoint as Px4Setpoint
-from tests.sim.test_px4 import free_port
 
 ROOT = Path(__file__).parents[2]
 CLIMB = Velocity((0.0, 0.0, -2.0))
@@ -74,7 +74,7 @@ def served(*links: Px4Link, port: int) -> Iterator[Px4Server]:
 
 @contextmanager
 def connected(vehicle: Px4Vehicle) -> Iterator[tuple[MavsdkAutopilot, Px4Server]]:
-    port = free_port()
+    (port,) = free_ports(1)
     with (
         MavsdkAutopilot(f"udpin://127.0.0.1:{port}", system_id=7) as autopilot,
         served(Px4Link(vehicle, system_id=7), port=port) as server,
@@ -226,7 +226,7 @@ def test_position_and_origin_belong_together_when_the_origin_jumps() -> None:
 
 
 def test_a_vehicle_that_appears_late_goes_and_comes_back() -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     link = Px4Link(new_vehicle(), system_id=7)
     with MavsdkAutopilot(f"udpin://127.0.0.1:{port}") as autopilot:
         assert autopilot.state() == VehicleState()
@@ -247,7 +247,7 @@ def test_a_vehicle_that_appears_late_goes_and_comes_back() -> None:
 
 
 def test_it_speaks_to_its_own_vehicle_alone() -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     own, other = new_vehicle(1), new_vehicle(2)
     links = Px4Link(other, system_id=3), Px4Link(own, system_id=5)
     with (
@@ -263,7 +263,7 @@ def test_it_speaks_to_its_own_vehicle_alone() -> None:
 
 @pytest.mark.parametrize(("uids", "boot_s"), [((1, 2), 0.0), ((1, 1), 0.5)])
 def test_two_vehicles_with_one_system_id_are_noticed(uids: tuple[int, int], boot_s: float) -> None:
-    port = free_port()
+    (port,) = free_ports(1)
     first, second = new_vehicle(1), new_vehicle(2)
     while first.time_s < boot_s:
         first.step(0.02)
@@ -566,7 +566,7 @@ def program(port: int, way: str) -> Iterator[subprocess.Popen[str]]:
 def test_a_program_that_stands_still_stops_the_vehicle() -> None:
     """Its process stopped, its interpreter held up, itself killed: each flies a vehicle."""
     ways = ("process", "interpreter", "killed")
-    ports = [free_port() for _ in ways]
+    ports = free_ports(len(ways))
     vehicles = [
         new_vehicle(seed, COM_OF_LOSS_T=0.5, COM_OBL_RC_ACT=4, COM_FAIL_ACT_T=1.0)
         for seed in (1, 2, 3)
@@ -610,7 +610,7 @@ with MavsdkAutopilot(f"udpin://127.0.0.1:{sys.argv[1]}") as autopilot:
         time.sleep(0.02)
     raise SystemExit(3)
 """
-    port = free_port()
+    (port,) = free_ports(1)
     with served(Px4Link(new_vehicle(), system_id=7), port=port):
         arguments = [sys.executable, "-c", code, str(port), str(with_vehicle)]
         assert subprocess.run(arguments, cwd=ROOT, timeout=120.0, check=False).returncode == 3

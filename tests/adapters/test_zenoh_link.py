@@ -18,6 +18,7 @@ import pytest
 import zenoh
 
 from edge.adapters.zenoh_link import LinkError, ZenohLink
+from sim.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
 
@@ -73,9 +74,8 @@ class Inbox:
 
 
 def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    (port,) = free_ports(1)
+    return f"tcp/127.0.0.1:{port}"
 
 
 def eventually(condition: Callable[[], object], timeout_s: float = 60.0) -> None:

@@ -20,11 +20,11 @@ from fleet.enroll import _predecessors_step
 from fleet.on_robot import enrolment, landing, probes, releases, service
 from fleet.on_robot.calls import Refused
 from fleet.release import _entry
+from sim.ports import free_ports
 from sim.px4.link import Px4Link
 from sim.px4.modes import Mode
 from sim.px4.server import Instance, Px4Server
 from sim.px4.vehicle import Px4Vehicle
-from tests.sim.test_px4 import free_port
 
 ROOT = Path(__file__).parents[2]
 
@@ -171,7 +171,8 @@ def test_no_heartbeat_is_silence(datagrams: tuple[int, socket.socket]) -> None:
 def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
     said = {"fresh": True}
     monkeypatch.setattr(service, "service", lambda: said)
-    vehicle, port = Px4Vehicle(seed=1, ready_after_s=0.0), free_port()
+    vehicle = Px4Vehicle(seed=1, ready_after_s=0.0)
+    (port,) = free_ports(1)
 
     def refused(why: str, system_id: int = 7) -> None:
         with pytest.raises(Refused, match=why):
@@ -209,7 +210,7 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
 @needs_root
 def test_where_nothing_is_heard_nothing_is_landed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "service", lambda: {"fresh": False})
-    port = free_port()
+    (port,) = free_ports(1)
     with pytest.raises(Refused, match=f"^nothing is heard of PX4 at UDP port {port}$"):
         landing.land(port, 7)
 

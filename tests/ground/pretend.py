@@ -9,7 +9,6 @@ import json
 import math
 import secrets
 import signal
-import socket
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -40,7 +39,7 @@ from edge.core.safety import Fence
 from edge.core.vehicle import Vector
 from edge.core.world import format_world, random_features
 from edge.runtime.bundle import load_bundle
-from sim.fleet_vehicles import free_ports
+from sim.ports import free_ports
 from tests.conftest import SHIPPED
 
 PERIOD_S = 0.25
@@ -394,8 +393,7 @@ class PretendedFleet:
         self._stack = ExitStack()
 
     def __enter__(self) -> "PretendedFleet":
-        with free_ports(len(self.robots), socket.SOCK_STREAM) as ports:
-            self.ports = tuple(ports)
+        self.ports = free_ports(len(self.robots))
         self._write()
         for robot in self.robots:
             if robot.robot_id not in self._absent:

@@ -1,7 +1,6 @@
 """The scripted ground station, against robots that only talk."""
 
 import dataclasses
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,8 +22,8 @@ from edge.core.mission import (
     world_id,
 )
 from edge.core.safety import Fence
-from sim.fleet_vehicles import free_ports
 from sim.operator import Operator
+from sim.ports import free_ports
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
 STATUS = RobotStatus(
@@ -83,8 +82,7 @@ def talking(
     robots: int = 1, *, lifetime_s: float = 600.0
 ) -> Iterator[tuple[Operator, list[Talker]]]:
     """An operator that hears the robots' first statuses, which count for `lifetime_s`."""
-    with free_ports(robots, socket.SOCK_STREAM) as ports:
-        endpoints = [f"tcp/127.0.0.1:{port}" for port in ports]
+    endpoints = [f"tcp/127.0.0.1:{port}" for port in free_ports(robots)]
     talkers = [Talker(endpoint, robot) for robot, endpoint in enumerate(endpoints)]
     try:
         with (

@@ -2,7 +2,6 @@
 
 import asyncio
 import math
-import socket
 from collections.abc import AsyncGenerator, Callable, Iterator
 from contextlib import aclosing, contextmanager
 from typing import Any, TypeVar
@@ -31,6 +30,7 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 from mavsdk.asyncio.plugins.telemetry import FlightMode, LandedState, TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
+from sim.ports import free_ports
 from sim.px4 import checks
 from sim.px4.checks import Component
 from sim.px4.link import Px4Link
@@ -566,16 +566,10 @@ def test_a_message_for_another_system_is_not_obeyed() -> None:
 T = TypeVar("T")
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
-        udp.bind(("127.0.0.1", 0))
-        return int(udp.getsockname()[1])
-
-
 @contextmanager
 def served(vehicle: Px4Vehicle, system_id: int) -> Iterator[tuple[Px4Server, str]]:
     """The vehicle on a port of its own, and the address for MAVSDK."""
-    port = free_port()
+    (port,) = free_ports(1)
     link = Px4Link(vehicle, system_id=system_id)
     with Px4Server([Instance(link, 0, port)]) as server:
         yield server, f"udpin://127.0.0.1:{port}"
