@@ -235,6 +235,10 @@ class Px4Build:
             setpoints_s = setpoint_times_s(instance.logs())
             return float(instance.to_monotonic_s(setpoints_s)[-1])
 
+    def logs(self, number: int) -> list[Path]:
+        """What a PX4 has logged so far, some tenths of a second old."""
+        return self._instances[number].logs()
+
     def pid(self, number: int) -> int:
         """The process of a PX4."""
         process = self._instances[number].process

@@ -271,6 +271,15 @@ class FaultRig:
                 return vehicle.last_setpoint_s()
             return vehicle._setpoint_at_s
 
+    def silence_before_landing_s(self, robot: int, landing_s: float) -> float:
+        """How long the vehicle had no setpoints when it began to land, at `landing_s`."""
+        with self.simulated.stepped:
+            vehicle = self.vehicle(robot)
+            if isinstance(vehicle, RealVehicle):
+                # What is heard of it comes some milliseconds late, and its clock may be slow.
+                return vehicle.silence_before_landing_s()
+            return landing_s - vehicle._setpoint_at_s
+
     def truth(self, robot: int, since_s: float) -> list[Truth]:
         """What was really so since then; it is never nothing."""
         with self.simulated.stepped:
@@ -282,11 +291,13 @@ class FaultRig:
         """The greatest true speed since then; with 2 axes the horizontal one."""
         return max(speed_m_s(entry.velocity_m_s, axes) for entry in self.truth(robot, since_s))
 
-    def jump_origin(self, robot: int, north_m: float, east_m: float) -> tuple[float, F64]:
+    def jump_origin(
+        self, robot: int, north_m: float, east_m: float, down_m: float
+    ) -> tuple[float, F64]:
         """Its estimator starts over from another origin; its time then, and where it really was."""
         with self.simulated.stepped:
             vehicle = self.vehicle(robot)
-            vehicle.jump_estimator_origin(north_m, east_m)
+            vehicle.jump_estimator_origin(north_m, east_m, down_m)
             return vehicle.time_s, vehicle.position_m.copy()
 
     def true_position_m(self, robot: int) -> F64:

@@ -20,12 +20,15 @@ from sim.px4.modes import CUSTOM_MODES, Mode
 from sim.px4.vehicle import Truth
 from sim.px4.world import WorldOrigin
 from sim.px4_build import GROUND_PORT, Px4Build, frames, payload
+from sim.px4_log import read_truth, setpoint_times_s
 
 AIRBORNE_ABOVE_M = 0.15
 # PX4's DESCEND is told as LAND.
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Mode.DESCEND}
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
+# Of vehicle_status in PX4's log.
+NAVIGATION_LAND = 18
 # Not in pymavlink's dialect: custom_mode comes first. PX4 has it since v1.15.
 CURRENT_MODE = 436
 _RATES_HZ = {
@@ -150,6 +153,14 @@ class RealVehicle:
     def last_setpoint_s(self) -> float:
         """When the last setpoint reached it, by its log, some tenths of a second old."""
         return self._px4s.last_setpoint_s(self._instance)
+
+    def silence_before_landing_s(self) -> float:
+        """From the last setpoint until it landed by itself: by its log, in its own time."""
+        logs = self._px4s.logs(self._instance)
+        truth = read_truth(logs, self._world)
+        assert truth is not None
+        landing_s = truth.status_s[truth.navigation_state == NAVIGATION_LAND][0]
+        return float(landing_s - setpoint_times_s(logs)[-1])
 
     def _receive(self) -> bytes:
         with suppress(ConnectionError, BlockingIOError):

@@ -181,7 +181,8 @@ def comes_straight_down(rig: FaultRig, robot: int, since_s: float, within_m: flo
     began_s = landing[0].time_s
     truth = rig.truth(robot, began_s)
     assert math.dist(truth[0].position_m[:2], truth[-1].position_m[:2]) < within_m
-    assert all(entry.velocity_m_s[2] > -0.3 for entry in truth)
+    # But for what it still had of a climb.
+    assert all(truth[0].position_m[2] - entry.position_m[2] < 0.3 for entry in truth)
     return began_s
 
 
@@ -268,7 +269,8 @@ def test_a_program_is_killed(rig: FaultRig) -> None:
         assert program.wait(60.0) == -signal.SIGKILL
         rig.wait_vehicle(robot, is_down)
         assert rig.is_forgotten(robot)
-    assert comes_straight_down(rig, robot, began_s) < rig.last_setpoint_s(robot) + 1.2
+    landing_s = comes_straight_down(rig, robot, began_s)
+    assert rig.silence_before_landing_s(robot, landing_s) < 1.2
     silent_s = rig.last_setpoint_s(robot)
     assert rig.max_speed_m_s(robot, silent_s + 2.0, axes=2) < rig.at_rest_m_s
 
@@ -354,7 +356,7 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
         # Until its next setpoint the vehicle follows the last one, which is another place now: a
         # jump in which the robot was held up tells nothing. Ten such in a row count all the same.
         for _ in range(10):
-            began_s, began_m = rig.jump_origin(robot, north_m, -0.75 * north_m)
+            began_s, began_m = rig.jump_origin(robot, north_m, -0.75 * north_m, north_m)
             if longest_without_setpoint_s(rig, robot, began_s + 3.0) < 0.2:
                 break
             north_m = -north_m
@@ -371,6 +373,10 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
         assert rig.max_speed_m_s(robot, began_s, axes=2) < fastest_m_s + 0.5
         moved_m = math.dist(rig.truth(robot, began_s)[-1].position_m[:2], began_m[:2])
         assert moved_m < (1.0 if state is _S.HOLD else 3.0 * rig.fleet.max_speed_m_s)
+        # Others fly above and below.
+        assert all(
+            abs(entry.position_m[2] - began_m[2]) < 1.5 for entry in rig.truth(robot, began_s)
+        )
         rig.operator.calm("none", robot)
 
 
@@ -485,7 +491,8 @@ def test_the_battery_is_low(rig: FaultRig) -> None:
         heard_s = time.monotonic()
         rig.drain(robot, 0.245)
         status = rig.wait_state(robot, _S.RETURN)
-        assert status.reason == status.alarms[0] and "battery low" in status.reason
+        # Below its percentage, or too little for the way home, whichever comes first.
+        assert status.reason.startswith("battery l") and status.alarms[0].startswith("battery l")
         rig.wait_landed(robot)
         told = [heard.status for heard in rig.heard(robot, heard_s)]
         # Whether it still says "mission" once is a matter of the instant.
