@@ -181,7 +181,9 @@ def up(
         _print_findings(diagnoses)
         _print_free_ground(config)
         _print_decisions(decisions, batteries)
-        typer.echo(f"trials: of {trial:g} s, before the battery is low; --trial for others")
+        typer.echo(
+            f"trials: how many of {trial:g} s each pack lasts for; --trial SECONDS for others"
+        )
     no_go = [decision.robot for decision in decisions if not decision.go]
     if no_go:
         raise ValueError(f"NO-GO: {', '.join(no_go)}")

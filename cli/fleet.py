@@ -207,7 +207,7 @@ def restart(
 def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Land vehicles whose programs are gone, where they are: over SSH, by their PX4.
 
-    Where the program runs it refuses, `lpac mission land` is for that; and where a pilot flies.
+    Refused while the program runs (use `lpac mission land`) and while a pilot flies.
     """
     from fleet.hold import visit
 

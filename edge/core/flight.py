@@ -201,7 +201,8 @@ class Robot:
         if not fence.floor_m <= height_m <= fence.ceiling_m:
             raise ValueError(
                 f"slot = {self.parameters.slot} flies at {height_m:g} m: must be from floor_m = "
-                f"{fence.floor_m:g} to ceiling_m = {fence.ceiling_m:g}"
+                f"{fence.floor_m:g} to ceiling_m = {fence.ceiling_m:g}; raise ceiling_m, or take "
+                "fewer slots"
             )
         x_m, y_m = self.parameters.landing_point_m
         if not fence.distance_m(x_m, y_m) >= fence.buffer_m:

@@ -148,7 +148,7 @@ class ErrorBudget:
         return Margin(
             math.ceil(self.position_m + px4_fence_m + way_m + fall_m),
             f"position {self.position_m:g} m, PX4's fence {px4_fence_m:g} m further out, "
-            f"{way_m:.1f} m to stop, {fall_m:.1f} m of fall from {ceiling_m:g} m",
+            f"{way_m:.1f} m to stop, {fall_m:.1f} m of drift while it falls from {ceiling_m:g} m",
         )
 
 

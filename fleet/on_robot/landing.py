@@ -24,7 +24,9 @@ def land(mavlink_port: int, system_id: int) -> Dict[str, Any]:
     """
     state = service.service()
     if state["fresh"]:
-        raise Refused("its program runs: `lpac mission land` lands it")
+        raise Refused(
+            "its program runs: `lpac mission land` lands it, in pilot after `lpac mission rejoin`"
+        )
     say("listens to PX4")
     beat = service.hear_heartbeat(mavlink_port)
     if beat is None:

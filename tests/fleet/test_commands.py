@@ -134,7 +134,10 @@ def test_a_vehicle_whose_program_is_gone_is_landed_over_ssh(operator: Operator) 
         return said
 
     await_said(r2, '"armed":false')
-    assert land(1)["problem"] == "its program runs: `lpac mission land` lands it"
+    assert (
+        land(1)["problem"]
+        == "its program runs: `lpac mission land` lands it, in pilot after `lpac mission rejoin`"
+    )
     operator.json("stop", "--robots", "r2")
     assert land(1)["problem"] == "it is disarmed: nothing is to land"
     with armed(r2):

@@ -184,7 +184,9 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
             vehicle.take_off(math.nan)
         return bool(vehicle.position_m[2] < -1.0)
 
-    refused("^its program runs: `lpac mission land` lands it$")
+    refused(
+        "^its program runs: `lpac mission land` lands it, in pilot after `lpac mission rejoin`$"
+    )
     said["fresh"] = False
     with Px4Server([Instance(Px4Link(vehicle, system_id=7), 0, port)]) as server:
         refused("^PX4 is system 7, not 8", system_id=8)
