@@ -457,7 +457,9 @@ class _Program:
             feature_age_s=self._pac.feature_age_s(now_s),
             neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
-            remote_control=vehicle.remote_control if self._config.failsafe.rc == "pilot" else None,
+            remote_control=(
+                bool(vehicle.remote_control) if self._config.failsafe.rc == "pilot" else None
+            ),
             battery_lasts_s=None if energy is None else energy.lasts_s,
             home_s=None if energy is None else energy.home_s,
             endurance_s=control.endurance_s,

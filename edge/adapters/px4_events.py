@@ -358,7 +358,7 @@ class Px4Events:
         """Whether the event with that number comes next; if not, what lies between is missing."""
         ahead = 1 if self._last is None else _ahead(sequence, self._last)
         given_up = self._missing_since_s is not None and now_s - self._missing_since_s > _ANSWER_S
-        if (ahead == 1 and arrived) or given_up:
+        if (ahead == 1 and arrived) or (given_up and 0 < ahead < _SEQUENCES // 2):
             if given_up:
                 self._report = None
             self._last = sequence

@@ -27,6 +27,8 @@ Fields = Mapping[str, Any]
 
 # PX4 sends a heartbeat at least every second.
 _CONNECTED_WITHIN_S = 2.5
+# Asked for twice a second; what is older says nothing about now.
+_SYS_STATUS_HEARD_S = 2.5
 # What is told once counts for so long, and as long as a failsafe lasts.
 _TOLD_FOR_S = 15.0
 # The reason for a failsafe comes up to a heartbeat before its state.
@@ -69,6 +71,7 @@ class Px4Telemetry:
         self._state = VehicleState()
         self._clock = _VehicleClock()
         self._twin = _TwinWatch()
+        self._sys_status_at_s = -math.inf
         self._gps_time_us: int | None = None
         self._jump_at_s: float | None = None
         self._origin: GlobalOrigin | None = None
@@ -108,6 +111,10 @@ class Px4Telemetry:
         """All fields but those of the link: system ids and command results are not known here."""
         with self._lock:
             state = self._state
+            if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
+                state = replace(
+                    state, armable=None, battery=None, voltage_v=None, remote_control=None
+                )
             problems: tuple[Reason, ...] = ()
             warnings: tuple[Reason, ...] = ()
             if state.armed:
@@ -179,7 +186,7 @@ class Px4Telemetry:
             heartbeat_at_s=now_s - self._clock.delay_s,
         )
 
-    def _on_sys_status(self, fields: Fields, _: float) -> None:
+    def _on_sys_status(self, fields: Fields, now_s: float) -> None:
         present = fields["onboard_control_sensors_present"]
         healthy = fields["onboard_control_sensors_health"]
         percent, millivolts = fields["battery_remaining"], fields["voltage_battery"]
@@ -189,6 +196,7 @@ class Px4Telemetry:
             voltage_v=None if millivolts == _UNKNOWN_UINT16 else millivolts / 1e3,
             remote_control=bool(present & healthy & _SENSOR_RC),
         )
+        self._sys_status_at_s = now_s - self._clock.delay_s
 
     def _on_gps_raw_int(self, fields: Fields, now_s: float) -> None:
         hundredths, satellites = fields["eph"], fields["satellites_visible"]

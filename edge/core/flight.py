@@ -469,6 +469,11 @@ def _battery_below(t: _Tick, share: float, word: str) -> str | None:
     return None if battery is None or battery > share else f"battery {word}: {battery:.0%}"
 
 
+def _battery_not_known(t: _Tick) -> str | None:
+    unknown = t.inputs.vehicle.battery is None and not t.silent
+    return _if(unknown, "battery is not known")
+
+
 def _ground_lands(t: _Tick) -> str | None:
     return _if(t.calm == "land", "ground commands land")
 
@@ -508,9 +513,12 @@ def _outside(t: _Tick) -> str | None:
 
 
 def _remote_control_lost(t: _Tick) -> str | None:
-    lost_s = t.inputs.now_s - t.flight.remote_control_at_s
-    lost = t.inputs.vehicle.remote_control is False and lost_s > _REMOTE_CONTROL_LOST_S
-    return _if(lost and t.robot.on_remote_control_lost is not None, "remote control lost")
+    if t.robot.on_remote_control_lost is None or t.inputs.vehicle.remote_control or t.silent:
+        return None
+    # A program that was started in flight has not heard it yet.
+    heard_at_s = t.flight.remote_control_at_s
+    lost_s = t.inputs.now_s - (heard_at_s if heard_at_s > -math.inf else t.flight.since_s)
+    return _if(lost_s > _REMOTE_CONTROL_LOST_S, "remote control lost")
 
 
 def _holds_without_remote_control(t: _Tick) -> str | None:
@@ -1074,7 +1082,7 @@ def _alarms(t: _Tick) -> tuple[str, ...]:
     if t.flight.state in (*AIRBORNE, _S.PILOT):
         checks = (
             _failsafe, _hovers_alone, _remote_control_lost, _position_not_good, _too_close,
-            _outside, _battery_low, _ground_lost,
+            _outside, _battery_low, _battery_not_known, _ground_lost,
         )  # fmt: skip
         alarms += [text for check in checks if (text := check(t)) is not None]
         alarms += [f"PX4: {warning.text}" for warning in t.inputs.vehicle.warnings]

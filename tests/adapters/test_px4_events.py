@@ -237,6 +237,17 @@ def test_events_that_never_come_are_given_up() -> None:
     assert why(events) == ["no data from compass 2"]
 
 
+def test_a_repeat_is_no_news_when_others_were_given_up() -> None:
+    events = Px4Events()
+    told(events, report(0, BAROMETER))
+    told(events, report(30, COMPASS), now_s=1.0)
+    told(events, [event(1, "sensor_failover_baro", 0), event(2, "sensor_failover_baro", 0)], 3.5)
+    assert events.told(0.0) == ()
+    told(events, report(33, COMPASS), now_s=3.6)
+    told(events, report(36, COMPASS), now_s=3.7)
+    assert why(events) == ["no data from compass 2"]
+
+
 def test_a_vehicle_that_was_switched_on_anew_is_heard_again() -> None:
     events = Px4Events()
     told(events, report(40, BAROMETER))

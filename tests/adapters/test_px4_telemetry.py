@@ -107,6 +107,22 @@ def test_all_sensors_die_after_takeoff() -> None:
     ]
 
 
+def test_what_sys_status_told_is_not_known_once_it_falls_silent() -> None:
+    """While all else goes on."""
+    found: list[VehicleState] = []
+    telemetry = Px4Telemetry()
+    for heard_s, message in (r for r in recorded("normal") if r.is_px4):
+        kind = message.get_type()
+        if kind in telemetry.messages and not (kind == "SYS_STATUS" and heard_s > 30.0):
+            telemetry.hear(kind, message.to_dict(), heard_s)
+        if 31.0 < heard_s < 35.0:
+            found.append(telemetry.state(heard_s))
+    told = [(s.battery, s.voltage_v, s.remote_control, s.armable) for s in found]
+    assert None not in told[0]
+    assert told[-1] == (None, None, None, None)
+    assert found[-1].connected and found[-1].position_at_s > 34.0
+
+
 def test_battery_critical_while_landing_is_px4s_own_failsafe() -> None:
     assert changes("battery_fast", "mode", "failsafe")[-6:] == [
         (14.0, _M.OFFBOARD, False),

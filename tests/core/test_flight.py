@@ -107,7 +107,7 @@ class World:
         self.telemetry = True
         self.position_known = True
         self.accuracy_m = 0.9
-        self.battery = 0.9
+        self.battery: float | None = 0.9
         self.remote_control: bool | None = True
         self.energy: Energy | None = None
         self.beats: list[tuple[float, Mode, bool, bool, bool]] = []
@@ -1132,6 +1132,35 @@ def test_a_lost_remote_control_is_an_alarm_and_what_is_configured(world: World) 
         world.enable(calm="none" if reaction == "land" else "return")
         world.until(FlightState.LANDED, 40.0)
         world.remote_control = True
+
+
+def test_a_remote_control_of_which_nothing_is_told_any_more_is_lost(world: World) -> None:
+    world.robot = replace(ROBOT, on_remote_control_lost="land")
+    world.fly()
+    world.remote_control = None
+    world.run(0.8)
+    assert world.state() is FlightState.MISSION
+    world.run(0.5)
+    assert (world.state(), world.flight.reason) == (FlightState.LAND, "remote control lost")
+
+
+def test_what_was_not_told_while_the_program_stood_still_is_not_lost(world: World) -> None:
+    world.robot = replace(ROBOT, on_remote_control_lost="land")
+    world.fly()
+    world.remote_control = world.battery = None
+    world.stop(3.0)
+    world.remote_control, world.battery = True, 0.9
+    world.run(4.0)
+    assert world.state() is FlightState.HOLD
+    assert "remote control lost" not in world.tick().alarms
+
+
+def test_a_battery_that_is_not_known_in_flight_is_an_alarm(world: World) -> None:
+    world.fly()
+    assert world.tick().alarms == ()
+    world.battery = None
+    assert world.tick().alarms == ("battery is not known",)
+    assert world.state() is FlightState.MISSION
 
 
 def test_a_stale_policy_holds(world: World) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from edge.core.margins import ErrorBudget
 from edge.core.mission import FlightState, Origin, RobotStatus
-from edge.core.position import Judgement, Quality
+from edge.core.position import Cause, Judgement, Quality
 from edge.core.preflight import (
     HeardStatus,
     PreflightInputs,
@@ -135,6 +135,17 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
         "robot 2's clock differs by 30.0 s: set the time of both",
     ),
 ]
+# In the place of a position that is missing or old.
+POSITIONS: list[tuple[dict[str, Any], str]] = [
+    (
+        {"position": Judgement(Quality.DOUBTFUL, Cause.GLITCH)},
+        "position is doubtful (the autopilot's estimator takes the GPS for wrong): wait, or move",
+    ),
+    (
+        {"position": Judgement(Quality.LOST, Cause.NO_FIX)},
+        "position is lost (GPS has no fix): wait, or move to open sky",
+    ),
+]
 VEHICLES: list[tuple[dict[str, Any], str]] = [
     ({"connected": False}, "autopilot is not connected: check its power"),
     ({"system_id": None}, "autopilot has system id not known, configured is 1"),
@@ -166,7 +177,7 @@ def test_a_robot_that_is_ready_fails_no_check() -> None:
     assert failed_checks(alone, LIMITS) == ()
 
 
-@pytest.mark.parametrize(("change", "said"), INPUTS)
+@pytest.mark.parametrize(("change", "said"), [*INPUTS, *POSITIONS])
 def test_whatever_is_wrong_is_named_alone(change: dict[str, Any], said: str) -> None:
     (failed,) = failed_checks(dataclasses.replace(READY, **change), LIMITS)
     assert failed.startswith(said)
