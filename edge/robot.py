@@ -241,6 +241,7 @@ class _Program:
         self._link = link
         self._boot_nonce = boot_nonce
         self._started_s = time.monotonic()
+        self._fed_s = -math.inf
         self._control = FlightControl(
             robot=config.robot(boot_nonce),
             world_id=loaded.world_id,
@@ -318,6 +319,9 @@ class _Program:
     def _control_step(self) -> None:
         flying = self._control.tick(time.monotonic())
         self._deadman.feed(flying=flying)
+        now_s = time.monotonic()
+        self._control.look_back(self._fed_s, now_s)
+        self._fed_s = now_s
 
     def _perception_step(self) -> None:
         now_s = time.monotonic()

@@ -303,9 +303,7 @@ class _Tick:
     def lapse_s(self) -> float:
         """How long the control loop was silent; 0 if it was not, or has just begun."""
         silence_s = self.inputs.now_s - self.flight.tick_at_s
-        # A little before the watchdog does, so that what it does is never taken for a pilot's.
-        allowed_s = _LAPSE_SHARE * self.robot.parameters.command_timeout_s
-        return silence_s if allowed_s < silence_s < math.inf else 0.0
+        return silence_s if exceeds_silence(self.robot, silence_s) else 0.0
 
     @property
     def acts_from_s(self) -> float:
@@ -792,6 +790,14 @@ def step(robot: Robot, flight: Flight, inputs: FlightInputs) -> Decision:
         armed_asked=flight.armed_asked or Action.ARM in asked,
     )
     return Decision(flight, actions + asked, _alarms(tick), new_trial, row)
+
+
+def exceeds_silence(robot: Robot, silence_s: float) -> bool:
+    """Whether the control loop was silent for too long; not if it has just begun, with inf.
+
+    A little before the watchdog counts, so that what it does is never taken for a pilot's.
+    """
+    return _LAPSE_SHARE * robot.parameters.command_timeout_s < silence_s < math.inf
 
 
 def is_silent(flight: Flight, now_s: float) -> bool:

@@ -2,13 +2,21 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import NamedTuple
 
 import structlog
 
 from edge.core.energy import Consumption, Energy, EnergyParameters, home_s
-from edge.core.flight import Flight, FlightInputs, Robot, failsafe_acts, height_m, step
+from edge.core.flight import (
+    Flight,
+    FlightInputs,
+    Robot,
+    exceeds_silence,
+    failsafe_acts,
+    height_m,
+    step,
+)
 from edge.core.guidance import Guidance, MissionSetpoint, guide
 from edge.core.mailbox import Neighbour
 from edge.core.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
@@ -140,6 +148,14 @@ class FlightControl:
             _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
         self._record(inputs, setpoint, sent, decision.actions)
         return sent is not None and not failsafe_acts(vehicle)
+
+    def look_back(self, silent_since_s: float, now_s: float) -> None:
+        """Nothing was sent between these times, as the watchdog counts it.
+
+        A tick that took long began in time, and only this tells that the watchdog may have acted.
+        """
+        if exceeds_silence(self.assignment.robot, now_s - silent_since_s):
+            self.flight = replace(self.flight, tick_at_s=silent_since_s)
 
     @property
     def endurance_s(self) -> float:

@@ -273,6 +273,26 @@ def test_it_flies_what_it_is_told_and_lands(flown: Flown) -> None:
     assert answers == [OrderResult(str(number), True) for number in (1, 2, 3)]
 
 
+def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilots(
+    flown: Flown,
+) -> None:
+    flown.take_off()
+    flown.explore("a")
+    now_s = flown.now_s
+    # Late, but the watchdog has not acted.
+    flown.control.look_back(now_s - 0.4, now_s)
+    flown.tick()
+    assert flown.state is FlightState.MISSION
+    flown.vehicle.set_mode(Px4Mode.HOLD)
+    flown.control.look_back(now_s - 0.5, now_s)
+    flown.tick()
+    assert flown.state is FlightState.HOLD
+    assert flown.control.flight.reason.startswith("control was silent for 0.6 s")
+    for _ in range(50):
+        flown.tick()
+    assert flown.state is FlightState.HOLD and flown.vehicle.mode is Px4Mode.OFFBOARD
+
+
 def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
     flown.take_off()
     flown.explore("a")
