@@ -26,12 +26,55 @@ from sim.px4.modes import Mode
 from sim.px4.server import STEP_S
 from sim.px4.vehicle import Airframe, Px4Vehicle, Setpoint
 
+# One look; and by when the vehicle flies at its height.
+TICK_S, READY_S = 0.1, 20.0
 _CORES = 2
-_TICK_S = 0.1
 _SPEED_M_S = 1.25
 _HEIGHT_M = 8.0
 _TURN_S = 10.0
-_READY_S = 20.0
+
+
+class Watched:
+    """A vehicle that flies about, and what its robot would take its position to be worth."""
+
+    def __init__(self, seed: int, endurance_s: float) -> None:
+        self.vehicle = Px4Vehicle(
+            seed=seed,
+            airframe=Airframe(endurance_s=endurance_s),
+            errors=Errors(seed, fleet_seed=seed),
+        )
+        self.judgement = Judgement()
+        self.greatest_offset_m = 0.0
+        self._rng = np.random.default_rng(seed)
+        self._velocity_m_s = np.zeros(3)
+        self._link, self._telemetry = Px4Link(self.vehicle, system_id=1), Px4Telemetry()
+        self._parser: Any = mavlink.MAVLink(None)
+        self._parser.robust_parsing = True
+        _ask_for_streams(self._link)
+
+    def tick(self) -> None:
+        """Fly for a tenth of a second, and look."""
+        vehicle, telemetry = self.vehicle, self._telemetry
+        for _ in range(round(TICK_S / STEP_S)):
+            vehicle.step(STEP_S)
+            for datagram in self._link.due():
+                for message in self._parser.parse_buffer(datagram) or ():
+                    if message.get_type() in telemetry.messages:
+                        telemetry.hear(message.get_type(), message.to_dict(), vehicle.time_s)
+        now_s = vehicle.time_s
+        heard = telemetry.state(now_s)
+        self.judgement = judge(self.judgement, heard, PositionLimits(), now_s)
+        if vehicle.armed and heard.gps is not None and heard.gps.offset_m is not None:
+            self.greatest_offset_m = max(self.greatest_offset_m, heard.gps.offset_m)
+        if now_s % _TURN_S < TICK_S:
+            bearing = self._rng.uniform(0.0, math.tau)
+            self._velocity_m_s[:2] = _SPEED_M_S * np.array([math.cos(bearing), math.sin(bearing)])
+        height_m = -float(vehicle.local_position_m[2])
+        self._velocity_m_s[2] = -min(_HEIGHT_M - height_m, 1.5)
+        vehicle.offboard(Setpoint(np.full(3, np.nan), self._velocity_m_s.copy()))
+        if not vehicle.armed and vehicle.armable and now_s > READY_S / 2.0:
+            vehicle.set_mode(Mode.OFFBOARD)
+            vehicle.arm()
 
 
 class _Flight(NamedTuple):
@@ -41,6 +84,7 @@ class _Flight(NamedTuple):
     doubted: Counter[str]
     lost: int
     stopped_s: float
+    greatest_offset_m: float
 
 
 def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
@@ -59,12 +103,14 @@ def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
     doubted = sum((flight.doubted for flight in flown), Counter[str]())
     lost = sum(flight.lost for flight in flown)
     stopped_s = sum(flight.stopped_s for flight in flown)
+    greatest_offset_m = max(flight.greatest_offset_m for flight in flown)
     figures: dict[str, Any] = {
         "flights": flights,
         "hours_in_the_air": flown_h,
         "doubted": dict(doubted),
         "stopped_s": stopped_s,
         "lost": lost,
+        "greatest_offset_m": greatest_offset_m,
     }
     rows = [
         ("hours in the air", f"{flown_h:.1f}"),
@@ -72,6 +118,7 @@ def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
         *((f"  because of {cause}", f"{count}") for cause, count in doubted.most_common()),
         ("seconds stood still", f"{stopped_s:.0f}"),
         ("landings (position lost)", f"{lost}"),
+        ("fix from the estimate, greatest, m", f"{greatest_offset_m:.1f}"),
     ]
     table = Table("false alarms of position, simulated vehicles", ("", "count"), rows)
     targets = [
@@ -82,47 +129,21 @@ def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
 
 
 def _fly(seed: int, flight_s: float) -> _Flight:
-    rng = np.random.default_rng(seed)
-    vehicle = Px4Vehicle(
-        seed=seed,
-        airframe=Airframe(endurance_s=10.0 * flight_s),
-        errors=Errors(seed, fleet_seed=seed),
-    )
-    link, telemetry = Px4Link(vehicle, system_id=1), Px4Telemetry()
-    parser: Any = mavlink.MAVLink(None)
-    parser.robust_parsing = True
-    _ask_for_streams(link)
-    judgement = before = Judgement()
+    watched = Watched(seed, endurance_s=10.0 * flight_s)
     doubted: Counter[str] = Counter()
     lost, stopped_s, flown_s = 0, 0.0, 0.0
-    velocity_m_s = np.zeros(3)
-    while vehicle.time_s < _READY_S + flight_s:
-        for _ in range(round(_TICK_S / STEP_S)):
-            vehicle.step(STEP_S)
-            for datagram in link.due():
-                for message in parser.parse_buffer(datagram) or ():
-                    if message.get_type() in telemetry.messages:
-                        telemetry.hear(message.get_type(), message.to_dict(), vehicle.time_s)
-        now_s = vehicle.time_s
-        judgement = judge(before, telemetry.state(now_s), PositionLimits(), now_s)
-        if now_s >= _READY_S:
-            assert vehicle.armed, "the vehicle must fly"
-            flown_s += _TICK_S
-            stopped_s += _TICK_S if judgement.quality is not Quality.GOOD else 0.0
+    while watched.vehicle.time_s < READY_S + flight_s:
+        before = watched.judgement
+        watched.tick()
+        judgement = watched.judgement
+        if watched.vehicle.time_s >= READY_S:
+            assert watched.vehicle.armed, "the vehicle must fly"
+            flown_s += TICK_S
+            stopped_s += TICK_S if judgement.quality is not Quality.GOOD else 0.0
             if judgement.quality is Quality.DOUBTFUL and before.quality is Quality.GOOD:
                 doubted[str(judgement.cause)] += 1
             lost += judgement.quality is Quality.LOST and before.quality is not Quality.LOST
-        before = judgement
-        if now_s % _TURN_S < _TICK_S:
-            bearing = rng.uniform(0.0, math.tau)
-            velocity_m_s[:2] = _SPEED_M_S * np.array([math.cos(bearing), math.sin(bearing)])
-        height_m = -float(vehicle.local_position_m[2])
-        velocity_m_s[2] = -min(_HEIGHT_M - height_m, 1.5)
-        vehicle.offboard(Setpoint(np.full(3, np.nan), velocity_m_s.copy()))
-        if not vehicle.armed and vehicle.armable and now_s > _READY_S / 2.0:
-            vehicle.set_mode(Mode.OFFBOARD)
-            vehicle.arm()
-    return _Flight(flown_s, doubted, lost, stopped_s)
+    return _Flight(flown_s, doubted, lost, stopped_s, watched.greatest_offset_m)
 
 
 def _ask_for_streams(link: Px4Link) -> None:

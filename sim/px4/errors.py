@@ -13,8 +13,12 @@ from edge.core import F64
 
 # Of the whole horizontal error of a receiver.
 LEAST_BIAS_M, GREATEST_BIAS_M = 1.0, 5.0
-# What it says of itself: it knows its noise, and little of what biases it for minutes.
-GPS_ACCURACY_M = (1.5, 3.0)
+# What it says of itself, horizontally: it knows its noise, and little of what biases it for long.
+GPS_ACCURACIES_M, GPS_VERTICAL = (0.8, 1.4), 2.0
+SATELLITES = (8, 16)
+# Its fix, which an estimator smooths: noise, and now and then an echo from a wall or a tree.
+_FIX_WAVES, _FIX_WAVE_M, _FIX_PERIODS_S = 4, 0.2, (2.0, 60.0)
+_ECHOES_M, _ECHO_EVERY_S, _ECHO_FOR_S = (1.0, 3.5), (120.0, 400.0), (3.0, 15.0)
 # How far it walks, in its length and across, either way.
 _WALK_M, _WALK_PERIODS_S = 0.4, (200.0, 700.0)
 
@@ -53,8 +57,11 @@ class Wave(NamedTuple):
 
     def at(self, time_s: float) -> float:
         """How far it has walked since time 0."""
-        turn_rad = self.rate_rad_s * time_s + self.phase_rad
-        return self.amplitude * (math.sin(turn_rad) - math.sin(self.phase_rad))
+        return self.about(time_s) - self.about(0.0)
+
+    def about(self, time_s: float) -> float:
+        """How far it is from its middle."""
+        return self.amplitude * math.sin(self.rate_rad_s * time_s + self.phase_rad)
 
 
 class Errors:
@@ -90,6 +97,18 @@ class Errors:
         self._stale_every_s = float(own.uniform(*_STALE_EVERY_S))
         self._stale_for_s = float(own.uniform(*_STALE_FOR_S))
 
+        self._fix = [
+            [_draw_wave(own, _FIX_WAVE_M, _FIX_PERIODS_S) for _ in range(_FIX_WAVES)]
+            for _ in range(3)
+        ]
+        bearing_rad = float(own.uniform(0.0, math.tau))
+        self._echo_m = float(own.uniform(*_ECHOES_M)) * np.array(
+            [math.cos(bearing_rad), math.sin(bearing_rad), 0.0]
+        )
+        self._echo_every_s = float(own.uniform(*_ECHO_EVERY_S))
+        self._echo_for_s = float(own.uniform(*_ECHO_FOR_S))
+        self._sky = _draw_wave(own, 1.0, _WALK_PERIODS_S)
+
     def position_m(self, time_s: float, bias_m: F64) -> F64:
         """(3,), north, east, down: what the estimate errs by, of a receiver that began with a bias.
 
@@ -103,6 +122,32 @@ class Errors:
             cos, sin = factor * math.cos(turn_rad), factor * math.sin(turn_rad)
             north_m, east_m = cos * north_m - sin * east_m, sin * north_m + cos * east_m
         return np.array([north_m, east_m, down_m + self.height_m(time_s)])
+
+    def fix_m(self, time_s: float) -> F64:
+        """(3,), north, east, down: by how much a receiver's fix is further off than the estimate.
+
+        It is noise of a few decimetres, and an echo of up to 3.5 m for some seconds.
+        """
+        noise_m = [math.fsum(wave.about(time_s) for wave in waves) for waves in self._fix]
+        since_s = time_s % self._echo_every_s - (self._echo_every_s - self._echo_for_s)
+        echo = math.sin(math.pi * since_s / self._echo_for_s) if since_s > 0.0 else 0.0
+        fix_m: F64 = np.array(noise_m) + echo * self._echo_m
+        return fix_m
+
+    def gps_accuracy_m(self, time_s: float) -> tuple[float, float]:
+        """What the receiver says of its fix, horizontally and vertically."""
+        least_m, greatest_m = GPS_ACCURACIES_M
+        accuracy_m = least_m + (greatest_m - least_m) * (1.0 - self._share_of_sky(time_s))
+        return accuracy_m, GPS_VERTICAL * accuracy_m
+
+    def satellites(self, time_s: float) -> int:
+        """How many satellites the receiver sees."""
+        least, greatest = SATELLITES
+        return least + round((greatest - least) * self._share_of_sky(time_s))
+
+    def _share_of_sky(self, time_s: float) -> float:
+        """How well the satellites stand just now, 0 to 1."""
+        return 0.5 + 0.5 * self._sky.about(time_s)
 
     def height_m(self, time_s: float) -> float:
         """By how much lower than at the start the vehicle takes itself to be, where it is."""

@@ -23,6 +23,8 @@ DEAD_RECKONING_S = 5.0
 GPS_FUSION_S = 7.0
 GPS_REGAIN_S = 1.2
 DEAD_RECKONING_DRIFT_M = 0.5  # per square root of a second
+# A fix that is further off than PX4's gate is rejected, for so long; any other is followed smoothly.
+GPS_GATE_M, GPS_REJECTED_S, GPS_FOLLOW_S = 5.0, 7.0, 2.0
 
 
 class Estimator:
@@ -37,11 +39,13 @@ class Estimator:
         # It has never been there.
         self._gps_lost_since_s = -math.inf
         self._gps_back_at_s = -math.inf
+        self._followed_m: F64 = np.zeros(3)
+        self._rejects_since_s = math.inf
 
     @property
     def error_m(self) -> F64:
-        """(3,), north, east, down: noise, and what dead reckoning has gathered."""
-        return self._noise_m + self._drift_m
+        """(3,), north, east, down: noise, what dead reckoning has gathered, jumps it believes."""
+        return self._noise_m + self._drift_m + self._followed_m
 
     @property
     def has_origin(self) -> bool:
@@ -90,8 +94,9 @@ class Estimator:
 
     @property
     def doubts_gps(self) -> bool:
-        """Whether GPS is back, but not believed yet."""
-        return self.has_gps and self._time_s < self._gps_back_at_s
+        """Whether GPS is back, but not believed yet; or it jumped."""
+        is_new = self._time_s < self._gps_back_at_s
+        return self.has_gps and (is_new or self._rejects_since_s < math.inf)
 
     @property
     def uses_gps(self) -> bool:
@@ -107,9 +112,11 @@ class Estimator:
         is_back = self._time_s >= self._gps_back_at_s
         return is_back and self._time_s - self._gps_lost_since_s < without_gps_s
 
-    def step(self, time_s: float, dt_s: float, has_gps: bool, draws: F64) -> None:
-        """One step of time; `draws` (6,) are standard normal."""
+    def step(self, time_s: float, dt_s: float, has_gps: bool, jump_m: F64, draws: F64) -> None:
+        """One step of time: `jump_m` (3,) is what the fix jumped by, `draws` (6,) are normal."""
         self._time_s = time_s
+        if has_gps:
+            self._follow(jump_m, dt_s)
         if not has_gps:
             self._gps_lost_since_s = min(self._gps_lost_since_s, time_s)
         elif not self.has_gps:
@@ -123,3 +130,14 @@ class Estimator:
             return
         step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
         self._drift_m = self._drift_m + step_m * draws[3:6] * (1.0, 1.0, 0.0)
+
+    def _follow(self, jump_m: F64, dt_s: float) -> None:
+        """Go after a fix that jumped; where that is too far to be true, wait, then start over."""
+        off_m = jump_m - self._followed_m
+        if math.hypot(*off_m) <= GPS_GATE_M:
+            self._rejects_since_s = math.inf
+            self._followed_m = self._followed_m + off_m * (dt_s / GPS_FOLLOW_S)
+        else:
+            self._rejects_since_s = min(self._rejects_since_s, self._time_s)
+            if self._time_s - self._rejects_since_s >= GPS_REJECTED_S:
+                self._followed_m = jump_m.copy()

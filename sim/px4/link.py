@@ -404,11 +404,11 @@ class Px4Link:
             )
         self._gps_told_at_s = vehicle.time_s
         speed_cm_s = round(100.0 * math.hypot(vehicle.velocity_m_s[0], vehicle.velocity_m_s[1]))
-        place = _as_integers(vehicle.global_position)
+        place = _as_integers(vehicle.global_fix)
         if vehicle.gps_lost:
             fix, satellites, dilutions, accuracies_m = 0, 0, (10000, 10000), (100.0,) * 3
         else:
-            fix, satellites, dilutions = 3, 10, (70, 110)
+            fix, satellites, dilutions = 3, vehicle.gps_satellites, (70, 110)
             accuracies_m = vehicle.gps_accuracy_m
         return mavlink.MAVLink_gps_raw_int_message(
             self._boot_ms() * 1000,
@@ -451,7 +451,7 @@ class Px4Link:
         latitude, longitude, altitude_mm = _as_integers(vehicle.global_position)
         home = vehicle.global_home
         relative_mm = 0 if home is None else altitude_mm - round(home[2] * 1e3)
-        velocity_cm_s = np.rint(vehicle.velocity_m_s * 100.0).astype(int).tolist()
+        velocity_cm_s = np.rint(vehicle.estimated_velocity_m_s * 100.0).astype(int).tolist()
         heading_cdeg = round(math.degrees(vehicle.estimated_heading_rad) * 100.0) % 36000
         return mavlink.MAVLink_global_position_int_message(
             self._boot_ms(),
@@ -465,9 +465,11 @@ class Px4Link:
 
     def _local_position_ned(self) -> Any:
         """From the start, and whether the estimator vouches for it or not."""
-        position_m, velocity_m_s = self.vehicle.local_position_m, self.vehicle.velocity_m_s
+        vehicle = self.vehicle
         return mavlink.MAVLink_local_position_ned_message(
-            self._boot_ms(), *position_m.tolist(), *velocity_m_s.tolist()
+            self._boot_ms(),
+            *vehicle.local_position_m.tolist(),
+            *vehicle.estimated_velocity_m_s.tolist(),
         )
 
     def _odometry(self) -> Any:
@@ -480,7 +482,7 @@ class Px4Link:
             mavlink.MAV_FRAME_BODY_FRD,
             *vehicle.local_position_m.tolist(),
             level,
-            *self._body(vehicle.velocity_m_s),
+            *self._body(vehicle.estimated_velocity_m_s),
             0.0,
             0.0,
             vehicle.yaw_rate_rad_s,

@@ -19,8 +19,7 @@ import numpy as np
 from edge.core import F64
 from sim.px4 import checks
 from sim.px4.checks import Component, Event, Level, Problem, Report, Reporter
-from sim.px4.errors import GPS_ACCURACY_M as BIASED_ACCURACY_M
-from sim.px4.errors import Errors, draw_bias_m
+from sim.px4.errors import GPS_VERTICAL, Errors, draw_bias_m
 from sim.px4.estimator import NOISE_M, Estimator
 from sim.px4.failsafe import Failsafe
 from sim.px4.modes import (
@@ -68,7 +67,9 @@ HOVER_A, IDLE_A = 12.0, 0.5
 # What PX4 takes the pack's resistance for.
 ASSUMED_OHM = 0.02
 # What the receiver of PX4's own simulator says of itself.
-GPS_ACCURACY_M, GPS_ACCURACY_M_S = (0.9, 1.78), 0.4
+GPS_ACCURACY_M, GPS_ACCURACY_M_S, GPS_SATELLITES = (0.9, 1.78), 0.4, 10
+# How old a fix is when it is told.
+GPS_LAG_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,8 +148,11 @@ class Px4Vehicle:
     """One vehicle; deterministic for a seed, its steps and its commands.
 
     Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
-    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `dead_sensors`
-    (their drivers say nothing any more), `battery_remaining` (0 to 1), `rc_connected`.
+    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m` (3,)
+    (its fix is off by that much at once, and the estimator must see what to make of it),
+    `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
+    and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
+    any more), `battery_remaining` (0 to 1), `rc_connected`.
     `truth` grows by one entry every 0.04 s.
     """
 
@@ -194,7 +198,10 @@ class Px4Vehicle:
         self._gust = self.air_m_s = self.compensated_wind_m_s = np.zeros(3)
         self.battery_remaining, self._battery_warning = 1.0, 1
 
-        self.gps_lost = False
+        self.gps_lost = self.estimate_frozen = False
+        self.gps_jump_m: F64 = np.zeros(3)
+        self.gps_told_m: float | None = None
+        self._frozen: tuple[F64, F64] | None = None
         self.dead_sensors: set[Sensor] = set()
         self._dead_since_s: dict[Sensor, float] = {}
         self.estimator = Estimator(
@@ -206,13 +213,12 @@ class Px4Vehicle:
             0.0, (1.0, 1.0, 0.5)
         )
 
-        self.armed = False
+        self.armed = self._took_off = False
         self.mode = self.intended_mode = self._mode_after_disarm = Mode.HOLD
         self._mode_commands = 0
         self.landed = True
         self.home_m: F64 | None = None
         self._armed_at_s = 0.0
-        self._took_off = False
         self._lift_began_s: float | None = None
         self._on_ground_since_s, self._off_ground_since_s = -math.inf, math.inf
         self._takeoff_down_m = 0.0
@@ -220,11 +226,9 @@ class Px4Vehicle:
 
         self._setpoint: Setpoint | None = None
         self._setpoint_at_s = -math.inf
-        self.rc_connected = False
-        self._rc_at_arming = False
+        self.rc_connected = self._rc_at_arming = self._outside_fence = False
         self._sticks_m_s: F64 = np.zeros(3)
         self._ground_station_at_s = -math.inf
-        self._outside_fence = False
         self._fence_latch = -1
         self.failsafe = Failsafe()
         self._disarmed_at_s: float | None = None
@@ -236,7 +240,14 @@ class Px4Vehicle:
     @property
     def estimated_position_m(self) -> F64:
         """(3,), world frame: where the vehicle takes itself to be."""
+        if self._frozen is not None:
+            return self._frozen[0]
         return self.position_m + self.gps_bias_m + self._walk_m + self.estimator.error_m
+
+    @property
+    def estimated_velocity_m_s(self) -> F64:
+        """(3,), world frame: how fast the vehicle takes itself to be."""
+        return self.velocity_m_s if self._frozen is None else self._frozen[1]
 
     @property
     def estimated_heading_rad(self) -> float:
@@ -254,10 +265,30 @@ class Px4Vehicle:
         return self._world.to_global(self.estimated_position_m)
 
     @property
+    def global_fix(self) -> tuple[float, float, float]:
+        """What the receiver takes its place to be: latitude and longitude, deg, and height, m.
+
+        It errs as the estimate does, which follows it, and has noise besides; it comes late.
+        """
+        noise_m = np.zeros(3) if self._errors is None else self._errors.fix_m(self.time_s)
+        late_m = self.position_m - GPS_LAG_S * self.velocity_m_s
+        fix_m = late_m + self.gps_bias_m + self._walk_m + noise_m + self.gps_jump_m
+        return self._world.to_global(fix_m)
+
+    @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
         """What the receiver says of its fix: horizontally and vertically, m, and m/s."""
-        accuracy_m = GPS_ACCURACY_M if self._errors is None else BIASED_ACCURACY_M
+        accuracy_m = GPS_ACCURACY_M
+        if self._errors is not None:
+            accuracy_m = self._errors.gps_accuracy_m(self.time_s)
+        if self.gps_told_m is not None:
+            accuracy_m = self.gps_told_m, GPS_VERTICAL * self.gps_told_m
         return *accuracy_m, GPS_ACCURACY_M_S
+
+    @property
+    def gps_satellites(self) -> int:
+        """How many the receiver sees, if it sees any."""
+        return GPS_SATELLITES if self._errors is None else self._errors.satellites(self.time_s)
 
     @property
     def global_origin(self) -> tuple[float, float, float]:
@@ -444,6 +475,10 @@ class Px4Vehicle:
 
     def step(self, dt_s: float) -> None:
         """One step of time; 0.02 s suits the model."""
+        if not self.estimate_frozen:
+            self._frozen = None
+        elif self._frozen is None:
+            self._frozen = self.estimated_position_m, self.velocity_m_s
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
@@ -473,7 +508,7 @@ class Px4Vehicle:
     def _estimate(self, dt_s: float) -> None:
         draws = self._rng.standard_normal(10)
         has_gps = not self.gps_lost and Sensor.GPS not in self.dead_sensors
-        self.estimator.step(self.time_s, dt_s, has_gps, draws[:6])
+        self.estimator.step(self.time_s, dt_s, has_gps, self.gps_jump_m, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
         self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + VERTICAL_DRIFT_M_S * float(
             draws[6]

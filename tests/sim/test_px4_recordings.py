@@ -90,9 +90,7 @@ class Said(NamedTuple):
     message: Any
 
 
-IGNORED_FLAGS = (
-    mavlink.ESTIMATOR_POS_VERT_AGL | mavlink.ESTIMATOR_GPS_GLITCH | mavlink.ESTIMATOR_ACCEL_ERROR
-)
+IGNORED_FLAGS = mavlink.ESTIMATOR_POS_VERT_AGL | mavlink.ESTIMATOR_ACCEL_ERROR
 
 
 @dataclass(frozen=True)

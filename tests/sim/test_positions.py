@@ -1,0 +1,129 @@
+"""What goes wrong with a simulated vehicle's position is judged as docs/safety.md has it.
+
+By what the vehicle tells over its link, and what a robot concludes from it; nothing runs in real
+time.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bench.position import READY_S, TICK_S, Watched
+from edge.core.position import Cause, Quality
+from sim.px4.estimator import GPS_REJECTED_S
+from sim.px4.vehicle import Px4Vehicle, Sensor
+
+_Q = Quality
+
+
+def flying() -> Watched:
+    watched = Watched(seed=5, endurance_s=1200.0)
+    while watched.vehicle.time_s < READY_S:
+        watched.tick()
+    assert watched.vehicle.armed and watched.judgement.quality is _Q.GOOD
+    return watched
+
+
+def run(watched: Watched, seconds: float) -> list[tuple[float, Quality, Cause | None]]:
+    """What the position was worth as that changed: s from now on, with the cause."""
+    began_s, changes = watched.vehicle.time_s, []
+    for _ in range(round(seconds / TICK_S)):
+        before = watched.judgement.quality
+        watched.tick()
+        judgement = watched.judgement
+        if judgement.quality is not before:
+            changes.append((watched.vehicle.time_s - began_s, judgement.quality, judgement.cause))
+    return changes
+
+
+def sets(**fields: Any) -> Callable[[Px4Vehicle], None]:
+    def do(vehicle: Px4Vehicle) -> None:
+        for name, value in fields.items():
+            setattr(vehicle, name, value)
+
+    return do
+
+
+def jumps(north_m: float) -> Callable[[Px4Vehicle], None]:
+    return sets(gps_jump_m=np.array([north_m, 0.0, 0.0]))
+
+
+# What is done, why the position is doubted, and after how many seconds: told, and 0.4 s. Then when
+# it is lost, if it is: 2 s after it was told.
+LASTING = [
+    pytest.param(sets(gps_lost=True), Cause.NO_FIX, 0.8, 2.7, id="no fix"),
+    pytest.param(
+        # PX4 says so after a second.
+        lambda vehicle: vehicle.dead_sensors.add(Sensor.GPS), Cause.NO_FIX, 2.0, 3.9,
+        id="no driver",
+    ),
+    pytest.param(sets(estimate_frozen=True), Cause.FROZEN, 1.5, 3.4, id="frozen"),
+    pytest.param(sets(gps_told_m=11.0), Cause.INACCURATE, 0.8, 2.5, id="hopeless"),
+    pytest.param(sets(gps_told_m=6.0), Cause.INACCURATE, 0.8, None, id="inaccurate"),
+    pytest.param(jumps(7.0), Cause.DISAGREES, 0.8, None, id="jumps"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fault", "cause", "doubted_s", "lost_s"), LASTING)
+def test_what_goes_wrong_is_noticed_in_time(
+    fault: Callable[[Px4Vehicle], Any], cause: Cause, doubted_s: float, lost_s: float | None
+) -> None:
+    watched = flying()
+    fault(watched.vehicle)
+    (at_s, quality, why), *later = run(watched, 6.0)
+    assert quality is _Q.DOUBTFUL and why is cause
+    assert 0.4 <= at_s <= doubted_s
+    assert [quality for _, quality, _ in later] == ([_Q.LOST] if lost_s else [])
+    if lost_s:
+        assert 2.0 <= later[0][0] <= lost_s
+
+
+def test_an_accuracy_that_stays_bad_is_lost_after_a_minute() -> None:
+    watched = flying()
+    watched.vehicle.gps_told_m = 6.0
+    assert [quality for _, quality, _ in run(watched, 59.0)] == [_Q.DOUBTFUL]
+    assert [quality for _, quality, _ in run(watched, 2.0)] == [_Q.LOST]
+
+
+def test_a_jump_is_rejected_for_a_while_and_then_believed() -> None:
+    """PX4 takes the GPS for wrong, starts over from it, and the robot flies on by the new place."""
+    watched = flying()
+    vehicle = watched.vehicle
+    error_m = vehicle.estimated_position_m - vehicle.position_m
+    vehicle.gps_jump_m = np.array([7.0, 0.0, 0.0])
+    causes = set()
+    for _ in range(round((GPS_REJECTED_S - 0.5) / TICK_S)):
+        watched.tick()
+        causes.add(watched.judgement.cause)
+    still_m = vehicle.estimated_position_m - vehicle.position_m
+    assert still_m == pytest.approx(error_m, abs=0.5)
+    assert vehicle.estimator.doubts_gps and Cause.DISAGREES in causes
+    # For a second after it was believed the jump speaks against it; then three seconds of nothing.
+    (good,) = run(watched, 7.0)
+    assert good[1] is _Q.GOOD and 0.5 + 3.0 <= good[0] <= 0.5 + 1.0 + 3.0 + 1.5
+    moved_m = vehicle.estimated_position_m - vehicle.position_m - error_m
+    assert moved_m == pytest.approx([7.0, 0.0, 0.0], abs=0.7)
+    assert not vehicle.estimator.doubts_gps
+
+
+def test_a_jump_that_is_near_enough_to_be_true_is_followed_smoothly() -> None:
+    """Nobody notices: it is within what margins are for."""
+    watched = flying()
+    vehicle = watched.vehicle
+    error_m = vehicle.estimated_position_m - vehicle.position_m
+    vehicle.gps_jump_m = np.array([0.0, -3.0, 0.0])
+    assert run(watched, 12.0) == []
+    moved_m = vehicle.estimated_position_m - vehicle.position_m - error_m
+    assert moved_m == pytest.approx([0.0, -3.0, 0.0], abs=0.7)
+
+
+def test_a_good_receiver_is_noisy_late_and_believed() -> None:
+    """Its fix is not the estimate, and no further from it than a position may be."""
+    watched = flying()
+    assert run(watched, 20.0) == []
+    assert 0.3 < watched.greatest_offset_m < 4.5
+    vehicle = watched.vehicle
+    assert 8 <= vehicle.gps_satellites <= 16
+    assert 0.8 <= vehicle.gps_accuracy_m[0] <= 1.4
