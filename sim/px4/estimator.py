@@ -23,7 +23,7 @@ DEAD_RECKONING_S = 5.0
 GPS_FUSION_S = 7.0
 GPS_REGAIN_S = 1.2
 DEAD_RECKONING_DRIFT_M = 0.5  # per square root of a second
-# A fix that is further off than PX4's gate is rejected, for so long; any other is followed smoothly.
+# A fix further off than PX4's gate is rejected, for so long; any other is followed smoothly.
 GPS_GATE_M, GPS_REJECTED_S, GPS_FOLLOW_S = 5.0, 7.0, 2.0
 
 
