@@ -133,10 +133,9 @@ def sim(
             errors=errors,
         )
 
-        def prepared() -> None:
+        def prepared() -> int | None:
             """What is wrong with the flight itself has been said by now."""
-            if count is not None:
-                _say_if_carried(count, bundle, flown)
+            return None if count is None else _say_if_carried(count, bundle, flown)
 
         if not script:
             _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared)
@@ -251,15 +250,17 @@ def _as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int
     return robots
 
 
-def _say_if_carried(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> None:
+def _say_if_carried(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
+    """How many robots this machine carries; says so, and what to do if they are too few."""
     from sim.load import robots_carried
 
     carried = int(robots_carried(bundle, vehicle))
     if carried >= robots:
         typer.echo(_carries(carried), err=True)
-        return
+        return carried
     advice = f"; fewer: -n {max(1, carried)}" if robots > 1 else ""
     typer.echo(f"{_carries(carried)}, not {robots}: it may not keep up{advice}", err=True)
+    return carried
 
 
 def _carries(robots: int) -> str:
@@ -273,11 +274,11 @@ def _launch(
     px4: Path | None,
     as_json: bool,
     out: Path | None,
-    prepared: Callable[[], None],
+    prepared: Callable[[], int | None],
 ) -> None:
     """Run a fleet of processes; exit code 1 if its flight did not end as it should.
 
-    `prepared` is called before anything starts.
+    `prepared` is called before anything starts; it tells how many robots this machine carries.
     """
     from sim.fleet import Fleet
     from sim.fleet_flight import fly, summary_lines
@@ -286,7 +287,7 @@ def _launch(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
         fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
-        prepared()
+        fleet.carried = prepared()
         flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
     if out:
         from sim.fleet_report import write_fleet_flight
@@ -308,7 +309,7 @@ def _serve(
     bundle: Path,
     px4: Path | None,
     out: Path,
-    prepared: Callable[[], None],
+    prepared: Callable[[], int | None],
 ) -> None:
     """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
     from sim.fleet import Fleet
@@ -317,7 +318,7 @@ def _serve(
     try:
         with _live() as (show, say):
             fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say)
-            prepared()
+            fleet.carried = prepared()
             with fleet:
                 while not fleet.operator.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
                     fleet.require_running()

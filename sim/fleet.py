@@ -108,10 +108,14 @@ class Lateness(NamedTuple):
 
 
 class OverloadError(RuntimeError):
-    """This machine does not keep up; the text says how far it is behind, and what to do."""
+    """This machine does not keep up; the text says how far it is behind, and what to do.
 
-    def __init__(self, lateness: Lateness, robots: int) -> None:
-        advice = f"fly fewer: -n {robots // 2}" if robots > 1 else "end what else runs on it"
+    `carried` is how many robots it was found to carry, None if nobody looked.
+    """
+
+    def __init__(self, lateness: Lateness, robots: int, carried: int | None = None) -> None:
+        fewer = robots // 2 if carried is None else max(1, min(robots - 1, carried))
+        advice = f"fly fewer: -n {fewer}" if robots > 1 else "end what else runs on it"
         super().__init__(
             f"this machine does not keep up with {robots} robots: within {_WHILE_S:g} s the "
             f"vehicles fell {lateness.vehicles_s:.1f} s behind real time, the robots left out "
@@ -217,7 +221,8 @@ class Fleet:
     `robots[i]` is robot i's process, `operator` speaks to all. `simulated` are the vehicles
     themselves, for whoever wants to do something to them; None where they are real PX4.
     `pads_m` (N, 2) is where they really stand, `landing_points_m` (N, 2) where they return to, both
-    in the mission frame. `endpoints` are the robots' zenoh addresses, `name` the fleet's.
+    in the mission frame. `endpoints` are the robots' zenoh addresses, `name` the fleet's. `carried`
+    is how many robots this machine was found to carry; who finds it out says so.
     `fleet_toml` describes the fleet to `lpac ground`, as if its robots were in the field.
     """
 
@@ -277,6 +282,7 @@ class Fleet:
             RobotProcess(robot, self.folder / "robots" / str(robot))
             for robot in range(scenario.robots)
         )
+        self.carried: int | None = None
         self._say = say
         self.operator = Operator(
             fleet=self.name, connect=self.endpoints, say=self.say_unless_behind
@@ -327,7 +333,7 @@ class Fleet:
         """Raises OverloadError if this machine is too far behind."""
         recent = self._recent_lateness()
         if max(recent) > OVERLOADED_S:
-            raise OverloadError(recent, self.scenario.robots)
+            raise OverloadError(recent, self.scenario.robots, self.carried)
 
     def _lateness(self) -> "Lateness":
         control_s = 1.0 / Rates().control_hz

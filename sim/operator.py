@@ -376,7 +376,7 @@ class Script:
         self._operator.calm("land")
         self.began_s["land"] = time.monotonic()
         end_s = time.monotonic() + 60.0
-        while not self._operator.wait_for(self._all_down, PERIOD_S) and time.monotonic() < end_s:
+        while not self._operator.wait_for(self._all_landed, PERIOD_S) and time.monotonic() < end_s:
             watch("land")
 
     def _go(self, step: Step, watch: Callable[[str], None]) -> None:
@@ -426,6 +426,10 @@ class Script:
     def _all_down(self, statuses: Statuses) -> bool:
         """A robot that is not heard any more cannot be waited for."""
         return all(s.state in ON_GROUND and not s.armed for s in statuses.values())
+
+    def _all_landed(self, statuses: Statuses) -> bool:
+        """Whose vehicle does not answer any more lands nothing: it is not waited for."""
+        return self._all_down({r: s for r, s in statuses.items() if s.state is not _S.FAULT})
 
     # What is done in a step
 

@@ -6,7 +6,7 @@ import pytest
 
 import sim.load
 from cli.sim import _as_many_as_carried, _say_if_carried
-from sim.fleet import OVERLOADED_S, Fleet, FleetScenario
+from sim.fleet import OVERLOADED_S, Fleet, FleetScenario, Lateness, OverloadError
 from sim.fleet_flight import fly, summary_lines
 from sim.load import robots_carried
 from tests.conftest import SHIPPED
@@ -37,16 +37,26 @@ def test_who_asks_for_more_is_warned(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sim.load, "_units_per_s", lambda _: FIVE_FLEW)
-    _say_if_carried(5, SHIPPED, "mavlink")
+    assert _say_if_carried(5, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("carries about 5 of these robots and vehicles")
-    _say_if_carried(6, SHIPPED, "mavlink")
+    assert _say_if_carried(6, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert (
         "carries about 5 of these robots" in line
         and "not 6" in line
         and line.endswith("fewer: -n 5")
     )
+
+
+@pytest.mark.parametrize(
+    ("robots", "carried", "advice"), [(10, None, 5), (10, 7, 7), (10, 12, 9), (3, 0, 1)]
+)
+def test_who_falls_behind_is_told_what_was_found_out(
+    robots: int, carried: int | None, advice: int
+) -> None:
+    error = OverloadError(Lateness(9.0, 0.0), robots, carried)
+    assert str(error).endswith(f"fly fewer: -n {advice}")
 
 
 @pytest.mark.parametrize("in_the_air", [False, True])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
@@ -22,7 +23,7 @@ from edge.core.mission import (
     world_id,
 )
 from edge.core.safety import Fence
-from sim.operator import Operator
+from sim.operator import Operator, Script
 from sim.ports import free_ports
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
@@ -203,3 +204,14 @@ def test_a_silent_robot_is_no_longer_among_the_statuses() -> None:
         assert operator.wait_for(only_the_other, 60.0)
         assert len(operator.history(0)) >= 1
         assert not operator.wait_for(lambda statuses: 0 in statuses, 0.1)
+
+
+def test_a_robot_whose_vehicle_is_gone_is_not_waited_for() -> None:
+    with talking(2) as (operator, [gone, other]):
+        gone.say(state=FlightState.FAULT)
+        assert operator.wait_for(lambda statuses: statuses[0].state is FlightState.FAULT, 60.0)
+        script = Script(operator, robots=(0, 1), origin=ORIGIN, mission_s=0.0, trial="test")
+        began_s = time.monotonic()
+        script.land(lambda _: other.say(state=FlightState.LANDED, armed=False))
+        assert operator.statuses()[1].state is FlightState.LANDED
+        assert time.monotonic() - began_s < 30.0
