@@ -38,6 +38,8 @@ _FAILSAFE_LATE_S = 2.5
 # for every second between.
 _JUMP_M, _JUMP_M_S = 1.0, 1.0
 _ORIGIN_ANSWER_S = 0.5
+# After a longer silence, nobody knows what of a jump in height was motion.
+_HEIGHT_JUMP_WITHIN_S = 1.0
 
 # Present says which sensors there are; of PREARM_CHECK PX4 tells in health alone.
 _SENSOR_RC, _PREARM_CHECK = 1 << 16, 1 << 28
@@ -179,9 +181,12 @@ class Px4Telemetry:
         failsafe = fields["system_status"] in (_CRITICAL, _EMERGENCY)
         if failsafe and not self._state.failsafe:
             self._failsafe_at_s = now_s
+        armed = bool(fields["base_mode"] & _SAFETY_ARMED)
+        if armed and not self._state.armed:
+            self._change(height_jumped_m=0.0)
         self._change(
             mode=Mode(mode_name(fields["custom_mode"])),
-            armed=bool(fields["base_mode"] & _SAFETY_ARMED),
+            armed=armed,
             failsafe=failsafe,
             heartbeat_at_s=now_s - self._clock.delay_s,
         )
@@ -262,21 +267,33 @@ class Px4Telemetry:
         boot_s = fields["time_boot_ms"] / 1e3
         self._twin.vehicle_time(boot_s, now_s)
         at_s = now_s - self._clock.hear(boot_s, now_s)
-        if self._is_held_back(position_m, at_s, now_s):
+        was_held_back = self._jump_at_s is not None
+        if self._is_held_back(position_m, velocity_m_s, at_s, now_s):
             return
         state = self._state
         changed = (position_m, velocity_m_s) != (state.position_local_m, state.velocity_local_m_s)
-        jumped = self._jumped(position_m, at_s, self._origin)
+        between_s = max(at_s - state.position_at_s, 0.0)
+        off_m = self._off_m(position_m, velocity_m_s, between_s, self._origin)
+        # That it jumped was seen at once: the time that it was held back makes it no motion.
+        unexplained = was_held_back and self._origin == state.origin
+        uncertain_s = 0.0 if unexplained else between_s
+        jumped = _is_jump(off_m, uncertain_s)
+        height_jumped_m = state.height_jumped_m
+        if jumped and state.armed and between_s <= _HEIGHT_JUMP_WITHIN_S:
+            height_jumped_m -= off_m[2]
         self._change(
             position_local_m=position_m,
             velocity_local_m_s=velocity_m_s,
             position_at_s=at_s,
             position_changed_at_s=at_s if changed else state.position_changed_at_s,
             jumped_at_s=at_s if jumped else state.jumped_at_s,
+            height_jumped_m=height_jumped_m,
             origin=self._origin,
         )
 
-    def _is_held_back(self, position_m: Vector, at_s: float, now_s: float) -> bool:
+    def _is_held_back(
+        self, position_m: Vector, velocity_m_s: Vector, at_s: float, now_s: float
+    ) -> bool:
         """Whether the position may belong to another origin than the one that is known."""
         if self._origin != self._state.origin:
             self._jump_at_s = None
@@ -284,27 +301,36 @@ class Px4Telemetry:
             answered = self._origin_at_s > self._jump_at_s
             if answered or now_s - self._jump_at_s > _ORIGIN_ANSWER_S:
                 self._jump_at_s = None
-        elif self._jumped(position_m, at_s, self._state.origin):
-            self._jump_at_s = now_s
+        else:
+            between_s = max(at_s - self._state.position_at_s, 0.0)
+            off_m = self._off_m(position_m, velocity_m_s, between_s, self._state.origin)
+            if _is_jump(off_m, between_s):
+                self._jump_at_s = now_s
         return self._jump_at_s is not None
 
-    def _jumped(self, position_m: Vector, at_s: float, origin: GlobalOrigin | None) -> bool:
-        """Whether a position from that origin is not where motion led from the last one."""
-        last_m, velocity_m_s = self._state.position_local_m, self._state.velocity_local_m_s
+    def _off_m(
+        self,
+        position_m: Vector,
+        velocity_m_s: Vector,
+        between_s: float,
+        origin: GlobalOrigin | None,
+    ) -> Vector:
+        """How far a position from that origin lies from where motion led from the last one."""
+        last_m, last_m_s = self._state.position_local_m, self._state.velocity_local_m_s
         last_origin = self._state.origin
-        if last_m is None or velocity_m_s is None:
-            return False
+        if last_m is None or last_m_s is None:
+            return 0.0, 0.0, 0.0
         shift_m = (0.0, 0.0, 0.0)
         if origin is not None and last_origin is not None:
             shift_m = _shift_m(last_origin, origin)
-        between_s = max(at_s - self._state.position_at_s, 0.0)
-        off_m = math.hypot(
-            *(
-                position_m[i] + shift_m[i] - last_m[i] - velocity_m_s[i] * between_s
-                for i in range(3)
-            )
+        north_m, east_m, down_m = (
+            position_m[i]
+            + shift_m[i]
+            - last_m[i]
+            - (last_m_s[i] + velocity_m_s[i]) / 2.0 * between_s
+            for i in range(3)
         )
-        return off_m > _JUMP_M + _JUMP_M_S * between_s
+        return north_m, east_m, down_m
 
     def _on_statustext(self, fields: Fields, now_s: float) -> None:
         text = fields["text"].strip()
@@ -389,6 +415,10 @@ def _vector(fields: Fields, *names: str) -> Vector:
     """Raises TypeError if one is not finite: then it has no value in the message."""
     x, y, z = (float(fields[name]) for name in names)
     return x, y, z
+
+
+def _is_jump(off_m: Vector, between_s: float) -> bool:
+    return math.hypot(*off_m) > _JUMP_M + _JUMP_M_S * between_s
 
 
 def _shift_m(start: GlobalOrigin, end: GlobalOrigin) -> Vector:

@@ -151,11 +151,12 @@ class FlightInputs:
     """What one control tick knows.
 
     `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
-    above sea level; None when the position is lost or old, or there is no mission origin.
-    `policy_velocity_m_s` (2,) is None when the policy has no fresh answer. `closest` is the nearest
-    neighbour. `busy_neighbours` say of themselves that they arm or take off. `failed_checks` are
-    preflight's; None before the first. `not_taken` is what of the ground's state the robot does not
-    fly by, in words. `order` is new in this tick. `energy` is None when the battery is not known.
+    above sea level, less what that jumped in flight; None when the position is lost or old, or
+    there is no mission origin. `policy_velocity_m_s` (2,) is None when the policy has no fresh
+    answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
+    take off. `failed_checks` are preflight's; None before the first. `not_taken` is what of the
+    ground's state the robot does not fly by, in words. `order` is new in this tick. `energy` is
+    None when the battery is not known.
     """
 
     now_s: float

@@ -105,7 +105,9 @@ class VehicleState:
 
     `position_local_m` and `velocity_local_m_s` were received together, at `position_at_s`; their
     values last changed at `position_changed_at_s`, and jumped, in another way than `origin`
-    explains, at `jumped_at_s`. Whether to trust them is for `position.judge` to say.
+    explains, at `jumped_at_s`. `height_jumped_m` is how far they have jumped up so in all, m,
+    since the vehicle was armed; the vehicle did not move when they did. Whether to trust them is
+    for `position.judge` to say.
     `mode`, `armed` and `failsafe` (the autopilot acts on a failure by itself) come with its
     heartbeat, once a second, last at `heartbeat_at_s`.
     `origin` is the estimator's. `height_above_home_m` is above where the vehicle was armed, up
@@ -125,6 +127,7 @@ class VehicleState:
     position_at_s: float = float("-inf")
     position_changed_at_s: float = float("-inf")
     jumped_at_s: float = float("-inf")
+    height_jumped_m: float = 0.0
     heading_rad: float | None = None
     origin: GlobalOrigin | None = None
     height_above_home_m: float | None = None

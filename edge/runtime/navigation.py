@@ -38,6 +38,9 @@ class Navigation:
 
     `frame`, `datum_m` and `position` are replaced whole by the control thread: where the mission
     frame lies, the altitude of the robot's takeoff point, and what the position is worth.
+
+    Altitudes are as if the estimate had never jumped in height since the vehicle was armed: it did
+    not move then, and must not for that, through the heights of others.
     """
 
     def __init__(
@@ -70,15 +73,19 @@ class Navigation:
         return Odometry((x_m, y_m, height_m), estimate.velocity_m_s)
 
     def estimate(self, vehicle: VehicleState) -> Odometry | None:
-        """The same with z being the altitude above sea level; None when lost or too old."""
+        """The same with z being the altitude above sea level, less what it jumped in flight.
+
+        None when lost or too old.
+        """
         transform = self._transform(vehicle)
         position_m, velocity_m_s = vehicle.position_local_m, vehicle.velocity_local_m_s
         if transform is None or position_m is None or velocity_m_s is None:
             return None
         if not self._is_known(vehicle):
             return None
+        x_m, y_m, z_m = _vector(transform.local_to_mission(np.array(position_m)))
         return Odometry(
-            _vector(transform.local_to_mission(np.array(position_m))),
+            (x_m, y_m, z_m - vehicle.height_jumped_m),
             _vector(transform.velocity_to_mission(np.array(velocity_m_s))),
         )
 
@@ -107,7 +114,7 @@ class Navigation:
             if self._clock_s() - vehicle.position_at_s > _PLACE_POSITION_AGE_S:
                 return Velocity((0.0, 0.0, 0.0))
             x_m, y_m, height_m = setpoint.position_m
-            place_m = np.array([x_m, y_m, height_m + self.datum_m])
+            place_m = np.array([x_m, y_m, height_m + self.datum_m + vehicle.height_jumped_m])
             return Position(_vector(transform.mission_to_local(place_m)))
         return Velocity(_vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
 

@@ -223,6 +223,7 @@ def test_position_and_origin_belong_together_when_the_origin_jumps() -> None:
         while not has_followed(autopilot.state()):
             assert time.monotonic() < deadline_s
         assert autopilot.state().jumped_at_s == -math.inf
+        assert autopilot.state().height_jumped_m == 0.0
 
 
 def test_a_vehicle_that_appears_late_goes_and_comes_back() -> None:

@@ -107,6 +107,32 @@ def test_all_sensors_die_after_takeoff() -> None:
     ]
 
 
+def test_a_jump_in_height_that_an_origin_explains_late_is_none() -> None:
+    telemetry, told = Px4Telemetry(), []
+    heartbeat = {"autopilot": 12, "custom_mode": 6 << 16, "system_status": 4}
+
+    def origin(altitude_m: float) -> None:
+        fields = {"latitude": 0, "longitude": 0, "altitude": altitude_m * 1e3}
+        telemetry.hear("GPS_GLOBAL_ORIGIN", fields, now_s)
+
+    for tick in range(400):
+        now_s, jumped = tick * 0.05, tick >= 200
+        if tick == 0:
+            origin(400.0)
+        if tick == 300:
+            origin(394.0)
+        if tick % 20 == 0:
+            armed = 0x80 if tick >= 40 else 0
+            telemetry.hear("HEARTBEAT", {**heartbeat, "base_mode": armed}, now_s)
+        down_m = -5.0 - 0.01 * tick - (6.0 if jumped else 0.0) - (4.0 if tick < 20 else 0.0)
+        position = {"x": 0.0, "y": 0.0, "z": down_m, "vx": 0.0, "vy": 0.0, "vz": -0.2}
+        telemetry.hear("LOCAL_POSITION_NED", {**position, "time_boot_ms": now_s * 1e3}, now_s)
+        told.append(telemetry.state(now_s).height_jumped_m)
+    assert set(told[:200]) == {0.0}  # On the ground it may jump.
+    assert told[230:300] == pytest.approx([6.0] * 70, abs=0.01)
+    assert told[301:] == pytest.approx([0.0] * 99, abs=0.02)
+
+
 def test_what_sys_status_told_is_not_known_once_it_falls_silent() -> None:
     """While all else goes on."""
     found: list[VehicleState] = []

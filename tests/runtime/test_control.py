@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from edge.adapters.idf_sensor import IdfSensor
+from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core import F32
 from edge.core.mission import (
     FlightState,
@@ -21,6 +23,7 @@ from edge.core.mission import (
     RobotStatus,
     to_json,
 )
+from edge.core.position import Quality
 from edge.core.preflight import HeardStatus
 from edge.core.safety import Fence
 from edge.core.vehicle import (
@@ -43,6 +46,7 @@ from edge.runtime.navigation import Navigation
 from edge.runtime.pac import Pac
 from edge.runtime.policy import Policy
 from edge.runtime.readiness import Checks
+from sim.px4.link import Px4Link
 from sim.px4.modes import Mode as Px4Mode
 from sim.px4.modes import Result
 from sim.px4.vehicle import Px4Vehicle
@@ -115,14 +119,36 @@ class DirectAutopilot:
         self.result = ActionResult(action, result is Result.ACCEPTED, "", self.vehicle.time_s)
 
 
+class ListeningAutopilot(DirectAutopilot):
+    """One that knows of the vehicle what it says by MAVLink."""
+
+    def __init__(self, vehicle: Px4Vehicle) -> None:
+        super().__init__(vehicle)
+        self._link, self._telemetry = Px4Link(vehicle, system_id=7), Px4Telemetry()
+        self._parser: Any = mavlink.MAVLink(None)
+
+    def state(self) -> VehicleState:
+        now_s = self.vehicle.time_s
+        for datagram in self._link.due():
+            for message in self._parser.parse_buffer(datagram) or ():
+                if message.get_type() in self._telemetry.messages:
+                    self._telemetry.hear(message.get_type(), message.to_dict(), now_s)
+        return dataclasses.replace(self._telemetry.state(now_s), system_id=7, result=self.result)
+
+
 class Flown:
     """A robot whose ground, policy and vehicle a test steps through time."""
 
-    def __init__(self, folder: Path, policy: Policy) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        policy: Policy,
+        autopilot: type[DirectAutopilot] = DirectAutopilot,
+    ) -> None:
         path = write_config(folder, url="udpin://127.0.0.1:1", endpoint="tcp/127.0.0.1:1")
         config = load_config(path)
         self.vehicle = new_vehicle(COM_OBL_RC_ACT=4)
-        self.autopilot = DirectAutopilot(self.vehicle)
+        self.autopilot = autopilot(self.vehicle)
         self.records: list[tuple[str, Mapping[str, object]]] = []
         self.navigation = Navigation(self.autopilot, lambda: self.now_s, config.position)
         self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
@@ -291,6 +317,35 @@ def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilot
     for _ in range(50):
         flown.tick()
     assert flown.state is FlightState.HOLD and flown.vehicle.mode is Px4Mode.OFFBOARD
+
+
+@pytest.mark.parametrize("state", [FlightState.HOLD, FlightState.MISSION, FlightState.RETURN])
+@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 6.0), (0.0, 0.0, -6.0), (5.0, 0.0, -2.0)])
+def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
+    tmp_path: Path, shipped_policy: Policy, state: FlightState, jump_m: Vector
+) -> None:
+    """North, east, down: without a new origin. The vehicle itself has not moved."""
+    flown = Flown(tmp_path, shipped_policy, ListeningAutopilot)
+    flown.take_off()
+    if state is not FlightState.HOLD:
+        flown.explore("a")
+    if state is FlightState.RETURN:
+        flown.say(calm="return")
+        flown.until(state)
+    before_m = -flown.vehicle.position_m[2]
+    flown.vehicle.gps_bias_m = np.array(jump_m)
+    qualities = []
+    for _ in range(100 if state is not FlightState.RETURN else 30):
+        flown.tick()
+        assert flown.state is state
+        assert abs(-flown.vehicle.position_m[2] - before_m) < 1.0
+        qualities.append(flown.navigation.position.quality)
+    assert set(qualities) == {Quality.GOOD, Quality.DOUBTFUL}
+    assert abs(flown.odometry()[2] - 5.0) < 0.8
+    doubted = [r["height_m"] for t, r in flown.records[-30:] if t == "control"]
+    assert max(doubted) - min(doubted) < 1.0
+    flown.say(calm="land")
+    flown.until(FlightState.LANDED)
 
 
 def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
