@@ -83,8 +83,8 @@ class FaultRig:
 
     Times are a vehicle's own, s. What the vehicle really did is `truth`. `at_rest_m_s` is what a
     vehicle that holds its place does not exceed, `log_lag_s` how late its log tells of setpoints,
-    `drift_m` how far it comes down from where it was without GPS, in still air; in that, without
-    control of its place, it is carried by a wind of `wind_m_s`.
+    `drift_m` how far it comes down from where it was without GPS, in still air, and `drift_m_s` how
+    fast it goes there; without control of its place, it is carried by a wind of `wind_m_s`.
     """
 
     def __init__(
@@ -94,11 +94,12 @@ class FaultRig:
         self.operator = fleet.operator
         self.simulated = vehicles
         self.flying = set(robots)
-        # PX4's own vehicle model wanders up to 0.24 m/s in PX4's own hold.
-        # PX4's own vehicle model wanders by itself, the simulated ones have gusts.
+        # PX4's own vehicle model wanders by 0.24 m/s in PX4's own hold; simulated ones have gusts.
         self.at_rest_m_s = 0.35
         # A real PX4 was seen 7.5 m away after it had landed without GPS.
         self.drift_m = 10.0 if isinstance(vehicles, RealVehicles) else 6.0
+        # The same one went at 1.15 m/s.
+        self.drift_m_s = 1.2
         self.wind_m_s = 0.0 if isinstance(vehicles, RealVehicles) else GREATEST_WIND_M_S
         self.log_lag_s = 1.5 if isinstance(vehicles, RealVehicles) else 0.1
 
