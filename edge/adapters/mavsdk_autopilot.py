@@ -38,7 +38,7 @@ RATES_HZ = {
     32: 20.0,  # LOCAL_POSITION_NED
     33: 5.0,  # GLOBAL_POSITION_INT
     49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
-    230: 2.0,  # ESTIMATOR_STATUS
+    230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
     245: 5.0,  # EXTENDED_SYS_STATE
 }
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245

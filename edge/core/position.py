@@ -22,12 +22,14 @@ _GPS_SILENT_S = 1.5
 _POSITION_OLD_S = 0.6
 # An estimate of a vehicle's sensors is never twice the same.
 _FROZEN_S = 1.0
-# Sent once a second; what is older says nothing about now.
+# Asked for at 5 Hz, sent once a second by itself; what is older says nothing about now.
 _ESTIMATOR_HEARD_S = 2.5
 # As long as a jump counts as one: longer than any `doubtful_after_s` that makes sense.
 _JUMP_S = 1.0
 # Whoever did not look for so long begins anew to count.
 _NOT_LOOKED_S = 0.5
+# What comes and goes faster is bad all along.
+_CLEAR_S = 0.5
 # An accuracy so much worse than allowed is no position.
 _HOPELESS = 2.0
 
@@ -76,9 +78,9 @@ class PositionLimits:
     """How good is good enough in flight, and for how long it must not be.
 
     `max_accuracy_m` is the receiver's own figure, `max_offset_m` the distance of its fix from the
-    estimate. A position is doubtful once something spoke against it for `doubtful_after_s`; lost
-    once there was none for `lost_after_s`, or it stayed doubtful for `doubtful_lost_after_s`; and
-    good again once nothing spoke against it for `good_after_s`.
+    estimate. A position is doubtful once something spoke against it for `doubtful_after_s`, never
+    silent for 0.5 s; lost once there was none for `lost_after_s`, or it stayed doubtful for
+    `doubtful_lost_after_s`; and good again once nothing spoke against it for `good_after_s`.
 
     Raises ValueError if a number is not finite or out of its range.
     """
@@ -114,7 +116,8 @@ class Judgement:
     """What the position is worth, since `since_s`; `cause` is what speaks against it now, or spoke.
 
     `value` is what was measured where the cause has a number. From `bad_since_s` on something
-    spoke against it, from `none_since_s` on there was no position; None if it is not so now.
+    spoke against it, never silent for 0.5 s; from `none_since_s` on there was no position, from
+    `good_since_s` on nothing spoke against it; None if it is not so now.
     """
 
     quality: Quality = Quality.LOST
@@ -150,19 +153,23 @@ def judge(
         looked_from_s = now_s
         before = replace(before, bad_since_s=None, none_since_s=None, good_since_s=None)
     findings = tuple(_findings(vehicle, limits, now_s))
-    bad_since_s = _since(before.bad_since_s, findings, looked_from_s)
     without = tuple(finding for finding in findings if finding.is_none)
     none_since_s = _since(before.none_since_s, without, looked_from_s)
     good_since_s = None
     if not findings:
         good_since_s = now_s if before.good_since_s is None else before.good_since_s
+    bad_since_s = before.bad_since_s
+    if before.good_since_s is not None and now_s - before.good_since_s >= _CLEAR_S:
+        bad_since_s = None
+    if findings:
+        bad_since_s = _since(bad_since_s, findings, looked_from_s)
     quality = before.quality
     doubtful_s = now_s - before.since_s if quality is Quality.DOUBTFUL else 0.0
     if (
         none_since_s is not None and now_s - none_since_s >= limits.lost_after_s
     ) or doubtful_s >= limits.doubtful_lost_after_s:
         quality = Quality.LOST
-    elif bad_since_s is not None and now_s - bad_since_s >= limits.doubtful_after_s:
+    elif findings and bad_since_s is not None and now_s - bad_since_s >= limits.doubtful_after_s:
         quality = Quality.DOUBTFUL if quality is Quality.GOOD else quality
     elif good_since_s is not None and now_s - good_since_s >= limits.good_after_s:
         quality = Quality.GOOD
@@ -199,12 +206,14 @@ def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> It
     if vehicle.position_local_m is None or vehicle.origin is None:
         yield _Finding(Cause.UNKNOWN, True, now_s)
     elif now_s - vehicle.position_at_s > _POSITION_OLD_S:
+        # Nothing is known of the vehicle since: that counts from the last word of it.
         yield _Finding(Cause.OLD, True, vehicle.position_at_s)
     elif now_s - vehicle.position_changed_at_s > _FROZEN_S:
-        yield _Finding(Cause.FROZEN, True, vehicle.position_changed_at_s)
+        yield _Finding(Cause.FROZEN, True, vehicle.position_changed_at_s + _FROZEN_S)
     gps = vehicle.gps
     if gps is None or now_s - gps.at_s > _GPS_SILENT_S:
-        yield _Finding(Cause.GPS_SILENT, True, now_s if gps is None else gps.at_s)
+        # From when it was noticed: a pause of the receiver must not land a drone at once.
+        yield _Finding(Cause.GPS_SILENT, True, now_s if gps is None else gps.at_s + _GPS_SILENT_S)
     elif gps.fix < _FIX_3D:
         yield _Finding(Cause.NO_FIX, True, now_s)
     estimator = vehicle.estimator

@@ -31,7 +31,13 @@ from edge.core.flight import (
     Transition,
     step,
 )
-from edge.core.guidance import Guidance, MissionPosition, MissionSetpoint, guide
+from edge.core.guidance import (
+    Guidance,
+    MissionPosition,
+    MissionSetpoint,
+    MissionVelocity,
+    guide,
+)
 from edge.core.mission import Calm, FlightState, GroundState, Order, OrderKind, OrderResult, Origin
 from edge.core.ports import Odometry
 from edge.core.position import Judgement, PositionLimits, Quality, judge
@@ -105,6 +111,7 @@ class World:
         self.watchdog = True
         # What is heard of it.
         self.telemetry = True
+        self.silent_from_s = math.inf
         self.position_known = True
         self.accuracy_m = 0.9
         self.battery: float | None = 0.9
@@ -326,9 +333,15 @@ class World:
             connected=silence_s < 2.5,
             battery=self.battery,
             position_local_m=(0.0, 0.0, 0.0),
-            position_at_s=self.now_s,
-            position_changed_at_s=self.now_s,
-            gps=Gps(3 if self.position_known else 0, 12, 0.8, self.accuracy_m, at_s=self.now_s),
+            position_at_s=min(self.now_s, self.silent_from_s),
+            position_changed_at_s=min(self.now_s, self.silent_from_s),
+            gps=Gps(
+                3 if self.position_known else 0,
+                12,
+                0.8,
+                self.accuracy_m,
+                at_s=min(self.now_s, self.silent_from_s),
+            ),
             height_above_home_m=self.height_m,
             remote_control=self.remote_control,
         )
@@ -1008,6 +1021,37 @@ def test_a_lost_position_stops_and_then_lands(world: World) -> None:
     assert "position lost: GPS has no fix" in world.tick().alarms
     world.position_known = True
     world.until(FlightState.LANDED, 30.0)
+
+
+@pytest.mark.parametrize(("beat_s_ago", "asked"), [(0.2, [Action.LAND]), (0.9, [])])
+def test_an_autopilot_that_falls_silent_is_stopped_landed_and_given_up(
+    beat_s_ago: float, asked: list[Action]
+) -> None:
+    """When docs/safety.md says, from its last word and its last heartbeat."""
+    after = "0.7 s and 2 s after its last word; FAULT 2.5 s after its last heartbeat, which may "
+    assert f"| {after}come first; PX4 1 s after the last setpoint |" in SAFETY_PAGE.read_text()
+    world = World()
+    world.fly()
+    while not beat_s_ago <= world.now_s - world.heard.heartbeat_at_s < beat_s_ago + TICK_S:
+        world.tick()
+    world.silent_from_s, world.telemetry, world.beats = world.now_s, False, []
+    stopped_s, actions, sent_s = math.inf, len(world.actions), 0.0
+    while world.state() is not FlightState.FAULT:
+        world.tick()
+        silent_s = world.now_s - world.silent_from_s
+        if world.setpoint == MissionVelocity((0.0, 0.0, pytest.approx(0.0, abs=0.5))):
+            stopped_s = min(stopped_s, silent_s)
+        if world.setpoint_at_s == world.now_s:
+            sent_s = silent_s
+    assert 0.6 <= stopped_s <= 0.7 + 1e-6
+    assert [action for _, action in world.actions[actions:]] == asked
+    fault_s = world.now_s - world.heard.heartbeat_at_s
+    assert 2.5 <= fault_s <= 2.6 + 1e-6
+    asked_s = [at_s - world.silent_from_s for at_s, _ in world.actions[actions:]]
+    assert all(2.0 <= at_s <= 2.1 + 1e-6 for at_s in asked_s)
+    world.run(3.0)
+    assert sent_s <= 2.0 and world.setpoint_at_s - world.silent_from_s == sent_s
+    assert len(world.actions) == actions + len(asked)
 
 
 def test_a_glitch_stops_and_the_mission_goes_on(world: World) -> None:

@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.adapters.mavsdk_autopilot import RATES_HZ
 from edge.core.position import Cause, Judgement, PositionLimits, Quality, judge
 from edge.core.vehicle import Estimator, GlobalOrigin, Gps, VehicleState
+from tests.conftest import ROOT
 
 LIMITS = PositionLimits()
 TICK_S = 0.1
@@ -147,12 +149,122 @@ def test_a_position_that_does_not_come_counts_from_the_last_one() -> None:
 def test_a_position_that_stands_still_is_no_estimate() -> None:
     watch = Watch()
     frozen_s = watch.now_s
-    watch.run(1.0, position_changed_at_s=frozen_s)
+    watch.run(1.3, position_changed_at_s=frozen_s)
     assert watch.judgement.quality is _Q.GOOD
     watch.run(0.2, position_changed_at_s=frozen_s)
     assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, Cause.FROZEN)
-    watch.run(1.0, position_changed_at_s=frozen_s)
+    watch.run(1.6, position_changed_at_s=frozen_s)
     assert watch.judgement.quality is _Q.LOST
+
+
+NO_FIX: dict[str, Any] = {"gps": dataclasses.replace(GPS, fix=0)}
+FLICKERS: list[dict[str, Any]] = [NO_FIX, NO_FIX, {}, {}]
+
+
+def test_a_fix_that_flickers_is_doubted_until_it_is_steady() -> None:
+    watch = Watch()
+    since_s, qualities = watch.now_s, []
+    while watch.now_s < since_s + 20.0:
+        for changes in FLICKERS:
+            watch.run(TICK_S, **changes)
+            qualities.append(watch.judgement.quality)
+    assert set(qualities[:4]) == {_Q.GOOD} and set(qualities[6:]) == {_Q.DOUBTFUL}
+    watch.run(2.5)
+    assert watch.judgement.quality is _Q.DOUBTFUL
+    watch.run(0.7)
+    assert watch.judgement.quality is _Q.GOOD
+
+
+def test_glitches_far_apart_are_none() -> None:
+    watch = Watch()
+    for _ in range(10):
+        watch.run(0.3, **NO_FIX)
+        watch.run(0.6)
+        assert watch.judgement.quality is _Q.GOOD
+
+
+def test_one_sample_with_a_doubt_does_not_stop_a_robot() -> None:
+    """At the rate that the estimator's word is asked for, told late by a tick."""
+    watch = Watch()
+    told_s = watch.now_s
+    watch.run(1.0 / RATES_HZ[230] + TICK_S, estimator=Estimator(True, True, told_s))
+    watch.run(1.0)
+    assert watch.judgement.quality is _Q.GOOD
+
+
+def test_a_pause_of_the_receiver_stops_a_robot_and_does_not_land_it() -> None:
+    watch = Watch()
+    silent_s = watch.now_s
+    for _ in range(34):
+        watch.now_s += TICK_S
+        silent = dataclasses.replace(GPS, at_s=silent_s)
+        watch.look(dataclasses.replace(heard(watch.now_s), gps=silent))
+    assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, Cause.GPS_SILENT)
+
+
+# Each row of docs/safety.md's table of wrong positions that the judgement has times for: the cause,
+# after how long, and what happens as they stand there; what is told; and when, in s after it is
+# told (or after the last that was), the position is doubtful and lost.
+_STOPS = "stop, and on when nothing speaks against it for 3 s; LAND after 60 s"
+WRONG: list[tuple[str, str, str, list[dict[str, Any]], float, float]] = [
+    ("no fix", "told within 0.3 s, and 0.4 s", "stop; LAND 2 s after it was told",
+     [NO_FIX], 0.4, 2.0),
+    ("a fix that comes and goes, never there for 0.5 s", "as no fix",
+     "stop; LAND after 60 s", FLICKERS, 0.4, 60.4),
+    ("nothing new from the receiver", "1.5 s and 0.4 s", "stop; LAND 2 s after it was noticed",
+     [{"gps_at_s": 0.0}], 1.9, 3.5),
+    ("positions do not come", "0.6 s", "stop; LAND 2 s after the last one",
+     [{"position_at_s": 0.0}], 0.6, 2.0),
+    ("accuracy reported worse than 5 m", "0.2 s and 0.4 s",
+     "stop; LAND after 60 s, worse than 10 m after 2 s",
+     [{"gps": dataclasses.replace(GPS, accuracy_m=5.1)}], 0.4, 60.4),
+    ("accuracy reported worse than 5 m", "0.2 s and 0.4 s",
+     "stop; LAND after 60 s, worse than 10 m after 2 s",
+     [{"gps": dataclasses.replace(GPS, accuracy_m=10.1)}], 0.4, 2.0),
+    ("accuracy between 1.5 m and 5 m", "", "heights keep robots apart; before takeoff more room is "
+     "asked for", [{"gps": dataclasses.replace(GPS, accuracy_m=5.0)}], math.inf, math.inf),
+    ("the position jumps by 1 m or more, or the receiver lies 5 m from the estimate", "0.4 s",
+     _STOPS, [{"jumped_at_s": 0.0}], 0.4, math.inf),
+    ("the position jumps by 1 m or more, or the receiver lies 5 m from the estimate", "0.4 s",
+     _STOPS, [{"gps": dataclasses.replace(GPS, offset_m=5.1)}], 0.4, 60.4),
+    ("the receiver jumps by less than 5 m", "never", "nothing: PX4 takes it for true and follows "
+     "smoothly", [{"gps": dataclasses.replace(GPS, offset_m=4.9)}], math.inf, math.inf),
+    ("frozen values", "1 s and 0.4 s", "stop; LAND 2 s after the freeze was noticed",
+     [{"position_changed_at_s": 0.0}], 1.4, 3.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("cause", "after", "happens", "told", "doubted_s", "lost_s"), WRONG)
+def test_wrong_positions_are_noticed_when_the_table_says(
+    cause: str,
+    after: str,
+    happens: str,
+    told: list[dict[str, Any]],
+    doubted_s: float,
+    lost_s: float,
+) -> None:
+    page = (ROOT / "docs" / "safety.md").read_text()
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| {cause} | "))
+    assert [cell.strip() for cell in row.split("|")[3:5]] == [after, happens]
+    watch = Watch()
+    since_s = watch.now_s
+    found: dict[Quality, float] = {}
+    for tick in range(round(65.0 / TICK_S)):
+        watch.now_s += TICK_S
+        changes = dict(told[tick % len(told)])
+        # Times count from the beginning; what is told is told for the first time in its first tick.
+        for name in changes.keys() & {"position_at_s", "position_changed_at_s", "jumped_at_s"}:
+            changes[name] += since_s
+        silent = changes.pop("gps_at_s", None) is not None
+        vehicle = heard(watch.now_s, **changes)
+        if silent:
+            vehicle = dataclasses.replace(vehicle, gps=dataclasses.replace(GPS, at_s=since_s))
+        watch.look(vehicle)
+        found.setdefault(watch.judgement.quality, watch.now_s - since_s)
+    assert found[_Q.GOOD] == pytest.approx(TICK_S)
+    for quality, at_s in ((_Q.DOUBTFUL, doubted_s), (_Q.LOST, lost_s)):
+        # A tick until it is told; another, and a third after a minute, until it is looked at.
+        assert at_s - 1e-6 <= found.get(quality, math.inf) <= at_s + 3.0 * TICK_S + 1e-6
 
 
 def test_a_jump_is_doubted_until_it_was_good_for_a_while() -> None:
