@@ -320,7 +320,7 @@ def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilot
 
 
 @pytest.mark.parametrize("state", [FlightState.HOLD, FlightState.MISSION, FlightState.RETURN])
-@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 6.0), (0.0, 0.0, -6.0), (5.0, 0.0, -2.0)])
+@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 6.0), (0.0, 0.0, -10.0), (5.0, 0.0, -1.3)])
 def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
     tmp_path: Path, shipped_policy: Policy, state: FlightState, jump_m: Vector
 ) -> None:
