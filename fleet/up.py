@@ -1,6 +1,7 @@
 """The start of a day in the field: robots that answer, clocks set, programs that run."""
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -146,13 +147,21 @@ def packs(
         count = None
         if share is not None and endurance_s is not None:
             flown = config.robot_config(robot.name)
+            flight, limits = flown.flight, flown.limits
             count = trials(
+                flown.energy,
                 share=share,
-                until_share=flown.flight.battery_low,
+                min_battery=flown.preflight.min_battery,
+                battery_low=flight.battery_low,
+                battery_critical=flight.battery_critical,
                 endurance_s=endurance_s,
                 trial_s=trial_s,
-                slot_height_m=flown.flight.slot_height_m,
-                max_climb_m_s=flown.limits.max_climb_m_s,
+                # A mission may end anywhere.
+                away_m=max(math.dist(v, flight.landing_point_m) for v in flown.fence.vertices_m),
+                slot=flight.slot,
+                slot_height_m=flight.slot_height_m,
+                max_speed_m_s=limits.max_speed_m_s,
+                max_climb_m_s=limits.max_climb_m_s,
             )
         found.append(Pack(robot.name, share, endurance_s, count))
     return found

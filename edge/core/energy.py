@@ -164,17 +164,37 @@ def home_s(
 
 
 def trials(
+    parameters: EnergyParameters,
     *,
     share: float,
-    until_share: float,
+    min_battery: float,
+    battery_low: float,
+    battery_critical: float,
     endurance_s: float,
     trial_s: float,
+    away_m: float,
+    slot: int,
     slot_height_m: float,
+    max_speed_m_s: float,
     max_climb_m_s: float,
 ) -> int:
-    """How many trials a pack is good for, until `until_share` of it is left.
+    """How many trials a pack is good for: none counts in which the robot would return by itself.
 
-    Each is `trial_s` of mission, a climb to the slot, a wait there for the others, and a landing.
+    Each is a climb to the slot, a wait there for the others, `trial_s` of mission, and the way home
+    from `away_m`, the queue and the landing. Then the next takes off, with `min_battery` at least.
     """
-    each_s = trial_s + 2.0 * slot_height_m / max_climb_m_s + slot_height_m / _LANDING_M_S
-    return max(int((share - until_share) * endurance_s / (each_s + _TOUCHDOWN_S)), 0)
+    down_s = home_s(
+        parameters,
+        away_m=away_m,
+        height_m=slot_height_m,
+        slot=slot,
+        slot_height_m=slot_height_m,
+        max_speed_m_s=max_speed_m_s,
+        max_climb_m_s=max_climb_m_s,
+    )
+    returns_at = max(battery_low, battery_critical + down_s / endurance_s)
+    mission_s = 2.0 * slot_height_m / max_climb_m_s + trial_s
+    # What may be used before the last one begins.
+    until = max(min_battery, returns_at + mission_s / endurance_s)
+    each_s = mission_s + down_s - parameters.reserve_s
+    return max(math.floor((share - until) * endurance_s / each_s) + 1, 0)
