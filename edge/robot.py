@@ -33,6 +33,7 @@ from edge.adapters.logs import configure_logging
 from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
 from edge.adapters.service_manager import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.adapters.zenoh_link import ZenohLink
+from edge.core.flight import flown_s
 from edge.core.mission import FlightState, RobotStatus, explored_to_bytes, to_json, world_id
 from edge.core.px4_version import in_words
 from edge.core.vehicle import Action
@@ -467,6 +468,7 @@ class _Program:
             battery_lasts_s=None if energy is None else energy.lasts_s,
             home_s=None if energy is None else energy.home_s,
             endurance_s=control.endurance_s,
+            flown_s=flown_s(flight, vehicle, now_s),
             position_quality=self._navigation.position.quality,
             position_cause=self._navigation.position.cause,
             gps_accuracy_m=None if gps is None else gps.accuracy_m,

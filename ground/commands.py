@@ -538,7 +538,7 @@ class Running:
         """Settle who has taken off; who was held up on its way is too low for a mission."""
         low = status.state is _S.HOLD and is_too_low(status)
         if low:
-            text += f"; below its height of {status.slot_height_m:g} m: land it, then take off"
+            text += f"; below its height of {status.slot_height_m:g} m: land all, then take off"
         self._settle(name, text, done=not low)
 
     def _start(self, _: Start) -> Waits:

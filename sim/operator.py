@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from edge.adapters.zenoh_link import ZenohLink
+from edge.core.margins import ErrorBudget
 from edge.core.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
@@ -317,6 +318,7 @@ class Step:
 class Script:
     """One flight of a fleet, from the first status to the last disarming.
 
+    All take off within `takeoffs_window_s`; who came to hold on its way up tries again until then.
     `began_s` tells when each step began (`time.monotonic()`), `restarts` how often each robot that
     had come to hold by itself was ordered to start again.
     """
@@ -329,6 +331,7 @@ class Script:
         origin: Origin,
         mission_s: float,
         trial: str,
+        takeoffs_window_s: float = ErrorBudget().takeoffs_window_s,
         say: Say = lambda _: None,
     ) -> None:
         """`say` is told what robots do that the script does not have."""
@@ -338,6 +341,7 @@ class Script:
         self._robots = frozenset(robots)
         self._origin = origin
         self._trial = trial
+        self._takeoffs_window_s = takeoffs_window_s
         self._say = say
         self._said: set[str] = set()
         self._last_takeoff_s = -math.inf
@@ -444,9 +448,17 @@ class Script:
         """The highest first: it climbs past nobody.
 
         Who came to hold on its way up is too low for a mission: it lands and takes off again.
+        Raises ScriptError once it is too late for that.
         """
-        statuses = self._operator.statuses().values()
+        statuses = [s for r, s in self._operator.statuses().items() if r in self._robots]
         low = [s for s in statuses if s.state is _S.LAND or (s.state is _S.HOLD and is_too_low(s))]
+        first_s = max((s.flown_s or 0.0 for s in statuses), default=0.0)
+        late = [s.robot_id for s in statuses if s in low or s.state in ON_GROUND]
+        if late and first_s > self._takeoffs_window_s:
+            raise ScriptError(
+                f"robots {', '.join(map(str, sorted(late)))} did not come to their heights, and "
+                f"the first took off {first_s:.0f} s ago: too late to try again"
+            )
         self._operator.calm_each("none", {status.robot_id: "land" for status in low})
         for status in sorted(statuses, key=lambda s: s.slot_height_m, reverse=True):
             if time.monotonic() - self._last_takeoff_s < _TAKEOFF_STAGGER_S:

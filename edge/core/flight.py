@@ -118,7 +118,8 @@ class Flight:
     the vehicle is in offboard again. `failsafe_at_s` is when the autopilot's own failsafe was last
     seen to act, `remote_control_at_s` when the remote control was last heard. `alone_since_s` is
     set while the vehicle hovers for no reason that anybody gave: since when nobody has answered.
-    `armed_by` is whose takeoff order this program armed it by.
+    `armed_by` is whose takeoff order this program armed it by, `disarmed_at_s` when the vehicle was
+    last known to be disarmed.
     `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
     """
 
@@ -138,6 +139,7 @@ class Flight:
     asked_at_s: float = -math.inf
     armed_asked: bool = False
     armed_by: str = ""
+    disarmed_at_s: float = -math.inf
     landed_since_s: float | None = None
     land_by: Literal["ground", "return", "safety"] = "safety"
     killed: bool = False
@@ -331,6 +333,12 @@ def height_m(flight: Flight, odometry: Odometry | None) -> float | None:
     if odometry is None or flight.datum_m is None:
         return None
     return odometry.position_m[2] - flight.datum_m
+
+
+def flown_s(flight: Flight, vehicle: VehicleState, now_s: float) -> float | None:
+    """How long ago the vehicle was armed, s; None if it is not, or was so before this program."""
+    since_s = now_s - flight.disarmed_at_s
+    return since_s if vehicle.armed and math.isfinite(since_s) else None
 
 
 def failsafe_acts(vehicle: VehicleState) -> bool:
@@ -553,7 +561,7 @@ def _left_alone(t: _Tick) -> str | None:
 
 def _hovers_alone(t: _Tick) -> str | None:
     limit_s = t.robot.parameters.hover_land_s
-    text = f"hovers, and lands if nobody orders or holds it within {limit_s:g} s"
+    text = f"hovers, and lands {limit_s:g} s after it began to, if nobody orders or holds it"
     return _if(t.flight.alone_since_s is not None, text)
 
 
@@ -824,6 +832,12 @@ def _look(t: _Tick) -> Flight:
         if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
             # PX4 goes on landing by itself; if it does not, it is asked again.
             flight = replace(flight, reached=False, asked_at_s=now_s)
+    if vehicle.connected and vehicle.armed is False:
+        flight = replace(flight, disarmed_at_s=now_s)
+        # What was on its way when arming was called off has arrived by then.
+        looked = vehicle.heartbeat_at_s > flight.since_s + _STALE_TELEMETRY_S
+        if flight.state in ON_GROUND and looked:
+            flight = replace(flight, armed_by="")
     if vehicle.remote_control:
         flight = replace(flight, remote_control_at_s=now_s)
     flight = replace(flight, alone_since_s=_alone_since_s(t))

@@ -16,6 +16,8 @@ _REPORT_FACTOR = 2.0
 # Without a report a receiver counts as one without corrections, whatever is configured.
 _UNREPORTED_M = 3.0
 _GRAVITY_M_S2 = 9.81
+# In which time all heights walk together by `height_common_m`.
+_COMMON_WALK_S = 300.0
 # Of a small multicopter that tumbles. Heavier ones fall faster, and wind carries them less far.
 _TERMINAL_M_S = 10.0
 _ROUNDING_M = 1e-6
@@ -47,10 +49,10 @@ class ErrorBudget:
     `gps_m`: its estimate's horizontal error. `wind_m`: how far a gust, or control, carries it from
     where it wants to be, `wind_m_s` the greatest speed of a gust, m/s. `height_apart_m`: by how
     much two vehicles' estimated heights come to differ in truth in one flight, each above its own
-    pad; `height_common_m`: how far all heights walk together, `takeoffs_height_m` how far they do
-    from the first takeoff to the last, since each is 0 when its robot is armed. `height_control_m`:
-    how far from its height it is held. `pads_height_m`: how much higher one pad may lie than
-    another. `drone_m`: its size, propellers and all.
+    pad; `height_common_m`: how far all heights walk together in five minutes, `takeoffs_height_m`
+    how far they do from the first takeoff to the last, since each is 0 when its robot is armed.
+    `height_control_m`: how far from its height it is held. `pads_height_m`: how much higher one pad
+    may lie than another. `drone_m`: its size, propellers and all.
 
     Raises ValueError if one is not finite or below 0 (`drone_m`: not above 0).
     """
@@ -86,6 +88,13 @@ class ErrorBudget:
         """
         estimate_m = _UNREPORTED_M if accuracy_m is None else _REPORT_FACTOR * accuracy_m
         return self.position_m + max(estimate_m - self.gps_m, 0.0)
+
+    @property
+    def takeoffs_window_s(self) -> float:
+        """From the first takeoff to the last of those who fly together, s; inf if nothing walks."""
+        if self.height_common_m == 0.0:
+            return math.inf
+        return _COMMON_WALK_S * self.takeoffs_height_m / self.height_common_m
 
     @property
     def slot_spacing(self) -> Margin:

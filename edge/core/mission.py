@@ -197,7 +197,8 @@ class RobotStatus:
     position is worth, `position_cause` what speaks against it; `gps_accuracy_m` is the receiver's
     own figure. `remote_control` tells whether its pilot's is heard, None where there is none.
     `battery_lasts_s` is how long it flies until its battery is critical, `home_s` what it needs to
-    be landed with the reserve left, and `endurance_s` what a full battery would last.
+    be landed with the reserve left, and `endurance_s` what a full battery would last. `flown_s` is
+    how long ago it was armed, None if it is not, or was so before its program started.
 
     What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
     look. Raises ValueError for what must be there and is not finite.
@@ -249,6 +250,7 @@ class RobotStatus:
     battery_lasts_s: float | None = None
     home_s: float | None = None
     endurance_s: float | None = None
+    flown_s: float | None = None
 
     def __post_init__(self) -> None:
         for name, size in (
@@ -263,7 +265,7 @@ class RobotStatus:
         for name in (
             "uptime_s", "unix_time_s", "slot_height_m", "heading_rad", "battery", "hdop",
             "feature_age_s", "ground_age_s", "gps_accuracy_m",
-            "battery_lasts_s", "home_s", "endurance_s",
+            "battery_lasts_s", "home_s", "endurance_s", "flown_s",
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not math.isfinite(value):

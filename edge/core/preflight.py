@@ -254,6 +254,27 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
         offset_s = status.unix_time_s - heard_at_unix_s
         if not abs(offset_s) <= limits.max_clock_difference_s:
             yield f"{other}'s clock differs by {offset_s:.1f} s: set the time of both"
+    if not inputs.vehicle.armed:
+        yield from _too_late(inputs.errors, [heard.status for heard in others])
+
+
+def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[str]:
+    """Whether somebody took off so long ago that heights above the pad mean another height now."""
+    armed = [status for status in others if status.armed]
+    known = [(s.robot_id, math.inf if s.flown_s is None else s.flown_s) for s in armed]
+    robot_id, flown_s = max(known, key=lambda each: each[1], default=(-1, -math.inf))
+    window_s = errors.takeoffs_window_s
+    if flown_s > window_s:
+        since = (
+            f"for more than {window_s:.3g} s"
+            if math.isfinite(flown_s)
+            else "since before its program started"
+        )
+        # In words that stay the same for as long as it lasts.
+        yield (
+            f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "
+            "until all are down, or raise takeoffs_height_m of [errors]"
+        )
 
 
 def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator[str]:
@@ -274,10 +295,10 @@ def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator
     apart_m = math.dist(status.landing_point_m, inputs.landing_point_m)
     if not places.holds(apart_m):
         planned = places_apart(errors.position_m, errors.position_m)
-        mend = "wait for a better GPS accuracy, or " if planned.holds(apart_m) else ""
+        why = "too near for the GPS accuracy that is reported; " if planned.holds(apart_m) else ""
         yield (
             f"{other} lands {apart_m:.1f} m away, {places}: "
-            f"{mend}change the landing points in the config, or on the ground"
+            f"{why}change the landing points in the config, or on the ground"
         )
 
 

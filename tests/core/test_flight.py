@@ -29,6 +29,7 @@ from edge.core.flight import (
     RemoteControlLost,
     Robot,
     Transition,
+    flown_s,
     step,
 )
 from edge.core.guidance import (
@@ -790,6 +791,50 @@ def test_a_vehicle_that_was_armed_as_the_link_was_lost_is_not_said_to_be_somebod
     assert world.flight.reason == "the vehicle is armed, without an order: only observing"
 
 
+def test_whoever_arms_by_hand_after_a_flight_that_is_over_is_not_this_program(
+    world: World,
+) -> None:
+    world.fly()
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.enable()
+    assert world.ground is not None
+    world.ground = replace(world.ground, enabled=False)
+    # Meanwhile it came down.
+    world.armed, world.mode, world.intended = False, Mode.HOLD, Mode.HOLD
+    world.position_m[2], world.landed_at_s = 0.0, world.now_s
+    world.telemetry = True
+    world.until(FlightState.IDLE, 6.0)
+    world.run(290.0)
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.until(FlightState.PILOT, 2.5)
+    assert world.flight.reason == "the vehicle is armed, without an order: only observing"
+
+
+def test_how_long_a_vehicle_has_been_in_the_air(world: World) -> None:
+    def flown() -> float | None:
+        return flown_s(world.flight, world.heard, world.now_s)
+
+    world.ready()
+    assert flown() is None
+    world.hover()
+    armed_s = next(at_s for at_s, action in world.actions if action is Action.ARM)
+    world.run(60.0)
+    assert flown() == pytest.approx(world.now_s - armed_s, abs=PERIOD_S + 0.5)
+    # What is not heard any more goes on.
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    assert flown() == pytest.approx(world.now_s - armed_s, abs=PERIOD_S + 0.5)
+    world.telemetry = True
+    world.until(FlightState.PILOT, 4.0)
+    world.restart()
+    world.until(FlightState.PILOT, 4.0)
+    assert flown() is None and world.heard.armed
+    world.armed = False
+    world.until(FlightState.LANDED, 2.5)
+    assert flown() is None
+
+
 def test_somebody_else_arms_meanwhile(world: World) -> None:
     world.ready()
     world.obey("takeoff")
@@ -1393,7 +1438,8 @@ def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
     world.run(30.0)
     world.stop(1.0)  # Another one is no answer.
     assert world.flight.alarming
-    assert any("lands if nobody" in alarm for alarm in world.tick().alarms)
+    text = "hovers, and lands 60 s after it began to, if nobody orders or holds it"
+    assert text in world.tick().alarms
     world.until(FlightState.LAND, 35.0)
     assert world.now_s - began_s == pytest.approx(60.0, abs=1.0)
     assert world.flight.reason == "nobody answered for 60 s"

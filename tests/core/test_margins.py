@@ -78,6 +78,19 @@ def test_at_the_least_spacing_two_above_each_other_do_not_touch(
     assert upper_m - lower_m > budget.drone_m - 1e-9
 
 
+@given(budgets)
+def test_within_the_takeoffs_window_heights_walk_no_further_than_allowed(
+    budget: ErrorBudget,
+) -> None:
+    window_s = budget.takeoffs_window_s
+    if budget.height_common_m == 0.0:
+        assert window_s == math.inf
+    else:
+        walked_m = budget.height_common_m * window_s / 300.0
+        assert walked_m == pytest.approx(budget.takeoffs_height_m)
+    assert DEFAULT.takeoffs_window_s == pytest.approx(50.0)
+
+
 @pytest.mark.parametrize("share", [1.0, LESS])
 def test_the_margins_are_no_padding(share: float) -> None:
     """All errors that are stated, at once, the wrong way round: that is where margins end."""

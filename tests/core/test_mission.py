@@ -40,7 +40,7 @@ STATUS = RobotStatus(
     message_counts={"accepted": 4}, neighbour_ages_s={"2": 0.1},
     loops={"control": LoopStatus(1, 0, 0, 0.1, 0.2, 0.3)}, fence=FENCE, not_taken=("in flight",),
     in_air=True, global_deg=(40.0, -75.0), hdop=0.8, policy_velocity_m_s=(0.1, -0.2),
-    feature_age_s=0.1, neighbour_messages={"2": 40}, ground_age_s=0.1,
+    feature_age_s=0.1, neighbour_messages={"2": 40}, ground_age_s=0.1, flown_s=63.5,
 )  # fmt: skip
 
 
@@ -55,13 +55,19 @@ def test_messages_survive_the_way() -> None:
         assert from_json(type(message), to_json(message)) == message
 
 
+def test_what_an_older_program_does_not_say_is_not_known() -> None:
+    told = dataclasses.asdict(STATUS)
+    del told["flown_s"]
+    assert from_json(RobotStatus, json.dumps(told).encode()).flown_s is None
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_what_is_no_number_is_not_known(number: float) -> None:
     odd = {
         "position_m": [1.0, number, 3.0], "velocity_m_s": [number, 0.0, 0.0],
         "global_deg": [number, number], "policy_velocity_m_s": [0.0, number],
         "heading_rad": number, "battery": number, "hdop": number, "feature_age_s": number,
-        "ground_age_s": number,
+        "ground_age_s": number, "flown_s": number,
     }  # fmt: skip
     ages_s = {"neighbour_ages_s": {"2": number, "4": 0.2}}
     data = json.dumps(dataclasses.asdict(STATUS) | odd | ages_s).encode()

@@ -218,6 +218,44 @@ def test_a_neighbour_without_an_origin_has_not_ours() -> None:
     assert failed.startswith("robot 2 has another mission origin")
 
 
+def in_the_air(*flown_s: float | None) -> tuple[HeardStatus, ...]:
+    """Neighbours from robot 2 on, each for so long."""
+    return tuple(
+        HeardStatus(
+            dataclasses.replace(
+                NEIGHBOUR, robot_id=2 + i, system_id=2 + i, state=FlightState.HOLD, armed=True,
+                flown_s=each_s, slot_height_m=9.5 + 4.5 * i, landing_point_m=(16.0 + 8.0 * i, 8.0),
+            ), 99.8, UNIX_S,
+        )
+        for i, each_s in enumerate(flown_s)
+    )  # fmt: skip
+
+
+def test_nobody_follows_those_who_took_off_long_ago() -> None:
+    def said(*flown_s: float | None, **changed: Any) -> tuple[str, ...]:
+        inputs = dataclasses.replace(READY, neighbours=in_the_air(*flown_s))
+        return failed_checks(dataclasses.replace(inputs, **changed), LIMITS)
+
+    assert said(49.9, 10.0) == ()
+    (line,) = said(30.0, 63.0)
+    assert line == (
+        "robot 3 has been in the air for more than 50 s: heights have walked since then; wait "
+        "until all are down, or raise takeoffs_height_m of [errors]"
+    )
+    # Its program has started since: it may have been long.
+    (line,) = said(63.0, None)
+    assert line.startswith("robot 3 has been in the air since before its program started: heights")
+    for patient in (ErrorBudget(takeoffs_height_m=1.0), ErrorBudget(height_common_m=0.0)):
+        wide = tuple(
+            heard._replace(status=dataclasses.replace(heard.status, slot_height_m=20.0 + 5.0 * i))
+            for i, heard in enumerate(in_the_air(63.0, 63.0))
+        )
+        assert said(errors=patient, neighbours=wide) == ()
+    # Who is in the air himself took off with them.
+    (line,) = said(63.0, 63.0, vehicle=dataclasses.replace(VEHICLE, armed=True))
+    assert line == "vehicle is armed: disarm it"
+
+
 def lines(
     own: Gps, its_accuracy_m: float | None, landing_x_m: float, errors: ErrorBudget
 ) -> tuple[str, ...]:
@@ -241,7 +279,7 @@ def test_a_receiver_that_reports_worse_than_the_budget_wants_more_room() -> None
     for own, its_accuracy_m in ((bad, 0.02), (good, 2.0)):
         (line,) = lines(own, its_accuracy_m, 16.0, budget)
         assert "must be 9 m (positions err by" in line
-        assert ": wait for a better GPS accuracy, or change the landing points" in line
+        assert ": too near for the GPS accuracy that is reported; change the landing" in line
     assert failed_checks(
         dataclasses.replace(
             READY, vehicle=dataclasses.replace(VEHICLE, gps=bad), neighbours=()
@@ -261,7 +299,7 @@ def test_receivers_with_corrections_stand_nearer_as_long_as_they_report_it() -> 
         (dataclasses.replace(fixed, accuracy_m=0.4), 0.02),
     ):
         (line,) = lines(own, its_accuracy_m, 10.2, rtk)
-        assert ": wait for a better GPS accuracy" in line
+        assert ": too near for the GPS accuracy that is reported" in line
 
 
 @pytest.mark.parametrize(

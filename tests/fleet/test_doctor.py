@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from edge.core.margins import ErrorBudget
+from edge.core.vehicle import Gps
 from fleet.config import FleetConfig, RobotHost, SshConfig, load_fleet
 from fleet.deploy import deploy
 from fleet.doctor import (
@@ -35,6 +37,7 @@ from fleet.up import bring_up, decide, packs
 from sim.hosts import RobotHost as Host
 from sim.hosts import RobotHosts
 from tests.conftest import ROOT
+from tests.core.test_preflight import lines
 from tests.fleet.field import SILENT, armed, lpac_fleet, name_robot, unwatched
 
 # On robot computers
@@ -362,6 +365,15 @@ def test_up_says_how_many_trials_the_packs_are_good_for(config: FleetConfig) -> 
     assert full.trials is not None and weak.trials is not None
     assert 0 < weak.trials < full.trials < 0.7 * 1000.0 / 60.0
     assert unknown == ("r3", None, 900.0, None)
+
+
+def test_an_accuracy_that_is_too_bad_for_the_landing_points_is_no_go(config: FleetConfig) -> None:
+    """That may pass, or not; nobody is told that he may fly meanwhile."""
+    bad = Gps(3, 14, 0.8, accuracy_m=2.0)
+    (line,) = lines(bad, 0.9, 16.0, ErrorBudget())
+    checks = judged(config, put("service.status.failed_checks", [line]))
+    assert checks["preflight"] == ("preflight", "FAILED", line, "mend what each line says")
+    assert not decide(Diagnosis("r1", tuple(checks.values()))).go
 
 
 @pytest.mark.parametrize(

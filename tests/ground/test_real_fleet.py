@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from edge.core.margins import ErrorBudget
 from edge.core.mission import ON_GROUND, FlightState, RobotStatus, world_id
 from edge.core.world import format_world
 from ground.client import GroundError, command, subscribe
@@ -40,6 +41,7 @@ from tests.ground.browser import live_map, opened
 _S = FlightState
 NAMES = ("r0", "r1")
 PATIENCE_S = 90.0
+PATIENT = ErrorBudget(takeoffs_height_m=3.0)
 # Of a command that is given again: nothing is wrong, and a robot was out of reach or not ready yet.
 NOT_YET = (
     "not heard", "it did not answer", "does not hear this station", "not ready: ",
@@ -52,7 +54,9 @@ MOST_TRIES = 3
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     """Robots that can also be reached from another network, and land quickly.
 
-    They wait for another ground for as long as one may take to start on a busy machine.
+    They wait for another ground for as long as one may take to start on a busy machine. Over a link
+    that loses much a takeoff is ordered again late: so they may take off within five minutes, which
+    asks for heights further apart.
     """
     made = Fleet(FleetScenario(robots=len(NAMES)), tmp_path_factory.mktemp("fleet"), SHIPPED)
     assert made.simulated is not None
@@ -65,6 +69,13 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         path = robot.folder / "robot.toml"
         text = path.read_text().replace('listen = ["tcp/127.0.0.1:', 'listen = ["tcp/0.0.0.0:')
         path.write_text(text.replace("[flight]\n", "[flight]\nground_lost_land_s = 30.0\n"))
+    for path in (made.fleet_toml, *(robot.folder / "robot.toml" for robot in made.robots)):
+        before = "slot_spacing_m = 4.5\n"
+        text = path.read_text()
+        assert text.count(before) == 1
+        errors = "robot.errors" if path == made.fleet_toml else "errors"
+        text = text.replace(before, f"slot_spacing_m = {PATIENT.slot_spacing.least_m}\n")
+        path.write_text(f"{text}\n[{errors}]\ntakeoffs_height_m = {PATIENT.takeoffs_height_m}\n")
     with made:
         found_all = made.operator.wait_for(
             lambda statuses: [s.state for s in statuses.values()] == [_S.IDLE] * len(NAMES),

@@ -271,11 +271,11 @@ def test_a_climb_that_is_held_up_is_no_takeoff() -> None:
     held_up.enter(_S.HOLD, "control was silent for 0.7 s")
     field.until(lambda: running.report, 30.0)
     assert running.report is not None
-    low = f"; below its height of {held_up.slot_height_m:g} m: land it, then take off"
+    low = f"; below its height of {held_up.slot_height_m:g} m: land all, then take off"
     assert why_not(running.report) == {"r1": f"control was silent for 0.7 s{low}"}
     assert why_not(field.do(Takeoff())) == {"r1": f"already in the air, in hold{low}"}
-    field.done(Calm("land", robots=("r1",), wait=True))
-    field.done(Takeoff(robots=("r1",)))
+    field.done(Calm("land", wait=True))
+    field.done(Takeoff(interval_s=0.0))
 
 
 def test_who_is_in_the_air_keeps_what_it_has() -> None:

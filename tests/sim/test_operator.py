@@ -23,7 +23,7 @@ from edge.core.mission import (
     world_id,
 )
 from edge.core.safety import Fence
-from sim.operator import Operator, Script
+from sim.operator import Operator, Script, ScriptError
 from sim.ports import free_ports
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
@@ -192,6 +192,31 @@ def test_what_flights_go_by_is_said_and_the_world_sent_while_somebody_lacks_it()
         operator.assign()
         robot.wait_for(lambda: robot.states[-1].fence is None)
         assert (robot.states[-1].places, robot.states[-1].world_id) == ({}, None)
+
+
+def test_who_is_held_up_tries_again_until_heights_have_walked() -> None:
+    up = {"state": FlightState.HOLD, "position_m": (0.0, 0.0, 4.0)}
+    with talking(2) as (operator, [robot, low]):
+
+        def say(first_s: float) -> None:
+            robot.say(flown_s=first_s, **up)
+            low.say(flown_s=first_s - 2.0, **up | {"position_m": (0.0, 0.0, 1.0)})
+            assert operator.wait_for(lambda s: {first_s} <= {s[0].flown_s, s[1].flown_s}, 60.0)
+            assert operator.wait_for(lambda s: s[1].flown_s == first_s - 2.0, 60.0)
+
+        script = Script(operator, robots=range(2), origin=ORIGIN, mission_s=1.0, trial="t")
+        takeoff = next(step for step in script.steps if step.name == "takeoff")
+        say(49.0)
+        takeoff.act()
+        low.wait_for(lambda: bool(low.states))
+        assert [low.states[-1].calm_for(robot) for robot in (0, 1)] == ["none", "land"]
+        say(51.0)
+        with pytest.raises(ScriptError, match="robots 1 did not come to their heights"):
+            takeoff.act()
+        # With all at their heights nothing is late.
+        low.say(**up)
+        assert operator.wait_for(takeoff.done, 60.0)
+        takeoff.act()
 
 
 def test_a_silent_robot_is_no_longer_among_the_statuses() -> None:
