@@ -44,7 +44,8 @@ _HEARD = {
 class RealVehicle:
     """One PX4, over its ground-station link; its fields are changed while `stepped` is held.
 
-    `time_s` is `time.monotonic()` of what was heard last. `truth` is all that was so.
+    `time_s` is `time.monotonic()` of what was heard last. `truth` is all that was so, `errors_m`
+    by how much PX4's estimate was off each time.
     """
 
     def __init__(self, px4s: Px4Build, instance: int, world: WorldOrigin) -> None:
@@ -54,6 +55,7 @@ class RealVehicle:
         self.position_m: F64 = np.zeros(3)
         self.velocity_m_s: F64 = np.zeros(3)
         self.truth: list[Truth] = []
+        self.errors_m: list[F64] = []
         self._world = world
         self._local_m: F64 = np.zeros(3)
         self._origin_m: F64 = np.zeros(3)
@@ -194,6 +196,7 @@ class RealVehicle:
         self.velocity_m_s = np.array([message.vx, message.vy, message.vz]) * 1e-2
         north, east, down = self.position_m.tolist()
         v_north, v_east, v_down = self.velocity_m_s.tolist()
+        self.errors_m.append(self.estimated_position_m - self.position_m)
         self.truth.append(
             Truth(
                 time_s=now_s, position_m=(north, east, down),
