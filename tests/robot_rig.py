@@ -35,7 +35,7 @@ HELD_UP = re.compile(
     r"the control loop was silent|checks are still running|the ground commands|"
     r"not in offboard yet|position or height is not known|is not heard|was not answered|expired|"
     # A program that has just begun has not listened for long enough.
-    r"nothing new comes from the GPS receiver"
+    r"nothing new comes from the GPS receiver|position lost: it is not known"
 )
 
 Changes = dict[str, dict[str, Any]]

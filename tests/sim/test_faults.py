@@ -47,6 +47,9 @@ _S = FlightState
 def grounded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     """All programs run, two of them with one robot id, and nobody has taken off."""
     fleet = Fleet(FleetScenario(robots=8), tmp_path_factory.mktemp("faults"), SHIPPED)
+    assert fleet.simulated is not None
+    for vehicle in fleet.simulated.vehicles:
+        vehicle.parameters |= {"MPC_LAND_SPEED": 1.5, "COM_DISARM_LAND": 0.5}
     programs = list(fleet.robots)
     for faulty in (FAULTY, TWIN):
         programs[faulty] = FaultyRobot(faulty, programs[faulty].folder)
@@ -54,7 +57,6 @@ def grounded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     change_config(fleet, TWIN, f"robot_id = {TWIN}", f"robot_id = {STOPPED}")
     change_config(fleet, STOPPED, 'rc = "none"', 'rc = "pilot"')
     with fleet:
-        assert fleet.simulated is not None
         rig = FaultRig(fleet, range(TWIN), fleet.simulated)
         rig.change(STOPPED, rc_connected=True)
         rig.script("assemble")

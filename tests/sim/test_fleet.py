@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -45,9 +45,16 @@ ORDER_OF_STATES = [
 ]  # fmt: skip
 
 
+class Flown(NamedTuple):
+    """A flight over each world, as it told of itself, and its folder; and one that was stopped."""
+
+    flights: dict[int, tuple[dict[str, Any], Path]]
+    stopped: tuple[int, dict[str, Any]]
+
+
 @pytest.fixture(scope="module")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[int, tuple[dict[str, Any], Path]]:
-    """A flight of five robots over each of five worlds, as many at once as there are cores."""
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """Five robots over each of five worlds, and two until Ctrl-C; as many at once as cores."""
 
     folder = tmp_path_factory.mktemp("fleet")
 
@@ -60,11 +67,25 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[int, tuple[dict[st
         assert result.stdout, result.stderr
         return json.loads(result.stdout), out
 
+    def fly_until_ctrl_c() -> tuple[int, dict[str, Any]]:
+        with launched("-n", 2, "--json") as process:
+            read_until(process.stderr, r" s  mission$")
+            process.send_signal(signal.SIGINT)
+            output, _ = process.communicate(timeout=180.0)
+        return process.returncode, json.loads(output)
+
     with ThreadPoolExecutor(min(len(SEEDS), os.cpu_count() or 1)) as at_once:
-        return dict(zip(SEEDS, at_once.map(fly, SEEDS), strict=True))
+        flights = at_once.map(fly, SEEDS)
+        stopped = at_once.submit(fly_until_ctrl_c)
+        return Flown(dict(zip(SEEDS, flights, strict=True)), stopped.result())
 
 
 Flights = dict[int, tuple[dict[str, Any], Path]]
+
+
+@pytest.fixture(scope="module")
+def flights(flown: Flown) -> Flights:
+    return flown.flights
 
 
 def test_all_robots_take_off_cover_and_land(flights: Flights) -> None:
@@ -206,13 +227,9 @@ def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
     raise AssertionError(f"{pattern!r} is not among {lines}")
 
 
-def test_ctrl_c_lands_all() -> None:
-    with launched("-n", 2, "--json") as process:
-        read_until(process.stderr, r" s  mission$")
-        process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=180.0)
-    assert process.returncode == 1
-    flight = json.loads(output)
+def test_ctrl_c_lands_all(flown: Flown) -> None:
+    code, flight = flown.stopped
+    assert code == 1
     assert flight["problem"] == "stopped by Ctrl-C" and flight["all_landed"]
 
 
