@@ -37,7 +37,7 @@ export: .venv/export ## rebuild the shipped policy's bundle from its checkpoint
 ARCH ?= arm64
 image: | .venv/bin/pip ## the robot's image for ARM (or ARCH=amd64), and its size: out/image
 	@deploy/docker/image.sh $(ARCH)
-	@$(RUN) fleet.image out/image/$(ARCH)
+	@$(RUN) lpac.fleet.image out/image/$(ARCH)
 	@! command -v systemd-analyze > /dev/null || \
 		systemd-analyze security --offline=yes systemd/lpac-robot.service | tail -n 1
 

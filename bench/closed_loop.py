@@ -16,9 +16,9 @@ from rich.progress import track
 from bench import BUNDLE
 from bench.report import Report, Table, Target
 from edge.core.world import random_features
-from edge.runtime.bundle import Bundle, load_bundle
-from sim.baselines import BaselineName
-from sim.experiment import Scenario, fly
+from edge.policy.bundle import Bundle, load_bundle
+from lpac.sim.baselines import BaselineName
+from lpac.sim.experiment import Scenario, fly
 
 LPAC, LOSSY = "lpac", "lpac, 30 % loss"
 RIVAL: BaselineName = "decentralized-cvt"

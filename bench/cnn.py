@@ -16,8 +16,8 @@ from onnx import TensorProto, helper, shape_inference
 from bench.report import Table
 from bench.timing import interleaved, quartiles, with_quartiles
 from edge.core import F32
-from edge.runtime.bundle import CNN, Bundle
-from edge.runtime.policy import Policy
+from edge.policy.bundle import CNN, Bundle
+from edge.policy.lpac.graphs import Policy
 
 # Large enough for the peak, small enough for the second-level cache of a small core.
 _GEMM_SIZE = 512

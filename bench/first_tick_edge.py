@@ -4,14 +4,14 @@ import numpy as np
 
 from bench import BUNDLE
 from bench.first_tick import ENV_SCALE, NEIGHBOURS_M, POSITION_M, run
-from edge.adapters.idf_sensor import IdfSensor
 from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import encode
-from edge.runtime.bundle import load_bundle
-from edge.runtime.pac import Pac, PacParameters
-from edge.runtime.policy import Policy
+from edge.drivers.world_sensor import WorldSensor
+from edge.policy.bundle import load_bundle
+from edge.policy.lpac.graphs import Policy
+from edge.robot.pac import Pac, PacParameters
 
 
 class _Standing:
@@ -31,7 +31,7 @@ def main() -> None:
         robot_id=0,
         boot_epoch=1,
         policy=policy,
-        sensor=IdfSensor(importance, perception.sensor_size),
+        sensor=WorldSensor(importance, perception.sensor_size),
         odometry=_Standing(),
         parameters=PacParameters(scale=ModelScale(ENV_SCALE, 0.25), max_speed_m_s=1.25),
     )

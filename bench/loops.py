@@ -15,9 +15,9 @@ from typing import Any
 
 from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
-from edge.core.mission import LoopStatus, RobotStatus
-from sim.fleet import Fleet, FleetScenario
-from sim.fleet_flight import fly
+from edge.messages.mission import LoopStatus, RobotStatus
+from lpac.sim.fleet.flight import fly
+from lpac.sim.fleet.processes import Fleet, FleetScenario
 
 LOOPS = ("perception", "policy", "control")
 _FLEET = 10

@@ -5,17 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge.adapters.idf_sensor import IdfSensor
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.perception import Perception, RobotMap, neighbours_in_range, window_corner
 from edge.core.world import random_features, rasterize
-from edge.runtime.bundle import Manifest
-from edge.runtime.pac import Pac, PacParameters
-from edge.runtime.policy import Policy
-from sim.experiment import FIELD_SCALE
-from sim.medium import Medium
-from sim.swarm import Swarm
+from edge.drivers.world_sensor import WorldSensor
+from edge.policy.bundle import Manifest
+from edge.policy.lpac.graphs import Policy
+from edge.robot.pac import Pac, PacParameters
+from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.medium import Medium
+from lpac.sim.swarm import Swarm
 
 NEIGHBOURS = 10
 # So many that robots in the middle have ten neighbours.
@@ -98,7 +98,7 @@ def _seen_on(path: F64, importance: F32, manifest: Manifest) -> tuple[Perception
     assert parameters and images
     memory = Perception(parameters, len(images.channels), images.size)
     robot_map = RobotMap(parameters.world_size, parameters.unknown_importance)
-    sensor = IdfSensor(importance, parameters.sensor_size)
+    sensor = WorldSensor(importance, parameters.sensor_size)
     for position in path:
         view = sensor.view(position)
         memory.observe(position, view)

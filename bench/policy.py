@@ -19,9 +19,9 @@ from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_
 from edge.core import F32
 from edge.core.aggregation import HopBuffer
 from edge.core.wire import decode, encode
-from edge.runtime.bundle import ACTION, gnn_graph, load_bundle
-from edge.runtime.pac import position_feature
-from edge.runtime.policy import Policy
+from edge.policy.bundle import ACTION, gnn_graph, load_bundle
+from edge.policy.lpac.graphs import Policy
+from edge.robot.pac import position_feature
 
 EDGE, TRACED, EAGER = "lpac-edge", "torch traced", "torch + PyG eager"
 TOLERANCE = 1e-4

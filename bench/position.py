@@ -17,14 +17,14 @@ from rich.console import Console
 from rich.progress import track
 
 from bench.report import Report, Table, Target
-from edge.adapters.mavsdk_autopilot import RATES_HZ
-from edge.adapters.px4_telemetry import Px4Telemetry
-from edge.core.position import Judgement, PositionLimits, Quality, judge
-from sim.px4.errors import Errors
-from sim.px4.link import Px4Link
-from sim.px4.modes import Mode
-from sim.px4.server import STEP_S
-from sim.px4.vehicle import Airframe, Px4Vehicle, Setpoint
+from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
+from edge.drivers.px4.autopilot import RATES_HZ
+from edge.drivers.px4.telemetry import Px4Telemetry
+from lpac.sim.px4.errors import Errors
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.server import STEP_S
+from lpac.sim.px4.vehicle import Airframe, Px4Setpoint, Px4Vehicle
 
 # One look; and by when the vehicle flies at its height.
 TICK_S, READY_S = 0.1, 20.0
@@ -43,7 +43,7 @@ class Watched:
             airframe=Airframe(endurance_s=endurance_s),
             errors=Errors(seed, fleet_seed=seed),
         )
-        self.judgement = Judgement()
+        self.judgement = PositionJudgement()
         self.greatest_offset_m = 0.0
         self._rng = np.random.default_rng(seed)
         self._velocity_m_s = np.zeros(3)
@@ -71,13 +71,13 @@ class Watched:
             self._velocity_m_s[:2] = _SPEED_M_S * np.array([math.cos(bearing), math.sin(bearing)])
         height_m = -float(vehicle.local_position_m[2])
         self._velocity_m_s[2] = -min(_HEIGHT_M - height_m, 1.5)
-        vehicle.offboard(Setpoint(np.full(3, np.nan), self._velocity_m_s.copy()))
+        vehicle.offboard(Px4Setpoint(np.full(3, np.nan), self._velocity_m_s.copy()))
         if not vehicle.armed and vehicle.armable and now_s > READY_S / 2.0:
-            vehicle.set_mode(Mode.OFFBOARD)
+            vehicle.set_mode(Px4Mode.OFFBOARD)
             vehicle.arm()
 
 
-class _Flight(NamedTuple):
+class _WatchedFlight(NamedTuple):
     """One flight: its time in the air, s, and how often its position was doubted and lost."""
 
     flown_s: float
@@ -128,7 +128,7 @@ def measure(hours: float = 24.0, flight_s: float = 600.0) -> Report:
     return Report("position", figures, [table], targets)
 
 
-def _fly(seed: int, flight_s: float) -> _Flight:
+def _fly(seed: int, flight_s: float) -> _WatchedFlight:
     watched = Watched(seed, endurance_s=10.0 * flight_s)
     doubted: Counter[str] = Counter()
     lost, stopped_s, flown_s = 0, 0.0, 0.0
@@ -139,11 +139,17 @@ def _fly(seed: int, flight_s: float) -> _Flight:
         if watched.vehicle.time_s >= READY_S:
             assert watched.vehicle.armed, "the vehicle must fly"
             flown_s += TICK_S
-            stopped_s += TICK_S if judgement.quality is not Quality.GOOD else 0.0
-            if judgement.quality is Quality.DOUBTFUL and before.quality is Quality.GOOD:
+            stopped_s += TICK_S if judgement.quality is not PositionQuality.GOOD else 0.0
+            if (
+                judgement.quality is PositionQuality.DOUBTFUL
+                and before.quality is PositionQuality.GOOD
+            ):
                 doubted[str(judgement.cause)] += 1
-            lost += judgement.quality is Quality.LOST and before.quality is not Quality.LOST
-    return _Flight(flown_s, doubted, lost, stopped_s, watched.greatest_offset_m)
+            lost += (
+                judgement.quality is PositionQuality.LOST
+                and before.quality is not PositionQuality.LOST
+            )
+    return _WatchedFlight(flown_s, doubted, lost, stopped_s, watched.greatest_offset_m)
 
 
 def _ask_for_streams(link: Px4Link) -> None:

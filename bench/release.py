@@ -9,7 +9,7 @@ from urllib.parse import urljoin
 
 from bench import BUNDLE, ROOT
 from bench.report import Report, Table, Target, progress
-from fleet.image import measure as measure_image
+from lpac.fleet.image import measure as measure_image
 
 IMAGE = ROOT / "out" / "image" / "arm64"
 _INDEX = "https://pypi.org/simple/torch/"

@@ -13,8 +13,8 @@ from bench import BUNDLE
 from bench.memory import memory_mb
 from bench.report import Report, Table, Target, progress
 from edge.core.coverage import coverage_cost
-from edge.runtime.bundle import Bundle, load_bundle
-from sim.experiment import SAMPLE_S, Flight, Scenario, fly
+from edge.policy.bundle import Bundle, load_bundle
+from lpac.sim.experiment import SAMPLE_S, Scenario, SimulatedFlight, fly
 
 # Of training: ten robots and ten features in one world.
 _ROBOTS_PER_WORLD = 10
@@ -116,7 +116,7 @@ def _measure_flight(robots: int, duration_s: float, seed: int) -> dict[str, floa
     }
 
 
-def _cost_evaluation_s(flight: Flight) -> float:
+def _cost_evaluation_s(flight: SimulatedFlight) -> float:
     """What evaluating J took in the flight, but for the one at its start."""
     start_s = perf_counter()
     for time_s in flight.cost_time_s[1:]:

@@ -1,13 +1,13 @@
 """From a checkpoint and its parameters to a bundle."""
 
 import hashlib
-import tomllib
+from importlib.metadata import version
 from pathlib import Path
 
 import torch
 
 from edge.core.perception import MAP_CHANNELS
-from edge.runtime.bundle import (
+from edge.policy.bundle import (
     GOLDEN,
     SCHEMA_VERSION,
     Bundle,
@@ -16,7 +16,7 @@ from edge.runtime.bundle import (
     Provenance,
     make_bundle,
 )
-from edge.runtime.verify import TOLERANCE, verify
+from edge.policy.verify import TOLERANCE, verify
 from export.checkpoint import CheckpointError, read_checkpoint
 from export.golden import golden_vectors
 from export.graphs import OPSET, build_graphs
@@ -55,7 +55,7 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
             checkpoint_sha256=network.sha256,
             parameters=parameters.name,
             parameters_sha256=hashlib.sha256(parameters.read_bytes()).hexdigest(),
-            exporter=f"lpac-edge {_version()}",
+            exporter=f"lpac-edge {version('lpac-edge')}",
             torch=torch.__version__,
         ),
         files=dict.fromkeys(files, ""),  # make_bundle puts the hashes in
@@ -68,9 +68,3 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
                 f"{check.relative_error:.1e}, allowed is {TOLERANCE:g}"
             )
     return bundle
-
-
-def _version() -> str:
-    """This repository's version: export always runs from it, installed or not."""
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text("utf-8"))
-    return str(project["project"]["version"])

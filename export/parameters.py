@@ -7,7 +7,7 @@ from pathlib import Path
 
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
-from edge.runtime.bundle import Training
+from edge.policy.bundle import Training
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +33,13 @@ def read_parameters(path: Path) -> tuple[PerceptionParameters, Training]:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
     environment = document.get("Environment")
     if isinstance(environment, Mapping) and "Maps" in environment:
-        document = _from_coverage_control(_Reader(document, path))
+        document = _from_coverage_control(_TableReader(document, path))
     parameters = from_mapping(_Parameters, document, str(path))
     return parameters.perception, parameters.training
 
 
 @dataclass(frozen=True, slots=True)
-class _Reader:
+class _TableReader:
     """Single values of a TOML document; a missing one or one of another type is a ConfigError."""
 
     document: Mapping[str, object]
@@ -67,7 +67,7 @@ class _Reader:
         return float(value)
 
 
-def _from_coverage_control(reader: _Reader) -> dict[str, object]:
+def _from_coverage_control(reader: _TableReader) -> dict[str, object]:
     """CoverageControl's names and units in our file's form."""
     maps, idf, robot = "Environment.Maps", "Environment.IDF", "RobotModel"
     resolution = reader.number(maps, "Resolution")

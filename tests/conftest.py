@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from edge.runtime.bundle import Bundle, load_bundle
-from edge.runtime.policy import Policy
+from edge.policy.bundle import Bundle, load_bundle
+from edge.policy.lpac.graphs import Policy
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"

@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from edge.core.mission import FlightState, Origin, RobotStatus
 from edge.core.world import format_world, random_features
-from edge.runtime.config import RobotConfig, load_config
-from sim.operator import Operator
-from sim.ports import free_ports
-from sim.px4.link import Px4Link
-from sim.px4.server import Instance, Px4Server
-from sim.px4.vehicle import Px4Vehicle
-from sim.px4.world import WorldOrigin
+from edge.messages.mission import FlightState, Origin, RobotStatus
+from edge.robot.config import RobotConfig, load_config
+from lpac.sim.operator import Operator
+from lpac.sim.ports import free_ports
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.px4.world import WorldOrigin
 from tests.conftest import ROOT, SHIPPED
 
 SYSTEM_ID = 7
@@ -142,9 +142,9 @@ class Rig:
         self.wait(lambda status: status.ready or status.state is FlightState.HOLD)
         held_up = self.status.reason.startswith("control was silent")
         if held_up:
-            self.operator.calm("land")
+            self.operator.safety_action("land")
             self.wait_for_state(FlightState.LANDED)
-            self.operator.calm("none")
+            self.operator.safety_action("none")
         if held_up or self.status.ready:
             self.take_off()
 
@@ -212,7 +212,7 @@ def lpac_robot(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "cli.main", "robot", *arguments]
+    return [sys.executable, "-m", "lpac.cli.main", "robot", *arguments]
 
 
 def environment() -> dict[str, str]:

@@ -9,35 +9,44 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-OURS = ("edge", "export", "sim", "ground", "fleet", "cli")
+OURS = ("edge", "export", "lpac")
 
+_EDGE = {"edge.core", "edge.messages", "edge.flight", "edge.policy", "edge.robot", "edge.drivers"}
 # Part -> the parts of the project that it may import (besides itself).
 ALLOWED = {
     "edge.core": set(),
-    "edge.runtime": {"edge.core"},
-    "edge.adapters": {"edge.core"},
-    "edge.robot": {"edge.core", "edge.runtime", "edge.adapters"},
-    "export": {"edge.core", "edge.runtime", "edge.adapters", "edge.robot"},
-    "sim": {"edge.core", "edge.runtime", "edge.adapters", "edge.robot"},
-    "ground": {"edge.core", "edge.runtime", "edge.adapters", "edge.robot"},
-    "fleet": {"edge.core", "edge.runtime", "edge.adapters", "edge.robot"},
-    "cli": {*OURS, "edge.core", "edge.runtime", "edge.adapters", "edge.robot"},
-}
+    "edge.messages": {"edge.core"},
+    "edge.flight": {"edge.core", "edge.messages"},
+    "edge.policy": {"edge.core", "edge.messages"},
+    "edge.drivers": {"edge.core", "edge.messages"},
+    "edge.robot": {"edge.core", "edge.messages", "edge.flight", "edge.policy"},
+    "edge.robot.process": _EDGE,
+    "export": {"edge.core", "edge.policy"},
+    "lpac.shipped": set(),
+    "lpac.analysis": _EDGE,
+    "lpac.ground": {*_EDGE, "lpac.analysis"},
+    "lpac.fleet": {*_EDGE, "lpac.shipped"},
+    "lpac.sim": {*_EDGE, "lpac.analysis", "lpac.ground"},
+    "lpac.cli": {
+        *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
+        "lpac.ground", "lpac.sim", "lpac.fleet",
+    },
+}  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
 ONLY_IN = {
-    "onnxruntime": {"edge/runtime/policy.py"},
+    "onnxruntime": {"edge/policy/lpac/graphs.py"},
     "torch": {"export/"},
     "onnx": {"export/"},
-    "matplotlib": {"sim/", "ground/"},
-    "mavsdk": {"edge/adapters/"},
-    "zenoh": {"edge/adapters/"},
-    "mcap": {"edge/adapters/"},
-    "pymavlink": {"sim/"},
-    "typer": {"cli/"},
-    "rich": {"cli/", "ground/watch"},
-    "textual": {"ground/watch"},
-    "aiohttp": {"ground/live_map"},
-    "tomlkit": {"fleet/"},
+    "matplotlib": {"lpac/sim/", "lpac/analysis/"},
+    "mavsdk": {"edge/drivers/"},
+    "zenoh": {"edge/drivers/"},
+    "mcap": {"edge/drivers/"},
+    "pymavlink": {"lpac/sim/"},
+    "typer": {"lpac/cli/"},
+    "rich": {"lpac/cli/", "lpac/ground/terminal/"},
+    "textual": {"lpac/ground/terminal/"},
+    "aiohttp": {"lpac/ground/map/"},
+    "tomlkit": {"lpac/fleet/"},
 }
 # The core has no clock, thread, file or socket (the mailbox has a lock, for its callers' threads).
 IMPURE = {
@@ -47,8 +56,9 @@ IMPURE = {
 
 
 def part_of(module: str) -> str:
-    head = ".".join(module.split(".")[:2])
-    return head if head in ALLOWED else module.split(".", maxsplit=1)[0]
+    names = module.split(".")
+    parts = (".".join(names[:n]) for n in range(len(names), 0, -1))
+    return next((part for part in parts if part in ALLOWED), names[0])
 
 
 def imports(path: Path, *, only_top_level: bool = False) -> Iterator[str]:
@@ -70,7 +80,7 @@ def test_imports_point_one_way(path: Path) -> None:
     name = path.relative_to(ROOT)
     own = part_of(".".join(name.with_suffix("").parts))
     for module in imports(path):
-        if module.split(".")[0] in OURS and module not in ("edge",):
+        if module.split(".")[0] in OURS and module not in ("edge", "lpac"):
             part = part_of(module)
             assert part == own or part in ALLOWED.get(own, set()), f"{name} imports {module}"
         for package, places in ONLY_IN.items():
@@ -82,10 +92,12 @@ def test_imports_point_one_way(path: Path) -> None:
             assert module.split(".")[0] not in IMPURE, f"{name} imports {module}"
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "cli").glob("*.py")), ids=lambda p: p.name)
+@pytest.mark.parametrize("path", sorted((ROOT / "lpac" / "cli").glob("*.py")), ids=lambda p: p.name)
 def test_cli_imports_its_parts_only_when_a_command_runs(path: Path) -> None:
-    top = {module.split(".")[0] for module in imports(path, only_top_level=True)}
-    assert top.isdisjoint({*OURS, "numpy", "rich"} - {"cli"})
+    for module in imports(path, only_top_level=True):
+        assert part_of(module) in ("lpac", "lpac.cli", "lpac.shipped") or module.split(".")[
+            0
+        ] not in {*OURS, "numpy", "rich"}, module
 
 
 def test_robot_process_loads_no_workstation_package() -> None:
@@ -93,12 +105,12 @@ def test_robot_process_loads_no_workstation_package() -> None:
     code = """
 import sys
 sys.argv = ["lpac", "bundle", "verify", "policies/lpac_l2_k3_n10_512"]
-import cli.main, edge.runtime.pac
+import lpac.cli.main, edge.robot.pac
 try:
-    cli.main.main()
+    lpac.cli.main.main()
 except SystemExit as stop:
     assert not stop.code, stop.code
-print(sorted({name.split(".")[0] for name in sys.modules}))
+print(sorted({name if name.startswith("lpac.") else name.split(".")[0] for name in sys.modules}))
 """
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
@@ -106,5 +118,5 @@ print(sorted({name.split(".")[0] for name in sys.modules}))
     loaded = set(ast.literal_eval(result.stdout.splitlines()[-1]))
     assert "onnxruntime" in loaded
     assert loaded.isdisjoint(
-        {"torch", "torch_geometric", "onnx", "matplotlib", "export", "sim", "ground"}
+        {"torch", "torch_geometric", "onnx", "matplotlib", "export", "lpac.sim", "lpac.ground"}
     )

@@ -1,4 +1,4 @@
-"""What a robot installs: the runtime and the command, nothing of the workstation's parts."""
+"""What is installed: everything, below three import names; and what a robot needs for it."""
 
 import re
 import subprocess
@@ -7,15 +7,24 @@ import tomllib
 import zipfile
 from pathlib import Path
 
-from tests.conftest import ROOT
+from tests.conftest import ROOT, SHIPPED
 
 
-def test_the_wheel_holds_the_robots_parts_only(tmp_path: Path) -> None:
+def test_the_wheel_holds_everything_below_three_names(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*command, "-w", tmp_path, ROOT], check=True, cwd=tmp_path)
     (wheel,) = tmp_path.glob("lpac_edge-*.whl")
-    folders = {Path(name).parts[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {folder for folder in folders if not folder.endswith(".dist-info")} == {"edge", "cli"}
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert {name.split("/")[0] for name in names} == {"edge", "export", "lpac"}
+    made = {path for part in ("edge", "export", "lpac") for path in (ROOT / part).rglob("*")}
+    for path in made:
+        if path.is_file() and "__pycache__" not in path.parts:
+            assert str(path.relative_to(ROOT)) in names
+    shipped = {name.removeprefix("lpac/_shipped/") for name in names if "/_shipped/" in name}
+    assert shipped == {
+        *(str(path.relative_to(ROOT)) for path in SHIPPED.iterdir()),
+        *(f"systemd/{path.name}" for path in (ROOT / "systemd").iterdir()),
+    }
 
 
 def test_a_robot_installs_nothing_that_it_does_not_need() -> None:

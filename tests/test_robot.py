@@ -17,15 +17,15 @@ import numpy as np
 import onnx
 import pytest
 
-from edge.adapters.flight_log import read as read_log
-from edge.adapters.zenoh_link import ZenohLink
-from edge.core.failsafe import PARAMETERS
-from edge.core.mission import FlightState, Place, explored_from_bytes, world_id
-from edge.core.safety import Fence
+from edge.core.fence import Fence
 from edge.core.world import format_world, random_features
-from edge.runtime.bundle import Bundle, make_bundle, write_bundle
-from sim.operator import Operator
-from sim.px4.modes import Mode
+from edge.drivers.flight_log import read as read_log
+from edge.drivers.zenoh_link import ZenohLink
+from edge.flight.failsafe import PARAMETERS
+from edge.messages.mission import FlightState, Place, explored_from_bytes, world_id
+from edge.policy.bundle import Bundle, make_bundle, write_bundle
+from lpac.sim.operator import Operator
+from lpac.sim.px4.modes import Px4Mode
 from tests.robot_rig import (
     ORIGIN,
     Changes,
@@ -59,25 +59,25 @@ def test_a_day_of_one_robot(tmp_path: Path) -> None:
                 f"{first.process.pid} on this machine: stop that first"
             )
             fly_a_mission(made, "a")
-            made.operator.calm("land")
+            made.operator.safety_action("land")
             made.wait_for_state(FlightState.LANDED)
             assert not vehicle.armed
 
-            made.operator.calm("none")
+            made.operator.safety_action("none")
             made.take_off()
             fly_a_mission(made, "b")
             assert first.end(signal.SIGTERM) == 0
-        assert made.vehicle_is(lambda v: v.mode is Mode.HOLD and horizontal_speed_m_s(v) < 0.2)
+        assert made.vehicle_is(lambda v: v.mode is Px4Mode.HOLD and horizontal_speed_m_s(v) < 0.2)
         assert vehicle.armed
 
         with program(made) as again:
             made.wait(lambda status: status.state is FlightState.PILOT and status.uptime_s > 3.0)
-            assert vehicle.mode is Mode.HOLD
+            assert vehicle.mode is Px4Mode.HOLD
             assert any("already armed" in alarm for alarm in made.status.alarms)
             made.order("rejoin")
             made.wait_for_state(FlightState.HOLD)
-            assert made.vehicle_is(lambda v: v.mode is Mode.OFFBOARD)
-            made.operator.calm("land")
+            assert made.vehicle_is(lambda v: v.mode is Px4Mode.OFFBOARD)
+            made.operator.safety_action("land")
             made.wait_for_state(FlightState.LANDED)
             assert again.end(signal.SIGINT) == 0
     look_into_the_logs(tmp_path / "logs")
@@ -90,9 +90,9 @@ def fly_a_mission(made: Rig, trial: str) -> None:
     assert made.vehicle_is(lambda v: horizontal_speed_m_s(v) > 0.3)
     assert all(loop.failures == 0 for loop in made.status.loops.values())
     assert made.status.message_counts["accepted"] == 0
-    made.operator.calm("hold")
+    made.operator.safety_action("hold")
     made.wait_for_state(FlightState.HOLD)
-    made.operator.calm("none")
+    made.operator.safety_action("none")
     made.order("start", trial)
     made.wait_for_state(FlightState.MISSION)
 
@@ -128,12 +128,12 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
         wait_until(lambda: explored[-1] > 1.3 * ONE_LOOK)
         assert made.refusal("disarm") == "in the air: land it first"
         made.order("pilot")
-        assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+        assert made.vehicle_is(lambda v: v.mode is Px4Mode.HOLD)
         pilot = FlightState.PILOT, "given to a pilot"
         made.wait(lambda status: (status.state, status.reason) == pilot)
         made.order("rejoin")
         made.wait_for_state(FlightState.HOLD)
-        made.operator.calm("land")
+        made.operator.safety_action("land")
         made.wait_for_state(FlightState.LANDED)
         assert explored[-1] > 1.3 * ONE_LOOK
         made.order("reset", "b")
@@ -292,14 +292,14 @@ def test_a_vehicle_that_does_not_answer_holds_up_neither_status_nor_end(tmp_path
 
 HANGING = """
 import pathlib, sys, time
-from edge.runtime.control import FlightControl
+from edge.robot.control import FlightControl
 tick = FlightControl.tick
 def hang(self, now_s):
     while pathlib.Path(sys.argv[-1]).with_name("hang").exists():
         time.sleep(0.1)
     return tick(self, now_s)
 FlightControl.tick = hang
-import cli.main
+import lpac.cli.main
 cli.main.main()
 """
 
@@ -342,7 +342,7 @@ def test_a_control_loop_that_hangs_in_flight_lets_the_vehicle_hold_and_the_progr
             made.take_off()
             fly_a_mission(made, "a")
             (tmp_path / "hang").touch()
-            assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+            assert made.vehicle_is(lambda v: v.mode is Px4Mode.HOLD)
             # A busy machine may have held up the loop for a moment on the ground.
             status, *others = news(
                 systemd, lambda told: "WATCHDOG=1" not in told and described(told[0])["armed"]
@@ -351,7 +351,7 @@ def test_a_control_loop_that_hangs_in_flight_lets_the_vehicle_hold_and_the_progr
             assert hanging.end(signal.SIGTERM) == 0
             news(systemd, lambda told: told == ["STOPPING=1"])
         assert vehicle.armed
-        assert vehicle.mode is Mode.HOLD
+        assert vehicle.mode is Px4Mode.HOLD
 
 
 def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_hold_and_lands_it(
@@ -362,7 +362,7 @@ def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_ho
         with program(made) as hanging:
             made.take_off()
             hanging.process.send_signal(signal.SIGSTOP)
-            assert made.vehicle_is(lambda v: v.mode is Mode.HOLD)
+            assert made.vehicle_is(lambda v: v.mode is Px4Mode.HOLD)
             # As systemd does it.
             for number in (signal.SIGABRT, signal.SIGCONT):
                 hanging.process.send_signal(number)
@@ -377,7 +377,7 @@ def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_ho
                 )
             )
             assert vehicle.armed
-            assert vehicle.mode is Mode.HOLD
+            assert vehicle.mode is Px4Mode.HOLD
             assert horizontal_speed_m_s(vehicle) < 0.2
             # Nobody answers.
             made.wait(lambda status: status.reason == "nobody answered for 12 s")
@@ -390,11 +390,11 @@ def test_ended_in_flight_it_lands_if_configured_to(tmp_path: Path) -> None:
         with program(made) as flying:
             made.take_off()
             assert flying.end(signal.SIGTERM) == 0
-        assert vehicle.mode is Mode.LAND
+        assert vehicle.mode is Px4Mode.LAND
         ended_s = vehicle.time_s
         assert made.vehicle_is(lambda v: not v.armed)
         # The watchdog has not interrupted it.
-        assert Mode.HOLD not in {truth.mode for truth in vehicle.truth if truth.time_s > ended_s}
+        assert Px4Mode.HOLD not in {truth.mode for truth in vehicle.truth if truth.time_s > ended_s}
 
 
 def test_a_robot_with_an_altered_policy_says_so_and_does_not_arm(

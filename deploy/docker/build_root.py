@@ -107,7 +107,7 @@ def fetch(architecture: str, folder: Path) -> None:
 
 
 def assemble(architecture: str, fetched: Path, root: Path) -> None:
-    """The tree of what was fetched, and of edge and cli, in the new folder `root`."""
+    """The tree of what was fetched, and of edge and the command, in the new folder `root`."""
     root.mkdir()
     locked = read_debian_lock(DEBIAN_LOCK, architecture)
     for deb in sorted((fetched / "debian").iterdir()):

@@ -18,7 +18,7 @@ folder=out/image/$arch
 
 inputs=$({
     echo "$base"
-    find deploy/docker edge cli pyproject.toml README.md LICENSE -type f \
+    find deploy/docker edge lpac/*.py lpac/cli pyproject.toml README.md LICENSE -type f \
         -not -path '*/__pycache__/*' -not -name lock_debian.py -print0 |
         sort -z | xargs -0 sha256sum
 } | sha256sum)

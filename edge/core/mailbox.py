@@ -34,7 +34,7 @@ class _Received(NamedTuple):
     born_s: float
 
 
-class _Heard(NamedTuple):
+class _LastHeard(NamedTuple):
     boot_epoch: int
     sequence: int
     at_s: float
@@ -71,7 +71,7 @@ class Mailbox:
         self._received: dict[int, _Received] = {}
         self._handed_out: dict[int, _Received] = {}  # the paper's rule only
         # Outlives the messages: a late duplicate must not pass for news.
-        self._heard: dict[int, _Heard] = {}
+        self._heard: dict[int, _LastHeard] = {}
         self._accepted: Counter[int] = Counter()
         self._counts: Counter[str] = Counter(
             dict.fromkeys(["accepted", *(reason.value for reason in Rejection)], 0)
@@ -97,7 +97,7 @@ class Mailbox:
             born_s = now_s - max(delay_s, 0.0)
             rejection = self._rejection(message, born_s, now_s)
             if rejection is None:
-                self._heard[sender] = _Heard(
+                self._heard[sender] = _LastHeard(
                     message.boot_epoch, message.sequence, now_s, shortest_s
                 )
                 self._received[sender] = _Received(message, born_s)
@@ -150,7 +150,7 @@ class Mailbox:
             self._received = {}
             self._handed_out = {}
 
-    def _silent(self, heard: _Heard, now_s: float) -> bool:
+    def _silent(self, heard: _LastHeard, now_s: float) -> bool:
         return now_s - heard.at_s > self._restart_silence_s
 
     def _is_fresh(self, born_s: float, now_s: float) -> bool:

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from edge.core import F32, F64
-from edge.core.mission import EXPLORED_CELLS, Bools
+from edge.core import F32, F64, Bools
 
 # The images by number of channels, in the order in which CoverageControl stacks them.
 MAP_CHANNELS = {
@@ -22,6 +21,8 @@ MAP_CHANNELS = {
     4: ("importance", "neighbours_x", "neighbours_y", "obstacles"),
 }
 
+# What a robot has explored is told in this many cells along each side of the world.
+EXPLORED_CELLS = 64
 TILE_SIZE = 128
 MAX_WORLD_SIZE = 2**15  # whose raster takes 4 GiB
 

@@ -1,8 +1,8 @@
 """Whether the robot may trust its position: one judgement for preflight, flight and status.
 
-What is heard of the vehicle -> what speaks against its position (`Cause`) -> `Quality`, with
-hysteresis: one glitch must not land a drone, and nothing may be flown blind. Nothing here has a
-clock.
+What is heard of the vehicle -> what speaks against its position (`PositionCause`) ->
+`PositionQuality`, with hysteresis: one glitch must not land a drone, and nothing may be flown
+blind. Nothing here has a clock.
 
 What one receiver cannot notice, such as a bias that walks, is margin: see docs/safety.md.
 """
@@ -34,7 +34,7 @@ _CLEAR_S = 0.5
 _HOPELESS = 2.0
 
 
-class Quality(StrEnum):
+class PositionQuality(StrEnum):
     """GOOD: fly by it. DOUBTFUL: stay where you are. LOST: land."""
 
     GOOD = "good"
@@ -42,7 +42,7 @@ class Quality(StrEnum):
     LOST = "lost"
 
 
-class Cause(StrEnum):
+class PositionCause(StrEnum):
     """What speaks against a position, the gravest first."""
 
     UNKNOWN = "unknown"
@@ -59,17 +59,17 @@ class Cause(StrEnum):
 
 
 _WORDS = {
-    Cause.UNKNOWN: "it is not known",
-    Cause.OLD: "it does not come any more",
-    Cause.FROZEN: "it stands still, as no estimate does",
-    Cause.GPS_SILENT: "nothing new comes from the GPS receiver",
-    Cause.NO_FIX: "GPS has no fix",
-    Cause.NOT_ESTIMATED: "the autopilot's estimator does not vouch for it",
-    Cause.INACCURATE: "GPS is accurate to {value:.1f} m only",
-    Cause.DISAGREES: "the GPS fix is {value:.1f} m away from the estimate",
-    Cause.GLITCH: "the autopilot's estimator takes the GPS for wrong",
-    Cause.JUMPED: "it jumped",
-    Cause.FEW_SATELLITES: "GPS sees {value:.0f} satellites only",
+    PositionCause.UNKNOWN: "it is not known",
+    PositionCause.OLD: "it does not come any more",
+    PositionCause.FROZEN: "it stands still, as no estimate does",
+    PositionCause.GPS_SILENT: "nothing new comes from the GPS receiver",
+    PositionCause.NO_FIX: "GPS has no fix",
+    PositionCause.NOT_ESTIMATED: "the autopilot's estimator does not vouch for it",
+    PositionCause.INACCURATE: "GPS is accurate to {value:.1f} m only",
+    PositionCause.DISAGREES: "the GPS fix is {value:.1f} m away from the estimate",
+    PositionCause.GLITCH: "the autopilot's estimator takes the GPS for wrong",
+    PositionCause.JUMPED: "it jumped",
+    PositionCause.FEW_SATELLITES: "GPS sees {value:.0f} satellites only",
 }
 
 
@@ -112,7 +112,7 @@ class PositionLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class PositionJudgement:
     """What the position is worth, since `since_s`; `cause` is what speaks against it now, or spoke.
 
     `value` is what was measured where the cause has a number. From `bad_since_s` on something
@@ -120,8 +120,8 @@ class Judgement:
     `good_since_s` on nothing spoke against it; None if it is not so now.
     """
 
-    quality: Quality = Quality.LOST
-    cause: Cause | None = Cause.UNKNOWN
+    quality: PositionQuality = PositionQuality.LOST
+    cause: PositionCause | None = PositionCause.UNKNOWN
     value: float = math.nan
     since_s: float = -math.inf
     bad_since_s: float | None = None
@@ -137,15 +137,15 @@ class Judgement:
 
 
 class _Finding(NamedTuple):
-    cause: Cause
+    cause: PositionCause
     is_none: bool
     since_s: float
     value: float = math.nan
 
 
 def judge(
-    before: Judgement, vehicle: VehicleState, limits: PositionLimits, now_s: float
-) -> Judgement:
+    before: PositionJudgement, vehicle: VehicleState, limits: PositionLimits, now_s: float
+) -> PositionJudgement:
     """What the position is worth now. To be called a few times a second."""
     looked_from_s = before.looked_from_s
     if not now_s - before.looked_at_s <= _NOT_LOOKED_S:
@@ -164,22 +164,22 @@ def judge(
     if findings:
         bad_since_s = _since(bad_since_s, findings, looked_from_s)
     quality = before.quality
-    doubtful_s = now_s - before.since_s if quality is Quality.DOUBTFUL else 0.0
+    doubtful_s = now_s - before.since_s if quality is PositionQuality.DOUBTFUL else 0.0
     if (
         none_since_s is not None and now_s - none_since_s >= limits.lost_after_s
     ) or doubtful_s >= limits.doubtful_lost_after_s:
-        quality = Quality.LOST
+        quality = PositionQuality.LOST
     elif findings and bad_since_s is not None and now_s - bad_since_s >= limits.doubtful_after_s:
-        quality = Quality.DOUBTFUL if quality is Quality.GOOD else quality
+        quality = PositionQuality.DOUBTFUL if quality is PositionQuality.GOOD else quality
     elif good_since_s is not None and now_s - good_since_s >= limits.good_after_s:
-        quality = Quality.GOOD
+        quality = PositionQuality.GOOD
     if findings:
         cause, value = findings[0].cause, findings[0].value
-    elif quality is Quality.GOOD:
+    elif quality is PositionQuality.GOOD:
         cause, value = None, math.nan
     else:
         cause, value = before.cause, before.value
-    return Judgement(
+    return PositionJudgement(
         quality=quality,
         cause=cause,
         value=value,
@@ -204,32 +204,34 @@ def _since(
 def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> Iterator[_Finding]:
     """All that speaks against the position now, the gravest first."""
     if vehicle.position_local_m is None or vehicle.origin is None:
-        yield _Finding(Cause.UNKNOWN, True, now_s)
+        yield _Finding(PositionCause.UNKNOWN, True, now_s)
     elif now_s - vehicle.position_at_s > _POSITION_OLD_S:
         # Nothing is known of the vehicle since: that counts from the last word of it.
-        yield _Finding(Cause.OLD, True, vehicle.position_at_s)
+        yield _Finding(PositionCause.OLD, True, vehicle.position_at_s)
     elif now_s - vehicle.position_changed_at_s > _FROZEN_S:
-        yield _Finding(Cause.FROZEN, True, vehicle.position_changed_at_s + _FROZEN_S)
+        yield _Finding(PositionCause.FROZEN, True, vehicle.position_changed_at_s + _FROZEN_S)
     gps = vehicle.gps
     if gps is None or now_s - gps.at_s > _GPS_SILENT_S:
         # From when it was noticed: a pause of the receiver must not land a drone at once.
-        yield _Finding(Cause.GPS_SILENT, True, now_s if gps is None else gps.at_s + _GPS_SILENT_S)
+        yield _Finding(
+            PositionCause.GPS_SILENT, True, now_s if gps is None else gps.at_s + _GPS_SILENT_S
+        )
     elif gps.fix < _FIX_3D:
-        yield _Finding(Cause.NO_FIX, True, now_s)
+        yield _Finding(PositionCause.NO_FIX, True, now_s)
     estimator = vehicle.estimator
     known = estimator is not None and now_s - estimator.at_s <= _ESTIMATOR_HEARD_S
     if estimator is not None and known and not estimator.horizontal:
-        yield _Finding(Cause.NOT_ESTIMATED, True, now_s)
+        yield _Finding(PositionCause.NOT_ESTIMATED, True, now_s)
     if gps is not None and gps.fix >= _FIX_3D:
         accuracy_m, offset_m = gps.accuracy_m, gps.offset_m
         if accuracy_m is not None and not accuracy_m <= limits.max_accuracy_m:
             hopeless = not accuracy_m <= _HOPELESS * limits.max_accuracy_m
-            yield _Finding(Cause.INACCURATE, hopeless, now_s, accuracy_m)
+            yield _Finding(PositionCause.INACCURATE, hopeless, now_s, accuracy_m)
         if offset_m is not None and not offset_m <= limits.max_offset_m:
-            yield _Finding(Cause.DISAGREES, False, now_s, offset_m)
+            yield _Finding(PositionCause.DISAGREES, False, now_s, offset_m)
     if estimator is not None and known and estimator.glitch:
-        yield _Finding(Cause.GLITCH, False, now_s)
+        yield _Finding(PositionCause.GLITCH, False, now_s)
     if now_s - vehicle.jumped_at_s <= _JUMP_S:
-        yield _Finding(Cause.JUMPED, False, vehicle.jumped_at_s)
+        yield _Finding(PositionCause.JUMPED, False, vehicle.jumped_at_s)
     if gps is not None and gps.fix >= _FIX_3D and gps.satellites < limits.min_satellites:
-        yield _Finding(Cause.FEW_SATELLITES, False, now_s, gps.satellites)
+        yield _Finding(PositionCause.FEW_SATELLITES, False, now_s, gps.satellites)

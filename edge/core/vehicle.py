@@ -79,7 +79,7 @@ class Gps:
     at_s: float = float("-inf")
 
 
-class Estimator(NamedTuple):
+class EstimatorStatus(NamedTuple):
     """What the autopilot's estimator says of itself.
 
     `horizontal` is whether it vouches for a position and a velocity in the plane, `glitch` whether
@@ -139,7 +139,7 @@ class VehicleState:
     battery: float | None = None
     voltage_v: float | None = None
     gps: Gps | None = None
-    estimator: Estimator | None = None
+    estimator: EstimatorStatus | None = None
     armable: bool | None = None
     problems: tuple[Reason, ...] = ()
     warnings: tuple[Reason, ...] = ()

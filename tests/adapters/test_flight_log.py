@@ -22,7 +22,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 
-from edge.adapters.flight_log import (
+from edge.core.fence import Fence
+from edge.core.vehicle import Action, ActionResult, GlobalOrigin, VehicleState, Velocity
+from edge.drivers.flight_log import (
     FlightLog,
     FlightLogError,
     FlightMetadata,
@@ -30,16 +32,15 @@ from edge.adapters.flight_log import (
     read_metadata,
     topic,
 )
-from edge.core.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
-from edge.core.safety import Fence
-from edge.core.vehicle import Action, ActionResult, GlobalOrigin, VehicleState, Velocity
+from edge.messages.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
 from tests.conftest import ROOT
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", '{"robot": {"id": 3}}', "0.1.0")
 NOW = 1.7e9
 STATE = GroundState(
     sequence=1, operator="ann", origin=Origin(47.0, 8.0, 0.0), robot_enabled={"3": True},
-    robot_calm={"3": "hold"}, fence=Fence(((0.0, 0.0), (9.0, 0.0), (9.0, 9.0)), 0.5, 1.0, 9.0),
+    robot_safety_actions={"3": "hold"}, fence=Fence(((0.0, 0.0), (9.0, 0.0), (9.0, 9.0)), 0.5,
+    1.0, 9.0),
     places={"3": Place(1, (1.0, 2.0))}, world_id="abc",
 )  # fmt: skip
 NOISE = np.random.default_rng(0).integers(0, 256, 50_000, np.uint8)  # does not compress
@@ -301,7 +302,7 @@ def test_a_file_that_ends_in_rubbish_is_read_up_to_there(tmp_path: Path) -> None
 CHILD = """
 import sys
 from pathlib import Path
-from edge.adapters.flight_log import FlightLog
+from edge.drivers.flight_log import FlightLog
 from tests.adapters.test_flight_log import METADATA, NOISE
 
 log = FlightLog(Path(sys.argv[1]), METADATA, sync_period_s=0)
@@ -417,7 +418,7 @@ def test_a_full_disk_stops_the_log_and_nothing_else(
     code = """
 import resource, sys
 from pathlib import Path
-from edge.adapters.flight_log import FlightLog
+from edge.drivers.flight_log import FlightLog
 from tests.adapters.test_flight_log import METADATA, NOISE
 
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))

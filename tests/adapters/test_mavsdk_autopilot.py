@@ -16,16 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
-from edge.adapters.mavsdk_autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
-from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
-from sim.ports import free_ports
-from sim.px4.link import Px4Link
-from sim.px4.modes import CUSTOM_MODES, Result
-from sim.px4.modes import Mode as Px4Mode
-from sim.px4.server import Instance, Px4Server
-from sim.px4.vehicle import Px4Vehicle
-from sim.px4.vehicle import Setpoint as Px4Setpoint
+from edge.drivers.px4.autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
+from edge.drivers.px4.telemetry import Px4Telemetry
+from lpac.sim.ports import free_ports
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import CUSTOM_MODES, MavResult, Px4Mode
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 
 ROOT = Path(__file__).parents[2]
 CLIMB = Velocity((0.0, 0.0, -2.0))
@@ -37,8 +35,8 @@ NORTH = Velocity((1.0, 0.0, 0.0))
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """No command is given up because this machine is slow."""
     patient = {action: command._replace(wait_s=60.0) for action, command in _COMMANDS.items()}
-    monkeypatch.setattr("edge.adapters.mavsdk_autopilot._COMMANDS", patient)
-    monkeypatch.setattr("edge.adapters.mavsdk_autopilot._STALE_COMMAND_S", 60.0)
+    monkeypatch.setattr("edge.drivers.px4.autopilot._COMMANDS", patient)
+    monkeypatch.setattr("edge.drivers.px4.autopilot._STALE_COMMAND_S", 60.0)
 
 
 def new_vehicle(seed: int = 1, **parameters: float) -> Px4Vehicle:
@@ -462,7 +460,7 @@ def test_an_unanswered_arm_is_sent_once(monkeypatch: pytest.MonkeyPatch) -> None
         armings: list[float] = []
         arm = vehicle.arm
 
-        def counted(*, force: bool = False) -> Result:
+        def counted(*, force: bool = False) -> MavResult:
             armings.append(vehicle.time_s)
             return arm(force=force)
 
@@ -528,7 +526,7 @@ def test_an_impossible_url_is_named() -> None:
 PILOT_PROGRAM = """
 import ctypes, logging, sys, time
 import structlog
-from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
+from edge.drivers.px4.autopilot import MavsdkAutopilot
 from edge.core.vehicle import Action, Mode, Velocity
 
 structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
@@ -605,7 +603,7 @@ def test_a_program_that_stands_still_stops_the_vehicle() -> None:
 def test_the_interpreter_exits_without_a_close(with_vehicle: bool) -> None:
     code = """
 import sys, time
-from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
+from edge.drivers.px4.autopilot import MavsdkAutopilot
 with MavsdkAutopilot(f"udpin://127.0.0.1:{sys.argv[1]}") as autopilot:
     while sys.argv[2] == "True" and not autopilot.state().connected:
         time.sleep(0.02)

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.adapters.px4_events import _WORDS, Px4Events, event_id, to_reason
-from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core.vehicle import Mode, VehicleState
+from edge.drivers.px4.events import _WORDS, Px4Events, event_id, to_reason
+from edge.drivers.px4.telemetry import Px4Telemetry
 from tests.px4_recordings import RECORDINGS, Recorded, recorded
 
 BEGIN_S = 100.0

@@ -2,9 +2,9 @@
 
 import re
 
-from edge.adapters.px4_telemetry import Px4Telemetry
-from edge.core.failsafe import PARAMETERS
 from edge.core.px4_version import EVIDENCE, OLDEST
+from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.flight.failsafe import PARAMETERS
 from tests.conftest import ROOT
 
 TEXT = (ROOT / "docs" / "px4.md").read_text()

@@ -5,18 +5,24 @@ from typing import NamedTuple
 
 import pytest
 
-from edge.adapters.px4_telemetry import Px4Telemetry
-from edge.core.flight import Flight, FlightInputs, step
-from edge.core.mission import FlightState
-from edge.core.position import Cause, Judgement, PositionLimits, Quality, judge
+from edge.core.position import (
+    PositionCause,
+    PositionJudgement,
+    PositionLimits,
+    PositionQuality,
+    judge,
+)
 from edge.core.vehicle import Action, Mode, VehicleState
-from edge.runtime.config import load_config
+from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.flight.flight import FlightInputs, FlightMemory, step
+from edge.messages.mission import FlightState
+from edge.robot.config import load_config
 from tests.conftest import ROOT
 from tests.px4_recordings import RECORDINGS, recorded
 
 TICK_S = 0.1
 
-_Q, _M = Quality, Mode
+_Q, _M = PositionQuality, Mode
 
 
 class Conclusion(NamedTuple):
@@ -24,12 +30,12 @@ class Conclusion(NamedTuple):
 
     time_s: float
     vehicle: VehicleState
-    judgement: Judgement
+    judgement: PositionJudgement
 
 
 def conclusions(name: str) -> list[Conclusion]:
     """One ten times a second."""
-    telemetry, judgement = Px4Telemetry(), Judgement()
+    telemetry, judgement = Px4Telemetry(), PositionJudgement()
     found: list[Conclusion] = []
     for heard_s, message in (r for r in recorded(name) if r.is_px4):
         while (now_s := len(found) * TICK_S) <= heard_s:
@@ -92,18 +98,20 @@ def test_gps_lost_in_the_mission() -> None:
     ]
     causes = [c.judgement.cause for c in conclusions("gps") if 27.2 < c.time_s < 58.0]
     # The machine stood still for a moment at 29.3 s.
-    assert set(causes) == {Cause.NO_FIX, Cause.OLD}
-    assert Cause.JUMPED in {c.judgement.cause for c in conclusions("gps") if c.time_s > 59.0}
+    assert set(causes) == {PositionCause.NO_FIX, PositionCause.OLD}
+    assert PositionCause.JUMPED in {
+        c.judgement.cause for c in conclusions("gps") if c.time_s > 59.0
+    }
     assert changes("gps", "failsafe")[2:] == [(34.4, True), (53.9, False)]
 
 
 def test_all_sensors_die_after_takeoff() -> None:
     """Just after 8 s. PX4 goes on to tell of a receiver from which nothing comes."""
     assert changes("sensors_die", "quality", "cause")[-4:] == [
-        (9.0, _Q.GOOD, Cause.NO_FIX),
-        (9.4, _Q.DOUBTFUL, Cause.NO_FIX),
-        (10.5, _Q.DOUBTFUL, Cause.GPS_SILENT),
-        (11.0, _Q.LOST, Cause.GPS_SILENT),
+        (9.0, _Q.GOOD, PositionCause.NO_FIX),
+        (9.4, _Q.DOUBTFUL, PositionCause.NO_FIX),
+        (10.5, _Q.DOUBTFUL, PositionCause.GPS_SILENT),
+        (11.0, _Q.LOST, PositionCause.GPS_SILENT),
     ]
 
 
@@ -163,7 +171,7 @@ def test_battery_critical_while_landing_is_px4s_own_failsafe() -> None:
 def test_a_landing_that_px4s_own_failsafe_interrupts_is_not_let_go_of() -> None:
     """The program that was recorded let go: "the vehicle left land for hold"."""
     robot = load_config(ROOT / "docs" / "robot.toml").robot(boot_nonce=1)
-    flight = Flight(FlightState.LAND, "at the landing point", since_s=33.4, land_by="return")
+    flight = FlightMemory(FlightState.LAND, "at the landing point", since_s=33.4, land_by="return")
     told: list[tuple[FlightState, tuple[Action, ...], tuple[str, ...]]] = []
     for now_s, vehicle, judgement in conclusions("battery_fast"):
         if now_s < flight.since_s or flight.state is FlightState.LANDED:
@@ -216,5 +224,5 @@ def test_no_recording_has_a_false_loss(name: str) -> None:
     until_s = FLOWN_UNTIL_S.get(name, 1e9)
     flown = [c for c in conclusions(name) if c.vehicle.armed and c.time_s < until_s]
     assert not any(c.judgement.quality is _Q.LOST for c in flown)
-    assert {c.judgement.cause for c in flown} <= {None, Cause.OLD, Cause.GPS_SILENT}
+    assert {c.judgement.cause for c in flown} <= {None, PositionCause.OLD, PositionCause.GPS_SILENT}
     assert all(c.vehicle.jumped_at_s == float("-inf") for c in flown)

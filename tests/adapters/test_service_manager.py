@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from edge.adapters.service_manager import ServiceManager, status_text
-from edge.core.mission import FlightState, LoopStatus, RobotStatus
+from edge.drivers.systemd import ServiceManager, status_text
+from edge.messages.mission import FlightState, LoopStatus, RobotStatus
 
 
 @contextmanager

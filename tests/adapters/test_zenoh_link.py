@@ -17,8 +17,8 @@ from typing import Any, Self
 import pytest
 import zenoh
 
-from edge.adapters.zenoh_link import LinkError, ZenohLink
-from sim.ports import free_ports
+from edge.drivers.zenoh_link import LinkError, ZenohLink
+from lpac.sim.ports import free_ports
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 ROBOTS = """
 import json, select, sys
 from contextlib import ExitStack
-from edge.adapters.zenoh_link import ZenohLink
+from edge.drivers.zenoh_link import ZenohLink
 
 class Robot:
     def __init__(self, stack, settings):
@@ -434,7 +434,7 @@ def test_close_twice_then_publish() -> None:
 
 def test_the_interpreter_exits_after_an_exception() -> None:
     code = """
-from edge.adapters.zenoh_link import ZenohLink
+from edge.drivers.zenoh_link import ZenohLink
 with ZenohLink(fleet="test", robot_id=1, connect=["tcp/127.0.0.1:1"]):
     raise SystemExit(3)
 """

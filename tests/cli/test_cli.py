@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 import typer
 
-from cli.main import app
 from edge.core.world import parse_world
+from lpac.cli.main import app
 from tests.conftest import ROOT, SHIPPED
 
 
 def lpac(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "cli.main", *map(str, arguments)],
+        [sys.executable, "-m", "lpac.cli.main", *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"},
     )  # fmt: skip
@@ -47,7 +47,7 @@ def test_every_command_that_people_are_pointed_to_exists() -> None:
     """In the documents, and in what programs say."""
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.*")]
-    parts = ("cli", "edge", "fleet", "ground", "sim")
+    parts = ("edge", "lpac")
     programs = [path for part in parts for path in (ROOT / part).rglob("*.py")]
     for path in [*(page for page in pages if page.suffix in (".md", ".toml")), *programs]:
         for name, sub in re.findall(r"`lpac ([a-z]+)(?: ([a-z]+))?", path.read_text()):
@@ -103,8 +103,9 @@ def test_bundle_benchmark_times_the_steps_of_a_flight() -> None:
 
 def test_a_machine_that_is_too_slow_is_told_in_one_line() -> None:
     code = (
-        "import sys, edge.runtime.benchmark as b; b.MOST_OF_PERIOD = 0.0; sys.argv = ['lpac', "
-        f"'bundle', 'benchmark', '{SHIPPED}', '--seconds', '0.1']; import cli.main as m; m.main()"
+        "import sys, edge.robot.benchmark as b; b.MOST_OF_PERIOD = 0.0; sys.argv = ['lpac', "
+        f"'bundle', 'benchmark', '{SHIPPED}', '--seconds', '0.1']; "
+        "import lpac.cli.main as m; m.main()"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
@@ -168,26 +169,27 @@ def test_a_world_with_nothing_to_cover_is_said_to_be_one(tmp_path: Path) -> None
 def test_what_is_not_installed_is_said_in_one_line() -> None:
     code = (
         "import sys; sys.modules['torch'] = None; sys.argv = ['lpac', 'export', "
-        f"'{SHIPPED}.pt', '--params', '{SHIPPED}.toml', '-o', 'x']; import cli.main as m; m.main()"
+        f"'{SHIPPED}.pt', '--params', '{SHIPPED}.toml', '-o', 'x']; "
+        "import lpac.cli.main as m; m.main()"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
-    assert (
-        error_line(result)
-        == "lpac: torch is not installed here: run `make setup` in the repository"
+    assert error_line(result) == (
+        "lpac: torch is not installed here: `pip install 'lpac-edge[export]'`, "
+        "or `make setup` in the repository"
     )
 
 
 def test_ctrl_c_while_a_program_starts_is_one_line() -> None:
     code = """
 import sys
-import cli.main, fleet.config
+import lpac.cli.main, lpac.fleet.config
 def stopped(_):
     raise KeyboardInterrupt
-fleet.config.load_fleet = stopped
+lpac.fleet.config.load_fleet = stopped
 sys.argv = ["lpac", "watch"]
-cli.main.main()
+lpac.cli.main.main()
 """
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
@@ -214,7 +216,8 @@ def test_export_then_verify(tmp_path: Path) -> None:
 
 def test_verify_imports_no_torch() -> None:
     result = subprocess.run(
-        [sys.executable, "-X", "importtime", "-m", "cli.main", "bundle", "verify", str(SHIPPED)],
+        [sys.executable, "-X", "importtime", "-m", "lpac.cli.main", "bundle", "verify",
+        str(SHIPPED)],
         cwd=ROOT, capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert "onnxruntime" in result.stderr
@@ -224,7 +227,7 @@ def test_verify_imports_no_torch() -> None:
 def test_nothing_is_written_into_the_home_folder(tmp_path: Path) -> None:
     """onnxruntime would leave a telemetry database there."""
     subprocess.run(
-        [sys.executable, "-m", "cli.main", "bundle", "verify", str(SHIPPED)],
+        [sys.executable, "-m", "lpac.cli.main", "bundle", "verify", str(SHIPPED)],
         cwd=ROOT, check=True, capture_output=True,
         env={**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)},
     )  # fmt: skip

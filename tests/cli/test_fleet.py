@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from cli.fleet_status import State, print_status
-from fleet.config import FleetConfig, load_fleet
-from fleet.logs import Entry, parse_entry, readable
-from fleet.operations import Outcome
+from lpac.cli.fleet_status import State, print_status
+from lpac.fleet.config import FleetConfig, load_fleet
+from lpac.fleet.logs import Entry, parse_entry, readable
+from lpac.fleet.operations import Outcome
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
 
@@ -169,7 +169,7 @@ def test_exec_ends_quietly_when_nobody_reads_on(here: Path) -> None:
     first = f"mkdir '{here.parent / 'first'}' 2> /dev/null && exec seq 1 9999999"
     command = f"{first}; echo process $$; exec sleep 1000"
     with subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "fleet", "exec", "--fleet", str(here), command],
+        [sys.executable, "-m", "lpac.cli.main", "fleet", "exec", "--fleet", str(here), command],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as program:  # fmt: skip
         assert program.stdout is not None and program.stderr is not None
@@ -190,7 +190,7 @@ def test_ctrl_c_ends_all_sessions_in_order(here: Path, times: int) -> None:
     ssh = here.parent / "bin" / "ssh"
     ssh.write_text(f"#!/bin/sh\necho $$ > '{came}'\nexec sleep 1000\n")
     with subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "fleet", "stop", "--fleet", str(here)], cwd=ROOT,
+        [sys.executable, "-m", "lpac.cli.main", "fleet", "stop", "--fleet", str(here)], cwd=ROOT,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as program:  # fmt: skip
         # Open for writing too: one that comes late finds somebody who reads.

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from cli.main import main
-from edge.core.mission import FlightState, Order, OrderKind, RobotStatus
-from ground.protocol import Picture
+from edge.messages.mission import FlightState, Order, OrderKind, RobotStatus
+from lpac.analysis.snapshot import FleetSnapshot
+from lpac.cli.main import main
 from tests.conftest import ROOT
-from tests.ground.conftest import wait_for_picture
+from tests.ground.conftest import wait_for_snapshot
 from tests.ground.pretend import ORIGIN, PretendedFleet, PretendedRobot, pretended
 
 _S = FlightState
@@ -89,17 +89,17 @@ class Field(NamedTuple):
         for robot, place_m in places_m.items():
             self.robots[robot].position_m = (place_m[0], place_m[1], 0.0)
 
-        def knows(picture: Picture) -> bool:
-            said = [robot.status and robot.status.position_m for robot in picture.robots]
+        def knows(snapshot: FleetSnapshot) -> bool:
+            said = [robot.status and robot.status.position_m for robot in snapshot.robots]
             return said[: len(self.robots)] == [robot.position_m for robot in self.robots]
 
-        wait_for_picture(self.fleet.name, knows)
+        wait_for_snapshot(self.fleet.name, knows)
 
     @contextlib.contextmanager
     def running(self, *arguments: str | Path) -> Iterator["subprocess.Popen[str]"]:
         """The command, in a process of its own."""
         with subprocess.Popen(
-            [sys.executable, "-m", "cli.main", *map(str, arguments)],
+            [sys.executable, "-m", "lpac.cli.main", *map(str, arguments)],
             cwd=ROOT, env=self.environment, text=True,
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         ) as process:  # fmt: skip
@@ -135,13 +135,13 @@ def ground(folder: Path, fleet: PretendedFleet, name: str) -> Iterator[dict[str,
     folder.mkdir()
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder), "LPAC_FLEET": str(fleet.fleet_toml)}
     process = subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "ground", "--name", name],
+        [sys.executable, "-m", "lpac.cli.main", "ground", "--name", name],
         cwd=ROOT, env=environment, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_RUNTIME_DIR", str(folder))
-            wait_for_picture(fleet.name)
+            wait_for_snapshot(fleet.name)
         yield environment
     finally:
         # The second Ctrl-C ends it also while robots fly.
@@ -309,7 +309,7 @@ def on_terminal(field: Field, answer: str, *arguments: str) -> str:
     """What a command prints on a terminal at which somebody types."""
     ours, theirs = pty.openpty()
     with subprocess.Popen(
-        [sys.executable, "-m", "cli.main", *arguments],
+        [sys.executable, "-m", "lpac.cli.main", *arguments],
         cwd=ROOT, env=field.environment, stdin=theirs, stdout=theirs, stderr=theirs,
     ) as process:  # fmt: skip
         os.close(theirs)
@@ -602,7 +602,7 @@ def test_hold_is_the_operators_also_while_the_script_starts_a_robot(
 
 def test_script_says_what_is_missing(field: Field) -> None:
     field.do("mission", "enable")
-    wait_for_picture(
+    wait_for_snapshot(
         field.fleet.name, lambda p: all(r.status and r.status.ready for r in p.robots[:3])
     )
     field.do("mission", "hold", "r1")

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge.adapters.flight_log import FlightLog, FlightMetadata
-from edge.runtime.bundle import Bundle
-from edge.runtime.policy import Policy
+from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.policy.bundle import Bundle
+from edge.policy.lpac.graphs import Policy
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import SHIPPED
 from tests.runtime.test_replay import Messages, fly

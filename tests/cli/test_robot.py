@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.px4.link import Px4Link
+from lpac.sim.px4.link import Px4Link
 from tests.robot_rig import (
     ORIGIN,
     SYSTEM_ID,

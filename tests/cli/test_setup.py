@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from sim.px4.link import Px4Link
+from lpac.sim.px4.link import Px4Link
 from tests.robot_rig import SYSTEM_ID, lpac_robot, new_vehicle, rig
 
 

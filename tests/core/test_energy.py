@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.energy import Consumption, Energy, EnergyParameters, home_s, trials
+from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s, trials
 
 CRITICAL = 0.15
 

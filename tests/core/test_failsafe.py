@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.failsafe import PARAMETERS, RemoteControl, check, explain, required
-from sim.px4 import modes
-from sim.px4.parameters import PARAMETERS as PX4_DEFAULTS
+from edge.flight.failsafe import PARAMETERS, RemoteControl, check, explain, required
+from lpac.sim.px4 import modes
+from lpac.sim.px4.parameters import PARAMETERS as PX4_DEFAULTS
 
 KINDS: tuple[RemoteControl, ...] = ("pilot", "none")
 values = st.none() | st.integers(-2, 130000) | st.floats(allow_nan=True, allow_infinity=True)
@@ -144,11 +144,11 @@ def test_defaults_of_px4_are_explained_as_they_were_flown() -> None:
 
 
 WORDS = {
-    modes.Action.HOLD: "hold",
-    modes.Action.RETURN: "RETURN",
-    modes.Action.LAND: "land",
-    modes.Action.STOP_MOTORS: "STOP ITS MOTORS",
-    modes.Action.WARN: "warn",
+    modes.FailsafeAction.HOLD: "hold",
+    modes.FailsafeAction.RETURN: "RETURN",
+    modes.FailsafeAction.LAND: "land",
+    modes.FailsafeAction.STOP_MOTORS: "STOP ITS MOTORS",
+    modes.FailsafeAction.WARN: "warn",
 }
 
 
@@ -162,7 +162,7 @@ WORDS = {
     ],
 )
 def test_the_simulated_vehicle_acts_as_explained(
-    name: str, about: str, actions: dict[int, modes.Action]
+    name: str, about: str, actions: dict[int, modes.FailsafeAction]
 ) -> None:
     for value, action in actions.items():
         parameters = {**safe("pilot"), name: value, "COM_FAIL_ACT_T": 0.0, "COM_RCL_EXCEPT": 0}

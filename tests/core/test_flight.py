@@ -19,30 +19,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.core.energy import Energy
-from edge.core.flight import (
-    TRANSITIONS,
-    Decision,
-    Flight,
-    FlightInputs,
-    FlightParameters,
-    RemoteControlLost,
-    Robot,
-    Transition,
-    flown_s,
-    step,
-)
-from edge.core.guidance import (
-    Guidance,
-    MissionPosition,
-    MissionSetpoint,
-    MissionVelocity,
-    guide,
-)
-from edge.core.mission import Calm, FlightState, GroundState, Order, OrderKind, OrderResult, Origin
+from edge.core.fence import Fence
 from edge.core.ports import Odometry
-from edge.core.position import Judgement, PositionLimits, Quality, judge
-from edge.core.safety import Closest, Fence, MotionLimits
+from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
 from edge.core.vehicle import (
     PILOTED,
     Action,
@@ -53,7 +32,37 @@ from edge.core.vehicle import (
     Reason,
     VehicleState,
 )
-from edge.runtime.navigation import MAX_POSITION_AGE_S
+from edge.flight.energy import Energy
+from edge.flight.flight import (
+    TRANSITIONS,
+    Decision,
+    FlightInputs,
+    FlightMemory,
+    FlightParameters,
+    RemoteControlLost,
+    Robot,
+    Transition,
+    flown_s,
+    step,
+)
+from edge.flight.guidance import (
+    Guidance,
+    MissionPosition,
+    MissionSetpoint,
+    MissionVelocity,
+    guide,
+)
+from edge.flight.safety import Closest, MotionLimits
+from edge.messages.mission import (
+    FlightState,
+    GroundState,
+    Order,
+    OrderKind,
+    OrderResult,
+    Origin,
+    SafetyAction,
+)
+from edge.robot.navigation import MAX_POSITION_AGE_S
 
 TICK_S = 0.1
 PERIOD_S = 1.0
@@ -141,7 +150,7 @@ class World:
 
     def restart(self) -> None:
         """The robot's program starts anew, and has heard nothing yet."""
-        self.flight, self.guidance, self.position = Flight(), Guidance(), Judgement()
+        self.flight, self.guidance, self.position = FlightMemory(), Guidance(), PositionJudgement()
         self.heard, self.beats = replace(self.heard, mode=None, armed=None, in_air=None), []
         self.started_s = self.now_s
 
@@ -178,8 +187,10 @@ class World:
 
     # The ground
 
-    def enable(self, calm: Calm = "none") -> None:
-        self.ground = GroundState(1, "op", Origin(47.0, 8.0, 0.0), enabled=True, calm=calm)
+    def enable(self, safety_action: SafetyAction = "none") -> None:
+        self.ground = GroundState(
+            1, "op", Origin(47.0, 8.0, 0.0), enabled=True, safety_action=safety_action
+        )
 
     def new_order(self, kind: OrderKind, trial: str = "") -> Order:
         self.orders += 1
@@ -351,7 +362,7 @@ class World:
         self.position = judge(self.position, vehicle, PositionLimits(), self.now_s)
         odometry = None
         fresh = self.now_s - vehicle.position_at_s <= MAX_POSITION_AGE_S
-        if fresh and self.position.quality is not Quality.LOST:
+        if fresh and self.position.quality is not PositionQuality.LOST:
             x_m, y_m, height_m = self.position_m.tolist()
             vx, vy, vz = self.velocity_m_s.tolist()
             odometry = Odometry((x_m, y_m, height_m + ZERO_M), (vx, vy, vz))
@@ -391,7 +402,7 @@ class World:
 
     def _check(
         self,
-        before: Flight,
+        before: FlightMemory,
         vehicle: VehicleState,
         decision: Decision,
         setpoint: MissionSetpoint | None,
@@ -450,7 +461,7 @@ def test_takes_off_flies_returns_lands_and_flies_again(world: World) -> None:
         east_m = float(world.position_m[0])
         world.run(3.0)
         assert world.position_m[0] > east_m + 2.0
-        world.enable(calm="return")
+        world.enable(safety_action="return")
         world.until(FlightState.LAND, 30.0)
         assert world.position_m[:2] == pytest.approx(ROBOT.parameters.landing_point_m, abs=0.6)
         world.until(FlightState.LANDED, 20.0)
@@ -464,7 +475,7 @@ def test_takes_off_flies_returns_lands_and_flies_again(world: World) -> None:
 
 def test_the_same_trial_goes_on_after_a_hold(world: World) -> None:
     world.fly()
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.run(2.0)
     assert world.state() is FlightState.HOLD
     world.enable()
@@ -480,8 +491,8 @@ def test_the_same_trial_goes_on_after_a_hold(world: World) -> None:
 
 
 def test_repeated_ground_states_never_arm(world: World) -> None:
-    for calm in ("none", "hold", "return", "land", "none"):
-        world.enable(calm=calm)
+    for safety_action in ("none", "hold", "return", "land", "none"):
+        world.enable(safety_action=safety_action)
         world.run(5.0)
     assert world.state() is FlightState.PREFLIGHT
     assert world.actions == []
@@ -535,7 +546,7 @@ def test_a_takeoff_order_counts_no_more_after_others_were_answered(world: World)
     world.ready()
     takeoff = world.new_order("takeoff")
     assert world.give(takeoff).accepted
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.until(FlightState.IDLE, 1.0)
     world.enable()
     world.until(FlightState.PREFLIGHT, 3.0)
@@ -568,7 +579,7 @@ def test_orders_are_refused_with_the_reason(world: World) -> None:
         assert world.give(far).reason.endswith("too long")
     world.give(replace(world.new_order("takeoff"), boot_nonce=1))
     assert "another start" in world.flight.answers[-1].reason
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     assert world.refuse("takeoff") == "the ground commands hold"
     answers = world.flight.answers
     world.order = replace(world.new_order("takeoff"), robot_id=4)
@@ -650,7 +661,7 @@ def test_what_the_ground_says_and_the_robot_does_not_fly_by_keeps_it_from_starti
 def test_the_next_trial_is_reset_on_the_ground_or_in_hold_and_then_started(world: World) -> None:
     world.fly()
     assert world.refuse("reset") == "reset is not taken in mission: mission started"
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.run(2.0)
     for trial in ("second", "second", "third"):
         world.order = world.new_order("reset", trial)
@@ -670,7 +681,7 @@ def test_the_next_trial_is_reset_on_the_ground_or_in_hold_and_then_started(world
 
 def test_a_reset_is_taken_though_the_state_changes_in_the_same_tick(world: World) -> None:
     world.hover()
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.order = world.new_order("reset", "second")
     decision = world.tick()
     assert decision.flight.state is FlightState.LAND
@@ -702,7 +713,7 @@ def test_disarm_stops_the_motors_on_the_ground_only(world: World) -> None:
     world.heavy = False
     world.hover()
     assert world.refuse("disarm") == "in the air: land it first"
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     assert world.refuse("disarm") == "in the air: land it first"
     world.until(FlightState.LANDED, 20.0)
 
@@ -729,10 +740,10 @@ def test_takeoff_waits_for_the_vehicle_and_stops_where_it_is_refused(world: Worl
 
 def test_arming_is_called_off(world: World) -> None:
     world.ready()
-    for calm in ("hold", "return", "land"):
+    for safety_action in ("hold", "return", "land"):
         world.obey("takeoff")
         world.run(0.4)
-        world.enable(calm=calm)
+        world.enable(safety_action=safety_action)
         world.tick()
         assert world.state() is FlightState.IDLE
         world.ready()
@@ -879,44 +890,44 @@ def test_a_takeoff_on_hold_stays_where_it_is_in_the_air_or_on_the_ground(world: 
     while world.height_m < 3.0:
         world.tick()
     world.run(2.5 - world.latency_s if world.latency_s < 0.5 else 0.0)
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.tick()
     assert world.state() is FlightState.HOLD
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.until(FlightState.LANDED, 20.0)
     world.ready()
     world.heavy = True
     world.obey("takeoff")
     world.until(FlightState.TAKEOFF, 6.0)
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.until(FlightState.LAND, 3.0)
     assert world.flight.reason == "it stands on the ground"
     # Nothing that the ground repeats lifts it off again.
     world.heavy = False
-    world.enable(calm="return")
+    world.enable(safety_action="return")
     world.until(FlightState.LANDED, 10.0)
     assert world.height_m == 0.0
 
 
 def test_land_and_return_end_a_takeoff(world: World) -> None:
-    calms: tuple[Calm, ...] = ("land", "return")
-    for calm in calms:
+    safety_actions: tuple[SafetyAction, ...] = ("land", "return")
+    for safety_action in safety_actions:
         world.ready()
         world.obey("takeoff")
         world.until(FlightState.TAKEOFF, 6.0)
         world.run(1.0)
-        world.enable(calm=calm)
+        world.enable(safety_action=safety_action)
         world.tick()
         assert world.state() is FlightState.LAND
         world.until(FlightState.LANDED, 15.0)
 
 
-# The ground calms
+# Safety commands of the ground
 
 
 def test_the_latest_of_hold_land_and_return_counts(world: World) -> None:
     world.fly()
-    steps: tuple[tuple[Calm, FlightState], ...] = (
+    steps: tuple[tuple[SafetyAction, FlightState], ...] = (
         ("hold", FlightState.HOLD),
         ("land", FlightState.LAND),
         ("hold", FlightState.HOLD),
@@ -926,8 +937,8 @@ def test_the_latest_of_hold_land_and_return_counts(world: World) -> None:
         ("return", FlightState.RETURN),
         ("land", FlightState.LAND),
     )
-    for calm, state in steps:
-        world.enable(calm=calm)
+    for safety_action, state in steps:
+        world.enable(safety_action=safety_action)
         world.tick()
         assert world.state() is state
         world.run(0.9)
@@ -937,19 +948,19 @@ def test_the_latest_of_hold_land_and_return_counts(world: World) -> None:
 
 def test_changing_ones_mind_quickly_ends_in_what_was_said_last(world: World) -> None:
     world.fly()
-    said: tuple[tuple[Calm, float], ...] = (
+    said: tuple[tuple[SafetyAction, float], ...] = (
         ("land", 0.4),
         ("hold", 0.8),
         ("land", 0.2),
         ("hold", 0.6),
     )
-    for calm, seconds in said:
-        world.enable(calm=calm)
+    for safety_action, seconds in said:
+        world.enable(safety_action=safety_action)
         world.run(seconds)
     world.run(5.0)
     assert world.state() is FlightState.HOLD
     assert world.mode is Mode.OFFBOARD
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.run(0.2)
     assert world.state() is FlightState.LAND
     world.until(FlightState.LANDED, 20.0)
@@ -958,7 +969,7 @@ def test_changing_ones_mind_quickly_ends_in_what_was_said_last(world: World) -> 
 def test_one_robot_alone_is_called_and_disabling_holds(world: World) -> None:
     world.fly()
     assert world.ground is not None
-    world.ground = replace(world.ground, robot_calm={"3": "hold"})
+    world.ground = replace(world.ground, robot_safety_actions={"3": "hold"})
     world.tick()
     assert world.state() is FlightState.HOLD
     world.enable()
@@ -969,14 +980,14 @@ def test_one_robot_alone_is_called_and_disabling_holds(world: World) -> None:
 
 
 def test_after_touchdown_hold_and_return_do_not_lift_it(world: World) -> None:
-    calms: tuple[Calm, ...] = ("hold", "return")
-    for calm in calms:
+    safety_actions: tuple[SafetyAction, ...] = ("hold", "return")
+    for safety_action in safety_actions:
         world.hover()
-        world.enable(calm="land")
+        world.enable(safety_action="land")
         while world.height_m > 0.0:
             world.tick()
         world.run(0.2)
-        world.enable(calm=calm)
+        world.enable(safety_action=safety_action)
         world.until(FlightState.LANDED, 12.0)
         assert world.height_m < 0.5
         world.enable()
@@ -999,7 +1010,7 @@ def test_a_robot_that_was_knocked_down_in_its_mission_lands(world: World) -> Non
 def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:
     world.fly()
     world.position_m[:2] = (33.0, 16.0)
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.until(FlightState.HOLD, 1.0)
     assert "outside the fence" in world._decide(world._hear()).alarms
     world.run(20.0)
@@ -1016,13 +1027,13 @@ def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
     world.until(FlightState.LAND, 11.0)
     assert world.now_s - lost_s == pytest.approx(13.0, abs=0.2)
     world.ground_on = True
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.until(FlightState.LANDED, 20.0)
 
 
 def test_the_ground_comes_back_and_the_robot_waits(world: World) -> None:
     world.fly()
-    world.enable(calm="return")
+    world.enable(safety_action="return")
     world.run(0.5)
     world.ground_on = False
     world.until(FlightState.HOLD, 4.0)
@@ -1040,7 +1051,7 @@ def test_battery_low_returns_and_critical_lands(world: World) -> None:
     decision = world.tick()
     assert world.state() is FlightState.RETURN
     assert decision.alarms == ("battery low: 24%",)
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.run(1.0)
     assert world.state() is FlightState.HOLD
     world.enable()
@@ -1049,7 +1060,7 @@ def test_battery_low_returns_and_critical_lands(world: World) -> None:
     world.battery = 0.1
     world.tick()
     assert world.state() is FlightState.LAND
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.until(FlightState.LANDED, 20.0)
 
 
@@ -1120,7 +1131,7 @@ def test_a_position_in_doubt_is_stood_still_by(world: World, state: FlightState)
         world.run(3.0)
     else:
         world.fly()
-        world.enable(calm="hold" if state is FlightState.HOLD else "return")
+        world.enable(safety_action="hold" if state is FlightState.HOLD else "return")
         world.run(3.0)
     assert world.state() is state
     world.accuracy_m = 7.0
@@ -1174,7 +1185,7 @@ def test_a_battery_that_just_lasts_for_the_way_home_returns(world: World) -> Non
         decision = world.tick()
         assert world.state() is FlightState.RETURN
         assert decision.alarms == (said,)
-        world.enable(calm="hold")
+        world.enable(safety_action="hold")
         world.run(1.0)
         assert world.refuse("start") == "the ground commands hold"
         world.enable()
@@ -1191,7 +1202,7 @@ def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
     assert world.state() is FlightState.HOLD
     assert decision.alarms == ("only 1.4 m to robot 9",)
     # On its way home it brakes, but does not flicker between two states.
-    world.enable(calm="return")
+    world.enable(safety_action="return")
     world.run(1.0)
     assert world.state() is FlightState.RETURN
 
@@ -1218,7 +1229,7 @@ def test_a_lost_remote_control_is_an_alarm_and_what_is_configured(world: World) 
         if reaction == "hold":
             assert world.refuse("start") == "remote control lost"
         # On its way home it goes on.
-        world.enable(calm="none" if reaction == "land" else "return")
+        world.enable(safety_action="none" if reaction == "land" else "return")
         world.until(FlightState.LANDED, 40.0)
         world.remote_control = True
 
@@ -1267,7 +1278,7 @@ def test_the_autopilot_that_lands_is_left_to_land(world: World) -> None:
     world.fly()
     world.mode = world.intended = Mode.LAND
     world.until(FlightState.LAND, 2.5)
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.until(FlightState.LANDED, 20.0)
     assert world.asked(Action.OFFBOARD) == 1
 
@@ -1319,14 +1330,14 @@ def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
 def test_a_landing_that_the_autopilots_failsafe_interrupts_goes_on(world: World) -> None:
     # As PX4 v1.17 does with a critical battery: 5.5 s of hold, then it lands.
     world.hover()
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.run(4.0)
     asked = len(world.actions)
     world.failsafe = Mode.HOLD
     world.run(5.5)
     assert "the autopilot's own failsafe acts: hold" in world.tick().alarms
     assert world.state() is FlightState.LAND
-    world.enable(calm="hold")
+    world.enable(safety_action="hold")
     world.run(0.5)
     world.failsafe = Mode.LAND
     world.until(FlightState.LANDED, 20.0)
@@ -1335,7 +1346,7 @@ def test_a_landing_that_the_autopilots_failsafe_interrupts_goes_on(world: World)
 
 def test_a_landing_is_resumed_when_the_autopilots_failsafe_ends_without_one(world: World) -> None:
     world.hover()
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.run(4.0)
     world.intended = world.failsafe = Mode.HOLD
     world.run(4.0)
@@ -1348,10 +1359,10 @@ def test_a_landing_is_resumed_when_the_autopilots_failsafe_ends_without_one(worl
 
 
 def test_a_pilot_wins_over_the_autopilots_failsafe(world: World) -> None:
-    calms: tuple[Calm, ...] = ("hold", "land")
-    for calm in calms:
+    safety_actions: tuple[SafetyAction, ...] = ("hold", "land")
+    for safety_action in safety_actions:
         world.hover()
-        world.enable(calm=calm)
+        world.enable(safety_action=safety_action)
         world.run(3.0)
         world.failsafe = Mode.HOLD
         world.run(3.0)
@@ -1374,7 +1385,7 @@ def test_the_autopilots_failsafe_in_a_mission_holds_and_then_lands(world: World)
     assert world.flight.alarming
     world.run(3.0)
     # The ground comes after it.
-    world.enable(calm="return")
+    world.enable(safety_action="return")
     world.run(3.0)
     assert world.state() is FlightState.HOLD
     assert world.refuse("start") == "the ground commands return"
@@ -1398,7 +1409,7 @@ def test_after_the_autopilots_failsafe_the_robot_holds_or_returns_home(world: Wo
     assert world.state() is FlightState.HOLD
     assert world.mode is Mode.OFFBOARD
     assert world.position_m == pytest.approx(at_m, abs=0.3)
-    world.enable(calm="return")
+    world.enable(safety_action="return")
     world.run(1.5)
     world.failsafe = Mode.HOLD
     world.until(FlightState.HOLD, 2.5)
@@ -1423,7 +1434,7 @@ def test_a_landing_that_the_autopilots_failsafe_holds_for_a_minute_is_asked_for_
     world: World,
 ) -> None:
     world.hover()
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.run(4.0)
     world.failsafe = Mode.HOLD
     world.run(50.0)
@@ -1448,7 +1459,7 @@ def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
 
 def test_after_a_lapse_that_somebody_answers_it_stays(world: World) -> None:
     def hold() -> None:
-        world.enable(calm="hold")
+        world.enable(safety_action="hold")
         world.run(0.5)
         world.enable()
 
@@ -1459,7 +1470,7 @@ def test_after_a_lapse_that_somebody_answers_it_stays(world: World) -> None:
         answer()
         world.run(65.0)
         assert world.state() is FlightState.HOLD
-        world.enable(calm="land")
+        world.enable(safety_action="land")
         world.until(FlightState.LANDED, 20.0)
 
 
@@ -1494,7 +1505,7 @@ def test_a_vehicle_in_hold_that_somebody_has_is_left_to_him(world: World) -> Non
         world.mode = world.intended = Mode.HOLD
 
     def hold() -> None:
-        world.enable(calm="hold")
+        world.enable(safety_action="hold")
         world.run(0.5)
 
     for answer in (fly_a_little, hold, lambda: world.refuse("takeoff")):
@@ -1597,14 +1608,14 @@ def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> Non
         world.run(1.0)
 
     def hold() -> None:
-        world.enable(calm="hold")
+        world.enable(safety_action="hold")
         world.run(1.0)
 
     def fly_home() -> None:
-        world.enable(calm="return")
+        world.enable(safety_action="return")
         world.run(1.0)
 
-    calms: tuple[Calm, ...] = ("land", "return", "hold", "none")
+    safety_actions: tuple[SafetyAction, ...] = ("land", "return", "hold", "none")
     world.hover()
     for begin, state in (
         (hold, FlightState.HOLD), (start, FlightState.MISSION), (fly_home, FlightState.RETURN),
@@ -1616,8 +1627,8 @@ def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> Non
         assert "given to a pilot" in world.tick().alarms
         # Again is no mistake; and nothing that the ground repeats takes it back.
         world.obey("pilot")
-        for calm in calms:
-            world.enable(calm=calm)
+        for safety_action in safety_actions:
+            world.enable(safety_action=safety_action)
             world.run(1.5)
             assert world.state() is FlightState.PILOT
             assert world.mode == Mode.HOLD
@@ -1626,7 +1637,7 @@ def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> Non
         world.run(3.0)
         assert world.state() is FlightState.HOLD
         assert world.mode is Mode.OFFBOARD
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.run(1.0)
     assert world.refuse("pilot") == "pilot is not taken in land: ground commands land"
 
@@ -1654,11 +1665,11 @@ def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> N
 
 
 def test_a_pilot_keeps_a_vehicle_that_was_told_to_land_or_to_stop_landing(world: World) -> None:
-    for calm in ("land", "hold"):
+    for safety_action in ("land", "hold"):
         world.hover()
-        world.enable(calm="land")
-        world.run(0.1 if calm == "land" else 3.0)
-        world.enable(calm=calm)
+        world.enable(safety_action="land")
+        world.run(0.1 if safety_action == "land" else 3.0)
+        world.enable(safety_action=safety_action)
         world.run(0.9)
         world.pilot()
         world.until(FlightState.PILOT, 2.5)
@@ -1675,7 +1686,7 @@ def test_a_pilot_keeps_a_vehicle_that_was_told_to_land_or_to_stop_landing(world:
 
 def test_a_landing_that_somebody_else_ends_is_his(world: World) -> None:
     world.hover()
-    world.enable(calm="land")
+    world.enable(safety_action="land")
     world.run(3.0)
     world.mode = world.intended = Mode.HOLD
     world.until(FlightState.PILOT, 2.5)
@@ -1689,8 +1700,8 @@ def test_a_program_that_starts_in_flight_only_observes_until_rejoin(world: World
     world.restart()
     world.until(FlightState.PILOT, 2.0)
     assert "already armed when this program found it" in world.flight.reason
-    for calm in ("none", "hold", "land", "return", "none"):
-        world.enable(calm=calm)
+    for safety_action in ("none", "hold", "land", "return", "none"):
+        world.enable(safety_action=safety_action)
         world.run(2.0)
     world.battery = 0.1
     world.run(2.0)
@@ -1872,8 +1883,8 @@ def _arm(world: World, draw: random.Random) -> None:
 
 
 def _ground(world: World, draw: random.Random) -> None:
-    calms: tuple[Calm, ...] = ("none", "none", "none", "hold", "return", "land")
-    world.enable(draw.choice(calms))
+    safety_actions: tuple[SafetyAction, ...] = ("none", "none", "none", "hold", "return", "land")
+    world.enable(draw.choice(safety_actions))
     world.ground_on = draw.random() < 0.9
 
 

@@ -9,20 +9,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
-from edge.core.flight import Flight, FlightInputs, FlightParameters, Robot
-from edge.core.guidance import (
+from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
+from edge.core.ports import Odometry
+from edge.core.position import PositionJudgement, PositionQuality
+from edge.core.vehicle import Vector, VehicleState
+from edge.flight.flight import FlightInputs, FlightMemory, FlightParameters, Robot
+from edge.flight.guidance import (
     Guidance,
     MissionPosition,
     MissionSetpoint,
     MissionVelocity,
     guide,
 )
-from edge.core.mailbox import Neighbour
-from edge.core.mission import FlightState
-from edge.core.ports import Odometry
-from edge.core.position import Judgement, Quality
-from edge.core.safety import Fence, MotionLimits
-from edge.core.vehicle import Vector, VehicleState
+from edge.flight.safety import MotionLimits
+from edge.messages.mission import FlightState
 
 TICK_S = 0.1
 ZERO_M = -3.0  # The takeoff point, from the estimator's zero.
@@ -38,8 +39,8 @@ AT_SLOT: Vector = (16.0, 16.0, SLOT_M)
 STILL: Vector = (0.0, 0.0, 0.0)
 
 
-def flight(state: FlightState, target_m: Vector | None = None) -> Flight:
-    return Flight(state=state, datum_m=ZERO_M, target_m=target_m)
+def flight(state: FlightState, target_m: Vector | None = None) -> FlightMemory:
+    return FlightMemory(state=state, datum_m=ZERO_M, target_m=target_m)
 
 
 def inputs(
@@ -47,7 +48,7 @@ def inputs(
     velocity_m_s: Vector = STILL,
     policy_m_s: F64 | None = None,
     neighbours: tuple[Neighbour, ...] = (),
-    quality: Quality = Quality.GOOD,
+    quality: PositionQuality = PositionQuality.GOOD,
 ) -> FlightInputs:
     odometry = None
     if position_m is not None:
@@ -56,7 +57,7 @@ def inputs(
     return FlightInputs(
         now_s=100.0,
         vehicle=VehicleState(),
-        position=Judgement(quality=quality, cause=None),
+        position=PositionJudgement(quality=quality, cause=None),
         odometry=odometry,
         policy_velocity_m_s=policy_m_s,
         neighbours=neighbours,
@@ -72,11 +73,11 @@ def inputs(
     )
 
 
-def setpoint(state: Flight, given: FlightInputs) -> MissionSetpoint | None:
+def setpoint(state: FlightMemory, given: FlightInputs) -> MissionSetpoint | None:
     return guide(ROBOT, state, given, Guidance(), TICK_S)[0]
 
 
-def position(state: Flight, given: FlightInputs) -> F64:
+def position(state: FlightMemory, given: FlightInputs) -> F64:
     sent = setpoint(state, given)
     assert isinstance(sent, MissionPosition)
     return np.array(sent.position_m)
@@ -92,7 +93,7 @@ class Vehicle:
 
     def fly(
         self,
-        state: Flight,
+        state: FlightMemory,
         seconds: float,
         policy_m_s: F64 | None = None,
         neighbours: tuple[Neighbour, ...] = (),

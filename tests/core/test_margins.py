@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
-from edge.core.flight import FlightParameters
-from edge.core.margins import ErrorBudget, places_apart
-from edge.core.safety import Fence, MotionLimits, keep_inside, limit_acceleration
-from sim.px4.errors import Errors, draw_bias_m
+from edge.core.fence import Fence
+from edge.flight.flight import FlightParameters
+from edge.flight.margins import ErrorBudget, places_apart
+from edge.flight.safety import MotionLimits, keep_inside, limit_acceleration
+from lpac.sim.px4.errors import Errors, draw_bias_m
 from tests.core.test_safety import CONTROL_S, SQUARE, Vehicle
 
 LIMITS = MotionLimits(1.25, 2.0, 2.0, 1.3)

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.mission import (
+from edge.core.fence import Fence
+from edge.core.schema import ConfigError
+from edge.messages.mission import (
     FlightState,
     GroundState,
     LoopStatus,
@@ -25,8 +27,6 @@ from edge.core.mission import (
     to_json,
     waiting_to_land,
 )
-from edge.core.safety import Fence
-from edge.core.schema import ConfigError
 
 FENCE = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0)), 2.0, 1.0, 30.0)
 STATUS = RobotStatus(
@@ -46,8 +46,9 @@ STATUS = RobotStatus(
 
 def test_messages_survive_the_way() -> None:
     state = GroundState(
-        7, "anna", Origin(1.0, 2.0, 3.0), enabled=True, robot_enabled={"4": False}, calm="hold",
-        calm_by="ben", robot_calm={"3": "land"}, fence=FENCE,
+        7, "anna", Origin(1.0, 2.0, 3.0), enabled=True, robot_enabled={"4": False},
+        safety_action="hold",
+        safety_action_by="ben", robot_safety_actions={"3": "land"}, fence=FENCE,
         places={"3": Place(2, (1.0, 2.0))}, world_id="cd", trial="t1", unix_time_s=1.8e9,
     )  # fmt: skip
     order = Order("x", 3, 2**47, "start", 22.5, "anna", trial="t1")
@@ -88,8 +89,10 @@ def test_a_status_has_a_time_and_a_place_to_go_to(odd: dict[str, object]) -> Non
 
 
 def test_what_is_asked_of_one_robot_overrides_what_is_asked_of_all() -> None:
-    state = GroundState(7, "anna", calm="hold", robot_calm={"3": "land", "4": "none"})
-    assert [state.calm_for(robot) for robot in (2, 3, 4)] == ["hold", "land", "none"]
+    state = GroundState(
+        7, "anna", safety_action="hold", robot_safety_actions={"3": "land", "4": "none"}
+    )
+    assert [state.safety_action_for(robot) for robot in (2, 3, 4)] == ["hold", "land", "none"]
     state = GroundState(7, "anna", enabled=True, robot_enabled={"3": False, "4": True})
     assert [state.enabled_for(robot) for robot in (2, 3, 4)] == [True, False, True]
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from edge.adapters.idf_sensor import IdfSensor
 from edge.core import F32, F64
 from edge.core.perception import Perception, PerceptionParameters, neighbours_in_range
 from edge.core.world import random_features
+from edge.drivers.world_sensor import WorldSensor
 from tests.reference import point_vector, reference_environment
 
 PARAMETERS = PerceptionParameters(
@@ -49,7 +49,7 @@ def test_images_are_the_librarys(seed: int) -> None:
     walk = random_walk(rng)
     environment = reference_environment(features, walk[0])
     # The library's own raster: ours is compared with it elsewhere.
-    sensor = IdfSensor(environment.GetWorldMap().astype(np.float32), PARAMETERS.sensor_size)
+    sensor = WorldSensor(environment.GetWorldMap().astype(np.float32), PARAMETERS.sensor_size)
     robots = [Perception(PARAMETERS, channels=4, image_size=32) for _ in range(ROBOTS)]
     seen = 0.0
     for positions in walk:

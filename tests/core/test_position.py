@@ -8,16 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.adapters.mavsdk_autopilot import RATES_HZ
-from edge.core.position import Cause, Judgement, PositionLimits, Quality, judge
-from edge.core.vehicle import Estimator, GlobalOrigin, Gps, VehicleState
+from edge.core.position import (
+    PositionCause,
+    PositionJudgement,
+    PositionLimits,
+    PositionQuality,
+    judge,
+)
+from edge.core.vehicle import EstimatorStatus, GlobalOrigin, Gps, VehicleState
+from edge.drivers.px4.autopilot import RATES_HZ
 from tests.conftest import ROOT
 
 LIMITS = PositionLimits()
 TICK_S = 0.1
 GPS = Gps(fix=3, satellites=12, hdop=0.8, accuracy_m=0.9, offset_m=0.3)
 
-_Q = Quality
+_Q = PositionQuality
 
 
 def heard(now_s: float, gps: Gps | None = GPS, **changes: Any) -> VehicleState:
@@ -28,7 +34,7 @@ def heard(now_s: float, gps: Gps | None = GPS, **changes: Any) -> VehicleState:
         "position_changed_at_s": now_s,
         "origin": GlobalOrigin(47.0, 8.0, 400.0),
         "gps": gps and dataclasses.replace(gps, at_s=now_s),
-        "estimator": Estimator(horizontal=True, glitch=False, at_s=now_s),
+        "estimator": EstimatorStatus(horizontal=True, glitch=False, at_s=now_s),
     }
     return VehicleState(**known | changes)
 
@@ -38,7 +44,7 @@ class Watch:
 
     def __init__(self) -> None:
         self.now_s = 100.0
-        self.judgement = Judgement()
+        self.judgement = PositionJudgement()
         self.run(LIMITS.good_after_s + 2 * TICK_S)
         assert self.judgement.quality is _Q.GOOD
 
@@ -52,41 +58,41 @@ class Watch:
 
 
 WITHOUT = [
-    ({"gps": dataclasses.replace(GPS, fix=0)}, Cause.NO_FIX, "GPS has no fix"),
-    ({"gps": dataclasses.replace(GPS, fix=2)}, Cause.NO_FIX, "GPS has no fix"),
-    ({"gps": None}, Cause.GPS_SILENT, "nothing new comes from the GPS receiver"),
+    ({"gps": dataclasses.replace(GPS, fix=0)}, PositionCause.NO_FIX, "GPS has no fix"),
+    ({"gps": dataclasses.replace(GPS, fix=2)}, PositionCause.NO_FIX, "GPS has no fix"),
+    ({"gps": None}, PositionCause.GPS_SILENT, "nothing new comes from the GPS receiver"),
     (
         {"gps": dataclasses.replace(GPS, accuracy_m=10.1)},
-        Cause.INACCURATE,
+        PositionCause.INACCURATE,
         "GPS is accurate to 10.1 m only",
     ),
     (
-        {"estimator": Estimator(False, False, 1e9)},
-        Cause.NOT_ESTIMATED,
+        {"estimator": EstimatorStatus(False, False, 1e9)},
+        PositionCause.NOT_ESTIMATED,
         "the autopilot's estimator does not vouch for it",
     ),
-    ({"position_local_m": None}, Cause.UNKNOWN, "it is not known"),
-    ({"origin": None}, Cause.UNKNOWN, "it is not known"),
+    ({"position_local_m": None}, PositionCause.UNKNOWN, "it is not known"),
+    ({"origin": None}, PositionCause.UNKNOWN, "it is not known"),
 ]
 POOR = [
     (
         {"gps": dataclasses.replace(GPS, accuracy_m=5.1)},
-        Cause.INACCURATE,
+        PositionCause.INACCURATE,
         "GPS is accurate to 5.1 m only",
     ),
     (
         {"gps": dataclasses.replace(GPS, offset_m=7.0)},
-        Cause.DISAGREES,
+        PositionCause.DISAGREES,
         "the GPS fix is 7.0 m away from the estimate",
     ),
     (
         {"gps": dataclasses.replace(GPS, satellites=5)},
-        Cause.FEW_SATELLITES,
+        PositionCause.FEW_SATELLITES,
         "GPS sees 5 satellites only",
     ),
     (
-        {"estimator": Estimator(True, True, 1e9)},
-        Cause.GLITCH,
+        {"estimator": EstimatorStatus(True, True, 1e9)},
+        PositionCause.GLITCH,
         "the autopilot's estimator takes the GPS for wrong",
     ),
 ]
@@ -94,7 +100,7 @@ POOR = [
 
 @pytest.mark.parametrize(("changes", "cause", "text"), [*WITHOUT, *POOR])
 def test_whatever_speaks_against_it_is_doubted_and_forgiven(
-    changes: dict[str, Any], cause: Cause, text: str
+    changes: dict[str, Any], cause: PositionCause, text: str
 ) -> None:
     watch = Watch()
     watch.run(0.4, **changes)
@@ -112,7 +118,7 @@ def test_whatever_speaks_against_it_is_doubted_and_forgiven(
 
 @pytest.mark.parametrize(("changes", "cause", "text"), WITHOUT)
 def test_no_position_for_two_seconds_is_lost(
-    changes: dict[str, Any], cause: Cause, text: str
+    changes: dict[str, Any], cause: PositionCause, text: str
 ) -> None:
     watch = Watch()
     watch.run(1.9, **changes)
@@ -123,7 +129,7 @@ def test_no_position_for_two_seconds_is_lost(
 
 @pytest.mark.parametrize(("changes", "cause", "text"), POOR)
 def test_a_poor_position_is_lost_after_a_minute(
-    changes: dict[str, Any], cause: Cause, text: str
+    changes: dict[str, Any], cause: PositionCause, text: str
 ) -> None:
     watch = Watch()
     watch.run(60.0, **changes)
@@ -143,7 +149,7 @@ def test_a_position_that_does_not_come_counts_from_the_last_one() -> None:
     assert set(qualities[:6]) == {_Q.GOOD}
     assert set(qualities[6:19]) == {_Q.DOUBTFUL}
     assert set(qualities[20:]) == {_Q.LOST}
-    assert watch.judgement.cause is Cause.OLD
+    assert watch.judgement.cause is PositionCause.OLD
 
 
 def test_a_position_that_stands_still_is_no_estimate() -> None:
@@ -152,7 +158,7 @@ def test_a_position_that_stands_still_is_no_estimate() -> None:
     watch.run(1.3, position_changed_at_s=frozen_s)
     assert watch.judgement.quality is _Q.GOOD
     watch.run(0.2, position_changed_at_s=frozen_s)
-    assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, Cause.FROZEN)
+    assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, PositionCause.FROZEN)
     watch.run(1.6, position_changed_at_s=frozen_s)
     assert watch.judgement.quality is _Q.LOST
 
@@ -187,7 +193,7 @@ def test_one_sample_with_a_doubt_does_not_stop_a_robot() -> None:
     """At the rate that the estimator's word is asked for, told late by a tick."""
     watch = Watch()
     told_s = watch.now_s
-    watch.run(1.0 / RATES_HZ[230] + TICK_S, estimator=Estimator(True, True, told_s))
+    watch.run(1.0 / RATES_HZ[230] + TICK_S, estimator=EstimatorStatus(True, True, told_s))
     watch.run(1.0)
     assert watch.judgement.quality is _Q.GOOD
 
@@ -199,7 +205,10 @@ def test_a_pause_of_the_receiver_stops_a_robot_and_does_not_land_it() -> None:
         watch.now_s += TICK_S
         silent = dataclasses.replace(GPS, at_s=silent_s)
         watch.look(dataclasses.replace(heard(watch.now_s), gps=silent))
-    assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, Cause.GPS_SILENT)
+    assert (watch.judgement.quality, watch.judgement.cause) == (
+        _Q.DOUBTFUL,
+        PositionCause.GPS_SILENT,
+    )
 
 
 # Each row of docs/safety.md's table of wrong positions that the judgement has times for: the cause,
@@ -248,7 +257,7 @@ def test_wrong_positions_are_noticed_when_the_table_says(
     assert [cell.strip() for cell in row.split("|")[3:5]] == [after, happens]
     watch = Watch()
     since_s = watch.now_s
-    found: dict[Quality, float] = {}
+    found: dict[PositionQuality, float] = {}
     for tick in range(round(65.0 / TICK_S)):
         watch.now_s += TICK_S
         changes = dict(told[tick % len(told)])
@@ -271,7 +280,7 @@ def test_a_jump_is_doubted_until_it_was_good_for_a_while() -> None:
     watch = Watch()
     jumped_s = watch.now_s
     watch.run(0.6, jumped_at_s=jumped_s)
-    assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, Cause.JUMPED)
+    assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, PositionCause.JUMPED)
     watch.run(3.2, jumped_at_s=jumped_s)
     assert watch.judgement.quality is _Q.DOUBTFUL
     watch.run(0.6, jumped_at_s=jumped_s)
@@ -281,7 +290,7 @@ def test_a_jump_is_doubted_until_it_was_good_for_a_while() -> None:
 def test_an_estimator_that_says_nothing_counts_for_nothing() -> None:
     watch = Watch()
     watch.run(5.0, estimator=None)
-    watch.run(5.0, estimator=Estimator(False, True, watch.now_s - 3.0))
+    watch.run(5.0, estimator=EstimatorStatus(False, True, watch.now_s - 3.0))
     assert watch.judgement.quality is _Q.GOOD
 
 

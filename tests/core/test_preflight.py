@@ -6,19 +6,19 @@ from typing import Any
 
 import pytest
 
-from edge.core.margins import ErrorBudget
-from edge.core.mission import FlightState, Origin, RobotStatus
-from edge.core.position import Cause, Judgement, Quality
-from edge.core.preflight import (
+from edge.core.fence import Fence
+from edge.core.position import PositionCause, PositionJudgement, PositionQuality
+from edge.core.px4_version import in_words
+from edge.core.schema import ConfigError, from_mapping
+from edge.core.vehicle import GlobalOrigin, Gps, Mode, Reason, VehicleState
+from edge.flight.margins import ErrorBudget
+from edge.flight.preflight import (
     HeardStatus,
     PreflightInputs,
     PreflightLimits,
     failed_checks,
 )
-from edge.core.px4_version import in_words
-from edge.core.safety import Fence
-from edge.core.schema import ConfigError, from_mapping
-from edge.core.vehicle import GlobalOrigin, Gps, Mode, Reason, VehicleState
+from edge.messages.mission import FlightState, Origin, RobotStatus
 
 UNIX_S = 1_790_000_000.0
 ORIGIN = Origin(47.4, 8.5, 90.0)
@@ -85,7 +85,7 @@ READY = PreflightInputs(
     fence=Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 3.0, 25.0),
     fence_uploaded=True,
     origin=ORIGIN,
-    position=Judgement(Quality.GOOD, None),
+    position=PositionJudgement(PositionQuality.GOOD, None),
     position_m=(8.0, 8.0, 0.0),
     slot_height_m=5.0,
     landing_point_m=(8.0, 8.0),
@@ -138,11 +138,11 @@ INPUTS: list[tuple[dict[str, Any], str]] = [
 # In the place of a position that is missing or old.
 POSITIONS: list[tuple[dict[str, Any], str]] = [
     (
-        {"position": Judgement(Quality.DOUBTFUL, Cause.GLITCH)},
+        {"position": PositionJudgement(PositionQuality.DOUBTFUL, PositionCause.GLITCH)},
         "position is doubtful (the autopilot's estimator takes the GPS for wrong): wait, or move",
     ),
     (
-        {"position": Judgement(Quality.LOST, Cause.NO_FIX)},
+        {"position": PositionJudgement(PositionQuality.LOST, PositionCause.NO_FIX)},
         "position is lost (GPS has no fix): wait, or move to open sky",
     ),
 ]

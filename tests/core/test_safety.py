@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
+from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
-from edge.core.safety import (
+from edge.core.schema import ConfigError, from_mapping
+from edge.flight.safety import (
     Closest,
-    Fence,
     MotionLimits,
     approach_speed,
     brake,
@@ -24,7 +25,6 @@ from edge.core.safety import (
     limit_speed,
     nearest,
 )
-from edge.core.schema import ConfigError, from_mapping
 
 SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from edge.adapters.flight_log import read as read_log
-from edge.core.mission import FlightState
-from edge.runtime.policy import Policy
-from edge.runtime.replay import replay
+from edge.drivers.flight_log import read as read_log
+from edge.messages.mission import FlightState
+from edge.policy.lpac.graphs import Policy
+from edge.policy.replay import replay
 from tests.conftest import ROOT, SHIPPED, BuildImage
 from tests.deploy.entering import inside
 from tests.robot_rig import Changes, Rig, new_vehicle, program, rig
@@ -154,6 +154,6 @@ def fly(made: Rig) -> None:
             # It may have begun to land just now, and refuse.
             made.refusal("start", "arm")
     assert all(loop.failures == 0 for loop in made.status.loops.values())
-    made.operator.calm("land")
+    made.operator.safety_action("land")
     made.wait_for_state(FlightState.LANDED)
     assert not made.vehicle.armed

@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from bench import release
-from fleet.image import measure, package_of, table
+from lpac.fleet.image import measure, package_of, table
 from tests.conftest import ROOT, SHIPPED, BuildImage
 from tests.deploy.entering import inside
 

@@ -8,12 +8,12 @@ import torch
 import typer
 from typer.testing import CliRunner, Result
 
-from cli.export import export
 from edge.core.perception import PerceptionParameters
-from edge.runtime.bundle import load_bundle
-from edge.runtime.verify import verify
+from edge.policy.bundle import load_bundle
+from edge.policy.verify import verify
 from export.checkpoint import CheckpointError
 from export.exporter import export_bundle
+from lpac.cli.export import export
 from tests.export.states import random_state
 
 ROOT = Path(__file__).parents[2]

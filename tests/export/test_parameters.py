@@ -6,7 +6,7 @@ import pytest
 
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError
-from edge.runtime.bundle import Training
+from edge.policy.bundle import Training
 from export.parameters import read_parameters
 
 ROOT = Path(__file__).parents[2]

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import pytest
 
-from sim.host_base import NoHostsError
-from sim.hosts import RobotHosts
+from lpac.sim.hosts.base import NoHostsError
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import SHIPPED
 from tests.fleet.field import lpac_fleet, name_robot
 
 
 @pytest.fixture(scope="package")
-def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
+def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedHosts]:
     """r1, r2 and r3 with a slot each, r4 without; as the test before left them."""
     with ExitStack() as stack:
         try:
             running = stack.enter_context(
-                RobotHosts(
+                SimulatedHosts(
                     4,
                     tmp_path_factory.mktemp("hosts"),
                     image=amd64_image,
@@ -32,7 +32,7 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture(scope="package")
-def deployed(hosts: RobotHosts) -> RobotHosts:
+def deployed(hosts: SimulatedHosts) -> SimulatedHosts:
     """With new disks r1 and r3, which fly, and r4, a spare; they have the release. Not r2."""
     for host in (hosts[0], *hosts[2:]):
         host.reset()

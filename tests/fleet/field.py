@@ -8,7 +8,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from sim.hosts import RobotHost, RobotHosts
+from lpac.sim.hosts.host import SimulatedHost
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
 
 SILENT = "it does not answer: it is off, or out of reach"
@@ -16,7 +17,7 @@ SILENT = "it does not answer: it is off, or out of reach"
 
 def _typed(fleet: Path, command: str, options: tuple[object, ...]) -> list[str]:
     words = (command, "--fleet", fleet, *options)
-    return [sys.executable, "-m", "cli.main", "fleet", *map(str, words)]
+    return [sys.executable, "-m", "lpac.cli.main", "fleet", *map(str, words)]
 
 
 def _environment() -> dict[str, str]:
@@ -53,14 +54,14 @@ def unwatched(_: str, __: float | None) -> None:
     """A report that nobody reads."""
 
 
-def name_robot(hosts: RobotHosts, host: RobotHost) -> None:
+def name_robot(hosts: SimulatedHosts, host: SimulatedHost) -> None:
     """Give the host its identity, as `enroll` does."""
     identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
     host.run(f"mkdir -p /etc/lpac; echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
 
 
 @contextmanager
-def armed(host: RobotHost) -> Iterator[None]:
+def armed(host: SimulatedHost) -> Iterator[None]:
     """Its vehicle is armed meanwhile, and does not disarm by itself."""
     with host.stepped:
         host.vehicle.parameters["COM_DISARM_PRFLT"] = 0.0
@@ -72,7 +73,7 @@ def armed(host: RobotHost) -> Iterator[None]:
             host.vehicle.disarm(force=True)
 
 
-def await_said(host: RobotHost, text: str) -> None:
+def await_said(host: SimulatedHost, text: str) -> None:
     """Until the robot's program says so of itself."""
     host.run(
         f"until systemctl show -p StatusText lpac-robot | grep -q '{text}'; do sleep 0.1; done"

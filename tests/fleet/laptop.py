@@ -5,19 +5,19 @@ import time
 from pathlib import Path
 from typing import Any
 
-from fleet.config import FleetConfig, RobotHost, load_fleet
-from fleet.deploy import Deployed, deploy, rollback
-from fleet.hold import Report
-from fleet.release import Common, Release, load_common, make_release
-from fleet.session import connect
-from sim.hosts import RobotHosts
+from lpac.fleet.config import FleetConfig, RobotHost, load_fleet
+from lpac.fleet.deploy import Deployed, deploy, rollback
+from lpac.fleet.hold import Report
+from lpac.fleet.release import Common, Release, load_common, make_release
+from lpac.fleet.session import connect
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.fleet.field import unwatched
 
 
 class Laptop:
     """What an operator has: fleet.toml as it is now, and the releases made from it."""
 
-    def __init__(self, hosts: RobotHosts, folder: Path) -> None:
+    def __init__(self, hosts: SimulatedHosts, folder: Path) -> None:
         self.hosts = hosts
         self.config: FleetConfig = load_fleet(hosts.fleet_toml)
         self.common: Common = load_common(self.config)

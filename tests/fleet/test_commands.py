@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from sim.host_rack import children
-from sim.hosts import RobotHosts
-from sim.px4.modes import Mode
+from lpac.sim.hosts.hosts import SimulatedHosts
+from lpac.sim.hosts.rack import children
+from lpac.sim.px4.modes import Px4Mode
 from tests.fleet.field import (
     SILENT,
     armed,
@@ -26,7 +26,7 @@ from tests.fleet.field import (
 class Operator:
     """Types commands for one fleet."""
 
-    def __init__(self, hosts: RobotHosts) -> None:
+    def __init__(self, hosts: SimulatedHosts) -> None:
         self.hosts = hosts
         self.fleet_toml = hosts.fleet_toml
 
@@ -44,7 +44,7 @@ class Operator:
 
 
 @pytest.fixture(scope="module")
-def operator(hosts: RobotHosts) -> Operator:
+def operator(hosts: SimulatedHosts) -> Operator:
     """Of three robots that run a release, and a spare that has one."""
     operator = Operator(hosts)
     for host in hosts:
@@ -147,15 +147,15 @@ def test_a_vehicle_whose_program_is_gone_is_landed_over_ssh(operator: Operator) 
             r2.vehicle.pilot()
         assert land(1)["problem"] == "a pilot flies it (position): he lands it"
         with r2.stepped:
-            assert r2.vehicle.mode is Mode.POSCTL
-            r2.vehicle.set_mode(Mode.HOLD)
-            assert r2.stepped.wait_for(lambda: r2.vehicle.mode is Mode.HOLD, 60.0)
+            assert r2.vehicle.mode is Px4Mode.POSCTL
+            r2.vehicle.set_mode(Px4Mode.HOLD)
+            assert r2.stepped.wait_for(lambda: r2.vehicle.mode is Px4Mode.HOLD, 60.0)
         both = operator("land", "--robots", "r1,r2")
         assert both.returncode == 1
         assert "it lands" in both.stdout
         assert both.stderr.splitlines()[-1] == "lpac: landing: 1 of 2 robots; failed: r1"
         with r2.stepped:
-            assert r2.vehicle.mode is Mode.LAND
+            assert r2.vehicle.mode is Px4Mode.LAND
             assert r2.stepped.wait_for(lambda: not r2.vehicle.armed, 120.0)
             r2.vehicle.rc_connected = False
     operator.json("start", "--robots", "r2")

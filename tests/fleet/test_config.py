@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core.schema import ConfigError
-from edge.runtime.config import RobotConfig, load_config
-from fleet.config import FleetConfig, RobotHost, add_robot, assign, load_fleet, select
+from edge.robot.config import RobotConfig, load_config
+from lpac.fleet.config import FleetConfig, RobotHost, add_robot, assign, load_fleet, select
 from tests.conftest import ROOT, SHIPPED
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"

@@ -12,17 +12,18 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from edge.runtime.bundle import BUNDLE_ID, MANIFEST, make_bundle
-from fleet.deploy import deploy
-from fleet.release import make_release
-from fleet.session import FleetError, RemoteError, UnreachableError, connect
-from sim.hosts import RobotHost, RobotHosts
+from edge.policy.bundle import BUNDLE_ID, MANIFEST, make_bundle
+from lpac.fleet.deploy import deploy
+from lpac.fleet.release import make_release
+from lpac.fleet.session import FleetError, RemoteError, UnreachableError, connect
+from lpac.sim.hosts.host import SimulatedHost
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.fleet.field import armed, await_said, name_robot, running_lpac_fleet, unwatched
 from tests.fleet.laptop import Laptop, boot_nonce
 
 
 @pytest.fixture(scope="module")
-def laptop(hosts: RobotHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
     """r1 and r2 run a first release; r3 is there, whatever it has."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
     for index in range(2):
@@ -38,7 +39,7 @@ def await_true(holds: Callable[[], bool], within_s: float = 120.0) -> None:
         time.sleep(0.05)
 
 
-def await_free(host: RobotHost) -> None:
+def await_free(host: SimulatedHost) -> None:
     """Until nobody holds the robot. To ask mends nothing, as the robot's own `lock` does."""
     host.run("flock --shared /run/lpac-fleet.lock true")
 

@@ -15,14 +15,14 @@ from typing import Any
 
 import pytest
 
-from edge.core.margins import ErrorBudget
 from edge.core.vehicle import Gps
-from fleet.config import FleetConfig, RobotHost, SshConfig, load_fleet
-from fleet.deploy import deploy
-from fleet.doctor import (
-    Check,
+from edge.flight.margins import ErrorBudget
+from lpac.fleet.config import FleetConfig, RobotHost, SshConfig, load_fleet
+from lpac.fleet.deploy import deploy
+from lpac.fleet.doctor import (
     ClockOffset,
     Diagnosis,
+    DoctorCheck,
     Examination,
     diagnose,
     examine,
@@ -30,12 +30,12 @@ from fleet.doctor import (
     judge,
     on,
 )
-from fleet.laptop import iptables_blocks, nft_blocks, rsync_version
-from fleet.operations import Outcome, for_each
-from fleet.release import load_common, make_release
-from fleet.up import bring_up, decide, packs
-from sim.hosts import RobotHost as Host
-from sim.hosts import RobotHosts
+from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
+from lpac.fleet.operations import Outcome, for_each
+from lpac.fleet.release import load_common, make_release
+from lpac.fleet.up import bring_up, decide, packs
+from lpac.sim.hosts.host import SimulatedHost
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
 from tests.core.test_preflight import lines
 from tests.fleet.field import SILENT, armed, lpac_fleet, name_robot, unwatched
@@ -44,7 +44,7 @@ from tests.fleet.field import SILENT, armed, lpac_fleet, name_robot, unwatched
 
 
 @pytest.fixture(scope="module")
-def enrolled(hosts: RobotHosts) -> RobotHosts:
+def enrolled(hosts: SimulatedHosts) -> SimulatedHosts:
     """With their identity; r1, r2 and r3 with new disks, and nothing else is done to them."""
     for host in hosts[:3]:
         host.reset()
@@ -54,7 +54,7 @@ def enrolled(hosts: RobotHosts) -> RobotHosts:
 
 
 @contextlib.contextmanager
-def deaf(one: Host, other: Host) -> Iterator[None]:
+def deaf(one: SimulatedHost, other: SimulatedHost) -> Iterator[None]:
     """Nothing passes from one to the other, though both have the network."""
     script = 'ip -n "$1" route "$2" blackhole "$3"/32'
     one._rack.sh(script, one.name, "add", other.address)
@@ -65,8 +65,8 @@ def deaf(one: Host, other: Host) -> Iterator[None]:
 
 
 def run_doctor(
-    hosts: RobotHosts, robots: str = "r1,r2,r3", **clock: Any
-) -> dict[str, dict[str, Check]]:
+    hosts: SimulatedHosts, robots: str = "r1,r2,r3", **clock: Any
+) -> dict[str, dict[str, DoctorCheck]]:
     config = load_fleet(hosts.fleet_toml)
     chosen = [config.robots[name] for name in robots.split(",")]
 
@@ -81,7 +81,7 @@ def run_doctor(
     }
 
 
-def test_a_stock_robot_is_told_what_it_lacks(enrolled: RobotHosts) -> None:
+def test_a_stock_robot_is_told_what_it_lacks(enrolled: SimulatedHosts) -> None:
     for checks in run_doctor(enrolled).values():
         verdicts = {check.name: check.verdict for check in checks.values()}
         assert {name for name, verdict in verdicts.items() if verdict == "FAILED"} == {
@@ -95,7 +95,7 @@ def test_a_stock_robot_is_told_what_it_lacks(enrolled: RobotHosts) -> None:
             assert verdicts[name] == "ok", checks[name]
 
 
-def test_each_robot_has_its_own_faults_alone(enrolled: RobotHosts) -> None:
+def test_each_robot_has_its_own_faults_alone(enrolled: SimulatedHosts) -> None:
     """A full disk, no radio link between two, and one that is off."""
     r1, r2, r3, r4 = enrolled
     r1.fill_disk()
@@ -115,7 +115,7 @@ def test_each_robot_has_its_own_faults_alone(enrolled: RobotHosts) -> None:
     assert (reach.name, reach.verdict, reach.found) == ("reach", "FAILED", SILENT)
 
 
-def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: RobotHosts) -> None:
+def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: SimulatedHosts) -> None:
     text = enrolled.fleet_toml.read_text()
     changed = text.replace("robot_id = 1\n", "robot_id = 1\nsystem_id = 99\n")
     changed = changed.replace(
@@ -133,7 +133,7 @@ def test_another_clock_another_vehicle_and_one_that_is_silent(enrolled: RobotHos
     assert "14551, configured is 14999" in found["r2"]["vision-hub"].found
 
 
-def test_doctor_prints_a_board_and_fails(enrolled: RobotHosts) -> None:
+def test_doctor_prints_a_board_and_fails(enrolled: SimulatedHosts) -> None:
     asked = (enrolled.fleet_toml, "doctor", "--robots", "r1,r3")
     shown = lpac_fleet(*asked)
     assert shown.returncode == 1
@@ -148,7 +148,7 @@ def test_doctor_prints_a_board_and_fails(enrolled: RobotHosts) -> None:
     assert hub["fix"].startswith("lpac fleet enroll r1")
 
 
-def test_ping_has_every_way(enrolled: RobotHosts) -> None:
+def test_ping_has_every_way(enrolled: SimulatedHosts) -> None:
     shown = lpac_fleet(enrolled.fleet_toml, "ping", "--json")
     assert shown.returncode == 0, shown.stderr
     robots = json.loads(shown.stdout)["robots"]
@@ -163,7 +163,7 @@ def test_ping_has_every_way(enrolled: RobotHosts) -> None:
     assert "lost" in shown.stdout
 
 
-def test_up_says_no_go_with_the_reasons(enrolled: RobotHosts) -> None:
+def test_up_says_no_go_with_the_reasons(enrolled: SimulatedHosts) -> None:
     enrolled[2].cut()
     try:
         shown = lpac_fleet(enrolled.fleet_toml, "up", "--timeout", "3", "--json")
@@ -178,7 +178,7 @@ def test_up_says_no_go_with_the_reasons(enrolled: RobotHosts) -> None:
     assert robots["r3"]["reasons"] == [f"up: {SILENT}"]
 
 
-def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: RobotHosts) -> None:
+def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: SimulatedHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
     robot = config.robots["r1"]
     waits: list[str] = []
@@ -194,7 +194,7 @@ def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: RobotHosts) -> 
     assert arrival == ((), ())
 
 
-def test_a_clock_that_cannot_be_set_is_no_go(enrolled: RobotHosts) -> None:
+def test_a_clock_that_cannot_be_set_is_no_go(enrolled: SimulatedHosts) -> None:
     """A container may not set the clock of the machine that it runs on."""
     config = load_fleet(enrolled.fleet_toml)
     arrival = asyncio.run(
@@ -206,7 +206,9 @@ def test_a_clock_that_cannot_be_set_is_no_go(enrolled: RobotHosts) -> None:
     assert arrival.problems[0].startswith("its clock cannot be set")
 
 
-def test_up_starts_what_was_switched_off_and_says_go(enrolled: RobotHosts, tmp_path: Path) -> None:
+def test_up_starts_what_was_switched_off_and_says_go(
+    enrolled: SimulatedHosts, tmp_path: Path
+) -> None:
     host = enrolled[0]
     config = load_fleet(enrolled.fleet_toml)
     robot = config.robots[host.name]
@@ -244,7 +246,7 @@ def test_up_starts_what_was_switched_off_and_says_go(enrolled: RobotHosts, tmp_p
     assert host.run("systemctl is-active lpac-robot || true") == "inactive\n"
 
 
-def test_no_clock_is_set_under_an_armed_vehicle(enrolled: RobotHosts) -> None:
+def test_no_clock_is_set_under_an_armed_vehicle(enrolled: SimulatedHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
     with armed(enrolled[1]):
         arrival = asyncio.run(
@@ -319,7 +321,7 @@ def well(config: FleetConfig, name: str) -> Examination:
     return Examination(facts, ClockOffset(0.001, 0.01), "its program says so itself", pings)
 
 
-def judged(config: FleetConfig, change: Any = lambda _: None) -> dict[str, Check]:
+def judged(config: FleetConfig, change: Any = lambda _: None) -> dict[str, DoctorCheck]:
     """The checks of r1, with its facts changed."""
     fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
     facts: dict[str, Any] = copy.deepcopy(dict(fleet["r1"].facts))

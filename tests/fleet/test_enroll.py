@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from fleet.config import load_fleet
-from fleet.enroll import _robot
-from sim.hosts import RobotHost, RobotHosts
+from lpac.fleet.config import load_fleet
+from lpac.fleet.enroll import _robot
+from lpac.sim.hosts.host import SimulatedHost
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
 from tests.fleet.field import armed, lpac_fleet
 
@@ -49,7 +50,7 @@ UNIT = "[Service]\nExecStart=/bin/sleep infinity\n[Install]\nWantedBy=multi-user
 
 
 @pytest.fixture
-def new(hosts: RobotHosts) -> RobotHost:
+def new(hosts: SimulatedHosts) -> SimulatedHost:
     """r4 as it came: only a password lets in, and the fleet of `fleet_file` does not know it."""
     host = hosts[3]
     host.reset()
@@ -57,7 +58,7 @@ def new(hosts: RobotHosts) -> RobotHost:
 
 
 @pytest.fixture
-def fleet_file(hosts: RobotHosts, tmp_path: Path) -> Path:
+def fleet_file(hosts: SimulatedHosts, tmp_path: Path) -> Path:
     """The fleet without r4, with predecessors; ssh asks about unknown hosts, as is its default."""
     text = hosts.fleet_toml.read_text()
     before, _, after = text.partition("\n[robots.r4]\n")
@@ -89,7 +90,7 @@ def person(tmp_path: Path) -> dict[str, str]:
     return {"SSH_ASKPASS": str(script), "SSH_ASKPASS_REQUIRE": "force"}
 
 
-def install(host: RobotHost, path: str, text: str, mode: int = 0o644) -> None:
+def install(host: SimulatedHost, path: str, text: str, mode: int = 0o644) -> None:
     file = host.root / path
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text)
@@ -106,7 +107,7 @@ def outcomes(text: str) -> dict[str, str]:
     }
 
 
-def as_a_lab_left_it(new: RobotHost) -> None:
+def as_a_lab_left_it(new: SimulatedHost) -> None:
     """A password, and three programs that may command the vehicle."""
     (new.root / "root/.ssh/authorized_keys").write_text("ssh-ed25519 AAAA another's")
     new.run(f"echo 'root:{PASSWORD}' | chpasswd; echo PermitRootLogin yes >> /etc/ssh/sshd_config")
@@ -119,7 +120,7 @@ def as_a_lab_left_it(new: RobotHost) -> None:
     )
 
 
-def assert_alone(new: RobotHost, said: str) -> None:
+def assert_alone(new: SimulatedHost, said: str) -> None:
     """The predecessors do not run any more; what else runs was told."""
     containers = json.loads((new.root / "var/lib/docker.json").read_text())
     old, camera = containers["old_stack"], containers["camera"]
@@ -133,7 +134,11 @@ def assert_alone(new: RobotHost, said: str) -> None:
 
 
 def test_from_a_password_to_a_robot_of_the_fleet(
-    hosts: RobotHosts, new: RobotHost, fleet_file: Path, tmp_path: Path, person: dict[str, str]
+    hosts: SimulatedHosts,
+    new: SimulatedHost,
+    fleet_file: Path,
+    tmp_path: Path,
+    person: dict[str, str],
 ) -> None:
     as_a_lab_left_it(new)
     comment = "/* made by voxl-configure: 'offboard_mode': // \"x\" */\n"
@@ -200,7 +205,11 @@ def test_from_a_password_to_a_robot_of_the_fleet(
 
 
 def test_a_robot_is_not_renamed_nor_touched_in_flight_nor_let_in_unseen(
-    hosts: RobotHosts, new: RobotHost, fleet_file: Path, tmp_path: Path, person: dict[str, str]
+    hosts: SimulatedHosts,
+    new: SimulatedHost,
+    fleet_file: Path,
+    tmp_path: Path,
+    person: dict[str, str],
 ) -> None:
     # Nobody is there who could say that the host key is right.
     done = lpac_fleet(fleet_file, "enroll", "r4", new.address)

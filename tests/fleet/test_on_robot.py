@@ -15,23 +15,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common
 
-from edge.adapters import raw_mavlink
-from fleet.enroll import _predecessors_step
-from fleet.on_robot import enrolment, landing, probes, releases, service
-from fleet.on_robot.calls import Refused
-from fleet.release import _entry
-from sim.ports import free_ports
-from sim.px4.link import Px4Link
-from sim.px4.modes import Mode
-from sim.px4.server import Instance, Px4Server
-from sim.px4.vehicle import Px4Vehicle
+from edge.drivers.px4 import raw_mavlink
+from lpac.fleet.enroll import _predecessors_step
+from lpac.fleet.on_robot import enrolment, landing, probes, releases, service
+from lpac.fleet.on_robot.calls import Refused
+from lpac.fleet.release import _entry
+from lpac.sim.ports import free_ports
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Vehicle
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize(
     "path",
-    [*sorted((ROOT / "fleet" / "on_robot").glob("*.py")), Path(raw_mavlink.__file__)],
+    [*sorted((ROOT / "lpac" / "fleet" / "on_robot").glob("*.py")), Path(raw_mavlink.__file__)],
     ids=lambda path: path.name,
 )
 def test_the_robots_python_3_6_can_read_it(path: Path) -> None:
@@ -194,18 +194,18 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
         assert server.wait_for(takes_off, 60.0)
         with server.stepped:
             vehicle.pilot()
-        assert server.wait_for(lambda: vehicle.mode is Mode.POSCTL, 60.0)
+        assert server.wait_for(lambda: vehicle.mode is Px4Mode.POSCTL, 60.0)
         # PX4 tells it within a second.
         heard = {}
         while heard.get("mode") != "position":
             heard = service.hear_heartbeat(port) or {}
         refused(r"^a pilot flies it \(position\): he lands it$")
         with server.stepped:
-            vehicle.set_mode(Mode.HOLD)
+            vehicle.set_mode(Px4Mode.HOLD)
         while heard.get("mode") != "hold":
             heard = service.hear_heartbeat(port) or {}
         assert landing.land(port, 7) == {"mode": "land", "armed": True}
-        assert vehicle.mode is Mode.LAND
+        assert vehicle.mode is Px4Mode.LAND
         assert server.wait_for(lambda: vehicle.landed and not vehicle.armed, 60.0)
 
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet import doctor
-from fleet.on_robot import probes, service
+from lpac.fleet import doctor
+from lpac.fleet.on_robot import probes, service
 from tests.conftest import ROOT
 
 NAMES = st.from_regex(r"[a-z][a-z0-9-]{0,14}", fullmatch=True)
@@ -212,5 +212,5 @@ def test_a_clock_is_set_by_its_offset(monkeypatch: pytest.MonkeyPatch) -> None:
 )  # fmt: skip
 def test_doctor_sorts_the_programs_checks_by_words_that_it_says(words: str) -> None:
     """Reworded there alone, a fault would pass for something that only takes a while."""
-    said = [ROOT / "edge" / name for name in ("core/preflight.py", "robot.py")]
+    said = [ROOT / "edge" / name for name in ("flight/preflight.py", "robot/process.py")]
     assert any(words in path.read_text() for path in said)

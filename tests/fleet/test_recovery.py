@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet.on_robot.service import UNIT
-from fleet.session import RemoteError
-from sim.hosts import RobotHosts
+from lpac.fleet.on_robot.service import UNIT
+from lpac.fleet.session import RemoteError
+from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.fleet.field import armed, lpac_fleet, name_robot
 from tests.fleet.laptop import Laptop, boot_nonce
 
@@ -15,7 +15,7 @@ OTHERS_UNIT = "/etc/systemd/system/lpac-robot.service.d/60-others.conf"
 
 
 @pytest.fixture(scope="module")
-def laptop(hosts: RobotHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
     """r1 runs a second release, and has the first to go back to."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
     hosts[0].reset()

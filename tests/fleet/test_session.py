@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from fleet.config import RobotHost, load_fleet
-from fleet.operations import for_each
-from fleet.session import explain
+from lpac.fleet.config import RobotHost, load_fleet
+from lpac.fleet.operations import for_each
+from lpac.fleet.session import explain
 from tests.conftest import ROOT
 
 

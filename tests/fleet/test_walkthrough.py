@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.host_base import NoHostsError, require_tools
+from lpac.sim.hosts.base import NoHostsError, require_tools
 from tests.conftest import ROOT, SHIPPED
 
 
@@ -26,7 +26,7 @@ def test_the_readme_can_be_followed_line_by_line(amd64_image: Path, tmp_path: Pa
     programs = Path(sys.executable).parent
     environment = os.environ | {variable: value, "PATH": f"{programs}:{os.environ['PATH']}"}
     demo = subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "hosts", "-n", "3", "--image", str(amd64_image),
+        [sys.executable, "-m", "lpac.cli.main", "hosts", "-n", "3", "--image", str(amd64_image),
          "--bundle", str(SHIPPED), "--out", str(tmp_path / Path(value).parent)],
         cwd=ROOT, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip

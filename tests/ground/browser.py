@@ -101,7 +101,7 @@ def lpac(*arguments: str) -> Iterator[str]:
     Raises RuntimeError if it says none.
     """
     program = subprocess.Popen(
-        [sys.executable, "-m", "cli.main", *arguments],
+        [sys.executable, "-m", "lpac.cli.main", *arguments],
         cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     with program:

@@ -16,34 +16,42 @@ from typing import Protocol
 
 import pytest
 
-from ground import client
-from ground.protocol import Picture, Progress, Report, Request, Setup, Told, to_line, told_from_line
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.ground.station import client
+from lpac.ground.station.protocol import (
+    CommandProgress,
+    CommandReport,
+    Request,
+    ServerMessage,
+    server_message_from_line,
+    to_line,
+)
 from tests.conftest import ROOT
 
 # Nothing here takes so long unless it is broken.
 PATIENCE_S = 60.0
 
 
-def all_heard(picture: Picture) -> bool:
-    return all(robot.fresh for robot in picture.robots)
+def all_heard(snapshot: FleetSnapshot) -> bool:
+    return all(robot.fresh for robot in snapshot.robots)
 
 
-def wait_for_picture(
+def wait_for_snapshot(
     fleet: str,
-    condition: Callable[[Picture], object] = all_heard,
+    condition: Callable[[FleetSnapshot], object] = all_heard,
     assert_runs: Callable[[], None] = lambda: None,
-) -> Picture:
+) -> FleetSnapshot:
     """The first picture that is so, of the ground process that this environment has.
 
     It may still have to start.
     """
     until_s = time.monotonic() + PATIENCE_S
-    last: Picture | None = None
+    last: FleetSnapshot | None = None
     while time.monotonic() < until_s:
         assert_runs()
         try:
             with client.subscribe(fleet) as told:
-                for last in (t for t in told if isinstance(t, Picture)):
+                for last in (t for t in told if isinstance(t, FleetSnapshot)):
                     if condition(last):
                         return last
                     if time.monotonic() > until_s:
@@ -61,7 +69,7 @@ class GroundStation:
         self.name = name
         self.log = log
         arguments = ["ground", "--fleet", str(fleet_toml), "--name", name]
-        self._command = [sys.executable, "-m", "cli.main", *arguments]
+        self._command = [sys.executable, "-m", "lpac.cli.main", *arguments]
         match = re.search(r'^fleet = "(.*)"', fleet_toml.read_text(), re.MULTILINE)
         assert match is not None
         self.fleet = match[1]
@@ -102,8 +110,8 @@ class GroundStation:
         self.process.wait()
 
     def command(
-        self, request: Request, on_progress: Callable[[Progress], None] = lambda _: None
-    ) -> Report:
+        self, request: Request, on_progress: Callable[[CommandProgress], None] = lambda _: None
+    ) -> CommandReport:
         with self._here():
             return client.command(self.fleet, request, on_progress)
 
@@ -111,25 +119,25 @@ class GroundStation:
         """A command that runs beside the test; its first progress tells that it was taken."""
         return Pending(self, request)
 
-    def wait_for(self, condition: Callable[[Picture], object]) -> Picture:
+    def wait_for(self, condition: Callable[[FleetSnapshot], object]) -> FleetSnapshot:
         """The first picture that is so. Waits for a socket, too."""
         with self._here():
-            return wait_for_picture(self.fleet, condition, self._assert_runs)
+            return wait_for_snapshot(self.fleet, condition, self._assert_runs)
 
     def _assert_runs(self) -> None:
         assert self.process is not None
         assert self.process.poll() is None, self.log.read_text()
 
-    def told(self) -> list[Told]:
+    def told(self) -> list[ServerMessage]:
         """What a new subscriber is told first, up to a picture."""
         with self._here(), client.subscribe(self.fleet) as told:
-            return [*itertools.takewhile(lambda t: not isinstance(t, Picture), told)]
+            return [*itertools.takewhile(lambda t: not isinstance(t, FleetSnapshot), told)]
 
-    def setup(self) -> Setup:
+    def setup(self) -> FleetSetup:
         """The fleet as it is now."""
-        return next(told for told in self.told() if isinstance(told, Setup))
+        return next(told for told in self.told() if isinstance(told, FleetSetup))
 
-    def subscribed(self) -> Iterator[Told]:
+    def subscribed(self) -> Iterator[ServerMessage]:
         """All that a subscriber is told."""
         with ExitStack() as stack:
             with self._here():
@@ -157,16 +165,16 @@ class Pending:
         self._socket.sendall(to_line(request))
         self._lines = self._socket.makefile("rb")
 
-    def progress(self, of: str) -> Progress:
+    def progress(self, of: str) -> CommandProgress:
         """The next of one robot."""
         for told in self._told():
-            if isinstance(told, Progress) and told.robot == of:
+            if isinstance(told, CommandProgress) and told.robot == of:
                 return told
         raise AssertionError("it has ended")
 
-    def report(self) -> Report:
+    def report(self) -> CommandReport:
         """What came of it."""
-        report = next(told for told in self._told() if isinstance(told, Report))
+        report = next(told for told in self._told() if isinstance(told, CommandReport))
         self.leave()
         return report
 
@@ -175,8 +183,8 @@ class Pending:
         self._lines.close()
         self._socket.close()
 
-    def _told(self) -> Iterator[Told]:
-        return map(told_from_line, self._lines)
+    def _told(self) -> Iterator[ServerMessage]:
+        return map(server_message_from_line, self._lines)
 
 
 class NewStation(Protocol):

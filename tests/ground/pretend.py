@@ -19,9 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from edge.adapters.zenoh_link import ZenohLink
-from edge.core.mission import (
-    EXPLORED_CELLS,
+from edge.core.fence import Fence
+from edge.core.perception import EXPLORED_CELLS
+from edge.core.vehicle import Vector
+from edge.core.world import format_world, random_features
+from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.mission import (
     ON_GROUND,
     FlightState,
     GroundState,
@@ -35,11 +38,8 @@ from edge.core.mission import (
     to_json,
     world_id,
 )
-from edge.core.safety import Fence
-from edge.core.vehicle import Vector
-from edge.core.world import format_world, random_features
-from edge.runtime.bundle import load_bundle
-from sim.ports import free_ports
+from edge.policy.bundle import load_bundle
+from lpac.sim.ports import free_ports
 from tests.conftest import SHIPPED
 
 PERIOD_S = 0.25
@@ -166,16 +166,16 @@ class PretendedRobot:
         }[order.kind]  # fmt: skip
         if self.state not in sources:
             return f"{order.kind} is not taken in {self.state}"
-        if order.kind in ("takeoff", "start") and self._calm() != "none":
-            return f"the ground commands {self._calm()}"
+        if order.kind in ("takeoff", "start") and self._safety_action() != "none":
+            return f"the ground commands {self._safety_action()}"
         if order.kind == "takeoff" and self.refuses:
             return f"not ready: {self.refuses}"
         return ""
 
-    def _calm(self) -> str:
+    def _safety_action(self) -> str:
         if self.ground is None:
             return "none"
-        asked = self.ground.calm_for(self.robot_id)
+        asked = self.ground.safety_action_for(self.robot_id)
         return "hold" if asked == "none" and not self._enabled() else asked
 
     def _enabled(self) -> bool:
@@ -197,7 +197,7 @@ class PretendedRobot:
         self._take_up()
         age_s = now_s - self.since_s
         heard = self.hears_ground
-        calm = self._calm() if heard else "none"
+        safety_action = self._safety_action() if heard else "none"
         state = self.state
         steered = (_S.TAKEOFF, _S.HOLD, _S.MISSION, _S.RETURN)
         may_fly = heard and self._enabled() and self.origin is not None
@@ -207,19 +207,19 @@ class PretendedRobot:
             self.enter(_S.PREFLIGHT, "enabled")
         elif state is _S.PREFLIGHT and not may_fly:
             self.enter(_S.IDLE, "not enabled" if heard else "ground lost")
-        elif state is _S.LANDED and may_fly and calm == "none":
+        elif state is _S.LANDED and may_fly and safety_action == "none":
             self.enter(_S.PREFLIGHT, "enabled")
-        elif state is _S.ARMING and (calm != "none" or not heard):
-            self.enter(_S.IDLE, f"ground commands {calm} while arming")
+        elif state is _S.ARMING and (safety_action != "none" or not heard):
+            self.enter(_S.IDLE, f"ground commands {safety_action} while arming")
         elif state is _S.ARMING and age_s > 0.2:
             self.enter(_S.TAKEOFF, "armed")
-        elif state in steered and calm == "land":
+        elif state in steered and safety_action == "land":
             self.enter(_S.LAND, "ground commands land")
-        elif state is _S.TAKEOFF and calm == "return":
+        elif state is _S.TAKEOFF and safety_action == "return":
             self.enter(_S.LAND, "ground commands return during takeoff")
-        elif state in (_S.TAKEOFF, _S.MISSION, _S.RETURN, _S.LAND) and calm == "hold":
+        elif state in (_S.TAKEOFF, _S.MISSION, _S.RETURN, _S.LAND) and safety_action == "hold":
             self.enter(_S.HOLD, "ground commands hold")
-        elif state in (_S.HOLD, _S.MISSION) and calm == "return":
+        elif state in (_S.HOLD, _S.MISSION) and safety_action == "return":
             self.enter(_S.RETURN, "ground commands return")
         elif state in (_S.MISSION, _S.RETURN) and not heard:
             self.enter(_S.HOLD, "ground lost")

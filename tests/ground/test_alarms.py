@@ -7,24 +7,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.mission import FlightState, GroundState, LoopStatus, Origin
-from edge.core.safety import Fence
-from ground.alarms import SEVERITIES, Alarm, alarms
-from ground.protocol import Picture
-from tests.ground.pictures import FENCE, LOOP, ORIGIN, on_ground, picture, robot, setup, status
+from edge.core.fence import Fence
+from edge.messages.mission import FlightState, GroundState, LoopStatus, Origin
+from lpac.analysis.snapshot import FleetSnapshot
+from lpac.ground.alarms import SEVERITIES, Alarm, alarms
+from tests.ground.snapshots import FENCE, LOOP, ORIGIN, on_ground, robot, setup, snapshot, status
 
 _S = FlightState
 SETUP = setup(3)
 
 
-def told(seen: Picture, before: Picture | None = None) -> tuple[Alarm, ...]:
+def told(seen: FleetSnapshot, before: FleetSnapshot | None = None) -> tuple[Alarm, ...]:
     return alarms(SETUP, seen, before)
 
 
-def fleet(*, said: dict[str, Any] | None = None, known: dict[str, Any] | None = None) -> Picture:
+def fleet(
+    *, said: dict[str, Any] | None = None, known: dict[str, Any] | None = None
+) -> FleetSnapshot:
     """Three robots that fly well; r1 is different."""
     r1 = robot(status(1, **(said or {})), **(known or {}))
-    return picture(robot(status(0)), r1, robot(status(2)))
+    return snapshot(robot(status(0)), r1, robot(status(2)))
 
 
 def test_nothing_of_a_fleet_that_flies_well() -> None:
@@ -32,13 +34,13 @@ def test_nothing_of_a_fleet_that_flies_well() -> None:
 
 
 def test_robots_before_enable_are_not_alarming() -> None:
-    seen = picture(*(robot(on_ground(i)) for i in range(3)), commander="", ground=None)
+    seen = snapshot(*(robot(on_ground(i)) for i in range(3)), commander="", ground=None)
     assert told(seen, seen) == (Alarm("note", "", "nobody commands the fleet yet"),)
 
 
 def test_robots_after_enable_say_why_they_are_not_ready() -> None:
     robots = [robot(on_ground(i, state=_S.PREFLIGHT)) for i in range(3)]
-    assert told(picture(*robots)) == tuple(
+    assert told(snapshot(*robots)) == tuple(
         Alarm("note", f"r{i}", "not ready: GPS sees 3 satellites") for i in range(3)
     )
 
@@ -102,23 +104,23 @@ def test_a_robot_that_falls_silent_says_nothing_else() -> None:
 
 def test_a_silent_robot_on_the_ground_is_less_grave() -> None:
     robots = robot(status(0)), robot(on_ground(1), age_s=60.0), robot(status(2))
-    assert told(picture(*robots)) == (Alarm("warning", "r1", "not heard any more, last in idle"),)
+    assert told(snapshot(*robots)) == (Alarm("warning", "r1", "not heard any more, last in idle"),)
 
 
 def test_robots_that_were_never_heard_are_one_alarm() -> None:
     silent = [replace(robot(status(i)), status=None, age_s=None) for i in (1, 2)]
-    (alarm,) = told(picture(robot(on_ground(0, failed_checks=())), *silent))
+    (alarm,) = told(snapshot(robot(on_ground(0, failed_checks=())), *silent))
     assert alarm == ("note", "", "not heard yet: r1 r2")
-    assert told(picture(*silent)) == (Alarm("note", "", "no robot is heard yet"),)
+    assert told(snapshot(*silent)) == (Alarm("note", "", "no robot is heard yet"),)
 
 
 def test_robots_out_of_range_need_not_be_heard() -> None:
     far = robot(status(1, position_m=(30.0, 30.0, 4.0), neighbour_ages_s={}))
-    assert told(picture(robot(status(0)), far, robot(status(2)))) == ()
+    assert told(snapshot(robot(status(0)), far, robot(status(2)))) == ()
 
 
 def test_a_new_state_may_take_a_moment_to_be_obeyed() -> None:
-    hold = GroundState(5, "alice", ORIGIN, enabled=True, calm="hold", trial="t1")
+    hold = GroundState(5, "alice", ORIGIN, enabled=True, safety_action="hold", trial="t1")
     now = replace(fleet(), ground=hold)
     assert told(now, fleet()) == ()
     assert {a.text for a in told(now, now)} == {"does not obey what the ground says"}
@@ -131,7 +133,7 @@ def test_a_robot_obeys_another_operator() -> None:
 
 
 def test_loops_that_miss_ticks_or_fail() -> None:
-    def with_loop(loop: LoopStatus) -> Picture:
+    def with_loop(loop: LoopStatus) -> FleetSnapshot:
         return fleet(said={"loops": {"control": loop}})
 
     missed, failed = replace(LOOP, overruns=3), replace(LOOP, overruns=3, failures=1)
@@ -168,7 +170,9 @@ def test_a_world_that_is_not_here() -> None:
 
 
 def test_hold_of_another_station() -> None:
-    held = GroundState(4, "alice", ORIGIN, enabled=True, calm="hold", calm_by="bob")
+    held = GroundState(
+        4, "alice", ORIGIN, enabled=True, safety_action="hold", safety_action_by="bob"
+    )
     assert told(replace(fleet(), ground=held)) == (
         Alarm("warning", "", "bob asks 3 robots to hold"),
     )
@@ -198,7 +202,7 @@ def test_the_gravest_comes_first_and_each_once(said: list[Any], ages_s: list[Any
         robot(replace(s, robot_id=i), age_s=age_s)
         for i, (s, age_s) in enumerate(zip(said, ages_s, strict=True))
     ]
-    found = told(picture(*robots), fleet())
+    found = told(snapshot(*robots), fleet())
     order = [SEVERITIES.index(alarm.severity) for alarm in found]
     assert order == sorted(order)
     assert len(found) == len(set(found))

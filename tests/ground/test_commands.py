@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import pytest
 
-from edge.core.mission import FlightState, Place
-from ground.protocol import (
-    Again,
-    Calm,
-    Command,
+from edge.messages.mission import FlightState, Place
+from lpac.ground.station.protocol import (
     Enable,
-    Give,
+    NextTrial,
     Request,
     Resume,
+    RobotCommand,
+    SafetyCommand,
     SetFence,
     SetOrigin,
     SetPlaces,
     SetWorld,
+    TakeCommand,
     Takeoff,
 )
 from tests.ground.pretend import ORIGIN
@@ -41,7 +41,7 @@ def two_stations() -> Field:
 @pytest.mark.parametrize("by", ["alice", "bob"])
 def test_a_hold_on_the_ground_is_not_withdrawn_by_takeoff(by: str) -> None:
     field = two_stations()
-    field.done(Calm("hold"), by)
+    field.done(SafetyCommand("hold"), by)
     field.run(1.0)
     who = "" if by == "alice" else " by bob"
     refusal = f"hold is commanded{who}: `lpac mission resume` withdraws it"
@@ -55,25 +55,25 @@ def test_a_hold_on_the_ground_is_not_withdrawn_by_takeoff(by: str) -> None:
 
 def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> None:
     field = two_stations()
-    field.done(Calm("hold", robots=("r1",)), "bob")
+    field.done(SafetyCommand("hold", robots=("r1",)), "bob")
     field.run(1.0)
     assert why_not(field.do(TAKEOFF)) == {
         "r1": "hold is commanded by bob: `lpac mission resume` withdraws it"
     }
-    field.done(Calm("land", robots=("r0", "r2"), wait=True))
+    field.done(SafetyCommand("land", robots=("r0", "r2"), wait=True))
     field.done(Takeoff(robots=("r0",)))
     state = field.stations["alice"].state
     assert state is not None
-    assert state.robot_calm == {"1": "hold", "2": "land"}
+    assert state.robot_safety_actions == {"1": "hold", "2": "land"}
     # Asked of all, it is as if all were to be set in motion.
-    field.done(Calm("land", robots=("r0",), wait=True))
+    field.done(SafetyCommand("land", robots=("r0",), wait=True))
     assert "`lpac mission resume` withdraws it" in field.do(TAKEOFF).problem
 
 
 def test_who_is_not_heard_may_be_in_the_air() -> None:
     field = a_field()
     field.take_off()
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))
     field.robots[1].silent = True
     field.run(12.0)
     assert "land is commanded" in field.do(TAKEOFF).problem
@@ -81,7 +81,7 @@ def test_who_is_not_heard_may_be_in_the_air() -> None:
     field.done(Takeoff(interval_s=0.0, robots=("r0", "r2")))
     state = field.stations["alice"].state
     assert state is not None
-    assert state.calm_for(1) == "land"
+    assert state.safety_action_for(1) == "land"
 
 
 def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
@@ -90,11 +90,11 @@ def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
     field.robots[2].silent = True
     field.run(1.0)
     field.take_off()
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))
     field.done(TAKEOFF)
     state = field.stations["alice"].state
     assert state is not None
-    assert (state.calm, state.robot_calm) == ("none", {})
+    assert (state.safety_action, state.robot_safety_actions) == ("none", {})
 
 
 # A mission that was not started is not resumed
@@ -103,9 +103,9 @@ def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
 def test_a_reset_robot_has_not_begun_the_trial() -> None:
     field = a_field()
     field.make_ready()
-    field.done(Again("second"))
+    field.done(NextTrial("second"))
     field.done(TAKEOFF)
-    field.done(Calm("hold"))
+    field.done(SafetyCommand("hold"))
     report = field.done(Resume())
     texts = {result.text for result in report.results}
     assert texts == {"holds: it has not begun this trial; `lpac mission start`"}
@@ -137,8 +137,8 @@ def test_who_is_not_addressed_keeps_what_it_has(request_: Request) -> None:
 def test_a_killed_robot_is_not_in_the_others_way() -> None:
     field = a_field()
     field.take_off()
-    field.done(Give("kill", ("r0",)))
-    field.done(Calm("land", robots=("r1", "r2"), wait=True))
+    field.done(RobotCommand("kill", ("r0",)))
+    field.done(SafetyCommand("land", robots=("r1", "r2"), wait=True))
     field.done(SetWorld(OTHER_WORLD, "w", robots=("r1", "r2")))
 
 
@@ -164,11 +164,11 @@ def test_who_takes_over_has_gathered_its_robots_first() -> None:
     field = two_stations()
     # It knows who commands before it has heard every robot.
     field.join("carol")
-    field.done(Command(), "carol")
+    field.done(TakeCommand(), "carol")
 
 
 def test_who_took_over_is_not_robbed_of_the_command() -> None:
-    for request in (Again(), Give("disarm", ("r0",)), Calm("hold"), Enable()):
+    for request in (NextTrial(), RobotCommand("disarm", ("r0",)), SafetyCommand("hold"), Enable()):
         field = two_stations()
         # It obeys somebody who is gone, and hears nobody: alice waits for it.
         robot = field.robots[0]
@@ -178,7 +178,7 @@ def test_who_took_over_is_not_robbed_of_the_command() -> None:
         waiting = field.begin(request)
         field.run(1.0)
         assert waiting.report is None
-        taken = field.begin(Command(), "bob")
+        taken = field.begin(TakeCommand(), "bob")
         field.run(1.0)
         assert waiting.report is not None
         assert why_not(waiting.report)["r0"] == "abandoned: bob commands the fleet"
@@ -192,9 +192,9 @@ def test_kill_goes_on_whoever_takes_over() -> None:
     field = two_stations()
     field.done(TAKEOFF)
     field.robots[0].deaf = True
-    kill = field.begin(Give("kill", ("r0",)))
+    kill = field.begin(RobotCommand("kill", ("r0",)))
     field.run(1.0)
-    field.begin(Command(), "bob")
+    field.begin(TakeCommand(), "bob")
     field.run(1.0)
     field.robots[0].deaf = False
     field.until(lambda: kill.report)
@@ -205,8 +205,8 @@ def test_kill_goes_on_whoever_takes_over() -> None:
 def test_anothers_hold_ends_only_what_sets_in_motion() -> None:
     field = two_stations()
     field.robots[0].deaf = True
-    again = field.begin(Again())
-    field.done(Calm("hold", robots=("r1",)), "bob")
+    again = field.begin(NextTrial())
+    field.done(SafetyCommand("hold", robots=("r1",)), "bob")
     field.run(1.0)
     assert again.report is None
     field.robots[0].deaf = False
@@ -226,7 +226,7 @@ def half_resumed() -> Field:
     for robot in field.robots:
         robot.position_m = (30.0, 30.0, robot.slot_height_m)
     field.run(0.5)
-    field.done(Calm("return"))
+    field.done(SafetyCommand("return"))
     return field
 
 
@@ -243,7 +243,7 @@ def test_who_is_told_to_hold_goes_nowhere_if_resume_is_abandoned(by: str) -> Non
     field = half_resumed()
     resume = field.begin(Resume())
     field.run(0.1)
-    field.done(Calm("hold"), by)
+    field.done(SafetyCommand("hold"), by)
     field.run(1.0)
     assert resume.report is not None
     assert set(why_not(resume.report)) == {"r0", "r1", "r2"}
@@ -257,9 +257,9 @@ def test_who_is_told_to_hold_goes_nowhere_if_resume_is_abandoned(by: str) -> Non
 def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
     field = a_field()
     field.take_off()
-    field.done(Give("pilot", ("r1",)))
+    field.done(RobotCommand("pilot", ("r1",)))
     field.robots[1].state = _S.HOLD
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))
     assert field.states() == {_S.LANDED}
 
 
@@ -268,10 +268,10 @@ def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
 
 def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
     field = two_stations()
-    field.done(Give("kill", ("r1",)))
+    field.done(RobotCommand("kill", ("r1",)))
     why = "fault: killed by the operator; look at it, then `lpac fleet restart`"
     assert why_not(field.do(Enable())) == {"r1": why}
-    assert field.done(Calm("land", wait=True))
+    assert field.done(SafetyCommand("land", wait=True))
     field.done(Resume())
     abort = replace(TAKEOFF, abort_on_failure=True)
     assert why_not(field.do(abort)) == {
@@ -299,10 +299,10 @@ def test_two_holds_at_once_are_both_done() -> None:
     field = a_field()
     field.fly()
     field.robots[1].silent = True
-    first = field.begin(Calm("hold"))
+    first = field.begin(SafetyCommand("hold"))
     field.run(1.0)
     field.robots[1].silent = False
-    assert field.do(Calm("hold")).done
+    assert field.do(SafetyCommand("hold")).done
     assert first.report is not None
     assert first.report.done
 
@@ -310,18 +310,18 @@ def test_two_holds_at_once_are_both_done() -> None:
 def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
     field = a_field()
     field.fly()
-    field.done(Calm("hold", robots=("r0",)))
-    problem = field.do(Again(robots=("r0",))).problem
+    field.done(SafetyCommand("hold", robots=("r0",)))
+    problem = field.do(NextTrial(robots=("r0",))).problem
     assert problem == "r1, r2 fly the mission: hold or land first"
 
 
 def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
     field = a_field()
     field.fly()
-    hold = field.begin(Calm("hold", wait=True))
+    hold = field.begin(SafetyCommand("hold", wait=True))
     monkeypatch.setattr(hold, "_steps", (1 / 0 for _ in range(1)))
     with pytest.raises(ZeroDivisionError):
         field.commands["alice"].step()
     assert hold.report is not None
     assert hold.report.problem == "a defect of lpac ground ended this command"
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))

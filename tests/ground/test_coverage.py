@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from edge.core import F64
 from edge.core.coverage import coverage_cost, voronoi_cells
-from edge.core.mission import FlightState, RobotStatus
 from edge.core.world import format_world, parse_world, random_features, rasterize
-from ground.coverage import Coverage, Whereabouts
-from ground.protocol import Picture, RobotPicture
+from edge.messages.mission import FlightState, RobotStatus
+from lpac.analysis.coverage import Coverage, Whereabouts
+from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 
 SIZE, SCALE = 128, 4.0
 S = FlightState
@@ -138,10 +138,12 @@ STATUS = RobotStatus(
 )  # fmt: skip
 
 
-def picture(*robots: tuple[S, bool, float, float | None], unix_time_s: float = 0.0) -> Picture:
+def snapshot(
+    *robots: tuple[S, bool, float, float | None], unix_time_s: float = 0.0
+) -> FleetSnapshot:
     """Robots of (state, armed, age_s, x_m)."""
-    pictures = (
-        RobotPicture(
+    snapshots = (
+        RobotSnapshot(
             f"r{i}", i,
             dataclasses.replace(
                 STATUS, robot_id=i, state=state, armed=armed,
@@ -151,34 +153,34 @@ def picture(*robots: tuple[S, bool, float, float | None], unix_time_s: float = 0
         )
         for i, (state, armed, age_s, x_m) in enumerate(robots)
     )  # fmt: skip
-    return Picture(unix_time_s, "", None, (*pictures, RobotPicture("silent", 99)))
+    return FleetSnapshot(unix_time_s, "", None, (*snapshots, RobotSnapshot("silent", 99)))
 
 
-def counted(seen: Picture) -> dict[str, tuple[float, float]]:
+def counted(seen: FleetSnapshot) -> dict[str, tuple[float, float]]:
     return Whereabouts().counted(seen)
 
 
 def test_who_counts() -> None:
-    waiting = picture(
+    waiting = snapshot(
         (S.IDLE, False, 0.1, 1.0), (S.IDLE, False, 9.0, 2.0), (S.IDLE, False, 0.1, None)
     )
     assert counted(waiting) == {"r0": (1.0, 2.0)}
-    flying = picture(
+    flying = snapshot(
         (S.MISSION, True, 0.1, 1.0), (S.IDLE, False, 0.1, 2.0), (S.LAND, True, 0.1, 3.0),
         (S.LAND, False, 0.1, 4.0), (S.PILOT, True, 0.1, 5.0), (S.PILOT, False, 0.1, 6.0),
         (S.HOLD, True, 3.0, 7.0), (S.MISSION, True, 0.1, math.nan), (S.MISSION, True, 0.1, None),
     )  # fmt: skip
     assert counted(flying) == {"r0": (1.0, 2.0), "r2": (3.0, 2.0), "r4": (5.0, 2.0)}
-    assert counted(picture()) == {}
+    assert counted(snapshot()) == {}
 
 
 def test_who_does_not_know_where_it_is_counts_for_a_moment() -> None:
     whereabouts = Whereabouts()
     here, nowhere = (S.HOLD, True, 0.1, 1.0), (S.HOLD, True, 0.1, None)
     other = (S.HOLD, True, 0.1, 5.0)
-    whereabouts.counted(picture(here, other))
-    assert whereabouts.counted(picture(nowhere, other, unix_time_s=1.9))["r0"] == (1.0, 2.0)
-    assert "r0" not in whereabouts.counted(picture(nowhere, other, unix_time_s=2.1))
-    whereabouts.counted(picture(here, other, unix_time_s=3.0))
+    whereabouts.counted(snapshot(here, other))
+    assert whereabouts.counted(snapshot(nowhere, other, unix_time_s=1.9))["r0"] == (1.0, 2.0)
+    assert "r0" not in whereabouts.counted(snapshot(nowhere, other, unix_time_s=2.1))
+    whereabouts.counted(snapshot(here, other, unix_time_s=3.0))
     on_ground = (S.LANDED, False, 0.1, None)
-    assert "r0" not in whereabouts.counted(picture(on_ground, other, unix_time_s=3.5))
+    assert "r0" not in whereabouts.counted(snapshot(on_ground, other, unix_time_s=3.5))

@@ -13,15 +13,16 @@ from urllib.parse import urlsplit
 import aiohttp
 import pytest
 
-from edge.core.mission import ON_GROUND, FlightState, GroundState
-from edge.core.safety import Fence
-from ground.client import command, listen
-from ground.live_map import Outbox, serving
-from ground.live_map_access import Access, is_loopback, reached_at
-from ground.live_map_view import Missions, detail_view
-from ground.protocol import Command, Picture, RobotPicture, SetOrigin, Setup
+from edge.core.fence import Fence
+from edge.messages.mission import ON_GROUND, FlightState, GroundState
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.ground.map.access import Access, is_loopback, reached_at
+from lpac.ground.map.server import Outbox, serving
+from lpac.ground.map.view import Missions, detail_view
+from lpac.ground.station.client import command, listen
+from lpac.ground.station.protocol import SetOrigin, TakeCommand
 from tests.ground.browser import PATIENCE_S, Opened, live_map, lpac, opened
-from tests.ground.conftest import wait_for_picture
+from tests.ground.conftest import wait_for_snapshot
 from tests.ground.pretend import FENCE, ORIGIN, PretendedFleet, PretendedRobot, pretended
 
 TOKEN = "correct-horse"
@@ -203,14 +204,14 @@ def test_a_map_that_only_observes_refuses_every_action(
             asking(fleet.name) as (address, session),
             session.ws_connect(address + "live") as stream,
         ):
-            await until(stream, of_kind("picture"))
+            await until(stream, of_kind("snapshot"))
             for nonsense in ("", "[", "[]", '{"do": 3, "robots": []}', '{"do": "land"}'):
                 await stream.send_str(nonsense)
             await stream.send_json(wish)
             report = await until(stream, of_kind("report"))
             assert not report["done"] and "only observes" in report["problem"]
-            picture = await until(stream, of_kind("picture"))
-            assert picture["calm"] == "none"
+            snapshot = await until(stream, of_kind("snapshot"))
+            assert snapshot["safety_action"] == "none"
 
     asyncio.run(ask())
     assert all(robot.state in ON_GROUND for robot in fleet.robots)
@@ -237,7 +238,7 @@ def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
     async def straight(told_s: list[float]) -> None:
         async for told in listen(fleet.name):
             match told:
-                case Picture(unix_time_s):
+                case FleetSnapshot(unix_time_s):
                     told_s.append(unix_time_s)
 
     def keeps_up(told_s: list[float], shown_s: list[float]) -> bool:
@@ -261,7 +262,7 @@ def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
                 while not keeps_up(told_s, shown_s):
                     text = await stream.receive_str()
                     message = json.loads(text)
-                    if message["kind"] == "picture":
+                    if message["kind"] == "snapshot":
                         assert len(message["robots"]) == 30
                         assert len(text) < 40_000
                         shown_s.append(message["unix_time_s"])
@@ -271,33 +272,33 @@ def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
     asyncio.run(ask())
 
 
-def test_a_page_that_takes_nothing_misses_pictures() -> None:
+def test_a_page_that_takes_nothing_misses_snapshots() -> None:
     async def ask() -> list[str]:
         page = Outbox()
         page.put("setup", "setup")
         for n in range(1000):
-            page.put(f"picture {n}", "picture")
+            page.put(f"snapshot {n}", "snapshot")
             page.put_each(f"event {n}")
         return await page.take()
 
     taken = asyncio.run(ask())
-    assert taken[:2] == ["setup", "picture 999"]
+    assert taken[:2] == ["setup", "snapshot 999"]
     assert taken[-1] == "event 999" and len(taken) <= 202
 
 
-def picture_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> Picture:
+def snapshot_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> FleetSnapshot:
     robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
     status = replace(
         robot.status(0.0), state=state, trial=trial, armed=state not in ON_GROUND, boot_nonce=7
     )
     ground = GroundState(1, "alice", trial=trial)
-    return Picture(unix_time_s, "alice", ground, (RobotPicture("r1", 1, status, 0.1),))
+    return FleetSnapshot(unix_time_s, "alice", ground, (RobotSnapshot("r1", 1, status, 0.1),))
 
 
 def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     missions = Missions()
     waiting, flying = (
-        picture_of(state, 100.0) for state in (FlightState.HOLD, FlightState.MISSION)
+        snapshot_of(state, 100.0) for state in (FlightState.HOLD, FlightState.MISSION)
     )
     missions.take(waiting)
     assert not missions.begins(waiting) and missions.time_s(waiting) is None
@@ -312,31 +313,33 @@ def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
     assert len(view["points"]) <= 3000
     # Hold is part of a mission, landing is not.
-    assert missions.time_s(picture_of(FlightState.HOLD, 160.0)) == 60.0
-    assert missions.time_s(picture_of(FlightState.LAND, 160.0)) is None
-    assert not missions.begins(picture_of(FlightState.MISSION, 170.0))
+    assert missions.time_s(snapshot_of(FlightState.HOLD, 160.0)) == 60.0
+    assert missions.time_s(snapshot_of(FlightState.LAND, 160.0)) is None
+    assert not missions.begins(snapshot_of(FlightState.MISSION, 170.0))
     # What was seen of it over another world is nothing to compare with.
     missions.change_world()
-    assert not missions.begin(picture_of(FlightState.MISSION, 180.0), 40.0).whole
+    assert not missions.begin(snapshot_of(FlightState.MISSION, 180.0), 40.0).whole
 
 
 @pytest.mark.parametrize(
     ("between", "trial", "anew"),
     [
-        (picture_of(FlightState.HOLD, 110.0), "t1", False),
-        (picture_of(FlightState.LANDED, 110.0), "t1", True),
-        (picture_of(FlightState.HOLD, 110.0, ""), "t1", True),
-        (picture_of(FlightState.HOLD, 110.0), "t2", True),
+        (snapshot_of(FlightState.HOLD, 110.0), "t1", False),
+        (snapshot_of(FlightState.LANDED, 110.0), "t1", True),
+        (snapshot_of(FlightState.HOLD, 110.0, ""), "t1", True),
+        (snapshot_of(FlightState.HOLD, 110.0), "t2", True),
     ],
 )
-def test_a_mission_after_another_is_a_new_curve(between: Picture, trial: str, anew: bool) -> None:
+def test_a_mission_after_another_is_a_new_curve(
+    between: FleetSnapshot, trial: str, anew: bool
+) -> None:
     missions = Missions()
-    flying = picture_of(FlightState.MISSION, 100.0)
+    flying = snapshot_of(FlightState.MISSION, 100.0)
     missions.take(flying)
     missions.begin(flying, 50.0)
     missions.take(between)
     waiting, again = (
-        picture_of(state, 120.0, trial) for state in (FlightState.HOLD, FlightState.MISSION)
+        snapshot_of(state, 120.0, trial) for state in (FlightState.HOLD, FlightState.MISSION)
     )
     missions.take(waiting)
     assert (missions.time_s(waiting) is None) == anew
@@ -354,8 +357,8 @@ def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
             await until(stream, lambda m: m["kind"] == "setup" and m["density"] is None)
             told = await until(stream, of_kind("coverage"))
             assert told["cost"] is None and not told["cells"]
-            picture = await until(stream, of_kind("picture"))
-            assert any("no density, no cost" in alarm["text"] for alarm in picture["alarms"])
+            snapshot = await until(stream, of_kind("snapshot"))
+            assert any("no density, no cost" in alarm["text"] for alarm in snapshot["alarms"])
 
     with pretended(tmp_path, 1) as fleet:
         fleet.robots[0].world_id = "0123456789ab"
@@ -364,11 +367,13 @@ def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
 
 
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
-    (robot,) = picture_of(FlightState.HOLD, 0.0).robots
+    (robot,) = snapshot_of(FlightState.HOLD, 0.0).robots
     assert robot.status is not None
     late = replace(robot.status.loops["control"], lateness_p99_ms=math.nan)
     broken = replace(robot.status, loops={"control": late}, hdop=math.nan)
-    setup = Setup("f", "alice", {"r1": 1}, (), FENCE, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0)
+    setup = FleetSetup(
+        "f", "alice", {"r1": 1}, (), FENCE, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0
+    )
     view = detail_view(setup, replace(robot, status=broken))
     shown = json.loads(json.dumps(view, allow_nan=False))["status"]
     assert shown["loops"]["control"]["lateness_p99_ms"] is None and shown["hdop"] is None
@@ -406,7 +411,7 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         opened(address) as seen,
     ):
         page = seen.page
-        wait_for_picture(few.name)
+        wait_for_snapshot(few.name)
         assert command(few.name, SetOrigin(ORIGIN)).done
         # On a tablet, upright, and on a phone hold is in reach.
         for width, height in ((768, 1024), (400, 800), (1280, 800)):
@@ -446,7 +451,7 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         page.wait_for_selector("#ask >> text=Land")
         page.keyboard.press("h")
         seen.wait_for_states({"r0": "hold"})
-        page.wait_for_selector("#calm >> text=HOLD by alice")
+        page.wait_for_selector("#safety-action >> text=HOLD by alice")
         page.click("#ask-no")
         seen.act("resume")
         seen.wait_for_states({"r0": "mission"})
@@ -468,8 +473,8 @@ def test_the_command_is_taken_by_a_click(few: PretendedFleet, tmp_path: Path) ->
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
             with lpac(*ground, "bob"):
-                wait_for_picture(few.name)
-                assert command(few.name, Command()).done
+                wait_for_snapshot(few.name)
+                assert command(few.name, TakeCommand()).done
                 seen.act("command")
                 page.wait_for_selector("#ask >> text=Take the command from bob?")
                 page.click("#ask-yes")
@@ -500,7 +505,7 @@ def test_a_page_that_observes(few: PretendedFleet) -> None:
             with lpac(*ground):
                 page.wait_for_selector("#banner", state="hidden")
                 page.wait_for_selector("#link >> text=ground live")
-                assert "HOLD" not in page.inner_text("#calm")
+                assert "HOLD" not in page.inner_text("#safety-action")
                 # Of a world that this laptop does not have.
                 assert command(few.name, SetOrigin(ORIGIN)).done
                 page.keyboard.press("Escape")

@@ -9,25 +9,23 @@ from pathlib import Path
 
 import pytest
 
-from cli.ground import load_setup
-from edge.core.mission import FlightState, world_id
-from ground import client
-from ground.protocol import (
-    Again,
-    Calm,
-    Command,
+from edge.messages.mission import FlightState, world_id
+from lpac.analysis.snapshot import Explored, FleetSnapshot, GroundEvent
+from lpac.cli.ground import load_setup
+from lpac.ground.station import client
+from lpac.ground.station.protocol import (
+    CommandProgress,
+    CommandReport,
     Enable,
-    Event,
-    Explored,
-    Give,
-    Picture,
-    Progress,
-    Report,
-    Result,
+    NextTrial,
     Resume,
+    RobotCommand,
+    RobotResult,
+    SafetyCommand,
     SetOrigin,
     SetWorld,
     Start,
+    TakeCommand,
     Takeoff,
 )
 from tests.ground.conftest import PATIENCE_S, GroundStation, NewStation, all_heard
@@ -43,15 +41,15 @@ def fleet(tmp_path: Path) -> Iterator[PretendedFleet]:
         yield running
 
 
-def everywhere(picture: Picture, state: FlightState, count: int = 3) -> bool:
-    return all(r.status and r.status.state is state for r in picture.robots[:count])
+def everywhere(snapshot: FleetSnapshot, state: FlightState, count: int = 3) -> bool:
+    return all(r.status and r.status.state is state for r in snapshot.robots[:count])
 
 
-def obeying(picture: Picture, operator: str) -> bool:
-    return all(r.status and r.status.operator == operator for r in picture.robots[:3])
+def obeying(snapshot: FleetSnapshot, operator: str) -> bool:
+    return all(r.status and r.status.operator == operator for r in snapshot.robots[:3])
 
 
-def done(report: Report) -> Report:
+def done(report: CommandReport) -> CommandReport:
     assert report.done, report
     return report
 
@@ -68,7 +66,7 @@ def fly(station: GroundStation) -> None:
     done(station.command(Start()))
 
 
-def refusals(report: Report) -> dict[str, str]:
+def refusals(report: CommandReport) -> dict[str, str]:
     return {result.robot: result.text for result in report.results if not result.done}
 
 
@@ -76,26 +74,26 @@ def test_a_whole_flight(fleet: PretendedFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     assert "no mission origin" in station.command(Takeoff()).problem
     make_ready(station)
-    progress: list[Progress] = []
+    progress: list[CommandProgress] = []
     report = station.command(Takeoff(interval_s=0.1), progress.append)
-    assert done(report).results[0] == Result("r0", True, "at its height, 4 m")
+    assert done(report).results[0] == RobotResult("r0", True, "at its height, 4 m")
     began = [p.robot for p in progress if p.text == "takes off"]
     assert began == ["r2", "r1", "r0"], "the highest first"
     done(station.command(Start()))
-    done(station.command(Calm("hold")))
+    done(station.command(SafetyCommand("hold")))
     done(station.command(Resume()))
     assert everywhere(station.wait_for(lambda p: everywhere(p, _S.MISSION)), _S.MISSION)
     assert "are armed" in station.command(SetWorld("Uniform 3 1 0 0 9 0 9 9", "w.env")).problem
-    done(station.command(Give("pilot", ("r1",))))
-    done(station.command(Give("rejoin", ("r1",))))
-    done(station.command(Calm("return", wait=True)))
-    done(station.command(Again()))
+    done(station.command(RobotCommand("pilot", ("r1",))))
+    done(station.command(RobotCommand("rejoin", ("r1",))))
+    done(station.command(SafetyCommand("return", wait=True)))
+    done(station.command(NextTrial()))
     # What brought them down does not keep them there.
     done(station.command(Takeoff(interval_s=0.0)))
-    done(station.command(Calm("land", wait=True)))
-    picture = station.wait_for(lambda p: p.ground is not None)
-    assert picture.ground is not None
-    assert picture.ground.trial == "t2"
+    done(station.command(SafetyCommand("land", wait=True)))
+    snapshot = station.wait_for(lambda p: p.ground is not None)
+    assert snapshot.ground is not None
+    assert snapshot.ground.trial == "t2"
 
 
 def test_who_joins_late_has_the_state(tmp_path: Path, new_station: NewStation) -> None:
@@ -131,10 +129,10 @@ def test_a_station_that_was_killed_goes_on_where_it_was(
     takeoff.leave()
     fleet.robots[2].takeoff_s = 1.0
     station.start()
-    picture = station.wait_for(lambda p: p.ground is not None)
-    assert picture.ground is not None
-    assert picture.ground.origin == ORIGIN
-    assert picture.ground.enabled
+    snapshot = station.wait_for(lambda p: p.ground is not None)
+    assert snapshot.ground is not None
+    assert snapshot.ground.origin == ORIGIN
+    assert snapshot.ground.enabled
     # Nothing half done: what had taken off comes to hold, and nothing else takes off.
     states = [_S.PREFLIGHT, _S.PREFLIGHT, _S.HOLD]
     station.wait_for(lambda p: [r.status and r.status.state for r in p.robots[:3]] == states)
@@ -142,12 +140,12 @@ def test_a_station_that_was_killed_goes_on_where_it_was(
     done(station.command(Takeoff(interval_s=0.0)))
     done(station.command(Start()))
     # What robots do not say is not forgotten either.
-    done(station.command(Calm("hold")))
+    done(station.command(SafetyCommand("hold")))
     station.kill()
     station.start()
-    picture = station.wait_for(lambda p: p.ground is not None)
-    assert picture.ground is not None
-    assert picture.ground.calm == "hold"
+    snapshot = station.wait_for(lambda p: p.ground is not None)
+    assert snapshot.ground is not None
+    assert snapshot.ground.safety_action == "hold"
     assert "hold is commanded" in station.command(Start()).problem
     # A memory that is broken is none.
     station.kill()
@@ -161,29 +159,29 @@ def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
     fly(alice)
     bob = new_station(fleet.fleet_toml, "bob")
     assert bob.wait_for(lambda p: p.ground and all_heard(p)).commander == "alice"
-    for request in (Calm("land"), Start(), Again(), Give("disarm", ("r0",))):
+    for request in (SafetyCommand("land"), Start(), NextTrial(), RobotCommand("disarm", ("r0",))):
         assert bob.command(request).problem == (
             "alice commands the fleet: `lpac mission command` takes over"
         )
     # Anybody may hold.
-    done(bob.command(Calm("hold")))
-    picture = alice.wait_for(lambda p: p.ground and p.ground.calm == "hold")
-    assert picture.commander == "alice"
-    assert picture.ground is not None
-    assert picture.ground.calm_by == "bob"
+    done(bob.command(SafetyCommand("hold")))
+    snapshot = alice.wait_for(lambda p: p.ground and p.ground.safety_action == "hold")
+    assert snapshot.commander == "alice"
+    assert snapshot.ground is not None
+    assert snapshot.ground.safety_action_by == "bob"
     assert "hold is commanded by bob" in alice.command(Start()).problem
     done(alice.command(Resume()))
     assert everywhere(bob.wait_for(lambda p: everywhere(p, _S.MISSION)), _S.MISSION)
     # Taking over, on purpose, in flight.
-    done(bob.command(Command()))
+    done(bob.command(TakeCommand()))
     assert everywhere(alice.wait_for(lambda p: p.commander == "bob"), _S.MISSION)
-    assert "bob commands the fleet" in alice.command(Calm("return")).problem
+    assert "bob commands the fleet" in alice.command(SafetyCommand("return")).problem
     # Killing is everybody's, too.
-    done(alice.command(Give("kill", ("r0",))))
+    done(alice.command(RobotCommand("kill", ("r0",))))
     # With the commander gone, a hold commands.
     bob.kill()
     alice.wait_for(lambda p: p.commander_age_s > 2.0)
-    done(alice.command(Calm("hold", robots=("r1", "r2"))))
+    done(alice.command(SafetyCommand("hold", robots=("r1", "r2"))))
     alice.wait_for(lambda p: p.commander == "alice")
 
 
@@ -224,19 +222,19 @@ def test_a_ground_that_hangs(
     station.process.send_signal(signal.SIGSTOP)
     monkeypatch.setattr(client, "_PATIENCE_S", 0.5)
     with pytest.raises(client.GroundError, match="does not answer: end it, and start"):
-        station.command(Calm("hold"))
+        station.command(SafetyCommand("hold"))
     with pytest.raises(client.GroundError, match="does not answer"):
         station.told()
     with pytest.raises(client.GroundError, match="does not answer"):
         list(subscribed)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(station.runtime))
     with pytest.raises(client.GroundError, match="does not answer"):
-        asyncio.run(client.send(station.fleet, Calm("hold")))
+        asyncio.run(client.send(station.fleet, SafetyCommand("hold")))
     monkeypatch.undo()
     station.process.send_signal(signal.SIGCONT)
     fleet.robots[2].takeoff_s = 1.0
     # What it was told meanwhile it does.
-    station.wait_for(lambda p: p.ground and p.ground.calm == "hold")
+    station.wait_for(lambda p: p.ground and p.ground.safety_action == "hold")
     takeoff.leave()
 
 
@@ -269,7 +267,7 @@ def test_another_fleet_is_not_reached(fleet: PretendedFleet, new_station: NewSta
     station = new_station(other)
     report = station.command(SetOrigin(ORIGIN))
     assert refusals(report) == dict.fromkeys(("r0", "r1", "r2"), "not heard")
-    assert refusals(station.command(Give("kill", ("r0",)))) == {"r0": "not heard"}
+    assert refusals(station.command(RobotCommand("kill", ("r0",)))) == {"r0": "not heard"}
     assert all(robot.ground is None for robot in fleet.robots)
 
 
@@ -280,7 +278,7 @@ def test_mistakes(fleet: PretendedFleet, new_station: NewStation) -> None:
     assert station.command(Start(robots=("r7",))).problem == (
         "robot 'r7' is unknown; known are r0, r1, r2, r3"
     )
-    assert "no robot is named" in station.command(Give("kill", ())).problem
+    assert "no robot is named" in station.command(RobotCommand("kill", ())).problem
     make_ready(station)
     fleet.robots[1].refuses = "the battery is low: 20 %"
     report = station.command(Takeoff(interval_s=0.0))
@@ -293,7 +291,7 @@ def test_lines_that_are_no_commands(fleet: PretendedFleet, new_station: NewStati
     station = new_station(fleet.fleet_toml)
     for line in (
         b"", b"\n", b"{}\n", b"[" * 100_000 + b"\n", b'{"takeoff": {"interval_s": "x"}}\n',
-        b"\xff\xfe\n", b'{"picture": {}}\n', b"subscribe", b"x" * 1000,
+        b"\xff\xfe\n", b'{"snapshot": {}}\n', b"subscribe", b"x" * 1000,
     ):  # fmt: skip
         with socket.socket(socket.AF_UNIX) as connection:
             connection.connect(str(station.socket_path))
@@ -317,9 +315,9 @@ def test_who_leaves_abandons_what_is_not_ordered(
     # A hold ends a takeoff, too, and then land is just as quick.
     takeoff = station.begin(Takeoff(interval_s=60.0))
     takeoff.progress("r1")
-    done(station.command(Calm("hold")))
+    done(station.command(SafetyCommand("hold")))
     assert refusals(takeoff.report())["r0"] == "abandoned: hold"
-    done(station.command(Calm("land", wait=True)))
+    done(station.command(SafetyCommand("land", wait=True)))
 
 
 def test_two_programs_of_one_robot(fleet: PretendedFleet, new_station: NewStation) -> None:
@@ -350,7 +348,7 @@ def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) ->
     # They are in the air for as long as it has something to say.
     for robot in fleet.robots:
         robot.takeoff_s = math.inf
-    done(station.command(Calm("land")))
+    done(station.command(SafetyCommand("land")))
     for robot in fleet.robots:
         robot.takeoff_s = 1.0
     assert station.process.wait(PATIENCE_S) == 0
@@ -378,7 +376,7 @@ def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
             late.connect(str(station.socket_path))
             late.sendall(b"subscribe\n")
             fly(station)
-            done(station.command(Calm("hold")))
+            done(station.command(SafetyCommand("hold")))
         # Maps have no hurry on the radio.
         station.wait_for(
             lambda _: (
@@ -386,4 +384,4 @@ def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
                 == set(station.setup().robots)
             )
         )
-        assert any(isinstance(t, Event) and t.kind == "result" for t in station.told())
+        assert any(isinstance(t, GroundEvent) and t.kind == "result" for t in station.told())

@@ -8,42 +8,39 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.mission import (
-    EXPLORED_CELLS,
-    GroundState,
-    Place,
-    explored_from_bytes,
-    explored_to_bytes,
-)
+from edge.core.perception import EXPLORED_CELLS
 from edge.core.schema import ConfigError
 from edge.core.world import MOST_FEATURES, format_world, random_features
-from ground.protocol import (
-    Again,
-    Calm,
-    Command,
-    Enable,
-    Event,
+from edge.messages.mission import GroundState, Place, explored_from_bytes, explored_to_bytes
+from lpac.analysis.snapshot import (
     Explored,
-    Give,
-    Picture,
-    Progress,
-    Report,
+    FleetSetup,
+    FleetSlot,
+    FleetSnapshot,
+    GroundEvent,
+    RobotSnapshot,
+)
+from lpac.ground.station.protocol import (
+    CommandProgress,
+    CommandReport,
+    Enable,
+    NextTrial,
     Request,
-    Result,
     Resume,
-    RobotPicture,
+    RobotCommand,
+    RobotResult,
+    SafetyCommand,
+    ServerMessage,
     SetFence,
     SetOrigin,
     SetPlaces,
-    Setup,
     SetWorld,
-    Site,
     Start,
+    TakeCommand,
     Takeoff,
-    Told,
     request_from_line,
+    server_message_from_line,
     to_line,
-    told_from_line,
 )
 from tests.ground.pretend import FENCE, ORIGIN, PretendedRobot
 
@@ -51,26 +48,28 @@ REQUESTS: tuple[Request, ...] = (
     SetOrigin(ORIGIN), SetFence(FENCE, ("r1",)), SetFence(None),
     SetWorld("CircularBND 1 2 3 4\n", "a world.env"),
     SetPlaces({"r1": Place(3, (1.0, 2.0))}), Enable(), Enable(on=False, robots=("r1", "r2")),
-    Takeoff(interval_s=0.5, abort_on_failure=True), Start(), Calm("return", wait=True), Resume(),
-    Give("kill", ("r1",)), Again("windy-2"), Again(), Command(),
+    Takeoff(interval_s=0.5, abort_on_failure=True), Start(), SafetyCommand("return", wait=True),
+    Resume(),
+    RobotCommand("kill", ("r1",)), NextTrial("windy-2"), NextTrial(), TakeCommand(),
 )  # fmt: skip
 
 
-def status_picture() -> RobotPicture:
+def status_snapshot() -> RobotSnapshot:
     robot = PretendedRobot(1, 1, (2.0, 2.0), (2.0, 2.0), 3, "bundle", "world")
-    return RobotPicture("r1", 1, robot.status(robot.now_s), 0.1, -0.01, {"2": 2.5})
+    return RobotSnapshot("r1", 1, robot.status(robot.now_s), 0.1, -0.01, {"2": 2.5})
 
 
-TOLD: tuple[Told, ...] = (
-    Setup("demo", "me@here", {"r1": 1}, (Site(Place(0, (1.0, 2.0)), (1.0, 1.0), "r1"),), FENCE,
+TOLD: tuple[ServerMessage, ...] = (
+    FleetSetup("demo", "me@here", {"r1": 1}, (FleetSlot(Place(0, (1.0, 2.0)), (1.0, 1.0), "r1"),),
+    FENCE,
           "Uniform 0 0\n", "abc", "bundle", 512, 64, 128.0, 16.0, 2.0, 1.0),
-    Picture(1e9, "me", GroundState(4, "me", ORIGIN, robot_calm={"1": "hold"}),
-            (status_picture(), RobotPicture("r2", 2)), ("takeoff",), 0.4),
-    Event(1e9, "state", "r1", "hold: ground commands hold", "me", "t1"),
+    FleetSnapshot(1e9, "me", GroundState(4, "me", ORIGIN, robot_safety_actions={"1": "hold"}),
+            (status_snapshot(), RobotSnapshot("r2", 2)), ("takeoff",), 0.4),
+    GroundEvent(1e9, "state", "r1", "hold: ground commands hold", "me", "t1"),
     Explored("r1", base64.b64encode(bytes(512)).decode()),
-    Progress("r1", "takes off"),
-    Report((Result("r1", True, "ready"), Result("r2", False, "not heard"))),
-    Report(problem="no mission origin"),
+    CommandProgress("r1", "takes off"),
+    CommandReport((RobotResult("r1", True, "ready"), RobotResult("r2", False, "not heard"))),
+    CommandReport(problem="no mission origin"),
 )  # fmt: skip
 
 
@@ -82,10 +81,10 @@ def test_requests_survive(request_: Request) -> None:
 
 
 @pytest.mark.parametrize("told", TOLD, ids=lambda told: type(told).__name__)
-def test_answers_survive(told: Told) -> None:
+def test_answers_survive(told: ServerMessage) -> None:
     line = to_line(told)
     assert line.count(b"\n") == 1
-    assert told_from_line(line) == told
+    assert server_message_from_line(line) == told
 
 
 @given(st.binary(max_size=200))
@@ -95,13 +94,26 @@ def test_bytes_are_no_request(data: bytes) -> None:
 
 
 @given(
-    st.sampled_from(["origin", "takeoff", "calm", "give", "world", "again", "places", "enable"]),
+    st.sampled_from(
+        [
+            "origin",
+            "takeoff",
+            "safety_command",
+            "robot_command",
+            "world",
+            "next_trial",
+            "places",
+            "enable",
+        ]
+    ),
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
         lambda inner: (
             st.lists(inner, max_size=3)
             | st.dictionaries(
-                st.sampled_from(["robots", "calm", "kind", "interval_s", "trial", "places", "on"]),
+                st.sampled_from(
+                    ["robots", "action", "kind", "interval_s", "trial", "places", "on"]
+                ),
                 inner,
                 max_size=3,
             )
@@ -126,10 +138,10 @@ def test_json_is_a_request_or_a_clear_refusal(name: str, fields: object) -> None
         (b'{"takeoff": {"interval_s": NaN}}', "interval_s = nan: must be from 0 to 600"),
         (b'{"origin": {"origin": {"latitude_deg": 1, "longitude_deg": 2, "heading_deg": 360}}}',
          "heading_deg = 360.0: must be in [0, 360)"),
-        (b'{"calm": {"calm": "fly"}}', "allowed are 'hold', 'return', 'land'"),
+        (b'{"safety_command": {"action": "fly"}}', "allowed are 'hold', 'return', 'land'"),
         (b'{"world": {"text": "Circle 1 2", "name": "w.env"}}', "w.env: record 1 (Circle)"),
         (b'{"world": {"text": "", "name": "a\\nb"}}', "must be printable"),
-        (b'{"again": {"trial": "a b"}}', "trial = 'a b': must be at most 32 letters"),
+        (b'{"next_trial": {"trial": "a b"}}', "trial = 'a b': must be at most 32 letters"),
         (b'{"reboot": {}}', "one of origin, fence"),
         (b'{"start": {}, "land": {}}', "one of origin, fence"),
     ],
@@ -153,15 +165,15 @@ def test_a_world_of_more_features_than_robots_take() -> None:
 
 
 def test_a_report_is_done_when_every_robot_is() -> None:
-    ready, refused = Result("r1", True, "ready"), Result("r2", False, "not heard")
-    assert Report((ready,)).done
-    assert not Report((ready, refused)).done
-    assert not Report(problem="not enabled").done
+    ready, refused = RobotResult("r1", True, "ready"), RobotResult("r2", False, "not heard")
+    assert CommandReport((ready,)).done
+    assert not CommandReport((ready, refused)).done
+    assert not CommandReport(problem="not enabled").done
 
 
 def test_explored_maps_survive() -> None:
     explored = np.random.default_rng(0).random((EXPLORED_CELLS, EXPLORED_CELLS)) < 0.3
     cells = Explored("r1", base64.b64encode(explored_to_bytes(explored)).decode())
-    told = told_from_line(to_line(cells))
+    told = server_message_from_line(to_line(cells))
     assert isinstance(told, Explored)
     assert np.array_equal(explored_from_bytes(base64.b64decode(told.cells)), explored)

@@ -17,24 +17,24 @@ from pathlib import Path
 
 import pytest
 
-from edge.core.margins import ErrorBudget
-from edge.core.mission import ON_GROUND, FlightState, RobotStatus, world_id
 from edge.core.world import format_world
-from ground.client import GroundError, command, subscribe
-from ground.protocol import (
-    Calm,
+from edge.flight.margins import ErrorBudget
+from edge.messages.mission import ON_GROUND, FlightState, RobotStatus, world_id
+from lpac.analysis.snapshot import FleetSnapshot
+from lpac.ground.station.client import GroundError, command, subscribe
+from lpac.ground.station.protocol import (
+    CommandReport,
     Enable,
-    Picture,
-    Report,
     Request,
     Resume,
+    SafetyCommand,
     SetFence,
     SetOrigin,
     SetWorld,
     Start,
     Takeoff,
 )
-from sim.fleet import ORIGIN, Fleet, FleetScenario
+from lpac.sim.fleet.processes import ORIGIN, Fleet, FleetScenario
 from tests.conftest import ROOT, SHIPPED
 from tests.ground.browser import live_map, opened
 
@@ -105,7 +105,8 @@ class Ground:
         self._log = fleet_toml.with_suffix(".log")
         with self._log.open("ab") as output:
             self.process = subprocess.Popen(
-                [*enter, sys.executable, "-m", "cli.main", "ground", "--fleet", str(fleet_toml)],
+                [*enter, sys.executable, "-m", "lpac.cli.main", "ground", "--fleet",
+                str(fleet_toml)],
                 env={**os.environ, "PYTHONPATH": str(ROOT)},
                 stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
             )  # fmt: skip
@@ -114,14 +115,14 @@ class Ground:
         """What it has printed."""
         return self._log.read_text()
 
-    def pictures(self, timeout_s: float = PATIENCE_S) -> Iterator[Picture]:
+    def snapshots(self, timeout_s: float = PATIENCE_S) -> Iterator[FleetSnapshot]:
         """What it shows, from its start on; it must not end meanwhile."""
         until_s = time.monotonic() + timeout_s
         while time.monotonic() < until_s:
             try:
                 with subscribe(self.fleet) as told:
                     for message in told:
-                        if isinstance(message, Picture):
+                        if isinstance(message, FleetSnapshot):
                             yield message
                         if time.monotonic() > until_s:
                             return
@@ -130,21 +131,21 @@ class Ground:
                 assert self.process.poll() is None, self.said()
                 time.sleep(0.05)
 
-    def wait(self, condition: Callable[[Picture], bool]) -> Picture:
+    def wait(self, condition: Callable[[FleetSnapshot], bool]) -> FleetSnapshot:
         """Until it shows a fleet that is so."""
-        picture = None
-        for picture in self.pictures():
-            if condition(picture):
-                return picture
-        raise AssertionError((picture, self.said()))
+        snapshot = None
+        for snapshot in self.snapshots():
+            if condition(snapshot):
+                return snapshot
+        raise AssertionError((snapshot, self.said()))
 
-    def wait_states(self, *states: FlightState) -> Picture:
+    def wait_states(self, *states: FlightState) -> FleetSnapshot:
         """Until every robot is in one of these states."""
         return self.wait(lambda p: all(r.status and r.status.state in states for r in p.robots))
 
-    def ask(self, request: Request) -> Report:
+    def ask(self, request: Request) -> CommandReport:
         """Command something, once the ground hears all robots."""
-        self.wait(lambda picture: all(robot.fresh for robot in picture.robots))
+        self.wait(lambda snapshot: all(robot.fresh for robot in snapshot.robots))
         return command(self.fleet, request)
 
     def do(self, request: Request) -> None:
@@ -193,7 +194,7 @@ def run_ground(
         ground.kill()
 
 
-def refusals(report: Report) -> str:
+def refusals(report: CommandReport) -> str:
     """Why a command was not done: one text."""
     assert not report.done
     return " ".join([report.problem, *(r.text for r in report.results if not r.done)])
@@ -266,7 +267,7 @@ def test_a_page_flies_the_fleet(fleet: Fleet, tmp_path: Path) -> None:
     """Take off, start, hold and land are clicked in a real browser."""
     with run_ground(fleet) as ground:
         ground.make_ready()
-        picture = tmp_path / "map.png"
+        snapshot = tmp_path / "map.png"
         with (
             live_map(fleet.fleet_toml, "--operate") as address,
             opened(address) as seen,
@@ -278,9 +279,9 @@ def test_a_page_flies_the_fleet(fleet: Fleet, tmp_path: Path) -> None:
                 seen.act(action, sure=action in ("takeoff", "land"))
                 seen.wait_for_states(dict.fromkeys(NAMES, state.value))
                 if action == "start":
-                    seen.screenshot(picture)
+                    seen.screenshot(snapshot)
             assert seen.errors == []
-        assert picture.stat().st_size > 20_000
+        assert snapshot.stat().st_size > 20_000
 
 
 def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Path) -> None:
@@ -296,7 +297,7 @@ def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Pa
         with run_ground(fleet, far_toml, enter) as ground:
             for request in (
                 SetOrigin(ORIGIN), Resume(), Enable(), Takeoff(interval_s=0.5), Start(),
-                Calm("hold"), Resume(),
+                SafetyCommand("hold"), Resume(),
             ):  # fmt: skip
                 ground.do_in_the_end(request)
             trial = ground.wait_states(_S.MISSION, _S.HOLD).ground
@@ -304,15 +305,15 @@ def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Pa
             ground.kill()
     began_s = time.monotonic()
     with run_ground(fleet) as ground:
-        picture = ground.wait(lambda p: p.ground is not None and all(r.fresh for r in p.robots))
+        snapshot = ground.wait(lambda p: p.ground is not None and all(r.fresh for r in p.robots))
         print(f"a new ground knows all {time.monotonic() - began_s:.2f} s after its start")
-        assert picture.ground is not None
-        assert (picture.ground.origin, picture.ground.trial) == (ORIGIN, trial.trial)
+        assert snapshot.ground is not None
+        assert (snapshot.ground.origin, snapshot.ground.trial) == (ORIGIN, trial.trial)
         # Robots that heard no ground for too long hold, and no longer.
         ground.wait_states(_S.MISSION, _S.HOLD)
         world = SetWorld("CircularBND 100 100 20 5\n", "other.env")
         assert "armed" in refusals(ground.ask(world)) or "flight" in refusals(ground.ask(world))
-        ground.do(Calm("land", wait=True))
+        ground.do(SafetyCommand("land", wait=True))
 
 
 def test_a_ground_that_dies_while_robots_take_off(fleet: Fleet) -> None:

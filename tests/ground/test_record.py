@@ -15,28 +15,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.adapters.flight_log import FlightLogError, read, read_metadata
 from edge.core.coverage import coverage_cost
-from edge.core.mission import FlightState, GroundState, Origin, Place
-from edge.core.safety import Fence
+from edge.core.fence import Fence
 from edge.core.world import parse_world, rasterize
-from ground.client import command
-from ground.protocol import (
-    Calm,
+from edge.drivers.flight_log import FlightLogError, read, read_metadata
+from edge.messages.mission import FlightState, GroundState, Origin, Place
+from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent, RobotSnapshot
+from lpac.ground.record import Recording
+from lpac.ground.station.client import command
+from lpac.ground.station.protocol import (
     Enable,
-    Event,
-    Explored,
-    Picture,
-    RobotPicture,
+    SafetyCommand,
+    ServerMessage,
     SetOrigin,
-    Setup,
     Start,
     Takeoff,
-    Told,
 )
-from ground.record import Recording
 from tests.conftest import ROOT
-from tests.ground.conftest import PATIENCE_S, all_heard, wait_for_picture
+from tests.ground.conftest import PATIENCE_S, all_heard, wait_for_snapshot
 from tests.ground.pretend import ORIGIN, pretended
 from tests.ground.test_coverage import STATUS, model
 
@@ -44,7 +40,7 @@ S = FlightState
 MAGIC = b"\x89MCAP0\r\n"  # at the end of a log that was closed
 FENCE = Fence(((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)), 0.5, 1.0, 20.0)
 WORLD = model()
-SETUP = Setup(
+SETUP = FleetSetup(
     fleet="f", operator="ann", robots={"r0": 0, "r1": 1}, slots=(), fence=FENCE,
     world=WORLD.world, world_id=WORLD.world_id, bundle_id="b", world_size=WORLD.world_size,
     sensor_size=16, communication_range=64.0, env_scale=WORLD.env_scale,
@@ -64,7 +60,9 @@ class Kept:
         return [message for name, _, message in self.entries if name == topic]
 
 
-def picture(now_s: float, sequence: int, x_m: float, state: S = S.MISSION, **more: Any) -> Picture:
+def snapshot(
+    now_s: float, sequence: int, x_m: float, state: S = S.MISSION, **more: Any
+) -> FleetSnapshot:
     """Two robots, of which the second was heard 0.1 s ago."""
     statuses = (
         dataclasses.replace(
@@ -74,21 +72,21 @@ def picture(now_s: float, sequence: int, x_m: float, state: S = S.MISSION, **mor
         for i in range(2)
     )  # fmt: skip
     robots = tuple(
-        RobotPicture(f"r{i}", i, status, 0.1 * i, 0.5) for i, status in enumerate(statuses)
+        RobotSnapshot(f"r{i}", i, status, 0.1 * i, 0.5) for i, status in enumerate(statuses)
     )
-    return Picture(now_s, "ann", STATE, robots, **more)
+    return FleetSnapshot(now_s, "ann", STATE, robots, **more)
 
 
 def test_each_thing_is_recorded_once() -> None:
     kept = Kept()
-    event = Event(99.0, "command", "", "takeoff", "ann", "t1")
-    told: list[tuple[float, Told]] = [
+    event = GroundEvent(99.0, "command", "", "takeoff", "ann", "t1")
+    told: list[tuple[float, ServerMessage]] = [
         (100.0, SETUP), (100.0, event), (100.0, Explored("r0", "AAAA")),
-        (100.2, picture(100.2, 1, 1.0)), (100.4, picture(100.4, 1, 1.0)),
+        (100.2, snapshot(100.2, 1, 1.0)), (100.4, snapshot(100.4, 1, 1.0)),
         # The same again from the ground's next process, and something new.
         (105.0, event), (105.0, Explored("r0", "AAAA")), (105.0, Explored("r0", "AAAB")),
-        (105.2, picture(105.2, 2, 2.0)),
-        (166.0, picture(166.0, 3, 3.0)),
+        (105.2, snapshot(105.2, 2, 2.0)),
+        (166.0, snapshot(166.0, 3, 3.0)),
     ]  # fmt: skip
     for now_s, message in told:
         kept.recording.take(message, now_s)
@@ -110,9 +108,9 @@ def test_each_thing_is_recorded_once() -> None:
 def test_the_cost_is_normalised_by_each_trials_begin() -> None:
     kept = Kept()
     kept.recording.take(SETUP, 0.0)
-    kept.recording.take(picture(1.0, 1, 1.0, S.HOLD), 1.0)
-    kept.recording.take(picture(2.0, 2, 5.0), 2.0)
-    kept.recording.take(picture(3.0, 3, 9.0), 3.0)
+    kept.recording.take(snapshot(1.0, 1, 1.0, S.HOLD), 1.0)
+    kept.recording.take(snapshot(2.0, 2, 5.0), 2.0)
+    kept.recording.take(snapshot(3.0, 3, 9.0), 3.0)
     kept.recording.close()
     raster = rasterize(parse_world(WORLD.world), WORLD.world_size, 2.0, 1.0)
     expected = [
@@ -132,7 +130,7 @@ def test_a_name_that_is_flown_again_begins_anew() -> None:
     kept.recording.take(SETUP, 0.0)
     flown = ((S.MISSION, 1.0), (S.HOLD, 5.0), (S.MISSION, 6.0), (S.LANDED, 7.0), (S.HOLD, 7.0))
     for second, (state, x_m) in enumerate((*flown, (S.MISSION, 9.0)), 1):
-        kept.recording.take(picture(float(second), second, x_m, state), float(second))
+        kept.recording.take(snapshot(float(second), second, x_m, state), float(second))
     kept.recording.close()
     costs = kept.of("cost")
     first = costs[0]["cost"]
@@ -145,7 +143,7 @@ def test_a_name_that_is_flown_again_begins_anew() -> None:
 def test_without_a_world_all_else_is_recorded(world: str) -> None:
     kept = Kept()
     kept.recording.take(dataclasses.replace(SETUP, world=world), 0.0)
-    kept.recording.take(picture(1.0, 1, 1.0), 1.0)
+    kept.recording.take(snapshot(1.0, 1, 1.0), 1.0)
     kept.recording.close()
     assert [topic for topic, _, _ in kept.entries] == ["setup", "state", "status", "status"]
 
@@ -157,7 +155,7 @@ class Recorder:
         # As from a terminal, also if these tests have none to lose.
         before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet_toml)],
+            [sys.executable, "-m", "lpac.cli.main", "record", "--fleet", str(fleet_toml)],
             cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
@@ -181,7 +179,8 @@ class Recorder:
 
 def ground_process(fleet_toml: Path) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "ground", "--name", "ann", "--fleet", str(fleet_toml)],
+        [sys.executable, "-m", "lpac.cli.main", "ground", "--name", "ann", "--fleet",
+        str(fleet_toml)],
         cwd=ROOT, stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
 
@@ -189,7 +188,7 @@ def ground_process(fleet_toml: Path) -> "subprocess.Popen[bytes]":
 def wait_until_all_are_told(fleet: str, state: S) -> None:
     """Until all clients are told that every robot is so: a first picture is for one alone."""
     shown = itertools.count()
-    wait_for_picture(
+    wait_for_snapshot(
         fleet,
         lambda told: all(r.status and r.status.state is state for r in told.robots) and next(shown),
     )
@@ -206,7 +205,7 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
             recorder.wait_for("waiting for it")
             processes.append(ground_process(fleet.fleet_toml))
             recorder.wait_for("hears the ground station")
-            wait_for_picture(fleet.name)
+            wait_for_snapshot(fleet.name)
             for request, state in (
                 (SetOrigin(ORIGIN), S.IDLE), (Enable(), S.PREFLIGHT),
                 (Takeoff(interval_s=0.1), S.HOLD), (Start(), S.MISSION),
@@ -218,17 +217,17 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
             recorder.wait_for("has ended")
             processes.append(ground_process(fleet.fleet_toml))
             recorder.wait_for("hears the ground station")
-            wait_for_picture(fleet.name, lambda told: told.commander == "ann" and all_heard(told))
+            wait_for_snapshot(fleet.name, lambda told: told.commander == "ann" and all_heard(told))
             # They sink for as long as the test has a use for it.
             for robot in fleet.robots:
                 robot.takeoff_s = math.inf
-            assert command(fleet.name, Calm("land")).done
+            assert command(fleet.name, SafetyCommand("land")).done
             wait_until_all_are_told(fleet.name, S.LAND)
             # Its terminal is closed: it goes on until all have landed.
             recorder.process.send_signal(signal.SIGHUP)
             for robot in fleet.robots:
                 robot.takeoff_s = 1.0
-            assert command(fleet.name, Calm("land", wait=True)).done
+            assert command(fleet.name, SafetyCommand("land", wait=True)).done
             assert recorder.end() == 0
         finally:
             processes += [recorder.process]
@@ -252,7 +251,7 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
     assert all(abs(s["clock_offset_s"]) < PATIENCE_S for s in by_topic["status"])
     commands = [e for e in by_topic["event"] if e["kind"] == "command"]
     assert {e["operator"] for e in commands} == {"ann"} and len(commands) >= 4
-    assert any(s["calm"] == "land" for s in by_topic["state"])
+    assert any(s["safety_action"] == "land" for s in by_topic["state"])
     assert_costs_are_of_the_last_statuses(entries)
     with pytest.raises(FlightLogError, match="was not written by a robot"):
         read_metadata(path)
@@ -295,7 +294,7 @@ def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, below: str, wh
     with pretended(tmp_path, 1) as fleet:
         done = subprocess.run(
             [
-                sys.executable, "-m", "cli.main", "record", "--fleet", str(fleet.fleet_toml),
+                sys.executable, "-m", "lpac.cli.main", "record", "--fleet", str(fleet.fleet_toml),
                 "--out", str(file / below),
             ],
             cwd=ROOT, capture_output=True, text=True, check=False,

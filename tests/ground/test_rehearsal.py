@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ground.rehearsal import commanded
+from lpac.ground.rehearsal import commanded
 
 
 @pytest.mark.parametrize(

@@ -18,19 +18,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cli.main import app
-from edge.adapters.flight_log import FlightLog, FlightMetadata
 from edge.core.coverage import coverage_cost
-from edge.core.mission import FlightState, LoopStatus, Order, OrderResult, RobotStatus
-from edge.core.mission import world_id as id_of
 from edge.core.world import format_world, parse_world, random_features, rasterize
-from edge.runtime.bundle import load_bundle
-from ground.protocol import Event, Setup
-from ground.record import TOPICS, GroundMetadata
-from ground.report import Examined, Wanted, examine, write
-from ground.report_logs import read_logs
-from ground.report_page import Drawn, page
-from ground.report_trials import find_missions
+from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.messages.mission import FlightState, LoopStatus, Order, OrderResult, RobotStatus
+from edge.messages.mission import world_id as id_of
+from edge.policy.bundle import load_bundle
+from lpac.analysis.logs import read_logs
+from lpac.analysis.page import Drawn, page
+from lpac.analysis.report import Examined, Wanted, examine, write
+from lpac.analysis.snapshot import FleetSetup, GroundEvent
+from lpac.analysis.trials import find_missions
+from lpac.cli.main import app
+from lpac.ground.record import TOPICS, GroundMetadata
 from tests.conftest import SHIPPED
 from tests.ground.pretend import FENCE
 from tests.ground.test_coverage import STATUS
@@ -160,7 +160,7 @@ class Writer:
         """The ground's log, FOLDER/ground-0001.mcap."""
         perception = BUNDLE.manifest.perception
         assert perception is not None
-        setup = Setup(
+        setup = FleetSetup(
             fleet="f", operator="ann", robots={"r0": 0, "r1": 1, "r2": 2}, slots=(), fence=FENCE,
             world=self.world, world_id=id_of(self.world), bundle_id=self.bundle_id,
             world_size=perception.world_size, sensor_size=perception.sensor_size,
@@ -172,7 +172,7 @@ class Writer:
             told_s = BEGAN_S + self.flights[0].begin_s - 6.0
             log.record("setup", told_s, {**dataclasses.asdict(setup), **self.setup})
             for flight in self.flights:
-                event = Event(
+                event = GroundEvent(
                     BEGAN_S + flight.begin_s, "command", "", "start <b>now</b>", "ann", flight.trial
                 )
                 log.record("event", event.unix_time_s, dataclasses.asdict(event))

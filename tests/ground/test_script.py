@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from edge.core.mission import Origin
-from ground.script import (
+from edge.messages.mission import Origin
+from lpac.ground.script import (
     MissionStep,
     OriginStep,
     Perturbation,
@@ -22,7 +22,7 @@ from ground.script import (
     WorldStep,
     load_script,
 )
-from ground.site import Sites
+from lpac.ground.site import Sites
 from tests.conftest import ROOT
 from tests.ground.conftest import PATIENCE_S, NewStation
 from tests.ground.pretend import PretendedFleet
@@ -134,7 +134,7 @@ def test_ctrl_c_at_the_question_between_trials(tmp_path: Path, new_station: NewS
         runtime = new_station(fleet.fleet_toml).runtime
         arguments = ("mission", "run", script, "--json", "--fleet", fleet.fleet_toml)
         with subprocess.Popen(
-            [sys.executable, "-m", "cli.main", *map(str, arguments)],
+            [sys.executable, "-m", "lpac.cli.main", *map(str, arguments)],
             cwd=ROOT, env={**os.environ, "XDG_RUNTIME_DIR": str(runtime)},
             stdin=terminal, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         ) as process:  # fmt: skip

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.margins import ErrorBudget
-from edge.core.mission import FlightState, Origin, RobotStatus
-from edge.core.safety import Fence
-from ground.site import (
+from edge.core.fence import Fence
+from edge.flight.margins import ErrorBudget
+from edge.messages.mission import FlightState, Origin, RobotStatus
+from lpac.ground.site import (
     CLEARLY_FURTHER_M,
     MAX_PAD_DISTANCE_M,
     OnPad,

@@ -12,28 +12,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.core.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
-from ground.commands import Commands, Running
-from ground.protocol import (
-    Again,
-    Calm,
-    Command,
+from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
+from lpac.analysis.snapshot import FleetSetup, FleetSlot, GroundEvent
+from lpac.ground.station.commands import Commands, CommandTask
+from lpac.ground.station.protocol import (
+    CommandReport,
     Enable,
-    Event,
-    Give,
-    Report,
+    NextTrial,
     Request,
     Resume,
+    RobotCommand,
+    SafetyCommand,
     SetFence,
     SetOrigin,
     SetPlaces,
-    Setup,
     SetWorld,
-    Site,
     Start,
+    TakeCommand,
     Takeoff,
 )
-from ground.station import NameTakenError, Station, next_trial
+from lpac.ground.station.station import NameTakenError, Station, next_trial
 from tests.ground.pretend import BASE_HEIGHT_M, FENCE, ORIGIN, SLOT_SPACING_M, PretendedRobot
 
 _S = FlightState
@@ -42,12 +40,12 @@ WORLD = "CircularBND 256 256 40 8\n"
 OTHER_WORLD = "CircularBND 100 100 20 5\n"
 
 
-def setup(operator: str, n: int, spares: int = 0) -> Setup:
-    return Setup(
+def setup(operator: str, n: int, spares: int = 0) -> FleetSetup:
+    return FleetSetup(
         fleet="test",
         operator=operator,
         robots={f"r{i}": i for i in range(n + spares)},
-        slots=tuple(Site(Place(i, pad_m(i)), pad_m(i), f"r{i}") for i in range(n)),
+        slots=tuple(FleetSlot(Place(i, pad_m(i)), pad_m(i), f"r{i}") for i in range(n)),
         fence=FENCE,
         world=WORLD,
         world_id="configured",
@@ -76,7 +74,7 @@ class Field:
         self.cut: set[frozenset[str]] = set()
         self.stations: dict[str, Station] = {}
         self.commands: dict[str, Commands] = {}
-        self.events: list[Event] = []
+        self.events: list[GroundEvent] = []
         self.robots = [self.new_robot(i, n) for i in range(n + spares)]
         self.programs = list(self.robots)
         self._n, self._spares = n, spares
@@ -161,16 +159,16 @@ class Field:
             self.step()
         raise AssertionError([(r.state, r.reason) for r in self.robots])
 
-    def begin(self, request: Request, by: str = "alice") -> Running:
+    def begin(self, request: Request, by: str = "alice") -> CommandTask:
         return self.commands[by].begin(request)
 
-    def do(self, request: Request, by: str = "alice") -> Report:
+    def do(self, request: Request, by: str = "alice") -> CommandReport:
         running = self.begin(request, by)
         self.until(lambda: running.report, 300.0)
         assert running.report is not None
         return running.report
 
-    def done(self, request: Request, by: str = "alice") -> Report:
+    def done(self, request: Request, by: str = "alice") -> CommandReport:
         report = self.do(request, by)
         assert report.done, report
         return report
@@ -203,7 +201,7 @@ def a_field(n: int = 3, **options: float) -> Field:
     return field
 
 
-def why_not(report: Report) -> dict[str, str]:
+def why_not(report: CommandReport) -> dict[str, str]:
     return {result.robot: result.text for result in report.results if not result.done}
 
 
@@ -223,9 +221,9 @@ def test_commands_arrive_although_messages_are_lost(loss: float) -> None:
         field = a_field(4, loss=loss, seed=seed)
         field.fly()
         assert field.states() == {_S.MISSION}
-        field.done(Calm("hold"))
+        field.done(SafetyCommand("hold"))
         field.done(Resume())
-        field.done(Calm("return", wait=True))
+        field.done(SafetyCommand("return", wait=True))
         field.done(SetWorld(OTHER_WORLD, "w.env"))
 
 
@@ -274,7 +272,7 @@ def test_a_climb_that_is_held_up_is_no_takeoff() -> None:
     low = f"; below its height of {held_up.slot_height_m:g} m: land all, then take off"
     assert why_not(running.report) == {"r1": f"control was silent for 0.7 s{low}"}
     assert why_not(field.do(Takeoff())) == {"r1": f"already in the air, in hold{low}"}
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))
     field.done(Takeoff(interval_s=0.0))
 
 
@@ -288,21 +286,21 @@ def test_who_is_in_the_air_keeps_what_it_has() -> None:
         assert "armed: land and disarm first" in report.problem
         assert field.stations["alice"].state == before
     field.done(Start())
-    assert "fly the mission" in field.do(Again()).problem
+    assert "fly the mission" in field.do(NextTrial()).problem
 
 
 def test_what_is_asked_of_some_robots_is_asked_of_them_alone() -> None:
     field = a_field()
     field.fly()
-    field.done(Calm("hold", robots=("r1",)))
+    field.done(SafetyCommand("hold", robots=("r1",)))
     assert [robot.state for robot in field.robots] == [_S.MISSION, _S.HOLD, _S.MISSION]
     assert why_not(field.do(Start())) == {
         "r1": "hold is commanded: `lpac mission resume` withdraws it"
     }
-    field.done(Calm("land", robots=("r0",), wait=True))
+    field.done(SafetyCommand("land", robots=("r0",), wait=True))
     assert [robot.state for robot in field.robots] == [_S.LANDED, _S.HOLD, _S.MISSION]
-    # The fleet's calm is everybody's again.
-    field.done(Calm("hold"))
+    # The fleet's safety action is everybody's again.
+    field.done(SafetyCommand("hold"))
     field.done(Resume())
     assert [robot.state for robot in field.robots][1:] == [_S.MISSION, _S.MISSION]
     field.done(Takeoff(robots=("r0",)))
@@ -313,7 +311,7 @@ def test_resume_starts_only_who_flew_this_trial() -> None:
     field = a_field()
     field.take_off()
     field.done(Start(robots=("r0",)))
-    field.done(Calm("hold"))
+    field.done(SafetyCommand("hold"))
     report = field.done(Resume())
     assert [robot.state for robot in field.robots] == [_S.MISSION, _S.HOLD, _S.HOLD]
     assert "it has not begun this trial" in report.results[1].text
@@ -322,7 +320,7 @@ def test_resume_starts_only_who_flew_this_trial() -> None:
     for robot in field.robots:
         robot.position_m = (30.0, 30.0, robot.slot_height_m)
     field.run(0.5)
-    field.done(Calm("return"))
+    field.done(SafetyCommand("return"))
     assert field.states() == {_S.RETURN}
     field.done(Resume())
     assert field.states() == {_S.MISSION}
@@ -330,13 +328,13 @@ def test_resume_starts_only_who_flew_this_trial() -> None:
 
 def test_what_brought_robots_down_does_not_keep_them_there() -> None:
     field = a_field()
-    for calm in ("land", "return", "hold"):
+    for safety_action in ("land", "return", "hold"):
         field.take_off()
-        field.done(Calm(calm))
-        if calm == "hold":
+        field.done(SafetyCommand(safety_action))
+        if safety_action == "hold":
             # Those that hold in the air are not sent off by somebody who forgot that.
             assert "hold is commanded" in field.do(Takeoff()).problem
-            field.done(Calm("land"))
+            field.done(SafetyCommand("land"))
         field.land()
 
 
@@ -346,7 +344,7 @@ def test_who_returns_waits_for_those_below() -> None:
     for robot, far_m in zip(field.robots, (28.0, 4.0, 20.0, 6.0), strict=True):
         x_m, y_m = robot.landing_point_m
         robot.position_m = (x_m, y_m + far_m, robot.slot_height_m)
-    field.begin(Calm("return"))
+    field.begin(SafetyCommand("return"))
     landing: list[int] = []
     while field.states() != {_S.LANDED}:
         field.step()
@@ -365,7 +363,7 @@ def a_return(field: Field, slow: int) -> None:
     field.fly()
     field.run(5.0)
     field.robots[slow].speed_m_s = 0.1
-    field.begin(Calm("return"))
+    field.begin(SafetyCommand("return"))
     above = field.robots[slow + 1 :]
     field.until(lambda: all(robot.state is _S.HOLD for robot in above))
 
@@ -378,7 +376,7 @@ def test_whom_somebody_holds_in_a_return_stays(by: str) -> None:
     over = field.robots[0]
     field.until(lambda: over.state is _S.LAND or over._away_m(over.landing_point_m) < 1.4)
     # Also where it could be taken for one that waits.
-    field.done(Calm("hold", robots=("r0",)), by)
+    field.done(SafetyCommand("hold", robots=("r0",)), by)
     states = set()
     for _ in range(100):
         field.step()
@@ -386,13 +384,13 @@ def test_whom_somebody_holds_in_a_return_stays(by: str) -> None:
     assert states == {_S.HOLD}
     # Who waits goes on when its way is free, and not before.
     assert [robot.state for robot in field.robots[1:]] == [_S.RETURN, _S.HOLD]
-    field.done(Calm("hold", robots=("r1",)), by)
+    field.done(SafetyCommand("hold", robots=("r1",)), by)
     field.until(lambda: field.robots[2].state is _S.LANDED)
     field.run(5.0)
     assert [robot.state for robot in field.robots[:2]] == [_S.HOLD, _S.HOLD]
-    field.done(Calm("return", robots=("r0",), wait=True))
+    field.done(SafetyCommand("return", robots=("r0",), wait=True))
     assert field.robots[1].state is _S.HOLD
-    field.done(Calm("land", robots=("r1",), wait=True))
+    field.done(SafetyCommand("land", robots=("r1",), wait=True))
 
 
 @pytest.mark.parametrize("by", ["alice", "bob"])
@@ -400,20 +398,20 @@ def test_who_waits_in_a_return_may_be_held(by: str) -> None:
     field = a_field()
     field.join("bob")
     a_return(field, slow=0)
-    field.done(Calm("hold", robots=("r0", "r2")), by)
+    field.done(SafetyCommand("hold", robots=("r0", "r2")), by)
     field.until(lambda: field.robots[1].state is _S.LANDED)
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     field.run(20.0)
     assert [robot.state for robot in field.robots] == [_S.HOLD, _S.LANDED, _S.HOLD]
     field.robots[0].speed_m_s = 1.0
-    field.done(Calm("return", wait=True), "bob")
+    field.done(SafetyCommand("return", wait=True), "bob")
 
 
 def test_a_return_goes_on_with_another_commander() -> None:
     field = a_field()
     field.join("bob")
     a_return(field, slow=0)
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     field.run(2.0)
     assert [robot.state for robot in field.robots] == [_S.RETURN, _S.HOLD, _S.HOLD]
     field.leave("alice")
@@ -474,7 +472,7 @@ def test_a_world_that_is_not_known_is_not_shown_as_another() -> None:
     field.run(0.5)
     assert (bob.setup.world, bob.setup.world_id) == ("", world_id(OTHER_WORLD))
     # Nor does a commander send a world that it does not have.
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     field.robots[1].world_id = "configured"
     field.run(0.5)
     assert bob.published_world() is None
@@ -517,8 +515,8 @@ def test_trials_are_numbered() -> None:
     assert (next_trial("windy"), next_trial("windy9")) == ("windy2", "windy10")
     field = a_field()
     field.fly()
-    field.done(Calm("land", wait=True))
-    assert not field.do(Again("second")).problem
+    field.done(SafetyCommand("land", wait=True))
+    assert not field.do(NextTrial("second")).problem
     field.done(Takeoff(interval_s=0.0))
     field.done(Start())
     assert {robot.trial for robot in field.robots} == {"second"}
@@ -530,7 +528,7 @@ def test_disable_holds_what_flies() -> None:
     field.fly()
     field.done(Enable(on=False))
     assert field.states() == {_S.HOLD}
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))
     assert "not enabled" in field.do(Takeoff()).problem
     field.done(Enable(robots=("r1",)))
     assert why_not(field.do(Takeoff(robots=("r1",)))) == {}
@@ -538,13 +536,14 @@ def test_disable_holds_what_flies() -> None:
 
 def test_disarm_of_who_is_not_armed() -> None:
     field = a_field()
-    report = field.done(Give("disarm", ("r0", "r2")))
+    report = field.done(RobotCommand("disarm", ("r0", "r2")))
     assert {result.text for result in report.results} == {"is not armed"}
     assert [result.robot for result in report.results] == ["r0", "r2"]
 
 
-def test_what_calms_ends_what_sets_in_motion() -> None:
-    for request in (Calm("hold"), Calm("land"), Calm("hold", robots=("r0",)), Give("kill", ("r0",)),
+def test_a_safety_command_ends_what_sets_in_motion() -> None:
+    for request in (SafetyCommand("hold"), SafetyCommand("land"), SafetyCommand("hold",
+    robots=("r0",)), RobotCommand("kill", ("r0",)),
                     Enable(on=False)):  # fmt: skip
         field = a_field()
         field.make_ready()
@@ -560,11 +559,11 @@ def test_what_calms_ends_what_sets_in_motion() -> None:
 
 def takeoff_ended_by(request: Request) -> str:
     match request:
-        case Calm(robots=("r0",)):
+        case SafetyCommand(robots=("r0",)):
             return "hold r0"
-        case Calm():
-            return request.calm
-        case Give():
+        case SafetyCommand():
+            return request.action
+        case RobotCommand():
             return "kill r0"
         case _:
             return "disable"
@@ -598,7 +597,7 @@ def test_an_order_that_is_not_answered_expires() -> None:
     assert why_not(field.do(Takeoff(interval_s=0.0))) == {"r1": "it did not answer"}
     field.robots[0].silent = True
     field.run(12.0)
-    report = field.do(Give("disarm", ("r0", "r2")))
+    report = field.do(RobotCommand("disarm", ("r0", "r2")))
     assert why_not(report)["r0"] == "not heard"
 
 
@@ -620,7 +619,7 @@ def test_a_silent_robot_is_killed_too() -> None:
     field.take_off()
     field.robots[0].silent = True
     field.run(8.0)
-    kill = field.begin(Give("kill", ("r0",)))
+    kill = field.begin(RobotCommand("kill", ("r0",)))
     field.run(1.0)
     assert field.robots[0].state is _S.FAULT
     field.robots[0].silent = False
@@ -630,7 +629,7 @@ def test_a_silent_robot_is_killed_too() -> None:
     never = Field(1)
     never.robots[0].silent = True
     never.join("alice")
-    assert why_not(never.do(Give("kill", ("r0",)))) == {"r0": "not heard"}
+    assert why_not(never.do(RobotCommand("kill", ("r0",)))) == {"r0": "not heard"}
 
 
 def test_of_two_orders_the_later_expires_later() -> None:
@@ -654,7 +653,7 @@ def test_all_programs_of_one_robot_are_killed() -> None:
     second = field.new_robot(1, 3)
     field.programs.append(second)
     field.run(1.0)
-    field.done(Give("kill", ("r1",)))
+    field.done(RobotCommand("kill", ("r1",)))
     field.run(1.0)
     assert (field.robots[1].state, second.state) == (_S.FAULT, _S.FAULT)
     field.run(12.0)
@@ -667,28 +666,28 @@ def test_two_programs_of_one_robot_settle_nothing() -> None:
     second = field.new_robot(1, 3)
     field.programs.append(second)
     field.run(1.0)
-    pictures = field.stations["alice"].picture().robots
-    assert [picture.duplicate for picture in pictures] == [False, True, False]
+    snapshots = field.stations["alice"].snapshot().robots
+    assert [snapshot.duplicate for snapshot in snapshots] == [False, True, False]
     # Who was there first is shown.
-    assert pictures[1].status is not None
-    assert pictures[1].status.boot_nonce == field.robots[1].boot_nonce
+    assert snapshots[1].status is not None
+    assert snapshots[1].status.boot_nonce == field.robots[1].boot_nonce
     report = field.do(Takeoff(interval_s=0.0))
     assert why_not(report) == {"r1": "two programs say that they are this robot"}
     field.programs.remove(field.robots[1])
     field.run(5.0)
-    assert not field.stations["alice"].picture().robots[1].duplicate
+    assert not field.stations["alice"].snapshot().robots[1].duplicate
 
 
-def test_what_a_picture_tells() -> None:
+def test_what_a_snapshot_tells() -> None:
     field = a_field()
     field.run(5.0)
-    robot = field.stations["alice"].picture().robots[0]
+    robot = field.stations["alice"].snapshot().robots[0]
     assert robot.fresh
     assert robot.clock_offset_s == pytest.approx(0.0, abs=1e-3)
     assert robot.rates_hz["1"] == pytest.approx(2.5, abs=0.5)
     field.robots[0].silent = True
     field.run(3.0)
-    robot = field.stations["alice"].picture().robots[0]
+    robot = field.stations["alice"].snapshot().robots[0]
     assert not robot.fresh
     assert robot.age_s == pytest.approx(3.0, abs=0.3)
     field.robots[0].silent = False
@@ -716,7 +715,7 @@ def test_a_station_started_again_takes_up_what_robots_do() -> None:
     assert after == replace(before, sequence=after.sequence, unix_time_s=after.unix_time_s)
     field.run(30.0)
     assert field.states() == {_S.MISSION}
-    field.done(Calm("land", wait=True))
+    field.done(SafetyCommand("land", wait=True))
 
 
 def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
@@ -725,7 +724,7 @@ def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
     field.done(SetPlaces({"r2": Place(7, (20.0, 20.0))}))
     field.done(Takeoff(interval_s=0.0))
     field.done(Start(robots=("r0", "r1")))
-    field.done(Calm("hold"))
+    field.done(SafetyCommand("hold"))
     before = field.stations["alice"].state
     # Of whom it hears one alone.
     field.cut = {frozenset(("alice", f"r{i}")) for i in (1, 2)}
@@ -739,7 +738,7 @@ def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
     # What somebody else said since is what counts.
     field.join("bob")
     field.run(1.0)
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     field.done(Resume(), "bob")
     bob = field.stations["bob"].state
     field.leave("bob")
@@ -749,7 +748,7 @@ def test_a_station_started_again_remembers_what_robots_do_not_say() -> None:
     assert after.commands
     assert after.state is not None
     assert bob is not None
-    assert (after.state.calm, after.state.sequence) == ("none", bob.sequence + 1)
+    assert (after.state.safety_action, after.state.sequence) == ("none", bob.sequence + 1)
 
 
 def test_a_return_goes_on_after_a_restart() -> None:
@@ -851,7 +850,7 @@ def test_a_station_does_not_take_over_from_one_that_only_robots_hear() -> None:
     assert "alice commands the fleet" in field.do(Start(), "bob").problem
     assert {robot.ground.operator for robot in field.robots if robot.ground} == {"alice"}
     # It may hold, still.
-    field.done(Calm("hold"), "bob")
+    field.done(SafetyCommand("hold"), "bob")
     field.run(10.0)
     assert field.states() == {_S.HOLD}
 
@@ -865,27 +864,27 @@ def test_stations_that_do_not_hear_each_other() -> None:
     field.cut.add(frozenset(("alice", "bob")))
     bob = field.join("bob")
     field.run(2.0)
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     for trial in ("t7", "t8", "t9"):
         bob.change(trial=trial)
     field.run(0.5)
     # It may hold at once, also before it knows.
     alice = field.stations["alice"]
     assert alice.commands
-    field.done(Calm("hold"))
+    field.done(SafetyCommand("hold"))
     assert field.states() == {_S.HOLD}
     field.run(2.0)
     assert field.states() == {_S.HOLD}
     assert (bob.commands, bob.commander) == (False, "alice")
     assert "alice commands the fleet" in field.do(Start(), "bob").problem
     # Who is told so by robots alone does not say that it commands.
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     takeoff = field.begin(Takeoff())
     field.run(2.0)
     assert takeoff.report is not None
     assert (alice.commands, alice.commander) == (False, "bob")
     assert {robot.ground.operator for robot in field.robots if robot.ground} == {"bob"}
-    field.done(Calm("hold"))
+    field.done(SafetyCommand("hold"))
 
 
 def test_an_observer_holds_and_nothing_else() -> None:
@@ -894,22 +893,23 @@ def test_an_observer_holds_and_nothing_else() -> None:
     bob = field.join("bob")
     field.run(2.0)
     assert (bob.commands, bob.commander) == (False, "alice")
-    for request in (Calm("land"), Calm("return"), Start(), Resume(), Takeoff(), Enable(on=False),
-                    SetOrigin(ORIGIN), Again(), Give("disarm", ("r0",))):  # fmt: skip
+    for request in (SafetyCommand("land"), SafetyCommand("return"), Start(), Resume(), Takeoff(),
+    Enable(on=False),
+                    SetOrigin(ORIGIN), NextTrial(), RobotCommand("disarm", ("r0",))):  # fmt: skip
         assert "alice commands the fleet" in field.do(request, "bob").problem
-    field.done(Calm("hold", robots=("r1",)), "bob")
+    field.done(SafetyCommand("hold", robots=("r1",)), "bob")
     assert [robot.state for robot in field.robots] == [_S.MISSION, _S.HOLD, _S.MISSION]
-    field.done(Calm("hold"), "bob")
+    field.done(SafetyCommand("hold"), "bob")
     assert field.states() == {_S.HOLD}
     alice = field.stations["alice"]
     assert alice.commands
     assert alice.state is not None
-    assert alice.state.calm_by == "bob"
+    assert alice.state.safety_action_by == "bob"
     # It is the commander's to withdraw, for good.
     field.done(Resume())
     field.run(5.0)
     assert field.states() == {_S.MISSION}
-    field.done(Give("kill", ("r0",)), "bob")
+    field.done(RobotCommand("kill", ("r0",)), "bob")
     assert field.robots[0].state is _S.FAULT
 
 
@@ -920,7 +920,7 @@ def test_an_observers_hold_ends_a_takeoff() -> None:
     field.run(2.0)
     takeoff = field.begin(Takeoff(interval_s=30.0))
     field.until(lambda: field.robots[2].state is _S.HOLD)
-    field.done(Calm("hold"), "bob")
+    field.done(SafetyCommand("hold"), "bob")
     field.run(1.0)
     assert takeoff.report is not None
     assert set(why_not(takeoff.report).values()) == {"abandoned: bob commands hold"}
@@ -931,9 +931,9 @@ def test_taking_over() -> None:
     field.fly()
     field.join("bob")
     field.run(2.0)
-    takeoff = field.begin(Calm("return", wait=True))
+    takeoff = field.begin(SafetyCommand("return", wait=True))
     field.run(0.5)
-    field.done(Command(), "bob")
+    field.done(TakeCommand(), "bob")
     field.run(0.5)
     assert takeoff.report is not None
     assert "bob commands the fleet" in takeoff.report.results[0].text
@@ -941,7 +941,7 @@ def test_taking_over() -> None:
     # What the other wanted goes on.
     field.land()
     field.done(Takeoff(interval_s=0.0), "bob")
-    field.done(Command())
+    field.done(TakeCommand())
     assert [s.commands for s in field.stations.values()] == [True, False]
 
 
@@ -952,7 +952,7 @@ def test_a_hold_when_the_commander_is_gone_commands() -> None:
     field.run(2.0)
     field.leave("alice")
     field.run(0.3)
-    field.done(Calm("hold"), "bob")
+    field.done(SafetyCommand("hold"), "bob")
     field.run(3.0)
     assert field.stations["bob"].commands
     field.done(Resume(), "bob")
@@ -998,9 +998,10 @@ def test_a_second_station_of_a_name_ends_and_not_the_first() -> None:
 
 
 REQUESTS = st.sampled_from([
-    Calm("hold"), Calm("hold", robots=("r0",)), Calm("land"), Calm("return"), Command(), Start(),
-    Takeoff(interval_s=0.0), Resume(), Enable(), Again(), Give("pilot", ("r1",)),
-    Give("rejoin", ("r1",)), SetWorld(OTHER_WORLD, "w"),
+    SafetyCommand("hold"), SafetyCommand("hold", robots=("r0",)), SafetyCommand("land"),
+    SafetyCommand("return"), TakeCommand(), Start(),
+    Takeoff(interval_s=0.0), Resume(), Enable(), NextTrial(), RobotCommand("pilot", ("r1",)),
+    RobotCommand("rejoin", ("r1",)), SetWorld(OTHER_WORLD, "w"),
 ])  # fmt: skip
 NAMES = ("alice", "bob", "carol")
 
@@ -1034,7 +1035,7 @@ def test_stations_agree_whatever_they_are_told(
     (commander,) = {station.commander for station in field.stations.values()}
     assert {robot.ground.operator for robot in field.robots if robot.ground} == {commander}
     # Whoever holds then, all hold.
-    field.do(Calm("hold"), NAMES[seed % 3])
+    field.do(SafetyCommand("hold"), NAMES[seed % 3])
     field.run(3.0)
     flying = {s for s in field.states() if s in (_S.MISSION, _S.RETURN, _S.TAKEOFF)}
     assert not flying

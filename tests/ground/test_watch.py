@@ -26,32 +26,29 @@ from rich.cells import cell_len
 from textual.pilot import Pilot
 from typer.testing import CliRunner
 
-from cli.main import app
-from edge.core.mission import FlightState, GroundState
-from ground.alarms import Alarm, alarms
-from ground.client import command, socket_path
-from ground.protocol import (
+from edge.messages.mission import FlightState, GroundState
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent, RobotSnapshot
+from lpac.cli.main import app
+from lpac.ground.alarms import Alarm, alarms
+from lpac.ground.station.client import command, socket_path
+from lpac.ground.station.protocol import (
+    CommandReport,
     Enable,
-    Event,
-    Picture,
-    Report,
-    Result,
-    RobotPicture,
+    RobotResult,
     SetOrigin,
-    Setup,
     Start,
     Takeoff,
     to_line,
 )
-from ground.watch import Lines, Watch
-from ground.watch_lines import Line, age, fit, number, some
-from ground.watch_robot import detail, in_short
-from ground.watch_table import Row, columns, heading, in_order, table_row
-from ground.watch_text import all_of_it, few_alarms, header, outcome
+from lpac.ground.terminal.app import Lines, Watch
+from lpac.ground.terminal.lines import Line, age, fit, number, some
+from lpac.ground.terminal.robot import detail, in_short
+from lpac.ground.terminal.table import Row, columns, heading, in_order, table_row
+from lpac.ground.terminal.text import all_of_it, few_alarms, header, outcome
 from tests.conftest import ROOT
-from tests.ground.conftest import PATIENCE_S, wait_for_picture
-from tests.ground.pictures import on_ground, picture, robot, setup, status
+from tests.ground.conftest import PATIENCE_S, wait_for_snapshot
 from tests.ground.pretend import ORIGIN, PretendedFleet
+from tests.ground.snapshots import on_ground, robot, setup, snapshot, status
 
 _S = FlightState
 
@@ -90,7 +87,7 @@ odd_statuses = st.builds(
 def test_no_value_moves_a_column(said: Any, age_s: Any, name: str, width: int) -> None:
     fleet = replace(setup(3), robots={name: 1, "r0": 0})
     shown = columns(fleet, width)
-    row = Row(RobotPicture(name, 1, said, age_s, rates_hz={"0": math.nan}), "warning", fleet)
+    row = Row(RobotSnapshot(name, 1, said, age_s, rates_hz={"0": math.nan}), "warning", fleet)
     ordinary = Row(robot(status(0)), None, fleet)
     cells = [column.width + 1 for column in shown]
     for line in (*heading(shown), table_row(shown, row), table_row(shown, ordinary)):
@@ -98,7 +95,7 @@ def test_no_value_moves_a_column(said: Any, age_s: Any, name: str, width: int) -
     for line in (table_row(shown, row), table_row(shown, ordinary)):
         assert [cell_len(span.text) for span in line[::2]] == [cell - 1 for cell in cells]
         assert all(span.text == " " for span in line[1::2])
-    for line in (*detail(row, picture(row.robot), (), max(width, 40)), *in_short(row, width)):
+    for line in (*detail(row, snapshot(row.robot), (), max(width, 40)), *in_short(row, width)):
         assert width_of(line) in (width, max(width, 40))
 
 
@@ -125,8 +122,10 @@ def test_words_for_numbers(text: str, expected: str) -> None:
 
 
 def test_header_says_who_commands_and_who_asked() -> None:
-    ground = GroundState(5, "bob", ORIGIN, enabled=True, calm="hold", calm_by="carol", trial="t2")
-    seen = picture(robot(status(0)), commander="bob", ground=ground, running=("takeoff",))
+    ground = GroundState(
+        5, "bob", ORIGIN, enabled=True, safety_action="hold", safety_action_by="carol", trial="t2"
+    )
+    seen = snapshot(robot(status(0)), commander="bob", ground=ground, running=("takeoff",))
     lines = ["".join(span.text for span in line) for line in header(setup(1), seen, 125.0, 90)]
     assert lines[0].split("  ")[:3] == ["field", "bob commands, alice observes", "trial t2"]
     assert lines[0].rstrip().endswith("mission 02:05")
@@ -137,16 +136,16 @@ def test_header_says_who_commands_and_who_asked() -> None:
 def test_a_heading_is_below_360_degrees_however_it_is_rounded() -> None:
     origin = replace(ORIGIN, heading_deg=359.96)
     ground = GroundState(5, "alice", origin, enabled=True)
-    lines = header(setup(1), picture(robot(status(0)), ground=ground), None, 90)
+    lines = header(setup(1), snapshot(robot(status(0)), ground=ground), None, 90)
     assert " 0°  bundle" in "".join(span.text for span in lines[2])
     row = Row(robot(status(0, origin=origin, heading_rad=math.radians(-0.1))), None, setup(1))
-    known = "\n".join("".join(s.text for s in line) for line in detail(row, picture(), (), 90))
+    known = "\n".join("".join(s.text for s in line) for line in detail(row, snapshot(), (), 90))
     assert "heading 0°" in known and " 0.0°" in known and "360" not in known
 
 
-def test_calm_of_single_robots() -> None:
-    ground = GroundState(5, "alice", enabled=True, robot_calm={"1": "land", "0": "hold"})
-    lines = header(setup(2), picture(ground=ground), None, 80)
+def test_safety_action_of_single_robots() -> None:
+    ground = GroundState(5, "alice", enabled=True, robot_safety_actions={"1": "land", "0": "hold"})
+    lines = header(setup(2), snapshot(ground=ground), None, 80)
     assert "HOLD r0, LAND r1 by alice" in "".join(span.text for span in lines[1])
 
 
@@ -163,15 +162,19 @@ def test_alarms_of_many_robots_with_one_text_are_one_line() -> None:
 
 
 def test_outcome_says_first_who_did_not() -> None:
-    report = Report((Result("r1", True, "holds"), Result("r2", False, "does not answer")))
+    report = CommandReport(
+        (RobotResult("r1", True, "holds"), RobotResult("r2", False, "does not answer"))
+    )
     assert outcome("hold", report) == ("hold: NOT r2: does not answer; r1: holds", "critical")
-    everybody = Report(tuple(Result(f"r{i}", True, "holds") for i in range(30)))
+    everybody = CommandReport(tuple(RobotResult(f"r{i}", True, "holds") for i in range(30)))
     assert outcome("hold", everybody) == ("hold: all 30: holds", "good")
-    assert outcome("land", Report(problem="bob commands")).text == "land NOT DONE: bob commands"
+    assert (
+        outcome("land", CommandReport(problem="bob commands")).text == "land NOT DONE: bob commands"
+    )
 
 
 def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:
-    seen = picture(*(robot(status(i)) for i in range(4)))
+    seen = snapshot(*(robot(status(i)) for i in range(4)))
     told = [Alarm("critical", "r3", "x"), Alarm("warning", "r2", "x"), Alarm("note", "r1", "x")]
     rows = in_order(setup(4), seen, told)
     assert [row.robot.name for row in rows] == ["r3", "r2", "r0", "r1"]
@@ -224,7 +227,7 @@ def _own_sockets(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.M
 
 
 def lpac(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "cli.main", *map(str, arguments)]
+    return [sys.executable, "-m", "lpac.cli.main", *map(str, arguments)]
 
 
 def environment(**changes: str) -> dict[str, str]:
@@ -238,7 +241,7 @@ def ground(fleet: PretendedFleet) -> Iterator[subprocess.Popen[bytes]]:
         env=environment(), stdout=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        wait_for_picture(fleet.name)
+        wait_for_snapshot(fleet.name)
         yield process
     finally:
         process.kill()
@@ -321,7 +324,7 @@ def test_a_ground_process_that_ends_and_comes_back(tmp_path: Path) -> None:
 
 @asynccontextmanager
 async def told(
-    fleet: Setup, seen: Callable[[], Picture], events: Sequence[Event] = ()
+    fleet: FleetSetup, seen: Callable[[], FleetSnapshot], events: Sequence[GroundEvent] = ()
 ) -> AsyncIterator[None]:
     """A ground process that tells events, and then whatever picture it is given."""
 
@@ -352,11 +355,11 @@ def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
     async def use() -> None:
         landed = ((800.0, "mission: mission started"), (900.0, "landed: the vehicle is disarmed"))
         events = [
-            Event(at_s, "state", name, text, trial="t1")
+            GroundEvent(at_s, "state", name, text, trial="t1")
             for at_s, text in (*landed, (935.0, "hold: at its height"), (940.0, landed[0][1]))
             for name in ("r0", "r1")
         ]
-        seen_last = picture(robot(status(0)), robot(status(1)), unix_time_s=1000.0)
+        seen_last = snapshot(robot(status(0)), robot(status(1)), unix_time_s=1000.0)
         async with told(setup(2), lambda: seen_last, events), watching("field") as seen:
             await seen.until(lambda: "mission 01:00" in seen.text("header"))
 
@@ -365,7 +368,7 @@ def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
 
 @pytest.mark.parametrize("size", [(40, 12), (40, 8)])
 def test_what_is_asked_is_seen_in_a_small_terminal(size: tuple[int, int]) -> None:
-    ill = picture(*(robot(status(i, alarms=(f"{i} is lost",))) for i in range(9)))
+    ill = snapshot(*(robot(status(i, alarms=(f"{i} is lost",))) for i in range(9)))
 
     async def use() -> None:
         async with told(setup(9), lambda: ill), watching("field", size) as seen:
@@ -382,7 +385,7 @@ def test_what_is_asked_is_seen_in_a_small_terminal(size: tuple[int, int]) -> Non
 
 
 def test_thirty_robots_at_80_columns_and_24_lines() -> None:
-    def heard(robot_id: int, **changes: Any) -> RobotPicture:
+    def heard(robot_id: int, **changes: Any) -> RobotSnapshot:
         return robot(status(robot_id, neighbour_ages_s=everybody, **changes))
 
     everybody = {str(i): 0.2 for i in range(30)}
@@ -397,8 +400,8 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
     late = heard(29, alarms=("position lost",))
 
     async def use() -> None:
-        pictures = [picture(*odd, *flying, late)]
-        async with told(setup(30), lambda: pictures[0]), watching("field") as seen:
+        snapshots = [snapshot(*odd, *flying, late)]
+        async with told(setup(30), lambda: snapshots[0]), watching("field") as seen:
             await seen.until(lambda: "position lost" in seen.text("alarms"))
             for part in seen.app.query(Lines):
                 assert all(len(line) <= 80 for line in seen.lines(part.id or ""))
@@ -416,7 +419,7 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
             r28 = "r28 (robot 28)  mission: mission started"
             await seen.until(lambda: seen.text("heading").startswith(r28))
             # Who was selected stays so, wherever his row goes.
-            pictures[0] = picture(*odd, *flying[:-1], heard(28, battery=0.1), late)
+            snapshots[0] = snapshot(*odd, *flying[:-1], heard(28, battery=0.1), late)
             await seen.press("escape")
             await seen.until(lambda: "battery critical: 10%" in seen.text("alarms"))
             await seen.press("home", "enter")
@@ -506,7 +509,7 @@ def read_until(screen: int, wanted: str) -> None:
 
 
 def test_what_is_printed_once() -> None:
-    seen = picture(robot(status(0)), robot(status(1, alarms=("position lost",))))
+    seen = snapshot(robot(status(0)), robot(status(1, alarms=("position lost",))))
     text = all_of_it(setup(2), seen, alarms(setup(2), seen), 80)
     assert text.splitlines()[3] == "! r1             position lost"
     assert text.splitlines()[-2].startswith("! r1   mission    90  14 offboard   5.0  12.0")

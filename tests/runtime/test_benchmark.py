@@ -2,8 +2,8 @@
 
 import pytest
 
-from edge.runtime.benchmark import StepTimes, benchmark
-from edge.runtime.bundle import Bundle
+from edge.policy.bundle import Bundle
+from edge.robot.benchmark import StepTimes, benchmark
 
 
 def test_a_step_may_take_half_of_its_period() -> None:

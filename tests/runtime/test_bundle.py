@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
-from edge.runtime.bundle import (
+from edge.policy.bundle import (
     BUNDLE_ID,
     GOLDEN,
     MANIFEST,
@@ -22,8 +22,8 @@ from edge.runtime.bundle import (
     make_bundle,
     write_bundle,
 )
-from edge.runtime.policy import Policy
-from edge.runtime.verify import verify
+from edge.policy.lpac.graphs import Policy
+from edge.policy.verify import verify
 
 GRAPHS = ("cnn.onnx", "gnn_1.onnx", "gnn_2.onnx", "action.onnx")
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.schema import ConfigError
-from edge.runtime.config import load_config
+from edge.robot.config import load_config
 from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "docs" / "robot.toml"

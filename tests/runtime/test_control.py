@@ -9,10 +9,26 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from edge.adapters.idf_sensor import IdfSensor
-from edge.adapters.px4_telemetry import Px4Telemetry
 from edge.core import F32
-from edge.core.mission import (
+from edge.core.fence import Fence
+from edge.core.position import PositionQuality
+from edge.core.vehicle import (
+    Action,
+    ActionResult,
+    EstimatorStatus,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    Setpoint,
+    Vector,
+    VehicleState,
+    Velocity,
+)
+from edge.core.world import random_features, rasterize
+from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.drivers.world_sensor import WorldSensor
+from edge.flight.preflight import HeardStatus
+from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
@@ -23,34 +39,16 @@ from edge.core.mission import (
     RobotStatus,
     to_json,
 )
-from edge.core.position import Quality
-from edge.core.preflight import HeardStatus
-from edge.core.safety import Fence
-from edge.core.vehicle import (
-    Action,
-    ActionResult,
-    Estimator,
-    GlobalOrigin,
-    Gps,
-    Mode,
-    Setpoint,
-    Vector,
-    VehicleState,
-    Velocity,
-)
-from edge.core.world import random_features, rasterize
-from edge.runtime.config import load_config
-from edge.runtime.control import FlightControl, GroundWorld
-from edge.runtime.inbox import Inbox
-from edge.runtime.navigation import Navigation
-from edge.runtime.pac import Pac
-from edge.runtime.policy import Policy
-from edge.runtime.readiness import Checks
-from sim.px4.link import Px4Link
-from sim.px4.modes import Mode as Px4Mode
-from sim.px4.modes import Result
-from sim.px4.vehicle import Px4Vehicle
-from sim.px4.vehicle import Setpoint as Px4Setpoint
+from edge.policy.lpac.graphs import Policy
+from edge.robot.config import load_config
+from edge.robot.control import FlightControl, GroundWorld
+from edge.robot.inbox import Inbox
+from edge.robot.navigation import Navigation
+from edge.robot.pac import Pac
+from edge.robot.readiness import Checks
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import MavResult, Px4Mode
+from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 from tests.core.test_preflight import NEIGHBOUR
 from tests.robot_rig import ORIGIN, new_vehicle, write_config
 
@@ -87,7 +85,7 @@ class DirectAutopilot:
             heading_rad=vehicle.heading_rad,
             origin=GlobalOrigin(*vehicle.global_origin),
             gps=Gps(0 if vehicle.gps_lost else 3, 14, 0.8, at_s=vehicle.time_s),
-            estimator=Estimator(vehicle.position_valid, False, vehicle.time_s),
+            estimator=EstimatorStatus(vehicle.position_valid, False, vehicle.time_s),
             height_above_home_m=float(-vehicle.position_m[2]),
             mode=MODES[vehicle.mode],
             armed=vehicle.armed,
@@ -116,7 +114,7 @@ class DirectAutopilot:
                 result = self.vehicle.disarm(force=action is Action.KILL)
             case _:
                 result = self.vehicle.set_mode(Px4Mode[action.name])
-        self.result = ActionResult(action, result is Result.ACCEPTED, "", self.vehicle.time_s)
+        self.result = ActionResult(action, result is MavResult.ACCEPTED, "", self.vehicle.time_s)
 
 
 class ListeningAutopilot(DirectAutopilot):
@@ -154,7 +152,7 @@ class Flown:
         self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         world = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
         self.pac = Pac(
-            robot_id=config.robot_id, boot_epoch=1, policy=policy, sensor=IdfSensor(world, 64),
+            robot_id=config.robot_id, boot_epoch=1, policy=policy, sensor=WorldSensor(world, 64),
             odometry=self.navigation, parameters=config.pac,
         )  # fmt: skip
         self.control = FlightControl(
@@ -230,8 +228,8 @@ class Flown:
         """Somebody flies it, and leaves it to PX4 to hold."""
         self.vehicle.parameters["MIS_TAKEOFF_ALT"] = height_m
         self.vehicle.step(0.02)
-        assert self.vehicle.arm() is Result.ACCEPTED
-        assert self.vehicle.set_mode(Px4Mode.TAKEOFF) is Result.ACCEPTED
+        assert self.vehicle.arm() is MavResult.ACCEPTED
+        assert self.vehicle.set_mode(Px4Mode.TAKEOFF) is MavResult.ACCEPTED
         for _ in range(150):
             self.tick()
         self.vehicle.set_mode(Px4Mode.HOLD)
@@ -283,14 +281,14 @@ def test_it_flies_what_it_is_told_and_lands(flown: Flown) -> None:
     assert abs(-flown.vehicle.position_m[2] - 5.0) < 0.8
     flown.explore("a")
     assert np.linalg.norm(flown.vehicle.velocity_m_s[:2]) > 0.2
-    flown.say(calm="hold")
+    flown.say(safety_action="hold")
     flown.until(FlightState.HOLD)
-    flown.say(calm="return")
+    flown.say(safety_action="return")
     flown.until(FlightState.LANDED)
     assert not flown.sent
     assert not flown.vehicle.armed
     assert flown.autopilot.commands.count(Action.ARM) == 1
-    flown.say(calm="none")
+    flown.say(safety_action="none")
     flown.take_off()
     topics = [topic for topic, _ in flown.records]
     assert topics.count("control") == round(flown.now_s / 0.1)
@@ -330,7 +328,7 @@ def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
     if state is not FlightState.HOLD:
         flown.explore("a")
     if state is FlightState.RETURN:
-        flown.say(calm="return")
+        flown.say(safety_action="return")
         flown.until(state)
     before_m = -flown.vehicle.position_m[2]
     flown.vehicle.gps_bias_m = np.array(jump_m)
@@ -340,11 +338,11 @@ def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
         assert flown.state is state
         assert abs(-flown.vehicle.position_m[2] - before_m) < 1.0
         qualities.append(flown.navigation.position.quality)
-    assert set(qualities) == {Quality.GOOD, Quality.DOUBTFUL}
+    assert set(qualities) == {PositionQuality.GOOD, PositionQuality.DOUBTFUL}
     assert abs(flown.odometry()[2] - 5.0) < 0.8
     doubted = [r["height_m"] for t, r in flown.records[-30:] if t == "control"]
     assert max(doubted) - min(doubted) < 1.0
-    flown.say(calm="land")
+    flown.say(safety_action="land")
     flown.until(FlightState.LANDED)
 
 
@@ -353,9 +351,9 @@ def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
     flown.explore("a")
     explored = flown.explored()
     for trial, forgets in (("a", False), ("b", True)):
-        flown.say(calm="hold")
+        flown.say(safety_action="hold")
         flown.until(FlightState.HOLD)
-        flown.say(calm="none")
+        flown.say(safety_action="none")
         flown.tick()
         assert flown.order("start", trial).accepted
         flown.tick()
@@ -376,7 +374,7 @@ def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
     flown.say(origin=ELSEWHERE)
     flown.tick()
     assert place() == ORIGIN
-    flown.say(calm="land")
+    flown.say(safety_action="land")
     flown.until(FlightState.LANDED)
     flown.tick()
     assert place() == ELSEWHERE
@@ -412,7 +410,7 @@ def test_fence_and_place_are_taken_up_together_on_the_ground_and_given_back(flow
     kept = ("mission origin", "fence", "place", "world")
     assert told == tuple(f"in flight: keeps its {what}" for what in kept)
     assert flown.order("start", "a").reason == "; ".join(told)
-    flown.say(calm="land", world_id=None)
+    flown.say(safety_action="land", world_id=None)
     flown.until(FlightState.LANDED)
     flown.tick()
     assert flies_by(flown) == configured
@@ -443,7 +441,7 @@ def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown
     assert flown.control.not_taken == (waiting,)
     assert flown.control.wanted_world_id == "flat"
     assert flown.explored() > 0
-    flown.control.world = GroundWorld("stale", IdfSensor(np.ones((512, 512), np.float32), 64), "")
+    flown.control.world = GroundWorld("stale", WorldSensor(np.ones((512, 512), np.float32), 64), "")
     flown.tick()
     assert flies_by(flown)[2] == "configured"
     flown.control.world = GroundWorld("flat", None, "world flat: record 1 (X): unknown kind")
@@ -451,7 +449,7 @@ def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown
     problem = "the ground's world cannot be used: world flat: record 1 (X): unknown kind"
     assert flown.control.failed_checks(flown.now_s) == (problem,)
     assert flown.control.wanted_world_id is None
-    flown.control.world = GroundWorld("flat", IdfSensor(np.zeros((512, 512), np.float32), 64), "")
+    flown.control.world = GroundWorld("flat", WorldSensor(np.zeros((512, 512), np.float32), 64), "")
     flown.tick()
     assert flies_by(flown)[2] == "flat"
     # Its checks, and what it sees, are of the new one.
@@ -466,7 +464,7 @@ def test_a_program_that_starts_in_flight_flies_on_by_what_the_ground_says(flown:
     flown.say(fence=FENCE, places={"3": PLACE}, world_id="flat")
     flown.take_off_by_hand(9.5)
     assert flies_by(flown) == (FENCE, PLACE, "configured")
-    flown.control.world = GroundWorld("flat", IdfSensor(np.zeros((512, 512), np.float32), 64), "")
+    flown.control.world = GroundWorld("flat", WorldSensor(np.zeros((512, 512), np.float32), 64), "")
     flown.tick()
     assert flies_by(flown) == (FENCE, PLACE, "flat")
     assert flown.order("rejoin").accepted
@@ -480,7 +478,7 @@ def test_a_reset_forgets_what_was_seen_and_moves_nothing(flown: Flown) -> None:
     flown.take_off()
     flown.explore("a")
     explored = int(flown.pac.explored().sum())
-    flown.say(calm="hold")
+    flown.say(safety_action="hold")
     flown.until(FlightState.HOLD)
     assert flown.order("reset", "b").accepted
     flown.tick()

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.mission import GroundState, Order, Origin, to_json
-from edge.runtime.inbox import Inbox
+from edge.messages.mission import GroundState, Order, Origin, to_json
+from edge.robot.inbox import Inbox
 
 STATE = GroundState(sequence=5, operator="anna", origin=Origin(40.0, -75.0, 30.0), enabled=True)
 ORDER = Order("a", 3, 77, "takeoff", 12.0, "anna")
@@ -37,7 +37,7 @@ def test_an_older_state_that_arrives_late_does_not_count() -> None:
     inbox = make_inbox()
     inbox.put_ground(to_json(STATE), 1.0, 1e9)
     assert inbox.ground(1.0)[0] == STATE
-    older = dataclasses.replace(STATE, sequence=4, calm="land")
+    older = dataclasses.replace(STATE, sequence=4, safety_action="land")
     inbox.put_ground(to_json(older), 1.5, 1e9)
     assert inbox.ground(1.5) == (STATE, 0.5)
 

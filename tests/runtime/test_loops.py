@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from edge.runtime.loops import Loop
+from edge.robot.loops import Loop
 
 
 def run_until(loop: Loop, done: threading.Event) -> None:
@@ -46,7 +46,7 @@ def ticks_of(
 
     loop = Loop("test", period_s, step)
     loop._stop = clock
-    monkeypatch.setattr("edge.runtime.loops.time", SimpleNamespace(monotonic=clock.monotonic))
+    monkeypatch.setattr("edge.robot.loops.time", SimpleNamespace(monotonic=clock.monotonic))
     loop._run()
     return began_s, loop
 

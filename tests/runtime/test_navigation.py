@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.frames import MissionFrame
-from edge.core.guidance import MissionPosition, MissionVelocity
-from edge.core.position import Judgement, PositionLimits, Quality
+from edge.core.position import PositionJudgement, PositionLimits, PositionQuality
 from edge.core.vehicle import (
     Action,
     GlobalOrigin,
@@ -19,7 +18,8 @@ from edge.core.vehicle import (
     VehicleState,
     Velocity,
 )
-from edge.runtime.navigation import MAX_POSITION_AGE_S, Navigation
+from edge.flight.guidance import MissionPosition, MissionVelocity
+from edge.robot.navigation import MAX_POSITION_AGE_S, Navigation
 
 FRAME = MissionFrame(39.95, -75.16, math.radians(30.0))
 VEHICLE = VehicleState(
@@ -49,7 +49,7 @@ class Standing:
 
 def navigation(vehicle: VehicleState = VEHICLE, now_s: float = 100.1) -> Navigation:
     made = Navigation(Standing(vehicle), lambda: now_s, PositionLimits())
-    made.frame, made.position = FRAME, Judgement(quality=Quality.GOOD, cause=None)
+    made.frame, made.position = FRAME, PositionJudgement(quality=PositionQuality.GOOD, cause=None)
     return made
 
 

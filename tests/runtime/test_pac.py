@@ -11,9 +11,9 @@ from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import Rejection, decode, encode
-from edge.runtime.bundle import Bundle, BundleError
-from edge.runtime.pac import Pac, PacParameters, position_feature
-from edge.runtime.policy import Policy
+from edge.policy.bundle import Bundle, BundleError
+from edge.policy.lpac.graphs import Policy
+from edge.robot.pac import Pac, PacParameters, position_feature
 
 PARAMETERS = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=1.25)
 

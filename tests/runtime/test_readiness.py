@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.adapters.mavsdk_autopilot import MavsdkAutopilot
-from edge.core.failsafe import PARAMETERS
-from edge.core.mission import GroundState, Origin
-from edge.core.position import Judgement
-from edge.core.safety import Fence
-from edge.runtime.config import load_config
-from edge.runtime.readiness import Assignment, Checks, Readiness
-from sim.px4.modes import Result
-from sim.px4.vehicle import Px4Vehicle
+from edge.core.fence import Fence
+from edge.core.position import PositionJudgement
+from edge.drivers.px4.autopilot import MavsdkAutopilot
+from edge.flight.failsafe import PARAMETERS
+from edge.messages.mission import GroundState, Origin
+from edge.robot.config import load_config
+from edge.robot.readiness import Assignment, Checks, Readiness
+from lpac.sim.px4.modes import MavResult
+from lpac.sim.px4.vehicle import Px4Vehicle
 from tests.robot_rig import ORIGIN, SYSTEM_ID, Rig, new_vehicle, rig, write_config
 
 
@@ -49,7 +49,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
     now_s = time.monotonic()
     known: dict[str, Any] = {
         "assignment": assignment(asked, origin),
-        "position": Judgement(),
+        "position": PositionJudgement(),
         "odometry": None,
         "peers": (),
         "not_understood": (),
@@ -156,7 +156,7 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
     vehicle = new_vehicle()
     with readiness(tmp_path, vehicle, "set") as (asked, made):
         with made.server.stepped:
-            assert vehicle.arm() is Result.ACCEPTED
+            assert vehicle.arm() is MavResult.ACCEPTED
         before = dict(vehicle.parameters)
         deadline_s = time.monotonic() + 60.0
         while asked._autopilot.state().armed is not True:

@@ -10,10 +10,10 @@ import pytest
 from edge.core import F64
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
-from edge.runtime.bundle import Bundle, BundleError
-from edge.runtime.pac import Pac, PacParameters, PayloadType
-from edge.runtime.policy import Policy
-from edge.runtime.replay import ReplayError, replay
+from edge.policy.bundle import Bundle, BundleError
+from edge.policy.lpac.graphs import Policy
+from edge.policy.replay import ReplayError, replay
+from edge.robot.pac import Pac, PacParameters, PayloadType
 
 Messages = list[tuple[str, float, dict[str, Any]]]
 

@@ -11,10 +11,10 @@ from edge.core import F32, F64
 from edge.core.aggregation import Geometry
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
-from edge.runtime.bundle import Bundle
-from edge.runtime.pac import Pac, PacParameters, position_feature
-from edge.runtime.policy import Policy
-from edge.runtime.verify import swarm_velocities
+from edge.policy.bundle import Bundle
+from edge.policy.lpac.graphs import Policy
+from edge.policy.verify import swarm_velocities
+from edge.robot.pac import Pac, PacParameters, position_feature
 from tests.conftest import ROOT, SHIPPED
 
 torch = pytest.importorskip("torch", reason="torch is the oracle here")

@@ -19,17 +19,17 @@ from unittest.mock import patch
 
 import numpy as np
 
-import edge.robot
-from cli.robot import run
-from edge.adapters.idf_sensor import IdfSensor
+import edge.robot.process
 from edge.core import F32, F64
-from edge.core.mission import FlightState, OrderKind, OrderResult, RobotStatus
-from edge.runtime.pac import Pac, PolicyTick
-from sim.fleet import ORIGIN, Fleet, RobotProcess
-from sim.fleet_vehicles import SimulatedVehicles
-from sim.operator import Heard, Script, Statuses
-from sim.px4.errors import GREATEST_WIND_M_S
-from sim.px4.vehicle import Px4Vehicle, Truth
+from edge.drivers.world_sensor import WorldSensor
+from edge.messages.mission import FlightState, OrderKind, OrderResult, RobotStatus
+from edge.robot.pac import Pac, PolicyTick
+from lpac.cli.robot import run
+from lpac.sim.fleet.processes import ORIGIN, Fleet, RobotProcess
+from lpac.sim.fleet.vehicles import SimulatedVehicles
+from lpac.sim.operator import Heard, OperatorScript, Statuses
+from lpac.sim.px4.errors import GREATEST_WIND_M_S
+from lpac.sim.px4.vehicle import Px4Vehicle, Truth
 from tests.conftest import ROOT
 from tests.robot_rig import HELD_UP
 from tests.sim.px4_rig import RealVehicle, RealVehicles
@@ -112,7 +112,7 @@ class FaultRig:
 
     def script(self, name: str) -> None:
         """Do one step of the script with the robots that fly."""
-        script = Script(
+        script = OperatorScript(
             self.operator, robots=self.flying, origin=ORIGIN, mission_s=0.0, trial="faults"
         )
         step = next(step for step in script.steps if step.name == name)
@@ -386,13 +386,13 @@ def _run(folder: Path) -> None:
                 raise RuntimeError("the policy was made to fail")
             return super().infer(now_s, unix_now_s)
 
-    class FailingSensor(IdfSensor):
+    class FailingSensor(WorldSensor):
         def view(self, position: F64) -> F32:
             nothing = np.zeros((0, 0), np.float32)
             return nothing if (folder / "fail-sensor").exists() else super().view(position)
 
     with patch.multiple(
-        edge.robot, Pac=FailingPac, IdfSensor=FailingSensor, _take_alone=lambda *_: None
+        edge.robot, Pac=FailingPac, WorldSensor=FailingSensor, _take_alone=lambda *_: None
     ):
         run(folder / "robot.toml")
 

@@ -1,7 +1,7 @@
 """Real PX4s as the fault rig sees vehicles: what is done to them, and what they do.
 
 What is done to a PX4 comes from a ground station on its ground-station link; where the vehicle
-really is tells PX4's own vehicle model. The names are those of `sim.px4.vehicle.Px4Vehicle`.
+really is tells PX4's own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
 """
 
 import math
@@ -16,15 +16,15 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
-from sim.px4.modes import CUSTOM_MODES, Mode
-from sim.px4.vehicle import Truth
-from sim.px4.world import WorldOrigin
-from sim.px4_build import GROUND_PORT, Px4Build, frames, payload
-from sim.px4_log import read_truth, setpoint_times_s
+from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
+from lpac.sim.px4.vehicle import Truth
+from lpac.sim.px4.world import WorldOrigin
+from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames, payload
+from lpac.sim.sitl.log import read_truth, setpoint_times_s
 
 AIRBORNE_ABOVE_M = 0.15
 # PX4's DESCEND is told as LAND.
-_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Mode.DESCEND}
+_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 # Of vehicle_status in PX4's log.
@@ -50,7 +50,7 @@ class RealVehicle:
 
     def __init__(self, px4s: Px4Build, instance: int, world: WorldOrigin) -> None:
         self.time_s = 0.0
-        self.mode = Mode.HOLD
+        self.mode = Px4Mode.HOLD
         self.armed = False
         self.position_m: F64 = np.zeros(3)
         self.velocity_m_s: F64 = np.zeros(3)
@@ -80,7 +80,7 @@ class RealVehicle:
 
     # What is done to it
 
-    def set_mode(self, mode: Mode) -> None:
+    def set_mode(self, mode: Px4Mode) -> None:
         """A ground station asks for a mode."""
         custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, *CUSTOM_MODES[mode])

@@ -8,8 +8,8 @@ import pytest
 
 from edge.core.frames import ModelScale
 from edge.core.world import GaussianFeature
-from edge.runtime.bundle import Bundle, BundleError
-from sim.experiment import Controller, Flight, Scenario, fly
+from edge.policy.bundle import Bundle, BundleError
+from lpac.sim.experiment import Controller, Scenario, SimulatedFlight, fly
 
 CONTROLLERS: tuple[Controller, ...] = (
     "lpac", "decentralized-cvt", "centralized-cvt", "clairvoyant-cvt",
@@ -17,7 +17,7 @@ CONTROLLERS: tuple[Controller, ...] = (
 MAX_SPEED_M_S = 1.25
 
 
-def short(bundle: Bundle, **changes: object) -> Flight:
+def short(bundle: Bundle, **changes: object) -> SimulatedFlight:
     return fly(Scenario(**{"duration_s": 6.0, "robots": 4, **changes}), bundle)  # type: ignore[arg-type]
 
 

@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 import zenoh
 
-from edge.core.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus, to_json
 from edge.core.wire import Rejection, decode, encode
-from sim.fleet import ERRORS, ORIGIN, WORLD, Fleet, FleetScenario
-from sim.operator import Statuses
-from sim.px4.modes import Mode
-from sim.px4.vehicle import Px4Vehicle
-from sim.px4_build import Px4Build
+from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus, to_json
+from lpac.sim.fleet.processes import ERRORS, ORIGIN, WORLD, Fleet, FleetScenario
+from lpac.sim.operator import Statuses
+from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.sitl.build import Px4Build
 from tests.conftest import SHIPPED
 from tests.sim.fault_rig import FaultRig, FaultyRobot, flies_on, speed_m_s
 from tests.sim.px4_rig import RealVehicle, RealVehicles
@@ -173,7 +173,7 @@ def longest_without_setpoint_s(rig: FaultRig, robot: int, until_s: float) -> flo
         nonlocal longest_s
         if isinstance(vehicle, Px4Vehicle):
             longest_s = max(longest_s, vehicle.time_s - vehicle._setpoint_at_s)
-        return vehicle.time_s >= until_s or vehicle.mode is Mode.LAND
+        return vehicle.time_s >= until_s or vehicle.mode is Px4Mode.LAND
 
     rig.wait_vehicle(robot, is_over)
     return longest_s
@@ -187,7 +187,7 @@ def comes_straight_down(
     Near by its own estimate, which may walk from the truth as far as the error budget has it; or
     within `carried_m` in truth, where it has no estimate that is worth anything.
     """
-    landing = [entry for entry in rig.truth(robot, since_s) if entry.mode is Mode.LAND]
+    landing = [entry for entry in rig.truth(robot, since_s) if entry.mode is Px4Mode.LAND]
     began_s = landing[0].time_s
     truth = rig.truth(robot, began_s)
     if carried_m is None:
@@ -264,7 +264,7 @@ def test_a_program_is_stopped_and_continued(rig: FaultRig) -> None:
         status = rig.wait_state(robot, _S.HOLD)
         assert status.reason == status.alarms[0]
         assert status.reason.startswith("control was silent for")
-        rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Mode.OFFBOARD)
+        rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Px4Mode.OFFBOARD)
         # Nothing but the operator's order makes it fly on.
         rig.wait_time(robot, rig.now_s(robot) + 5.0)
         assert rig.status(robot).state is _S.HOLD, rig.told()
@@ -363,7 +363,7 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
     robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot):
         if state is _S.HOLD:
-            rig.operator.calm("hold", robot)
+            rig.operator.safety_action("hold", robot)
             rig.wait_state(robot, _S.HOLD)
             rig.wait_time(robot, rig.now_s(robot) + 2.5)
         north_m = 5.6
@@ -391,22 +391,22 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
         assert all(
             abs(entry.position_m[2] - began_m[2]) < 1.5 for entry in rig.truth(robot, began_s)
         )
-        rig.operator.calm("none", robot)
+        rig.operator.safety_action("none", robot)
 
 
 def test_a_vehicle_leaves_offboard(rig: FaultRig) -> None:
     robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot):
         with rig.simulated.stepped:
-            rig.vehicle(robot).set_mode(Mode.HOLD)
+            rig.vehicle(robot).set_mode(Px4Mode.HOLD)
         status = rig.wait_state(robot, _S.PILOT)
         assert status.reason == status.alarms[0] == "the vehicle left offboard for hold"
         nothing_is_sent(rig, robot)
-        assert rig.vehicle(robot).mode is Mode.HOLD
+        assert rig.vehicle(robot).mode is Px4Mode.HOLD
         refusal = rig.order("start", robot)
         assert not refusal.accepted and "start is taken in hold only" in refusal.reason
         assert rig.order("rejoin", robot).accepted
-        rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Mode.OFFBOARD)
+        rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Px4Mode.OFFBOARD)
 
 
 @pytest.mark.simulated_only("PX4's simulator has no remote control that can be taken away")
@@ -416,7 +416,7 @@ def test_a_remote_control_is_lost_and_comes_back(rig: FaultRig) -> None:
         rig.change(robot, rc_connected=False)
         status = rig.wait_status(robot, lambda status: "remote control lost" in status.alarms)
         assert status.remote_control is False
-        assert rig.vehicle(robot).mode is Mode.OFFBOARD
+        assert rig.vehicle(robot).mode is Px4Mode.OFFBOARD
         rig.change(robot, rc_connected=True)
         rig.wait_status(robot, lambda status: "remote control lost" not in status.alarms)
 
@@ -467,7 +467,7 @@ def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig)
         assert rig.status(robot).state is _S.PILOT
         began_s = rig.now_s(robot)
         assert rig.order("rejoin", robot).accepted
-        rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Mode.OFFBOARD)
+        rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Px4Mode.OFFBOARD)
         # Nothing but the operator's order makes it fly on.
         rig.wait_time(robot, rig.now_s(robot) + 3.0)
         assert rig.status(robot).state is _S.HOLD
@@ -484,7 +484,7 @@ def test_gps_is_lost(rig: FaultRig) -> None:
         landing = [h.status for h in rig.heard(robot, heard_s) if h.status.state is _S.LAND]
         assert {status.reason for status in landing} == {"position lost: GPS has no fix"}
         # Its estimate drifts by metres on the way; and once PX4 gives it up, the wind carries it.
-        descent_s = [e.time_s for e in rig.truth(robot, began_s) if e.mode is Mode.DESCEND]
+        descent_s = [e.time_s for e in rig.truth(robot, began_s) if e.mode is Px4Mode.DESCEND]
         carried_m = rig.wind_m_s * (max(descent_s) - min(descent_s)) if descent_s else 0.0
         landing_s = comes_straight_down(rig, robot, began_s, rig.drift_m + carried_m)
         # 2.4 s, and the messages on the way; besides what this machine kept the robot waiting.

@@ -18,16 +18,16 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import pytest
 
-from edge.adapters.flight_log import read_metadata
-from edge.core.mission import FlightState
 from edge.core.world import parse_world
-from edge.runtime.bundle import Bundle
-from edge.runtime.config import load_config
-from fleet.config import load_fleet
-from sim.experiment import Scenario
-from sim.experiment import fly as fly_in_process
-from sim.fleet import APART_M, ERRORS, Fleet, FleetError, FleetScenario
-from sim.operator import Operator
+from edge.drivers.flight_log import read_metadata
+from edge.messages.mission import FlightState
+from edge.policy.bundle import Bundle
+from edge.robot.config import load_config
+from lpac.fleet.config import load_fleet
+from lpac.sim.experiment import Scenario
+from lpac.sim.experiment import fly as fly_in_process
+from lpac.sim.fleet.processes import APART_M, ERRORS, Fleet, FleetScenario, SimulatedFleetError
+from lpac.sim.operator import Operator
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
 
@@ -181,14 +181,14 @@ def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
 def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sim.fleet.STOP_WITHIN_S", 60.0)
+    monkeypatch.setattr("lpac.sim.fleet.processes.STOP_WITHIN_S", 60.0)
     with Fleet(FleetScenario(robots=2), tmp_path, SHIPPED) as fleet:
         assert fleet.operator.wait_for(lambda statuses: len(statuses) == 2, 60.0)
         before = fleet.operator.statuses()[1].boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
         assert fleet.robots[1].wait(60.0) == -signal.SIGKILL
         assert fleet.operator.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
-        with pytest.raises(FleetError, match="the program of robot 1 has ended"):
+        with pytest.raises(SimulatedFleetError, match="the program of robot 1 has ended"):
             fleet.require_running()
         fleet.robots[1].start()
         assert fleet.operator.wait_for(
@@ -203,7 +203,7 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
 def launched(*arguments: object, vehicle: str = "mavlink") -> Iterator[subprocess.Popen[str]]:
     """`lpac sim --vehicle ...` in the background."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "cli.main", "sim", "--vehicle", vehicle, *map(str, arguments)],
+        [sys.executable, "-m", "lpac.cli.main", "sim", "--vehicle", vehicle, *map(str, arguments)],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "1000", "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip

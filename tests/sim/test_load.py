@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-import sim.load
-from cli.sim import _as_many_as_carried, _say_if_carried
-from sim.fleet import OVERLOADED_S, Fleet, FleetScenario, Lateness, OverloadError
-from sim.fleet_flight import fly, summary_lines
-from sim.load import robots_carried
+from lpac.cli.sim import _as_many_as_carried, _say_if_carried
+from lpac.sim.fleet import load
+from lpac.sim.fleet.flight import fly, summary_lines
+from lpac.sim.fleet.load import robots_carried
+from lpac.sim.fleet.processes import OVERLOADED_S, Backlog, Fleet, FleetScenario, OverloadError
 from tests.conftest import SHIPPED
 
 # Units of work a second, measured: two cores of a small cloud machine, which flew ten robots with
@@ -27,7 +27,7 @@ def test_as_many_robots_fly_as_the_machine_carries(
     units_per_s: float,
     robots: int,
 ) -> None:
-    monkeypatch.setattr(sim.load, "_units_per_s", lambda _: units_per_s)
+    monkeypatch.setattr(load, "_units_per_s", lambda _: units_per_s)
     assert _as_many_as_carried(SHIPPED, "mavlink") == robots
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f": flying {robots}")
@@ -36,7 +36,7 @@ def test_as_many_robots_fly_as_the_machine_carries(
 def test_who_asks_for_more_is_warned(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sim.load, "_units_per_s", lambda _: FIVE_FLEW)
+    monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
     assert _say_if_carried(5, SHIPPED, "mavlink") == 5
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("carries about 5 of these robots and vehicles")
@@ -55,7 +55,7 @@ def test_who_asks_for_more_is_warned(
 def test_who_falls_behind_is_told_what_was_found_out(
     robots: int, carried: int | None, advice: int
 ) -> None:
-    error = OverloadError(Lateness(9.0, 0.0), robots, carried)
+    error = OverloadError(Backlog(9.0, 0.0), robots, carried)
     assert str(error).endswith(f"fly fewer: -n {advice}")
 
 

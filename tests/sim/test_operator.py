@@ -9,8 +9,9 @@ from unittest.mock import patch
 
 import pytest
 
-from edge.adapters.zenoh_link import ZenohLink
-from edge.core.mission import (
+from edge.core.fence import Fence
+from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
@@ -22,9 +23,8 @@ from edge.core.mission import (
     to_json,
     world_id,
 )
-from edge.core.safety import Fence
-from sim.operator import Operator, Script, ScriptError
-from sim.ports import free_ports
+from lpac.sim.operator import Operator, OperatorScript, OperatorScriptError
+from lpac.sim.ports import free_ports
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
 STATUS = RobotStatus(
@@ -87,7 +87,7 @@ def talking(
     talkers = [Talker(endpoint, robot) for robot, endpoint in enumerate(endpoints)]
     try:
         with (
-            patch("sim.operator.STATUS_LIFETIME_S", lifetime_s),
+            patch("lpac.sim.operator.STATUS_LIFETIME_S", lifetime_s),
             Operator(fleet="test", connect=endpoints) as operator,
         ):
 
@@ -163,15 +163,15 @@ def test_the_state_is_repeated_and_its_sequence_grows_with_each_change() -> None
         operator.enable(ORIGIN)
         robot.wait_for(lambda: len(robot.states) >= 2)
         operator.enable(ORIGIN)
-        operator.calm("return", 3)
-        operator.calm("hold", 4)
-        robot.wait_for(lambda: bool(robot.states[-1].robot_calm.get("4")))
+        operator.safety_action("return", 3)
+        operator.safety_action("hold", 4)
+        robot.wait_for(lambda: bool(robot.states[-1].robot_safety_actions.get("4")))
         state = robot.states[-1]
         assert state.enabled and state.origin == ORIGIN and state.unix_time_s is not None
-        assert [state.calm_for(robot) for robot in (0, 3, 4)] == ["none", "return", "hold"]
+        assert [state.safety_action_for(robot) for robot in (0, 3, 4)] == ["none", "return", "hold"]
         assert (robot.states[0].sequence, state.sequence) == (1, 3)
-        operator.calm("land")
-        robot.wait_for(lambda: robot.states[-1].calm_for(3) == "land")
+        operator.safety_action("land")
+        robot.wait_for(lambda: robot.states[-1].safety_action_for(3) == "land")
 
 
 def test_what_flights_go_by_is_said_and_the_world_sent_while_somebody_lacks_it() -> None:
@@ -204,14 +204,14 @@ def test_who_is_held_up_tries_again_until_heights_have_walked() -> None:
             assert operator.wait_for(lambda s: {first_s} <= {s[0].flown_s, s[1].flown_s}, 60.0)
             assert operator.wait_for(lambda s: s[1].flown_s == first_s - 2.0, 60.0)
 
-        script = Script(operator, robots=range(2), origin=ORIGIN, mission_s=1.0, trial="t")
+        script = OperatorScript(operator, robots=range(2), origin=ORIGIN, mission_s=1.0, trial="t")
         takeoff = next(step for step in script.steps if step.name == "takeoff")
         say(49.0)
         takeoff.act()
         low.wait_for(lambda: bool(low.states))
-        assert [low.states[-1].calm_for(robot) for robot in (0, 1)] == ["none", "land"]
+        assert [low.states[-1].safety_action_for(robot) for robot in (0, 1)] == ["none", "land"]
         say(51.0)
-        with pytest.raises(ScriptError, match="robots 1 did not come to their heights"):
+        with pytest.raises(OperatorScriptError, match="robots 1 did not come to their heights"):
             takeoff.act()
         # With all at their heights nothing is late.
         low.say(**up)
@@ -235,7 +235,7 @@ def test_a_robot_whose_vehicle_is_gone_is_not_waited_for() -> None:
     with talking(2) as (operator, [gone, other]):
         gone.say(state=FlightState.FAULT)
         assert operator.wait_for(lambda statuses: statuses[0].state is FlightState.FAULT, 60.0)
-        script = Script(operator, robots=(0, 1), origin=ORIGIN, mission_s=0.0, trial="test")
+        script = OperatorScript(operator, robots=(0, 1), origin=ORIGIN, mission_s=0.0, trial="test")
         began_s = time.monotonic()
         script.land(lambda _: other.say(state=FlightState.LANDED, armed=False))
         assert operator.statuses()[1].state is FlightState.LANDED

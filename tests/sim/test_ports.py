@@ -7,10 +7,12 @@ from contextlib import ExitStack
 
 import pytest
 
-from sim.ports import free_ports
+from lpac.sim.ports import free_ports
 from tests.conftest import ROOT
 
-TAKER = "import sys; from sim.ports import free_ports; print(*free_ports(30), flush=True); input()"
+TAKER = (
+    "import sys; from lpac.sim.ports import free_ports; print(*free_ports(30), flush=True); input()"
+)
 
 
 def line_of(process: subprocess.Popen[str]) -> list[str]:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bench.position import READY_S, TICK_S, Watched
-from edge.core.position import Cause, Quality
-from sim.px4.estimator import GPS_REJECTED_S
-from sim.px4.vehicle import Px4Vehicle, Sensor
+from edge.core.position import PositionCause, PositionQuality
+from lpac.sim.px4.estimator import GPS_REJECTED_S
+from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
 
-_Q = Quality
+_Q = PositionQuality
 
 
 def flying() -> Watched:
@@ -26,7 +26,9 @@ def flying() -> Watched:
     return watched
 
 
-def run(watched: Watched, seconds: float) -> list[tuple[float, Quality, Cause | None]]:
+def run(
+    watched: Watched, seconds: float
+) -> list[tuple[float, PositionQuality, PositionCause | None]]:
     """What the position was worth as that changed: s from now on, with the cause."""
     began_s, changes = watched.vehicle.time_s, []
     for _ in range(round(seconds / TICK_S)):
@@ -53,22 +55,23 @@ def jumps(north_m: float) -> Callable[[Px4Vehicle], None]:
 # What is done, why the position is doubted, and after how many seconds: told, and 0.4 s. Then when
 # it is lost, if it is: 2 s after it was told.
 LASTING = [
-    pytest.param(sets(gps_lost=True), Cause.NO_FIX, 0.8, 2.7, id="no fix"),
+    pytest.param(sets(gps_lost=True), PositionCause.NO_FIX, 0.8, 2.7, id="no fix"),
     pytest.param(
         # PX4 says so after a second.
-        lambda vehicle: vehicle.dead_sensors.add(Sensor.GPS), Cause.NO_FIX, 2.0, 3.9,
+        lambda vehicle: vehicle.dead_sensors.add(SimulatedSensor.GPS), PositionCause.NO_FIX, 2.0,
+        3.9,
         id="no driver",
     ),
-    pytest.param(sets(estimate_frozen=True), Cause.FROZEN, 1.5, 3.4, id="frozen"),
-    pytest.param(sets(gps_told_m=11.0), Cause.INACCURATE, 0.8, 2.5, id="hopeless"),
-    pytest.param(sets(gps_told_m=6.0), Cause.INACCURATE, 0.8, None, id="inaccurate"),
-    pytest.param(jumps(7.0), Cause.DISAGREES, 0.8, None, id="jumps"),
+    pytest.param(sets(estimate_frozen=True), PositionCause.FROZEN, 1.5, 3.4, id="frozen"),
+    pytest.param(sets(gps_told_m=11.0), PositionCause.INACCURATE, 0.8, 2.5, id="hopeless"),
+    pytest.param(sets(gps_told_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"),
+    pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, None, id="jumps"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("fault", "cause", "doubted_s", "lost_s"), LASTING)
 def test_what_goes_wrong_is_noticed_in_time(
-    fault: Callable[[Px4Vehicle], Any], cause: Cause, doubted_s: float, lost_s: float | None
+    fault: Callable[[Px4Vehicle], Any], cause: PositionCause, doubted_s: float, lost_s: float | None
 ) -> None:
     watched = flying()
     fault(watched.vehicle)
@@ -99,7 +102,7 @@ def test_a_jump_is_rejected_for_a_while_and_then_believed() -> None:
         causes.add(watched.judgement.cause)
     still_m = vehicle.estimated_position_m - vehicle.position_m
     assert still_m == pytest.approx(error_m, abs=0.5)
-    assert vehicle.estimator.doubts_gps and Cause.DISAGREES in causes
+    assert vehicle.estimator.doubts_gps and PositionCause.DISAGREES in causes
     # For a second after it was believed the jump speaks against it; then three seconds of nothing.
     (good,) = run(watched, 7.0)
     assert good[1] is _Q.GOOD and 0.5 + 3.0 <= good[0] <= 0.5 + 1.0 + 3.0 + 1.5

@@ -30,21 +30,21 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 from mavsdk.asyncio.plugins.telemetry import FlightMode, LandedState, TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
-from sim.ports import free_ports
-from sim.px4 import checks
-from sim.px4.checks import Component
-from sim.px4.link import Px4Link
-from sim.px4.modes import Mode, Result
-from sim.px4.server import Instance, Px4Server
-from sim.px4.vehicle import Px4Vehicle, Sensor, Setpoint
-from sim.px4.world import FencePolygon, WorldOrigin
+from lpac.sim.ports import free_ports
+from lpac.sim.px4 import checks
+from lpac.sim.px4.checks import Component
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import MavResult, Px4Mode
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle, SimulatedSensor
+from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
 STEP_S = 0.02
 DENIED = "Arming denied: Resolve system health failures first"
 NAN_3 = np.full(3, math.nan)
 
 
-def run(vehicle: Px4Vehicle, duration_s: float, setpoint: Setpoint | None = None) -> None:
+def run(vehicle: Px4Vehicle, duration_s: float, setpoint: Px4Setpoint | None = None) -> None:
     """Let time pass, with the setpoint streamed at 10 Hz."""
     for step in range(round(duration_s / STEP_S)):
         if setpoint is not None and step % 5 == 0:
@@ -65,26 +65,26 @@ def hovering(seed: int = 1, altitude_m: float = 5.0, *, rc: bool = False) -> Px4
     vehicle.rc_connected = rc
     vehicle.parameters["MIS_TAKEOFF_ALT"] = altitude_m
     vehicle.step(STEP_S)
-    assert vehicle.arm() is Result.ACCEPTED
-    assert vehicle.take_off(math.nan) is Result.ACCEPTED
+    assert vehicle.arm() is MavResult.ACCEPTED
+    assert vehicle.take_off(math.nan) is MavResult.ACCEPTED
     run(vehicle, STEP_S)
-    run_until(vehicle, lambda: vehicle.mode is Mode.HOLD, 20.0)
+    run_until(vehicle, lambda: vehicle.mode is Px4Mode.HOLD, 20.0)
     run(vehicle, 2.0)
     return vehicle
 
 
-def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Setpoint:
-    return Setpoint(NAN_3, np.array([north, east, down]))
+def velocity(north: float, east: float = 0.0, down: float = 0.0) -> Px4Setpoint:
+    return Px4Setpoint(NAN_3, np.array([north, east, down]))
 
 
-def in_offboard(setpoint: Setpoint, *, rc: bool = False, **parameters: int) -> Px4Vehicle:
+def in_offboard(setpoint: Px4Setpoint, *, rc: bool = False, **parameters: int) -> Px4Vehicle:
     """Flying a setpoint whose last packet has just arrived."""
     vehicle = hovering(rc=rc)
     vehicle.parameters |= parameters
     vehicle.offboard(setpoint)
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+    assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.ACCEPTED
     run(vehicle, 3.0, setpoint)
-    assert vehicle.mode is Mode.OFFBOARD
+    assert vehicle.mode is Px4Mode.OFFBOARD
     vehicle.offboard(setpoint)
     return vehicle
 
@@ -103,10 +103,10 @@ def texts(vehicle: Px4Vehicle) -> list[str]:
 @pytest.mark.parametrize("seed", range(5))
 def test_arming_is_denied_until_health_is_good(seed: int) -> None:
     vehicle = Px4Vehicle(seed=seed)
-    assert vehicle.arm() is Result.TEMPORARILY_REJECTED
+    assert vehicle.arm() is MavResult.TEMPORARILY_REJECTED
     assert texts(vehicle) == [DENIED]
     assert 3.0 <= run_until(vehicle, lambda: vehicle.armable, 10.0) <= 6.1
-    assert vehicle.arm() is Result.ACCEPTED
+    assert vehicle.arm() is MavResult.ACCEPTED
 
 
 @pytest.mark.parametrize(
@@ -114,12 +114,12 @@ def test_arming_is_denied_until_health_is_good(seed: int) -> None:
     [
         (lambda v: setattr(v, "gps_lost", True), checks.NO_GLOBAL_POSITION),
         (lambda v: setattr(v, "battery_remaining", 0.06), checks.BATTERY_CRITICAL),
-        (lambda v: v.dead_sensors.add(Sensor.BAROMETER), checks.NO_BAROMETER),
-        (lambda v: v.dead_sensors.add(Sensor.COMPASS), checks.NO_COMPASS),
-        (lambda v: v.dead_sensors.add(Sensor.BATTERY), checks.BATTERY_SILENT),
-        (lambda v: v.set_mode(Mode.LAND), checks.MODE_PREVENTS_ARMING),
-        (lambda v: v.set_mode(Mode.OFFBOARD), checks.NO_OFFBOARD_SIGNAL),
-        (lambda v: v.set_mode(Mode.POSCTL), checks.NO_MANUAL_CONTROL),
+        (lambda v: v.dead_sensors.add(SimulatedSensor.BAROMETER), checks.NO_BAROMETER),
+        (lambda v: v.dead_sensors.add(SimulatedSensor.COMPASS), checks.NO_COMPASS),
+        (lambda v: v.dead_sensors.add(SimulatedSensor.BATTERY), checks.BATTERY_SILENT),
+        (lambda v: v.set_mode(Px4Mode.LAND), checks.MODE_PREVENTS_ARMING),
+        (lambda v: v.set_mode(Px4Mode.OFFBOARD), checks.NO_OFFBOARD_SIGNAL),
+        (lambda v: v.set_mode(Px4Mode.POSCTL), checks.NO_MANUAL_CONTROL),
         (lambda v: v.parameters.update(NAV_DLL_ACT=2), checks.GROUND_STATION_REQUIRED),
     ],
 )
@@ -135,9 +135,9 @@ def test_arming_is_denied_with_a_reason(
     vehicle.take_events()
     vehicle.run_prearm_checks()
     assert problem.event() in vehicle.take_events()
-    assert vehicle.arm() is Result.TEMPORARILY_REJECTED
+    assert vehicle.arm() is MavResult.TEMPORARILY_REJECTED
     assert texts(vehicle) == [DENIED]
-    assert vehicle.arm(force=True) is Result.ACCEPTED
+    assert vehicle.arm(force=True) is MavResult.ACCEPTED
 
 
 def test_a_low_battery_is_told_but_does_not_keep_from_arming() -> None:
@@ -146,7 +146,7 @@ def test_a_low_battery_is_told_but_does_not_keep_from_arming() -> None:
     run(vehicle, 2.5)
     assert vehicle.health is not None and Component.BATTERY in vehicle.health.unhealthy
     assert "Low battery" in texts(vehicle)
-    assert vehicle.arm() is Result.ACCEPTED
+    assert vehicle.arm() is MavResult.ACCEPTED
 
 
 def test_an_armed_vehicle_that_stays_on_the_ground_disarms_itself() -> None:
@@ -159,9 +159,9 @@ def test_an_armed_vehicle_that_stays_on_the_ground_disarms_itself() -> None:
 
 def test_disarming_in_the_air_is_denied_but_a_kill_drops_the_vehicle() -> None:
     vehicle = hovering()
-    assert vehicle.disarm() is Result.TEMPORARILY_REJECTED
+    assert vehicle.disarm() is MavResult.TEMPORARILY_REJECTED
     assert vehicle.armed
-    assert vehicle.disarm(force=True) is Result.ACCEPTED
+    assert vehicle.disarm(force=True) is MavResult.ACCEPTED
     assert run_until(vehicle, lambda: vehicle.landed, 5.0) < 2.5
 
 
@@ -175,21 +175,21 @@ def test_take_off_and_landing_take_as_long_as_measured() -> None:
     vehicle.arm()
     vehicle.take_off(math.nan)
     run(vehicle, STEP_S)
-    assert 6.0 <= run_until(vehicle, lambda: vehicle.mode is Mode.HOLD, 20.0) <= 9.0
+    assert 6.0 <= run_until(vehicle, lambda: vehicle.mode is Px4Mode.HOLD, 20.0) <= 9.0
     assert vehicle.position_m[2] == pytest.approx(-5.0, abs=0.6)
-    vehicle.set_mode(Mode.LAND)
+    vehicle.set_mode(Px4Mode.LAND)
     assert 8.0 <= run_until(vehicle, lambda: not vehicle.armed, 20.0) <= 19.0
     assert vehicle.landed
     run(vehicle, STEP_S)
-    assert vehicle.mode is Mode.HOLD
-    assert vehicle.arm() is Result.ACCEPTED
+    assert vehicle.mode is Px4Mode.HOLD
+    assert vehicle.arm() is MavResult.ACCEPTED
 
 
 def test_a_velocity_setpoint_lags_and_lets_the_height_drift() -> None:
     vehicle = hovering()
     before_m = vehicle.position_m
     vehicle.offboard(velocity(1.0))
-    vehicle.set_mode(Mode.OFFBOARD)
+    vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 10.0, velocity(1.0))
     moved_m = vehicle.position_m - before_m
     assert 7.0 <= moved_m[0] <= 8.8
@@ -200,9 +200,9 @@ def test_a_velocity_setpoint_lags_and_lets_the_height_drift() -> None:
 def test_an_offboard_position_is_one_of_the_local_frame() -> None:
     vehicle = hovering()
     target_m = vehicle.local_position_m + np.array([2.0, -3.0, -1.0])
-    setpoint = Setpoint(target_m, NAN_3, yaw_rad=1.0)
+    setpoint = Px4Setpoint(target_m, NAN_3, yaw_rad=1.0)
     vehicle.offboard(setpoint)
-    vehicle.set_mode(Mode.OFFBOARD)
+    vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 12.0, setpoint)
     assert vehicle.local_position_m == pytest.approx(target_m, abs=0.3)
     assert vehicle.heading_rad == pytest.approx(1.0)
@@ -212,7 +212,7 @@ def test_an_offboard_position_is_one_of_the_local_frame() -> None:
 def test_hold_stops_at_once() -> None:
     vehicle = in_offboard(velocity(1.0))
     run(vehicle, 5.0, velocity(1.0))
-    vehicle.set_mode(Mode.HOLD)
+    vehicle.set_mode(Px4Mode.HOLD)
     run(vehicle, 1.0)
     assert speed_m_s(vehicle) < 0.2
 
@@ -221,7 +221,7 @@ def test_return_climbs_flies_home_and_lands() -> None:
     vehicle = in_offboard(velocity(3.0))
     vehicle.parameters["RTL_RETURN_ALT"] = 12.0
     run(vehicle, 5.0, velocity(3.0))
-    vehicle.set_mode(Mode.RETURN)
+    vehicle.set_mode(Px4Mode.RETURN)
     run_until(vehicle, lambda: not vehicle.armed, 90.0)
     assert np.linalg.norm(vehicle.position_m) < 1.5
     assert min(sample.position_m[2] for sample in vehicle.truth) == pytest.approx(-12.0, abs=1.0)
@@ -232,59 +232,59 @@ def test_return_climbs_flies_home_and_lands() -> None:
 
 def test_offboard_needs_a_stream() -> None:
     vehicle = hovering()
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.TEMPORARILY_REJECTED
+    assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.TEMPORARILY_REJECTED
     vehicle.offboard(velocity(0.0))
     run(vehicle, 2.0)
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.TEMPORARILY_REJECTED
+    assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.TEMPORARILY_REJECTED
 
 
 @pytest.mark.parametrize(
     ("offboard_loss", "manual_loss", "then"),
     [
-        (4, 2, Mode.LAND),
-        (5, 2, Mode.HOLD),
-        (3, 0, Mode.RETURN),
-        (0, 2, Mode.RETURN),
-        (0, 3, Mode.LAND),
-        (0, 0, Mode.OFFBOARD),
+        (4, 2, Px4Mode.LAND),
+        (5, 2, Px4Mode.HOLD),
+        (3, 0, Px4Mode.RETURN),
+        (0, 2, Px4Mode.RETURN),
+        (0, 3, Px4Mode.LAND),
+        (0, 0, Px4Mode.OFFBOARD),
     ],
 )
-def test_what_a_lost_stream_leads_to(offboard_loss: int, manual_loss: int, then: Mode) -> None:
+def test_what_a_lost_stream_leads_to(offboard_loss: int, manual_loss: int, then: Px4Mode) -> None:
     """At once, without the delay that COM_FAIL_ACT_T puts before other failsafes."""
     vehicle = in_offboard(velocity(1.0), COM_OBL_RC_ACT=offboard_loss, NAV_RCL_ACT=manual_loss)
     run(vehicle, 0.98)
-    assert vehicle.mode is Mode.OFFBOARD
+    assert vehicle.mode is Px4Mode.OFFBOARD
     run(vehicle, 0.12)
     assert vehicle.mode is then
-    if then is Mode.OFFBOARD:
+    if then is Px4Mode.OFFBOARD:
         assert vehicle.velocity_m_s[0] == pytest.approx(1.0, abs=0.1)
-    if then is Mode.RETURN:
+    if then is Px4Mode.RETURN:
         run(vehicle, 2.0)
         assert vehicle.velocity_m_s[2] < -0.5
-    if then is Mode.LAND:
+    if then is Px4Mode.LAND:
         run_until(vehicle, lambda: not vehicle.armed, 30.0)
-        assert vehicle.mode is Mode.OFFBOARD
-        assert vehicle.arm() is Result.TEMPORARILY_REJECTED
+        assert vehicle.mode is Px4Mode.OFFBOARD
+        assert vehicle.arm() is MavResult.TEMPORARILY_REJECTED
 
 
 def test_a_lost_stream_gives_the_vehicle_to_a_pilot_who_is_there() -> None:
     vehicle = in_offboard(velocity(1.0), rc=True)
     run(vehicle, 3.0)
-    assert vehicle.mode is Mode.POSCTL
+    assert vehicle.mode is Px4Mode.POSCTL
     assert speed_m_s(vehicle) < 0.2
 
 
 def test_a_stream_that_comes_back_takes_the_vehicle_along_again() -> None:
     vehicle = in_offboard(velocity(1.0), COM_OBL_RC_ACT=5)
     run(vehicle, 3.0)
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
     run(vehicle, 4.0, velocity(1.0))
-    assert vehicle.mode is Mode.OFFBOARD
+    assert vehicle.mode is Px4Mode.OFFBOARD
     assert vehicle.velocity_m_s[0] > 0.8
     run(vehicle, 3.0)
-    vehicle.set_mode(Mode.HOLD)
+    vehicle.set_mode(Px4Mode.HOLD)
     run(vehicle, 3.0, velocity(1.0))
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
 
 
 # The pilot
@@ -292,22 +292,22 @@ def test_a_stream_that_comes_back_takes_the_vehicle_along_again() -> None:
 
 def test_a_pilot_takes_over_and_the_client_gets_the_vehicle_back() -> None:
     vehicle = in_offboard(velocity(1.0), rc=True)
-    assert vehicle.pilot(Mode.POSCTL, (0.0, -2.0, 0.0)) is Result.ACCEPTED
+    assert vehicle.pilot(Px4Mode.POSCTL, (0.0, -2.0, 0.0)) is MavResult.ACCEPTED
     run(vehicle, 3.0, velocity(1.0))
-    assert vehicle.mode is Mode.POSCTL
+    assert vehicle.mode is Px4Mode.POSCTL
     assert vehicle.velocity_m_s == pytest.approx([0.0, -2.0, 0.0], abs=0.1)
     vehicle.move_sticks(())
     run(vehicle, 3.0, velocity(1.0))
     assert speed_m_s(vehicle) < 0.2
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+    assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.ACCEPTED
     run(vehicle, 1.0, velocity(1.0))
-    assert vehicle.mode is Mode.OFFBOARD
+    assert vehicle.mode is Px4Mode.OFFBOARD
 
 
 def test_a_vehicle_stays_where_the_sticks_were_let_go_last() -> None:
     vehicle = hovering(rc=True)
     for north_m_s in (2.0, -2.0):
-        vehicle.pilot(Mode.POSCTL, (north_m_s, 0.0, 0.0))
+        vehicle.pilot(Px4Mode.POSCTL, (north_m_s, 0.0, 0.0))
         run(vehicle, 5.0)
         vehicle.move_sticks(())
         let_go_m = vehicle.position_m.copy()
@@ -316,9 +316,9 @@ def test_a_vehicle_stays_where_the_sticks_were_let_go_last() -> None:
         assert np.linalg.norm(vehicle.position_m - let_go_m) < 1.5
 
 
-@pytest.mark.parametrize(("override", "mode"), [(1, Mode.OFFBOARD), (2, Mode.POSCTL)])
+@pytest.mark.parametrize(("override", "mode"), [(1, Px4Mode.OFFBOARD), (2, Px4Mode.POSCTL)])
 def test_sticks_alone_leave_offboard_only_where_a_parameter_allows_it(
-    override: int, mode: Mode
+    override: int, mode: Px4Mode
 ) -> None:
     vehicle = in_offboard(velocity(1.0), rc=True, COM_RC_OVERRIDE=override)
     vehicle.move_sticks((1.0, 0.0, 0.0))
@@ -326,8 +326,8 @@ def test_sticks_alone_leave_offboard_only_where_a_parameter_allows_it(
     assert vehicle.mode is mode
 
 
-@pytest.mark.parametrize(("excepted", "mode"), [(0, Mode.LAND), (4, Mode.OFFBOARD)])
-def test_a_lost_remote_control_counts_unless_excepted(excepted: int, mode: Mode) -> None:
+@pytest.mark.parametrize(("excepted", "mode"), [(0, Px4Mode.LAND), (4, Px4Mode.OFFBOARD)])
+def test_a_lost_remote_control_counts_unless_excepted(excepted: int, mode: Px4Mode) -> None:
     vehicle = in_offboard(velocity(0.0), rc=True, COM_RCL_EXCEPT=excepted, NAV_RCL_ACT=3)
     vehicle.rc_connected = False
     run(vehicle, 5.2, velocity(0.0))
@@ -335,7 +335,7 @@ def test_a_lost_remote_control_counts_unless_excepted(excepted: int, mode: Mode)
 
 
 def test_manual_modes_need_a_remote_control() -> None:
-    assert hovering().set_mode(Mode.POSCTL) is Result.TEMPORARILY_REJECTED
+    assert hovering().set_mode(Px4Mode.POSCTL) is MavResult.TEMPORARILY_REJECTED
 
 
 # Other failsafes
@@ -345,9 +345,9 @@ def test_without_gps_it_descends_where_the_wind_takes_it() -> None:
     vehicle = hovering()
     vehicle.gps_lost = True
     run(vehicle, 4.5)
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
     run(vehicle, 1.0)
-    assert vehicle.mode is Mode.DESCEND
+    assert vehicle.mode is Px4Mode.DESCEND
     vehicle.wind_m_s = np.array([0.0, 1.5, 0.0])
     east_m = vehicle.position_m[1]
     run_until(vehicle, lambda: not vehicle.armed, 30.0)
@@ -366,22 +366,22 @@ def test_a_short_gap_of_gps_passes_unnoticed() -> None:
     run(vehicle, 4.0)
     vehicle.gps_lost = False
     run(vehicle, 3.0)
-    assert vehicle.position_valid and vehicle.mode is Mode.HOLD
+    assert vehicle.position_valid and vehicle.mode is Px4Mode.HOLD
 
 
 def test_a_critical_battery_interrupts_a_landing() -> None:
     """Time to take over, as before any other action: PX4 holds, and lands after that."""
     vehicle = hovering()
     vehicle.parameters["COM_LOW_BAT_ACT"] = 2
-    vehicle.set_mode(Mode.LAND)
+    vehicle.set_mode(Px4Mode.LAND)
     run(vehicle, 1.0)
     vehicle.battery_remaining = 0.06
     run(vehicle, 0.1)
-    assert vehicle.mode is Mode.HOLD and vehicle.failsafe.is_active
+    assert vehicle.mode is Px4Mode.HOLD and vehicle.failsafe.is_active
     run(vehicle, 4.8)
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
     run(vehicle, 0.2)
-    assert vehicle.mode is Mode.LAND and vehicle.failsafe.is_active
+    assert vehicle.mode is Px4Mode.LAND and vehicle.failsafe.is_active
 
 
 def test_whoever_asks_for_a_mode_ends_a_failsafe_that_is_not_of_need() -> None:
@@ -389,29 +389,29 @@ def test_whoever_asks_for_a_mode_ends_a_failsafe_that_is_not_of_need() -> None:
     vehicle.parameters["COM_LOW_BAT_ACT"] = 2
     vehicle.battery_remaining = 0.06
     run(vehicle, 6.0)
-    assert vehicle.mode is Mode.LAND
-    assert vehicle.set_mode(Mode.HOLD) is Result.ACCEPTED
+    assert vehicle.mode is Px4Mode.LAND
+    assert vehicle.set_mode(Px4Mode.HOLD) is MavResult.ACCEPTED
     run(vehicle, 1.0)
-    assert vehicle.mode is Mode.HOLD and not vehicle.failsafe.is_active
+    assert vehicle.mode is Px4Mode.HOLD and not vehicle.failsafe.is_active
     vehicle.gps_lost = True
     run(vehicle, 5.2)
-    assert vehicle.mode is Mode.DESCEND
-    vehicle.set_mode(Mode.LAND)
+    assert vehicle.mode is Px4Mode.DESCEND
+    vehicle.set_mode(Px4Mode.LAND)
     run(vehicle, 1.0)
-    assert vehicle.mode is Mode.DESCEND and vehicle.failsafe.is_active
+    assert vehicle.mode is Px4Mode.DESCEND and vehicle.failsafe.is_active
 
 
 @pytest.mark.parametrize(
     ("setting", "remaining", "mode"),
     [
-        (0, 0.01, Mode.HOLD),
-        (2, 0.10, Mode.HOLD),
-        (2, 0.06, Mode.LAND),
-        (3, 0.06, Mode.RETURN),
-        (3, 0.04, Mode.LAND),
+        (0, 0.01, Px4Mode.HOLD),
+        (2, 0.10, Px4Mode.HOLD),
+        (2, 0.06, Px4Mode.LAND),
+        (3, 0.06, Px4Mode.RETURN),
+        (3, 0.04, Px4Mode.LAND),
     ],
 )
-def test_low_battery(setting: int, remaining: float, mode: Mode) -> None:
+def test_low_battery(setting: int, remaining: float, mode: Px4Mode) -> None:
     vehicle = hovering()
     vehicle.parameters["COM_LOW_BAT_ACT"] = setting
     vehicle.battery_remaining = remaining
@@ -426,9 +426,9 @@ def test_a_silent_ground_station_counts_only_if_a_parameter_says_so() -> None:
     vehicle.parameters["NAV_DLL_ACT"] = 3
     vehicle.ground_station_heartbeat()
     run(vehicle, 9.0)
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
     run(vehicle, 7.0)
-    assert vehicle.mode is Mode.LAND
+    assert vehicle.mode is Px4Mode.LAND
 
 
 @pytest.mark.parametrize("polygon", [False, True])
@@ -442,12 +442,12 @@ def test_the_fence_acts_once_on_a_breach(polygon: bool) -> None:
     else:
         vehicle.parameters["GF_MAX_HOR_DIST"] = 10.0
     run(vehicle, 8.0, velocity(2.0))
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
     assert vehicle.home_m is not None
     assert 10.0 < (vehicle.estimated_position_m - vehicle.home_m)[0] < 12.0
-    vehicle.set_mode(Mode.OFFBOARD)
+    vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 1.0, velocity(-2.0))
-    assert vehicle.mode is Mode.OFFBOARD
+    assert vehicle.mode is Px4Mode.OFFBOARD
 
 
 # Where it is
@@ -495,9 +495,9 @@ def test_an_origin_jump_moves_local_positions_and_what_follows_them() -> None:
     north_m = vehicle.position_m[0]
     run(vehicle, 3.0)
     assert vehicle.position_m[0] == pytest.approx(north_m, abs=0.5)
-    setpoint = Setpoint(local_m, NAN_3)
+    setpoint = Px4Setpoint(local_m, NAN_3)
     vehicle.offboard(setpoint)
-    vehicle.set_mode(Mode.OFFBOARD)
+    vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 10.0, setpoint)
     assert vehicle.position_m[0] - north_m == pytest.approx(7.0, abs=1.0)
 
@@ -507,9 +507,9 @@ def test_an_origin_that_moves_in_height_lets_the_vehicle_climb_unseen() -> None:
     here_m, height_m = vehicle.local_position_m, -vehicle.position_m[2]
     vehicle.jump_estimator_origin(0.0, 0.0, -6.0)
     assert vehicle.local_position_m - here_m == pytest.approx([0.0, 0.0, 6.0])
-    setpoint = Setpoint(here_m, NAN_3)
+    setpoint = Px4Setpoint(here_m, NAN_3)
     vehicle.offboard(setpoint)
-    vehicle.set_mode(Mode.OFFBOARD)
+    vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 10.0, setpoint)
     assert vehicle.local_position_m[2] == pytest.approx(here_m[2], abs=0.3)
     assert -vehicle.position_m[2] == pytest.approx(height_m + 6.0, abs=0.7)
@@ -543,7 +543,7 @@ def test_no_datagram_upsets_the_link(noise: bytes, command: int, values: list[fl
     ):
         link.receive(message.pack(client))
     vehicle.arm()
-    vehicle.set_mode(Mode.OFFBOARD)
+    vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 0.1)
     assert all(len(datagram) <= 1400 for datagram in link.due())
     assert np.isfinite(vehicle.position_m).all()
@@ -730,7 +730,7 @@ def test_a_client_that_goes_away_leaves_the_vehicle_to_its_failsafe() -> None:
         asyncio.run(fly_and_leave(address))
         assert server.wait_for(lambda: not vehicle.armed and vehicle.landed, 60.0)
     silent_s = vehicle._setpoint_at_s
-    landing = next(truth for truth in vehicle.truth if truth.mode is Mode.LAND)
+    landing = next(truth for truth in vehicle.truth if truth.mode is Px4Mode.LAND)
     assert silent_s < landing.time_s < silent_s + 1.5
 
 
@@ -743,7 +743,7 @@ def test_mavsdk_sees_a_pilot_take_over_and_kills() -> None:
             telemetry, action = TelemetryAsync(system), ActionAsync(system)
             await take_off_in_offboard(system)
             with server.stepped:
-                assert vehicle.pilot(Mode.POSCTL) is Result.ACCEPTED
+                assert vehicle.pilot(Px4Mode.POSCTL) is MavResult.ACCEPTED
             await until(telemetry.subscribe_flight_mode(), lambda m: m is FlightMode.POSCTL)
             await until(telemetry.subscribe_rc_status(), lambda rc: bool(rc.is_available))
             await action.kill()

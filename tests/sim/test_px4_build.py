@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim import ordinary
-from sim.fleet_vehicles import VehicleError
-from sim.px4.world import WorldOrigin
-from sim.px4_build import Px4Build, _require_alone
-from sim.px4_log import read_truth
+from lpac.sim.fleet.vehicles import VehicleError
+from lpac.sim.px4.world import WorldOrigin
+from lpac.sim.sitl import ordinary
+from lpac.sim.sitl.build import Px4Build, _require_alone
+from lpac.sim.sitl.log import read_truth
 from tests.cli.test_cli import error_line, lpac
 from tests.conftest import ROOT
 from tests.sim.test_fleet import launched, pid_of, read_until
@@ -34,10 +34,10 @@ import argparse, os, signal, socket, sys, threading, time
 sys.path.insert(0, {str(ROOT)!r})
 from pathlib import Path
 from pymavlink.dialects.v20 import common as mavlink
-from sim.px4.link import Px4Link
-from sim.px4.server import Instance, Px4Server
-from sim.px4.vehicle import Px4Vehicle
-from sim.px4.world import WorldOrigin
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.px4.world import WorldOrigin
 
 parser = argparse.ArgumentParser()
 parser.add_argument("-i", type=int, required=True)
@@ -163,7 +163,7 @@ def test_a_px4_that_still_runs_is_named() -> None:
             # Of one's own lock nobody is told.
             told = subprocess.run(
                 [sys.executable, "-c",
-                 f"from sim.px4_build import _require_alone; _require_alone({number})"],
+                 f"from lpac.sim.sitl.build import _require_alone; _require_alone({number})"],
                 cwd=ROOT, capture_output=True, text=True, check=False,
             )  # fmt: skip
         assert f"another PX4 runs as instance {number}, perhaps an old one" in told.stderr
@@ -213,7 +213,7 @@ def test_a_px4_that_is_killed_ends_the_flight_with_that_line(build: Path, tmp_pa
 def test_a_px4_ends_with_whoever_started_it(build: Path, tmp_path: Path) -> None:
     start = (
         "import sys, time; from pathlib import Path\n"
-        "from sim.px4.world import WorldOrigin; from sim.px4_build import Px4Build\n"
+        "from lpac.sim.px4.world import WorldOrigin; from lpac.sim.sitl.build import Px4Build\n"
         "build, out = map(Path, sys.argv[1:])\n"
         "with Px4Build(build, [(0.0, 0.0)], WorldOrigin(), out) as vehicles:\n"
         "    print(vehicles.pid(0), flush=True); time.sleep(60.0)\n"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.px4.errors import (
+from lpac.sim.px4.errors import (
     COMMON_HEIGHT_M,
     COMPASS_RAD,
     GREATEST_BIAS_M,
@@ -17,12 +17,12 @@ from sim.px4.errors import (
     Errors,
     draw_bias_m,
 )
-from sim.px4.modes import Mode, Result
-from sim.px4.vehicle import Px4Vehicle, Setpoint
+from lpac.sim.px4.modes import MavResult, Px4Mode
+from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 
 STEP_S = 0.02
 FLIGHT_S = np.arange(0.0, 900.0, 7.0)
-# edge.core.margins: what heights of two vehicles come to differ by in one flight.
+# edge.flight.margins: what heights of two vehicles come to differ by in one flight.
 HEIGHT_APART_M = 2.0
 
 seeds = st.integers(0, 2**32 - 1)
@@ -38,11 +38,11 @@ def flying(errors: Errors | None, seed: int = 1, height_m: float = 8.0) -> Px4Ve
     vehicle = Px4Vehicle(seed=seed, ready_after_s=0.0, errors=errors)
     vehicle.parameters["MIS_TAKEOFF_ALT"] = height_m
     vehicle.step(STEP_S)
-    assert vehicle.arm() is Result.ACCEPTED
+    assert vehicle.arm() is MavResult.ACCEPTED
     vehicle.take_off(math.nan)
     vehicle.step(STEP_S)
     fly(vehicle, 25.0)
-    assert vehicle.mode is Mode.HOLD
+    assert vehicle.mode is Px4Mode.HOLD
     return vehicle
 
 
@@ -136,9 +136,9 @@ def test_gusts_and_a_wrong_compass_move_a_vehicle_that_holds_by_less_than_a_metr
 
 def test_gusts_disturb_a_velocity_that_is_followed() -> None:
     vehicle = flying(Errors(2, 2))
-    setpoint = Setpoint(np.full(3, math.nan), np.array([0.5, 0.0, 0.0]))
+    setpoint = Px4Setpoint(np.full(3, math.nan), np.array([0.5, 0.0, 0.0]))
     vehicle.offboard(setpoint)
-    assert vehicle.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+    assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.ACCEPTED
     off_m_s = []
     for step in range(round(60.0 / STEP_S)):
         if step % 5 == 0:
@@ -158,7 +158,7 @@ def test_a_voltage_sags_under_load_and_pulls_the_charge_with_it() -> None:
     flown = flying(errors)
     assert flown.voltage_v < resting_v - 0.25
     assert flown.battery_told < flown.battery_remaining - 0.02 < resting
-    flown.set_mode(Mode.LAND)
+    flown.set_mode(Px4Mode.LAND)
     fly(flown, 30.0)
     assert not flown.armed
     assert flown.battery_told == pytest.approx(flown.battery_remaining, abs=0.005)

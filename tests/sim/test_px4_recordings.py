@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sim.px4.link import Px4Link
-from sim.px4.modes import Mode
-from sim.px4.vehicle import CHECKS_PERIOD_S, LANDED_AFTER_S, Px4Vehicle, Sensor
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vehicle import CHECKS_PERIOD_S, LANDED_AFTER_S, Px4Vehicle, SimulatedSensor
 from tests.px4_recordings import frames
 
 STEP_S = 0.02
@@ -154,7 +154,7 @@ def parameter(name: str, value: int) -> Callable[[Px4Vehicle], None]:
     return lambda vehicle: vehicle.parameters.update({name: value})
 
 
-def dies(*sensors: Sensor) -> Callable[[Px4Vehicle], None]:
+def dies(*sensors: SimulatedSensor) -> Callable[[Px4Vehicle], None]:
     return lambda vehicle: vehicle.dead_sensors.update(sensors)
 
 
@@ -195,8 +195,8 @@ SCENARIOS = {
             (21.1, parameter("COM_RC_IN_MODE", 1)),
             (21.3, sets(rc_connected=True)),
             *ground_station(21.16, 78.0),
-            (24.16, lambda vehicle: vehicle.set_mode(Mode.HOLD)),
-            (42.90, lambda vehicle: vehicle.set_mode(Mode.POSCTL)),
+            (24.16, lambda vehicle: vehicle.set_mode(Px4Mode.HOLD)),
+            (42.90, lambda vehicle: vehicle.set_mode(Px4Mode.POSCTL)),
             (43.41, lambda vehicle: vehicle.move_sticks((1.0, 0.0, 0.0))),
             (46.41, lambda vehicle: vehicle.move_sticks(())),
         ),
@@ -205,15 +205,18 @@ SCENARIOS = {
     "battery_fast": Scenario((0.0, 12.5, 24.7, 28.7, 55.2, 58.5), given_battery=True),
     "refused": Scenario(
         (0.0, 7.3, 9.4, 22.5, 36.5, 52.5, 66.3),
-        ((9.35, dies(Sensor.BAROMETER)), *ground_station(22.52, 66.0)),
+        ((9.35, dies(SimulatedSensor.BAROMETER)), *ground_station(22.52, 66.0)),
         gcs_on_link_from_s=36.5,
     ),
     # One second after arming, says the README; PX4's own timeouts say when.
     "sensors_die": Scenario(
         (0.0, 6.9, 14.1, 18.0),
         (
-            (7.95, dies(Sensor.BAROMETER, Sensor.COMPASS, Sensor.BATTERY)),
-            (8.1, dies(Sensor.GPS)),
+            (
+                7.95,
+                dies(SimulatedSensor.BAROMETER, SimulatedSensor.COMPASS, SimulatedSensor.BATTERY),
+            ),
+            (8.1, dies(SimulatedSensor.GPS)),
         ),
         until_s=18.0,
     ),

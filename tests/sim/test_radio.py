@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from sim.fleet import Fleet, FleetScenario
-from sim.px4.modes import Mode
+from lpac.sim.fleet.processes import Fleet, FleetScenario
+from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 from tests.sim.fault_rig import FaultRig, speed_m_s
 
@@ -37,7 +37,7 @@ def test_all_hold_and_land_where_they_are_if_no_radio_comes_back(tmp_path: Path)
         flight = json.loads((tmp_path / f"{robot}.json").read_text())
         # While a machine is behind, a vehicle's clock stands still, and a robot's does not.
         behind_s, truth = flight["behind_s"], flight["truth"]
-        landing_s = next(entry["after_s"] for entry in truth if entry["mode"] == Mode.LAND)
+        landing_s = next(entry["after_s"] for entry in truth if entry["mode"] == Px4Mode.LAND)
         assert LANDS_S - 0.5 - behind_s < landing_s < LANDS_S + LATE_S, robot
         holding = [e for e in truth if HOLDS_S + LATE_S < e["after_s"] < landing_s]
         assert max(speed_m_s(e["velocity_m_s"], 2) for e in holding) < flight["at_rest_m_s"], robot

@@ -15,13 +15,14 @@ from typing import Any
 import pytest
 import tomlkit
 
-from edge.core.mission import FlightState
-from fleet.config import FleetConfig, load_fleet
-from sim.fleet import ORIGIN
-from sim.host_base import NoHostsError
-from sim.hosts import RobotHost, RobotHosts
-from sim.operator import Operator, Statuses
-from sim.px4.modes import Mode
+from edge.messages.mission import FlightState
+from lpac.fleet.config import FleetConfig, load_fleet
+from lpac.sim.fleet.processes import ORIGIN
+from lpac.sim.hosts.base import NoHostsError
+from lpac.sim.hosts.host import SimulatedHost
+from lpac.sim.hosts.hosts import SimulatedHosts
+from lpac.sim.operator import Operator, Statuses
+from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 
 UNIT = ROOT / "systemd" / "lpac-robot.service"
@@ -72,12 +73,14 @@ def test_the_units_may_do_little(unit: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RobotHosts]:
+def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimulatedHosts]:
     """One robot's computer, with a release and the unit, which does not run."""
     with ExitStack() as stack:
         try:
             running = stack.enter_context(
-                RobotHosts(1, tmp_path_factory.mktemp("hosts"), image=amd64_image, bundle=SHIPPED)
+                SimulatedHosts(
+                    1, tmp_path_factory.mktemp("hosts"), image=amd64_image, bundle=SHIPPED
+                )
             )
         except NoHostsError as reason:
             pytest.skip(str(reason))
@@ -97,22 +100,22 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
 
 
 @pytest.fixture
-def config(hosts: RobotHosts) -> FleetConfig:
+def config(hosts: SimulatedHosts) -> FleetConfig:
     return load_fleet(hosts.fleet_toml)
 
 
 @pytest.fixture
-def host(hosts: RobotHosts) -> RobotHost:
+def host(hosts: SimulatedHosts) -> SimulatedHost:
     return hosts[0]
 
 
-def shown(host: RobotHost, *properties: str) -> dict[str, str]:
+def shown(host: SimulatedHost, *properties: str) -> dict[str, str]:
     """The unit's properties."""
     output = host.run(f"systemctl show lpac-robot -p {','.join(properties)}")
     return dict(line.split("=", 1) for line in output.splitlines())
 
 
-def status(host: RobotHost) -> dict[str, Any]:
+def status(host: SimulatedHost) -> dict[str, Any]:
     """What the robot told systemd last; empty if nothing."""
     text = shown(host, "StatusText")["StatusText"]
     told: dict[str, Any] = json.loads(text or "{}")
@@ -126,27 +129,27 @@ def wait_until(condition: Callable[[], object], timeout_s: float = 180.0) -> Non
         time.sleep(0.05)
 
 
-def journal(host: RobotHost, options: str = "") -> str:
+def journal(host: SimulatedHost, options: str = "") -> str:
     """What is in the unit's journal so far: it is written a moment later."""
     return host.run(f"journalctl --unit lpac-robot --output cat {options}")
 
 
-def is_in_journal(host: RobotHost, text: str) -> bool:
+def is_in_journal(host: SimulatedHost, text: str) -> bool:
     return text in journal(host)
 
 
-def events(host: RobotHost) -> list[str]:
+def events(host: SimulatedHost) -> list[str]:
     """What the program has logged so far."""
     lines = journal(host, "--identifier lpac-robot").splitlines()
     return [json.loads(line)["event"] for line in lines if line.startswith("{")]
 
 
-def processes(host: RobotHost, pid: str) -> list[str]:
+def processes(host: SimulatedHost, pid: str) -> list[str]:
     """The command lines of a process and of those that it started."""
     return host.run(f"ps -o args= --pid {pid} --ppid {pid} || true").splitlines()
 
 
-def test_a_spare_has_nothing_to_start(host: RobotHost, config: FleetConfig) -> None:
+def test_a_spare_has_nothing_to_start(host: SimulatedHost, config: FleetConfig) -> None:
     toml = host.root / config.directory.lstrip("/") / "current/robot.toml"
     text = toml.read_text()
     toml.unlink()
@@ -158,7 +161,7 @@ def test_a_spare_has_nothing_to_start(host: RobotHost, config: FleetConfig) -> N
     toml.write_text(text)
 
 
-def test_it_starts_says_how_it_is_and_ends(host: RobotHost) -> None:
+def test_it_starts_says_how_it_is_and_ends(host: SimulatedHost) -> None:
     # It returns once each loop has ticked.
     host.run("systemctl start lpac-robot")
     wait_until(lambda: status(host))
@@ -173,7 +176,7 @@ def test_it_starts_says_how_it_is_and_ends(host: RobotHost) -> None:
 
     pid = shown(host, "MainPID")["MainPID"]
     program, watchdog = processes(host, pid)
-    assert "lpac robot run" in program and "deadman" in watchdog
+    assert "lpac robot run" in program and "px4.watchdog" in watchdog
     look_at_the_sandbox(host, pid)
     assert any((host.root / "var/lib/lpac/logs").glob("*.mcap"))
     wait_until(lambda: "robot runs" in events(host))
@@ -186,10 +189,10 @@ def test_it_starts_says_how_it_is_and_ends(host: RobotHost) -> None:
         "ExecMainStatus": "0",
         "NRestarts": "0",
     }
-    assert "deadman" not in host.run("ps -eo args=")
+    assert "px4.watchdog" not in host.run("ps -eo args=")
 
 
-def look_at_the_sandbox(host: RobotHost, pid: str) -> None:
+def look_at_the_sandbox(host: SimulatedHost, pid: str) -> None:
     """Not root, no capability, nothing to write to but its state and its own /tmp."""
     lines = (line.split(None, 1) for line in host.run(f"cat /proc/{pid}/status").splitlines())
     facts = {line[0]: line[1] for line in lines if len(line) == 2}
@@ -207,7 +210,7 @@ def look_at_the_sandbox(host: RobotHost, pid: str) -> None:
 
 
 def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_hold(
-    host: RobotHost, config: FleetConfig
+    host: SimulatedHost, config: FleetConfig
 ) -> None:
     with host.stepped:
         host.vehicle.parameters |= {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
@@ -218,26 +221,26 @@ def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_h
         hung = shown(host, "MainPID")["MainPID"]
         host.run(f"kill -STOP {hung}")
         with host.stepped:
-            assert host.stepped.wait_for(lambda: host.vehicle.mode is Mode.HOLD, 60.0)
+            assert host.stepped.wait_for(lambda: host.vehicle.mode is Px4Mode.HOLD, 60.0)
         wait_until(lambda: shown(host, "NRestarts")["NRestarts"] == "1")
         wait_until(lambda: status(host).get("state") == "pilot")
         assert status(host)["armed"]
         with host.stepped:
-            assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
+            assert host.vehicle.armed and host.vehicle.mode is Px4Mode.HOLD
     wait_until(partial(is_in_journal, host, "Failed with result 'watchdog'"))
     host.run("systemctl stop lpac-robot")
     with host.stepped:
-        assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
+        assert host.vehicle.armed and host.vehicle.mode is Px4Mode.HOLD
 
 
 def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
-    host: RobotHost, config: FleetConfig
+    host: SimulatedHost, config: FleetConfig
 ) -> None:
     """In the air, in hold, as the test before left it."""
     toml = host.root / config.directory.lstrip("/") / "current/robot.toml"
     text = toml.read_text()
     with host.stepped:
-        assert host.vehicle.armed and host.vehicle.mode is Mode.HOLD
+        assert host.vehicle.armed and host.vehicle.mode is Px4Mode.HOLD
     changed = tomlkit.parse(text)
     changed["flight"]["hover_land_s"] = 10.0  # type: ignore[index]
     changed["policy"]["bundle"] = "nowhere"  # type: ignore[index]
@@ -249,7 +252,7 @@ def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
     with host.stepped:
         assert host.stepped.wait_for(lambda: not host.vehicle.armed, 120.0)
         modes = [truth.mode for truth in host.vehicle.truth]
-    assert Mode.LAND in modes
+    assert Px4Mode.LAND in modes
     said = "journalctl --unit lpac-land --output cat"
     wait_until(lambda: "nobody has taken the vehicle: land" in host.run(said))
     toml.write_text(text)
@@ -267,7 +270,7 @@ def take_off(operator: Operator) -> None:
 
 
 def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_says(
-    host: RobotHost, config: FleetConfig
+    host: SimulatedHost, config: FleetConfig
 ) -> None:
     elsewhere = dataclasses.replace(config, directory="/data/lpac")
     for name, text in elsewhere.drop_ins(config.robots[host.name]).items():
@@ -291,7 +294,7 @@ def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_say
     assert "Traceback" not in journal(host)
 
 
-def test_nothing_was_added_to_the_release(host: RobotHost, amd64_image: Path) -> None:
+def test_nothing_was_added_to_the_release(host: SimulatedHost, amd64_image: Path) -> None:
     def names(tree: Path) -> set[Path]:
         return {path.relative_to(tree) for path in tree.rglob("*")}
 

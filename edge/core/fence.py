@@ -1,0 +1,158 @@
+"""The geofence: a convex polygon in the mission frame, with a floor and a ceiling."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+
+_LARGEST_FENCE_M = 1e4
+# An angle, rad, below which three vertices lie on one line.
+_STRAIGHT_RAD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Fence:
+    """Where the robot may fly: a convex polygon, m, and heights from `floor_m` to `ceiling_m`.
+
+    `vertices_m` are (x, y), three or more, either way round; the last is joined to the first.
+    Robots stop `buffer_m` inside the line.
+
+    Raises ValueError if the polygon is not convex, has no room within the buffer, or a number is
+    not finite or out of its range.
+    """
+
+    vertices_m: tuple[tuple[float, ...], ...]
+    buffer_m: float
+    floor_m: float
+    ceiling_m: float
+
+    def __post_init__(self) -> None:
+        if len(self.vertices_m) < 3:
+            raise ValueError(f"vertices_m has {len(self.vertices_m)} vertices: must be 3 or more")
+        for vertex in self.vertices_m:
+            if len(vertex) != 2 or not all(abs(c) <= _LARGEST_FENCE_M for c in vertex):
+                raise ValueError(
+                    f"vertices_m has {list(vertex)}: must be [x, y], each within "
+                    f"{_LARGEST_FENCE_M:g} m"
+                )
+        if not 0.0 < self.buffer_m < math.inf:
+            raise ValueError(f"buffer_m = {self.buffer_m}: must be finite and above 0")
+        if not 0.0 <= self.floor_m < math.inf:
+            raise ValueError(f"floor_m = {self.floor_m}: must be finite and at least 0")
+        if not self.floor_m < self.ceiling_m < math.inf:
+            raise ValueError(
+                f"ceiling_m = {self.ceiling_m}: must be finite and above floor_m = {self.floor_m}"
+            )
+        corners = np.array(self.vertices_m)
+        if not _is_convex(corners):
+            raise ValueError(
+                f"vertices_m = {[list(vertex) for vertex in self.vertices_m]}: must be the "
+                "corners of a convex polygon, in order, none twice"
+            )
+        depth_m = self.distance_m(*_centroid(corners))
+        if not depth_m > self.buffer_m:
+            raise ValueError(
+                f"buffer_m = {self.buffer_m}: must be below {depth_m:.3g}, "
+                "the distance from the fence's centroid to its line"
+            )
+
+    def distance_m(self, x_m: float, y_m: float) -> float:
+        """Distance to the line, m: positive inside; outside, minus how far beyond the worst edge.
+
+        NaN where x or y is.
+        """
+        return float(self.edges().distances_m(np.array([x_m, y_m])).min())
+
+    def moved_inside_m(self, x_m: float, y_m: float, depth_m: float) -> tuple[float, float]:
+        """The place itself, or one near it that is at least about `depth_m` inside every line."""
+        edges = self.edges()
+        place = np.array([x_m, y_m])
+        # In a corner, mending one line's shortfall makes another's: in rounds it converges.
+        for _ in range(100):
+            missing_m = np.maximum(depth_m - edges.distances_m(place), 0.0)
+            if not missing_m.any():
+                break
+            for inward, distance_m in zip(edges.inward, edges.offsets_m, strict=True):
+                place = place + inward * max(depth_m - float(inward @ place - distance_m), 0.0)
+        return float(place[0]), float(place[1])
+
+    def grown_m(self, margin_m: float) -> tuple[tuple[float, float], ...]:
+        """Corners (x, y) of the polygon whose every line lies `margin_m` further out.
+
+        Inward, by at most `buffer_m`, an edge that is short may be gone.
+        """
+        edges = self.edges()
+        if margin_m < 0.0:
+            corners = np.array(self.vertices_m)
+            for inward, offset_m in zip(edges.inward, edges.offsets_m - margin_m, strict=True):
+                corners = _cut(corners, inward, offset_m)
+            return tuple((float(x_m), float(y_m)) for x_m, y_m in corners)
+        after = edges.inward
+        before = np.roll(after, 1, axis=0)
+        outward = (before + after) / (1.0 + (before * after).sum(axis=1, keepdims=True))
+        corners = np.array(self.vertices_m) - margin_m * outward
+        return tuple((float(x_m), float(y_m)) for x_m, y_m in corners)
+
+    def edges(self) -> "Edges":
+        """The lines of its polygon."""
+        corners = np.array(self.vertices_m)
+        along = np.roll(corners, -1, axis=0) - corners
+        along = along / np.hypot(along[:, :1], along[:, 1:])
+        left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        inward = left if _area(corners) > 0.0 else -left
+        return Edges(inward, (inward * corners).sum(axis=1))
+
+
+class Edges(NamedTuple):
+    """A polygon's half planes: inward unit normals (n, 2), and offsets (n,), m."""
+
+    inward: F64
+    offsets_m: F64
+
+    def distances_m(self, point_m: F64) -> F64:
+        """(n,): how far inside each edge's line a point (2,) is."""
+        return self.inward @ point_m - self.offsets_m
+
+
+def _cut(corners: F64, inward: F64, offset_m: float) -> F64:
+    """What of a convex polygon (n, 2) lies on that side of a line."""
+    inside_m = corners @ inward - offset_m
+    kept = []
+    for k in range(len(corners)):
+        if inside_m[k - 1] * inside_m[k] < 0.0:
+            share = inside_m[k - 1] / (inside_m[k - 1] - inside_m[k])
+            kept.append(corners[k - 1] + share * (corners[k] - corners[k - 1]))
+        if inside_m[k] >= 0.0:
+            kept.append(corners[k])
+    return np.array(kept)
+
+
+def _area(corners: F64) -> float:
+    """The area inside corners (n, 2), positive if they run counterclockwise."""
+    x, y = corners.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def _centroid(corners: F64) -> tuple[float, float]:
+    base, rest = corners[0], corners[1:] - corners[0]
+    x, y = rest.T
+    weights = x[:-1] * y[1:] - y[:-1] * x[1:]
+    x_m, y_m = base + (weights[:, None] * (rest[:-1] + rest[1:])).sum(axis=0) / (3 * weights.sum())
+    return float(x_m), float(y_m)
+
+
+def _is_convex(corners: F64) -> bool:
+    """Whether the corners turn one way all round, and once."""
+    if abs(_area(corners - corners[0])) < 1e-9:
+        return False
+    along = np.roll(corners, -1, axis=0) - corners
+    if not (np.abs(along).max(axis=1) > 0.0).all():
+        return False
+    after = np.roll(along, -1, axis=0)
+    turns = np.arctan2(
+        along[:, 0] * after[:, 1] - along[:, 1] * after[:, 0], (along * after).sum(axis=1)
+    ) * math.copysign(1.0, _area(corners))
+    return bool((turns > -_STRAIGHT_RAD).all()) and math.isclose(turns.sum(), math.tau)

@@ -1,0 +1,54 @@
+"""What only one program on a machine may hold."""
+
+import errno
+import socket
+import struct
+from types import TracebackType
+from typing import Self
+
+
+class ProcessLock:
+    """A context that holds `what` for this process, against all others on this machine.
+
+    Abstract socket names belong to the network as ports do, so containers see each other; they need
+    no file, and vanish with their process.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._socket = socket.socket(socket.AF_UNIX)
+
+    def __enter__(self) -> Self:
+        """Raises OSError, in one line, if another process holds it."""
+        name = f"\0lpac {self._what}"
+        try:
+            self._socket.bind(name)
+        except OSError as error:
+            self._socket.close()
+            if error.errno != errno.EADDRINUSE:
+                raise
+            raise OSError(
+                f"{self._what} is in use by {_holder(name)} on this machine: stop that first"
+            ) from None
+        self._socket.listen()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._socket.close()
+
+
+def _holder(name: str) -> str:
+    with socket.socket(socket.AF_UNIX) as caller:
+        try:
+            caller.connect(name)
+        except OSError:
+            return "another process"
+        pid, _, _ = struct.unpack(
+            "3i", caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        )
+    return f"process {pid}" if pid else "another container"

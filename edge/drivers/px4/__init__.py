@@ -1,0 +1,1 @@
+"""PX4 by MAVLink: autopilot, telemetry, events, watchdog."""

@@ -1,0 +1,545 @@
+"""PX4 by MAVSDK: telemetry, setpoints and commands of one vehicle.
+
+Setpoints go through `mavlink_direct`, which sends each once: MAVSDK's offboard plugin would repeat
+the last one for ever and so hide a dead control loop from PX4's failsafe. Commands go the same way:
+MAVSDK repeats an unanswered one three times within two seconds, and arming must never be repeated.
+"""
+
+import json
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from functools import cache
+from threading import Condition, Lock, Thread
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import structlog
+from mavsdk.component_type import ComponentType
+from mavsdk.connection_result import ConnectionResult
+from mavsdk.exceptions import MavsdkError
+from mavsdk.logging import LogLevel, log_subscribe
+from mavsdk.mavsdk import Configuration, Mavsdk
+from mavsdk.plugins.geofence import FenceType, Geofence, GeofenceData, Point, Polygon
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
+from mavsdk.plugins.param import Param
+from mavsdk.system import System
+
+from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
+from edge.drivers.px4.telemetry import Px4Telemetry
+
+_log = structlog.get_logger(__name__)
+
+# Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
+RATES_HZ = {
+    1: 2.0,  # SYS_STATUS
+    24: 5.0,  # GPS_RAW_INT
+    32: 20.0,  # LOCAL_POSITION_NED
+    33: 5.0,  # GLOBAL_POSITION_INT
+    49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
+    230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
+    245: 5.0,  # EXTENDED_SYS_STATE
+}
+_HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
+
+_AUTOPILOT = 1  # component id
+_NAV_LAND, _DO_SET_MODE, _ARM_DISARM = 21, 176, 400
+_RUN_PREARM_CHECKS, _SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE = 401, 511, 512
+_CUSTOM_MODE, _MAIN_AUTO, _MAIN_OFFBOARD, _SUB_HOLD = 1.0, 4.0, 6.0, 3.0
+_FORCE = 21196.0
+_INT32, _REAL32 = 6, 9
+_LOCAL_NED = 1
+# Ignored: acceleration, yaw, yaw rate; and position or velocity.
+_VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
+# More is a mistake, and beyond float32 it would be sent as infinite.
+_MAX_COORDINATE = 1e6
+
+# MAV_RESULT
+_ACCEPTED, _IN_PROGRESS = 0, 5
+_REFUSALS = {1: "not now", 2: "denied", 3: "not supported", 4: "failed", 6: "cancelled"}
+
+_LOOK_S = 0.2
+_RENEW_S = 1.0
+_STREAMS_S = 10.0
+_PREARM_CHECKS_S = 10.0
+_REASON_S = 0.3
+_STALE_COMMAND_S = 1.0
+_PARAMETER_ROUNDS, _PARAMETER_ROUND_S = 3, 0.3
+
+
+class AutopilotError(OSError):
+    """What the autopilot did not do, in one line."""
+
+
+class _Command(NamedTuple):
+    """How an action is sent: a COMMAND_LONG, `times` at most, until one is answered.
+
+    `overrides` are the actions that must not be carried out after this one was asked for.
+    """
+
+    number: int
+    parameters: tuple[float, ...]
+    times: int
+    wait_s: float
+    overrides: frozenset[Action]
+
+
+_COMMANDS = {
+    Action.ARM: _Command(_ARM_DISARM, (1.0,), 1, 1.5, frozenset()),
+    # Not repeated: a pilot may have taken the vehicle in between.
+    Action.OFFBOARD: _Command(_DO_SET_MODE, (_CUSTOM_MODE, _MAIN_OFFBOARD), 1, 1.5, frozenset()),
+    Action.HOLD: _Command(
+        _DO_SET_MODE,
+        (_CUSTOM_MODE, _MAIN_AUTO, _SUB_HOLD),
+        3,
+        0.5,
+        frozenset({Action.ARM, Action.OFFBOARD, Action.LAND}),
+    ),
+    Action.LAND: _Command(
+        _NAV_LAND,
+        (),
+        3,
+        0.5,
+        frozenset({Action.ARM, Action.OFFBOARD, Action.HOLD}),
+    ),
+    Action.DISARM: _Command(_ARM_DISARM, (0.0,), 3, 0.5, frozenset({Action.ARM, Action.OFFBOARD})),
+    # Sent every time: the answer may be the one to an ARM that it overtook.
+    Action.KILL: _Command(_ARM_DISARM, (0.0, _FORCE), 5, 0.1, frozenset(Action) - {Action.KILL}),
+}
+# What must not happen late, and not to a vehicle that is not there.
+_STARTS = frozenset({Action.ARM, Action.OFFBOARD})
+
+
+class _Link(NamedTuple):
+    """One vehicle that was found."""
+
+    system: System
+    system_id: int
+    direct: MavlinkDirect
+
+
+class MavsdkAutopilot:
+    """The vehicle behind one MAVLink connection: an `Autopilot`, as a context.
+
+    It comes up at once, finds the vehicle when it appears, and again after it was gone. MAVSDK's
+    threads only store; a thread of its own finds vehicles, asks for streams and carries out
+    commands. `state`, `send`, `command` and `close` may be called from any thread and never raise.
+    """
+
+    def __init__(self, url: str, *, system_id: int | None = None) -> None:
+        """`url` is MAVSDK's, e.g. udpin://127.0.0.1:14551.
+
+        With `system_id` no other vehicle is listened to; None takes the first that is heard.
+        """
+        self._url = url
+        self._wanted_system_id = system_id
+        self._telemetry = Px4Telemetry()
+        self._mavsdk: Mavsdk | None = None
+        self._own_id = (0, 0)
+        self._link: _Link | None = None
+        self._others: tuple[int, ...] = ()
+        self._worker = Thread(target=self._work, name="autopilot")
+        self._next_s = self._next_renewal_s = self._next_streams_s = self._next_checks_s = 0.0
+        self._heard = (False, 0)
+        # Not to send on what is being destroyed.
+        self._sending = Lock()
+        self._failures: Counter[str] = Counter()
+        # Guards what follows.
+        self._wake = Condition()
+        self._closing = False
+        self._queue: list[tuple[Action, float]] = []
+        self._running: Action | None = None
+        self._overridden = False
+        self._awaited = 0
+        self._answer: int | None = None
+        self._result: ActionResult | None = None
+        self._parameter_types: dict[str, int] = {}
+
+    def __enter__(self) -> Self:
+        """Raises AutopilotError if there can be no such connection."""
+        _take_over_log()
+        configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
+        if self._wanted_system_id is not None:
+            # A companion has its vehicle's system id.
+            configuration.system_id = self._wanted_system_id
+        self._own_id = (configuration.system_id, configuration.component_id)
+        self._mavsdk = Mavsdk(configuration)
+        result = self._mavsdk.add_any_connection(self._url)
+        if result is not ConnectionResult.SUCCESS:
+            self._mavsdk.destroy()
+            raise AutopilotError(f"autopilot url = {self._url!r}: {result.name}")
+        self._worker.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop, without a word to the vehicle. Commands that still wait are not sent."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify_all()
+        if self._worker.ident is not None:
+            self._worker.join()
+        if self._mavsdk is not None:
+            with self._sending:
+                self._mavsdk.destroy()
+
+    # In flight
+
+    def state(self) -> VehicleState:
+        """See `Autopilot.state`. `other_system_ids` has the own one if two vehicles share it."""
+        now_s = time.monotonic()
+        link = self._link
+        state = self._telemetry.state(now_s)
+        others = self._others
+        if link is not None and self._telemetry.has_twin(now_s):
+            others = (*others, link.system_id)
+        return replace(
+            state,
+            system_id=None if link is None else link.system_id,
+            other_system_ids=others,
+            result=self._result,
+        )
+
+    def send(self, setpoint: Setpoint) -> Setpoint | None:
+        """See `Autopilot.send`. A setpoint that is not finite is not sent; yaw stays as it is."""
+        position_m = velocity_m_s = (0.0, 0.0, 0.0)
+        if isinstance(setpoint, Velocity):
+            mask, velocity_m_s = _VELOCITY_MASK, setpoint.velocity_local_m_s
+        else:
+            mask, position_m = _POSITION_MASK, setpoint.position_local_m
+        if not all(abs(value) <= _MAX_COORDINATE for value in (*position_m, *velocity_m_s)):
+            self._count("setpoint that is not finite", str(setpoint))
+            return None
+        names = ("x", "y", "z", "vx", "vy", "vz")
+        sent = self._send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            time_boot_ms=0,
+            coordinate_frame=_LOCAL_NED,
+            type_mask=mask,
+            **dict(zip(names, map(float, (*position_m, *velocity_m_s)), strict=True)),
+        )
+        return setpoint if sent else None
+
+    def command(self, action: Action) -> None:
+        """See `Autopilot.command`.
+
+        HOLD, LAND, DISARM and KILL drop what they contradict: dropped commands end as "superseded".
+        An action that waits already, or is being carried out, is not queued again.
+        """
+        overrides = _COMMANDS[action].overrides
+        with self._wake:
+            if action is self._running or any(action is queued for queued, _ in self._queue):
+                return
+            for queued, _ in self._queue:
+                if queued in overrides:
+                    self._finish(queued, "superseded")
+            self._queue = [entry for entry in self._queue if entry[0] not in overrides]
+            self._overridden = self._overridden or self._running in overrides
+            self._queue.append((action, time.monotonic()))
+            self._wake.notify_all()
+
+    # Before flight: these wait for the vehicle, a few seconds at most
+
+    def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
+        """PX4's values; None where it has no such parameter. Called from one thread at a time.
+
+        Raises AutopilotError if the vehicle is not there, or falls silent meanwhile.
+        """
+        types = self._types_of(names)
+        parameters = Param(self._required_link().system)
+        values: dict[str, int | float | None] = dict.fromkeys(names)
+        for name, kind in types.items():
+            read = parameters.get_param_float if kind == _REAL32 else parameters.get_param_int
+            try:
+                values[name] = read(name)
+            except MavsdkError as error:
+                # It was there a moment ago; each further one would be waited for as well.
+                raise AutopilotError(f"parameter {name}: {_reason(error)}") from error
+        return values
+
+    def set_parameter(self, name: str, value: int | float) -> None:
+        """Set it, in the type that PX4 has it in. Called from one thread at a time.
+
+        Raises AutopilotError if the vehicle is not there, has no such parameter or refuses.
+        """
+        kind = self._types_of([name]).get(name)
+        if kind is None:
+            raise AutopilotError(f"parameter {name}: the autopilot has none of that name")
+        if kind == _INT32 and value != int(value):
+            raise AutopilotError(f"parameter {name} = {value}: must be a whole number")
+        parameters = Param(self._required_link().system)
+        try:
+            if kind == _REAL32:
+                parameters.set_param_float(name, float(value))
+            else:
+                parameters.set_param_int(name, int(value))
+        except MavsdkError as error:
+            raise AutopilotError(f"parameter {name} = {value}: {_reason(error)}") from error
+
+    def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
+        """Replace PX4's fence by one polygon to stay in: latitude and longitude, deg, in order.
+
+        Raises AutopilotError if the vehicle is not there or refuses.
+        """
+        points = [
+            Point(latitude_deg, longitude_deg) for latitude_deg, longitude_deg in vertices_deg
+        ]
+        fence = GeofenceData([Polygon(points, FenceType.INCLUSION)], [])
+        try:
+            Geofence(self._required_link().system).upload_geofence(fence)
+        except MavsdkError as error:
+            raise AutopilotError(f"fence upload: {_reason(error)}") from error
+
+    def _required_link(self) -> _Link:
+        link = self._link
+        if link is None or not self.state().connected:
+            raise AutopilotError(f"no vehicle on {self._url}")
+        return link
+
+    def _types_of(self, names: Iterable[str]) -> dict[str, int]:
+        """Which of the parameters there are: all are asked for at once, so that none is waited for
+        on its own."""
+        self._required_link()
+        wanted = set(names)
+        with self._wake:
+            self._parameter_types = {}
+        for _ in range(_PARAMETER_ROUNDS):
+            for name in sorted(wanted - self._parameter_types.keys()):
+                self._send("PARAM_REQUEST_READ", param_id=name, param_index=-1)
+            with self._wake:
+                if self._wake.wait_for(
+                    lambda: self._parameter_types.keys() >= wanted, _PARAMETER_ROUND_S
+                ):
+                    break
+        return {name: self._parameter_types[name] for name in wanted & self._parameter_types.keys()}
+
+    # Sending, from any thread
+
+    def _send(self, name: str, **fields: Any) -> bool:
+        """One message to the vehicle; whether it went out."""
+        link = self._link
+        if link is None:
+            return False
+        target = {"target_system": link.system_id, "target_component": _AUTOPILOT}
+        text = json.dumps(target | fields)
+        message = MavlinkMessage(name, 0, 0, link.system_id, _AUTOPILOT, text)
+        try:
+            with self._sending:
+                if self._closing:
+                    return False
+                link.direct.send_message(message)
+        except MavsdkError as error:
+            self._count(f"sending {name}", repr(error))
+            return False
+        return True
+
+    def _send_command(self, number: int, *parameters: float) -> bool:
+        padded = (*parameters, *(0.0,) * (7 - len(parameters)))
+        fields = {f"param{i}": value for i, value in enumerate(padded, 1)}
+        return self._send("COMMAND_LONG", command=number, confirmation=0, **fields)
+
+    def _count(self, what: str, detail: str) -> None:
+        """Count a failure, and log the first of its kind: there may be many a second."""
+        self._failures[what] += 1
+        if self._failures[what] == 1:
+            _log.warning("autopilot link", failure=what, detail=detail)
+
+    # MAVSDK's thread
+
+    def _hears(self, name: str, act: Callable[[dict[str, Any]], None]) -> Callable[..., None]:
+        def on_message(message: MavlinkMessage, _: object) -> None:
+            if message.component_id != _AUTOPILOT:
+                return
+            try:
+                act(json.loads(message.fields_json))
+            except Exception as error:
+                self._count(f"hearing {name}", repr(error))
+
+        return on_message
+
+    def _on_telemetry(self, name: str) -> Callable[[dict[str, Any]], None]:
+        def on_telemetry(fields: dict[str, Any]) -> None:
+            self._telemetry.hear(name, fields, time.monotonic())
+            needs_origin = self._telemetry.needs_origin()
+            if needs_origin or name in ("STATUSTEXT", "EVENT"):
+                with self._wake:
+                    self._next_s = 0.0 if needs_origin else self._next_s
+                    self._wake.notify_all()
+
+        return on_telemetry
+
+    def _on_command_ack(self, fields: dict[str, Any]) -> None:
+        asked = fields["target_system"], fields["target_component"]
+        ours = all(to in (0, own) for to, own in zip(asked, self._own_id, strict=True))
+        if not ours or fields["result"] == _IN_PROGRESS:
+            return
+        with self._wake:
+            if fields["command"] == self._awaited:
+                self._answer = fields["result"]
+                self._wake.notify_all()
+
+    def _on_param_value(self, fields: dict[str, Any]) -> None:
+        with self._wake:
+            self._parameter_types[fields["param_id"]] = fields["param_type"]
+            self._wake.notify_all()
+
+    # The worker's thread
+
+    def _work(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(self._has_work, max(self._next_s - time.monotonic(), 0.0))
+                if self._closing:
+                    return
+                action, asked_at_s = self._queue.pop(0) if self._queue else (None, 0.0)
+                self._running, self._overridden = action, False
+            try:
+                if action is not None:
+                    self._carry_out(action, asked_at_s)
+                self._keep_up(time.monotonic())
+            except Exception as error:
+                self._count("autopilot thread", repr(error))
+
+    def _has_work(self) -> bool:
+        return self._closing or bool(self._queue) or time.monotonic() >= self._next_s
+
+    def _finish(self, action: Action, refusal: str) -> None:
+        self._result = ActionResult(action, not refusal, refusal, time.monotonic())
+        _log.info("command", action=action.value, accepted=not refusal, refusal=refusal)
+
+    def _carry_out(self, action: Action, asked_at_s: float) -> None:
+        refusal = "internal error"
+        try:
+            refusal = self._refusal(action, asked_at_s)
+        finally:
+            with self._wake:
+                self._running = None
+                self._finish(action, refusal)
+        # Sooner than the next that is due.
+        self._request(_HEARTBEAT)
+        self._request(_EXTENDED_SYS_STATE)
+
+    def _refusal(self, action: Action, asked_at_s: float) -> str:
+        """Carry it out; "" or why it was not."""
+        began_s = time.monotonic()
+        if action in _STARTS and began_s - asked_at_s > _STALE_COMMAND_S:
+            return "asked for too long ago"
+        if self._link is None or (action in _STARTS and not self.state().connected):
+            return "no vehicle"
+        command = _COMMANDS[action]
+        answer = None
+        for _ in range(command.times):
+            if not self._overridden:
+                answer = self._ask(command)
+            if self._overridden or self._closing:
+                return "superseded"
+            if answer is not None and action is not Action.KILL:
+                break
+        if answer is None:
+            return "no answer"
+        return "" if answer == _ACCEPTED else self._explain(answer, began_s)
+
+    def _ask(self, command: _Command) -> int | None:
+        """Send it once, and wait for the answer."""
+        with self._wake:
+            self._awaited, self._answer = command.number, None
+        self._send_command(command.number, *command.parameters)
+        with self._wake:
+            self._wake.wait_for(
+                lambda: self._answer is not None or self._overridden or self._closing,
+                command.wait_s,
+            )
+            self._awaited = 0
+            return self._answer
+
+    def _explain(self, answer: int, since_s: float) -> str:
+        """PX4 says why it refused soon before or after the answer."""
+        word = _REFUSALS.get(answer, f"result {answer}")
+        with self._wake:
+            self._wake.wait_for(
+                lambda: bool(self._telemetry.refusal_reasons(since_s)) or self._overridden,
+                _REASON_S,
+            )
+        reasons = "; ".join(reason.text for reason in self._telemetry.refusal_reasons(since_s))
+        return f"{word}: {reasons}" if reasons else word
+
+    def _keep_up(self, now_s: float) -> None:
+        """Find the vehicle, and keep its streams and its origin coming."""
+        self._next_s = now_s + _LOOK_S
+        if self._link is None or now_s >= self._next_renewal_s:
+            self._look_for_vehicles()
+        if self._link is None:
+            return
+        state = self.state()
+        heard = state.connected, self._telemetry.restarts()
+        if heard != self._heard or now_s >= self._next_streams_s:
+            self._heard, self._next_streams_s = heard, now_s + _STREAMS_S
+            self._ask_for_streams()
+        if self._telemetry.needs_origin():
+            self._request(_GPS_GLOBAL_ORIGIN)
+        missing = self._telemetry.missing_events()
+        if missing is not None:
+            self._send("REQUEST_EVENT", first_sequence=missing[0], last_sequence=missing[1])
+        if now_s >= self._next_renewal_s:
+            self._next_renewal_s = now_s + _RENEW_S
+            self._request(_GPS_GLOBAL_ORIGIN)
+            if not state.armed:
+                self._request(_AUTOPILOT_VERSION)
+        if now_s >= self._next_checks_s and state.armable is False and not state.armed:
+            self._next_checks_s = now_s + _PREARM_CHECKS_S
+            self._send_command(_RUN_PREARM_CHECKS)
+
+    def _look_for_vehicles(self) -> None:
+        assert self._mavsdk is not None
+        autopilots = {
+            system.get_system_id(): system
+            for system in self._mavsdk.get_systems()
+            if system.has_autopilot() and system.is_connected()
+        }
+        if self._link is None:
+            wanted = self._wanted_system_id
+            system_id = min(autopilots, default=0) if wanted is None else wanted
+            if system_id in autopilots:
+                self._listen_to(system_id, autopilots[system_id])
+        own = None if self._link is None else self._link.system_id
+        self._others = tuple(sorted(autopilots.keys() - {own}))
+
+    def _listen_to(self, system_id: int, system: System) -> None:
+        direct = MavlinkDirect(system)
+        for name in self._telemetry.messages:
+            direct.subscribe_message(name, self._hears(name, self._on_telemetry(name)))
+        direct.subscribe_message("COMMAND_ACK", self._hears("COMMAND_ACK", self._on_command_ack))
+        direct.subscribe_message("PARAM_VALUE", self._hears("PARAM_VALUE", self._on_param_value))
+        self._link = _Link(system, system_id, direct)
+        _log.info("autopilot found", system_id=system_id)
+
+    def _ask_for_streams(self) -> None:
+        for message_id, rate_hz in RATES_HZ.items():
+            self._send_command(_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
+
+    def _request(self, message_id: int) -> None:
+        self._send_command(_REQUEST_MESSAGE, message_id)
+
+
+@cache
+def _take_over_log() -> None:
+    """Once: another callback would free the one that MAVSDK's threads may be in."""
+    log_subscribe(_log_mavsdk)
+
+
+def _log_mavsdk(level: LogLevel, text: str, _file: str | None, _line: int) -> bool:
+    """Into our log, and not to the terminal."""
+    _log.debug("mavsdk", level=level.name, text=text)
+    return True
+
+
+def _reason(error: MavsdkError) -> str:
+    return str(error.args[0].name).lower().replace("_", " ")

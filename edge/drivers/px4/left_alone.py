@@ -1,0 +1,107 @@
+"""Lands a vehicle that hovers in PX4's hold mode while nobody has it: the robot's program does not.
+
+Hangs share nothing with it but the socket; it needs the standard library alone. Whoever takes the
+vehicle meanwhile, by any other mode, keeps it.
+"""
+
+import select
+import socket
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from edge.drivers.px4.raw_mavlink import Heartbeat, heartbeat, land_command
+
+_COMPONENT = 197  # as the watchdog
+# PX4 sends heartbeats at 1 Hz.
+_FRESH_S = 2.5
+# Whoever else has the socket takes some of them; after so many it is another flight.
+_GAP_S = 10.0
+_AGAIN_S = 1.0
+_LOOK_S = 0.2
+_HOVER_LAND_S = 60.0  # where the configuration says nothing: its own default
+_DATAGRAM_BYTES = 2048
+
+
+def land_if_left(
+    udp: socket.socket, system_id: int, after_s: float, pipe: int | None = None
+) -> bool:
+    """Land the vehicle once it has hovered for `after_s`; True when there is nothing left to do.
+
+    False as soon as `pipe` can be read. `udp` hears the vehicle: its datagrams are read here, and
+    nobody else gets them. Mode OFFBOARD is PX4's to end: without setpoints it lands by itself.
+    """
+    heard_s = since_s = time.monotonic()
+    asked_s, hovered, sequence = -_AGAIN_S, False, 0
+    peer: tuple[str, int] | None = None
+    while True:
+        inputs = [udp.fileno()] if pipe is None else [udp.fileno(), pipe]
+        readable, _, _ = select.select(inputs, [], [], _LOOK_S)
+        now_s = time.monotonic()
+        if pipe in readable:
+            return False
+        for beat, sender in _waiting(udp):
+            if beat.system_id != system_id:
+                continue
+            if now_s - heard_s > _GAP_S:
+                since_s, hovered = now_s, False
+            heard_s, peer = now_s, sender
+            if not beat.armed or beat.mode == "land":
+                return _end("it lands" if beat.armed else "it is disarmed")
+            if beat.mode == "hold":
+                hovered = True
+            elif hovered or beat.mode != "offboard":
+                return _end(f"somebody has it: {beat.mode}")
+        if now_s - heard_s > max(after_s, _GAP_S) + _FRESH_S:
+            return _end("it is not heard")
+        due = hovered and now_s - since_s >= after_s and now_s - heard_s < _FRESH_S
+        if due and peer is not None and now_s - asked_s >= _AGAIN_S:
+            say("nobody has taken the vehicle: land")
+            asked_s, sequence = now_s, sequence + 1
+            with suppress(OSError):
+                udp.sendto(land_command(sequence, system_id, _COMPONENT), peer)
+
+
+def _waiting(udp: socket.socket) -> Iterator[tuple[Heartbeat, tuple[str, int]]]:
+    """The heartbeats that have come, and from where."""
+    with suppress(OSError):
+        while True:
+            data, address = udp.recvfrom(_DATAGRAM_BYTES, socket.MSG_DONTWAIT)
+            if (beat := heartbeat(data)) is not None:
+                yield beat, (address[0], address[1])
+
+
+def _end(how: str) -> bool:
+    say(f"the vehicle that was left alone: {how}")
+    return True
+
+
+def say(text: str) -> None:
+    """A line to whoever is left to read it."""
+    with suppress(OSError):
+        print(f"lpac: {text}", file=sys.stderr, flush=True)
+
+
+def main() -> None:
+    """For systemd, when it has given the robot's program up: `robot.toml` is the argument."""
+    (path,) = sys.argv[1:]
+    try:
+        config = tomllib.loads(Path(path).read_text("utf-8"))
+        port = int(config["autopilot"]["url"].rsplit(":", 1)[1])
+        system_id = int(config["autopilot"]["system_id"])
+        after_s = float(config.get("flight", {}).get("hover_land_s", _HOVER_LAND_S))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        say(f"{path}: the vehicle is not known: {error!r}")
+        sys.exit(1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        # A program that is started again has the datagrams, since it asks for the port later.
+        udp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        udp.bind(("0.0.0.0", port))
+        land_if_left(udp, system_id, after_s)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,431 @@
+"""What PX4 says, as one `VehicleState`: MAVLink messages in; no socket, thread or clock.
+
+Messages come as MAVLink's common dialect names them, with their fields in MAVLink's units.
+"""
+
+import math
+import re
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from threading import Lock
+from typing import Any
+
+from edge.core.vehicle import (
+    EstimatorStatus,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    Reason,
+    Vector,
+    VehicleState,
+)
+from edge.drivers.px4.events import Px4Events, without_repetition
+from edge.drivers.px4.raw_mavlink import mode_name
+
+Fields = Mapping[str, Any]
+
+# PX4 sends a heartbeat at least every second.
+_CONNECTED_WITHIN_S = 2.5
+# Asked for twice a second; what is older says nothing about now.
+_SYS_STATUS_HEARD_S = 2.5
+# What is told once counts for so long, and as long as a failsafe lasts.
+_TOLD_FOR_S = 15.0
+# The reason for a failsafe comes up to a heartbeat before its state.
+_FAILSAFE_LATE_S = 2.5
+
+# A position is taken for a jump if it lies further from where motion led than this, plus as much
+# for every second between.
+_JUMP_M, _JUMP_M_S = 1.0, 1.0
+_ORIGIN_ANSWER_S = 0.5
+# After a longer silence, nobody knows what of a jump in height was motion.
+_HEIGHT_JUMP_WITHIN_S = 1.0
+
+# Present says which sensors there are; of PREARM_CHECK PX4 tells in health alone.
+_SENSOR_RC, _PREARM_CHECK = 1 << 16, 1 << 28
+_VELOCITY_HORIZ, _POS_HORIZ_ABS, _GPS_GLITCH = 1 << 1, 1 << 4, 1 << 10
+_SAFETY_ARMED = 1 << 7
+_CRITICAL, _EMERGENCY = 5, 6  # MAV_STATE
+_AUTOPILOT_INVALID = 8
+_WARNING = 4
+_ON_GROUND = 1
+_UNKNOWN_UINT16 = 0xFFFF
+_FIX_3D = 3
+_M_PER_DEG = 111_195.0  # of latitude: a sphere is good enough for differences of metres
+_REFUSAL = re.compile(r"^(?:\w+ denied|preflight fail)[:!]?\s*", re.IGNORECASE)
+
+
+class Px4Telemetry:
+    """The newest of everything that one vehicle said. Every method may be called from any thread.
+
+    Times are the robot's monotonic clock, s.
+
+    Messages that were held up, because this process or the link stood still, arrive in one go: the
+    vehicle's own clock tells how old they are, and `position_at_s` and `heartbeat_at_s` count from
+    when they were due.
+
+    Position and origin always belong together. A position that jumps is held back until the origin
+    is known anew, half a second at most, and a new origin counts from the next position on.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._state = VehicleState()
+        self._clock = _VehicleClock()
+        self._twin = _TwinWatch()
+        self._sys_status_at_s = -math.inf
+        self._gps_time_us: int | None = None
+        self._jump_at_s: float | None = None
+        self._origin: GlobalOrigin | None = None
+        self._origin_at_s = -math.inf
+        self._texts: deque[tuple[float, str]] = deque(maxlen=16)
+        self._events = Px4Events()
+        self._failsafe_at_s = -math.inf
+        self._handlers = {
+            "HEARTBEAT": self._on_heartbeat,
+            "SYS_STATUS": self._on_sys_status,
+            "GPS_RAW_INT": self._on_gps_raw_int,
+            "LOCAL_POSITION_NED": self._on_local_position_ned,
+            "GLOBAL_POSITION_INT": self._on_global_position_int,
+            "GPS_GLOBAL_ORIGIN": self._on_gps_global_origin,
+            "ESTIMATOR_STATUS": self._on_estimator_status,
+            "EXTENDED_SYS_STATE": self._on_extended_sys_state,
+            "STATUSTEXT": self._on_statustext,
+            "EVENT": self._events.hear,
+            "CURRENT_EVENT_SEQUENCE": self._events.hear_sequence,
+            "AUTOPILOT_VERSION": self._on_autopilot_version,
+        }
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """The names of the messages that `hear` understands."""
+        return tuple(self._handlers)
+
+    def hear(self, name: str, fields: Fields, now_s: float) -> None:
+        """Take in one message of the autopilot.
+
+        Raises KeyError, TypeError or ValueError for one that is no such message: nothing changes.
+        """
+        with self._lock:
+            self._handlers[name](fields, now_s)
+
+    def state(self, now_s: float) -> VehicleState:
+        """All fields but those of the link: system ids and command results are not known here."""
+        with self._lock:
+            state = self._state
+            if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
+                state = replace(
+                    state, armable=None, battery=None, voltage_v=None, remote_control=None
+                )
+            problems: tuple[Reason, ...] = ()
+            warnings: tuple[Reason, ...] = ()
+            if state.armed:
+                told = self._events.told(self._told_since_s(now_s))
+                warnings = without_repetition((*told, *self._events.wrong(state.mode)))
+            elif not state.armable:
+                problems = self._why_not_armed(now_s - _TOLD_FOR_S)
+            return replace(
+                state,
+                connected=now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S,
+                problems=problems,
+                warnings=warnings,
+            )
+
+    def needs_origin(self) -> bool:
+        """Whether the position jumped, and an origin that is as new has not come yet."""
+        with self._lock:
+            return self._jump_at_s is not None
+
+    def has_twin(self, now_s: float) -> bool:
+        """Whether two vehicles seem to speak with the same system id."""
+        with self._lock:
+            return self._twin.seen(now_s)
+
+    def restarts(self) -> int:
+        """How often the vehicle was found to have been switched on anew."""
+        with self._lock:
+            return self._clock.restarts
+
+    def missing_events(self) -> tuple[int, int] | None:
+        """The first and last sequence number of events that were lost and are to be asked for."""
+        with self._lock:
+            return self._events.missing()
+
+    def refusal_reasons(self, since_s: float) -> tuple[Reason, ...]:
+        """Why a command that was sent then was refused: what was told since, and is wrong now."""
+        with self._lock:
+            told = self._events.told(since_s)
+            return without_repetition((*told, *self._why_not_armed(since_s)))
+
+    def _told_since_s(self, now_s: float) -> float:
+        """When what is told once must have been told to count now."""
+        since_s = now_s - _TOLD_FOR_S
+        return (
+            min(since_s, self._failsafe_at_s - _FAILSAFE_LATE_S)
+            if self._state.failsafe
+            else since_s
+        )
+
+    def _why_not_armed(self, since_s: float) -> tuple[Reason, ...]:
+        """By PX4's checks; a vehicle that does not tell them may have said it in a text."""
+        texts = {text: None for at_s, text in self._texts if at_s >= since_s}
+        said = tuple(Reason("text", (), text) for text in texts)
+        return self._events.why_not_armed(self._state.mode) or said
+
+    def _change(self, **changes: Any) -> None:
+        self._state = replace(self._state, **changes)
+
+    def _on_heartbeat(self, fields: Fields, now_s: float) -> None:
+        if fields["autopilot"] == _AUTOPILOT_INVALID:
+            return
+        failsafe = fields["system_status"] in (_CRITICAL, _EMERGENCY)
+        if failsafe and not self._state.failsafe:
+            self._failsafe_at_s = now_s
+        armed = bool(fields["base_mode"] & _SAFETY_ARMED)
+        if armed and not self._state.armed:
+            self._change(height_jumped_m=0.0)
+        self._change(
+            mode=Mode(mode_name(fields["custom_mode"])),
+            armed=armed,
+            failsafe=failsafe,
+            heartbeat_at_s=now_s - self._clock.delay_s,
+        )
+
+    def _on_sys_status(self, fields: Fields, now_s: float) -> None:
+        present = fields["onboard_control_sensors_present"]
+        healthy = fields["onboard_control_sensors_health"]
+        percent, millivolts = fields["battery_remaining"], fields["voltage_battery"]
+        self._change(
+            armable=bool(healthy & _PREARM_CHECK),
+            battery=percent / 100.0 if percent >= 0 else None,
+            voltage_v=None if millivolts == _UNKNOWN_UINT16 else millivolts / 1e3,
+            remote_control=bool(present & healthy & _SENSOR_RC),
+        )
+        self._sys_status_at_s = now_s - self._clock.delay_s
+
+    def _on_gps_raw_int(self, fields: Fields, now_s: float) -> None:
+        hundredths, satellites = fields["eph"], fields["satellites_visible"]
+        accuracy_mm, has_fix = fields["h_acc"], fields["fix_type"] >= _FIX_3D
+        at_s = -math.inf if self._state.gps is None else self._state.gps.at_s
+        if fields["time_usec"] != self._gps_time_us:
+            # PX4 goes on telling of a receiver from which nothing comes any more.
+            self._gps_time_us, at_s = fields["time_usec"], now_s - self._clock.delay_s
+        offset_m = None
+        if has_fix:
+            place = GlobalOrigin(fields["lat"] / 1e7, fields["lon"] / 1e7, 0.0)
+            offset_m = self._offset_m(place)
+        self._change(
+            gps=Gps(
+                fix=fields["fix_type"],
+                satellites=0 if satellites == 0xFF else satellites,
+                hdop=math.inf if hundredths == _UNKNOWN_UINT16 else hundredths / 100.0,
+                accuracy_m=accuracy_mm / 1e3 if accuracy_mm and has_fix else None,
+                offset_m=offset_m,
+                at_s=at_s,
+            )
+        )
+
+    def _offset_m(self, place: GlobalOrigin) -> float | None:
+        """How far in the plane a place is from the newest position."""
+        origin, position_m = self._state.origin, self._state.position_local_m
+        if origin is None or position_m is None:
+            return None
+        north_m, east_m, _ = _shift_m(origin, place)
+        return math.hypot(north_m - position_m[0], east_m - position_m[1])
+
+    def _on_estimator_status(self, fields: Fields, now_s: float) -> None:
+        flags, wanted = fields["flags"], _VELOCITY_HORIZ | _POS_HORIZ_ABS
+        self._change(
+            estimator=EstimatorStatus(
+                horizontal=flags & wanted == wanted,
+                glitch=bool(flags & _GPS_GLITCH),
+                at_s=now_s - self._clock.delay_s,
+            )
+        )
+
+    def _on_global_position_int(self, fields: Fields, _: float) -> None:
+        changes: dict[str, float] = {"height_above_home_m": fields["relative_alt"] / 1e3}
+        if fields["hdg"] != _UNKNOWN_UINT16:
+            changes["heading_rad"] = math.radians(fields["hdg"] / 100.0 % 360.0)
+        self._change(**changes)
+
+    def _on_extended_sys_state(self, fields: Fields, _: float) -> None:
+        state = fields["landed_state"]
+        self._change(in_air=state > _ON_GROUND if state else None)
+
+    def _on_gps_global_origin(self, fields: Fields, now_s: float) -> None:
+        self._origin = GlobalOrigin(
+            fields["latitude"] / 1e7, fields["longitude"] / 1e7, fields["altitude"] / 1e3
+        )
+        self._origin_at_s = now_s
+        if self._state.position_local_m is None:
+            self._change(origin=self._origin)
+
+    def _on_local_position_ned(self, fields: Fields, now_s: float) -> None:
+        position_m = _vector(fields, "x", "y", "z")
+        velocity_m_s = _vector(fields, "vx", "vy", "vz")
+        boot_s = fields["time_boot_ms"] / 1e3
+        self._twin.vehicle_time(boot_s, now_s)
+        at_s = now_s - self._clock.hear(boot_s, now_s)
+        was_held_back = self._jump_at_s is not None
+        if self._is_held_back(position_m, velocity_m_s, at_s, now_s):
+            return
+        state = self._state
+        changed = (position_m, velocity_m_s) != (state.position_local_m, state.velocity_local_m_s)
+        between_s = max(at_s - state.position_at_s, 0.0)
+        off_m = self._off_m(position_m, velocity_m_s, between_s, self._origin)
+        # That it jumped was seen at once: the time that it was held back makes it no motion.
+        unexplained = was_held_back and self._origin == state.origin
+        uncertain_s = 0.0 if unexplained else between_s
+        jumped = _is_jump(off_m, uncertain_s)
+        height_jumped_m = state.height_jumped_m
+        if jumped and state.armed and between_s <= _HEIGHT_JUMP_WITHIN_S:
+            height_jumped_m -= off_m[2]
+        self._change(
+            position_local_m=position_m,
+            velocity_local_m_s=velocity_m_s,
+            position_at_s=at_s,
+            position_changed_at_s=at_s if changed else state.position_changed_at_s,
+            jumped_at_s=at_s if jumped else state.jumped_at_s,
+            height_jumped_m=height_jumped_m,
+            origin=self._origin,
+        )
+
+    def _is_held_back(
+        self, position_m: Vector, velocity_m_s: Vector, at_s: float, now_s: float
+    ) -> bool:
+        """Whether the position may belong to another origin than the one that is known."""
+        if self._origin != self._state.origin:
+            self._jump_at_s = None
+        elif self._jump_at_s is not None:
+            answered = self._origin_at_s > self._jump_at_s
+            if answered or now_s - self._jump_at_s > _ORIGIN_ANSWER_S:
+                self._jump_at_s = None
+        else:
+            between_s = max(at_s - self._state.position_at_s, 0.0)
+            off_m = self._off_m(position_m, velocity_m_s, between_s, self._state.origin)
+            if _is_jump(off_m, between_s):
+                self._jump_at_s = now_s
+        return self._jump_at_s is not None
+
+    def _off_m(
+        self,
+        position_m: Vector,
+        velocity_m_s: Vector,
+        between_s: float,
+        origin: GlobalOrigin | None,
+    ) -> Vector:
+        """How far a position from that origin lies from where motion led from the last one."""
+        last_m, last_m_s = self._state.position_local_m, self._state.velocity_local_m_s
+        last_origin = self._state.origin
+        if last_m is None or last_m_s is None:
+            return 0.0, 0.0, 0.0
+        shift_m = (0.0, 0.0, 0.0)
+        if origin is not None and last_origin is not None:
+            shift_m = _shift_m(last_origin, origin)
+        north_m, east_m, down_m = (
+            position_m[i]
+            + shift_m[i]
+            - last_m[i]
+            - (last_m_s[i] + velocity_m_s[i]) / 2.0 * between_s
+            for i in range(3)
+        )
+        return north_m, east_m, down_m
+
+    def _on_statustext(self, fields: Fields, now_s: float) -> None:
+        text = fields["text"].strip()
+        if fields["chunk_seq"] and self._texts:
+            at_s, start = self._texts.pop()
+            self._texts.append((at_s, start + text))
+        elif fields["severity"] <= _WARNING:
+            self._texts.append((now_s, _REFUSAL.sub("", text)))
+
+    def _on_autopilot_version(self, fields: Fields, now_s: float) -> None:
+        self._twin.hardware((fields["uid"], *fields["uid2"]), now_s)
+        version = fields["flight_sw_version"]
+        if version:
+            self._change(version=".".join(str(version >> bits & 0xFF) for bits in (24, 16, 8)))
+
+
+class _VehicleClock:
+    """How long messages were held up, from the vehicle's own clock.
+
+    While a backlog drains, the vehicle's time passes faster than ours. Once messages come at the
+    vehicle's pace again, there is none: what then still differs is the clocks.
+    """
+
+    _RESTART_S = 1.0
+    _AT_PACE = 10
+
+    def __init__(self) -> None:
+        self.delay_s = 0.0
+        self.restarts = 0
+        self._last: tuple[float, float] | None = None
+        self._at_pace = 0
+
+    def hear(self, vehicle_s: float, now_s: float) -> float:
+        """The delay of a message that the vehicle sent at its own time, s."""
+        last_vehicle_s, last_now_s = self._last or (vehicle_s, now_s)
+        self._last = vehicle_s, now_s
+        sent_between_s, between_s = vehicle_s - last_vehicle_s, now_s - last_now_s
+        if sent_between_s < -self._RESTART_S:
+            self.restarts += 1
+            self.delay_s = 0.0
+            return 0.0
+        self.delay_s = max(self.delay_s + between_s - sent_between_s, 0.0)
+        regular = 0.5 * sent_between_s <= between_s <= 2.0 * sent_between_s + 0.1
+        self._at_pace = self._at_pace + 1 if regular else 0
+        if self._at_pace >= self._AT_PACE:
+            self._at_pace = 0
+            self.delay_s = 0.0
+        return self.delay_s
+
+
+class _TwinWatch:
+    """Notices that two vehicles speak with one system id: MAVSDK takes them for one.
+
+    Their clocks differ, so that time seems to go back again and again; and so may their hardware
+    ids, which some boards have all in common.
+    """
+
+    _WITHIN_S = 5.0
+    _BACK_S = 0.03
+    _TIMES = 3
+
+    def __init__(self) -> None:
+        self._last_s = -math.inf
+        self._back_at_s: deque[float] = deque(maxlen=self._TIMES)
+        self._hardware_at_s: dict[tuple[int, ...], float] = {}
+
+    def vehicle_time(self, vehicle_s: float, now_s: float) -> None:
+        if vehicle_s < self._last_s - self._BACK_S:
+            self._back_at_s.append(now_s)
+        self._last_s = vehicle_s
+
+    def hardware(self, uid: tuple[int, ...], now_s: float) -> None:
+        self._hardware_at_s[uid] = now_s
+
+    def seen(self, now_s: float) -> bool:
+        since_s = now_s - self._WITHIN_S
+        back = len(self._back_at_s) == self._TIMES and self._back_at_s[0] > since_s
+        return back or sum(at_s > since_s for at_s in self._hardware_at_s.values()) > 1
+
+
+def _vector(fields: Fields, *names: str) -> Vector:
+    """Raises TypeError if one is not finite: then it has no value in the message."""
+    x, y, z = (float(fields[name]) for name in names)
+    return x, y, z
+
+
+def _is_jump(off_m: Vector, between_s: float) -> bool:
+    return math.hypot(*off_m) > _JUMP_M + _JUMP_M_S * between_s
+
+
+def _shift_m(start: GlobalOrigin, end: GlobalOrigin) -> Vector:
+    """North, east and down, m, from one place to another that is near."""
+    east_deg = math.remainder(end.longitude_deg - start.longitude_deg, 360.0)
+    return (
+        (end.latitude_deg - start.latitude_deg) * _M_PER_DEG,
+        east_deg * _M_PER_DEG * math.cos(math.radians(start.latitude_deg)),
+        start.altitude_m - end.altitude_m,
+    )

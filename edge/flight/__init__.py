@@ -1,0 +1,1 @@
+"""Pure: the flight state machine, guidance, limits and preflight checks."""

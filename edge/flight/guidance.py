@@ -1,0 +1,158 @@
+"""Where to fly in each flight state: one control tick's setpoint in the mission frame.
+
+Heights are above the robot's own takeoff point. HOLD, TAKEOFF and RETURN are flown as positions a
+short way ahead of the estimate, which PX4 stops at much sooner than at a velocity of 0, and which
+never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity. Neighbours and
+the fence limit RETURN and MISSION. While the position is in doubt, all of them stand still.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.position import PositionQuality
+from edge.core.vehicle import Vector
+from edge.flight.flight import FlightInputs, FlightMemory, Robot, height_m, is_silent
+from edge.flight.safety import (
+    MotionLimits,
+    approach_speed,
+    brake,
+    clear_height_m,
+    hold_height,
+    keep_inside,
+    leash,
+    limit_acceleration,
+)
+from edge.messages.mission import STEERED, FlightState
+
+# PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P).
+_HOLD_LEASH_M = 0.5
+_AHEAD_S = 1.0
+# RETURN flies nowhere before it is this near its own height.
+_AT_OWN_HEIGHT_M = 1.0
+
+
+class MissionVelocity(NamedTuple):
+    """Fly with this velocity: the mission frame, m/s."""
+
+    velocity_m_s: Vector
+
+
+class MissionPosition(NamedTuple):
+    """Fly to x and y of the mission frame, at this height, m."""
+
+    position_m: Vector
+
+
+MissionSetpoint = MissionVelocity | MissionPosition
+
+_STOP = MissionVelocity((0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guidance:
+    """What guidance remembers: the last commanded velocity (3,), and a recovery to the fence."""
+
+    velocity_m_s: F64 = field(default_factory=lambda: np.zeros(3))
+    recovering: bool = False
+
+
+def guide(
+    robot: Robot,
+    flight: FlightMemory,
+    inputs: FlightInputs,
+    guidance: Guidance,
+    dt_s: float,
+) -> tuple[MissionSetpoint | None, Guidance]:
+    """The setpoint of this tick, None when nothing is to be sent, and the memory for the next.
+
+    `flight` is what `flight.step` made of the same inputs; `dt_s` is the time since the last tick.
+    """
+    state, limits = flight.state, robot.limits
+    if state not in (FlightState.ARMING, *STEERED) or is_silent(flight, inputs.now_s):
+        return None, Guidance()
+    height = height_m(flight, inputs.odometry)
+    if state is FlightState.ARMING or inputs.odometry is None or height is None:
+        return _STOP, Guidance()
+    position_m = np.array([*inputs.odometry.position_m[:2], height])
+    if not np.isfinite(position_m).all():
+        return _STOP, Guidance()
+    if inputs.position.quality is not PositionQuality.GOOD:
+        return _stay(robot, flight, height), Guidance()
+    if state in (FlightState.TAKEOFF, FlightState.HOLD):
+        highest_m = math.inf
+        if state is FlightState.TAKEOFF:
+            separation_m = robot.parameters.min_separation_m
+            clear_m = clear_height_m(position_m, inputs.neighbours, separation_m)
+            highest_m = max(height, clear_m)
+        return _towards(flight.target_m, highest_m, position_m, limits), Guidance()
+    wanted_m_s = np.zeros(3)
+    if state is FlightState.RETURN:
+        wanted_m_s[:2] = _homewards(robot, position_m)
+    elif inputs.policy_velocity_m_s is not None:
+        wanted_m_s[:2] = inputs.policy_velocity_m_s
+    wanted_m_s = limit_acceleration(
+        guidance.velocity_m_s, wanted_m_s, limits.max_acceleration_m_s2, dt_s
+    )
+    wanted_m_s[2] = hold_height(height, robot.parameters.slot_height_m, limits.max_climb_m_s)
+    velocity_m_s = np.array(inputs.odometry.velocity_m_s)
+    inside_m_s, recovering = keep_inside(
+        robot.fence, position_m, velocity_m_s, wanted_m_s, limits, guidance.recovering
+    )
+    safe_m_s = brake(
+        position_m,
+        velocity_m_s,
+        inside_m_s,
+        inputs.neighbours,
+        robot.parameters.min_separation_m,
+        limits,
+        robot.fence,
+    )
+    remembered = Guidance(np.array([*safe_m_s[:2], 0.0]), recovering)
+    if state is FlightState.RETURN:
+        return MissionPosition(_vector(position_m + safe_m_s * _AHEAD_S)), remembered
+    return MissionVelocity(_vector(safe_m_s)), remembered
+
+
+def _stay(robot: Robot, flight: FlightMemory, height_m: float) -> MissionVelocity:
+    """Stand still at one height, by the estimate of motion alone."""
+    wanted_m = robot.parameters.slot_height_m
+    if flight.state is FlightState.TAKEOFF:
+        wanted_m = height_m
+    elif flight.target_m is not None:
+        wanted_m = flight.target_m[2]
+    climb_m_s = hold_height(height_m, wanted_m, robot.limits.max_climb_m_s)
+    return MissionVelocity((0.0, 0.0, climb_m_s))
+
+
+def _towards(
+    target_m: Vector | None, highest_m: float, position_m: F64, limits: MotionLimits
+) -> MissionSetpoint:
+    """A position on the way to the target: near in the plane, and a second's climb away."""
+    if target_m is None:
+        return _STOP
+    place_m = leash(np.array(target_m[:2]), position_m[:2], _HOLD_LEASH_M)
+    if place_m is None:
+        return _STOP
+    height = float(position_m[2])
+    wanted_m = min(target_m[2], highest_m)
+    climb_m = hold_height(height, wanted_m, limits.max_climb_m_s) * _AHEAD_S
+    return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
+
+
+def _homewards(robot: Robot, position_m: F64) -> F64:
+    """(2,): towards the landing point, once at the robot's own height."""
+    if abs(position_m[2] - robot.parameters.slot_height_m) >= _AT_OWN_HEIGHT_M:
+        return np.zeros(2)
+    offset_m = np.array(robot.parameters.landing_point_m) - position_m[:2]
+    distance_m = float(np.hypot(*offset_m))
+    speed_m_s = min(approach_speed(distance_m, robot.limits), robot.limits.max_speed_m_s)
+    return offset_m * (speed_m_s / max(distance_m, 1e-9))
+
+
+def _vector(values: F64) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

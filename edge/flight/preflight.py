@@ -1,0 +1,310 @@
+"""The checks before a takeoff: everything that speaks against it, and what to do about it."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from edge.core.fence import Fence
+from edge.core.position import PositionJudgement, PositionQuality
+from edge.core.px4_version import OLDEST, is_too_old
+from edge.core.vehicle import Gps, VehicleState
+from edge.flight.failsafe import RemoteControl
+from edge.flight.margins import ErrorBudget, places_apart
+from edge.messages.mission import Origin, RobotStatus
+
+# 2026-01-01 UTC. A computer that lost its clock with its battery starts years before.
+_EARLIEST_UNIX_S = 1_767_225_600.0
+_FIX_3D = 3
+
+
+@dataclass(frozen=True, slots=True)
+class PreflightLimits:
+    """How good is good enough; `min_battery` is a share, 0 to 1.
+
+    Raises ValueError if a number is not finite or out of its range.
+    """
+
+    min_battery: float = 0.5
+    min_satellites: int = 8
+    max_hdop: float = 2.0
+    max_position_age_s: float = 0.5
+    max_ground_age_s: float = 3.0
+    max_clock_difference_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.min_battery <= 1.0:
+            raise ValueError(f"min_battery = {self.min_battery}: must be above 0 and at most 1")
+        if self.min_satellites < 4:
+            raise ValueError(f"min_satellites = {self.min_satellites}: must be at least 4")
+        for name in (
+            "max_hdop",
+            "max_position_age_s",
+            "max_ground_age_s",
+            "max_clock_difference_s",
+        ):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: must be finite and above 0")
+
+
+class HeardStatus(NamedTuple):
+    """Another robot's status, and when it came: this robot's monotonic and wall clock, s."""
+
+    status: RobotStatus
+    heard_at_s: float
+    heard_at_unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PreflightInputs:
+    """What the checks look at.
+
+    `bundle_problem` is why the bundle was not verified on this CPU, None if it was.
+    `system_id` is the configured one. `position` is what the position is worth; `position_m` (3,)
+    and `landing_point_m` (2,) are in the mission frame; the slot's height is above the takeoff
+    point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
+    `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
+    robots that were heard lately, `not_understood` those who said what cannot be read.
+    `ground_age_s` is how long ago the ground was heard, None if never; `ground_clock_offset_s` is
+    its wall clock minus this one, None if it is not known.
+    """
+
+    now_s: float
+    unix_now_s: float
+    robot_id: int
+    duplicate_id: bool
+    bundle_problem: str | None
+    bundle_id: str
+    world_id: str
+    system_id: int
+    vehicle: VehicleState
+    failsafe_problems: Sequence[str] | None
+    fence: Fence
+    fence_uploaded: bool
+    origin: Origin | None
+    position: PositionJudgement
+    position_m: Sequence[float] | None
+    slot_height_m: float
+    landing_point_m: Sequence[float]
+    min_separation_m: float
+    errors: ErrorBudget
+    neighbours: Sequence[HeardStatus]
+    not_understood: Sequence[str]
+    rc: RemoteControl
+    ground_age_s: float | None
+    ground_clock_offset_s: float | None
+
+
+def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[str, ...]:
+    """Every check that fails, one plain line each with what to do; empty means ready."""
+    return (
+        *_program(inputs, limits),
+        *_vehicle(inputs, limits),
+        *_place(inputs),
+        *_fleet(inputs, limits),
+    )
+
+
+def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
+    if inputs.bundle_problem is not None:
+        yield f"bundle is not verified ({inputs.bundle_problem}): deploy it again"
+    if not inputs.unix_now_s >= _EARLIEST_UNIX_S:
+        yield "clock is before 2026: set the time of this robot"
+    age_s = inputs.ground_age_s
+    if age_s is None:
+        yield "ground was not heard: start `lpac ground`, check the radio and the fleet's name"
+    elif not age_s <= limits.max_ground_age_s:
+        yield f"ground was last heard {age_s:.1f} s ago: check the radio"
+    offset_s = inputs.ground_clock_offset_s
+    if offset_s is not None and not abs(offset_s) <= limits.max_clock_difference_s:
+        yield f"clock differs from the ground's by {offset_s:.1f} s: set the time of this robot"
+
+
+def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
+    vehicle = inputs.vehicle
+    if not vehicle.connected:
+        # Whatever was heard before says nothing about now.
+        others = ", ".join(map(str, vehicle.other_system_ids))
+        yield (
+            f"autopilot with system id {inputs.system_id} is not connected, but system id {others} "
+            "is: set MAV_SYS_ID or the config"
+            if others
+            else "autopilot is not connected: check its power and the connection's address"
+        )
+        return
+    if vehicle.system_id != inputs.system_id:
+        yield (
+            f"autopilot has system id {_or_unknown(vehicle.system_id)}, configured is "
+            f"{inputs.system_id}: check which vehicle this is, set MAV_SYS_ID or the config"
+        )
+    if is_too_old(vehicle.version):
+        oldest = ".".join(map(str, OLDEST))
+        yield f"autopilot has PX4 {vehicle.version}, must have {oldest} or newer: update it"
+    if vehicle.other_system_ids:
+        others = ", ".join(map(str, vehicle.other_system_ids))
+        yield f"other vehicles are on this link (system id {others}): give each its own port"
+    if inputs.rc == "pilot" and not vehicle.remote_control:
+        yield "remote control is not heard, and the config has a pilot: switch it on"
+    if vehicle.armed is not False:
+        state = "armed" if vehicle.armed else "not known to be disarmed"
+        yield f"vehicle is {state}: disarm it"
+    yield from _estimate(vehicle, inputs, limits)
+    yield from _gps(vehicle.gps, limits)
+    if vehicle.battery is None:
+        yield "battery is not known: check the power module"
+    elif not vehicle.battery >= limits.min_battery:
+        yield (
+            f"battery has {100.0 * vehicle.battery:.0f} %, must have "
+            f"{100.0 * limits.min_battery:.0f} %: charge or change it"
+        )
+    if not vehicle.armable:
+        reasons = "; ".join(problem.text for problem in vehicle.problems) or "it does not say why"
+        yield f"autopilot would not arm ({reasons}): mend what it names"
+    if inputs.failsafe_problems is None:
+        yield "autopilot's failsafe parameters were not read: wait, or check the link"
+    else:
+        yield from (f"autopilot's {problem}" for problem in inputs.failsafe_problems)
+    if not inputs.fence_uploaded:
+        yield "autopilot does not have the fence: wait for the upload, or check the link"
+
+
+def _estimate(
+    vehicle: VehicleState, inputs: PreflightInputs, limits: PreflightLimits
+) -> Iterator[str]:
+    age_s = inputs.now_s - vehicle.position_at_s
+    if vehicle.position_local_m is None:
+        yield "position is not known: wait for the autopilot's estimate"
+    elif not age_s <= limits.max_position_age_s:
+        yield f"position is {age_s:.1f} s old: check the link to the autopilot"
+    elif inputs.position.quality is not PositionQuality.GOOD:
+        yield (
+            f"position is {inputs.position.quality} ({inputs.position.text}): wait, or move to "
+            "open sky"
+        )
+    if vehicle.origin is None:
+        yield "estimator's origin is not known: wait for a GPS fix"
+    if vehicle.heading_rad is None:
+        yield "heading is not known: check the compass"
+
+
+def _gps(gps: Gps | None, limits: PreflightLimits) -> Iterator[str]:
+    if gps is None:
+        yield "GPS is not heard: check the receiver"
+        return
+    if gps.fix < _FIX_3D:
+        yield "GPS has no 3-D fix: wait, or move to open sky"
+    if gps.satellites < limits.min_satellites:
+        yield (
+            f"GPS sees {gps.satellites} satellites, must see {limits.min_satellites}: "
+            "wait, or move to open sky"
+        )
+    if not gps.hdop <= limits.max_hdop:
+        yield (
+            f"GPS precision (HDOP) is {gps.hdop:.1f}, must be at most {limits.max_hdop:g}: "
+            "wait, or move to open sky"
+        )
+
+
+def _place(inputs: PreflightInputs) -> Iterator[str]:
+    fence = inputs.fence
+    if inputs.origin is None:
+        yield "mission origin is not set: set it on the ground"
+    if inputs.position_m is None:
+        yield "place in the fence is not known: it needs the position and the mission origin"
+    else:
+        x_m, y_m, _ = inputs.position_m
+        depth_m = fence.distance_m(x_m, y_m)
+        if not depth_m >= fence.buffer_m:
+            yield (
+                f"robot stands {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
+                "carry it there, or check the mission origin"
+            )
+    depth_m = fence.distance_m(*inputs.landing_point_m)
+    if not depth_m >= fence.buffer_m:
+        yield (
+            f"landing point lies {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
+            "change it in the config, or on the ground"
+        )
+    if not fence.floor_m <= inputs.slot_height_m <= fence.ceiling_m:
+        yield (
+            f"slot height is {inputs.slot_height_m:g} m, must be from the floor at "
+            f"{fence.floor_m:g} m to the ceiling at {fence.ceiling_m:g} m: "
+            "change it in the config, or on the ground"
+        )
+
+
+def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
+    others = [heard for heard in inputs.neighbours if heard.status.robot_id != inputs.robot_id]
+    if inputs.duplicate_id or len(others) < len(inputs.neighbours):
+        yield f"another program says that it is robot {inputs.robot_id}: stop it, or change its id"
+    for robot in inputs.not_understood:
+        yield f"{robot} runs another version of this program: deploy one to all"
+    for status, _, heard_at_unix_s in others:
+        other = f"robot {status.robot_id}"
+        if status.system_id is not None and status.system_id == inputs.system_id:
+            yield f"{other}'s vehicle has the same system id {status.system_id}: set MAV_SYS_ID"
+        if status.bundle_id != inputs.bundle_id:
+            yield f"{other} has another bundle: deploy one to all"
+        if status.world_id != inputs.world_id:
+            yield f"{other} has another world: set one on the ground, or deploy it to all"
+        if inputs.origin is not None and status.origin != inputs.origin:
+            yield f"{other} has another mission origin: set it again on the ground"
+        yield from _apart(inputs, status, other)
+        offset_s = status.unix_time_s - heard_at_unix_s
+        if not abs(offset_s) <= limits.max_clock_difference_s:
+            yield f"{other}'s clock differs by {offset_s:.1f} s: set the time of both"
+    if not inputs.vehicle.armed:
+        yield from _too_late(inputs.errors, [heard.status for heard in others])
+
+
+def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[str]:
+    """Whether somebody took off so long ago that heights above the pad mean another height now."""
+    armed = [status for status in others if status.armed]
+    known = [(s.robot_id, math.inf if s.flown_s is None else s.flown_s) for s in armed]
+    robot_id, flown_s = max(known, key=lambda each: each[1], default=(-1, -math.inf))
+    window_s = errors.takeoffs_window_s
+    if flown_s > window_s:
+        since = (
+            f"for more than {window_s:.3g} s"
+            if math.isfinite(flown_s)
+            else "since before its program started"
+        )
+        # In words that stay the same for as long as it lasts.
+        yield (
+            f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "
+            "until all are down, or raise takeoffs_height_m of [errors]"
+        )
+
+
+def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator[str]:
+    """Whether two robots stay apart in truth, above each other and where they land."""
+    errors, gps = inputs.errors, inputs.vehicle.gps
+    limit_m = inputs.min_separation_m
+    heights = errors.slot_spacing.or_at_least(limit_m, "min_separation_m")
+    apart_m = abs(status.slot_height_m - inputs.slot_height_m)
+    if not heights.holds(apart_m):
+        yield (
+            f"{other} flies {apart_m:.1f} m above or below, {heights}: "
+            "change the slots in the config, or on the ground"
+        )
+    places = places_apart(
+        errors.reported_position_m(None if gps is None else gps.accuracy_m),
+        errors.reported_position_m(status.gps_accuracy_m),
+    ).or_at_least(limit_m, "min_separation_m")
+    apart_m = math.dist(status.landing_point_m, inputs.landing_point_m)
+    if not places.holds(apart_m):
+        planned = places_apart(errors.position_m, errors.position_m)
+        why = "too near for the GPS accuracy that is reported; " if planned.holds(apart_m) else ""
+        yield (
+            f"{other} lands {apart_m:.1f} m away, {places}: "
+            f"{why}change the landing points in the config, or on the ground"
+        )
+
+
+def _where(depth_m: float) -> str:
+    return f"{depth_m:.1f} m inside the fence" if depth_m >= 0.0 else f"{-depth_m:.1f} m outside it"
+
+
+def _or_unknown(value: int | None) -> str:
+    return "not known" if value is None else str(value)

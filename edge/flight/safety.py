@@ -1,0 +1,299 @@
+"""Limits on what the vehicle is told to do.
+
+Mission frame: x right, y forward, z up, m, heights above the robot's own takeoff point. Positions
+and velocities are (3,) float64 unless said otherwise.
+
+What is commanded passes `limit_speed` and `limit_acceleration` first, then `keep_inside`, and
+`brake` last, which keeps to the fence too: nothing may soften a stop.
+
+Nothing here raises in flight. A number that is not finite, or beyond 1000 km, is no measurement:
+where one comes in, a velocity goes out as 0, and a point as None.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
+
+_ABSURD = 1e6
+# A slack is used up no faster than in this time: five control periods, which leaves room for the
+# age of the estimate.
+_SLACK_TIME_S = 0.5
+_RECOVERY_SHARE = 0.5
+_ROUNDING_M_S = 1e-9
+_HEIGHT_GAIN_PER_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class MotionLimits:
+    """How fast the robot may move, and how its vehicle answers.
+
+    `max_acceleration_m_s2` is at most 0.7 of what the vehicle reaches: it may have to brake and to
+    turn at once. `lag_s` is the measured time constant of its answer to a velocity setpoint: PX4 in
+    offboard mode takes 1.3 s.
+
+    Raises ValueError if one is not finite and above 0 (the lag: at least 0).
+    """
+
+    max_speed_m_s: float
+    max_climb_m_s: float
+    max_acceleration_m_s2: float
+    lag_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("max_speed_m_s", "max_climb_m_s", "max_acceleration_m_s2"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: must be finite and above 0")
+        if not 0.0 <= self.lag_s < math.inf:
+            raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
+
+
+class Closest(NamedTuple):
+    """The nearest other robot, and its 3-D distance, m."""
+
+    robot_id: int
+    distance_m: float
+
+
+def nearest(position_m: Sequence[float], neighbours: Iterable[Neighbour]) -> Closest | None:
+    """Who is nearest by 3-D distance, each taken to have flown on as it did; None if nobody is.
+
+    Neighbours of which something is not known are left out.
+    """
+    distances = [
+        Closest(neighbour.robot_id, math.dist(_extrapolated(neighbour), position_m))
+        for neighbour in neighbours
+        if _is_known(neighbour)
+    ]
+    return min(distances, key=lambda closest: closest.distance_m, default=None)
+
+
+def clear_height_m(
+    position_m: F64, neighbours: Iterable[Neighbour], min_separation_m: float
+) -> float:
+    """How high a robot may climb from here, m: `min_separation_m` below whoever is above it.
+
+    Infinite if nobody is. Who is less than twice that distance away in the plane counts as above.
+    """
+    heights_m = [math.inf]
+    for neighbour in filter(_is_known, neighbours):
+        x_m, y_m, height_m = _extrapolated(neighbour)
+        apart_m = math.hypot(x_m - position_m[0], y_m - position_m[1])
+        if apart_m < 2.0 * min_separation_m and height_m > position_m[2]:
+            heights_m.append(height_m - min_separation_m)
+    return min(heights_m)
+
+
+def limit_speed(velocity: F64, max_speed: float) -> F64:
+    """`velocity` (2,), shortened to `max_speed` if it is longer; the direction stays.
+
+    A velocity that is not finite becomes 0.
+    """
+    speed = float(np.hypot(*velocity))
+    if not np.isfinite(speed):
+        return np.zeros(2)
+    return velocity if speed <= max_speed else velocity * (max_speed / speed)
+
+
+def limit_acceleration(
+    previous_m_s: F64, wanted_m_s: F64, max_acceleration_m_s2: float, dt_s: float
+) -> F64:
+    """`wanted_m_s`, or as far on the way to it from `previous_m_s` as `dt_s` allows."""
+    if not _plausible(previous_m_s, wanted_m_s, (dt_s,)):
+        return np.zeros(3)
+    change = wanted_m_s - previous_m_s
+    largest = max_acceleration_m_s2 * max(dt_s, 0.0)
+    size = math.hypot(*change)
+    return wanted_m_s if size <= largest else previous_m_s + change * (largest / size)
+
+
+def hold_height(height_m: float, wanted_height_m: float, max_climb_m_s: float) -> float:
+    """The climb rate, m/s, up positive, towards a height: K_p (wanted - height), K_p = 1 / s."""
+    if not _plausible((height_m, wanted_height_m)):
+        return 0.0
+    climb_m_s = _HEIGHT_GAIN_PER_S * (wanted_height_m - height_m)
+    return min(max(climb_m_s, -max_climb_m_s), max_climb_m_s)
+
+
+def leash(target_m: F64, position_m: F64, length_m: float) -> F64 | None:
+    """`target_m`, or the point towards it that is `length_m` away from the position.
+
+    So a position setpoint does not make the vehicle dash when its estimate jumps. None if there is
+    no telling where that is: then command no velocity instead.
+    """
+    if not _plausible(target_m, position_m):
+        return None
+    offset_m = target_m - position_m
+    distance_m = math.hypot(*offset_m)
+    return target_m if distance_m <= length_m else position_m + offset_m * (length_m / distance_m)
+
+
+def stopping_m(speed_m_s: float, limits: MotionLimits) -> float:
+    """The way that it takes to stop from a speed of 0 or more, m: v lag + v^2 / 2a."""
+    return speed_m_s * (limits.lag_s + speed_m_s / (2.0 * limits.max_acceleration_m_s2))
+
+
+def approach_speed(distance_m: float, limits: MotionLimits) -> float:
+    """The largest speed that `distance_m` is enough to stop from; 0 if none."""
+    if not 0.0 < distance_m < _ABSURD:
+        return 0.0
+    lag_s, acceleration = limits.lag_s, limits.max_acceleration_m_s2
+    return 2.0 * distance_m / (lag_s + math.sqrt(lag_s * lag_s + 2.0 * distance_m / acceleration))
+
+
+def keep_inside(
+    fence: Fence,
+    position_m: F64,
+    velocity_m_s: F64,
+    wanted_m_s: F64,
+    limits: MotionLimits,
+    recovering: bool,
+) -> tuple[F64, bool]:
+    """What may be flown of `wanted_m_s`, so that the vehicle stops at the buffer inside the line.
+
+    `velocity_m_s` is the vehicle's own, as estimated: for its lag it moves on, whatever is told.
+    Towards each edge the velocity is shortened, along it not. A vehicle that was carried outside is
+    brought back, at half the greatest speed, until it is half the buffer inside: pass the second
+    result in again as `recovering`. Heights stop at the floor and at the ceiling themselves, and
+    come back to them. Not for takeoff and landing, which pass through the floor.
+    """
+    if not _plausible(position_m, velocity_m_s, wanted_m_s):
+        return np.zeros(3), recovering
+    edges = fence.edges()
+    distances_m = edges.distances_m(position_m[:2])
+    depth_m = float(distances_m.min())
+    recovering = depth_m < 0.0 or (recovering and depth_m < fence.buffer_m / 2.0)
+    if recovering:
+        # Downhill on the sum of the squared shortfalls, which is convex: it ends inside, in
+        # corners too.
+        inward = np.maximum(fence.buffer_m - distances_m, 0.0) @ edges.inward
+        speed_m_s = _RECOVERY_SHARE * limits.max_speed_m_s
+        horizontal = inward * (speed_m_s / max(math.hypot(*inward), 1e-9))
+    else:
+        caps = _caps_at_edges(fence, position_m, velocity_m_s, limits)
+        horizontal = _limit_towards(wanted_m_s[:2], -edges.inward, caps)
+    climb_m_s = _keep_height(fence, position_m[2], velocity_m_s[2], wanted_m_s[2], limits)
+    return np.array([*horizontal, climb_m_s]), recovering
+
+
+def brake(
+    position_m: F64,
+    velocity_m_s: F64,
+    wanted_m_s: F64,
+    neighbours: Sequence[Neighbour],
+    min_separation_m: float,
+    limits: MotionLimits,
+    fence: Fence | None,
+) -> F64:
+    """What may be flown of `wanted_m_s`, so that the robot stays `min_separation_m` from others.
+
+    `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
+    did. One that is `min_separation_m` or more above or below brakes nothing, since robots cross in
+    their height slots. Towards another one the robot may close half the slack: that one does the
+    same. Away from it, it may always fly. Climbing is not limited. Giving way to a neighbour leads
+    over no edge of `fence`; None where there is none to keep to.
+
+    A neighbour of which something is not known stops the robot.
+    """
+    if not _plausible(position_m, velocity_m_s, wanted_m_s):
+        return np.zeros(3)
+    if not all(map(_is_known, neighbours)):
+        return np.zeros(3)
+    directions: list[F64] = []
+    caps: list[float] = []
+    for neighbour in neighbours:
+        offset_m = np.array(_extrapolated(neighbour)) - position_m
+        up_m = float(offset_m[2])
+        if abs(up_m) >= min_separation_m:
+            continue
+        apart_m = math.hypot(offset_m[0], offset_m[1])
+        if apart_m == 0.0:
+            return np.zeros(3)  # Every way may be the wrong one.
+        direction = offset_m[:2] / apart_m
+        # Squares of far smaller numbers than a separation may vanish: never below 0.
+        needed_m = math.sqrt(max(min_separation_m * min_separation_m - up_m * up_m, 0.0))
+        speed = float(direction @ velocity_m_s[:2])
+        directions.append(direction)
+        caps.append(_speed_towards((apart_m - needed_m) / 2.0, speed, limits))
+    towards = zip(directions, caps, strict=True)
+    if all(float(direction @ wanted_m_s[:2]) <= cap for direction, cap in towards):
+        return wanted_m_s
+    if fence is not None:
+        directions += list(-fence.edges().inward)
+        caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
+    horizontal = _limit_towards(wanted_m_s[:2], directions, caps)
+    return np.array([*horizontal, wanted_m_s[2]])
+
+
+def _extrapolated(neighbour: Neighbour) -> list[float]:
+    """Where it is now, (3,), if it has flown on as it did."""
+    return [
+        place_m + speed_m_s * neighbour.age_s
+        for place_m, speed_m_s in zip(neighbour.position_m, neighbour.velocity_m_s, strict=True)
+    ]
+
+
+def _is_known(neighbour: Neighbour) -> bool:
+    return _plausible(neighbour.position_m, neighbour.velocity_m_s, (neighbour.age_s,))
+
+
+def _caps_at_edges(
+    fence: Fence, position_m: F64, velocity_m_s: F64, limits: MotionLimits
+) -> list[float]:
+    """How fast to be told to fly outwards at each edge."""
+    edges = fence.edges()
+    slacks_m = edges.distances_m(position_m[:2]) - fence.buffer_m
+    outward_m_s = -(edges.inward @ velocity_m_s[:2])
+    return [
+        _speed_towards(slack_m, speed_m_s, limits)
+        for slack_m, speed_m_s in zip(slacks_m.tolist(), outward_m_s.tolist(), strict=True)
+    ]
+
+
+def _speed_towards(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
+    """How fast to be told to fly towards a line `slack_m` away, already doing `speed_m_s`.
+
+    `approach_speed` alone is overshot by a third of the way: the vehicle follows a falling command
+    late. What the slack leaves after the way that it needs to stop falls by itself no faster than
+    by what is commanded, and never below 0 if that is a small part of it.
+    """
+    left_m = slack_m - stopping_m(max(speed_m_s, 0.0), limits)
+    return min(approach_speed(slack_m, limits), max(left_m, 0.0) / _SLACK_TIME_S)
+
+
+def _limit_towards(velocity: F64, directions: Iterable[F64], caps: Sequence[float]) -> F64:
+    """`velocity` (2,) with at most `caps`, 0 or more, along each of `directions` (2,)."""
+    limited = velocity
+    pairs = list(zip(directions, caps, strict=True))
+    for direction, cap in pairs:
+        limited = limited - direction * max(float(direction @ limited) - cap, 0.0)
+    # Where directions oppose each other, mending one breaks another: the whole vector gives way.
+    share = 1.0
+    for direction, cap in pairs:
+        speed = float(direction @ limited)
+        if speed > cap + _ROUNDING_M_S:
+            share = min(share, cap / speed)
+    return limited * share
+
+
+def _keep_height(
+    fence: Fence, height_m: float, climb_m_s: float, wanted_m_s: float, limits: MotionLimits
+) -> float:
+    highest, lowest = (
+        hold_height(height_m, limit_m, limits.max_climb_m_s)
+        if (limit_m - height_m) * sign < 0.0
+        else sign * _speed_towards((limit_m - height_m) * sign, climb_m_s * sign, limits)
+        for limit_m, sign in ((fence.ceiling_m, 1.0), (fence.floor_m, -1.0))
+    )
+    return max(min(wanted_m_s, highest), lowest)
+
+
+def _plausible(*vectors: Iterable[float]) -> bool:
+    return all(abs(number) < _ABSURD for vector in vectors for number in vector)

@@ -1,0 +1,1 @@
+"""What robots and ground say to each other."""

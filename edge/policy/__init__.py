@@ -1,0 +1,1 @@
+"""A learned policy on disk: the bundle, its verification and its replay."""

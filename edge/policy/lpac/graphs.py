@@ -1,0 +1,108 @@
+"""The learned policy as ONNX graphs: the only user of onnxruntime."""
+
+import os
+
+import numpy as np
+
+from edge.core import F32
+from edge.core.aggregation import HopBuffer
+from edge.policy.bundle import ACTION, CNN, Bundle, BundleError, Manifest, gnn_graph
+
+# onnxruntime writes a telemetry database into the home directory unless told so before its import.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+import onnxruntime as ort
+
+
+class Policy:
+    """Runs a bundle's graphs. Has no state of its own: several threads may call it at once."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        """Load the graphs of `bundle`; raises BundleError for a graph that does not fit it."""
+        self.manifest: Manifest = bundle.manifest
+        self.bundle_id = bytes.fromhex(bundle.id)
+        geometry, images = bundle.manifest.geometry, bundle.manifest.images
+        sizes, hops = geometry.feature_sizes, geometry.hops
+        self._cnn = None
+        if images:
+            shape = (len(images.channels), images.size, images.size)
+            self._cnn = _Graph(bundle, CNN, "images", shape, "features", (images.features,))
+        self._layers = tuple(
+            _Graph(
+                bundle, gnn_graph(layer), "hops", (hops + 1, sizes[layer - 1]),
+                "features", (sizes[layer],),
+            )
+            for layer in range(1, geometry.layers + 1)
+        )  # fmt: skip
+        self._action = _Graph(bundle, ACTION, "features", (sizes[-1],), "velocity", (2,))
+
+    def run(self, graph: str, batch: F32) -> F32:
+        """The output of the graph of that file name for a batch of inputs."""
+        by_name = {g.name: g for g in (self._cnn, *self._layers, self._action) if g}
+        return by_name[graph].run(batch)
+
+    def image_features(self, images: F32) -> F32:
+        """The CNN's features (32,) of one robot's images (1, channels, size, size).
+
+        Raises BundleError if the bundle was exported without perception.
+        """
+        if self._cnn is None:
+            raise BundleError(f"bundle {self.manifest.name!r} has no perception (no {CNN})")
+        features: F32 = self._cnn.run(images)[0]
+        return features
+
+    def velocity(self, features: F32, hops: HopBuffer) -> F32:
+        """The action (2,), in model units/s, of a robot with input x_i = `features` (F_0,).
+
+        `hops` holds y_kl for k = 1..K; this fills in its y_0l, layer by layer (paper, section
+        "Decentralized Graph Neural Networks": z_l = sum over k of y_kl H_lk, x_l = ReLU(z_l)).
+        """
+        for graph, layer in zip(self._layers, hops.layers, strict=True):
+            layer[0, 0] = features
+            features = graph.run(layer)[0]
+        velocity: F32 = self._action.run(features[None])[0]
+        return velocity
+
+
+class _Graph:
+    def __init__(
+        self,
+        bundle: Bundle,
+        name: str,
+        input_name: str,
+        input_shape: tuple[int, ...],
+        output_name: str,
+        output_shape: tuple[int, ...],
+    ) -> None:
+        self.name = name
+        options = ort.SessionOptions()
+        # One robot shares its board with the autopilot: no thread pool, nothing that spins.
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        try:
+            self._session = ort.InferenceSession(
+                bundle.files[name], options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime's errors have no common base below Exception
+            raise BundleError(
+                f"{name}: is not a graph that onnxruntime can load: {error}"
+            ) from None
+        found = {
+            kind: {value.name: tuple(value.shape[1:]) for value in values}
+            for kind, values in (
+                ("input", self._session.get_inputs()),
+                ("output", self._session.get_outputs()),
+            )
+        }
+        expected = {"input": {input_name: input_shape}, "output": {output_name: output_shape}}
+        for kind, shapes in expected.items():
+            if found[kind] != shapes:
+                raise BundleError(
+                    f"{name}: its {kind} is {found[kind]}; the manifest's geometry needs {shapes}"
+                )
+        self._input, self._outputs = input_name, [output_name]
+
+    def run(self, batch: F32) -> F32:
+        output: F32 = self._session.run(self._outputs, {self._input: np.ascontiguousarray(batch)})[
+            0
+        ]
+        return output

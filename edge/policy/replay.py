@@ -1,0 +1,129 @@
+"""Does the policy compute what it computed in flight? From a flight log's messages alone."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core.aggregation import AggregatedMessage, HopBuffer
+from edge.core.wire import Rejection, decode, encode
+from edge.policy.bundle import BundleError
+from edge.policy.lpac.graphs import Policy
+
+_Array = npt.NDArray[Any]
+
+# Whoever sent it, in whatever mission frame: a robot's own message is read like any other.
+_NOBODY = -1
+
+
+class ReplayError(ValueError):
+    """The messages are not those of a flight with this policy; the text says which and why."""
+
+
+@dataclass(slots=True)
+class Comparison:
+    """One output of the policy over all ticks: what was logged, and what is computed now.
+
+    `largest_difference` is absolute; NaN if one of the two is not a number where they differ.
+    """
+
+    name: str
+    ticks: int = 0
+    differing: int = 0
+    largest_difference: float = 0.0
+
+    def add(self, logged: _Array, computed: _Array) -> None:
+        """Compare one tick's arrays, which have one shape."""
+        self.ticks += 1
+        if np.array_equal(logged, computed, equal_nan=True):
+            return
+        self.differing += 1
+        with np.errstate(invalid="ignore"):
+            difference = np.abs(logged.astype(np.float64) - computed.astype(np.float64)).max()
+        self.largest_difference = float(np.maximum(self.largest_difference, difference))
+
+
+def replay(
+    policy: Policy, messages: Iterable[tuple[str, float, Mapping[str, Any]]]
+) -> tuple[Comparison, Comparison, Comparison]:
+    """Run every tick again from its logged inputs; compares features, velocity and message.
+
+    `messages` are (topic, Unix time in s, message), of which `perception` (the fields of a
+    `PerceptionTick`) and `policy` (of a `PolicyTick`) count. Every tick stands for itself, so that
+    gaps do no harm. Of the message it is the payload that is compared, as it was sent: in float16
+    if that was its type.
+
+    Raises ReplayError that names the tick if one is not of this policy, and BundleError if no robot
+    can fly it.
+    """
+    features, velocity, payload = (Comparison(n) for n in ("features", "velocity", "message"))
+    hops = HopBuffer(policy.manifest.geometry)
+    for topic, unix_time_s, message in messages:
+        try:
+            if topic == "perception":
+                features.add(*_perceive(policy, message))
+            elif topic == "policy":
+                velocities, payloads = _infer(policy, hops, message)
+                velocity.add(*velocities)
+                payload.add(*payloads)
+        except BundleError:
+            raise
+        except KeyError as error:
+            raise ReplayError(f"{topic} at {unix_time_s:.3f} s: {error} is missing") from None
+        except ValueError as error:
+            raise ReplayError(f"{topic} at {unix_time_s:.3f} s: {error}") from None
+    return features, velocity, payload
+
+
+def _perceive(policy: Policy, message: Mapping[str, Any]) -> tuple[_Array, _Array]:
+    """The features that were logged, and those of now."""
+    inputs = policy.manifest.images
+    if inputs is None:
+        raise BundleError(f"bundle {policy.manifest.name!r} has no perception: no robot flew it")
+    shape = (1, len(inputs.channels), inputs.size, inputs.size)
+    images = _checked("images", message["images"], shape)
+    position_feature = _checked("position_feature", message["position_feature"], (2,))
+    logged = _checked("features", message["features"], policy.manifest.geometry.feature_sizes[:1])
+    return logged, np.concatenate([policy.image_features(images), position_feature])
+
+
+def _infer(
+    policy: Policy, hops: HopBuffer, message: Mapping[str, Any]
+) -> tuple[tuple[_Array, _Array], tuple[_Array, _Array]]:
+    """The velocity that was logged, and that of now; the payload that was sent, and that of now."""
+    geometry = policy.manifest.geometry
+    features = _checked("features", message["features"], geometry.feature_sizes[:1])
+    logged = _checked("velocity", message["velocity"], (2,))
+    payloads = [_checked("payloads", p, (geometry.message_size,)) for p in message["payloads"]]
+    degree = message["degree"]
+    if degree < len(payloads):
+        raise ValueError(f"degree = {degree}: is less than its {len(payloads)} payloads")
+    sent = _decoded(policy, message["message"])
+    hops.diffuse(payloads, degree)
+    velocity = policy.velocity(features, hops)
+    now = dataclasses.replace(sent, payload=hops.message(degree))
+    again = _decoded(policy, encode(now, policy.bundle_id, sent.payload.dtype))
+    return (logged, velocity), (sent.payload, again.payload)
+
+
+def _checked(name: str, value: object, shape: tuple[int, ...]) -> _Array:
+    if not isinstance(value, np.ndarray) or value.dtype.kind != "f" or value.shape != shape:
+        found = getattr(value, "shape", type(value).__name__)
+        raise ValueError(f"{name}: is {found}; the policy needs {shape}")
+    return value
+
+
+def _decoded(policy: Policy, data: bytes) -> AggregatedMessage:
+    message = decode(
+        data,
+        bundle_id=policy.bundle_id,
+        frame_id=None,
+        own_robot_id=_NOBODY,
+        message_size=policy.manifest.geometry.message_size,
+    )
+    if isinstance(message, Rejection):
+        raise ValueError(f"message: would be refused: {message}")
+    return message

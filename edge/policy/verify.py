@@ -1,0 +1,94 @@
+"""Does this machine compute what torch computed? Needs no torch: the bundle holds its outputs."""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F32
+from edge.core.aggregation import HopBuffer
+from edge.policy.bundle import GOLDEN, Bundle, BundleError
+from edge.policy.lpac.graphs import Policy
+
+# Float32 rounding stays a factor of six below it, on x86-64 and on AArch64.
+TOLERANCE = 1e-5
+SWARM = "swarm"
+
+
+@dataclass(frozen=True, slots=True)
+class GraphCheck:
+    """How far one graph, or the whole swarm, is from its golden outputs."""
+
+    name: str
+    relative_error: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the error is within TOLERANCE (a NaN is not)."""
+        return self.relative_error <= TOLERANCE
+
+
+def verify(bundle: Bundle) -> Iterator[GraphCheck]:
+    """Run every graph on its golden inputs, then a swarm through its rounds of messages.
+
+    Raises BundleError if the golden vectors cannot be read or do not fit the graphs.
+    """
+    policy = Policy(bundle)
+    try:
+        golden = dict(np.load(io.BytesIO(bundle.files[GOLDEN]), allow_pickle=False))
+        for graph in bundle.manifest.graphs:
+            output = policy.run(graph, golden[f"{graph}/input"])
+            yield GraphCheck(graph, _relative_error(output, golden[f"{graph}/output"]))
+        velocities = swarm_velocities(
+            policy,
+            golden[f"{SWARM}/neighbours"],
+            golden[f"{SWARM}/features"],
+            rounds=len(golden[f"{SWARM}/velocities"]) - 1,
+        )
+        yield GraphCheck(SWARM, _relative_error(velocities, golden[f"{SWARM}/velocities"]))
+    except KeyError as error:
+        raise BundleError(f"{GOLDEN}: {error} is missing") from None
+    except Exception as error:
+        if isinstance(error, BundleError):
+            raise
+        raise BundleError(f"{GOLDEN}: does not fit the graphs: {error}") from None
+
+
+def swarm_velocities(
+    policy: Policy, neighbours: npt.NDArray[np.bool_], features: F32, rounds: int
+) -> F32:
+    """Velocities (rounds + 1, N, 2) of a swarm after 0, 1, ... synchronous exchanges of messages.
+
+    `neighbours` (N, N) is the static graph, known to the robots from the start; `features` is
+    (N, F_0). After K L rounds they are those of the centralised network.
+    """
+    robots = range(len(features))
+    buffers = [HopBuffer(policy.manifest.geometry) for _ in robots]
+    payloads: list[F32] | None = None
+    velocities = np.empty((rounds + 1, len(features), 2), np.float32)
+    for exchanged in range(rounds + 1):
+        for i in robots:
+            if payloads:
+                heard = [payloads[j] for j in np.flatnonzero(neighbours[i])]
+                buffers[i].diffuse(heard, degree=len(heard))
+            velocities[exchanged, i] = policy.velocity(features[i], buffers[i])
+        payloads = [buffers[i].message(int(neighbours[i].sum())) for i in robots]
+    return velocities
+
+
+def _relative_error(output: F32, golden: F32) -> float:
+    """The largest error of a row by the row's largest value, or by a third of the largest of all.
+
+    By row, so that a weight that shows in a few rows only is seen; not by less than that third,
+    since a velocity whose parts cancel is rounding alone.
+    """
+    errors, sizes = (
+        np.abs(values).reshape(len(golden), -1).max(axis=1)
+        for values in (output.astype(np.float64) - golden, golden)
+    )
+    scales = np.maximum(sizes, sizes.max() / 3.0)
+    with np.errstate(divide="ignore"):  # a network of zeros: any error is infinitely large
+        ratios = np.divide(errors, scales, out=np.zeros_like(errors), where=errors != 0.0)
+    return float(ratios.max())

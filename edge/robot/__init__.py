@@ -1,0 +1,1 @@
+"""One robot: its steps, its configuration, and the process around them."""

@@ -1,0 +1,158 @@
+"""How long a robot's steps take on this machine: its own code, with as many neighbours as asked."""
+
+import math
+import platform
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from edge.core import F32, F64
+from edge.core.aggregation import AggregatedMessage
+from edge.core.frames import ModelScale
+from edge.core.ports import Odometry
+from edge.core.wire import encode
+from edge.policy.bundle import Bundle
+from edge.policy.lpac.graphs import Policy
+from edge.robot.config import Rates
+from edge.robot.pac import Pac, PacParameters
+
+# Of a step's period that it may take: the loops share the core with each other and with PX4.
+MOST_OF_PERIOD = 0.5
+
+_WARM_UP_TICKS = 5
+_LEAST_TICKS = 20
+_MOST_NEIGHBOURS = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class StepTimes:
+    """What one step took, over all its calls, and the period that it has in flight; ms."""
+
+    step: str
+    calls: int
+    period_ms: float
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+
+    @property
+    def share(self) -> float:
+        """The 99th percentile as a share of the period."""
+        return self.p99_ms / self.period_ms
+
+    @property
+    def fits(self) -> bool:
+        """Whether it leaves enough of the period to the others."""
+        return self.share <= MOST_OF_PERIOD
+
+
+@dataclass(frozen=True, slots=True)
+class Benchmark:
+    """What was measured, and on which architecture: "aarch64", "x86_64"."""
+
+    architecture: str
+    neighbours: int
+    steps: tuple[StepTimes, ...]
+
+
+def benchmark(bundle: Bundle, neighbours: int, seconds: float) -> Benchmark:
+    """Let a robot perceive and infer, one tick after another, for about `seconds`.
+
+    All `neighbours` are in range, and each has sent a message before each tick. What they send and
+    what the robot sees is random, of the sizes that it has in flight. Raises BundleError if the
+    bundle has no perception, ValueError for a number that cannot be.
+    """
+    if not 0 <= neighbours <= _MOST_NEIGHBOURS:
+        raise ValueError(f"neighbours = {neighbours}: must be from 0 to {_MOST_NEIGHBOURS}")
+    if not 0.0 < seconds < math.inf:
+        raise ValueError(f"seconds = {seconds:g}: must be positive and finite")
+    flight = _Flight(bundle, neighbours)
+    for _ in range(_WARM_UP_TICKS):
+        flight.tick()
+    ticks_s: list[tuple[float, float]] = []
+    until_s = perf_counter() + seconds
+    while perf_counter() < until_s or len(ticks_s) < _LEAST_TICKS:
+        ticks_s.append(flight.tick())
+    rates = Rates()
+    rates_hz = {"perceive": rates.perception_hz, "infer": rates.policy_hz}
+    steps = tuple(
+        StepTimes(step, len(times_s), 1e3 / rate_hz, *_percentiles_ms(np.array(times_s)))
+        for (step, rate_hz), times_s in zip(
+            rates_hz.items(), zip(*ticks_s, strict=True), strict=True
+        )
+    )
+    return Benchmark(platform.machine(), neighbours, steps)
+
+
+class _Flight:
+    """One robot that circles over a random world, neighbours around it; mission and model agree."""
+
+    def __init__(self, bundle: Bundle, neighbours: int) -> None:
+        self._policy = Policy(bundle)
+        self._rng = np.random.default_rng(0)
+        self._ticks = 0
+        self._pac = Pac(
+            robot_id=0,
+            boot_epoch=1,
+            policy=self._policy,
+            sensor=self,
+            odometry=self,
+            parameters=PacParameters(scale=ModelScale(1.0, 1.0), max_speed_m_s=1.0),
+        )
+        perception = bundle.manifest.perception
+        assert perception is not None  # or Pac would have said so
+        self._perception = perception
+        self._view = self._rng.random((perception.sensor_size,) * 2, np.float32)
+        angles_rad = self._rng.uniform(0.0, math.tau, neighbours)
+        distances = self._rng.uniform(0.1, 0.9, neighbours) * perception.communication_range
+        self._offsets = distances[:, None] * np.stack([np.cos(angles_rad), np.sin(angles_rad)], 1)
+        size = bundle.manifest.geometry.message_size
+        self._payloads = self._rng.random((neighbours, size), np.float32)
+
+    def view(self, position: F64) -> F32:
+        """See `Sensor`."""
+        return self._view
+
+    def odometry(self) -> Odometry:
+        """See `OdometrySource`."""
+        quarter = self._perception.world_size / 4.0
+        angle_rad = 0.01 * self._ticks
+        x, y = 2.0 + math.cos(angle_rad), 2.0 + math.sin(angle_rad)
+        return Odometry((quarter * x, quarter * y, 4.0), (0.0, 0.0, 0.0))
+
+    def tick(self) -> tuple[float, float]:
+        """What `Pac.perceive` and `Pac.infer` took, s."""
+        self._ticks += 1
+        now_s = float(self._ticks)
+        self._receive(now_s)
+        began_s = perf_counter()
+        perceived = self._pac.perceive(now_s)
+        between_s = perf_counter()
+        inferred = self._pac.infer(now_s, now_s)
+        ended_s = perf_counter()
+        assert perceived is not None and inferred is not None
+        assert len(inferred.senders) == len(self._offsets)
+        return between_s - began_s, ended_s - between_s
+
+    def _receive(self, now_s: float) -> None:
+        x, y, height = self.odometry().position_m
+        for number, (offset, payload) in enumerate(
+            zip(self._offsets.tolist(), self._payloads, strict=True), 1
+        ):
+            message = AggregatedMessage(
+                robot_id=number,
+                boot_epoch=1,
+                sequence=self._ticks,
+                sent_at_s=now_s,
+                position_m=(x + offset[0], y + offset[1], height),
+                velocity_m_s=(0.0, 0.0, 0.0),
+                frame_id=0,
+                payload=payload,
+            )
+            self._pac.receive(encode(message, self._policy.bundle_id, "float16"), now_s, now_s)
+
+
+def _percentiles_ms(times_s: F64) -> tuple[float, float, float]:
+    p50, p99, largest = np.percentile(1e3 * times_s, (50.0, 99.0, 100.0)).tolist()
+    return p50, p99, largest

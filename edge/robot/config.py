@@ -1,0 +1,226 @@
+"""One robot's configuration: TOML into frozen dataclasses.
+
+Relative paths are meant from the file's own folder. Every mistake is one line that names the file,
+the key, the value and what is allowed.
+"""
+
+import math
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from edge.core.fence import Fence
+from edge.core.frames import ModelScale
+from edge.core.position import PositionLimits
+from edge.core.schema import ConfigError, from_mapping
+from edge.core.wire import MAX_ROBOT_ID
+from edge.flight.energy import EnergyParameters
+from edge.flight.failsafe import required
+from edge.flight.flight import FlightParameters, RemoteControlLost, Robot
+from edge.flight.margins import ErrorBudget, Margin
+from edge.flight.preflight import PreflightLimits
+from edge.flight.safety import MotionLimits
+from edge.robot.pac import PacParameters, PayloadType
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotConfig:
+    """Where PX4's datagrams come in (`url`, e.g. udpin://127.0.0.1:14551), and which one it is."""
+
+    url: str
+    system_id: int
+
+    def __post_init__(self) -> None:
+        if re.fullmatch(r"udpin://[^:/]+:\d{1,5}", self.url) is None:
+            raise ValueError(f"url = {self.url!r}: must be udpin://ADDRESS:PORT")
+        if not 1 <= self.port <= 65535:
+            raise ValueError(f"url = {self.url!r}: its port must be from 1 to 65535")
+        if not 1 <= self.system_id <= 255:
+            raise ValueError(f"system_id = {self.system_id}: must be from 1 to 255")
+
+    @property
+    def port(self) -> int:
+        """The UDP port of `url`."""
+        return int(self.url.rsplit(":", 1)[1])
+
+
+@dataclass(frozen=True, slots=True)
+class LinkConfig:
+    """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting.
+
+    A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
+    """
+
+    mode: Literal["peer", "client"] = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    scouting: bool = False
+
+    def __post_init__(self) -> None:
+        if not (self.listen or self.connect or self.scouting):
+            raise ValueError("listen, connect and scouting: one of them must be set")
+        if self.mode == "client" and not (self.connect or self.scouting):
+            raise ValueError("mode = 'client': connect or scouting must be set")
+        for name in ("listen", "connect"):
+            for endpoint in getattr(self, name):
+                if re.fullmatch(r"tcp/\S+:\d{1,5}", endpoint) is None:
+                    raise ValueError(f"{name} = {endpoint!r}: must be tcp/ADDRESS:PORT")
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """How often the three loops run, Hz."""
+
+    perception_hz: float = 5.0
+    policy_hz: float = 2.5
+    control_hz: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("perception_hz", "policy_hz", "control_hz"):
+            if not 0.1 <= getattr(self, name) <= 100.0:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be from 0.1 to 100")
+        if self.control_hz < 4.0:
+            raise ValueError(f"control_hz = {self.control_hz}: PX4 needs setpoints at 4 Hz or more")
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyConfig:
+    """The bundle, the world it flies over, and the paper's scales."""
+
+    bundle: str
+    world: str
+    env_scale: float = 16.0
+    velocity_scale: float = 0.25
+    max_message_age_s: float = 0.8
+    max_input_age_s: float = 1.0
+    payload: PayloadType = "float16"
+
+    def __post_init__(self) -> None:
+        ModelScale(self.env_scale, self.velocity_scale)
+        if not 0.0 <= self.max_message_age_s < math.inf:
+            raise ValueError(f"max_message_age_s = {self.max_message_age_s}: must be 0 or above")
+        if not 0.0 < self.max_input_age_s < math.inf:
+            raise ValueError(f"max_input_age_s = {self.max_input_age_s}: must be above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class FailsafeConfig:
+    """What PX4 does when something fails: for an RC pilot, or for none.
+
+    `parameters`: whether wrong PX4 parameters are set before flight, or arming is refused.
+    `fence_margin_m`: how far outside our fence PX4's own is. `rc_lost`: what a robot does whose
+    pilot's remote control is lost in flight.
+    """
+
+    rc: Literal["pilot", "none"]
+    rc_lost: RemoteControlLost = "alarm"
+    parameters: Literal["set", "refuse"] = "refuse"
+    fence_margin_m: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.fence_margin_m < math.inf:
+            raise ValueError(f"fence_margin_m = {self.fence_margin_m}: must be 0 or above")
+
+
+@dataclass(frozen=True, slots=True)
+class LogConfig:
+    """The flight log's folder and size, MB."""
+
+    folder: str = "logs"
+    max_total_mb: float = 2000.0
+
+    def __post_init__(self) -> None:
+        if not 50.0 <= self.max_total_mb < math.inf:
+            raise ValueError(f"max_total_mb = {self.max_total_mb}: must be 50 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class RobotConfig:
+    """All of robot.toml. `on_stop` is what a stopped program leaves a flying vehicle to do."""
+
+    fleet: str
+    robot_id: int
+    policy: PolicyConfig
+    autopilot: AutopilotConfig
+    link: LinkConfig
+    flight: FlightParameters
+    fence: Fence
+    limits: MotionLimits
+    failsafe: FailsafeConfig
+    energy: EnergyParameters = field(default_factory=EnergyParameters)
+    errors: ErrorBudget = field(default_factory=ErrorBudget)
+    rates: Rates = field(default_factory=Rates)
+    preflight: PreflightLimits = field(default_factory=PreflightLimits)
+    position: PositionLimits = field(default_factory=PositionLimits)
+    log: LogConfig = field(default_factory=LogConfig)
+    on_stop: Literal["hold", "land"] = "hold"
+
+    def __post_init__(self) -> None:
+        if re.fullmatch(r"[A-Za-z0-9_-]{1,32}", self.fleet) is None:
+            raise ValueError(
+                f"fleet = {self.fleet!r}: must be 1 to 32 letters, digits, '-' and '_'"
+            )
+        if not 0 <= self.robot_id <= MAX_ROBOT_ID:
+            raise ValueError(f"robot_id = {self.robot_id}: must be from 0 to {MAX_ROBOT_ID}")
+        if self.flight.command_timeout_s * self.rates.control_hz < 2.0:
+            raise ValueError(
+                f"flight: command_timeout_s = {self.flight.command_timeout_s}: must be at least "
+                f"two periods of rates: control_hz = {self.rates.control_hz}"
+            )
+        # What only shows when the tables come together, before any of it is used.
+        required(self.failsafe.rc, self.fence.ceiling_m, self.flight.command_timeout_s)
+        self.robot(boot_nonce=0)
+        beyond = self.errors.px4_fence(self.limits)
+        if not beyond.holds(self.failsafe.fence_margin_m):
+            raise ValueError(f"failsafe: fence_margin_m = {self.failsafe.fence_margin_m}: {beyond}")
+
+    def robot(self, boot_nonce: int) -> Robot:
+        """Who flies, in this start of its program."""
+        return Robot(
+            self.robot_id,
+            boot_nonce,
+            self.flight,
+            self.fence,
+            self.limits,
+            None if self.failsafe.rc == "none" else self.failsafe.rc_lost,
+            self.errors,
+        )
+
+    @property
+    def free_ground(self) -> Margin:
+        """How far around its fence nobody may be, whatever fails."""
+        beyond_m, ceiling_m = self.failsafe.fence_margin_m, self.fence.ceiling_m
+        return self.errors.free_ground(self.limits, beyond_m, ceiling_m)
+
+    @property
+    def pac(self) -> PacParameters:
+        """The part of it that the perception-action-communication loop takes."""
+        policy = self.policy
+        return PacParameters(
+            scale=ModelScale(policy.env_scale, policy.velocity_scale),
+            max_speed_m_s=self.limits.max_speed_m_s,
+            max_message_age_s=policy.max_message_age_s,
+            max_input_age_s=policy.max_input_age_s,
+            payload=policy.payload,
+        )
+
+
+def load_config(path: Path) -> RobotConfig:
+    """The configuration in the file, its paths made absolute. Raises ConfigError."""
+    try:
+        mapping = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: no TOML: {error}") from None
+    folder = path.resolve().parent
+    for table, key in (("policy", "bundle"), ("policy", "world"), ("log", "folder")):
+        section = mapping.get(table)
+        if isinstance(section, dict) and isinstance(section.get(key), str):
+            section[key] = str(folder / section[key])
+    mapping.setdefault("log", {})
+    if isinstance(mapping["log"], dict):
+        mapping["log"].setdefault("folder", str(folder / "logs"))
+    return from_mapping(RobotConfig, mapping, str(path))

@@ -1,0 +1,328 @@
+"""One control tick of a robot: what it knows -> flight state -> setpoint and commands."""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from typing import NamedTuple
+
+import structlog
+
+from edge.core.mailbox import Neighbour
+from edge.core.ports import Autopilot, Odometry, Recorder, Sensor
+from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
+from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
+from edge.flight.flight import (
+    FlightInputs,
+    FlightMemory,
+    Robot,
+    exceeds_silence,
+    failsafe_acts,
+    height_m,
+    step,
+)
+from edge.flight.guidance import Guidance, MissionSetpoint, guide
+from edge.flight.preflight import HeardStatus
+from edge.flight.safety import Closest, nearest
+from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
+from edge.robot.inbox import Inbox
+from edge.robot.navigation import Navigation
+from edge.robot.pac import Pac
+from edge.robot.readiness import Assignment, Checks
+
+_log = structlog.get_logger(__name__)
+
+# The statuses' period is a quarter of a second.
+_MAX_STATUS_AGE_S = 1.5
+# Checks that are older say nothing about now.
+_MAX_CHECKS_AGE_S = 5.0
+_BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
+
+
+class GroundWorld(NamedTuple):
+    """A world that the ground sent, as a sensor over it; or why it cannot be one."""
+
+    world_id: str
+    sensor: Sensor | None
+    problem: str
+
+
+class FlightControl:
+    """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
+
+    Another thread sets `checks`, `peers` (what the other robots say of themselves), and `world` for
+    the `wanted_world_id`, whole. `obeyed_sequence` and `operator` are the last ground state's.
+    `assignment` is what is flown by, `not_taken` what of the ground's state it is not. `energy` is
+    how long the battery lasts, and the way home takes.
+    """
+
+    def __init__(
+        self,
+        *,
+        robot: Robot,
+        world_id: str,
+        autopilot: Autopilot,
+        navigation: Navigation,
+        pac: Pac,
+        inbox: Inbox,
+        recorder: Recorder,
+        energy: EnergyParameters,
+        unix_clock_s: Callable[[], float],
+        started_s: float,
+    ) -> None:
+        self._configured = robot
+        self._autopilot = autopilot
+        self._navigation = navigation
+        self._pac = pac
+        self._inbox = inbox
+        self._recorder = recorder
+        self._unix_clock_s = unix_clock_s
+        self._started_s = started_s
+        self._guidance = Guidance()
+        self._last_tick_s: float | None = None
+        self._has_flown = False
+        self._energy_parameters = energy
+        self._consumption = Consumption(energy)
+        self.energy: Energy | None = None
+        self.flight = FlightMemory()
+        self.alarms: tuple[str, ...] = ()
+        self.checks: Checks | None = None
+        self.peers: tuple[HeardStatus, ...] = ()
+        self.assignment = Assignment(None, robot, world_id)
+        self.not_taken: tuple[str, ...] = ()
+        self.wanted_world_id: str | None = None
+        self.world: GroundWorld | None = None
+        self.obeyed_sequence = -1
+        self.operator = ""
+
+    def tick(self, now_s: float) -> bool:
+        """One tick: reads the newest of everything, sends at most one setpoint.
+
+        Whether the vehicle flies by it: one that PX4's own failsafe has is not to be held.
+        """
+        vehicle = self._autopilot.state()
+        ground, ground_age_s = self._inbox.ground(now_s)
+        if ground is not None:
+            if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
+                self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
+            self.obeyed_sequence, self.operator = ground.sequence, ground.operator
+            self._take_up(ground, vehicle.armed)
+        self._navigation.look(vehicle, now_s)
+        odometry = self._navigation.estimate(vehicle)
+        neighbours = self._neighbours(now_s)
+        inputs = FlightInputs(
+            now_s=now_s,
+            vehicle=vehicle,
+            position=self._navigation.position,
+            odometry=odometry,
+            policy_velocity_m_s=self._pac.control(now_s),
+            neighbours=neighbours,
+            closest=self._closest(odometry, neighbours),
+            busy_neighbours=tuple(
+                peer.status.robot_id for peer in self.peers if peer.status.state in _BUSY
+            ),
+            ground=ground,
+            ground_age_s=ground_age_s,
+            failed_checks=self.failed_checks(now_s),
+            not_taken=self.not_taken,
+            order=self._inbox.order(),
+            uptime_s=now_s - self._started_s,
+            energy=self._energy(now_s, vehicle, odometry),
+        )
+        self.energy = inputs.energy
+        before, robot = self.flight, self.assignment.robot
+        decision = step(robot, before, inputs)
+        self.flight, self.alarms = decision.flight, decision.alarms
+        self._has_flown |= decision.flight.state in (FlightState.ARMING, *AIRBORNE)
+        self._navigation.datum_m = decision.flight.datum_m
+        if decision.new_trial:
+            self._pac.forget()
+        for action in decision.actions:
+            self._autopilot.command(action)
+        dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s
+        self._last_tick_s = now_s
+        setpoint, self._guidance = guide(robot, decision.flight, inputs, self._guidance, dt_s)
+        local = None if setpoint is None else self._navigation.to_local(setpoint, vehicle)
+        sent = None if local is None else self._autopilot.send(local)
+        if decision.flight.state is not before.state:
+            flight = decision.flight
+            _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
+        self._record(inputs, setpoint, sent, decision.actions)
+        return sent is not None and not failsafe_acts(vehicle)
+
+    def look_back(self, silent_since_s: float, now_s: float) -> None:
+        """Nothing was sent between these times, as the watchdog counts it.
+
+        A tick that took long began in time, and only this tells that the watchdog may have acted.
+        """
+        if exceeds_silence(self.assignment.robot, now_s - silent_since_s):
+            self.flight = replace(self.flight, tick_at_s=silent_since_s)
+
+    @property
+    def endurance_s(self) -> float:
+        """How long a full battery lasts, as measured in flight, or else as configured."""
+        return self._consumption.endurance_s
+
+    def failed_checks(self, now_s: float) -> tuple[str, ...] | None:
+        """What keeps the robot on the ground; None if nobody looked lately. From any thread."""
+        checks = self.checks
+        if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
+            return None
+        # The same one, not an equal one: what was set in between may be on its way to the vehicle.
+        if checks.assignment is not self.assignment:
+            return None
+        return (*checks.failed, *self.not_taken)
+
+    def leave(self, on_stop: Action) -> Action | None:
+        """What the program that ends asks of the vehicle it was flying; None if it was not.
+
+        Once the control loop has ended. Nothing is taken from a pilot, or from PX4's failsafe.
+        """
+        if self.flight.state is FlightState.ARMING:
+            return Action.DISARM
+        vehicle = self._autopilot.state()
+        obeys = vehicle.mode in (Mode.OFFBOARD, Mode.HOLD) and not failsafe_acts(vehicle)
+        return on_stop if self.flight.state in STEERED and obeys else None
+
+    def _take_up(self, ground: GroundState, armed: bool | None) -> None:
+        """Take what the ground sets for a flight, on the ground only.
+
+        A program that has not flown its vehicle, such as one that was started in flight, takes it
+        at any time: it steers nothing by it.
+        """
+        now = self.assignment
+        origin = now.origin if ground.origin is None else ground.origin
+        world_id = now.world_id if ground.world_id is None else ground.world_id
+        self.wanted_world_id = None
+        if self._has_flown and not (armed is False and self.flight.state in ON_GROUND):
+            fence, place = self._configured.told(ground)
+            told = {
+                "mission origin": (origin, now.origin),
+                "fence": (fence, now.robot.fence),
+                "place": (place, now.robot.place),
+                "world": (world_id, now.world_id),
+            }
+            where = "in flight" if armed else "not known to be on the ground"
+            self.not_taken = tuple(
+                f"{where}: keeps its {what}" for what, (new, own) in told.items() if new != own
+            )
+            return
+        robot, sensor, not_taken = now.robot, None, []
+        try:
+            robot = self._configured.assigned(ground)
+        except ValueError as error:
+            not_taken.append(str(error))
+        if world_id != now.world_id:
+            arrived = self.world if self.world and self.world.world_id == world_id else None
+            if arrived is None:
+                self.wanted_world_id = world_id
+                not_taken.append(f"world {world_id} of the ground has not arrived: wait")
+            elif arrived.sensor is None:
+                not_taken.append(f"the ground's world cannot be used: {arrived.problem}")
+            else:
+                sensor = arrived.sensor
+        self.not_taken = tuple(not_taken)
+        self._assign(
+            Assignment(origin, robot, now.world_id if sensor is None else world_id), sensor
+        )
+
+    def _assign(self, assignment: Assignment, sensor: Sensor | None) -> None:
+        """`sensor` is over the world, None if that stays."""
+        before = self.assignment
+        if assignment == before:
+            return
+        self.assignment = assignment
+        origin, robot, world_id = assignment
+        if origin is not None and origin != before.origin:
+            frame = origin.frame()
+            self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
+            self._pac.forget()
+        if sensor is not None:
+            self._pac.sensor = sensor
+            self._pac.forget()
+        _log.info(
+            "taken up from the ground",
+            origin=origin and asdict(origin),
+            fence=asdict(robot.fence),
+            place=asdict(robot.place),
+            world=world_id,
+        )
+
+    def _neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
+        """Whom to keep away from: also robots that are silent since their policy or sensor failed.
+
+        They still tell their place in their status, if not as often.
+        """
+        heard = self._pac.mailbox.neighbours(now_s)
+        known = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
+        told = []
+        for status, heard_at_s, _ in self.peers:
+            age_s = now_s - heard_at_s
+            comparable = status.origin == self.assignment.origin and age_s <= _MAX_STATUS_AGE_S
+            if status.robot_id in known or not comparable:
+                continue
+            if status.position_m is not None and status.velocity_m_s is not None:
+                told.append(
+                    Neighbour(status.robot_id, status.position_m, status.velocity_m_s, age_s)
+                )
+        return (*heard, *told)
+
+    def _closest(
+        self, odometry: Odometry | None, neighbours: tuple[Neighbour, ...]
+    ) -> Closest | None:
+        if odometry is None:
+            return None
+        # What the robot itself tells of its height.
+        height = height_m(self.flight, odometry) or 0.0
+        return nearest((*odometry.position_m[:2], height), neighbours)
+
+    def _energy(
+        self, now_s: float, vehicle: VehicleState, odometry: Odometry | None
+    ) -> Energy | None:
+        self._consumption.hear(now_s, vehicle.armed, vehicle.battery, vehicle.voltage_v)
+        robot, way_s = self.assignment.robot, None
+        height = height_m(self.flight, odometry)
+        if odometry is not None and height is not None:
+            parameters, limits = robot.parameters, robot.limits
+            way_s = home_s(
+                self._energy_parameters,
+                away_m=math.dist(odometry.position_m[:2], parameters.landing_point_m),
+                height_m=height,
+                slot=parameters.slot,
+                slot_height_m=parameters.slot_height_m,
+                max_speed_m_s=limits.max_speed_m_s,
+                max_climb_m_s=limits.max_climb_m_s,
+            )
+        return self._consumption.energy(robot.parameters.battery_critical, way_s)
+
+    def _record(
+        self,
+        inputs: FlightInputs,
+        setpoint: MissionSetpoint | None,
+        sent: Setpoint | None,
+        actions: tuple[Action, ...],
+    ) -> None:
+        odometry, velocity_m_s = inputs.odometry, inputs.policy_velocity_m_s
+        self._recorder.record(
+            "control",
+            self._unix_clock_s(),
+            {
+                "state": self.flight.state,
+                "reason": self.flight.reason,
+                "position_quality": inputs.position.quality,
+                "position_cause": inputs.position.cause,
+                "height_m": height_m(self.flight, odometry),
+                "position_m": odometry and odometry.position_m,
+                "velocity_m_s": odometry and odometry.velocity_m_s,
+                "policy_velocity_m_s": None if velocity_m_s is None else velocity_m_s.tolist(),
+                "setpoint_kind": None if setpoint is None else type(setpoint).__name__,
+                "setpoint": None if setpoint is None else setpoint[0],
+                "sent_local": None if sent is None else sent[0],
+                "actions": actions,
+                "closest_m": inputs.closest and inputs.closest.distance_m,
+            },
+        )
+        if inputs.order is not None:
+            order_id = inputs.order.order_id
+            given = (answer for answer in self.flight.answers if answer.order_id == order_id)
+            record = {**asdict(inputs.order), "answer": next(given, None)}
+            self._recorder.record("order", self._unix_clock_s(), record)

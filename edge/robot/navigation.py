@@ -1,0 +1,137 @@
+"""The robot's position in the mission frame, from the autopilot's local one."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.frames import LocalTransform, MissionFrame
+from edge.core.ports import Autopilot, Odometry
+from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
+from edge.core.vehicle import (
+    GlobalOrigin,
+    Position,
+    Setpoint,
+    Vector,
+    VehicleState,
+    Velocity,
+)
+from edge.flight.guidance import MissionPosition, MissionSetpoint
+
+# At 20 Hz, a dozen positions that did not come.
+MAX_POSITION_AGE_S = 0.6
+_PLACE_POSITION_AGE_S = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fixed:
+    """A transform, and the two origins that it holds for."""
+
+    frame: MissionFrame
+    local_origin: GlobalOrigin
+    transform: LocalTransform
+
+
+class Navigation:
+    """Knows where the robot is (an OdometrySource). Every method may be called from any thread.
+
+    `frame`, `datum_m` and `position` are replaced whole by the control thread: where the mission
+    frame lies, the altitude of the robot's takeoff point, and what the position is worth.
+
+    Altitudes are as if the estimate had never jumped in height since the vehicle was armed: it did
+    not move then, and must not for that, through the heights of others.
+    """
+
+    def __init__(
+        self, autopilot: Autopilot, clock_s: Callable[[], float], limits: PositionLimits
+    ) -> None:
+        """`clock_s` is the monotonic clock of the autopilot's times, s."""
+        self._autopilot = autopilot
+        self._clock_s = clock_s
+        self._limits = limits
+        self._fixed: _Fixed | None = None
+        self.position = PositionJudgement()
+        self.frame: MissionFrame | None = None
+        self.datum_m: float | None = None
+
+    def look(self, vehicle: VehicleState, now_s: float) -> None:
+        """Judge the position anew, a few times a second. Called from the control thread alone."""
+        self.position = judge(self.position, vehicle, self._limits, now_s)
+
+    def odometry(self) -> Odometry | None:
+        """Position and velocity, z being the height above the takeoff point; 0 before takeoff.
+
+        None, too, for an armed vehicle whose takeoff point is not known.
+        """
+        vehicle = self._autopilot.state()
+        estimate = self.estimate(vehicle)
+        if estimate is None or (self.datum_m is None and vehicle.armed):
+            return None
+        x_m, y_m, z_m = estimate.position_m
+        height_m = 0.0 if self.datum_m is None else z_m - self.datum_m
+        return Odometry((x_m, y_m, height_m), estimate.velocity_m_s)
+
+    def estimate(self, vehicle: VehicleState) -> Odometry | None:
+        """The same with z being the altitude above sea level, less what it jumped in flight.
+
+        None when lost or too old.
+        """
+        transform = self._transform(vehicle)
+        position_m, velocity_m_s = vehicle.position_local_m, vehicle.velocity_local_m_s
+        if transform is None or position_m is None or velocity_m_s is None:
+            return None
+        if not self._is_known(vehicle):
+            return None
+        x_m, y_m, z_m = _vector(transform.local_to_mission(np.array(position_m)))
+        return Odometry(
+            (x_m, y_m, z_m - vehicle.height_jumped_m),
+            _vector(transform.velocity_to_mission(np.array(velocity_m_s))),
+        )
+
+    def global_deg(self, vehicle: VehicleState) -> tuple[float, float] | None:
+        """Latitude and longitude, also without a mission frame; None when lost or too old."""
+        origin, position_m = vehicle.origin, vehicle.position_local_m
+        if origin is None or position_m is None or not self._is_known(vehicle):
+            return None
+        north_m, east_m, _ = position_m
+        # A mission that points north has x to the east.
+        pointing_north = MissionFrame(origin.latitude_deg, origin.longitude_deg, heading_rad=0.0)
+        return pointing_north.to_global_deg(east_m, north_m)
+
+    def to_local(self, setpoint: MissionSetpoint, vehicle: VehicleState) -> Setpoint | None:
+        """The setpoint in the vehicle's local frame; None when there is no telling.
+
+        A place becomes a standstill while the position does not come: the estimator's origin may
+        have jumped, and the same numbers be another place.
+        """
+        transform = self._transform(vehicle)
+        if transform is None:
+            return None
+        if isinstance(setpoint, MissionPosition):
+            if self.datum_m is None:
+                return None
+            if self._clock_s() - vehicle.position_at_s > _PLACE_POSITION_AGE_S:
+                return Velocity((0.0, 0.0, 0.0))
+            x_m, y_m, height_m = setpoint.position_m
+            place_m = np.array([x_m, y_m, height_m + self.datum_m + vehicle.height_jumped_m])
+            return Position(_vector(transform.mission_to_local(place_m)))
+        return Velocity(_vector(transform.velocity_to_local(np.array(setpoint.velocity_m_s))))
+
+    def _is_known(self, vehicle: VehicleState) -> bool:
+        age_s = self._clock_s() - vehicle.position_at_s
+        return self.position.quality is not PositionQuality.LOST and age_s <= MAX_POSITION_AGE_S
+
+    def _transform(self, vehicle: VehicleState) -> LocalTransform | None:
+        frame, origin, fixed = self.frame, vehicle.origin, self._fixed
+        if frame is None or origin is None:
+            return None
+        if fixed is None or fixed.frame is not frame or fixed.local_origin != origin:
+            fixed = _Fixed(frame, origin, frame.relative_to(*origin))
+            self._fixed = fixed
+        return fixed.transform
+
+
+def _vector(values: F64) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

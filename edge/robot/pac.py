@@ -1,0 +1,279 @@
+"""One robot's perception, action and communication, as steps that somebody else times.
+
+Paper: "A Scalable Multi-Robot Framework for Decentralized and Asynchronous
+Perception-Action-Communication Loops". The robot calls these steps from threads, the simulator in
+simulated time; both run this code.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F32, F64, Bools
+from edge.core.aggregation import AggregatedMessage, HopBuffer
+from edge.core.frames import ModelScale
+from edge.core.mailbox import Mailbox
+from edge.core.perception import Perception, clamp_to_world, neighbours_in_range
+from edge.core.ports import Odometry, OdometrySource, Sensor
+from edge.core.wire import MAX_ROBOT_ID, Rejection, decode, encode
+from edge.flight.safety import limit_speed
+from edge.policy.bundle import BundleError
+from edge.policy.lpac.graphs import Policy
+
+Position = tuple[float, float, float]  # in the mission frame, m
+PayloadType = Literal["float16", "float32"]
+
+
+@dataclass(frozen=True, slots=True)
+class PacParameters:
+    """The fleet's settings of the loop; ages in s, see `Mailbox` for `max_message_age_s`.
+
+    Features, and then an action, that are older than `max_input_age_s` are not used: two ticks of
+    the policy may be missed, then the robot stops.
+    """
+
+    scale: ModelScale
+    max_speed_m_s: float
+    max_message_age_s: float = 0.8
+    max_input_age_s: float = 1.0
+    payload: PayloadType = "float16"
+
+    def __post_init__(self) -> None:
+        for name in ("max_speed_m_s", "max_input_age_s"):
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise ValueError(f"{name} = {value}: must be positive and finite")
+        if self.payload not in get_args(PayloadType):
+            raise ValueError(f"payload = {self.payload!r}: must be 'float16' or 'float32'")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Timed:
+    """A value that one thread replaces whole and another reads."""
+
+    value: F32
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerceptionTick:
+    """What `Pac.perceive` did.
+
+    `images` (1, channels, size, size) is valid until the next call; `position_feature` (2,);
+    `features` (F_0,) are the images' and then the position's.
+    """
+
+    images: F32
+    position_feature: F32
+    features: F32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolicyTick:
+    """What `Pac.infer` did.
+
+    From `features` (F_0,) and the `payloads` of `senders`, for a node of `degree` neighbours, came
+    `velocity` (2,), in model units, and `message`, the bytes for the neighbours.
+    """
+
+    features: F32
+    senders: tuple[int, ...]
+    payloads: tuple[F32, ...]
+    degree: int
+    velocity: F32
+    message: bytes
+
+
+class Pac:
+    """The steps of one robot.
+
+    `perceive` (with `explored`) and `infer` belong to one thread each, the rest to any number. They
+    exchange immutable values by reference and never wait for one another.
+    """
+
+    def __init__(
+        self,
+        *,
+        robot_id: int,
+        boot_epoch: int,
+        policy: Policy,
+        sensor: Sensor,
+        odometry: OdometrySource,
+        parameters: PacParameters,
+    ) -> None:
+        """Raises BundleError if the policy has no perception, ValueError for an impossible id."""
+        if not 0 <= robot_id <= MAX_ROBOT_ID:
+            raise ValueError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
+        manifest = policy.manifest
+        if manifest.images is None or manifest.perception is None:
+            raise BundleError(
+                f"bundle {manifest.name!r} has no perception: it cannot drive a robot"
+            )
+        self._robot_id = robot_id
+        self._boot_epoch = boot_epoch
+        self._policy = policy
+        self._odometry = odometry
+        self._parameters = parameters
+        self._world_size = manifest.perception.world_size
+        self._sensor_size = manifest.perception.sensor_size
+        self._communication_range = manifest.perception.communication_range
+        self._new_perception = partial(
+            Perception, manifest.perception, len(manifest.images.channels), manifest.images.size
+        )
+        self._perception = self._new_perception()
+        self._forget_map = False
+        self._hops = HopBuffer(manifest.geometry)
+        self._sequence = 0
+        self._features: _Timed | None = None
+        self._action: _Timed | None = None
+        self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+        # Replaced whole when the ground sets another origin or another world, which it does while
+        # nobody flies.
+        self.frame_id = 0
+        self.sensor = sensor
+
+    def forget(self) -> None:
+        """Start anew: no explored map and no messages. From any thread.
+
+        The last action is left to the next tick of the policy, so that the robot need not stop.
+        """
+        self._forget_map = True
+        self._features = None
+        self.mailbox.clear()
+
+    def receive(self, data: bytes, now_s: float, unix_now_s: float) -> Rejection | None:
+        """Put a neighbour's message into the mailbox; returns, and counts, why it was not."""
+        message = decode(
+            data,
+            bundle_id=self._policy.bundle_id,
+            frame_id=self.frame_id,
+            own_robot_id=self._robot_id,
+            message_size=self._policy.manifest.geometry.message_size,
+        )
+        if isinstance(message, Rejection):
+            self.mailbox.reject(message)
+            return message
+        return self.mailbox.receive(message, now_s, unix_now_s)
+
+    def perceive(self, now_s: float) -> PerceptionTick | None:
+        """Sensor view -> robot map -> images -> features x_i (32 of the CNN, 2 of the position).
+
+        None when there is nothing to perceive: no position, or no valid view.
+        """
+        if self._forget_map:
+            self._forget_map = False
+            self._perception = self._new_perception()
+        odometry = self._finite_odometry()
+        if odometry is None:
+            return None
+        (own,) = self._to_model([odometry.position_m])
+        view = self.sensor.view(own)
+        if view is None or not self._is_valid(view):
+            return None
+        self._perception.observe(own, view)
+        heard = self._to_model([n.position_m for n in self.mailbox.neighbours(now_s)])
+        neighbours = heard[neighbours_in_range(own, heard, self._communication_range)]
+        images = self._perception.images(own, neighbours)
+        position = position_feature(own, self._world_size)
+        features = np.concatenate([self._policy.image_features(images), position])
+        self._features = _Timed(features, now_s)
+        return PerceptionTick(images, position, features)
+
+    def explored(self) -> Bools:
+        """What it has seen, as `mission.explored_to_bytes` takes it; valid until it goes on."""
+        return self._perception.explored
+
+    def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
+        """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
+
+        None when there is nothing to send: no fresh features, no position, or a result that is
+        not finite. Then the action is left to grow old, and `control` stops the robot.
+        """
+        features, odometry = self._features, self._finite_odometry()
+        if features is None or odometry is None or self._is_old(features, now_s):
+            return None
+        (own,) = self._to_model([odometry.position_m])
+        # Before the swap, which may clear the mailbox: the neighbours are more than the messages.
+        heard = [n.position_m for n in self.mailbox.neighbours(now_s)]
+        messages = self.mailbox.swap(now_s)
+        near = self._in_range(own, [message.position_m for message in messages])
+        degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
+        heeded = [message for message, is_near in zip(messages, near, strict=True) if is_near]
+        payloads = tuple(message.payload for message in heeded)
+        self._hops.diffuse(payloads, degree)
+        velocity = self._policy.velocity(features.value, self._hops)
+        payload = self._hops.message(degree)
+        if not (np.isfinite(velocity).all() and np.isfinite(payload).all()):
+            return None
+        self._action = _Timed(velocity, now_s)
+        self._sequence += 1
+        message = AggregatedMessage(
+            robot_id=self._robot_id,
+            boot_epoch=self._boot_epoch,
+            sequence=self._sequence,
+            sent_at_s=unix_now_s,
+            position_m=odometry.position_m,
+            velocity_m_s=odometry.velocity_m_s,
+            frame_id=self.frame_id,
+            payload=payload,
+        )
+        return PolicyTick(
+            features=features.value,
+            senders=tuple(message.robot_id for message in heeded),
+            payloads=payloads,
+            degree=degree,
+            velocity=velocity,
+            message=encode(message, self._policy.bundle_id, self._parameters.payload),
+        )
+
+    def control(self, now_s: float) -> F64 | None:
+        """The velocity (2,) in the mission frame, m/s, within the speed limit.
+
+        None when there is no fresh action.
+        """
+        action = self._action
+        if action is None or self._is_old(action, now_s):
+            return None
+        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
+            action.value.astype(np.float64)
+        )
+        return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+
+    def feature_age_s(self, now_s: float) -> float | None:
+        """The age of the newest features, s; None if there are none."""
+        features = self._features
+        return None if features is None else now_s - features.time_s
+
+    def _finite_odometry(self) -> Odometry | None:
+        odometry = self._odometry.odometry()
+        if odometry is None:
+            return None
+        numbers = (*odometry.position_m, *odometry.velocity_m_s)
+        return odometry if all(map(math.isfinite, numbers)) else None
+
+    def _is_valid(self, view: F32) -> bool:
+        """Whether it may go into the map: one cell that is not finite would stay in it."""
+        return view.shape == (self._sensor_size,) * 2 and bool(np.isfinite(view).all())
+
+    def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
+        """(n,): which of the positions are within communication range of `own`, in model units."""
+        return neighbours_in_range(own, self._to_model(positions_m), self._communication_range)
+
+    def _to_model(self, positions_m: Sequence[Position]) -> F64:
+        """Horizontal positions (n, 2) in model units."""
+        horizontal = np.array(positions_m, np.float64).reshape(-1, 3)[:, :2]
+        return self._parameters.scale.position_to_model(horizontal)
+
+    def _is_old(self, timed: _Timed, now_s: float) -> bool:
+        return now_s - timed.time_s > self._parameters.max_input_age_s
+
+
+def position_feature(position: F64, world_size: int) -> F32:
+    """(p + W/2) / W, with p taken into the world: in [0.5, 1.5], as policies were trained."""
+    inside = clamp_to_world(position, world_size)
+    return ((inside + world_size / 2.0) / world_size).astype(np.float32)

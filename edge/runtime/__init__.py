@@ -1,1 +1,0 @@
-"""The policy and one robot's steps, built on the core."""

@@ -1,1 +1,0 @@
-"""Ground control: the process that speaks to the fleet, and its clients."""

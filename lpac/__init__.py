@@ -1,0 +1,1 @@
+"""The workstation: simulators, ground control, analysis, deployment, and the `lpac` command."""

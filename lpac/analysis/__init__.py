@@ -1,0 +1,1 @@
+"""From what was recorded of a flight to numbers, figures and a page."""

@@ -1,0 +1,340 @@
+"""What robots and ground recorded, brought together on one clock.
+
+A robot says each status once; its own log has it, and the ground's too if it was heard. Times are
+made from the robot's uptime, which does not jump, and from when the ground heard it: so robots
+whose clocks were wrong line up. Without a ground's log their own clocks must do.
+"""
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.fence import Fence
+from edge.core.schema import from_mapping
+from edge.drivers.flight_log import FlightLogError, FlightMetadata, read, read_metadata
+from edge.messages.mission import FlightState, LoopStatus
+from lpac.analysis.snapshot import FleetSetup, GroundEvent
+
+# Of the times from saying to hearing, the share that may be shorter than the one that is believed.
+_EARLY = 0.1
+_LATENESS = ("lateness_p50_ms", "lateness_p99_ms", "lateness_max_ms")
+
+Progress = Callable[[str, float], None]
+Program = tuple[int, int]  # robot id, boot nonce
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedStatus:
+    """What the report needs of a status; `time_s` is Unix time of the common clock.
+
+    Loops whose lateness it did not know are left out; the landing point is NaN if it was.
+    """
+
+    time_s: float
+    boot_nonce: int
+    state: FlightState
+    trial: str
+    armed: bool | None
+    position_m: tuple[float, float, float] | None
+    alarms: tuple[str, ...]
+    loops: Mapping[str, LoopStatus]
+    fence: Fence | None
+    battery: float | None
+    landing_point_m: tuple[float, float]
+    bundle_id: str
+    world_id: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Received:
+    """The messages that one robot got, in order: (M,) each.
+
+    `time_s` is on the common clock, and `age_s` corrected by it. `sequence` is -1, and `age_s` NaN,
+    where the message could not be read; `accepted` where it was used.
+    """
+
+    time_s: F64
+    sender: F64
+    sequence: F64
+    age_s: F64
+    accepted: F64
+
+
+class Ordered(NamedTuple):
+    """An order that a robot answered."""
+
+    time_s: float
+    robot_id: int
+    kind: str
+    operator: str
+    trial: str
+    accepted: bool
+    reason: str
+
+
+@dataclass(slots=True)
+class Logs:
+    """All that was found. `names` are the robots' by id, `statuses` and `received` by robot id.
+
+    `clocks_known` are the programs that a ground heard; of the others' clocks nothing is known.
+    `programs_logged` are those whose own logs were found. `setups` are in the order of the times,
+    Unix s, at which they were told. `notes` are for the reader.
+    """
+
+    names: dict[int, str] = field(default_factory=dict)
+    statuses: dict[int, list[LoggedStatus]] = field(default_factory=dict)
+    received: dict[int, Received] = field(default_factory=dict)
+    clocks_known: set[Program] = field(default_factory=set)
+    programs_logged: set[Program] = field(default_factory=set)
+    metadata: list[FlightMetadata] = field(default_factory=list)
+    setups: list[tuple[float, FleetSetup]] = field(default_factory=list)
+    events: list[GroundEvent] = field(default_factory=list)
+    orders: list[Ordered] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def name(self, robot_id: int) -> str:
+        """What people call the robot."""
+        return self.names.get(robot_id, str(robot_id))
+
+
+def read_logs(folders: Sequence[Path], progress: Progress) -> Logs:
+    """Read all robots' and grounds' logs below `folders`.
+
+    Raises ValueError if there are none, or a folder is not there.
+    """
+    paths: list[Path] = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise ValueError(f"{folder}: is not a folder")
+        for name in ("robot-*.mcap", "ground-*.mcap"):
+            paths += sorted(path for path in folder.rglob(name) if path.is_file())
+    if not paths:
+        where = ", ".join(map(str, folders))
+        raise ValueError(
+            f"{where}: holds no logs (robot-*.mcap, ground-*.mcap): `lpac fleet pull` fetches them"
+        )
+    reader = _LogReader()
+    paths = list(dict.fromkeys(path.resolve() for path in paths))
+    for index, path in enumerate(paths):
+        progress(f"reading {path.name}", index / len(paths))
+        reader.read(path)
+    return reader.logs()
+
+
+class _LogReader:
+    """Collects files, and then puts them on one clock."""
+
+    def __init__(self) -> None:
+        self._logs = Logs()
+        # program -> sequence -> status, in uptime; the robots' own are the same.
+        self._statuses: dict[Program, dict[int, LoggedStatus]] = defaultdict(dict)
+        # program -> what its clock said when it had begun, by each status
+        self._own_starts_s: dict[Program, list[float]] = defaultdict(list)
+        self._fences: dict[str, Fence] = {}
+        # program -> when the ground heard it, less its uptime
+        self._heard: dict[Program, list[float]] = defaultdict(list)
+        # program -> as the columns of `Received`, in the robot's clock
+        self._received: dict[Program, list[tuple[float, int, int, float, bool]]] = defaultdict(list)
+        self._orders: list[tuple[Program, Ordered]] = []  # in the robot's clock
+        self._events: set[GroundEvent] = set()
+
+    def read(self, path: Path) -> None:
+        """Take what is understood of a file; a note tells of the rest."""
+        notes = self._logs.notes
+        # topic -> why each message was not understood
+        odd: dict[str, list[str]] = defaultdict(list)
+        begun = False
+        try:
+            if path.name.startswith("ground-"):
+                take, topics = self._take_from_ground, ("setup", "status", "event")
+            else:
+                take = partial(self._take_from_robot, self._begin_robot(path))
+                topics = ("status", "received", "order")
+            for topic, time_s, message in read(path, *topics):
+                begun = True
+                try:
+                    take(topic, time_s, message)
+                except KeyError as error:
+                    odd[topic].append(f"{error} is missing")
+                except (AttributeError, OverflowError, TypeError, ValueError) as error:
+                    odd[topic].append(str(error))
+            if not begun:
+                notes.append(f"{path}: holds nothing, or broke off at its begin")
+        except FlightLogError as error:
+            notes.append(f"{error}: left out")
+        except ValueError as error:  # a message that is not even JSON
+            notes.append(f"{path}: {error}: left out from there")
+        notes += [
+            f"{path}: {why[0]}: left out: {len(why)} of topic {topic}" for topic, why in odd.items()
+        ]
+
+    def _begin_robot(self, path: Path) -> Program:
+        metadata = read_metadata(path)
+        program = (metadata.robot_id, metadata.boot_nonce)
+        self._logs.metadata.append(metadata)
+        self._logs.programs_logged.add(program)
+        if path.parent.name == "logs" and not path.parts[-3].isdigit():
+            # As `lpac fleet pull` calls the robots' folders.
+            self._logs.names.setdefault(metadata.robot_id, path.parts[-3])
+        return program
+
+    def _take_from_robot(
+        self, program: Program, topic: str, time_s: float, message: Mapping[str, Any]
+    ) -> None:
+        if topic == "status":
+            self._take_status(program, message)
+        elif topic == "received":
+            age_s, sequence = message["age_s"], message["sequence"]
+            self._received[program].append(
+                (
+                    time_s,
+                    int(message["sender"]),
+                    -1 if sequence is None else int(sequence),
+                    math.nan if age_s is None else float(age_s),
+                    message["rejection"] is None,
+                )
+            )
+        else:
+            answer = message["answer"]
+            order = Ordered(
+                time_s, program[0], message["kind"], message["operator"], message["trial"],
+                answer["accepted"], answer["reason"],
+            )  # fmt: skip
+            self._orders.append((program, order))
+
+    def _take_from_ground(self, topic: str, time_s: float, message: Mapping[str, Any]) -> None:
+        if topic == "setup":
+            self._logs.setups.append((time_s, _known(FleetSetup, message, "setup")))
+        elif topic == "event":
+            self._events.add(_known(GroundEvent, message, "event"))
+        else:
+            program = (message["robot_id"], message["boot_nonce"])
+            name = message["name"]
+            heard_s = _time_s(message, "heard_at_unix_s") - _time_s(message, "uptime_s")
+            self._take_status(program, message)
+            self._logs.names[program[0]] = name
+            self._heard[program].append(heard_s)
+
+    def _take_status(self, program: Program, status: Mapping[str, Any]) -> None:
+        sequence = status["sequence"]
+        if program in self._statuses and sequence in self._statuses[program]:
+            return
+        own_start_s = _time_s(status, "unix_time_s") - _time_s(status, "uptime_s")
+        self._statuses[program][sequence] = self._said(status)
+        self._own_starts_s[program].append(own_start_s)
+
+    def _said(self, status: Mapping[str, Any]) -> LoggedStatus:
+        position_m = status["position_m"]
+        if position_m is not None:
+            x_m, y_m, z_m = map(float, position_m)
+            position_m = (x_m, y_m, z_m) if math.isfinite(x_m + y_m + z_m) else None
+        fence = status.get("fence")
+        if fence is not None:
+            # They are all the same, and there are very many.
+            text = json.dumps(fence)
+            if text not in self._fences:
+                self._fences[text] = _known(Fence, fence, "fence")
+            fence = self._fences[text]
+        landing_x_m, landing_y_m = map(float, status["landing_point_m"])
+        return LoggedStatus(
+            time_s=_time_s(status, "uptime_s"),
+            boot_nonce=status["boot_nonce"],
+            state=FlightState(status["state"]),
+            trial=status["trial"],
+            armed=status["armed"],
+            position_m=position_m,
+            alarms=tuple(status["alarms"]),
+            loops={
+                name: _known(LoopStatus, loop, name)
+                for name, loop in status["loops"].items()
+                if None not in [_finite(loop[key]) for key in _LATENESS]
+            },
+            fence=fence,
+            battery=_finite(status["battery"]),
+            landing_point_m=(landing_x_m, landing_y_m),
+            bundle_id=status["bundle_id"],
+            world_id=status["world_id"],
+        )
+
+    def logs(self) -> Logs:
+        logs = self._logs
+        # By program: what turns its uptime into the common clock, and how far ahead its own is.
+        starts_s: dict[Program, float] = {}
+        ahead_s: dict[Program, float] = {}
+        for program, statuses in self._statuses.items():
+            starts_s[program] = own_s = float(np.median(self._own_starts_s[program]))
+            if program in self._heard:
+                starts_s[program] = float(np.quantile(self._heard[program], _EARLY))
+                logs.clocks_known.add(program)
+            ahead_s[program] = own_s - starts_s[program]
+            logs.statuses.setdefault(program[0], []).extend(
+                replace(said, time_s=starts_s[program] + said.time_s) for said in statuses.values()
+            )
+        for robot_statuses in logs.statuses.values():
+            robot_statuses.sort(key=lambda said: said.time_s)
+        self._sort_received(starts_s, ahead_s)
+        logs.orders = sorted(
+            order._replace(time_s=order.time_s - ahead_s.get(program, 0.0))
+            for program, order in self._orders
+        )
+        logs.events = sorted(self._events, key=lambda event: event.unix_time_s)
+        logs.setups.sort(key=lambda told: told[0])
+        for _, setup in logs.setups:
+            logs.names.update({robot_id: name for name, robot_id in setup.robots.items()})
+        return logs
+
+    def _sort_received(
+        self, starts_s: Mapping[Program, float], ahead_s: Mapping[Program, float]
+    ) -> None:
+        # A message names its sender, not the start of its program: the one that ran then sent it.
+        began: dict[int, list[tuple[float, float]]] = defaultdict(list)
+        for program, start_s in sorted(starts_s.items(), key=lambda item: item[1]):
+            began[program[0]].append((start_s, ahead_s[program]))
+        columns: dict[int, list[tuple[float, ...]]] = defaultdict(list)
+        for program, messages in self._received.items():
+            own_s = ahead_s.get(program, 0.0)
+            for at_s, sender, sequence, own_age_s, accepted in messages:
+                time_s = at_s - own_s
+                senders = [a for start_s, a in began[sender] if start_s <= time_s]
+                age_s = own_age_s - own_s + (senders[-1] if senders else 0.0)
+                columns[program[0]].append((time_s, sender, sequence, age_s, accepted))
+        for robot_id, rows in columns.items():
+            ordered = np.array(sorted(rows), np.float64).T
+            self._logs.received[robot_id] = Received(*ordered)
+
+
+def configured_fence(metadata: FlightMetadata) -> Fence | None:
+    """The fence of the robot's configuration; None if that cannot be read."""
+    try:
+        return from_mapping(Fence, json.loads(metadata.configuration)["fence"], "fence")
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def _known(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+    """As `from_mapping`, but of another version's keys, which this one does not know, all go."""
+    names = {field.name for field in fields(cls)}  # type: ignore[arg-type]
+    known = {key: value for key, value in mapping.items() if key in names}
+    return from_mapping(cls, known, where)
+
+
+def _finite(value: Any) -> float | None:
+    number = math.nan if value is None else float(value)
+    return number if math.isfinite(number) else None
+
+
+def _time_s(message: Mapping[str, Any], key: str) -> float:
+    value = _finite(message[key])
+    if value is None:
+        raise ValueError(f"{key} = {message[key]}")
+    return value

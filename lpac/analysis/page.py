@@ -1,0 +1,214 @@
+"""The report as one HTML page that holds everything: it opens anywhere, without a network."""
+
+import base64
+import html
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from typing import NamedTuple
+
+from lpac.analysis.trials import LOOPS, LoopLateness, Trial
+
+_CAPTIONS = {
+    "snapshots": "Robots, their paths so far and Voronoi cells over the density, which is faint "
+    "where no robot had looked by then.",
+    "start-and-end": "Where the robots began and ended the mission.",
+    "cost": "Coverage cost over that at the begin, beside the clairvoyant bound: what Lloyd's "
+    "algorithm comes to that knows the whole density.",
+    "states": "What each robot did; dashed: begin and end of the mission.",
+    "messages": "Messages between the robots during the mission: age when they came, and the share "
+    "that did not come, by the gaps in the senders' numbering.",
+    "loops": "How late the loops' ticks were, in the minute before each time.",
+}
+_MOST_ROWS = 30
+_REPEATABILITY = "Cost of all trials, their mean and standard deviation; and end positions."
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
+  max-width: 62rem; margin: 0 auto; padding: 1rem 1rem 4rem; }
+h1 { font-size: 1.7rem; margin: .5rem 0; }
+h2 { font-size: 1.3rem; margin: 3rem 0 .3rem; border-top: 2px solid #1a1a1a; padding-top: .6rem; }
+h3, summary { font-size: 1rem; font-weight: 600; margin: 1.5rem 0 .3rem; }
+p { margin: .3rem 0; } .quiet, figcaption { color: #555; font-size: .9rem; }
+figure { margin: 1.2rem 0; } img { width: 100%; height: auto; display: block; }
+img.narrow { max-width: 42rem; }
+.wide { overflow-x: auto; } table { border-collapse: collapse; font-size: .85rem; }
+th, td { text-align: left; padding: .25rem .9rem .25rem 0; border-bottom: 1px solid #ddd;
+  vertical-align: bottom; } th { font-weight: 600; line-height: 1.2; }
+td.number, th.number { text-align: right; }
+td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
+.bad { color: #a50f15; font-weight: 600; } td:first-child { white-space: nowrap; }
+@media print { h2 { break-before: page; } figure { break-inside: avoid; }
+  body { max-width: none; } }
+"""
+
+
+class Drawn(NamedTuple):
+    """A trial, and its figures: PNG by name."""
+
+    trial: Trial
+    figures: Mapping[str, bytes]
+
+
+def page(
+    title: str, drawn: Sequence[Drawn], repeatability: bytes | None, notes: Iterable[str]
+) -> str:
+    """The page's HTML."""
+    parts = [
+        "<!doctype html>",
+        f'<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title>',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<style>{_STYLE}</style></head><body>",
+        f"<h1>{_text(title)}</h1>",
+        _summary([d.trial for d in drawn]),
+    ]
+    if repeatability is not None:
+        parts.append("<h3>Repeatability</h3>")
+        parts.append(_figure(repeatability, _REPEATABILITY))
+    parts += [f'<p class="quiet">{_text(note)}</p>' for note in notes]
+    for number, (trial, figures) in enumerate(drawn, 1):
+        parts.append(f'<h2 id="trial-{number}">{_text(trial.name)}</h2>')
+        parts.append(_about(trial))
+        for name, png in figures.items():
+            caption = _CAPTIONS[name]
+            if name == "messages" and trial.clocks_known:
+                caption += " Clocks are corrected, to a few ms."
+            parts.append(_figure(png, caption, narrow=name == "start-and-end"))
+        parts.append(_robots(trial))
+        parts.append(_alarms(trial))
+        parts.append(_commands(trial))
+    parts.append("</body></html>")
+    return "\n".join(part for part in parts if part) + "\n"
+
+
+def _summary(trials: Sequence[Trial]) -> str:
+    header = (
+        "trial", "began", "s", "robots", "J at begin", "J at end", "J/J(0)", "bound",
+        "least distance", "inside fence", "messages lost", "alarms", "restarts",
+    )  # fmt: skip
+    rows = []
+    for number, trial in enumerate(trials, 1):
+        cost, separation = trial.cost, trial.separation
+        lost = math.nan if trial.messages is None else trial.messages.loss_share
+        rows.append(
+            (
+                f'<a href="#trial-{number}">{_text(trial.name)}</a>',
+                f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S}",
+                f"{trial.duration_s:.0f}",
+                str(len(trial.tracks)),
+                f"{cost[0]:.3g}" if len(cost) else "",
+                f"{cost[-1]:.3g}" if len(cost) else "",
+                f"{trial.normalized[-1]:.2f}" if len(trial.normalized) else "",
+                _number(trial.normalized_bound, "{:.2f}"),
+                "" if separation is None else f"{separation.distance_m:.2f} m",
+                _marked(f"{trial.fence_margin_m:.2f} m", trial.fence_margin_m < 0.0)
+                if math.isfinite(trial.fence_margin_m)
+                else "",
+                _number(100.0 * lost, "{:.1f} %"),
+                _marked(str(len(trial.alarms)), bool(trial.alarms)),
+                _marked(str(sum(trial.restarts.values())), bool(trial.restarts)),
+            )
+        )
+    return _table(header, rows, numbers=range(1, len(header)))
+
+
+def _about(trial: Trial) -> str:
+    words = [
+        f"{len(trial.tracks)} robots, {trial.duration_s:.0f} s, from "
+        f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S %Z}."
+    ]
+    if trial.separation is not None:
+        one, other = trial.separation.robots
+        words.append(
+            f"Least distance, as the robots said: {trial.separation.distance_m:.2f} m between "
+            f"{one} and {other}, at {trial.separation.time_s:.1f} s."
+        )
+    if not trial.clocks_known:
+        words.append("Each robot's times are its own clock's: no ground log tells the offsets.")
+    return f"<p>{_text(' '.join(words))}</p>"
+
+
+def _robots(trial: Trial) -> str:
+    header = (
+        "robot", "battery at end", *(f"{loop} late, 99 % / max" for loop in LOOPS), "overruns",
+        "restarts",
+    )  # fmt: skip
+    rows = []
+    for track in trial.tracks:
+        late = [trial.lateness[loop].get(track.name) for loop in LOOPS]
+        battery = track.said[-1].battery
+        rows.append(
+            (
+                _text(track.name),
+                "" if battery is None else f"{100.0 * battery:.0f} %",
+                *map(_late, late),
+                str(sum(loop.overruns for loop in late if loop is not None)),
+                str(trial.restarts.get(track.name, 0)),
+            )
+        )
+    return "<h3>Robots</h3>" + _table(header, rows, numbers=range(1, len(header)))
+
+
+def _late(loop: LoopLateness | None) -> str:
+    return "" if loop is None else f"{loop.p99_ms[-1]:.1f} / {loop.max_ms[-1]:.1f} ms"
+
+
+def _alarms(trial: Trial) -> str:
+    if not trial.alarms:
+        return ""
+    rows = [(_time(a.time_s), _text(a.robot), _text(a.text)) for a in trial.alarms]
+    return "<h3>Alarms</h3>" + _table(("s", "robot", "alarm"), rows, numbers=(0,))
+
+
+def _commands(trial: Trial) -> str:
+    if not trial.commands:
+        return ""
+    rows = [
+        (_time(c.time_s), _text(c.operator), _text(c.robot), _marked(_text(c.text), not c.done))
+        for c in trial.commands
+    ]
+    opened = " open" if len(rows) <= _MOST_ROWS else ""
+    return (
+        f"<details{opened}><summary>Commands ({len(rows)})</summary>"
+        + _table(("s", "who", "robot", "what"), rows, numbers=(0,))
+        + "</details>"
+    )
+
+
+def _table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()
+) -> str:
+    """`rows` are HTML; the columns in `numbers` are to the right."""
+    marks = [' class="number"' if column in set(numbers) else "" for column in range(len(header))]
+    lines = ['<div class="wide"><table><tr>']
+    lines += [f"<th{m}>{_text(name)}</th>" for m, name in zip(marks, header, strict=True)]
+    for row in rows:
+        cells = (f"<td{m}>{cell}</td>" for m, cell in zip(marks, row, strict=True))
+        lines.append("</tr><tr>" + "".join(cells))
+    return "".join(lines) + "</tr></table></div>"
+
+
+def _figure(png: bytes, caption: str, *, narrow: bool = False) -> str:
+    source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    mark = ' class="narrow"' if narrow else ""
+    return (
+        f'<figure><img{mark} alt="{_text(caption)}" src="{source}">'
+        f"<figcaption>{_text(caption)}</figcaption></figure>"
+    )
+
+
+def _marked(text: str, bad: bool) -> str:
+    return f'<span class="bad">{text}</span>' if bad else text
+
+
+def _time(time_s: float) -> str:
+    return f"{round(time_s, 1) + 0.0:.1f}"  # without a minus before 0
+
+
+def _number(value: float, form: str) -> str:
+    return form.format(value) if math.isfinite(value) else ""
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

@@ -1,0 +1,360 @@
+"""A flight's logs as the paper's figures, one HTML page, and numbers."""
+
+import contextlib
+import json
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from edge.messages.mission import world_id as id_of
+from edge.policy.bundle import Bundle, BundleError, load_bundle
+from lpac.analysis import figures
+from lpac.analysis.coverage import Coverage
+from lpac.analysis.logs import Logs, Progress, configured_fence, read_logs
+from lpac.analysis.page import Drawn, page
+from lpac.analysis.trials import LOOPS, Mission, Trial, find_missions, trial_of
+
+PAGE = "report.html"
+SUMMARY = "report.json"
+_SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a trial's duration
+_MOST_NOTES = 3  # in one line
+
+
+@dataclass(frozen=True, slots=True)
+class _World:
+    """What `Coverage` needs."""
+
+    world: str
+    world_id: str
+    world_size: int
+    env_scale: float
+    truncation: float
+    norm: float
+
+
+class _Sizes(NamedTuple):
+    """Of the policy's world; see `Setup`."""
+
+    world_size: int
+    sensor_size: int
+    env_scale: float
+    truncation: float
+    norm: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """What the report is to be of: only the missions called `trials` (none: all), snapshots at
+    `times_s` (none: at the begin, a quarter, half and all of each), over the world in `world`, for
+    the policy in `bundle`.
+    """
+
+    trials: tuple[str, ...] = ()
+    times_s: tuple[float, ...] = ()
+    world: Path | None = None
+    bundle: Path | None = None
+
+    def __post_init__(self) -> None:
+        for time_s in self.times_s:
+            if not 0.0 <= time_s < math.inf:
+                raise ValueError(f"--times {time_s:g}: must be 0 or above")
+
+
+class Examined(NamedTuple):
+    """The trials in some logs, and what a reader should know of these."""
+
+    trials: tuple[Trial, ...]
+    notes: tuple[str, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """What is to be said of them, as JSON values."""
+        return {"trials": [_values(trial) for trial in self.trials], "notes": list(self.notes)}
+
+
+def examine(folders: Sequence[Path], wanted: Wanted, progress: Progress) -> Examined:
+    """What is in the logs below `folders`.
+
+    `progress` gets what is being done, and the share of it. Raises ValueError if there are no logs,
+    or no mission in them; OSError if something cannot be read.
+    """
+    logs = read_logs(folders, progress)
+    missions = find_missions(logs)
+    chosen = _choose(logs, missions, wanted)
+    notes = list(logs.notes)
+    worlds = _Worlds(logs, folders, wanted, notes)
+    fences = {m.robot_id: configured_fence(m) for m in logs.metadata}
+    trials = []
+    for index, mission in enumerate(chosen):
+        progress(f"examining {mission.name}", index / len(chosen))
+        trial = trial_of(
+            logs, mission, [other for other in missions if other is not mission],
+            *worlds.of(mission), fences.get(mission.robots[0]),
+        )  # fmt: skip
+        notes += _notes(logs, trial, wanted)
+        trials.append(trial)
+    return Examined(tuple(trials), tuple(notes))
+
+
+def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Progress) -> Path:
+    """Write figures, page and summary to `out`; gives the page. Raises OSError."""
+    drawn = []
+    slugs: set[str] = set()
+    for index, trial in enumerate(examined.trials):
+        progress(f"drawing {trial.name}", index / len(examined.trials))
+        drawn.append(Drawn(trial, _draw(trial, out / _slug(trial.name, slugs), times_s)))
+    repeatability = None
+    with_cost = [trial for trial in examined.trials if len(trial.normalized)]
+    if len(with_cost) > 1:
+        progress("drawing all trials", 1.0)
+        pictures = figures.Pictures(out)
+        pictures.save("repeatability", figures.repeatability(with_cost))
+        pictures.save("costs", figures.costs(with_cost))
+        repeatability = pictures.drawn["repeatability"]
+    (out / SUMMARY).write_text(json.dumps(examined.summary(), indent=2) + "\n")
+    names = ", ".join(trial.name for trial in examined.trials[:3])
+    names += ", …" if len(drawn) > 3 else ""
+    text = page(f"Flight report: {names}", drawn, repeatability, examined.notes)
+    (out / PAGE).write_bytes(text.encode(errors="backslashreplace"))
+    return out / PAGE
+
+
+def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission]:
+    """Raises ValueError that says what there is."""
+    if not missions:
+        robots = len(logs.statuses)
+        left_out = "".join(f"; {note}" for note in logs.notes[:_MOST_NOTES])
+        more = len(logs.notes) - _MOST_NOTES
+        left_out += f"; and {more} more such notes" if more > 0 else ""
+        raise ValueError(f"no mission was flown in these logs, of {robots} robots{left_out}")
+    if not wanted.trials:
+        return missions
+    names = [mission.name for mission in missions]
+    for name in wanted.trials:
+        if name not in names:
+            raise ValueError(f"--trial {name!r}: the logs have {', '.join(map(repr, names))}")
+    return [mission for mission in missions if mission.name in wanted.trials]
+
+
+class _Worlds:
+    """The worlds that can be found, by what they are called."""
+
+    def __init__(
+        self, logs: Logs, folders: Iterable[Path], wanted: Wanted, notes: list[str]
+    ) -> None:
+        self._logs = logs
+        self._bundle = wanted.bundle
+        self._notes = notes
+        self._given = None if wanted.world is None else wanted.world.read_text("utf-8-sig")
+        self._texts = {setup.world_id: setup.world for _, setup in logs.setups if setup.world}
+        paths = [path for folder in folders for path in sorted(folder.rglob("*.env"))]
+        paths += [Path(_policy(m.configuration).get("world", "")) for m in logs.metadata]
+        for path in dict.fromkeys(paths):
+            # Not every .env file is a world.
+            with contextlib.suppress(OSError, UnicodeDecodeError):
+                text = path.read_text("utf-8-sig")
+                self._texts.setdefault(id_of(text), text)
+        self._coverages: dict[tuple[str, _Sizes], Coverage] = {}
+
+    def of(self, mission: Mission) -> tuple[Coverage | None, int]:
+        """The world that the mission's robots flew over; None, with a note, if it is not known.
+
+        And how many cells of it a robot's sensor saw. Raises BundleError for a given bundle that
+        cannot be loaded, or has no perception.
+        """
+        said = [
+            said
+            for robot in mission.robots
+            for said in self._logs.statuses[robot]
+            if mission.begin_s <= said.time_s <= mission.end_s
+        ]
+        sizes = self._sizes(mission, {s.bundle_id for s in said})
+        return self._coverage(mission, sorted({s.world_id for s in said}), sizes), sizes.sensor_size
+
+    def _coverage(self, mission: Mission, flown: list[str], sizes: _Sizes) -> Coverage | None:
+        if len(flown) > 1:
+            self._notes.append(
+                f"{mission.name}: the robots flew over several worlds: {', '.join(flown)}"
+            )
+        text = self._given
+        if text is not None and id_of(text) not in flown:
+            self._notes.append(
+                f"{mission.name}: --world is {id_of(text)}, and the robots flew over {flown[0]}"
+            )
+        if text is None:
+            text = self._texts.get(flown[0])
+        if text is None:
+            self._notes.append(
+                f"{mission.name}: world {flown[0]} is not here: no density, no cost; "
+                "give it with --world"
+            )
+            return None
+        name = id_of(text)
+        if (name, sizes) not in self._coverages:
+            self._coverages[name, sizes] = Coverage(
+                _World(text, name, sizes.world_size, sizes.env_scale, sizes.truncation, sizes.norm)
+            )
+        return self._coverages[name, sizes]
+
+    def _sizes(self, mission: Mission, bundle_ids: set[str]) -> _Sizes:
+        """From the ground's log of the policies that were flown, else from a policy's bundle."""
+        setups = [told for told in self._logs.setups if told[1].bundle_id in bundle_ids]
+        if setups and self._bundle is None:
+            before = [setup for at_s, setup in setups if at_s <= mission.end_s]
+            setup = before[-1] if before else setups[0][1]
+            return _Sizes(
+                setup.world_size, setup.sensor_size, setup.env_scale, setup.truncation, setup.norm
+            )
+        env_scale = 16.0
+        places = []
+        for metadata in self._logs.metadata:
+            if metadata.bundle_id in bundle_ids:
+                env_scale = float(_policy(metadata.configuration).get("env_scale", env_scale))
+                places.append(Path(metadata.bundle_path))
+        if self._bundle is not None:
+            return _sizes_of(self._bundle, load_bundle(self._bundle), env_scale)
+        for place in dict.fromkeys(places):
+            with contextlib.suppress(BundleError, OSError):
+                bundle = load_bundle(place)
+                if bundle.id in bundle_ids:  # There may be another one by now.
+                    return _sizes_of(place, bundle, env_scale)
+        sizes = _Sizes(512, 64, env_scale, 2.0, 1.0)
+        self._notes.append(
+            f"{mission.name}: the policy's bundle is not here (give it with --bundle): taken for "
+            f"granted are a world of {sizes.world_size} cells and a sensor of {sizes.sensor_size}"
+        )
+        return sizes
+
+
+def _sizes_of(place: Path, bundle: Bundle, env_scale: float) -> _Sizes:
+    """Raises BundleError if the bundle has no perception."""
+    perception, training = bundle.manifest.perception, bundle.manifest.training
+    if perception is None:
+        raise BundleError(f"{place}: the bundle has no perception")
+    return _Sizes(
+        perception.world_size, perception.sensor_size, env_scale, training.idf_truncation,
+        training.idf_norm,
+    )  # fmt: skip
+
+
+def _policy(configuration: str) -> dict[str, Any]:
+    try:
+        policy = json.loads(configuration)["policy"]
+    except (ValueError, KeyError, TypeError):
+        return {}
+    return policy if isinstance(policy, dict) else {}
+
+
+def _notes(logs: Logs, trial: Trial, wanted: Wanted) -> Iterable[str]:
+    late_s = [f"{time_s:g}" for time_s in wanted.times_s if time_s > trial.duration_s]
+    if late_s:
+        yield f"{trial.name}: lasted {trial.duration_s:.1f} s: no snapshot at {', '.join(late_s)} s"
+    if len(trial.cost) and not len(trial.normalized):
+        yield f"{trial.name}: the world holds no importance: no normalised cost"
+    silent = [
+        track.name
+        for track in trial.tracks
+        if not {(track.robot_id, said.boot_nonce) for said in track.said} & logs.programs_logged
+    ]
+    if silent:
+        whose = "any robot" if len(silent) == len(trial.tracks) else ", ".join(silent)
+        yield (
+            f"{trial.name}: no log of {whose} is here, only what the ground heard: nothing is "
+            "known of the messages that came there"
+        )
+    told = trial.messages
+    if told is not None and not trial.clocks_known and len(told.heard_age_s):
+        low_s, high_s = told.age_quantile_s(0.0), told.age_quantile_s(0.5)
+        if low_s < -0.05 or high_s > 2.0:
+            yield (
+                f"{trial.name}: the robots' clocks differ, and no ground log tells by how much: "
+                "message ages, and times between robots, are wrong"
+            )
+
+
+def _slug(name: str, taken: set[str]) -> str:
+    """A folder's name that no other trial has."""
+    plain = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "trial"
+    slug = next(
+        slug
+        for number in range(1, len(taken) + 2)
+        if (slug := plain if number == 1 else f"{plain}-{number}") not in taken
+    )
+    taken.add(slug)
+    return slug
+
+
+def _draw(trial: Trial, folder: Path, times_s: Sequence[float]) -> dict[str, bytes]:
+    """PNG by figure."""
+    pictures = figures.Pictures(folder)
+    shown_s = [time_s for time_s in times_s if time_s <= trial.duration_s]
+    shown_s = shown_s or [share * trial.duration_s for share in _SNAPSHOTS]
+    pictures.save("snapshots", figures.snapshots(trial, shown_s))
+    pictures.save("start-and-end", figures.start_and_end(trial))
+    if len(trial.normalized):
+        pictures.save("cost", figures.costs([trial]))
+    pictures.save("states", figures.states(trial))
+    if trial.messages is not None and len(trial.messages.heard_at_s):
+        pictures.save("messages", figures.messages(trial, trial.messages))
+    if any(trial.lateness[loop] for loop in LOOPS):
+        pictures.save("loops", figures.loops(trial))
+    return pictures.drawn
+
+
+def _values(trial: Trial) -> dict[str, Any]:
+    """What is to be said of a trial, as JSON values."""
+    told = trial.messages
+    return {
+        "trial": trial.name,
+        "began_unix_s": round(trial.begin_s, 3),
+        "duration_s": round(trial.duration_s, 3),
+        "robots": [track.name for track in trial.tracks],
+        "worlds": list(trial.world_ids),
+        "cost": {
+            "initial": _first(trial.cost, 0),
+            "final": _first(trial.cost, -1),
+            "normalized": _first(trial.normalized, -1),
+            "bound": _number(trial.bound),
+            "normalized_bound": _number(trial.normalized_bound),
+            "time_s": trial.cost_time_s[: len(trial.normalized)].round(3).tolist(),
+            "curve": trial.normalized.round(6).tolist(),
+        },
+        "separation": None if trial.separation is None else trial.separation._asdict(),
+        "fence_margin_m": _number(trial.fence_margin_m),
+        "restarts": dict(trial.restarts),
+        "alarms": [alarm._asdict() for alarm in trial.alarms],
+        "commands": [command._asdict() for command in trial.commands],
+        "messages": None
+        if told is None
+        else {
+            "came": len(told.heard_at_s),
+            "lost": told.lost,
+            "rejected": told.rejected,
+            "loss_share": _number(told.loss_share),
+            "age_p50_s": _number(told.age_quantile_s(0.5)),
+            "age_p99_s": _number(told.age_quantile_s(0.99)),
+            "ages_corrected": trial.clocks_known,
+        },
+        "loops": {
+            loop: {
+                "p99_ms": max(float(late.p99_ms.max()) for late in robots.values()),
+                "max_ms": max(float(late.max_ms.max()) for late in robots.values()),
+                "overruns": sum(late.overruns for late in robots.values()),
+                "failures": sum(late.failures for late in robots.values()),
+            }
+            for loop, robots in trial.lateness.items()
+            if robots
+        },
+        "start_m": trial.places_at(0.0),
+        "end_m": trial.places_at(trial.duration_s),
+    }
+
+
+def _first(values: Any, index: int) -> float | None:
+    return _number(float(values[index])) if len(values) else None
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

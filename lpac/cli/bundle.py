@@ -1,0 +1,122 @@
+"""`lpac bundle`: look at a bundle, prove that this machine computes what torch did, measure it."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(name="bundle", help="Look at a policy bundle; verify or time it on this machine.")
+
+BundlePath = Annotated[
+    Path, typer.Argument(metavar="BUNDLE", help="A bundle's directory or .zip archive.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@app.command()
+def info(path: BundlePath, as_json: AsJson = False) -> None:
+    """Print what the bundle holds: geometry, perception, training, origin."""
+    from edge.policy.bundle import MANIFEST, load_bundle
+
+    bundle = load_bundle(path)
+    manifest, geometry = bundle.manifest, bundle.manifest.geometry
+    if as_json:
+        typer.echo(json.dumps({"id": bundle.id, **json.loads(bundle.files[MANIFEST])}, indent=2))
+        return
+    images, perception, training = manifest.images, manifest.perception, manifest.training
+    sizes = " -> ".join(map(str, geometry.feature_sizes))
+    rows = [
+        ("name", manifest.name),
+        ("id", bundle.id),
+        ("network", f"L = {geometry.layers} layers ({sizes}), K = {geometry.hops} hops"),
+        (
+            "message",
+            f"{geometry.message_size} values: {4 * geometry.message_size:,} B in float32, "
+            f"{2 * geometry.message_size:,} B in float16",
+        ),
+    ]
+    if images and perception:
+        rows += [
+            ("images", f"{', '.join(images.channels)}: {images.size} x {images.size}"),
+            (
+                "perception",
+                f"world {perception.world_size}, local map {perception.local_map_size}, "
+                f"sensor {perception.sensor_size}, range {perception.communication_range:g}",
+            ),
+        ]
+    else:
+        rows.append(("perception", "none: graph neural network and action only"))
+    rows += [
+        ("training", f"{training.max_speed:g} units/s, time step {training.time_step:g} s"),
+        ("exported", f"from {manifest.provenance.checkpoint} ({manifest.provenance.exporter})"),
+        *((name, f"{len(bundle.files[name]):,} B") for name in manifest.files),
+    ]
+    for label, value in rows:
+        typer.echo(f"{label:12} {value}")
+
+
+@app.command()
+def verify(path: BundlePath, as_json: AsJson = False) -> None:
+    """Check every hash, then run every graph and a swarm against torch's golden outputs."""
+    from edge.policy.bundle import load_bundle
+    from edge.policy.verify import TOLERANCE
+    from edge.policy.verify import verify as run_checks
+
+    bundle = load_bundle(path)
+    checks = []
+    for check in run_checks(bundle):
+        checks.append(check)
+        if not as_json:
+            verdict = "ok" if check.passed else "FAILED"
+            typer.echo(f"{check.name:12} relative error {check.relative_error:.1e}  {verdict}")
+    failed = [check.name for check in checks if not check.passed]
+    if as_json:
+        errors = {check.name: check.relative_error for check in checks}
+        report = {"id": bundle.id, "tolerance": TOLERANCE, "failed": failed, "errors": errors}
+        typer.echo(json.dumps(report, indent=2))
+    elif not failed:
+        name = f"{bundle.manifest.name} {bundle.id[:12]}"
+        typer.echo(f"{name}: this machine computes the golden outputs")
+    if failed:
+        raise ValueError(
+            f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of torch's golden outputs"
+        )
+
+
+@app.command()
+def benchmark(
+    path: BundlePath,
+    neighbours: Annotated[int, typer.Option(help="How many send to the robot.")] = 10,
+    seconds: Annotated[float, typer.Option(help="How long to measure, s.")] = 3.0,
+    as_json: AsJson = False,
+) -> None:
+    """Time the steps of a robot on this machine; fails if one takes over half of its period."""
+    from edge.policy.bundle import load_bundle
+    from edge.robot.benchmark import MOST_OF_PERIOD
+    from edge.robot.benchmark import benchmark as measure
+
+    bundle = load_bundle(path)
+    result = measure(bundle, neighbours, seconds)
+    if as_json:
+        steps = {
+            step.step: {**dataclasses.asdict(step), "share": step.share} for step in result.steps
+        }
+        typer.echo(
+            json.dumps({**dataclasses.asdict(result), "id": bundle.id, "steps": steps}, indent=2)
+        )
+    else:
+        typer.echo(f"{bundle.manifest.name} on {result.architecture}, {neighbours} neighbours, ms:")
+        for step in result.steps:
+            typer.echo(
+                f"{step.step:12} p50 {step.p50_ms:.2f}  p99 {step.p99_ms:.2f}  "
+                f"max {step.max_ms:.2f}  p99 is {step.share:.1%} of {step.period_ms:.0f} ms"
+            )
+    slow = [step for step in result.steps if not step.fits]
+    if slow:
+        times = ", ".join(f"{s.step} {s.p99_ms:.0f} of {s.period_ms:.0f} ms" for s in slow)
+        raise ValueError(
+            f"{path}: too slow on this machine: {times} (p99), and at most {MOST_OF_PERIOD:.0%} "
+            "may be taken: end what else runs, or fly a smaller policy"
+        )

@@ -1,0 +1,46 @@
+"""`lpac export`: a trained torch checkpoint becomes a bundle."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def export(
+    checkpoint: Annotated[
+        Path, typer.Argument(help="LPAC state dict (.pt), or the authors' folder of tensors.")
+    ],
+    params: Annotated[
+        Path,
+        typer.Option(help="Our parameter file (TOML), or a coverage_control_params.toml."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Bundle to write: a directory, or a .zip archive."),
+    ],
+    name: Annotated[
+        str | None, typer.Option(help="The policy's name; by default the checkpoint's.")
+    ] = None,
+) -> None:
+    """Export a trained torch checkpoint as a bundle that runs without torch."""
+    from edge.policy.bundle import write_bundle
+    from export.exporter import export_bundle
+
+    bundle = export_bundle(checkpoint, params, name)
+    write_bundle(bundle, output)
+
+    manifest, geometry = bundle.manifest, bundle.manifest.geometry
+    images = manifest.images
+    perception = (
+        f"{images.size} x {images.size} images of {', '.join(images.channels)}"
+        if images
+        else "none: this checkpoint has no CNN"
+    )
+    size_mb = sum(map(len, bundle.files.values())) / 1e6
+    typer.echo(f"{output}: {manifest.name}, bundle {bundle.id}")
+    typer.echo(
+        f"  network     L = {geometry.layers}, K = {geometry.hops}, "
+        f"features {' -> '.join(map(str, geometry.feature_sizes))}"
+    )
+    typer.echo(f"  perception  {perception}")
+    typer.echo(f"  files       {', '.join(sorted(bundle.files))} ({size_mb:.1f} MB)")

@@ -1,0 +1,283 @@
+"""`lpac fleet`: the day in the field: is everything well, may it fly?"""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lpac.cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots, app, open_fleet
+from lpac.cli.fleet_table import (
+    BAD,
+    FAINT,
+    GOOD,
+    NOTABLE,
+    print_json,
+    print_notes,
+    print_problems,
+    print_table,
+    require_all,
+    run_for_each,
+    styled,
+)
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from lpac.fleet.config import FleetConfig, RobotHost
+    from lpac.fleet.doctor import Diagnosis, Examination, Round
+    from lpac.fleet.hold import Report
+    from lpac.fleet.operations import Outcome
+    from lpac.fleet.up import Arrival, GoDecision, Pack
+
+_STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}
+
+# doctor
+
+
+@app.command()
+def doctor(
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    laptop: Annotated[bool, typer.Option("--laptop", help="This machine, not the robots.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Look for whatever would keep the robots from flying, and say how to mend it.
+
+    Changes nothing, except that a robot whose program does not run has its PX4 parameters set if
+    its configuration says so.
+    """
+    from lpac.fleet.doctor import Diagnosis, diagnose
+    from lpac.fleet.laptop import examine_laptop
+
+    config, chosen = open_fleet(fleet, robots)
+    if laptop:
+        diagnoses = [Diagnosis("laptop", examine_laptop(config))]
+    else:
+        diagnoses = diagnose(config, _examine(config, chosen))
+    if as_json:
+        _echo(config, _described(diagnoses))
+    else:
+        _print_board(diagnoses)
+        _print_findings(diagnoses)
+        _print_free_ground(config)
+    _require_none_failed(diagnoses)
+
+
+def _examine(config: "FleetConfig", robots: Sequence["RobotHost"]) -> "list[Outcome[Examination]]":
+    from lpac.fleet.doctor import examine
+
+    async def one(robot: "RobotHost", report: "Report") -> "Examination":
+        others = [other for other in robots if other is not robot]
+        return await examine(config, robot, others, report)
+
+    return run_for_each(robots, one)
+
+
+def _print_board(diagnoses: "Sequence[Diagnosis]") -> None:
+    """A row for each check, a column for each robot."""
+    names = list(dict.fromkeys(check.name for each in diagnoses for check in each.checks))
+    verdicts = [{check.name: check.verdict for check in each.checks} for each in diagnoses]
+    rows: list[list[str | Text]] = [
+        [name, *(_verdict(of_robot.get(name)) for of_robot in verdicts)] for name in names
+    ]
+    print_table(("", *(each.robot for each in diagnoses)), rows)
+
+
+def _verdict(verdict: str | None) -> "Text":
+    if verdict is None:
+        return styled("", FAINT)
+    # Ten robots are to fit into a terminal.
+    short = {"skipped": "-", "warning": "warn"}.get(verdict, verdict)
+    return styled(short, _STYLES[verdict])
+
+
+def _print_findings(diagnoses: "Sequence[Diagnosis]") -> None:
+    """What is not well, the worst first; what several robots have in common, once."""
+    notes: list[tuple[str, str | Text]] = []
+    for verdict in ("FAILED", "warning", "skipped"):
+        found: dict[tuple[str, str], dict[str, str]] = {}
+        for diagnosis in diagnoses:
+            for check in diagnosis.checks:
+                if check.verdict == verdict:
+                    found.setdefault((check.name, check.found), {})[diagnosis.robot] = check.fix
+        for (name, text), fixes in found.items():
+            notes.append((", ".join(fixes), styled(f"{name}: {text}", _STYLES[verdict])))
+            first, *others = dict.fromkeys(fixes.values())
+            if first:
+                also = f"   (and so on {', '.join([*fixes][1:])})" if others else ""
+                notes.append(("", f"  → {first}{also}"))
+    print_notes(notes)
+
+
+def _print_free_ground(config: "FleetConfig") -> None:
+    margin = config.free_ground()
+    if margin is not None:
+        typer.echo(f"\nkeep free: the fence and {margin.least_m:g} m around it ({margin.why})")
+
+
+def _described(diagnoses: "Sequence[Diagnosis]") -> dict[str, Any]:
+    return {
+        each.robot: {
+            "ok": not each.failed(),
+            "checks": [check._asdict() for check in each.checks],
+        }
+        for each in diagnoses
+    }
+
+
+def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
+    failed = [each.robot for each in diagnoses if each.failed()]
+    if failed:
+        count = sum(len(each.failed()) for each in diagnoses)
+        raise ValueError(f"{count} check{'s' if count > 1 else ''} failed, on {', '.join(failed)}")
+
+
+# up
+
+
+@app.command()
+def up(
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    timeout: Annotated[float, typer.Option(help="How long robots are waited for, s.")] = 40.0,
+    trial: Annotated[
+        float, typer.Option(min=1.0, help="A trial's duration, s: how many is a pack good for?")
+    ] = 60.0,
+    as_json: AsJson = False,
+) -> None:
+    """Wait for the robots, set their clocks, start their programs, look at all: go or no-go.
+
+    Without --robots for all that have a slot. Nothing takes off.
+    """
+    from lpac.fleet.up import board, bring_up, decide, packs
+
+    config, chosen = open_fleet(fleet, robots)
+    if robots is None:
+        chosen = [robot for robot in chosen if config.slot_of(robot.name) is not None]
+        if not chosen:
+            raise ValueError(f"{config.path}: slots: no robot sits in one")
+    until_s = time.monotonic() + timeout
+
+    async def arrive(robot: "RobotHost", report: "Report") -> "Arrival":
+        return await bring_up(config, robot, until_s, report)
+
+    arrivals = run_for_each(chosen, arrive)
+    came = [outcome.robot for outcome in arrivals if outcome.value is not None]
+    examinations = _examine(config, came)
+    diagnoses = board(config, arrivals, examinations)
+    batteries = {pack.robot: pack for pack in packs(config, examinations, trial)}
+    decisions = [decide(diagnosis) for diagnosis in diagnoses]
+    if as_json:
+        described = _described(diagnoses)
+        for decision in decisions:
+            described[decision.robot] |= {"go": decision.go, "reasons": decision.reasons}
+            if (pack := batteries.get(decision.robot)) is not None:
+                described[decision.robot]["pack"] = pack._asdict()
+        _echo(config, described)
+    else:
+        _print_board(diagnoses)
+        _print_findings(diagnoses)
+        _print_free_ground(config)
+        _print_decisions(decisions, batteries)
+        typer.echo(
+            f"trials: how many of {trial:g} s each pack lasts for; --trial SECONDS for others"
+        )
+    no_go = [decision.robot for decision in decisions if not decision.go]
+    if no_go:
+        raise ValueError(f"NO-GO: {', '.join(no_go)}")
+
+
+def _print_decisions(decisions: "Sequence[GoDecision]", batteries: "Mapping[str, Pack]") -> None:
+    rows: list[tuple[str | Text, ...]] = []
+    for decision in decisions:
+        word = styled("GO", GOOD) if decision.go else styled("NO-GO", BAD)
+        reasons = decision.reasons or ("",)
+        pack = batteries.get(decision.robot)
+        battery = "" if pack is None or pack.share is None else f"{pack.share:.0%}"
+        count = "" if pack is None or pack.trials is None else str(pack.trials)
+        rows.append((decision.robot, word, battery, count, reasons[0]))
+        rows += [("", "", "", "", reason) for reason in reasons[1:]]
+    all_go = all(decision.go for decision in decisions)
+    known = [p.trials for p in batteries.values() if p.trials is not None]
+    least = str(min(known)) if known else ""
+    go = styled("GO", GOOD) if all_go else styled("NO-GO", BAD)
+    rows.append(("fleet", go, "", least, ""))
+    typer.echo()
+    print_table(("robot", "", "battery", "trials", "why"), rows, ("battery", "trials"))
+
+
+# ping
+
+
+@app.command()
+def ping(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Measure the radio: from here to each robot over SSH, and between the robots by ICMP."""
+    from lpac.fleet.doctor import measure_radio
+
+    config, chosen = open_fleet(fleet, robots)
+
+    async def one(robot: "RobotHost", report: "Report") -> "Round":
+        others = [other for other in chosen if other is not robot]
+        return await measure_radio(config, robot, others, report)
+
+    outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, lambda found: found._asdict())
+    else:
+        _print_matrix(outcomes)
+        print_problems(outcomes)
+    deaf = sorted(
+        f"{outcome.robot.name} → {other}"
+        for outcome in outcomes
+        if outcome.value is not None and not isinstance(outcome.value.others, str)
+        for other, found in outcome.value.others.items()
+        if found["loss"] >= 1.0
+    )
+    if deaf:
+        raise ValueError(f"no answer: {', '.join(deaf)}")
+    require_all(outcomes, "reached")
+
+
+def _print_matrix(outcomes: "Sequence[Outcome[Round]]") -> None:
+    """A row for each robot that asks, ms there and back to each other one, and losses."""
+    names = [outcome.robot.name for outcome in outcomes]
+    rows: list[list[str | Text]] = []
+    for outcome in outcomes:
+        if outcome.value is None:
+            rows.append([outcome.robot.name, styled("-", BAD), *("" for _ in names)])
+            continue
+        to_others = outcome.value.others
+        rows.append([
+            outcome.robot.name,
+            f"{outcome.value.laptop_ms:.1f}",
+            *(
+                styled(to_others, FAINT)
+                if isinstance(to_others, str)
+                else _way(to_others.get(name))
+                for name in names
+            ),
+        ])  # fmt: skip
+    print_table(("ms", "laptop", *names), rows, ("laptop", *names))
+
+
+def _way(found: "Mapping[str, Any] | None") -> "str | Text":
+    if found is None:
+        return ""
+    if found["loss"] >= 1.0:
+        return styled("lost", BAD)
+    if found["loss"] > 0.0:
+        return styled(f"{found['mean_ms']:.1f} ({100.0 * found['loss']:.0f} % lost)", NOTABLE)
+    return f"{found['mean_ms']:.1f}"
+
+
+def _echo(config: "FleetConfig", robots: dict[str, Any]) -> None:
+    margin = config.free_ground()
+    described = {
+        "fleet": config.fleet,
+        "ok": all(described["ok"] for described in robots.values()),
+        "free_ground_m": None if margin is None else margin.least_m,
+        "robots": robots,
+    }
+    typer.echo(json.dumps(described, indent=2))

@@ -1,0 +1,446 @@
+"""`lpac fleet`: the everyday commands, for all robots at once."""
+
+import json
+import shlex
+import signal
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+
+import typer
+
+from lpac.cli.fleet_status import SHORT, describe, flight, print_status, program, read_state
+from lpac.cli.fleet_table import (
+    BAD,
+    GOOD,
+    INTERRUPTED,
+    print_json,
+    print_notes,
+    print_problems,
+    print_table,
+    require_all,
+    run_all,
+    run_for_each,
+    styled,
+    working,
+)
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from lpac.cli.fleet_status import State
+    from lpac.fleet.config import FleetConfig, RobotHost
+    from lpac.fleet.deploy import Deployed
+    from lpac.fleet.hold import Report
+    from lpac.fleet.operations import Outcome
+
+T = TypeVar("T")
+
+app = typer.Typer(
+    name="fleet", help="Deploy to the robots, start and stop them.", no_args_is_help=True
+)
+
+Fleet = Annotated[
+    Path, typer.Option("--fleet", envvar="LPAC_FLEET", help="The fleet's description, TOML.")
+]
+Robots = Annotated[
+    str | None, typer.Option("--robots", help="Only these robots, such as r1,r3; else all.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+InFlight = Annotated[
+    bool, typer.Option("--in-flight", help="Also if the vehicle is armed: it holds or lands then.")
+]
+DEFAULT_FLEET = Path("fleet.toml")
+
+_COLOURS = ("cyan", "magenta", "yellow", "green", "blue", "bright_cyan", "bright_magenta")
+
+
+def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
+    """The fleet, and the robots that a command addresses. Raises ConfigError."""
+    from lpac.fleet.config import load_fleet, select
+
+    config = load_fleet(path)
+    return config, select(config, robots)
+
+
+# Releases
+
+
+class _Deployed(NamedTuple):
+    """What came of a deployment, and how long it took."""
+
+    deployed: "Deployed"
+    duration_s: float
+
+
+@app.command()
+def deploy(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Bring image, policy and configuration to the robots, prove them there, and run them.
+
+    A robot on which anything is wrong keeps what it had. A robot in flight refuses.
+    """
+    from lpac.fleet.deploy import deploy as deploy_to
+    from lpac.fleet.release import load_common, make_release
+
+    config, chosen = open_fleet(fleet, robots)
+    with tempfile.TemporaryDirectory(prefix="lpac-deploy-") as folder:
+        releases = {}
+        with working("reading image, policy and world"):
+            common = load_common(config)
+            for robot in chosen:
+                place = Path(folder, robot.name)
+                place.mkdir()
+                releases[robot.name] = make_release(config, robot, common, place)
+
+        async def one(robot: "RobotHost", report: "Report") -> _Deployed:
+            began_s = time.monotonic()
+            deployed = await deploy_to(config, robot, releases[robot.name], report)
+            return _Deployed(deployed, time.monotonic() - began_s)
+
+        outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, lambda v: {**v.deployed._asdict(), "duration_s": v.duration_s})
+    else:
+        numbers = ("MB sent", "perceive ms", "infer ms", "s")
+        _print_outcomes(outcomes, ("release", *numbers, "result"), _deployed_cells, numbers)
+    require_all(outcomes, "deployed on")
+
+
+def _deployed_cells(value: _Deployed) -> tuple["str | Text", ...]:
+    deployed = value.deployed
+    return (
+        deployed.release,
+        f"{deployed.sent_bytes / 1e6:.1f}",
+        _decimal(deployed.perceive_p99_ms),
+        _decimal(deployed.infer_p99_ms),
+        f"{value.duration_s:.0f}",
+        styled(deployed.summary, GOOD),
+    )
+
+
+@app.command()
+def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Run the release before the present one again. A robot in flight refuses."""
+    from lpac.fleet.deploy import rollback as roll_back
+
+    config, chosen = open_fleet(fleet, robots)
+    chosen = _without_spares(config, chosen, "rolled back")
+
+    async def one(robot: "RobotHost", report: "Report") -> str:
+        return await roll_back(config, robot, report)
+
+    outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, lambda release: {"release": release})
+    else:
+        _print_outcomes(
+            outcomes, ("release", "result"), lambda release: (release, styled("rolled back", GOOD))
+        )
+    require_all(outcomes, "rolled back on")
+
+
+# The program
+
+
+class _Controlled(NamedTuple):
+    """What the robot has, its unit, and which open switch was settled before (None: none)."""
+
+    release: str | None
+    service: dict[str, Any]
+    recovered: str | None
+
+
+@app.command()
+def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Start the robots' programs, now and at every boot. Nothing takes off by that."""
+    config, chosen = open_fleet(fleet, robots)
+    chosen = _without_spares(config, chosen, "started")
+    outcomes = _control(config, chosen, "start", lambda _: {"directory": config.directory})
+    _print_controlled(config, outcomes, "started on", as_json)
+
+
+@app.command()
+def stop(
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    in_flight: InFlight = False,
+    as_json: AsJson = False,
+) -> None:
+    """Stop the robots' programs, which do not start at the next boot either.
+
+    A robot in flight refuses.
+    """
+    config, chosen = open_fleet(fleet, robots)
+    outcomes = _control(
+        config, chosen, "stop",
+        lambda robot: {
+            "mavlink_port": robot.mavlink_port, "in_flight": in_flight, "disable": True,
+        },
+    )  # fmt: skip
+    _print_controlled(config, outcomes, "stopped on", as_json)
+
+
+@app.command()
+def restart(
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    in_flight: InFlight = False,
+    as_json: AsJson = False,
+) -> None:
+    """Stop the robots' programs and start them again. A robot in flight refuses."""
+    config, chosen = open_fleet(fleet, robots)
+    chosen = _without_spares(config, chosen, "restarted")
+    outcomes = _control(
+        config, chosen, "restart",
+        lambda robot: {
+            "directory": config.directory, "mavlink_port": robot.mavlink_port,
+            "in_flight": in_flight,
+        },
+    )  # fmt: skip
+    _print_controlled(config, outcomes, "restarted on", as_json)
+
+
+@app.command()
+def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Land vehicles whose programs are gone, where they are: over SSH, by their PX4.
+
+    Refused while the program runs (use `lpac mission land`) and while a pilot flies.
+    """
+    from lpac.fleet.hold import visit
+
+    config, chosen = open_fleet(fleet, robots)
+
+    async def one(robot: "RobotHost", report: "Report") -> dict[str, Any]:
+        async with visit(config, robot, report) as (session, _):
+            return await session.call(
+                "land", mavlink_port=robot.mavlink_port, system_id=robot.system_id
+            )
+
+    outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, dict)
+    else:
+        _print_outcomes(
+            outcomes,
+            ("result",),
+            lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
+        )
+    require_all(outcomes, "landing:")
+
+
+def _control(
+    config: "FleetConfig",
+    robots: Sequence["RobotHost"],
+    function: str,
+    arguments: Callable[["RobotHost"], dict[str, Any]],
+) -> list["Outcome[_Controlled]"]:
+    """Call a function that changes the unit on all robots, and holds them for that."""
+    from lpac.fleet.hold import hold
+
+    async def one(robot: "RobotHost", report: "Report") -> _Controlled:
+        async with hold(config, robot, report) as held:
+            report(function, None)
+            service = await held.session.call(function, **arguments(robot))
+            return _Controlled(held.found["current"], service, held.recovered)
+
+    return run_for_each(robots, one)
+
+
+def _print_controlled(
+    config: "FleetConfig", outcomes: list["Outcome[_Controlled]"], done: str, as_json: bool
+) -> None:
+    if as_json:
+        print_json(config, outcomes, _Controlled._asdict)
+    else:
+        _print_outcomes(
+            outcomes,
+            ("release", "flight", "result"),
+            lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
+        )
+        print_notes([
+            (o.robot.name, o.value.recovered) for o in outcomes if o.value and o.value.recovered
+        ])  # fmt: skip
+    require_all(outcomes, done)
+
+
+def _without_spares(
+    config: "FleetConfig", robots: list["RobotHost"], done: str
+) -> list["RobotHost"]:
+    spares = [robot.name for robot in robots if config.slot_of(robot.name) is None]
+    if len(spares) == len(robots):
+        raise ValueError(f"a spare is not {done}, it has no slot: {', '.join(spares)}")
+    if spares:
+        typer.echo(f"left out, since a spare is not {done}: {', '.join(spares)}", err=True)
+    return [robot for robot in robots if robot.name not in spares]
+
+
+# Looking
+
+
+@contextmanager
+def _while_somebody_reads() -> Iterator[None]:
+    """End as other programs do when `head` or `grep -m1` has read enough, after all sessions."""
+    try:
+        yield
+    except* BrokenPipeError:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+        signal.raise_signal(signal.SIGPIPE)
+
+
+@app.command()
+def status(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Show what each robot has, and how it is."""
+    config, chosen = open_fleet(fleet, robots)
+
+    async def one(robot: "RobotHost", _: "Report") -> "State":
+        return await read_state(config, robot)
+
+    outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, describe)
+    else:
+        print_status(config, outcomes)
+    require_all(outcomes, "reached")
+
+
+@app.command()
+@_while_somebody_reads()
+def logs(
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", "-f", help="Also what is to come, until Ctrl-C.")
+    ] = False,
+    lines: Annotated[
+        int, typer.Option("--lines", "-n", min=0, help="How many of each robot's last lines.")
+    ] = 50,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object a line.")] = False,
+) -> None:
+    """Show what the robots' programs, and systemd about them, have written, by time."""
+    from lpac.fleet.execute import execute
+    from lpac.fleet.logs import Entry, journal_command, parse_entry, readable
+    from lpac.fleet.session import RemoteError, as_root
+
+    config, chosen = open_fleet(fleet, robots)
+    label = _labels(chosen)
+    entries: list[tuple[Entry, str]] = []
+
+    def show(entry: Entry, name: str) -> None:
+        if as_json:
+            typer.echo(json.dumps({"robot": name, **entry._asdict()}))
+        else:
+            for line in readable(entry).split("\n"):
+                typer.echo(label[name] + line)
+
+    async def one(robot: "RobotHost") -> None:
+        def on_output(line: str) -> None:
+            entry = parse_entry(line)
+            if follow:
+                show(entry, robot.name)
+            else:
+                entries.append((entry, robot.name))
+
+        complaints: list[str] = []
+        command = as_root(shlex.join(journal_command(lines, follow=follow)))
+        if await execute(config, robot, command, on_output, complaints.append) != 0:
+            raise RemoteError(complaints[-1] if complaints else "journalctl failed")
+
+    outcomes = _run_plainly(chosen, one, label)
+    for entry, name in sorted(entries):
+        show(entry, name)
+    if follow:  # Ctrl-C is how that ends.
+        outcomes = [o._replace(problem=None) if o.problem == INTERRUPTED else o for o in outcomes]
+    require_all(outcomes, "read the journal of")
+
+
+@app.command("exec", context_settings={"allow_interspersed_args": False})
+@_while_somebody_reads()
+def execute_on_all(
+    command: Annotated[
+        list[str],
+        typer.Argument(help="Program and arguments; or one text for the robot's shell."),
+    ],
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Run a command on the robots, such as `lpac fleet exec --robots r1,r3 -- df -h /`."""
+    from lpac.fleet.execute import execute
+    from lpac.fleet.operations import Outcome
+
+    config, chosen = open_fleet(fleet, robots)
+    label = _labels(chosen)
+    text = command[0] if len(command) == 1 else shlex.join(command)
+
+    async def one(robot: "RobotHost") -> dict[str, Any]:
+        written: dict[str, list[str]] = {"stdout": [], "stderr": []}
+
+        def on_line(line: str, stream: str) -> None:
+            if as_json:
+                written[stream].append(line)
+            else:
+                typer.echo(label[robot.name] + line, err=stream == "stderr")
+
+        exit_code = await execute(
+            config, robot, text, lambda line: on_line(line, "stdout"),
+            lambda line: on_line(line, "stderr"),
+        )  # fmt: skip
+        if exit_code != 0 and not as_json:
+            typer.echo(f"{label[robot.name]}exit code {exit_code}", err=True)
+        return {"exit_code": exit_code, **written}
+
+    outcomes = [
+        Outcome(robot, value, f"exit code {value['exit_code']}")
+        if value is not None and value["exit_code"] != 0
+        else Outcome(robot, value, problem)
+        for robot, value, problem in _run_plainly(chosen, one, label)
+    ]
+    if as_json:
+        print_json(config, outcomes, lambda value: value)
+    require_all(outcomes, "succeeded on")
+
+
+def _run_plainly(
+    robots: Sequence["RobotHost"],
+    task: Callable[["RobotHost"], Awaitable[T]],
+    label: dict[str, str],
+) -> list["Outcome[T]"]:
+    """Without a table: the output is what counts. Problems are told on stderr as they come."""
+
+    def on_outcome(outcome: "Outcome[T]") -> None:
+        if outcome.problem is not None and outcome.problem != INTERRUPTED:
+            typer.echo(label[outcome.robot.name] + outcome.problem, err=True)
+
+    return run_all(robots, task, on_outcome)
+
+
+def _labels(robots: Sequence["RobotHost"]) -> dict[str, str]:
+    """What stands before each robot's lines."""
+    width = max(len(robot.name) for robot in robots)
+    return {
+        robot.name: typer.style(robot.name.ljust(width), fg=_COLOURS[n % len(_COLOURS)]) + "  "
+        for n, robot in enumerate(robots)
+    }
+
+
+def _print_outcomes(
+    outcomes: Sequence["Outcome[T]"],
+    headings: Sequence[str],
+    cells: Callable[[T], Sequence["str | Text"]],
+    right: Sequence[str] = (),
+) -> None:
+    """A row for each robot, whose last cell says what came of it; below, why not."""
+    blank = [""] * (len(headings) - 1)
+    rows = [
+        [o.robot.name, *([*blank, styled("failed", BAD)] if o.value is None else cells(o.value))]
+        for o in outcomes
+    ]
+    print_table(("robot", *headings), rows, right)
+    print_problems(outcomes)
+
+
+def _decimal(value: float | None) -> str:
+    return "" if value is None else f"{value:.1f}"

@@ -1,0 +1,192 @@
+"""What `lpac fleet status` shows of a robot, and in which words."""
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from lpac.cli.fleet_table import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from lpac.fleet.config import FleetConfig, RobotHost
+    from lpac.fleet.operations import Outcome
+
+# Characters of an id that tell it from others.
+SHORT = 8
+# A clock that is off by more is noted: what robots log cannot be put in order.
+_CLOCK_WITHIN_S = 0.5
+
+_HEADINGS = (
+    "robot", "slot", "release", "program", "flight", "armed", "battery", "sats", "peers",
+    "failed\nchecks", "clock\ns",
+)  # fmt: skip
+_NUMBERS = ("slot", "battery", "sats", "peers", "failed\nchecks", "clock\ns")
+
+
+class State(NamedTuple):
+    """A robot's `overview`, and how far its clock is ahead of ours.
+
+    `slot` is its slot's place in the list, None for a spare. `last_words` are those of a program
+    that has failed, None if it has not. `is_configured` tells whether its configuration is what
+    fleet.toml gives now, None without a release.
+    """
+
+    overview: dict[str, Any]
+    slot: int | None
+    clock_offset_s: float
+    last_words: str | None
+    is_configured: bool | None = None
+
+
+async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:
+    """Ask the robot; nothing of it is held or changed. Raises FleetError."""
+    from lpac.fleet.doctor import is_configured
+    from lpac.fleet.hold import visit
+
+    async with visit(config, robot) as (session, overview):
+        clock_offset_s = overview["unix_time_s"] - time.time()
+        words = None
+        if _failed(overview["service"]):
+            words = (await session.call("last_words"))["text"]
+    configured = None if overview["current"] is None else is_configured(config, robot, overview)
+    return State(overview, _slot(config, robot.name), clock_offset_s, words, configured)
+
+
+def describe(state: State) -> dict[str, object]:
+    """For JSON: the overview's keys, and the others."""
+    return {
+        **state.overview,
+        "slot": state.slot,
+        "clock_offset_s": round(state.clock_offset_s, 3),
+        "last_words": state.last_words,
+        "is_configured": state.is_configured,
+    }
+
+
+def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) -> None:
+    """The table of the fleet, and notes on what is not as it should be."""
+    states = {o.robot.name: o.value for o in outcomes if o.value is not None}
+    parts = {name: _parts(state.overview["versions"]) for name, state in states.items()}
+    most = _most_common(text for text in parts.values() if text is not None)
+    odd = {name: text for name, text in parts.items() if text not in (None, most)}
+    silent = ["", styled("see below", BAD), *[""] * (len(_HEADINGS) - 4)]
+    rows = []
+    for robot, state, _ in outcomes:
+        slot = _slot(config, robot.name)
+        place = styled("spare", FAINT) if slot is None else str(slot)
+        cells = silent if state is None else _cells(state, robot.name in odd)
+        rows.append([robot.name, place, *cells])
+    print_table(_HEADINGS, rows, _NUMBERS)
+    notes: list[tuple[str, str | Text]] = []
+    for outcome in outcomes:
+        if outcome.problem is not None:
+            notes.append((outcome.robot.name, styled(outcome.problem, BAD)))
+        if outcome.value is not None:
+            notes += [(outcome.robot.name, note) for note in _notes(outcome.value)]
+        if outcome.robot.name in odd:
+            notes.append((outcome.robot.name, styled(f"* {odd[outcome.robot.name]}", NOTABLE)))
+        if outcome.value is not None and outcome.value.is_configured is False:
+            note = (
+                f"* its configuration is not the one of {config.path.name}: lpac fleet deploy "
+                f"--robots {outcome.robot.name}"
+            )
+            notes.append((outcome.robot.name, styled(note, NOTABLE)))
+    if most is not None:
+        notes.append(("others" if odd else "all", most))
+    print_notes(notes)
+
+
+def program(service: Mapping[str, Any]) -> "Text":
+    """How the unit is, in a word or two."""
+    if not service["installed"]:
+        return styled("none", FAINT)
+    if _failed(service):
+        return styled("failed", BAD)
+    if service["active"] != "active":
+        return styled({"inactive": "stopped"}.get(service["active"], service["active"]), NOTABLE)
+    if not service["fresh"]:
+        return styled("silent", BAD)
+    return styled(f"up {_duration(service['uptime_s'])}", GOOD)
+
+
+def flight(service: Mapping[str, Any]) -> str:
+    """The state of the flight by the program's last word; empty if it does not run."""
+    return str(service["status"].get("state", "")) if service["fresh"] else ""
+
+
+def _cells(state: State, odd: bool) -> list["str | Text"]:
+    overview, service = state.overview, state.overview["service"]
+    said = service["status"] if service["fresh"] else {}
+    marks = ("*" if odd or state.is_configured is False else "") + (
+        "?" if overview["pending"] else ""
+    )
+    armed = said.get("armed")
+    failed_checks = len(said.get("failed_checks", ()))
+    clock_well = abs(state.clock_offset_s) <= _CLOCK_WITHIN_S
+    return [
+        (overview["current"] or "none")[:SHORT] + marks,
+        program(service),
+        flight(service),
+        "" if armed is None else styled("yes", NOTABLE) if armed else "no",
+        "" if said.get("battery") is None else f"{100.0 * said['battery']:.0f} %",
+        _number(said.get("satellites")),
+        _number(said.get("peers")),
+        "" if not said else styled(str(failed_checks), NOTABLE if failed_checks else ""),
+        styled(f"{round(state.clock_offset_s, 1) + 0.0:+.1f}", "" if clock_well else NOTABLE),
+    ]
+
+
+def _notes(state: State) -> list["str | Text"]:
+    notes: list[str | Text] = []
+    service, pending = state.overview["service"], state.overview["pending"]
+    if pending:
+        notes.append(
+            styled(
+                f"? a switch to {pending['release'][:SHORT]} is not confirmed yet: unless "
+                "somebody deploys, deploy again",
+                NOTABLE,
+            )
+        )
+    if state.last_words is not None:
+        notes.append(styled(state.last_words, BAD))
+    if service["restarts"]:
+        notes.append(f"its program was restarted {service['restarts']} times by itself")
+    return notes
+
+
+def _slot(config: "FleetConfig", robot: str) -> int | None:
+    robots = [slot.robot for slot in config.slots]
+    return robots.index(robot) if robot in robots else None
+
+
+def _failed(service: Mapping[str, Any]) -> bool:
+    """It is dead, or starts again after it died."""
+    died = service["result"] not in ("", "success") or service["restarts"] > 0
+    return service["active"] == "failed" or (service["active"] == "activating" and died)
+
+
+def _parts(versions: Mapping[str, Any] | None) -> str | None:
+    """What all robots of a fleet should have in common; None without a release."""
+    if versions is None:
+        return None
+    names = ("image", "bundle", "world")
+    return ", ".join(f"{name} {str(versions.get(name))[:SHORT]}" for name in names)
+
+
+def _most_common(texts: Iterable[str]) -> str | None:
+    """What more than half are; None if nothing is."""
+    counts = Counter(texts)
+    return next((text for text, n in counts.items() if 2 * n > counts.total()), None)
+
+
+def _duration(seconds: float) -> str:
+    for unit_s, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * unit_s:
+            return f"{seconds / unit_s:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _number(value: int | None) -> str:
+    return "" if value is None else str(value)

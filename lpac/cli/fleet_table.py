@@ -1,0 +1,245 @@
+"""What a person sees while the same is done on many robots: a live table, then a summary."""
+
+import asyncio
+import json
+import time
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from lpac.fleet.config import FleetConfig, RobotHost
+    from lpac.fleet.hold import Report
+    from lpac.fleet.operations import Outcome
+
+T = TypeVar("T")
+
+GOOD, BAD, NOTABLE, FAINT = "green", "red", "yellow", "dim"
+# The problem of a robot that was not done when Ctrl-C came.
+INTERRUPTED = "interrupted"
+
+_STEP_WIDTH, _BAR_WIDTH = 10, 16
+
+
+def run_all(
+    robots: Sequence["RobotHost"],
+    task: Callable[["RobotHost"], Awaitable[T]],
+    on_outcome: Callable[["Outcome[T]"], None],
+) -> list["Outcome[T]"]:
+    """Do `task` with all robots side by side until all are done, or Ctrl-C; the outcomes in order.
+
+    `on_outcome` hears each as it comes.
+    """
+    from lpac.fleet.operations import Outcome, for_each
+
+    finished: dict[str, Outcome[T]] = {}
+
+    def keep(outcome: Outcome[T]) -> None:
+        finished[outcome.robot.name] = outcome
+        on_outcome(outcome)
+
+    try:
+        asyncio.run(for_each(robots, task, keep))
+    except KeyboardInterrupt:
+        for robot in robots:
+            if robot.name not in finished:
+                keep(Outcome(robot, None, INTERRUPTED))
+    return [finished[robot.name] for robot in robots]
+
+
+def run_for_each(
+    robots: Sequence["RobotHost"], task: Callable[["RobotHost", "Report"], Awaitable[T]]
+) -> list["Outcome[T]"]:
+    """`run_all` with a task that reports its steps.
+
+    On stderr: a live table, or a line for each step where there is no terminal.
+    """
+    progress = _Progress({robot.name: _Row(robot.name, robot.host) for robot in robots})
+
+    async def one(robot: "RobotHost") -> T:
+        return await task(robot, lambda step, share: progress.show(robot.name, step, share))
+
+    with progress.shown():
+        outcomes = run_all(robots, one, lambda o: progress.end(o.robot.name, o.problem))
+    steps = {name: row.step for name, row in progress.rows.items()}
+    return [
+        o._replace(problem=f"{INTERRUPTED} at {steps[o.robot.name]}")
+        if o.problem == INTERRUPTED and steps[o.robot.name]
+        else o
+        for o in outcomes
+    ]
+
+
+@contextmanager
+def working(text: str) -> Iterator[None]:
+    """Say on a terminal what is being done, as long as it takes."""
+    with _stderr().status(text):
+        yield
+
+
+def print_table(
+    headings: Sequence[str], rows: Sequence[Sequence["str | Text"]], right: Sequence[str] = ()
+) -> None:
+    """A table on stdout; the headings in `right` are those of columns of numbers."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    table = _new_table(narrow=console.width < 100)
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(_plain(cell) if isinstance(cell, str) else cell for cell in row))
+    console.print(table)
+
+
+def print_notes(notes: Sequence[tuple[str, "str | Text"]]) -> None:
+    """Lines of a robot's name and something about it, below a table."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    grid = _new_table(narrow=False, heading=False)
+    for name, note in notes:
+        grid.add_row(_plain(name), _plain(note) if isinstance(note, str) else note)
+    if notes:
+        console.print()
+        console.print(grid)
+
+
+def print_problems(outcomes: Sequence["Outcome[T]"]) -> None:
+    """Why it was not done, for each robot where it was not."""
+    print_notes([(o.robot.name, styled(o.problem, BAD)) for o in outcomes if o.problem is not None])
+
+
+def print_json(
+    config: "FleetConfig",
+    outcomes: Sequence["Outcome[T]"],
+    describe: Callable[[T], Mapping[str, object]],
+) -> None:
+    """One object: each robot with its `problem`, null if it did it, and then what it has."""
+    robots = {
+        outcome.robot.name: {
+            "host": outcome.robot.host,
+            "problem": outcome.problem,
+            **({} if outcome.value is None else describe(outcome.value)),
+        }
+        for outcome in outcomes
+    }
+    typer.echo(json.dumps({"fleet": config.fleet, "robots": robots}, indent=2))
+
+
+def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:
+    """Raises ValueError, such as "stopped on 2 of 3 robots; failed: r2", unless all did it."""
+    failed = [outcome.robot.name for outcome in outcomes if outcome.problem is not None]
+    if failed:
+        count = len(outcomes)
+        raise ValueError(
+            f"{done} {count - len(failed)} of {count} robot{'s' if count > 1 else ''}; "
+            f"failed: {', '.join(failed)}"
+        )
+
+
+def styled(text: str, style: str) -> "Text":
+    """A cell or note in colour; brackets in it mean nothing."""
+    from rich.text import Text
+
+    return Text(text, style)
+
+
+def _plain(text: str) -> "Text":
+    return styled(text, "")
+
+
+def _stderr() -> "Console":
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False, markup=False)
+
+
+def _new_table(*, narrow: bool, heading: bool = True) -> "Table":
+    from rich.table import Table
+
+    return Table(
+        box=None,
+        show_header=heading,
+        header_style="bold",
+        pad_edge=False,
+        padding=(0, 1 if narrow else 2, 0, 0),
+    )
+
+
+@dataclass(slots=True)
+class _Row:
+    """How far one robot is; `share` of the step is done where that is known."""
+
+    name: str
+    host: str
+    step: str = ""
+    share: float | None = None
+    outcome: tuple[str, str] | None = None
+
+
+@dataclass(slots=True)
+class _Progress:
+    rows: dict[str, _Row]
+    _console: "Console" = field(default_factory=_stderr)
+    _began_s: float = field(default_factory=time.monotonic)
+
+    def show(self, name: str, step: str, share: float | None) -> None:
+        row = self.rows[name]
+        if step != row.step:
+            self._line(name, step)
+        row.step, row.share = step, share
+
+    def end(self, name: str, problem: str | None) -> None:
+        row = self.rows[name]
+        if row.step:
+            self._line(name, problem or "done")
+        row.outcome = ("done", GOOD) if problem is None else (problem, BAD)
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """The table, as long as this context lasts and if there is a terminal."""
+        from rich.live import Live
+
+        if not self._console.is_terminal:
+            yield
+            return
+        with Live(get_renderable=self._table, console=self._console, transient=True):
+            yield
+
+    def _line(self, name: str, text: str) -> None:
+        if not self._console.is_terminal:
+            self._console.print(
+                f"{time.monotonic() - self._began_s:6.1f} s  {name}  {text}", soft_wrap=True
+            )
+
+    def _table(self) -> "Table":
+        from rich.progress_bar import ProgressBar
+        from rich.text import Text
+
+        table = _new_table(narrow=False, heading=False)
+        # Of no robots, as after none has come up, there is a table too.
+        names = max((len(row.name) for row in self.rows.values()), default=0)
+        hosts = max((len(row.host) for row in self.rows.values()), default=0)
+        # Of one width all the time, whatever the present steps are; outcomes have the rest.
+        for width in (names, hosts, _STEP_WIDTH, _BAR_WIDTH, None):
+            table.add_column(no_wrap=True, min_width=width)
+        for row in self.rows.values():
+            bar: Text | ProgressBar = Text("")
+            if row.outcome is None and row.share is not None:
+                bar = ProgressBar(total=1.0, completed=row.share, width=_BAR_WIDTH)
+            table.add_row(
+                _plain(row.name),
+                styled(row.host, FAINT),
+                styled(row.step, FAINT if row.outcome else ""),
+                bar,
+                styled(*row.outcome) if row.outcome else styled("...", FAINT),
+            )
+        return table

@@ -1,0 +1,173 @@
+"""How commands speak to the ground, and what a person sees of it: who does what, then a table."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import typer
+
+from lpac.cli.fleet_table import BAD, FAINT, GOOD, print_table, styled
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
+
+    from lpac.ground.site import Standing
+    from lpac.ground.station.protocol import CommandProgress, CommandReport, Request
+    from lpac.ground.station.subscriber import GroundSubscriber
+
+
+class Addressed(NamedTuple):
+    """A fleet's name and file, and the robots that are meant; () are all that sit in a slot."""
+
+    fleet: str
+    path: Path
+    robots: tuple[str, ...]
+
+
+def address(path: Path, robots: str | None) -> Addressed:
+    """Whom a command addresses. Raises ConfigError for an unknown robot, or without fleet.toml."""
+    from lpac.fleet.config import load_fleet, select
+
+    config = load_fleet(path)
+    chosen = () if robots is None else tuple(robot.name for robot in select(config, robots))
+    return Addressed(config.fleet, path, chosen)
+
+
+Details = Mapping[str, Mapping[str, object]]
+
+
+def ask(
+    to: Addressed, request: "Request", name: str, *, as_json: bool, details: Details | None = None
+) -> None:
+    """Have a command done; print who did what, and who refused and why.
+
+    `details` are more columns, by robot and heading. Raises ValueError unless all did it.
+    """
+    from lpac.ground.station.client import command
+    from lpac.ground.station.protocol import SafetyCommand
+
+    told = (
+        f"robots that were told to {name} go on with it"
+        if isinstance(request, SafetyCommand)
+        else ""
+    )
+    with interruptible(name, told), _progress() as on_progress:
+        report = command(to.fleet, request, on_progress)
+    show(to, report, name, as_json=as_json, details=details or {})
+
+
+def show(
+    to: Addressed, report: "CommandReport", name: str, *, as_json: bool, details: Details
+) -> None:
+    """Print a command's report. Raises ValueError unless all did it."""
+    if as_json:
+        robots = {
+            r.robot: {"done": r.done, "text": r.text, **details.get(r.robot, {})}
+            for r in report.results
+        }
+        print_json({"fleet": to.fleet, "problem": report.problem or None, "robots": robots})
+    elif report.results:
+        headings = list(dict.fromkeys(key for its in details.values() for key in its))
+        rows: list[list[str | Text]] = [
+            [
+                r.robot,
+                *(str(details.get(r.robot, {}).get(key, "")) for key in headings),
+                styled("done", GOOD) if r.done else styled("FAILED", BAD),
+                r.text,
+            ]
+            for r in report.results
+        ]
+        print_table(("robot", *headings, "result", ""), rows, headings)
+    if report.problem:
+        raise ValueError(f"{name}: {report.problem}")
+    failed = [r.robot for r in report.results if not r.done]
+    if failed:
+        count = len(report.results)
+        raise ValueError(
+            f"{name}: {count - len(failed)} of {count} robots did it; failed: {', '.join(failed)}"
+        )
+
+
+@contextmanager
+def looking(to: Addressed) -> Iterator["GroundSubscriber"]:
+    """What the ground tells, as long as this context lasts. Raises GroundError."""
+    from lpac.ground.station.subscriber import GroundSubscriber
+
+    with GroundSubscriber(to.fleet) as subscriber:
+        yield subscriber
+
+
+def measure(
+    subscriber: "GroundSubscriber", robots: Sequence[str], seconds: float
+) -> dict[str, "Standing"]:
+    """Where these robots stand, averaged. Raises ValueError, one line, if one cannot tell."""
+    from lpac.ground.site import standing
+    from lpac.ground.station.subscriber import addressed
+
+    names = addressed(subscriber.setup, robots)
+    typer.echo(f"listening to {', '.join(names)} for {seconds:g} s", err=True)
+    with interruptible("listening"):
+        heard = subscriber.gather(names, seconds)
+    return {name: standing(name, heard[name]) for name in names}
+
+
+@contextmanager
+def interruptible(name: str, left: str = "") -> Iterator[None]:
+    """Ctrl-C ends the command in one line, and exit code 130; `left` says what goes on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        text = left or "what was not ordered yet is not done"
+        typer.echo(f"lpac: {name}: interrupted: {text}", err=True)
+        raise typer.Exit(130) from None
+
+
+def confirm(question: str, name: str, *, yes: bool) -> None:
+    """Let a person decide, unless they have. Raises ValueError if they do not want it."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise ValueError(f"{name} asks first, and there is no terminal: add --yes")
+    if not typer.confirm(question, err=True):
+        raise ValueError(f"{name}: nothing was done")
+
+
+def print_json(mapping: dict[str, object]) -> None:
+    """One object on stdout."""
+    typer.echo(json.dumps(mapping, indent=2))
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[["CommandProgress"], None]]:
+    """On stderr: a live table, or a line for each step where there is no terminal."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.table import Table
+
+    console = Console(stderr=True, highlight=False, markup=False)
+    began_s = time.monotonic()
+    told: dict[str, str] = {}
+
+    def line(progress: "CommandProgress") -> None:
+        who = f"{progress.robot}  " if progress.robot else ""
+        console.print(f"{time.monotonic() - began_s:6.1f} s  {who}{progress.text}", soft_wrap=True)
+
+    def table() -> "Table":
+        rows = Table.grid(padding=(0, 2, 0, 0))
+        for robot, text in told.items():
+            rows.add_row(styled(robot, ""), styled(text, FAINT))
+        return rows
+
+    def keep(progress: "CommandProgress") -> None:
+        told[progress.robot] = progress.text
+
+    if not console.is_terminal:
+        yield line
+        return
+    with Live(get_renderable=table, console=console, transient=True):
+        yield keep

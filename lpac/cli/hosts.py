@@ -1,0 +1,70 @@
+"""`lpac hosts`: robot computers on this machine, to try `lpac fleet` on."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lpac.cli.sim import DEFAULT_BUNDLE
+
+_FORGET_EVERY_S = 60.0
+
+
+def hosts(
+    *,
+    count: Annotated[int, typer.Option("--hosts", "-n", help="How many, spares and all.")] = 3,
+    spares: Annotated[int, typer.Option(help="How many of them have no slot.")] = 0,
+    image: Annotated[Path, typer.Option(help="What `make image ARCH=amd64` made.")] = Path(
+        "out/image/amd64"
+    ),
+    bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
+    out: Annotated[Path, typer.Option(help="Folder for fleet.toml, SSH's files and logs.")] = Path(
+        "out/fleet-demo"
+    ),
+) -> None:
+    """Run robot computers (Ubuntu 18.04, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
+    from lpac.sim.hosts.hosts import SimulatedHosts
+
+    def end(*_: object) -> None:
+        # Once: leaving must not be broken off, or hosts would stay.
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, end)
+    try:
+        with SimulatedHosts(
+            count, out, image=image, bundle=bundle, spares=spares, say=typer.echo
+        ) as running:
+            _give_to_user(out)
+            fleet = f"--fleet {running.fleet_toml}"
+            names = " ".join(host.name for host in running)
+            typer.echo(f"fleet {running.fleet}; Ctrl-C ends all; in another terminal:")
+            for line in (
+                f"for robot in {names}; do lpac fleet enroll $robot {fleet}; done",
+                f"lpac fleet deploy {fleet}",
+                f"lpac fleet status {fleet}",
+                f"lpac fleet stop {fleet}",
+                f"lpac fleet start {fleet}",
+                f"ssh -F {running.ssh_config} {running[0].name}",
+            ):
+                typer.echo(f"  {line}")
+            while True:
+                time.sleep(_FORGET_EVERY_S)
+                for host in running:
+                    with host.stepped:
+                        host.vehicle.truth.clear()
+    except KeyboardInterrupt:
+        typer.echo("ended")
+
+
+def _give_to_user(folder: Path) -> None:
+    """With sudo: SSH refuses keys of others."""
+    user, group = os.environ.get("SUDO_UID"), os.environ.get("SUDO_GID")
+    if user and group:
+        for path in (folder, *folder.iterdir()):
+            os.chown(path, int(user), int(group))

@@ -1,0 +1,60 @@
+"""`lpac map`: the live map, a page for the browser of the laptop."""
+
+from typing import Annotated
+
+import typer
+
+from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+
+
+def live_map(
+    fleet: Fleet = DEFAULT_FLEET,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8300,
+    host: Annotated[
+        str, typer.Option(help="Where to serve; beyond this machine a token is asked for.")
+    ] = "127.0.0.1",
+    operate: Annotated[
+        bool, typer.Option("--operate", help="Also command the fleet from the page.")
+    ] = False,
+    token: Annotated[
+        str | None, typer.Option(help="What a browser must know; made up where it is needed.")
+    ] = None,
+    open_page: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
+) -> None:
+    """Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.
+
+    It only observes, unless --operate.
+    """
+    import asyncio
+    import re
+    import secrets
+    import webbrowser
+
+    from lpac.fleet.config import load_fleet
+    from lpac.ground.map.access import Access, is_loopback
+    from lpac.ground.map.server import serve
+
+    config = load_fleet(fleet)
+    if token is not None and re.fullmatch(r"[A-Za-z0-9_-]+", token) is None:
+        raise ValueError("--token: must be letters, digits, '-' and '_'")
+    if host == "::":
+        # asyncio would serve IPv6 alone, of which a field's network has no address to open.
+        host = "0.0.0.0"
+    local = is_loopback(host)
+    if token is None and not local:
+        token = secrets.token_urlsafe(16)
+
+    def ready(addresses: list[str]) -> None:
+        for address in addresses:
+            typer.echo(f"map of {config.fleet}: {address}")
+        typer.echo("commands the fleet" if operate else "only observes; --operate commands")
+        typer.echo("Ctrl-C ends it, and nothing else")
+        if open_page:
+            webbrowser.open(addresses[0])
+
+    asyncio.run(
+        serve(
+            config.fleet, host=host, port=port, access=Access(local, token), operate=operate,
+            ready=ready,
+        )
+    )  # fmt: skip

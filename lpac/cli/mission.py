@@ -1,0 +1,452 @@
+"""`lpac mission`: command the fleet."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from lpac.cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots
+from lpac.cli.ground_report import (
+    Addressed,
+    address,
+    ask,
+    confirm,
+    interruptible,
+    looking,
+    measure,
+)
+from lpac.cli.mission_run import run
+from lpac.cli.rehearse import rehearse
+
+if TYPE_CHECKING:
+    from lpac.ground.site import Point, Standing
+    from lpac.ground.station.protocol import Request
+
+app = typer.Typer(
+    name="mission",
+    help="Command the fleet, through `lpac ground`. Done when every robot has answered.",
+    no_args_is_help=True,
+)
+# Negative numbers are no options.
+_NUMBERS = {"ignore_unknown_options": True}
+
+# The state's origin, fence and world are the whole fleet's.
+WaitFor = Annotated[
+    str | None,
+    typer.Option("--robots", help="Said to all; only these must take it up, such as r1,r3."),
+]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Until all have landed.")]
+Names = Annotated[
+    list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
+]
+
+
+# Where
+
+
+@app.command(context_settings=_NUMBERS)
+def origin(
+    latitude: Annotated[float | None, typer.Argument(metavar="LAT", help="Degrees.")] = None,
+    longitude: Annotated[float | None, typer.Argument(metavar="LON", help="Degrees.")] = None,
+    heading: Annotated[
+        float | None,
+        typer.Argument(metavar="HEADING_DEG", help="Of the y axis, from true north, [0, 360)."),
+    ] = None,
+    from_robot: Annotated[
+        str, typer.Option("--from", help="Where this robot stands, and its nose points.")
+    ] = "",
+    toward: Annotated[
+        str, typer.Option("--toward", help="The y axis points to this robot; with --from.")
+    ] = "",
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.5, max=600, help="How long --from listens.")
+    ] = 5.0,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: WaitFor = None,
+    as_json: AsJson = False,
+) -> None:
+    """Set where the mission frame lies: LAT LON HEADING_DEG, or as a robot stands (--from)."""
+    from edge.messages.mission import Origin
+    from lpac.ground.site import FAR_M, furthest_m, origin_at
+    from lpac.ground.station.protocol import SetOrigin
+
+    to = address(fleet, robots)
+    if from_robot:
+        if latitude is not None:
+            raise ValueError("origin: give LAT LON HEADING_DEG, or --from ROBOT, not both")
+        with looking(to) as subscriber:
+            stands = measure(subscriber, [from_robot, *filter(None, [toward])], seconds)
+        first, second = stands[from_robot], stands.get(toward)
+        where = origin_at(first, second)
+        typer.echo(_measured(first, second), err=True)
+    elif latitude is None or longitude is None or heading is None or toward:
+        raise ValueError(
+            "origin: give LAT LON HEADING_DEG, or --from ROBOT, with or without --toward ROBOT"
+        )
+    else:
+        try:
+            where = Origin(latitude, longitude, heading)
+        except ValueError as error:
+            raise ValueError(f"origin: {error}") from None
+        with looking(to) as subscriber:
+            far_m = furthest_m(where, subscriber.snapshot)
+        if far_m > FAR_M:
+            typer.echo(f"NOTE: robots are up to {far_m / 1e3:.1f} km from this origin", err=True)
+    typer.echo(
+        f"origin: {where.latitude_deg:.7f} {where.longitude_deg:.7f}, y axis {where.heading_deg:g} "
+        "deg from north",
+        err=True,
+    )
+    ask(to, SetOrigin(where, to.robots), "origin", as_json=as_json)
+
+
+def _measured(first: "Standing", second: "Standing | None") -> str:
+    from lpac.ground.site import distance_m, error_deg
+
+    text = f"{first.robot} stands within {first.spread_m:.2f} m"
+    if second is not None:
+        apart_m = distance_m(first.position_deg, second.position_deg)
+        return (
+            f"{text}, {second.robot} within {second.spread_m:.2f} m, {apart_m:.1f} m apart: "
+            f"1 m of GPS error turns the heading by {error_deg(apart_m):.0f} deg"
+        )
+    assert first.heading is not None
+    return f"{text}, its heading is within {first.heading.spread_deg:.1f} deg"
+
+
+fence = typer.Typer(name="fence", help="Where robots may fly.", no_args_is_help=True)
+app.add_typer(fence)
+
+
+@fence.command("on")
+def fence_on(fleet: Fleet = DEFAULT_FLEET, robots: WaitFor = None, as_json: AsJson = False) -> None:
+    """Each robot's configured fence again."""
+    from lpac.ground.station.protocol import SetFence
+
+    to = address(fleet, robots)
+    ask(to, SetFence(None, to.robots), "fence on", as_json=as_json)
+
+
+@fence.command("off")
+def fence_off(
+    yes: Yes = False, fleet: Fleet = DEFAULT_FLEET, robots: WaitFor = None, as_json: AsJson = False
+) -> None:
+    """A square of 500 m around the origin only: nothing keeps the robots near. Asks first."""
+    from lpac.ground.site import WIDE_FENCE_M, wide_fence
+    from lpac.ground.station.protocol import SetFence
+
+    to = address(fleet, robots)
+    confirm(
+        f"Let all robots of fleet {to.fleet} fly {WIDE_FENCE_M / 2:g} m far from the origin?",
+        "fence off",
+        yes=yes,
+    )
+    with looking(to) as subscriber:
+        wide = wide_fence(subscriber.setup.fence)
+    ask(to, SetFence(wide, to.robots), "fence off", as_json=as_json)
+
+
+@fence.command("set", context_settings=_NUMBERS)
+def fence_set(
+    corners: Annotated[
+        list[str], typer.Argument(metavar="X,Y...", help="Corners in the mission frame, m.")
+    ],
+    buffer: Annotated[
+        float | None, typer.Option("--buffer", help="How far inside robots stop, m.")
+    ] = None,
+    floor: Annotated[float | None, typer.Option("--floor", help="Lowest height, m.")] = None,
+    ceiling: Annotated[float | None, typer.Option("--ceiling", help="Greatest height, m.")] = None,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: WaitFor = None,
+    as_json: AsJson = False,
+) -> None:
+    """A convex polygon, such as 0,0 32,0 32,32 0,32; the rest as configured unless given."""
+    from edge.core.fence import Fence as Polygon
+    from lpac.ground.station.protocol import SetFence
+
+    to = address(fleet, robots)
+    points = tuple(_point(corner) for corner in corners)
+    with looking(to) as subscriber:
+        configured = subscriber.setup.fence
+    try:
+        polygon = Polygon(
+            points,
+            configured.buffer_m if buffer is None else buffer,
+            configured.floor_m if floor is None else floor,
+            configured.ceiling_m if ceiling is None else ceiling,
+        )
+    except ValueError as error:
+        raise ValueError(f"fence set: {error}") from None
+    ask(to, SetFence(polygon, to.robots), "fence set", as_json=as_json)
+
+
+def _point(text: str) -> "Point":
+    try:
+        x_m, y_m = map(float, text.split(","))
+    except ValueError:
+        raise ValueError(f"fence set: {text!r}: must be X,Y in m, such as 32,0") from None
+    return x_m, y_m
+
+
+@app.command()
+def world(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A CoverageControl world file.")],
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: WaitFor = None,
+    as_json: AsJson = False,
+) -> None:
+    """Send a world to the robots' virtual sensors. Refused in flight."""
+    from edge.messages.mission import world_id
+    from lpac.ground.script import read_world
+    from lpac.ground.station.protocol import SetWorld
+
+    to = address(fleet, robots)
+    text = read_world(file)
+    typer.echo(f"world: {file.name}, {world_id(text)}", err=True)
+    ask(to, SetWorld(text, file.name, to.robots), "world", as_json=as_json)
+
+
+@app.command()
+def assign(
+    site: Annotated[
+        str, typer.Option("--site", help="Its pads; else those of the site in use.")
+    ] = "",
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.5, max=600, help="How long to listen.")
+    ] = 2.0,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Give each robot the slot (height, landing point) of the pad where it stands, by GPS.
+
+    Refused if a robot is more than 3 m from every pad, if another pad is less than 1 m further than
+    the nearest, or if two robots stand at one pad.
+    """
+    from lpac.ground.site import Sites, assign_places, pads_in_use, place_now_m
+    from lpac.ground.station.protocol import SetPlaces
+    from lpac.ground.station.subscriber import addressed
+
+    to = address(fleet, robots)
+    with looking(to) as subscriber:
+        setup, ground = subscriber.setup, subscriber.snapshot.ground
+        names = addressed(setup, to.robots)
+        if ground is None or ground.origin is None:
+            raise ValueError("assign: the origin is not set: `lpac mission origin` sets it")
+        pads = pads_in_use(Sites(to.path), site, setup, ground.origin)
+        with interruptible("assign"):
+            heard = subscriber.gather(names, seconds)
+        places_m = {name: place_now_m(name, heard[name], ground.origin) for name in names}
+    assigned, places = assign_places(places_m, pads.slots, setup)
+    typer.echo(f"pads of {pads.source}", err=True)
+    details = {
+        name: {"pad": on_pad.height, "m": round(on_pad.distance_m, 2)}
+        for name, on_pad in assigned.items()
+    }
+    ask(to, SetPlaces(places), "assign", as_json=as_json, details=details)
+
+
+# Flying
+
+
+def _of_robots(request: Callable[[Addressed], "Request"]) -> None:
+    """Add the command of this name, for robots by name or by --robots; else for all."""
+    name = request.__name__
+
+    def command(
+        names: Names = None,
+        fleet: Fleet = DEFAULT_FLEET,
+        robots: Robots = None,
+        as_json: AsJson = False,
+    ) -> None:
+        to = _named(names, fleet, robots)
+        ask(to, request(to), name, as_json=as_json)
+
+    app.command(name, help=request.__doc__)(command)
+
+
+def _named(names: list[str] | None, fleet: Path, robots: str | None) -> Addressed:
+    """Whom a command addresses that takes robots' names as well as --robots."""
+    if names and robots is not None:
+        raise ValueError("give the robots' names, or --robots, not both")
+    return address(fleet, ",".join(names) if names else robots)
+
+
+@_of_robots
+def enable(to: Addressed) -> "Request":
+    """Let the robots run their checks, and fly."""
+    from lpac.ground.station.protocol import Enable
+
+    return Enable(True, to.robots)
+
+
+@_of_robots
+def disable(to: Addressed) -> "Request":
+    """Nothing is to fly: what is in the air holds."""
+    from lpac.ground.station.protocol import Enable
+
+    return Enable(False, to.robots)
+
+
+@app.command()
+def takeoff(
+    names: Names = None,
+    interval: Annotated[
+        float, typer.Option("--interval", min=0, max=60, help="Between two robots, s.")
+    ] = 2.0,
+    abort_on_failure: Annotated[
+        bool, typer.Option("--abort-on-failure", help="Nobody else takes off once one has failed.")
+    ] = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take off, the highest first; done when all hold at their heights."""
+    from lpac.ground.station.protocol import Takeoff
+
+    to = _named(names, fleet, robots)
+    ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=as_json)
+
+
+@_of_robots
+def start(to: Addressed) -> "Request":
+    """Fly the mission, from hold."""
+    from lpac.ground.station.protocol import Start
+
+    return Start(to.robots)
+
+
+@_of_robots
+def hold(to: Addressed) -> "Request":
+    """Stay where they are. Anybody may command it."""
+    from lpac.ground.station.protocol import SafetyCommand
+
+    return SafetyCommand("hold", to.robots)
+
+
+@_of_robots
+def resume(to: Addressed) -> "Request":
+    """Withdraw hold, return or land; who flew the mission flies it again."""
+    from lpac.ground.station.protocol import Resume
+
+    return Resume(to.robots)
+
+
+@app.command()
+def land(
+    names: Names = None,
+    wait: Wait = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Land where they are."""
+    _bring_down("land", _named(names, fleet, robots), wait=wait, as_json=as_json)
+
+
+@app.command("return")
+def return_(
+    names: Names = None,
+    wait: Wait = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fly to the landing points at their own heights, and land there, the lowest first."""
+    _bring_down("return", _named(names, fleet, robots), wait=wait, as_json=as_json)
+
+
+def _bring_down(
+    safety_action: Literal["return", "land"], to: Addressed, *, wait: bool, as_json: bool
+) -> None:
+    from lpac.ground.station.protocol import SafetyCommand
+
+    ask(to, SafetyCommand(safety_action, to.robots, wait), safety_action, as_json=as_json)
+
+
+# One robot at a time
+
+
+@_of_robots
+def pilot(to: Addressed) -> "Request":
+    """Hand robots to human pilots, by name: the program commands nothing until `rejoin`."""
+    return _give("pilot", to)
+
+
+@_of_robots
+def rejoin(to: Addressed) -> "Request":
+    """Take robots back from their pilots, by name: they hold; then `start`."""
+    return _give("rejoin", to)
+
+
+@_of_robots
+def disarm(to: Addressed) -> "Request":
+    """Stop the motors on the ground. A robot in the air refuses."""
+    from lpac.ground.station.protocol import RobotCommand
+    from lpac.ground.station.subscriber import addressed
+
+    if to.robots:
+        return RobotCommand("disarm", to.robots)
+    with looking(to) as subscriber:
+        return RobotCommand("disarm", addressed(subscriber.setup, ()))
+
+
+@app.command()
+def kill(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
+    ] = None,
+    yes: Yes = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
+    to = _named(names, fleet, robots)
+    request = _give("kill", to)
+    confirm(f"KILL {', '.join(to.robots)}? What flies falls.", "kill", yes=yes)
+    ask(to, request, "kill", as_json=as_json)
+
+
+def _give(kind: Literal["pilot", "rejoin", "kill"], to: Addressed) -> "Request":
+    """Raises ValueError if nobody is named."""
+    from lpac.ground.station.protocol import RobotCommand
+
+    if not to.robots:
+        raise ValueError(
+            f"{kind}: name the robots, such as `lpac mission {kind} r3`: it is never for all"
+        )
+    return RobotCommand(kind, to.robots)
+
+
+# Trials, and who commands
+
+
+@app.command()
+def again(
+    trial: Annotated[
+        str, typer.Argument(metavar="[TRIAL]", help="Its name; else numbered on.")
+    ] = "",
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    as_json: AsJson = False,
+) -> None:
+    """Begin the next trial: explored maps and mailboxes are forgotten."""
+    from lpac.ground.station.protocol import NextTrial
+
+    to = address(fleet, robots)
+    ask(to, NextTrial(trial, to.robots), "again", as_json=as_json)
+
+
+@app.command()
+def command(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
+    """Take the command of the fleet from another ground station."""
+    from lpac.ground.station.protocol import TakeCommand
+
+    ask(address(fleet, None), TakeCommand(), "command", as_json=as_json)
+
+
+app.command()(rehearse)
+app.command()(run)

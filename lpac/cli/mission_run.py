@@ -1,0 +1,179 @@
+"""`lpac mission run`: fly a script, and show how far it is."""
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+from lpac.cli.fleet_table import BAD, FAINT, NOTABLE, styled
+from lpac.cli.ground_report import address, looking
+
+if TYPE_CHECKING:
+    from rich.console import Console, Group
+    from rich.live import Live
+
+    from lpac.ground.station.subscriber import GroundSubscriber
+
+
+def run(
+    script: Annotated[
+        Path, typer.Argument(metavar="SCRIPT.toml", help="The script; see docs/script.toml.")
+    ],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask before the next trial takes off.")
+    ] = False,
+    fleet: Fleet = DEFAULT_FLEET,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print one JSON object a line: each step when it is done, then the outcome.",
+        ),
+    ] = False,
+) -> None:
+    """Fly a script: origin, world, and trials from preflight to landing.
+
+    If a step fails, and at Ctrl-C, the fleet is told to hold. Before each further trial it asks.
+    """
+    from lpac.ground.script import ScriptError, ScriptRun, load_script
+    from lpac.ground.site import Sites
+    from lpac.ground.station.client import GroundError
+
+    to = address(fleet, None)
+    sites = Sites(to.path)
+    loaded = load_script(script, sites)
+    if loaded.trials > 1 and not yes and not sys.stdin.isatty():
+        raise ValueError(
+            f"{script}: trials = {loaded.trials}: asks before the next trial takes off, and there "
+            "is no terminal: add --yes"
+        )
+    # A terminal that is closed ends a script as Ctrl-C does.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    with looking(to) as subscriber:
+        view = _View(subscriber, yes, as_json)
+        flight = ScriptRun(loaded, sites, subscriber, view)
+        view.robots = flight.robots
+        try:
+            with view.shown():
+                flight.fly()
+                view.end_step()
+        except ScriptError as error:
+            then = f"; {flight.hold()}" if error.hold else ""
+            problem, code = f"{error}{then}", 1
+        except GroundError as error:
+            problem, code = f"{error}; robots in the air hold by themselves, and then land", 1
+        except (KeyboardInterrupt, typer.Abort, OSError, SystemExit) as error:
+            # A question is aborted. A terminal that is gone cannot be written to; rich exits when
+            # its pipe breaks.
+            why = str(error) if isinstance(error, OSError) else "interrupted"
+            problem, code = f"{why}; {flight.hold()}", 130
+        else:
+            problem, code = "", 0
+    typer.echo(f"lpac: {script}: {problem}" if problem else f"{script}: done", err=True)
+    if as_json:
+        outcome = {"script": str(script), "done": not problem, "problem": problem or None}
+        typer.echo(json.dumps(outcome))
+    raise typer.Exit(code)
+
+
+@dataclass(slots=True)
+class _View:
+    """On stderr: step, time left, and robots on a terminal; a line for each step elsewhere."""
+
+    subscriber: "GroundSubscriber"
+    yes: bool
+    as_json: bool
+    robots: tuple[str, ...] = ()
+    _step: str = ""
+    _step_began_s: float = field(default_factory=time.monotonic)
+    _at_most_s: float | None = None
+    _began_s: float = field(default_factory=time.monotonic)
+    _console: "Console" = field(init=False)
+    _live: "Live" = field(init=False)
+
+    def __post_init__(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        self._console = Console(stderr=True, highlight=False, markup=False)
+        self._live = Live(get_renderable=self._render, console=self._console, transient=True)
+
+    def step(self, name: str, at_most_s: float | None) -> None:
+        """A step begins, and the one before is done."""
+        self.end_step()
+        self._step, self._at_most_s = name, at_most_s
+        self._step_began_s = time.monotonic()
+        self.line(name if at_most_s is None else f"{name}, {at_most_s:g} s")
+
+    def end_step(self) -> None:
+        """The step is done, if there is one."""
+        if self.as_json and self._step:
+            duration_s = round(time.monotonic() - self._step_began_s, 3)
+            typer.echo(json.dumps({"step": self._step, "duration_s": duration_s}))
+        self._step = ""
+
+    def line(self, text: str) -> None:
+        """Something is worth a line, which stays."""
+        self._console.print(f"{time.monotonic() - self._began_s:7.1f} s  {text}", soft_wrap=True)
+
+    def may(self, question: str) -> bool:
+        """Ask the person at the terminal, between two trials."""
+        self.end_step()
+        if self.yes:
+            return True
+        self._live.stop()
+        answer = typer.confirm(question, err=True)
+        self._start_live()
+        return answer
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """The live part, as long as this context lasts and if there is a terminal."""
+        self._start_live()
+        try:
+            yield
+        finally:
+            self._live.stop()
+
+    def _start_live(self) -> None:
+        # It would take what is printed to stdout to itself.
+        if self._console.is_terminal and not self.as_json:
+            self._live.start()
+
+    def _render(self) -> "Group":
+        from rich.console import Group
+        from rich.table import Table
+        from rich.text import Text
+
+        from edge.messages.mission import FlightState
+
+        passed_s = time.monotonic() - self._step_began_s
+        clock = f"{passed_s:.0f} s"
+        if self._at_most_s is not None:
+            clock += f", {max(0.0, self._at_most_s - passed_s):.0f} s left"
+        rows = Table.grid(padding=(0, 2, 0, 0))
+        for robot in self.subscriber.snapshot.robots:
+            if robot.name not in self.robots:
+                continue
+            status = robot.status
+            if status is None or not robot.fresh:
+                rows.add_row(styled(robot.name, ""), styled("not heard", BAD))
+                continue
+            style = "" if status.state is FlightState.MISSION else NOTABLE
+            rows.add_row(
+                styled(robot.name, ""),
+                styled(status.state.value, style),
+                styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
+                styled(status.reason, FAINT),
+            )
+        first = Text(f"{self._step or 'script'}: {clock}", "bold")
+        return Group(first, Text("Ctrl-C holds the fleet", "bold red"), rows)

@@ -1,0 +1,128 @@
+"""`lpac record` and `lpac report`: what happened, kept and shown."""
+
+import contextlib
+import json
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+
+
+def record(
+    fleet: Fleet = DEFAULT_FLEET,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder; else `logs` beside the fleet's description.")
+    ] = None,
+) -> None:
+    """Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs."""
+    from lpac.fleet.config import load_fleet
+    from lpac.ground.record import record as record_to
+
+    name = load_fleet(fleet).fleet
+    directory = (fleet.parent / "logs") if out is None else out
+    if sys.stdout.isatty():
+        record_to(name, directory, _say, _say)
+    else:
+        record_to(name, directory, _say)
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError):  # Nobody reads it: no reason to record no more.
+        typer.echo(text)
+
+
+def report(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(metavar="DIR...", help="Where the robots' and the ground's logs are."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write to; else `report` in the first DIR.")
+    ] = None,
+    trial: Annotated[
+        list[str] | None, typer.Option(help="Only this trial; may be repeated. Else all.")
+    ] = None,
+    times: Annotated[
+        str | None,
+        typer.Option(help="When to take snapshots, s from the mission's begin, such as 0,20,60."),
+    ] = None,
+    world: Annotated[
+        Path | None, typer.Option(help="The world file, if it is not beside the logs.")
+    ] = None,
+    bundle: Annotated[
+        Path | None,
+        typer.Option(help="The policy's bundle; where the robots had it, if not given."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Make figures and one HTML page of a flight's logs; of several trials, how they repeat."""
+    from lpac.analysis.report import Wanted, examine, write
+
+    wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
+    with _Bar() as bar:
+        examined = examine(folders, wanted, bar.show)
+        page = write(examined, out or folders[0] / "report", wanted.times_s, bar.show)
+    summary = examined.summary()
+    if as_json:
+        typer.echo(json.dumps(summary, indent=2))
+        return
+    for values in summary["trials"]:
+        typer.echo(_line(values))
+    for note in examined.notes:
+        typer.echo(f"note: {note}")
+    typer.echo(f"see {page}")
+
+
+def _times_s(times: str | None) -> tuple[float, ...]:
+    if times is None:
+        return ()
+    try:
+        return tuple(float(word) for word in times.split(","))
+    except ValueError:
+        raise ValueError(f"--times {times}: must be numbers such as 0,20,60") from None
+
+
+def _line(values: dict[str, object]) -> str:
+    """A trial in one line."""
+    cost, separation = values["cost"], values["separation"]
+    assert isinstance(cost, dict) and isinstance(values["robots"], list)
+    began_unix_s = values["began_unix_s"]
+    assert isinstance(began_unix_s, float)
+    words = [
+        f"{values['trial']}: {datetime.fromtimestamp(began_unix_s):%Y-%m-%d %H:%M:%S}, "
+        f"{len(values['robots'])} robots, {values['duration_s']:.0f} s"
+    ]
+    if cost["normalized"] is not None:
+        words.append(f"cost {cost['normalized']:.2f} of the initial")
+    if cost["normalized_bound"] is not None:
+        words.append(f"bound {cost['normalized_bound']:.2f}")
+    if isinstance(separation, dict):
+        words.append(f"least distance {separation['distance_m']:.2f} m")
+    if isinstance(values["messages"], dict) and values["messages"]["loss_share"] is not None:
+        words.append(f"{100.0 * values['messages']['loss_share']:.1f} % of the messages lost")
+    for name in ("alarms", "restarts"):
+        found = values[name]
+        if isinstance(found, list | dict) and found:
+            words.append(f"{len(found)} {name}")
+    return ", ".join(words)
+
+
+class _Bar:
+    """How far it is, on a terminal."""
+
+    def __enter__(self) -> "_Bar":
+        self._shown = sys.stderr.isatty()
+        return self
+
+    def show(self, what: str, share: float) -> None:
+        if self._shown:
+            done = round(20 * share)
+            typer.echo(f"\r\033[K[{'#' * done}{' ' * (20 - done)}] {what}", err=True, nl=False)
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            typer.echo("\r\033[K", err=True, nl=False)

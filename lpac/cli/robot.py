@@ -1,0 +1,136 @@
+"""`lpac robot`: fly one robot, or check whether it could fly."""
+
+import json
+import os
+import signal
+import sys
+import threading
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(name="robot", help="Fly one robot, or check whether it could.")
+
+_END_WITHIN_S = 2.9
+
+
+class Rc(StrEnum):
+    """Who may take the vehicle by remote control."""
+
+    PILOT = "pilot"
+    NONE = "none"
+
+
+ConfigPath = Annotated[Path, typer.Option("--config", help="The robot's configuration, TOML.")]
+
+
+@app.command()
+def run(config: ConfigPath = Path("robot.toml")) -> None:
+    """Fly this robot, under the ground's commands, until SIGTERM or Ctrl-C.
+
+    A vehicle that is flying then holds, or lands if the configuration says so.
+    """
+    # There is nothing to leave in order while all this is loaded.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: os._exit(0))
+    # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+
+    # structlog would load it to draw tracebacks: 5 MB that no robot has a use for.
+    sys.modules["rich"] = None  # type: ignore[assignment]
+    from edge.robot.config import load_config
+    from edge.robot.process import run as run_robot
+
+    loaded = load_config(config)
+    stop = threading.Event()
+
+    def on_signal(*_: object) -> None:
+        if not stop.is_set():
+            stop.set()
+            # Whatever hangs, the program ends; PX4 then lands a vehicle that it was flying.
+            signal.setitimer(signal.ITIMER_REAL, _END_WITHIN_S)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, on_signal)
+    run_robot(loaded, stop)
+
+
+@app.command()
+def check(
+    config: ConfigPath = Path("robot.toml"),
+    wait: Annotated[float, typer.Option(help="How long the robot may take to be ready, s.")] = 15.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Say which PX4 it is, what it would do when something fails, and what keeps it from flying.
+
+    With parameters = "set" in the configuration, unsafe PX4 parameters are set.
+    """
+    from edge.robot.config import load_config
+    from edge.robot.process import check as check_robot
+
+    report = check_robot(load_config(config), wait)
+    if as_json:
+        typer.echo(json.dumps(report._asdict(), indent=2))
+    else:
+        typer.echo(report.version)
+        for line in report.explanations:
+            typer.echo(line)
+        for line in report.changes:
+            typer.echo(f"set: {line}")
+        for line in report.failed:
+            typer.echo(f"FAILED  {line}")
+    if report.failed:
+        count = len(report.failed)
+        raise ValueError(f"not ready to fly: {count} check{'s' if count > 1 else ''} failed")
+    typer.echo("ready to fly", err=as_json)
+
+
+@app.command()
+def setup(
+    *,
+    system_id: Annotated[int, typer.Option(min=1, max=255, help="The MAV_SYS_ID it is to have.")],
+    rc: Annotated[Rc, typer.Option(help="Whether somebody holds a remote control.")],
+    ceiling: Annotated[float, typer.Option(help="The fence's, above the pad, m.")],
+    url: Annotated[
+        str, typer.Option(help="Where PX4's MAVLink comes in.")
+    ] = "udpin://127.0.0.1:14551",
+    command_timeout: Annotated[
+        float, typer.Option(help="After so long a hung program lets its vehicle hold, s.")
+    ] = 0.5,
+    wait: Annotated[float, typer.Option(help="How long to listen for the vehicle, s.")] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Set a vehicle's system id and failsafe parameters, once, also those that need a reboot.
+
+    It must be the only vehicle there, and disarmed. No configuration is needed.
+    """
+    import logging
+
+    import structlog
+
+    from edge.drivers.process_lock import ProcessLock
+    from edge.drivers.px4.autopilot import MavsdkAutopilot
+    from edge.flight.failsafe import required
+    from edge.robot.config import AutopilotConfig
+    from edge.robot.setup import set_up
+
+    requirements = required(rc.value, ceiling, command_timeout)
+    port = AutopilotConfig(url, system_id).port
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    with ProcessLock(f"the autopilot's port {port}"), MavsdkAutopilot(url) as autopilot:
+        report = set_up(autopilot, autopilot, requirements, system_id, wait)
+    if as_json:
+        typer.echo(json.dumps(report._asdict(), indent=2))
+    else:
+        for line in report.changes:
+            typer.echo(f"set: {line}")
+        for line in report.problems:
+            typer.echo(f"FAILED  {line}")
+    if report.problems:
+        raise ValueError("the vehicle is not safe to fly as it is")
+    if report.needs_reboot:
+        typer.echo("restart the autopilot: only then all of it counts", err=as_json)
+    elif not report.changes:
+        typer.echo("all was so already", err=as_json)

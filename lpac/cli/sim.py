@@ -1,0 +1,453 @@
+"""`lpac sim` and `lpac demo`: a swarm in this process, or a whole fleet on this machine."""
+
+import gc
+import json
+import shlex
+import signal
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from lpac.shipped import shipped
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+    from rich.table import Table
+
+    from lpac.sim.experiment import Scenario, SimulatedFlight
+    from lpac.sim.fleet.processes import Fleet, FleetScenario
+    from lpac.sim.operator import Statuses
+
+DEFAULT_OUT = Path("out/sim")
+DEFAULT_ROBOTS = 10
+DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
+
+
+class Controller(StrEnum):
+    """Who flies the swarm."""
+
+    LPAC = "lpac"
+    DECENTRALIZED_CVT = "decentralized-cvt"
+    CENTRALIZED_CVT = "centralized-cvt"
+    CLAIRVOYANT_CVT = "clairvoyant-cvt"
+
+
+class Scale(StrEnum):
+    """How large the model's world is in the air."""
+
+    FIELD = "field"
+    MODEL = "model"
+
+
+class Vehicle(StrEnum):
+    """What the robots fly."""
+
+    POINT = "point"
+    MAVLINK = "mavlink"
+    PX4 = "px4"
+
+
+def sim(
+    *,
+    context: typer.Context,
+    vehicle: Annotated[
+        Vehicle,
+        typer.Option(
+            help="point: points in simulated time, in this process; mavlink: one process per robot "
+            "in real time, each with a simulated PX4; px4: the same with real PX4s."
+        ),
+    ] = Vehicle.POINT,
+    bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
+    controller: Annotated[Controller, typer.Option(help="Who flies.")] = Controller.LPAC,
+    robots: Annotated[
+        str,
+        typer.Option(
+            "--robots",
+            "-n",
+            metavar="N|auto",
+            help=f"Number of robots; with mavlink and px4 also auto: as many, up to "
+            f"{DEFAULT_ROBOTS}, as this machine carries.",
+        ),
+    ] = str(DEFAULT_ROBOTS),
+    seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 0,
+    world: Annotated[
+        Path | None, typer.Option(help="CoverageControl world file (.env) instead of a random one.")
+    ] = None,
+    features: Annotated[int, typer.Option(help="Features of a random world.")] = 10,
+    duration: Annotated[
+        float, typer.Option(help="Flight time, s; with mavlink and px4 that of the mission.")
+    ] = 60.0,
+    scale: Annotated[
+        Scale, typer.Option(help="field: 16 units per m, velocity x 0.25; model: 1 and 1.")
+    ] = Scale.FIELD,
+    loss: Annotated[float, typer.Option(help="Probability that a message is lost.")] = 0.0,
+    delay: Annotated[float, typer.Option(help="Mean delay of a message, s.")] = 0.0,
+    max_message_age: Annotated[
+        float, typer.Option(help="Older messages are not used, s; 0: each is used once.")
+    ] = 0.8,
+    errors: Annotated[
+        bool,
+        typer.Option(help="mavlink: positions, heights, compasses and batteries err, gusts blow."),
+    ] = True,
+    px4: Annotated[
+        Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
+    ] = None,
+    script: Annotated[
+        bool,
+        typer.Option(help="mavlink, px4: take off, cover and land; else wait for `lpac ground`."),
+    ] = True,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the flight, its world, figure and flight logs; with --no-script "
+            f"{DEFAULT_OUT} if not given."
+        ),
+    ] = None,
+) -> None:
+    """Fly a swarm over an unknown world and print how well it covers it."""
+    from edge.core.world import parse_world
+
+    _require_options_of(context, vehicle)
+    count = _robot_count(robots)
+    if count is None and vehicle is Vehicle.POINT:
+        raise ValueError("--robots auto does nothing with --vehicle point")
+    world_features = parse_world(_text(world), str(world)) if world else None
+    if vehicle is not Vehicle.POINT:
+        from lpac.sim.fleet.processes import FleetScenario
+
+        flown: Literal["mavlink", "px4"] = "mavlink" if vehicle is Vehicle.MAVLINK else "px4"
+        if flown == "px4" and px4 is None:
+            raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+        fleet_scenario = FleetScenario(
+            robots=_as_many_as_carried(bundle, flown) if count is None else count,
+            seed=seed,
+            duration_s=duration,
+            features=world_features,
+            random_feature_count=features,
+            errors=errors,
+        )
+
+        def prepared() -> int | None:
+            """What is wrong with the flight itself has been said by now."""
+            return None if count is None else _say_if_carried(count, bundle, flown)
+
+        if not script:
+            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared)
+            return
+        _launch(fleet_scenario, bundle, px4, as_json, out, prepared)
+        return
+    from edge.core.frames import ModelScale
+    from lpac.sim.experiment import FIELD_SCALE, Scenario
+
+    assert count is not None
+    scenario = Scenario(
+        controller=controller.value,
+        robots=count,
+        seed=seed,
+        duration_s=duration,
+        features=world_features,
+        random_feature_count=features,
+        scale=FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0),
+        loss=loss,
+        delay_s=delay,
+        max_message_age_s=max_message_age,
+    )
+    if out:
+        out.mkdir(parents=True, exist_ok=True)
+    [flight] = _fly([(controller.value, scenario)], bundle)
+    if out:
+        from lpac.sim.report import write_flight
+
+        write_flight(flight, out)
+    if as_json:
+        typer.echo(json.dumps(flight.summary(), indent=2))
+        return
+    result = (
+        f"after {duration:g} s the coverage cost is {flight.normalized_cost[-1]:.3f} "
+        "of the initial cost"
+        if flight.importance.any()
+        else "the world has no importance anywhere, so that there was nothing to cover"
+    )
+    typer.echo(f"{controller.value}, {count} robots, seed {seed}: {result}")
+    if out:
+        typer.echo(f"see {out / 'flight.png'}")
+
+
+def demo(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the figure and the flights.")] = Path(
+        "out/demo"
+    ),
+    seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 7,
+) -> None:
+    """Ten robots over an unknown world for 60 s, beside the baselines; makes a figure of it."""
+    from lpac.sim.experiment import Scenario
+    from lpac.sim.report import write_demo
+
+    out.mkdir(parents=True, exist_ok=True)
+    scenarios = [
+        ("LPAC", Scenario(seed=seed)),
+        ("LPAC, 30 % loss", Scenario(seed=seed, loss=0.3)),
+        ("Decentralized CVT", Scenario(seed=seed, controller="decentralized-cvt")),
+        ("Centralized CVT", Scenario(seed=seed, controller="centralized-cvt")),
+        ("Clairvoyant CVT", Scenario(seed=seed, controller="clairvoyant-cvt")),
+    ]
+    names = [name for name, _ in scenarios]
+    flights = dict(zip(names, _fly(scenarios, DEFAULT_BUNDLE), strict=True))
+    write_demo(flights, out)
+    costs = "; ".join(
+        f"{name} {flight.normalized_cost[-1]:.3f}" for name, flight in flights.items()
+    )
+    typer.echo(f"coverage cost after 60 s over initial cost: {costs}")
+    typer.echo(f"see {out / 'demo.png'}")
+
+
+_ONLY_FOR = {
+    "controller": (Vehicle.POINT,),
+    "scale": (Vehicle.POINT,),
+    "loss": (Vehicle.POINT,),
+    "delay": (Vehicle.POINT,),
+    "max_message_age": (Vehicle.POINT,),
+    "errors": (Vehicle.MAVLINK,),
+    "px4": (Vehicle.PX4,),
+    "script": (Vehicle.MAVLINK, Vehicle.PX4),
+}
+
+
+def _require_options_of(context: typer.Context, vehicle: Vehicle) -> None:
+    """An option that would do nothing is a mistake."""
+    for name, vehicles in _ONLY_FOR.items():
+        source = context.get_parameter_source(name)
+        if vehicle not in vehicles and source is not None and source.name == "COMMANDLINE":
+            raise ValueError(
+                f"--{name.replace('_', '-')} does nothing with --vehicle {vehicle.value}"
+            )
+
+
+def _robot_count(text: str) -> int | None:
+    """None for auto."""
+    if text == "auto":
+        return None
+    try:
+        return int(text)
+    except ValueError:
+        raise ValueError(f"--robots {text!r}: must be a number, or auto") from None
+
+
+def _as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
+    """As many robots as this machine carries, from 1 to 10; says how many."""
+    from lpac.sim.fleet.load import robots_carried
+
+    carried = int(robots_carried(bundle, vehicle))
+    robots = max(1, min(DEFAULT_ROBOTS, carried))
+    typer.echo(f"{_carries(carried)}: flying {robots}", err=True)
+    return robots
+
+
+def _say_if_carried(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
+    """How many robots this machine carries; says so, and what to do if they are too few."""
+    from lpac.sim.fleet.load import robots_carried
+
+    carried = int(robots_carried(bundle, vehicle))
+    if carried >= robots:
+        typer.echo(_carries(carried), err=True)
+        return carried
+    advice = f"; fewer: -n {max(1, carried)}" if robots > 1 else ""
+    typer.echo(f"{_carries(carried)}, not {robots}: it may not keep up{advice}", err=True)
+    return carried
+
+
+def _carries(robots: int) -> str:
+    count = f"about {robots}" if robots else "less than one"
+    return f"this machine, as busy as it is now, carries {count} of these robots and vehicles"
+
+
+def _launch(
+    scenario: "FleetScenario",
+    bundle: Path,
+    px4: Path | None,
+    as_json: bool,
+    out: Path | None,
+    prepared: Callable[[], int | None],
+) -> None:
+    """Run a fleet of processes; exit code 1 if its flight did not end as it should.
+
+    `prepared` is called before anything starts; it tells how many robots this machine carries.
+    """
+    from lpac.sim.fleet.flight import fly, summary_lines
+    from lpac.sim.fleet.processes import Fleet
+
+    # Whoever stops this program means the fleet too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
+        fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
+        fleet.carried = prepared()
+        flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
+    if out:
+        from lpac.sim.fleet.report import write_fleet_flight
+
+        write_fleet_flight(flight, out)
+    if as_json:
+        typer.echo(json.dumps(flight.summary(), indent=2))
+    else:
+        for line in summary_lines(flight):
+            typer.echo(line)
+        if out:
+            typer.echo(f"see {out / 'flight.png'}; the flight logs are in {out / 'robots'}")
+    if flight.problem or not flight.all_landed:
+        raise typer.Exit(1)
+
+
+def _serve(
+    scenario: "FleetScenario",
+    bundle: Path,
+    px4: Path | None,
+    out: Path,
+    prepared: Callable[[], int | None],
+) -> None:
+    """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
+    from lpac.sim.fleet.processes import Fleet
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        with _live() as (show, say):
+            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say)
+            fleet.carried = prepared()
+            with fleet:
+                while not fleet.operator.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
+                    fleet.require_running()
+                    fleet.vehicles.require_running()
+                    show("programs start", fleet.operator.statuses())
+                fleet.begin()
+                typer.echo(
+                    f"{len(fleet.robots)} robots run until Ctrl-C; in a second terminal:\n\n"
+                    f"  export LPAC_FLEET={shlex.quote(str(out / fleet.fleet_toml.name))}\n"
+                    "  lpac ground\n"
+                )
+                try:
+                    _watch_over(fleet, show, say)
+                finally:
+                    # The robots' programs must be ended, whoever is in a hurry.
+                    for number in (signal.SIGINT, signal.SIGTERM):
+                        signal.signal(number, signal.SIG_IGN)
+    except KeyboardInterrupt:
+        typer.echo("ended")
+
+
+def _watch_over(
+    fleet: "Fleet", show: Callable[[str, "Statuses"], None], say: Callable[[str], None]
+) -> None:
+    """Say once that this machine does not keep up, and of each robot that its program has ended.
+
+    Raises FleetError if all have, VehicleError if a vehicle has ended.
+    """
+    from lpac.sim.fleet.processes import OverloadError, SimulatedFleetError
+
+    running, keeps_up = list(fleet.robots), True
+    while running:
+        fleet.vehicles.require_running()
+        try:
+            fleet.require_keeping_up()
+        except OverloadError as error:
+            if keeps_up:
+                say(str(error))
+            keeps_up = False
+        for robot in [robot for robot in running if not robot.running]:
+            running.remove(robot)
+            say(f"the program of {robot.name} has ended, {robot.ending()}")
+        show(f"fleet {fleet.name}", fleet.operator.statuses())
+        fleet.forget()
+        time.sleep(0.2)
+    raise SimulatedFleetError("the programs of all robots have ended")
+
+
+@contextmanager
+def _live() -> Iterator[tuple[Callable[[str, "Statuses"], None], Callable[[str], None]]]:
+    """On stderr: a table of the robots, on a terminal only; and a way to say a line above it."""
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console(stderr=True, highlight=False)
+    began_s = time.monotonic()
+
+    def say(text: str) -> None:
+        console.print(f"{time.monotonic() - began_s:6.1f} s  {text}", markup=False)
+
+    if not console.is_terminal:
+        yield (lambda *_: None), say
+        return
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        shown_s = -1.0
+
+        def show(step: str, statuses: "Statuses") -> None:
+            nonlocal shown_s
+            now_s = time.monotonic() - began_s
+            if now_s - shown_s >= 0.5:
+                shown_s = now_s
+                live.update(_table(f"{now_s:.0f} s: {step}", statuses), refresh=True)
+
+        yield show, say
+
+
+def _table(title: str, statuses: "Statuses") -> "Table":
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading, style in (
+        ("robot", ""), ("state", "bold"), ("x", ""), ("y", ""), ("height", ""), ("m/s", ""),
+        ("hears", ""), ("battery", ""), ("", ""),
+    ):  # fmt: skip
+        justify: Literal["left", "right"] = "right" if heading else "left"
+        table.add_column(heading, style=style, justify=justify, no_wrap=True)
+    for robot, status in sorted(statuses.items()):
+        position_m = status.position_m or ()
+        speed_m_s = sum(v * v for v in (status.velocity_m_s or ())[:2]) ** 0.5
+        table.add_row(
+            f"r{robot}",
+            status.state.value,
+            *(f"{metres:.1f}" for metres in position_m),
+            *("" for _ in range(3 - len(position_m))),
+            f"{speed_m_s:.1f}",
+            str(len(status.neighbour_ages_s)),
+            "" if status.battery is None else f"{100.0 * status.battery:.0f} %",
+            "; ".join(status.alarms if status.armed else status.failed_checks) or status.reason,
+        )
+    return table
+
+
+def _fly(scenarios: list[tuple[str, "Scenario"]], bundle_path: Path) -> list["SimulatedFlight"]:
+    """Simulate the named scenarios with a progress bar for each, on stderr."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from edge.policy.bundle import load_bundle
+    from lpac.sim.experiment import fly
+
+    bundle = load_bundle(bundle_path)
+    gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
+    flights = []
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        for name, scenario in scenarios:
+            task = progress.add_task(name, total=scenario.duration_s)
+            flights.append(fly(scenario, bundle, partial(_show, progress, task)))
+    return flights
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: is not a text file") from None
+
+
+def _show(progress: "Progress", task: "TaskID", time_s: float) -> None:
+    progress.update(task, completed=time_s)

@@ -1,0 +1,81 @@
+"""`lpac watch`: the fleet in a terminal."""
+
+import dataclasses
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+
+if TYPE_CHECKING:
+    from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+
+# Where there is no terminal, all columns.
+_WIDE = 160
+
+
+def watch(
+    fleet: Fleet = DEFAULT_FLEET,
+    once: Annotated[bool, typer.Option("--once", help="Print it once, as plain text.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print it once, as JSON.")] = False,
+    screenshot: Annotated[
+        Path | None, typer.Option("--screenshot", help="Save an SVG, and quit.", hidden=True)
+    ] = None,
+    size: Annotated[
+        str, typer.Option("--size", help="Of the screenshot, such as 100x30.", hidden=True)
+    ] = "100x30",
+) -> None:
+    """Show fleet and mission, alarms first; h holds all robots at once, l lands them, ? helps.
+
+    Without a terminal it prints them once.
+    """
+    from lpac.fleet.config import load_fleet
+
+    name = load_fleet(fleet).fleet
+    if screenshot is not None:
+        from lpac.ground.terminal.app import Watch
+
+        columns_and_lines = re.fullmatch(r"([1-9]\d{1,3})x([1-9]\d{1,3})", size)
+        if columns_and_lines is None:
+            raise ValueError(f"--size {size}: must be columns x lines, such as 100x30")
+        across, down = map(int, columns_and_lines.groups())
+        with screenshot.open("w") as file:
+            # There is a ground process, or this ends here.
+            _look(name)
+            app = Watch(name, screenshot=True)
+            file.write(app.run(headless=True, size=(across, down)) or "")
+    elif as_json:
+        _, snapshot = _look(name)
+        typer.echo(json.dumps(dataclasses.asdict(snapshot)))
+    elif once or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        from lpac.ground.alarms import alarms
+        from lpac.ground.terminal.text import all_of_it
+
+        setup, snapshot = _look(name)
+        width = shutil.get_terminal_size((_WIDE, 0)).columns
+        typer.echo(all_of_it(setup, snapshot, alarms(setup, snapshot), width))
+    else:
+        from lpac.ground.terminal.app import Watch
+
+        # Without the mouse the terminal's own way to mark and copy text works.
+        Watch(name).run(mouse=False)
+
+
+def _look(fleet: str) -> tuple["FleetSetup", "FleetSnapshot"]:
+    """The fleet as it is now."""
+    from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+    from lpac.ground.station.client import subscribe
+
+    setup = None
+    with subscribe(fleet) as told:
+        for answer in told:
+            if isinstance(answer, FleetSetup):
+                setup = answer
+            elif isinstance(answer, FleetSnapshot) and setup is not None:
+                return setup, answer
+    raise AssertionError("it ends by a picture or an error")

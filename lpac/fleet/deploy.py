@@ -1,0 +1,98 @@
+"""A release's way to a robot: travel, be checked whole, prove itself, switch; or change nothing."""
+
+from typing import NamedTuple
+
+from lpac.fleet.config import FleetConfig, RobotHost
+from lpac.fleet.hold import Held, Report, hold
+from lpac.fleet.release import Release
+from lpac.fleet.session import FleetError, RemoteError, rsync
+
+# Of folders; files keep theirs, which the manifest has.
+_MODES = "--chmod=Du=rwx,Dgo=rx"
+
+
+class Deployed(NamedTuple):
+    """What a robot has now, and what it took: bytes of content, and its policy's ticks, ms."""
+
+    release: str
+    summary: str
+    sent_bytes: int
+    perceive_p99_ms: float | None
+    infer_p99_ms: float | None
+
+
+async def deploy(
+    config: FleetConfig, robot: RobotHost, release: Release, report: Report
+) -> Deployed:
+    """Bring `release` to the robot and run it there, or leave what runs untouched.
+
+    Raises FleetError that says what went wrong; the robot then has what it had before.
+    """
+    async with hold(config, robot, report) as held:
+        before, session = held.found, held.session
+        if before["machine"] != release.image.machine:
+            raise RemoteError(
+                f"it is {before['machine']}, and the image is for {release.image.machine}: "
+                f"make image ARCH={'arm64' if before['machine'] == 'aarch64' else 'amd64'}"
+            )
+        spare = config.slot_of(robot.name) is None
+        runs = spare or before["service"]["fresh"]
+        if before["current"] == release.id and before["pending"] is None and runs:
+            return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
+        sent_bytes = await _bring(config, robot, release, held, report)
+        proof = await session.call("prove", directory=config.directory, release=release.id)
+        report("switch", None)
+        after = await session.call(
+            "switch", directory=config.directory, release=release.id,
+            mavlink_port=robot.mavlink_port,
+        )  # fmt: skip
+        steps = proof["benchmark"]["steps"]
+        return Deployed(
+            after["current"],
+            "spare, not started" if spare else "runs",
+            sent_bytes,
+            steps["perceive"]["p99_ms"],
+            steps["infer"]["p99_ms"],
+        )
+
+
+async def _bring(
+    config: FleetConfig, robot: RobotHost, release: Release, held: Held, report: Report
+) -> int:
+    """Have the release whole on the robot; how many bytes of content travelled."""
+    session = held.session
+    place = await session.call(
+        "prepare", directory=config.directory, release=release.id, image=release.image.id,
+        size_bytes=release.size_bytes, mavlink_port=robot.mavlink_port,
+    )  # fmt: skip
+    if place["complete"]:
+        return 0
+    target, like = f":{place['incoming']}", place["like"]
+    options = ["--delete", "--partial", _MODES]
+    try:
+        sent_bytes = await rsync(
+            config, robot, [f"{release.image.folder}/"], f"{target}/root/",
+            options=[*options, *(f"--link-dest={folder}/root" for folder in like)],
+            sudo=held.found["sudo"], on_share=lambda share: report("image", share),
+        )  # fmt: skip
+        sent_bytes += await rsync(
+            config, robot, [f"{release.folder}/"], f"{target}/",
+            options=[*options, "--exclude=/root", *(f"--link-dest={folder}" for folder in like)],
+            sudo=held.found["sudo"], on_share=lambda share: report("policy", share),
+        )  # fmt: skip
+    except FleetError as error:
+        if "disk is full" in str(error):
+            await session.call("discard", directory=config.directory, release=release.id)
+        raise
+    report("check", None)
+    await session.call("accept", directory=config.directory, release=release.id)
+    return sent_bytes
+
+
+async def rollback(config: FleetConfig, robot: RobotHost, report: Report) -> str:
+    """Run the last good release again; its id. Raises FleetError."""
+    async with hold(config, robot, report) as held:
+        after = await held.session.call(
+            "rollback", directory=config.directory, mavlink_port=robot.mavlink_port
+        )
+        return str(after["current"])

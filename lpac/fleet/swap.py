@@ -1,0 +1,91 @@
+"""A spare takes a failed robot's slot: its pad, height and landing point."""
+
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from edge.core.schema import ConfigError
+from lpac.fleet.config import FleetConfig, RobotHost, assign, load_fleet, select
+from lpac.fleet.deploy import Deployed, deploy
+from lpac.fleet.hold import Report, check_identity, visit
+from lpac.fleet.release import load_common, make_release
+from lpac.fleet.session import RemoteError, UnreachableError, connect
+
+
+class Swapped(NamedTuple):
+    """The slot's number in the file, counted from 0, and what runs on the spare now.
+
+    `changed` tells whether the slot was the failed robot's until now. `silent` is why that one
+    could not be stopped, None if it was. `callers` are the flying robots that call the spare by
+    their own configuration; it calls all others.
+    """
+
+    slot: int
+    changed: bool
+    deployed: Deployed
+    silent: str | None
+    callers: tuple[str, ...]
+
+
+async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
+    """Let `spare` fly instead of `failed`; a repeat finishes what was interrupted.
+
+    The spare is looked at before anything is changed, and the failed robot is stopped before the
+    spare gets its place. Raises ConfigError, or FleetError if the failed robot is armed or the
+    spare cannot have the release; ValueError or OSError if there is no release.
+    """
+    config = load_fleet(path)
+    index = _slot(config, failed, spare)
+    changed = config.slots[index].robot == failed
+    common = load_common(config)
+    report(f"look at {spare}", None)
+    async with visit(config, config.robots[spare]):
+        pass
+    report(f"stop {failed}", None)
+    silent = await _stop(config, config.robots[failed])
+    report(path.name, None)
+    assign(path, index, spare)
+    config = load_fleet(path)
+    robot = config.robots[spare]
+    with tempfile.TemporaryDirectory(prefix="lpac-swap-") as folder:
+        release = make_release(config, robot, common, Path(folder))
+        deployed = await deploy(config, robot, release, report)
+    return Swapped(index, changed, deployed, silent, _callers(config, robot))
+
+
+def _slot(config: FleetConfig, failed: str, spare: str) -> int:
+    """The slot that changes hands, or did so in an earlier try. Raises ConfigError."""
+    select(config, f"{failed},{spare}")
+    slots = {slot.robot: index for index, slot in enumerate(config.slots)}
+    if failed in slots and spare in slots:
+        raise ConfigError(f"{config.path}: {spare} is no spare: it has slots[{slots[spare]}]")
+    if failed not in slots and spare not in slots:
+        raise ConfigError(f"{config.path}: {failed} has no slot that {spare} could take")
+    return slots[failed if failed in slots else spare]
+
+
+def _callers(config: FleetConfig, robot: RobotHost) -> tuple[str, ...]:
+    """Of two robots the one with the larger id calls the other."""
+    flying = (config.robots[slot.robot] for slot in config.slots if slot.robot is not None)
+    return tuple(other.name for other in flying if other.robot_id > robot.robot_id)
+
+
+async def _stop(config: FleetConfig, robot: RobotHost) -> str | None:
+    """Stop the robot's program, now and at boot; why it was not found, None if it was.
+
+    Raises RemoteError if it refuses, since it flies.
+    """
+    try:
+        async with connect(config, robot) as session:
+            found = await session.call("overview", directory=config.directory)
+            try:
+                check_identity(found["identity"], config, robot)
+            except RemoteError as error:
+                return str(error)
+            # Without the lock: on a robot that is broken it may not be had.
+            await session.call(
+                "stop", mavlink_port=robot.mavlink_port, in_flight=False, disable=True
+            )
+    except UnreachableError as error:
+        return str(error)
+    return None

@@ -1,0 +1,175 @@
+"""The start of a day in the field: robots that answer, clocks set, programs that run."""
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from edge.flight.energy import trials
+from lpac.fleet.config import FleetConfig, RobotHost
+from lpac.fleet.doctor import (
+    GOOD_CLOCK_OFFSET_S,
+    Diagnosis,
+    DoctorCheck,
+    Examination,
+    diagnose,
+    measure_clock,
+)
+from lpac.fleet.hold import Report, lock, visit
+from lpac.fleet.operations import Outcome
+from lpac.fleet.session import RemoteError, Session, UnreachableError
+
+_ASK_AGAIN_S = 1.0
+
+
+class Arrival(NamedTuple):
+    """What was done on a robot to bring it up, and what could not be, in words."""
+
+    done: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+class GoDecision(NamedTuple):
+    """Whether a robot may fly, as far as that shows on the ground; and what speaks against it."""
+
+    robot: str
+    go: bool
+    reasons: tuple[str, ...]
+
+
+class Pack(NamedTuple):
+    """A robot's battery: its share, and how many trials it is good for; None if not known.
+
+    `endurance_s` is what a full one lasts, as measured in the last flight, or else as configured.
+    """
+
+    robot: str
+    share: float | None
+    endurance_s: float | None
+    trials: int | None
+
+
+async def bring_up(
+    config: FleetConfig,
+    robot: RobotHost,
+    until_s: float,
+    report: Report,
+    unix_time_s: Callable[[], float] = time.time,
+) -> Arrival:
+    """Wait for the robot, set its clock, finish an interrupted switch, start its program.
+
+    It is waited for until `until_s` of the monotonic clock. A program that was stopped on purpose
+    is not started. Raises FleetError if it does not come, or another robot answers.
+    """
+    while True:
+        try:
+            async with visit(config, robot, report) as (session, _):
+                return await _bring_up(config, robot, session, unix_time_s)
+        except UnreachableError as error:
+            # A robot that is starting refuses connections, and breaks them off.
+            if time.monotonic() + _ASK_AGAIN_S > until_s:
+                raise
+            report(f"waits: {error}", None)
+            await asyncio.sleep(_ASK_AGAIN_S)
+
+
+async def _bring_up(
+    config: FleetConfig,
+    robot: RobotHost,
+    session: Session,
+    unix_time_s: Callable[[], float],
+) -> Arrival:
+    done: list[str] = []
+    problems: list[str] = []
+
+    async def step(function: str, **arguments: object) -> dict[str, Any]:
+        try:
+            return await session.call(function, **arguments)
+        except RemoteError as error:
+            problems.append(str(error))
+            return {}
+
+    locked = False
+    try:
+        recovered = await lock(session, config, robot)
+        locked = True
+        if recovered is not None:
+            done.append(recovered)
+    except RemoteError as error:
+        problems.append(str(error))
+    clock = await measure_clock(session, unix_time_s)
+    if abs(clock.offset_s) > GOOD_CLOCK_OFFSET_S + clock.uncertainty_s:
+        port = robot.mavlink_port
+        if await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
+            done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
+    service = await session.call("service")
+    flies = config.slot_of(robot.name) is not None
+    idle = flies and locked and service["enabled"] and service["active"] != "active"
+    if idle and await step("start", directory=config.directory):
+        done.append("its program was started")
+    return Arrival(tuple(done), tuple(problems))
+
+
+def board(
+    config: FleetConfig,
+    arrivals: Sequence[Outcome[Arrival]],
+    examinations: Sequence[Outcome[Examination]],
+) -> list[Diagnosis]:
+    """All robots' checks: the doctor's, and what kept them from coming up."""
+    examined = {diagnosis.robot: diagnosis for diagnosis in diagnose(config, examinations)}
+    diagnoses = []
+    for outcome in arrivals:
+        name = outcome.robot.name
+        if outcome.value is None:
+            checks = (DoctorCheck("up", "FAILED", outcome.problem or ""),)
+            diagnoses.append(Diagnosis(name, checks))
+            continue
+        problems = "; ".join(outcome.value.problems)
+        done = "; ".join(outcome.value.done) or "nothing was to be done"
+        came = DoctorCheck("up", "FAILED", problems) if problems else DoctorCheck("up", "ok", done)
+        diagnoses.append(Diagnosis(name, (came, *examined[name].checks)))
+    return diagnoses
+
+
+def packs(
+    config: FleetConfig, examinations: Sequence[Outcome[Examination]], trial_s: float
+) -> list[Pack]:
+    """What the robots' batteries are good for, as their programs know them: the slots' robots."""
+    found = []
+    for outcome in examinations:
+        robot, examination = outcome.robot, outcome.value
+        if examination is None or config.slot_of(robot.name) is None:
+            continue
+        service = examination.facts["service"]
+        said = (service["status"] or {}) if service["fresh"] else {}
+        share, endurance_s = said.get("battery"), said.get("endurance_s")
+        count = None
+        if share is not None and endurance_s is not None:
+            flown = config.robot_config(robot.name)
+            flight, limits = flown.flight, flown.limits
+            count = trials(
+                flown.energy,
+                share=share,
+                min_battery=flown.preflight.min_battery,
+                battery_low=flight.battery_low,
+                battery_critical=flight.battery_critical,
+                endurance_s=endurance_s,
+                trial_s=trial_s,
+                # A mission may end anywhere.
+                away_m=max(math.dist(v, flight.landing_point_m) for v in flown.fence.vertices_m),
+                slot=flight.slot,
+                slot_height_m=flight.slot_height_m,
+                max_speed_m_s=limits.max_speed_m_s,
+                max_climb_m_s=limits.max_climb_m_s,
+            )
+        found.append(Pack(robot.name, share, endurance_s, count))
+    return found
+
+
+def decide(diagnosis: Diagnosis) -> GoDecision:
+    """Go or no-go: no-go for whatever failed."""
+    failed = diagnosis.failed()
+    return GoDecision(
+        diagnosis.robot, not failed, tuple(f"{check.name}: {check.found}" for check in failed)
+    )

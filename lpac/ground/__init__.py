@@ -1,0 +1,1 @@
+"""Ground control: the process that speaks to the fleet, its clients, scripts and records."""

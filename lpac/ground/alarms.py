@@ -1,0 +1,346 @@
+"""What an operator must see now, of all that the ground knows; nothing here has a clock."""
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from typing import Literal, NamedTuple, TypeVar
+
+from edge.flight.preflight import PreflightLimits
+from edge.messages.mission import AIRBORNE, FlightState, RobotStatus
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.ground.station.station import COMMANDER_SILENT_S
+
+Severity = Literal["critical", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = ("critical", "warning", "note")
+
+# How long ago the picture before should be.
+_BEFORE_S = 2.0
+
+_S = FlightState
+# Of robots, unless their own files say otherwise.
+LIMITS = PreflightLimits()
+# Above the share at which a robot returns by itself: somebody may still decide.
+BATTERY_LOW = 0.3
+# A robot has heard a state by then, and said so.
+_OBEYED_WITHIN_S = 1.0
+FEATURE_AGE_S = 1.0
+LATE_MS = 50.0
+# Half of the rate at which robots send.
+_MESSAGE_RATE_HZ = 1.25
+_ID = 8
+_NAMES = 4
+
+T = TypeVar("T", bound=Hashable)
+
+
+class Alarm(NamedTuple):
+    """`critical`: act now; `warning`: look into it; `note`: good to know.
+
+    `robot` is a name, "" for the fleet.
+    """
+
+    severity: Severity
+    robot: str
+    text: str
+
+
+def alarms(
+    setup: FleetSetup, snapshot: FleetSnapshot, before: FleetSnapshot | None = None
+) -> tuple[Alarm, ...]:
+    """The alarms of a picture, the gravest first, each robot's of one kind once.
+
+    `before` is what `Before` gives; without it nothing is told that needs two looks: that the
+    ground's state is not obeyed, that loops miss ticks.
+    """
+    fleet = _Fleet(setup, snapshot, before)
+    found = [Alarm(severity, "", text) for severity, text in _of_fleet(fleet)]
+    found += [
+        Alarm(alarm[0], seen.name, alarm[1])
+        for check in _CHECKS
+        for seen in fleet.seen
+        if (alarm := check(fleet, seen)) is not None
+    ]
+    return tuple(sorted(found, key=lambda alarm: SEVERITIES.index(alarm.severity)))
+
+
+class Before:
+    """Keeps the pictures of the last 2 s, as they come."""
+
+    def __init__(self) -> None:
+        self._snapshots: deque[tuple[float, FleetSnapshot]] = deque()
+
+    def take(self, snapshot: FleetSnapshot, now_s: float) -> FleetSnapshot | None:
+        """The picture of 2 s before this one, or a little more; None if there is none."""
+        self._snapshots.append((now_s, snapshot))
+        while len(self._snapshots) > 1 and now_s - self._snapshots[1][0] >= _BEFORE_S:
+            self._snapshots.popleft()
+        at_s, before = self._snapshots[0]
+        return before if now_s - at_s >= _BEFORE_S else None
+
+
+def is_flying(status: RobotStatus) -> bool:
+    """Whether it is in the air, or about to be, as far as its status tells."""
+    handed_over = status.state is _S.PILOT and status.armed is True
+    return status.state in AIRBORNE or status.in_air is True or handed_over
+
+
+_Found = tuple[Severity, str] | None
+
+
+class _Seen(NamedTuple):
+    """A robot that was heard at some time; `before` is its status in the picture before."""
+
+    robot: RobotSnapshot
+    status: RobotStatus
+    before: RobotStatus | None
+
+    @property
+    def name(self) -> str:
+        return self.robot.name
+
+
+class _Fleet:
+    """A picture, and what follows from all of it. `fresh` are those that are heard now."""
+
+    def __init__(
+        self, setup: FleetSetup, snapshot: FleetSnapshot, before: FleetSnapshot | None
+    ) -> None:
+        self.setup = setup
+        self.snapshot = snapshot
+        self.ground = snapshot.ground
+        self.ground_before = None if before is None else before.ground
+        statuses = {} if before is None else {r.name: r.status for r in before.robots}
+        self.seen = [
+            _Seen(robot, robot.status, statuses.get(robot.name))
+            for robot in snapshot.robots
+            if robot.status is not None
+        ]
+        self.fresh = [seen for seen in self.seen if seen.robot.fresh]
+        self.world = _most_common(s.status.world_id for s in self.fresh) or setup.world_id
+        self.origin = _most_common(s.status.origin for s in self.fresh if s.status.origin)
+        self.fence = setup.fence
+        if self.ground is not None:
+            self.world = self.ground.world_id or self.world
+            self.origin = self.ground.origin or self.origin
+            self.fence = self.ground.fence or self.fence
+
+    def enabled(self, robot: RobotSnapshot) -> bool:
+        return self.ground is not None and self.ground.enabled_for(robot.robot_id)
+
+    def in_range(self, a: RobotStatus, b: RobotStatus) -> bool:
+        """Whether two robots are near enough to hear each other."""
+        if a.position_m is None or b.position_m is None:
+            return False
+        range_m = self.setup.communication_range / self.setup.env_scale
+        return math.dist(a.position_m[:2], b.position_m[:2]) <= range_m
+
+
+def _most_common(values: Iterable[T]) -> T | None:
+    counts = Counter(values).most_common(1)
+    return counts[0][0] if counts else None
+
+
+def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, str]]:
+    ground = fleet.ground
+    flying = sum(is_flying(seen.status) for seen in fleet.seen)
+    silent = fleet.snapshot.commander_age_s > COMMANDER_SILENT_S
+    if flying and not fleet.snapshot.commander:
+        yield "critical", f"nobody commands the fleet, and {flying} fly: hold or land them"
+    if fleet.snapshot.commander and silent:
+        text = f"{fleet.snapshot.commander} commands, but is not heard: hold takes over"
+        yield ("critical" if flying else "warning"), text
+    if ground is not None and ground.safety_action_by not in ("", ground.operator):
+        held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
+        yield "warning", f"{ground.safety_action_by} asks {len(held)} robots to hold"
+    if not fleet.snapshot.commander and not flying:
+        yield "note", "nobody commands the fleet yet"
+    if not fleet.setup.world:
+        text = f"the robots' world {fleet.setup.world_id[:_ID]} is not here: no density, no cost"
+        yield "warning", f"{text}; `lpac mission world FILE`"
+    if fleet.seen:
+        slots = {site.robot for site in fleet.setup.slots}
+        unheard = [r.name for r in fleet.snapshot.robots if r.status is None and r.name in slots]
+        if unheard:
+            yield "note", f"not heard yet: {' '.join(unheard)}"
+    else:
+        yield "note", "no robot is heard yet"
+
+
+# Of one robot
+
+
+def _silent(fleet: _Fleet, seen: _Seen) -> _Found:
+    if seen.robot.fresh:
+        return None
+    if is_flying(seen.status):
+        return "critical", f"not heard any more, last in the air in {seen.status.state}"
+    return "warning", f"not heard any more, last in {seen.status.state}"
+
+
+def _duplicate(fleet: _Fleet, seen: _Seen) -> _Found:
+    if not seen.robot.duplicate:
+        return None
+    return "critical", "two programs say that they are this robot: end one"
+
+
+def _own(fleet: _Fleet, seen: _Seen) -> _Found:
+    status = seen.status
+    if not status.alarms:
+        return None
+    # What a pilot flies is in his hands, if they still move it.
+    has_pilot = status.state is _S.PILOT and status.remote_control is not False
+    grave = is_flying(status) and not has_pilot
+    return ("critical" if grave else "warning"), "; ".join(status.alarms)
+
+
+def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
+    """What the ground said in the picture before already, and the robot has had time to obey."""
+    said, status = fleet.ground_before, seen.status
+    if said is None or fleet.ground is None:
+        return None
+    if seen.robot.age_s is None or seen.robot.age_s > _BEFORE_S - _OBEYED_WITHIN_S:
+        return None
+    severity: Severity = "critical" if is_flying(status) else "warning"
+    if status.obeyed_sequence < said.sequence:
+        return severity, "does not obey what the ground says"
+    if status.operator not in ("", said.operator, fleet.ground.operator):
+        return severity, f"obeys {status.operator}, not {fleet.ground.operator}"
+    return None
+
+
+def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
+    battery = seen.status.battery
+    told = any("battery" in text for text in seen.status.alarms)
+    if told or battery is None or battery > BATTERY_LOW:
+        return None
+    if not is_flying(seen.status):
+        return "note", f"battery low: {battery:.0%}"
+    if battery <= fleet.setup.battery_critical:
+        return "critical", f"battery critical: {battery:.0%}"
+    return "warning", f"battery low: {battery:.0%}"
+
+
+def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
+    theirs, ours = seen.status.bundle_id, fleet.setup.bundle_id
+    if theirs == ours:
+        return None
+    return "warning", f"bundle {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
+
+
+def _world(fleet: _Fleet, seen: _Seen) -> _Found:
+    theirs, ours = seen.status.world_id, fleet.world
+    if theirs == ours or _says_why(seen, "world"):
+        return None
+    return "warning", f"world {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
+
+
+def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
+    if seen.status.origin in (None, fleet.origin) or _says_why(seen, "origin"):
+        return None
+    return "warning", "another origin than the fleet's"
+
+
+def _fence(fleet: _Fleet, seen: _Seen) -> _Found:
+    if seen.status.fence in (None, fleet.fence) or _says_why(seen, "fence"):
+        return None
+    return "warning", "another fence than the fleet's"
+
+
+def _says_why(seen: _Seen, what: str) -> bool:
+    """Whether it says itself that it does not take the fleet's: that is told, once."""
+    return any(what in text for text in seen.status.not_taken)
+
+
+def _not_taken(fleet: _Fleet, seen: _Seen) -> _Found:
+    return ("warning", "; ".join(seen.status.not_taken)) if seen.status.not_taken else None
+
+
+def _gps(fleet: _Fleet, seen: _Seen) -> _Found:
+    """In the air; on the ground its own checks tell."""
+    satellites, hdop = seen.status.satellites, seen.status.hdop
+    if not is_flying(seen.status):
+        return None
+    if satellites is not None and satellites < LIMITS.min_satellites:
+        return "warning", f"GPS sees {satellites} satellites"
+    if hdop is not None and not hdop <= LIMITS.max_hdop:
+        return "warning", f"GPS precision (HDOP) is {hdop:.1f}"
+    return None
+
+
+def _features(fleet: _Fleet, seen: _Seen) -> _Found:
+    if seen.status.state not in (_S.HOLD, _S.MISSION):
+        return None
+    age_s = seen.status.feature_age_s
+    if age_s is None:
+        return _graver_in_mission(seen), "has no features to ask the policy with"
+    if age_s > FEATURE_AGE_S:
+        return _graver_in_mission(seen), f"features are {age_s:.1f} s old"
+    return None
+
+
+def _neighbours(fleet: _Fleet, seen: _Seen) -> _Found:
+    """Whom it does not hear of those in range; a robot forgets messages that are 0.8 s old."""
+    status, flying = seen.status, (_S.HOLD, _S.MISSION, _S.RETURN)
+    if status.state not in flying:
+        return None
+    badly = []
+    for other in fleet.fresh:
+        key = str(other.robot.robot_id)
+        near = other is not seen and fleet.in_range(status, other.status)
+        if near and other.status.state in flying:
+            rate_hz = seen.robot.rates_hz.get(key, math.inf)
+            if key not in status.neighbour_ages_s or rate_hz < _MESSAGE_RATE_HZ:
+                badly.append(other.name)
+    if not badly:
+        return None
+    # The same words for all of them, so that a view can put them together.
+    whom = " ".join(badly) if len(badly) <= _NAMES else f"more than {_NAMES} of those in range"
+    return _graver_in_mission(seen), f"hears badly: {whom}"
+
+
+def _loops(fleet: _Fleet, seen: _Seen) -> _Found:
+    severity: Severity = "warning" if is_flying(seen.status) else "note"
+    for name, loop in seen.status.loops.items():
+        last = None if seen.before is None else seen.before.loops.get(name)
+        if last is not None and loop.failures > last.failures:
+            return severity, f"its {name} loop fails"
+        if last is not None and loop.overruns > last.overruns:
+            return severity, f"its {name} loop misses ticks"
+        if loop.lateness_p99_ms > LATE_MS:
+            return severity, f"its {name} loop is late by {loop.lateness_p99_ms:.0f} ms"
+    return None
+
+
+def _clock(fleet: _Fleet, seen: _Seen) -> _Found:
+    offset_s = seen.robot.clock_offset_s
+    if offset_s is None or abs(offset_s) <= LIMITS.max_clock_difference_s:
+        return None
+    return "warning", f"its clock is {abs(offset_s):.0f} s {'ahead' if offset_s > 0 else 'behind'}"
+
+
+def _not_ready(fleet: _Fleet, seen: _Seen) -> _Found:
+    status = seen.status
+    waits = status.state in (_S.INIT, _S.IDLE, _S.PREFLIGHT) and not status.ready
+    if not waits or not fleet.enabled(seen.robot) or not status.failed_checks:
+        return None
+    more = len(status.failed_checks) - 1
+    return "note", f"not ready: {status.failed_checks[0]}{f' (+ {more})' if more else ''}"
+
+
+def _graver_in_mission(seen: _Seen) -> Severity:
+    return "warning" if seen.status.state is _S.MISSION else "note"
+
+
+def _if_fresh(check: "_Check") -> "_Check":
+    """What a robot said long ago is no news."""
+    return lambda fleet, seen: check(fleet, seen) if seen.robot.fresh else None
+
+
+_Check = Callable[[_Fleet, _Seen], _Found]
+# Within one severity, the gravest first.
+_CHECKS: tuple[_Check, ...] = (
+    _silent, _duplicate, *map(_if_fresh, (
+        _own, _not_obeyed, _battery, _bundle, _world, _origin, _fence, _not_taken, _gps, _features,
+        _neighbours, _loops, _clock, _not_ready,
+    )),
+)  # fmt: skip

@@ -1,0 +1,1 @@
+"""`lpac map`: the fleet in a browser."""

@@ -1,0 +1,463 @@
+"""`lpac map`: a page on the laptop that shows the fleet; a client of the ground process.
+
+One event loop: it listens to the ground, and gives each page what is new. Coverage is computed
+beside it, in threads.
+"""
+
+import asyncio
+import contextlib
+import json
+import signal
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from aiohttp import WSMsgType, web
+
+from edge.core import F64
+from lpac.analysis.coverage import Coverage
+from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
+from lpac.ground.alarms import Alarm, Before, alarms
+from lpac.ground.map.access import Access, reached_at
+from lpac.ground.map.view import (
+    Json,
+    Missions,
+    detail_view,
+    report_view,
+    setup_view,
+    snapshot_view,
+)
+from lpac.ground.station.client import listen, send
+from lpac.ground.station.protocol import (
+    CommandReport,
+    Enable,
+    Request,
+    Resume,
+    SafetyCommand,
+    Start,
+    TakeCommand,
+    Takeoff,
+)
+
+_PAGE = Path(__file__).parent / "page"
+_FILES = {
+    "/": ("index.html", "text/html"),
+    **{
+        f"/{name}": (name, "text/javascript")
+        for name in ("map.js", "canvas.js", "chart.js", "panel.js", "drawer.js", "dom.js")
+    },
+    "/map.css": ("map.css", "text/css"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
+}
+# Of the page's own files alone, and with no script or style within the page.
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+_RETRY_S = 1.0
+# A page that takes nothing for this long is gone.
+_HEARTBEAT_S = 10.0
+_MAX_EVENTS = 200
+_MAX_REQUEST_BYTES = 4096
+
+# All that a page can ask of the fleet. Kill is not among it: `lpac mission kill` asks.
+_ACTIONS: dict[str, Callable[[tuple[str, ...]], Request]] = {
+    "enable": lambda robots: Enable(robots=robots),
+    "takeoff": lambda robots: Takeoff(robots=robots),
+    "start": lambda robots: Start(robots=robots),
+    "hold": lambda robots: SafetyCommand("hold", robots=robots),
+    "resume": lambda robots: Resume(robots=robots),
+    "return": lambda robots: SafetyCommand("return", robots=robots),
+    "land": lambda robots: SafetyCommand("land", robots=robots),
+    "command": lambda _: TakeCommand(),
+}
+
+
+class Outbox:
+    """What one open page is still to be told: of each kind the newest alone, and the last events.
+
+    So a page that takes it slowly misses snapshots, and costs no memory.
+    """
+
+    def __init__(self) -> None:
+        self.selected: str | None = None
+        self._newest: dict[str, str] = {}
+        self._each: deque[str] = deque(maxlen=_MAX_EVENTS)
+        self._some = asyncio.Event()
+
+    def put(self, text: str, kind: str) -> None:
+        self._newest[kind] = text
+        self._some.set()
+
+    def put_each(self, text: str) -> None:
+        self._each.append(text)
+        self._some.set()
+
+    async def take(self) -> list[str]:
+        """All that there is, in order; waits until there is something."""
+        await self._some.wait()
+        texts = [*self._newest.values(), *self._each]
+        self._newest.clear()
+        self._each.clear()
+        self._some.clear()
+        return texts
+
+
+class LiveMap:
+    """Shows one fleet to any number of pages; acts only with `operate`."""
+
+    def __init__(self, fleet: str, access: Access, *, operate: bool) -> None:
+        self._fleet = fleet
+        self._access = access
+        self._operate = operate
+        self._pages: set[Outbox] = set()
+        self._sockets: set[web.WebSocketResponse] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._problem = "no word from the ground process yet"
+        self._setup: FleetSetup | None = None
+        self._coverage: Coverage | None = None
+        self._setup_text = ""
+        self._snapshot: FleetSnapshot | None = None
+        # Of the robots that count for the cost, in this snapshot, m.
+        self._places_m: dict[str, tuple[float, float]] = {}
+        self._alarms: tuple[Alarm, ...] = ()
+        self._before = Before()
+        self._explored: dict[str, Explored] = {}
+        self._events: deque[GroundEvent] = deque(maxlen=_MAX_EVENTS)
+        self._missions = Missions()
+        self._new_snapshot = asyncio.Event()
+
+    def app(self) -> web.Application:
+        """The web server's part; `follow` and `compute` must run beside it."""
+        app = web.Application(middlewares=[self._guard], client_max_size=_MAX_REQUEST_BYTES)
+        for path in _FILES:
+            app.router.add_get(path, self._file)
+        app.router.add_get("/live", self._live)
+        app.on_shutdown.append(self._close)
+        return app
+
+    # From the ground
+
+    async def follow(self) -> None:
+        """Listen to the ground, and again when it comes back; for ever."""
+        while True:
+            try:
+                async for message in listen(self._fleet):
+                    await self._take(message)
+            except (OSError, ValueError) as error:
+                self._problem = str(error)
+                self._missions.interrupt()
+                self._before = Before()
+                self._put(self._ground_view())
+            await asyncio.sleep(_RETRY_S)
+
+    async def _take(self, message: object) -> None:
+        match message:
+            case FleetSetup():
+                await self._take_setup(message)
+            case FleetSnapshot():
+                self._take_snapshot(message)
+            case GroundEvent() if message not in self._events:
+                self._events.append(message)
+                for page in self._pages:
+                    page.put_each(_text(_event_view(message)))
+            case Explored():
+                self._explored[message.robot] = message
+                self._put(_explored_view(message), message.robot)
+
+    async def _take_setup(self, setup: FleetSetup) -> None:
+        if self._setup is None or self._setup.world != setup.world:
+            self._coverage = None
+            # Nothing else depends on a world that cannot be read, or is not known.
+            with contextlib.suppress(ValueError):
+                if setup.world:
+                    self._coverage = await asyncio.to_thread(Coverage, setup)
+            self._missions.change_world()
+        self._setup = setup
+        self._setup_text = _text(setup_view(setup, self._coverage))
+        for page in self._pages:
+            page.put(self._setup_text, "setup")
+
+    def _take_snapshot(self, snapshot: FleetSnapshot) -> None:
+        if self._setup is None:
+            return
+        self._snapshot = snapshot
+        before = self._before.take(snapshot, time.monotonic())
+        self._alarms = alarms(self._setup, snapshot, before)
+        self._places_m = self._missions.take(snapshot)
+        self._new_snapshot.set()
+        if self._problem:
+            self._problem = ""
+            self._put(self._ground_view())
+        self._put(snapshot_view(self._setup, snapshot, self._alarms))
+        for page in self._pages:
+            self._put_detail(page)
+
+    def _put_detail(self, page: Outbox) -> None:
+        if self._snapshot is None or self._setup is None:
+            return
+        for robot in self._snapshot.robots:
+            if robot.name == page.selected:
+                page.put(_text(detail_view(self._setup, robot)), "detail")
+
+    # Coverage
+
+    async def compute(self) -> None:
+        """The cost and the cells of the newest snapshot, again and again; for ever."""
+        while True:
+            await self._new_snapshot.wait()
+            self._new_snapshot.clear()
+            if self._snapshot is not None:
+                await self._compute(self._snapshot, self._places_m, self._coverage)
+
+    async def _compute(
+        self,
+        snapshot: FleetSnapshot,
+        places_m: dict[str, tuple[float, float]],
+        coverage: Coverage | None,
+    ) -> None:
+        if coverage is None or not places_m:
+            self._put({"kind": "coverage", "cost": None, "time_s": None, "cells": {}})
+            return
+        positions_m = np.array(list(places_m.values()))
+        cost, cells_m = await asyncio.to_thread(
+            lambda: (coverage.cost(positions_m), coverage.cells_m(positions_m))
+        )
+        if self._missions.begins(snapshot):
+            curve = self._missions.begin(snapshot, cost)
+            self._put(curve.view())
+            self._start(self._find_bound(coverage, positions_m))
+        time_s = self._missions.time_s(snapshot)
+        curve_now = self._missions.curve
+        share = None
+        if curve_now is not None and time_s is not None:
+            curve_now.add(time_s, cost)
+            share = curve_now.share(cost)
+        cells = {
+            name: [[round(x_m, 2), round(y_m, 2)] for x_m, y_m in cell]
+            for name, cell in zip(places_m, cells_m, strict=True)
+        }
+        self._put(
+            {"kind": "coverage", "cost": cost, "share": share, "time_s": time_s, "cells": cells}
+        )
+
+    async def _find_bound(self, coverage: Coverage, positions_m: F64) -> None:
+        curve = self._missions.curve
+        bound = await asyncio.to_thread(coverage.clairvoyant, positions_m)
+        if curve is not None and curve is self._missions.curve:
+            curve.bound = curve.share(bound)
+            self._put(curve.view())
+
+    # To the pages
+
+    def _put(self, view: Json, of: str = "") -> None:
+        """Tell all pages; it takes the place of what was to be told of the same kind."""
+        if self._pages:
+            text = _text(view)
+            for page in self._pages:
+                page.put(text, view["kind"] + of)
+
+    def _ground_view(self) -> Json:
+        return {"kind": "ground", "problem": self._problem}
+
+    def _welcome(self, page: Outbox) -> None:
+        """Tell a page that opens all that is known."""
+        page.put(_text({"kind": "hello", "fleet": self._fleet, "operate": self._operate}), "hello")
+        page.put(_text(self._ground_view()), "ground")
+        if self._setup is None:
+            return
+        page.put(self._setup_text, "setup")
+        page.put(_text(self._missions.paths_view()), "paths")
+        for explored in self._explored.values():
+            page.put(_text(_explored_view(explored)), "explored" + explored.robot)
+        for event in self._events:
+            page.put_each(_text(_event_view(event)))
+        if self._missions.curve is not None:
+            page.put(_text(self._missions.curve.view()), "curve")
+        if self._snapshot is not None:
+            view = snapshot_view(self._setup, self._snapshot, self._alarms)
+            page.put(_text(view), "snapshot")
+
+    @web.middleware
+    async def _guard(
+        self, request: web.Request, handler: Callable[[web.Request], Any]
+    ) -> web.StreamResponse:
+        cookie = _cookie(request)
+        query = request.query.get("token")
+        refusal = self._access.refusal(
+            request.headers.get("Host", ""),
+            request.headers.get("Origin"),
+            (request.cookies.get(cookie), query),
+        )
+        if refusal is not None:
+            return web.Response(status=403, text=f"{refusal}\n", headers=_HEADERS)
+        if query is not None and self._access.token is not None and request.path == "/":
+            # Out of the address, which others may see on the screen.
+            response = web.Response(status=303, headers={**_HEADERS, "Location": "/"})
+            response.set_cookie(cookie, self._access.token, httponly=True, samesite="Strict")
+            return response
+        answer: web.StreamResponse = await handler(request)
+        return answer
+
+    async def _file(self, request: web.Request) -> web.Response:
+        name, content_type = _FILES[request.path]
+        return web.Response(
+            body=(_PAGE / name).read_bytes(),
+            content_type=content_type,
+            charset="utf-8",
+            headers=_HEADERS,
+        )
+
+    async def _live(self, request: web.Request) -> web.WebSocketResponse:
+        stream = web.WebSocketResponse(heartbeat=_HEARTBEAT_S, max_msg_size=_MAX_REQUEST_BYTES)
+        await stream.prepare(request)
+        page = Outbox()
+        self._welcome(page)
+        self._pages.add(page)
+        self._sockets.add(stream)
+        writer = asyncio.create_task(_write(stream, page))
+        try:
+            async for message in stream:
+                if message.type is WSMsgType.TEXT:
+                    self._take_wish(page, message.data)
+        finally:
+            self._pages.discard(page)
+            self._sockets.discard(stream)
+            writer.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await writer
+        return stream
+
+    async def _close(self, _: web.Application) -> None:
+        for stream in tuple(self._sockets):
+            await stream.close(code=1001)
+        for task in tuple(self._tasks):
+            task.cancel()
+
+    # From the pages
+
+    def _take_wish(self, page: Outbox, text: str) -> None:
+        """{"select": name or null}, or {"do": action, "robots": [names]}; anything else is none."""
+        try:
+            wish = json.loads(text)
+        except (ValueError, RecursionError):
+            return
+        match wish:
+            case {"select": str() | None as name}:
+                page.selected = name
+                self._put_detail(page)
+            case {"do": str(action), "robots": [*robots]} if all(
+                isinstance(robot, str) for robot in robots
+            ):
+                self._start(self._act(page, action, tuple(robots)))
+
+    async def _act(self, page: Outbox, action: str, robots: tuple[str, ...]) -> None:
+        if not self._operate:
+            report = CommandReport(
+                problem="this map only observes: `lpac map --operate` can command"
+            )
+        elif action not in _ACTIONS:
+            report = CommandReport(problem="there is no such command here")
+        else:
+            try:
+                report = await send(self._fleet, _ACTIONS[action](robots))
+            except (OSError, ValueError) as error:
+                report = CommandReport(problem=str(error))
+        page.put_each(_text(report_view(action, report)))
+
+    def _start(self, work: Any) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+
+async def _write(stream: web.WebSocketResponse, page: Outbox) -> None:
+    while not stream.closed:
+        for text in await page.take():
+            # Waits as long as the page does not take what was sent before.
+            await stream.send_str(text)
+
+
+def _text(view: Json) -> str:
+    return json.dumps(view, separators=(",", ":"), allow_nan=False)
+
+
+def _event_view(event: GroundEvent) -> Json:
+    return {
+        "kind": "event",
+        "unix_time_s": event.unix_time_s,
+        "what": event.kind,
+        "robot": event.robot,
+        "text": event.text,
+        "operator": event.operator,
+    }
+
+
+def _explored_view(explored: Explored) -> Json:
+    return {"kind": "explored", "robot": explored.robot, "cells": explored.cells}
+
+
+def _cookie(request: web.Request) -> str:
+    """Browsers keep cookies by name and host, whatever the port."""
+    port = request.transport.get_extra_info("sockname")[1] if request.transport else 0
+    return f"lpac-map-{port}"
+
+
+@contextlib.asynccontextmanager
+async def serving(
+    fleet: str, *, host: str, port: int, access: Access, operate: bool
+) -> AsyncIterator[list[str]]:
+    """Serve the map of a fleet as long as this context lasts; gives its addresses.
+
+    Port 0 takes a free one. Raises OSError if it cannot listen there.
+    """
+    live_map = LiveMap(fleet, access, operate=operate)
+    runner = web.AppRunner(live_map.app(), access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        try:
+            await web.TCPSite(runner, host, port).start()
+        except OSError as error:
+            reason = error.strerror or error
+            raise OSError(f"--host {host} --port {port}: cannot serve there: {reason}") from None
+        own, own_port, *_ = runner.addresses[0]
+        names = [f"[{name}]" if ":" in name else name for name in reached_at(own)]
+        query = "" if access.token is None else f"?token={access.token}"
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(live_map.follow()), group.create_task(live_map.compute())]
+            try:
+                yield [f"http://{name}:{own_port}/{query}" for name in names]
+            finally:
+                for task in tasks:
+                    task.cancel()
+    finally:
+        await runner.cleanup()
+
+
+async def serve(
+    fleet: str,
+    *,
+    host: str,
+    port: int,
+    access: Access,
+    operate: bool,
+    ready: Callable[[list[str]], None],
+) -> None:
+    """Serve until SIGINT or SIGTERM; `ready` is told the addresses. Raises OSError."""
+    ended = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    async with serving(fleet, host=host, port=port, access=access, operate=operate) as addresses:
+        ready(addresses)
+        await ended.wait()

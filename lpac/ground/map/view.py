@@ -1,0 +1,266 @@
+"""What the live map's page is told, from what the ground tells: JSON values, few enough for 5 Hz.
+
+Pure. Positions are (x, y) or (x, y, z) in the mission frame, m; `yaw_rad` is clockwise from its y
+axis, as the map shows it.
+"""
+
+import base64
+import dataclasses
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from edge.messages.mission import FlightState, GroundState, RobotStatus
+from lpac.analysis.coverage import Coverage, Whereabouts, in_air
+from lpac.analysis.mission_tracker import MissionTracker
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.ground.alarms import Alarm
+from lpac.ground.station.protocol import CommandReport
+
+Json = dict[str, Any]
+
+# What the density is sent with: finer than a laptop shows it.
+DENSITY_CELLS = 256
+# The cost of these counts: a mission may be interrupted, and ends with return or land.
+_IN_MISSION = (FlightState.MISSION, FlightState.HOLD, FlightState.PILOT)
+_MAX_POINTS = 3000
+_PATH_POINTS = 400
+_PATH_STEP_M = 0.15
+
+
+def setup_view(setup: FleetSetup, coverage: Coverage | None) -> Json:
+    """What seldom changes; no density without `coverage`, as of a world that is not known here."""
+    return {
+        "kind": "setup",
+        "slots": [
+            {
+                "robot": site.robot,
+                "pad": _rounded(site.pad_m),
+                "landing": _rounded(site.place.landing_point_m),
+            }
+            for site in setup.slots
+        ],
+        "side_m": setup.world_size / setup.env_scale,
+        "range_m": setup.communication_range / setup.env_scale,
+        "sensor_m": setup.sensor_size / setup.env_scale,
+        "density": coverage
+        and {
+            "cells": DENSITY_CELLS,
+            "levels": base64.b64encode(coverage.density(DENSITY_CELLS).tobytes()).decode(),
+        },
+    }
+
+
+def snapshot_view(setup: FleetSetup, snapshot: FleetSnapshot, alarms: tuple[Alarm, ...]) -> Json:
+    """The fleet now."""
+    ground = snapshot.ground
+    fence = ground.fence if ground is not None and ground.fence is not None else setup.fence
+    heading_deg = None if ground is None or ground.origin is None else ground.origin.heading_deg
+    index = {robot.robot_id: n for n, robot in enumerate(snapshot.robots)}
+    return {
+        "kind": "snapshot",
+        "unix_time_s": snapshot.unix_time_s,
+        "commander": snapshot.commander,
+        "own": snapshot.commander == setup.operator,
+        "trial": "" if ground is None else ground.trial,
+        "safety_action": "none" if ground is None else ground.safety_action,
+        "safety_action_by": "" if ground is None else ground.safety_action_by or ground.operator,
+        "heading_deg": heading_deg,
+        "fence": [_rounded(corner) for corner in fence.vertices_m],
+        "buffer": [_rounded(corner) for corner in fence.grown_m(-fence.buffer_m)],
+        "running": list(snapshot.running),
+        "alarms": [alarm._asdict() for alarm in alarms],
+        "robots": [_robot_view(robot, ground, heading_deg, index) for robot in snapshot.robots],
+    }
+
+
+def _robot_view(
+    robot: RobotSnapshot,
+    ground: GroundState | None,
+    heading_deg: float | None,
+    index: dict[int, int],
+) -> Json:
+    view: Json = {
+        "name": robot.name,
+        "fresh": robot.fresh,
+        "age_s": _number(robot.age_s, 2),
+        "duplicate": robot.duplicate,
+        "enabled": ground is not None and ground.enabled_for(robot.robot_id),
+        "asked": "none" if ground is None else ground.safety_action_for(robot.robot_id),
+    }
+    status = robot.status
+    if status is None:
+        return view
+    return view | {
+        "state": status.state,
+        "reason": status.reason,
+        "ready": status.ready,
+        "failed_checks": list(status.failed_checks),
+        "in_air": in_air(status),
+        "position_m": _rounded(status.position_m),
+        "yaw_rad": _yaw_rad(status, heading_deg),
+        "wanted_m_s": _rounded(status.policy_velocity_m_s),
+        "battery": _number(status.battery, 3),
+        "satellites": status.satellites,
+        "landing_m": _rounded(status.landing_point_m),
+        # How old each neighbour's last message was then, by the neighbour's place in `robots`.
+        "hears": [
+            [index[int(neighbour)], _number(age_s, 2) if robot.fresh else None]
+            for neighbour, age_s in status.neighbour_ages_s.items()
+            if neighbour.isdecimal() and int(neighbour) in index
+        ],
+    }
+
+
+def detail_view(setup: FleetSetup, robot: RobotSnapshot) -> Json:
+    """Everything about one robot; neighbours by name."""
+    names = {str(robot_id): name for name, robot_id in setup.robots.items()}
+    view: Json = {"kind": "detail", **dataclasses.asdict(robot)}
+    view["rates_hz"] = {names.get(n, n): _number(r, 1) for n, r in robot.rates_hz.items()}
+    if robot.status is not None:
+        status = view["status"]
+        for key in ("neighbour_ages_s", "neighbour_messages"):
+            status[key] = {names.get(n, n): value for n, value in status[key].items()}
+    return cast(Json, _finite(view))
+
+
+def report_view(action: str, report: CommandReport) -> Json:
+    """What came of an action."""
+    return {"kind": "report", "action": action, "done": report.done, **dataclasses.asdict(report)}
+
+
+@dataclass(slots=True)
+class Curve:
+    """The coverage cost of one trial: `points` are (mission time, s; J over `first_cost`).
+
+    The mission began at `began_s` (unix time) with J = `first_cost`, unless not `whole`: then the
+    first snapshot showed it under way. `bound` is the clairvoyant's J over `first_cost`.
+    """
+
+    trial: str
+    began_s: float
+    whole: bool
+    first_cost: float
+    bound: float | None = None
+    points: list[tuple[float, float]] = field(default_factory=list)
+
+    def add(self, time_s: float, cost: float) -> None:
+        """Of a long mission every second point is forgotten, now and then."""
+        if len(self.points) >= _MAX_POINTS:
+            del self.points[1::2]
+        self.points.append((round(time_s, 2), self.share(cost)))
+
+    def share(self, cost: float) -> float:
+        """The cost over that of the start; 1 in a world without importance."""
+        return round(cost / self.first_cost, 4) if self.first_cost > 0.0 else 1.0
+
+    def view(self) -> Json:
+        """All of it."""
+        return {"kind": "curve", **dataclasses.asdict(self)}
+
+
+class Missions:
+    """Tells when missions begin and how long they last, and keeps the robots' paths."""
+
+    def __init__(self) -> None:
+        self.curve: Curve | None = None
+        self._paths: dict[str, deque[tuple[float, float]]] = {}
+        self._seen_before = False
+        self._mission_tracker = MissionTracker()
+        self._whereabouts = Whereabouts()
+
+    def begins(self, snapshot: FleetSnapshot) -> bool:
+        """Whether this snapshot shows a mission that has no curve yet."""
+        return self.curve is None and _flies_mission(snapshot)
+
+    def begin(self, snapshot: FleetSnapshot, cost: float) -> Curve:
+        """Begin another curve, and other paths."""
+        self._paths.clear()
+        self.curve = Curve(_trial(snapshot), snapshot.unix_time_s, self._seen_before, cost)
+        return self.curve
+
+    def time_s(self, snapshot: FleetSnapshot) -> float | None:
+        """The mission time; None if none is flown now."""
+        if self.curve is None or not any(
+            robot.fresh
+            and robot.status is not None
+            and robot.status.state in _IN_MISSION
+            and robot.robot_id in self._mission_tracker.robots
+            for robot in snapshot.robots
+        ):
+            return None
+        return max(0.0, snapshot.unix_time_s - self.curve.began_s)
+
+    def interrupt(self) -> None:
+        """The ground is gone: who knows what begins meanwhile."""
+        self._seen_before = False
+
+    def change_world(self) -> None:
+        """No cost of before can be compared with those of now."""
+        self.curve = None
+        self._seen_before = False
+
+    def take(self, snapshot: FleetSnapshot) -> dict[str, tuple[float, float]]:
+        """Take the next snapshot; gives the robots that count for J, and where they are, m."""
+        if not _flies_mission(snapshot):
+            self._seen_before = True
+        flying = set()
+        for robot in snapshot.robots:
+            if robot.status is None or robot.age_s is None:
+                continue
+            if in_air(robot.status):
+                flying.add(robot.name)
+            heard_s = snapshot.unix_time_s - robot.age_s
+            if self._mission_tracker.begins(robot.robot_id, robot.status, heard_s):
+                self.curve = None
+        places_m = self._whereabouts.counted(snapshot)
+        for name, (x_m, y_m) in places_m.items():
+            if name not in flying:
+                continue
+            path = self._paths.setdefault(name, deque(maxlen=_PATH_POINTS))
+            if not path or math.dist(path[-1], (x_m, y_m)) >= _PATH_STEP_M:
+                path.append((round(x_m, 2), round(y_m, 2)))
+        return places_m
+
+    def paths_view(self) -> Json:
+        """The robots' paths, for a page that opens."""
+        return {"kind": "paths", "paths": {name: list(p) for name, p in self._paths.items()}}
+
+
+def _flies_mission(snapshot: FleetSnapshot) -> bool:
+    return any(
+        robot.fresh and robot.status is not None and robot.status.state is FlightState.MISSION
+        for robot in snapshot.robots
+    )
+
+
+def _trial(snapshot: FleetSnapshot) -> str:
+    return "" if snapshot.ground is None else snapshot.ground.trial
+
+
+def _yaw_rad(status: RobotStatus, heading_deg: float | None) -> float | None:
+    """The nose's direction on the map; None as long as nobody knows how the map lies."""
+    own = status.origin.heading_deg if status.origin is not None else heading_deg
+    if status.heading_rad is None or own is None:
+        return None
+    return _number(status.heading_rad - math.radians(own), 3)
+
+
+def _rounded(numbers: tuple[float, ...] | None) -> list[float] | None:
+    if numbers is None or not all(map(math.isfinite, numbers)):
+        return None
+    return [round(number, 2) for number in numbers]
+
+
+def _finite(value: object) -> object:
+    """Without what JSON cannot say: a robot may send anything."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _number(number: float | None, digits: int) -> float | None:
+    return None if number is None or not math.isfinite(number) else round(number, digits)

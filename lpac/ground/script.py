@@ -1,0 +1,679 @@
+"""A script of trials, such as the paper's experiment: its file, and flying it.
+
+docs/script.toml has every key. What a script does are commands of the ground, like anybody's; it
+sees of the robots what the ground tells. Whoever holds the fleet meanwhile has it: the script ends.
+"""
+
+import math
+import re
+import time
+import tomllib
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from edge.core.schema import ConfigError, from_mapping
+from edge.core.world import parse_world
+from edge.messages.mission import FlightState, GroundState, Origin, RobotStatus
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
+from lpac.ground.station.client import command
+from lpac.ground.station.protocol import (
+    CommandReport,
+    Enable,
+    NextTrial,
+    Request,
+    Resume,
+    RobotCommand,
+    RobotResult,
+    SafetyCommand,
+    SetFence,
+    SetOrigin,
+    SetPlaces,
+    SetWorld,
+    Start,
+    Takeoff,
+)
+from lpac.ground.station.station import is_down
+from lpac.ground.station.subscriber import GroundSubscriber, addressed
+
+_S = FlightState
+
+_START_AGAIN_S = 3.0
+# So long a start may take: nothing else of the script may be due meanwhile.
+_START_TAKES_S = 7.0
+_REJOIN_WITHIN_S = 15.0
+_PERIOD_S = 0.2
+
+# The file
+
+
+@dataclass(frozen=True, slots=True)
+class OriginStep:
+    """Set the mission's origin: as given, or as `lpac mission origin --from` measures it."""
+
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    heading_deg: float | None = None
+    from_robot: str = ""
+    toward_robot: str = ""
+    average_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        given = (self.latitude_deg, self.longitude_deg, self.heading_deg)
+        if self.from_robot and given != (None, None, None):
+            raise ValueError(
+                "from_robot: measures the origin: latitude_deg, longitude_deg and heading_deg must "
+                "not be given too"
+            )
+        if not self.from_robot and (None in given or self.toward_robot):
+            raise ValueError(
+                "latitude_deg, longitude_deg and heading_deg must be given, or from_robot"
+            )
+        if not 0.0 < self.average_s <= 600.0:
+            raise ValueError(f"average_s = {self.average_s}: must be above 0, and at most 600")
+        self.given()
+
+    def given(self) -> Origin | None:
+        """The origin as it is written; None if it is to be measured."""
+        if self.latitude_deg is None or self.longitude_deg is None or self.heading_deg is None:
+            return None
+        return Origin(self.latitude_deg, self.longitude_deg, self.heading_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class SiteStep:
+    """Use a saved site: origin, fence, landing points."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class WorldStep:
+    """Send a world file, relative to the script's folder, to the robots."""
+
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
+class PreflightStep:
+    """Enable the robots, and wait until all are ready."""
+
+    at_most_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        _check_duration("at_most_s", self.at_most_s)
+
+
+@dataclass(frozen=True, slots=True)
+class TakeoffStep:
+    """Take off, one after another."""
+
+    interval_s: float = 2.0
+    abort_on_failure: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.interval_s <= 60.0:
+            raise ValueError(f"interval_s = {self.interval_s}: must be from 0 to 60")
+
+
+@dataclass(frozen=True, slots=True)
+class Perturbation:
+    """At that time of the mission, give a robot to a pilot, or take it back into the mission."""
+
+    at_s: float
+    robot: str
+    do: Literal["pilot", "rejoin"]
+
+
+@dataclass(frozen=True, slots=True)
+class MissionStep:
+    """Fly the mission; `restart`: robots that come to hold by themselves are started again."""
+
+    duration_s: float
+    restart: bool = False
+    perturb: tuple[Perturbation, ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_duration("duration_s", self.duration_s)
+        for perturbation in self.perturb:
+            if not 0.0 <= perturbation.at_s < self.duration_s:
+                raise ValueError(
+                    f"perturb: at_s = {perturbation.at_s}: must be 0 or above, and below "
+                    f"duration_s = {self.duration_s}"
+                )
+        given: set[str] = set()
+        for perturbation in self.in_time():
+            at = f"perturb: at_s = {perturbation.at_s}: {perturbation.robot}"
+            if perturbation.do == "pilot" and perturbation.robot in given:
+                raise ValueError(f"{at} has a pilot already: must rejoin before")
+            if perturbation.do == "rejoin" and perturbation.robot not in given:
+                raise ValueError(f"{at} has no pilot: must be given to one before it rejoins")
+            given ^= {perturbation.robot}
+
+    def in_time(self) -> list[Perturbation]:
+        """What is to be done, by its time."""
+        return sorted(self.perturb, key=lambda perturbation: perturbation.at_s)
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnStep:
+    """Fly to the landing points and land; done when all have."""
+
+
+@dataclass(frozen=True, slots=True)
+class LandStep:
+    """Land where the robots are; done when all have."""
+
+
+Step = (
+    OriginStep | SiteStep | WorldStep | PreflightStep | TakeoffStep | MissionStep | ReturnStep
+    | LandStep
+)  # fmt: skip
+
+_BEFORE: dict[str, type[Step]] = {"origin": OriginStep, "site": SiteStep, "world": WorldStep}
+_STEPS: dict[str, type[Step]] = {
+    "preflight": PreflightStep, "takeoff": TakeoffStep, "mission": MissionStep,
+    "return": ReturnStep, "land": LandStep,
+}  # fmt: skip
+_NAMES = {kind: name for name, kind in (_BEFORE | _STEPS).items()}
+
+
+@dataclass(frozen=True, slots=True)
+class _ScriptTable:
+    """The file as it is written."""
+
+    trial: str = ""
+    trials: int = 1
+    robots: tuple[str, ...] = ()
+    before: tuple[dict, ...] = ()  # type: ignore[type-arg]
+    steps: tuple[dict, ...] = ()  # type: ignore[type-arg]
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.trials <= 1000:
+            raise ValueError(f"trials = {self.trials}: must be from 1 to 1000")
+        if self.trial and re.fullmatch(r"[A-Za-z0-9_-]{1,24}", self.trial) is None:
+            raise ValueError(
+                f"trial = {self.trial!r}: must be 1 to 24 letters, digits, '-' and '_'"
+            )
+        if not self.steps:
+            raise ValueError("steps: none are given: write [[steps]] tables")
+
+
+@dataclass(frozen=True, slots=True)
+class Script:
+    """A script that can be flown as far as its file tells.
+
+    `before` happens once, `steps` in each of `trials`. `robots` empty: all that sit in a slot.
+    """
+
+    path: Path
+    trial: str
+    trials: int
+    robots: tuple[str, ...]
+    before: tuple[Step, ...]
+    steps: tuple[Step, ...]
+
+
+def load_script(path: Path, sites: Sites) -> Script:
+    """Raises ValueError, one line that names the file, the step, the key and what is allowed.
+
+    Looks into the worlds and sites that the script will need, too.
+    """
+    try:
+        mapping = tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: no TOML: {error}") from None
+    table = from_mapping(_ScriptTable, mapping, str(path))
+    before = _steps(table.before, _BEFORE, f"{path}: before")
+    for step in before:
+        if isinstance(step, WorldStep):
+            _set_world(path, step)
+        elif isinstance(step, SiteStep):
+            sites.load(step.name)
+    steps = _steps(table.steps, _STEPS, f"{path}: steps")
+    _check_order(steps, f"{path}: steps")
+    return Script(path, table.trial, table.trials, table.robots, before, steps)
+
+
+def read_world(path: Path) -> str:
+    """The text of a world file. Raises ConfigError that names the file and what is wrong in it."""
+    try:
+        text = path.read_text("utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: no text: {error}") from None
+    if not parse_world(text, str(path)):
+        raise ConfigError(f"{path}: holds no features")
+    return text
+
+
+def _set_world(script: Path, step: WorldStep, robots: tuple[str, ...] = ()) -> SetWorld:
+    file = script.parent / step.file
+    return SetWorld(read_world(file), file.name, robots)
+
+
+def _steps(
+    tables: Sequence[dict[str, Any]], kinds: Mapping[str, type[Step]], where: str
+) -> tuple[Step, ...]:
+    steps = []
+    for i, table in enumerate(tables):
+        kind = str(table.get("do", ""))
+        if kind not in kinds:
+            allowed = ", ".join(map(repr, kinds))
+            raise ConfigError(f"{where}[{i}]: do = {kind!r}: allowed are {allowed}")
+        keys = {key: value for key, value in table.items() if key != "do"}
+        steps.append(from_mapping(kinds[kind], keys, f"{where}[{i}] ({kind})"))
+    return tuple(steps)
+
+
+def _check_order(steps: Sequence[Step], where: str) -> None:
+    """A trial begins on the ground and ends there, with one mission between takeoff and landing."""
+    in_air = flown = False
+    for i, step in enumerate(steps):
+        at = f"{where}[{i}] ({_NAMES[type(step)]})"
+        match step:
+            case PreflightStep() | TakeoffStep() if in_air:
+                raise ConfigError(f"{at}: robots are in the air: must come after return or land")
+            case MissionStep() | ReturnStep() | LandStep() if not in_air:
+                raise ConfigError(f"{at}: robots are on the ground: must come after takeoff")
+            case MissionStep() if flown:
+                raise ConfigError(f"{at}: return or land must come between two missions")
+            case TakeoffStep():
+                in_air, flown = True, False
+            case MissionStep():
+                flown = True
+            case ReturnStep() | LandStep():
+                in_air = False
+    if not isinstance(steps[-1], ReturnStep | LandStep):
+        last = _NAMES[type(steps[-1])]
+        raise ConfigError(f"{where}: the last step is {last!r}: must be 'return' or 'land'")
+
+
+def _check_duration(name: str, value_s: float) -> None:
+    if not 0.0 < value_s <= 36000.0:
+        raise ValueError(f"{name} = {value_s}: must be above 0, and at most 36000")
+
+
+# Flying it
+
+
+class ScriptListener(Protocol):
+    """Who tells people how far a script is."""
+
+    def step(self, name: str, at_most_s: float | None) -> None:
+        """A step begins; it takes so long, or as long as it takes."""
+
+    def line(self, text: str) -> None:
+        """Something happened that is worth a line."""
+
+    def may(self, question: str) -> bool:
+        """Whether a person lets the script go on."""
+        ...
+
+
+class ScriptError(RuntimeError):
+    """A step failed; the text says which and why.
+
+    `hold`: whoever flies is to be held. Not so if somebody else commands the fleet to hold, return
+    or land, or robots are on their way to the ground.
+    """
+
+    def __init__(self, text: str, *, hold: bool = True) -> None:
+        super().__init__(text)
+        self.hold = hold
+
+
+class ScriptRun:
+    """One run of a script. `robots` are those that it addresses."""
+
+    def __init__(
+        self, script: Script, sites: Sites, subscriber: GroundSubscriber, teller: ScriptListener
+    ) -> None:
+        """Raises ValueError if the script names a robot that the fleet does not have."""
+        try:
+            self.robots = addressed(subscriber.setup, script.robots)
+            for step in (*script.before, *script.steps):
+                for name in _names(step):
+                    addressed(subscriber.setup, [name])
+                    if isinstance(step, MissionStep) and name not in self.robots:
+                        raise ValueError(f"perturb: robot {name!r} is none of the script's robots")
+        except ValueError as error:
+            raise ConfigError(f"{script.path}: {error}") from None
+        self._script = script
+        self._sites = sites
+        self._subscriber = subscriber
+        self._teller = teller
+        self._given: set[str] = set()
+        self._said: set[str] = set()
+        self._last_start_s: dict[str, float] = {}
+
+    def fly(self) -> None:
+        """Go through all steps of all trials. Raises ScriptError, and GroundError.
+
+        What flies then flies on: call `hold`, also after a KeyboardInterrupt.
+        """
+        script = self._script
+        for i, step in enumerate(script.before):
+            self._go(step, f"before[{i}]", "")
+        first = self._first_number()
+        for trial in range(1, script.trials + 1):
+            count = f"trial {trial} of {script.trials}: " if script.trials > 1 else ""
+            self._said.clear()
+            self._given.clear()
+            if trial > 1 and not self._teller.may(f"{count}let the robots take off again?"):
+                raise ScriptError(f"{count}not wanted", hold=False)
+            self._begin_trial(first + trial - 1, count)
+            for i, step in enumerate(script.steps):
+                self._go(step, f"steps[{i}]", count)
+
+    def hold(self) -> str:
+        """Hold whoever flies; what came of it, and what to do next, in words."""
+        # Who is not heard just now may well be.
+        last = [r.status for r in self._subscriber.snapshot.robots if r.name in self.robots]
+        if all(status is None or is_down(status) for status in last):
+            return "nobody is in the air"
+        report = self._command(SafetyCommand("hold", self._script.robots))
+        told = "the fleet is told to hold"
+        if not report.done:
+            told += f", but {_failures(report)}"
+        return f"{told}: next `lpac mission land`, `lpac mission return`, or `lpac mission resume`"
+
+    # Steps
+
+    def _go(self, step: Step, where: str, count: str) -> None:
+        name = f"{count}{_NAMES[type(step)]}"
+        try:
+            if isinstance(step, MissionStep):
+                # Its time counts from when all fly it.
+                self._teller.step(f"{count}start", None)
+                self._require_of_flying(Start(self._script.robots))
+            self._teller.step(name, _duration_s(step))
+            self._do(step)
+        except ScriptError as error:
+            raise ScriptError(f"{name} ({where}): {error}", hold=error.hold) from None
+        except ValueError as error:
+            raise ScriptError(f"{name} ({where}): {error}") from None
+
+    def _do(self, step: Step) -> None:
+        robots = self._script.robots
+        match step:
+            case OriginStep():
+                self._set_origin(step)
+            case SiteStep():
+                site = self._sites.load(step.name)
+                _require(
+                    take_site(self._subscriber.fleet, site, self._subscriber.setup, self.robots)
+                )
+                self._sites.use(step.name)
+            case WorldStep():
+                self._require(_set_world(self._script.path, step, robots))
+            case PreflightStep():
+                self._prepare(step)
+            case TakeoffStep():
+                self._require_of_flying(Takeoff(robots, step.interval_s, step.abort_on_failure))
+            case MissionStep():
+                self._fly_mission(step)
+            case ReturnStep():
+                self._bring_down(SafetyCommand("return", robots, wait=True))
+            case LandStep():
+                self._bring_down(SafetyCommand("land", robots, wait=True))
+
+    def _first_number(self) -> int:
+        """Of the first trial's name: a script that is run again numbers on."""
+        ground = self._subscriber.snapshot.ground
+        name = re.escape(self._script.trial)
+        match = re.fullmatch(rf"{name}-(\d{{1,6}})", "" if ground is None else ground.trial)
+        return 1 if match is None else int(match[1]) + 1
+
+    def _begin_trial(self, number: int, count: str) -> None:
+        trial = f"{self._script.trial}-{number}" if self._script.trial else ""
+        name = f"{count}reset maps"
+        self._teller.step(name, None)
+        try:
+            self._require(NextTrial(trial, self._script.robots))
+        except ScriptError as error:
+            raise ScriptError(f"{name}: {error}") from None
+
+    def _set_origin(self, step: OriginStep) -> None:
+        origin = step.given()
+        if origin is None:
+            heard = self._subscriber.gather(_names(step), step.average_s)
+            stands = [standing(name, statuses) for name, statuses in heard.items()]
+            origin = origin_at(stands[0], stands[1] if len(stands) > 1 else None)
+        self._teller.line(
+            f"origin {origin.latitude_deg:.7f} {origin.longitude_deg:.7f}, heading "
+            f"{origin.heading_deg:.1f} deg"
+        )
+        self._require(SetOrigin(origin, self._script.robots))
+
+    def _prepare(self, step: PreflightStep) -> None:
+        ground, ids = self._subscriber.snapshot.ground, self._subscriber.setup.robots
+        if ground and any(
+            ground.safety_action_for(ids[r]) in ("return", "land") for r in self.robots
+        ):
+            # The last trial's end, which keeps robots from flying again.
+            self._require(Resume(self._script.robots))
+        self._require(Enable(True, self._script.robots))
+        began_s = time.monotonic()
+
+        def ready(snapshot: FleetSnapshot) -> bool:
+            missing = self._not_ready(snapshot)
+            # At first everything is missing.
+            if time.monotonic() - began_s > min(5.0, step.at_most_s / 2.0):
+                for text in missing:
+                    self._say_once(text)
+            return not missing
+
+        if not self._subscriber.wait_for(ready, step.at_most_s):
+            missing = self._not_ready(self._subscriber.snapshot)
+            raise ScriptError(f"not ready after {step.at_most_s:g} s: {'; '.join(missing)}")
+
+    def _not_ready(self, snapshot: FleetSnapshot) -> list[str]:
+        missing = []
+        statuses = self._statuses(snapshot)
+        for name in self.robots:
+            status = statuses.get(name)
+            safety_action = (
+                snapshot.ground.safety_action_for(status.robot_id)
+                if snapshot.ground and status
+                else "none"
+            )
+            if status is None:
+                missing.append(f"{name} is not heard")
+            elif safety_action != "none":
+                missing.append(
+                    f"{name} is told to {safety_action}: withdraw it by `lpac mission resume`"
+                )
+            elif status.state is not _S.PREFLIGHT:
+                missing.append(f"{name} is in {status.state}: {status.reason}")
+            elif not status.ready:
+                checks = "; ".join(status.failed_checks) or "its checks are running"
+                missing.append(f"{name}: {checks}")
+        return missing
+
+    def _bring_down(self, request: SafetyCommand) -> None:
+        report = self._command(request)
+        if not report.done:
+            # Held, those that land already would stay in the air.
+            raise ScriptError(_failures(report), hold=False)
+
+    # The mission
+
+    def _fly_mission(self, step: MissionStep) -> None:
+        # An older picture may show robots that have not started yet.
+        self._subscriber.fresh_snapshot()
+        began_s = time.monotonic()
+        due = step.in_time()
+        before = dict.fromkeys(self.robots, _S.MISSION)
+        left_alone: set[str] = set()
+        while (left_s := began_s + step.duration_s - time.monotonic()) > 0.0:
+            while due and time.monotonic() - began_s >= due[0].at_s:
+                self._perturb(due.pop(0))
+            free_s = min([left_s, *(began_s + p.at_s - time.monotonic() for p in due)])
+            snapshot = self._subscriber.snapshot
+            self._look_for_others(snapshot)
+            statuses = self._statuses(snapshot)
+            for name in self.robots:
+                status = statuses.get(name)
+                if status is None:
+                    self._say_once(f"{name} is not heard")
+                    continue
+                given = name in self._given or _asked(snapshot.ground, status.robot_id) != "none"
+                if status.state is not _S.HOLD or given:
+                    left_alone.discard(name)
+                if before[name] is _S.MISSION and status.state is not _S.MISSION and not given:
+                    self._say_once(f"{name} left the mission: {status.state}: {status.reason}")
+                    if status.state is _S.HOLD:
+                        left_alone.add(name)
+                before[name] = status.state
+                if step.restart and name in left_alone and free_s > _START_TAKES_S:
+                    self._start_again(name)
+            if len(statuses) == len(self.robots) and all(map(is_down, statuses.values())):
+                raise ScriptError("nobody flies any more")
+            self._subscriber.wait_for(lambda _: False, max(0.0, min(free_s, _PERIOD_S)))
+
+    def _start_again(self, name: str) -> None:
+        if time.monotonic() - self._last_start_s.get(name, -math.inf) < _START_AGAIN_S:
+            return
+        self._last_start_s[name] = time.monotonic()
+        report = self._command(Start((name,)))
+        if not report.done:
+            self._say_once(f"{name} is not started again: {_failures(report)}")
+
+    def _perturb(self, perturbation: Perturbation) -> None:
+        name = perturbation.robot
+        self._require_of_flying(RobotCommand(perturbation.do, (name,)))
+        if perturbation.do == "pilot":
+            self._given.add(name)
+            self._teller.line(f"{name} is given to a pilot")
+            return
+
+        def holds(snapshot: FleetSnapshot) -> bool:
+            status = self._statuses(snapshot).get(name)
+            return status is not None and status.state is _S.HOLD
+
+        if not self._subscriber.wait_for(holds, _REJOIN_WITHIN_S):
+            self._look_for_others(self._subscriber.snapshot)
+            raise ScriptError(f"{name} does not come to hold")
+        self._require_of_flying(Start((name,)))
+        self._given.discard(name)
+        self._teller.line(f"{name} is back in the mission")
+
+    def _look_for_others(self, snapshot: FleetSnapshot) -> None:
+        """The script gives no safety command from takeoff on: if all have one,
+        somebody has the fleet."""
+        ground = snapshot.ground
+        asked = [_asked(ground, self._subscriber.setup.robots[name]) for name in self.robots]
+        if ground is not None and "none" not in asked:
+            by = ground.safety_action_by or ground.operator
+            raise ScriptError(f"{by} commands {asked[0]}: the fleet is theirs", hold=False)
+
+    # Around it
+
+    def _statuses(self, snapshot: FleetSnapshot) -> dict[str, RobotStatus]:
+        """Of the addressed robots that are heard."""
+        return {
+            robot.name: robot.status
+            for robot in snapshot.robots
+            if robot.name in self.robots and robot.status is not None and robot.fresh
+        }
+
+    def _command(self, request: Request) -> CommandReport:
+        return command(self._subscriber.fleet, request)
+
+    def _require(self, request: Request) -> None:
+        _require(self._command(request))
+
+    def _require_of_flying(self, request: Takeoff | Start | RobotCommand) -> None:
+        """What fails because somebody has the fleet meanwhile is no failure of the script's."""
+        report = self._command(request)
+        if not report.done:
+            snapshot = self._subscriber.fresh_snapshot()
+            # On the ground a safety command may be left from the last landing.
+            if not all(map(is_down, self._statuses(snapshot).values())):
+                self._look_for_others(snapshot)
+            raise ScriptError(_failures(report))
+
+    def _say_once(self, text: str) -> None:
+        """Say a text unless it differs from one that was said by its numbers only."""
+        kind = re.sub(r"(?<=[ (])-?[\d.]+", "#", text)
+        if kind not in self._said:
+            self._said.add(kind)
+            self._teller.line(text)
+
+
+def take_site(
+    fleet: str, site: SavedSite, setup: FleetSetup, robots: Collection[str]
+) -> CommandReport:
+    """Have the robots fly at a site, each at the height that it has.
+
+    A place may be impossible within the fence that the robot has still, or the other way round: so
+    what failed is asked for again after the rest. Raises ValueError and GroundError.
+    """
+    robots = addressed(setup, robots)
+    requests: tuple[Request, ...] = (
+        SetOrigin(site.origin, robots),
+        SetFence(site.fence, robots),
+        SetPlaces(places_at(site, setup, robots)),
+    )
+    reports: dict[int, CommandReport] = {}
+    for i in (0, 1, 2, 0, 1, 2):
+        if i not in reports or not reports[i].done:
+            reports[i] = command(fleet, requests[i])
+            if reports[i].problem:
+                return reports[i]
+    results = []
+    for name in robots:
+        its = [
+            result
+            for report in reports.values()
+            for result in report.results
+            if result.robot == name
+        ]
+        failed = [result for result in its if not result.done]
+        results.append(
+            failed[0] if failed else RobotResult(name, True, "has origin, fence and place")
+        )
+    return CommandReport(tuple(results))
+
+
+def _require(report: CommandReport) -> None:
+    if not report.done:
+        raise ScriptError(_failures(report))
+
+
+def _failures(report: CommandReport) -> str:
+    return report.problem or "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)
+
+
+def _asked(ground: GroundState | None, robot_id: int) -> str:
+    """What safety action is asked of a robot; who is not enabled is to hold."""
+    if ground is None:
+        return "none"
+    safety_action = ground.safety_action_for(robot_id)
+    return "hold" if safety_action == "none" and not ground.enabled_for(robot_id) else safety_action
+
+
+def _duration_s(step: Step) -> float | None:
+    match step:
+        case PreflightStep():
+            return step.at_most_s
+        case MissionStep():
+            return step.duration_s
+        case OriginStep() if step.from_robot:
+            return step.average_s
+    return None
+
+
+def _names(step: Step) -> list[str]:
+    match step:
+        case OriginStep():
+            return [name for name in (step.from_robot, step.toward_robot) if name]
+        case MissionStep():
+            return [perturbation.robot for perturbation in step.perturb]
+    return []

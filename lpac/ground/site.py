@@ -1,0 +1,570 @@
+"""Sites: where the mission frame, fence, pads and landing points lie; measured, and kept in files.
+
+A site is `sites/NAME.toml` beside fleet.toml, in the mission frame, m. Who stands where is measured
+from what robots say of themselves, averaged over their statuses.
+"""
+
+import itertools
+import math
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from geographiclib.geodesic import Geodesic
+
+from edge.core.fence import Fence
+from edge.core.schema import ConfigError, from_mapping
+from edge.flight.margins import ErrorBudget, places_apart
+from edge.messages.mission import GroundState, Origin, Place, RobotStatus
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+
+# Beyond these a robot does not stand still, or does not know where it is.
+MAX_SPREAD_M = 2.0
+MAX_HEADING_SPREAD_DEG = 10.0
+# Closer together, two robots give no heading.
+MIN_BASELINE_M = 2.0
+# Who is further from the mission's origin is not where the mission is.
+FAR_M = 500.0
+# How far a robot may stand from its pad by GPS, and by how much every other pad must be further.
+MAX_PAD_DISTANCE_M = 3.0
+CLEARLY_FURTHER_M = 1.0
+# `off` leaves a fence of this side around the mission's origin.
+WIDE_FENCE_M = 500.0
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,31}")
+_USED = "used"
+
+Point = tuple[float, float]
+
+
+# Measuring
+
+
+class CircularMean(NamedTuple):
+    """A mean direction in [0, 360), and how far the furthest is from it, deg."""
+
+    mean_deg: float
+    spread_deg: float
+
+
+class Standing(NamedTuple):
+    """Where a robot stands: (latitude, longitude), and its nose's heading, None if not known.
+
+    The spreads are those of the statuses that were furthest from the average.
+    """
+
+    robot: str
+    position_deg: Point
+    spread_m: float
+    heading: CircularMean | None
+
+
+def circular_mean_deg(headings_deg: Sequence[float]) -> CircularMean:
+    """Raises ValueError if there are none, or they point all ways."""
+    sin = math.fsum(math.sin(math.radians(h)) for h in headings_deg)
+    cos = math.fsum(math.cos(math.radians(h)) for h in headings_deg)
+    if not math.hypot(sin, cos) > 1e-6 * max(len(headings_deg), 1):
+        raise ValueError("the headings have no mean")
+    mean_deg = _compass_deg(math.degrees(math.atan2(sin, cos)))
+    return CircularMean(mean_deg, max(abs(turn_deg(mean_deg, h)) for h in headings_deg))
+
+
+def turn_deg(from_deg: float, to_deg: float) -> float:
+    """From one compass heading to another, clockwise positive, in [-180, 180]."""
+    return math.remainder(to_deg - from_deg, 360.0)
+
+
+def average_position(positions_deg: Sequence[Point]) -> Point:
+    """The middle of places (latitude, longitude) that are not far apart, anywhere on the earth.
+
+    The mean of the normals, which knows no poles and no date line. Raises ValueError if there are
+    none, or they have no middle.
+    """
+    normals = [_normal(*position) for position in positions_deg]
+    x, y, z = (math.fsum(n[axis] for n in normals) for axis in range(3))
+    if not math.hypot(x, y, z) > 1e-6 * max(len(normals), 1):
+        raise ValueError("the positions have no mean")
+    return math.degrees(math.atan2(z, math.hypot(x, y))), math.degrees(math.atan2(y, x))
+
+
+def distance_m(from_deg: Point, to_deg: Point) -> float:
+    """Along the geodesic, m."""
+    return float(Geodesic.WGS84.Inverse(*from_deg, *to_deg)["s12"])
+
+
+def bearing_deg(from_deg: Point, to_deg: Point) -> float:
+    """The compass heading in which the second place lies from the first, in [0, 360)."""
+    return _compass_deg(Geodesic.WGS84.Inverse(*from_deg, *to_deg)["azi1"])
+
+
+def standing(robot: str, statuses: Sequence[RobotStatus]) -> Standing:
+    """Where a robot stands, from what it said of itself while it was listened to.
+
+    Raises ValueError, one line, if it was not heard, is armed, does not know its position, or
+    moves.
+    """
+    _require_disarmed(robot, statuses)
+    places = [(s.global_deg[0], s.global_deg[1]) for s in statuses if s.global_deg is not None]
+    if not places:
+        raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
+    try:
+        middle = average_position(places)
+    except ValueError as error:
+        raise ValueError(f"{robot}: {error}") from None
+    spread_m = max(distance_m(middle, place) for place in places)
+    _require_still(robot, spread_m)
+    headings = [math.degrees(s.heading_rad) for s in statuses if s.heading_rad is not None]
+    return Standing(robot, middle, spread_m, circular_mean_deg(headings) if headings else None)
+
+
+def error_deg(apart_m: float) -> float:
+    """How far 1 m of GPS error turns the bearing between two robots."""
+    return math.degrees(math.atan2(1.0, apart_m))
+
+
+def origin_at(first: Standing, toward: Standing | None) -> Origin:
+    """The mission frame whose origin is where the first robot stands.
+
+    Its y axis points where the robot's nose points, or to the second robot. Raises ValueError if
+    there is no heading, or it cannot be trusted.
+    """
+    if toward is not None:
+        apart_m = distance_m(first.position_deg, toward.position_deg)
+        if not apart_m >= MIN_BASELINE_M:
+            raise ValueError(
+                f"{toward.robot} stands {apart_m:.1f} m from {first.robot}: it must be "
+                f"{MIN_BASELINE_M:g} m or more, and gives a better heading the further it is"
+            )
+        heading_deg = bearing_deg(first.position_deg, toward.position_deg)
+    elif first.heading is None:
+        raise ValueError(f"{first.robot} does not know its heading yet")
+    elif first.heading.spread_deg > MAX_HEADING_SPREAD_DEG:
+        raise ValueError(
+            f"{first.robot}: its heading moved by {first.heading.spread_deg:.0f} deg, allowed are "
+            f"{MAX_HEADING_SPREAD_DEG:g}: let it stand still, or use --toward another robot"
+        )
+    else:
+        heading_deg = first.heading.mean_deg
+    latitude_deg, longitude_deg = (round(angle, 8) for angle in first.position_deg)
+    return Origin(latitude_deg, longitude_deg, _compass_deg(round(heading_deg, 2)))
+
+
+def furthest_m(origin: Origin, snapshot: FleetSnapshot) -> float:
+    """How far the furthest robot that is heard stands from the origin, m; 0 if none is."""
+    place_deg = origin.latitude_deg, origin.longitude_deg
+    return max(
+        (
+            distance_m(place_deg, (robot.status.global_deg[0], robot.status.global_deg[1]))
+            for robot in snapshot.robots
+            if robot.fresh and robot.status is not None and robot.status.global_deg is not None
+        ),
+        default=0.0,
+    )
+
+
+def place_m(origin: Origin, position_deg: Point) -> Point:
+    """(x, y) of the mission frame, m, of a latitude and longitude."""
+    x_m, y_m, _ = origin.frame().relative_to(*position_deg).local_origin_m.tolist()
+    return x_m, y_m
+
+
+# Robots and pads
+
+
+class OnPad(NamedTuple):
+    """At which slot's pad a robot stands (its height's number), and how far from it."""
+
+    height: int
+    distance_m: float
+
+
+def assign(places_m: Mapping[str, Point], pads_m: Mapping[int, Point]) -> dict[str, OnPad]:
+    """Who stands at which pad: robots by name, pads by the number of their slot's height.
+
+    Every robot is at the pad nearest to it, which is the matching of the least total distance as
+    long as no pad is anybody else's. Raises ValueError, one line for all robots, if a robot is
+    more than `MAX_PAD_DISTANCE_M` from every pad, if another pad is not at least
+    `CLEARLY_FURTHER_M` further from it than its own, or if two robots are at one pad.
+    """
+    assigned: dict[str, OnPad] = {}
+    problems: list[str] = []
+    for robot, place in places_m.items():
+        near = sorted((math.dist(place, pad), height) for height, pad in pads_m.items())
+        if not near or not near[0][0] <= MAX_PAD_DISTANCE_M:
+            nearest = f"; the nearest, {near[0][1]}, is {near[0][0]:.1f} m away" if near else ""
+            problems.append(
+                f"{robot} at {_written(place)} m stands within {MAX_PAD_DISTANCE_M:g} m of no "
+                f"pad{nearest}"
+            )
+            continue
+        own_m, height = near[0]
+        if len(near) > 1 and near[1][0] < own_m + CLEARLY_FURTHER_M:
+            problems.append(
+                f"{robot} at {_written(place)} m is ambiguous: pad {height} is {own_m:.1f} m and "
+                f"pad {near[1][1]} {near[1][0]:.1f} m away, must be {CLEARLY_FURTHER_M:g} m more"
+            )
+            continue
+        beside = next((name for name, its in assigned.items() if its.height == height), None)
+        if beside is not None:
+            problems.append(f"{beside} and {robot} stand at one pad, {height}")
+        assigned[robot] = OnPad(height, own_m)
+    if problems:
+        raise ValueError("; ".join(problems))
+    return assigned
+
+
+class Pads(NamedTuple):
+    """The slots whose pads count, and where they are from, in words."""
+
+    source: str
+    slots: tuple["SiteSlot", ...]
+
+
+def pads_in_use(sites: "Sites", name: str, setup: FleetSetup, origin: Origin) -> Pads:
+    """The pads of the site called `name`; if that is "", of the site that was used last.
+
+    That one counts as long as the fleet has its origin; else it is fleet.toml's pads. Raises
+    ValueError if the site called `name` has another origin.
+    """
+    chosen = name or sites.used()
+    if chosen is not None:
+        site = sites.load(chosen)
+        if site.origin == origin:
+            return Pads(f"site {chosen}", site.slots)
+        if name:
+            raise ValueError(
+                f"site {name} has another origin than the fleet: `lpac site use {name}` sets it"
+            )
+    slots = tuple(
+        SiteSlot(slot.place.slot, slot.pad_m, slot.place.landing_point_m) for slot in setup.slots
+    )
+    return Pads("fleet.toml", slots)
+
+
+def place_now_m(robot: str, statuses: Sequence[RobotStatus], origin: Origin) -> Point:
+    """(x, y) of the mission frame, m, averaged.
+
+    Raises ValueError, one line, if the robot was not heard, is armed, has another origin, does not
+    know its position, or moves.
+    """
+    _require_disarmed(robot, statuses)
+    if statuses[-1].origin != origin:
+        raise ValueError(f"{robot} has not taken up the mission's origin")
+    points = [s.position_m[:2] for s in statuses if s.position_m is not None and s.origin == origin]
+    if not points:
+        raise ValueError(f"{robot} does not know its position yet: wait for its GPS")
+    x_m, y_m = (math.fsum(axis) / len(points) for axis in zip(*points, strict=True))
+    _require_still(robot, max(math.dist((x_m, y_m), point) for point in points))
+    return x_m, y_m
+
+
+def assign_places(
+    places_m: Mapping[str, Point], slots: Sequence["SiteSlot"], setup: FleetSetup
+) -> tuple[dict[str, OnPad], dict[str, Place]]:
+    """`assign` to the slots' pads, and the places that follow.
+
+    Raises ValueError, too, if a robot stands at the pad of one that is left out, or the places are
+    too close to each other.
+    """
+    assigned = assign(places_m, {slot.height: (slot.pad_m[0], slot.pad_m[1]) for slot in slots})
+    owners = {slot.place.slot: slot.robot for slot in setup.slots if slot.robot}
+    for robot, on_pad in assigned.items():
+        owner = owners.get(on_pad.height, robot)
+        if owner not in assigned:
+            raise ValueError(
+                f"{robot} stands at pad {on_pad.height}, which {owner} has: assign both at once"
+            )
+    by_height = {slot.height: slot for slot in slots}
+    its = {robot: by_height[on_pad.height] for robot, on_pad in assigned.items()}
+    require_apart(its.values(), setup.errors)
+    return assigned, {
+        robot: Place(slot.height, slot.landing_point_m) for robot, slot in its.items()
+    }
+
+
+def places_at(site: "SavedSite", setup: FleetSetup, robots: Iterable[str]) -> dict[str, Place]:
+    """Where these robots fly and land at the site: each in the slot with the height that it has.
+
+    Raises ValueError for a robot that sits in no slot, or in one that the site does not have, or if
+    the places are too close to each other.
+    """
+    heights = {slot.robot: slot.place.slot for slot in setup.slots if slot.robot}
+    chosen = {}
+    for robot in robots:
+        height = heights.get(robot)
+        if height is None:
+            raise ValueError(_is_spare(robot))
+        slot = site.slot(height)
+        if slot is None:
+            known = ", ".join(str(slot.height) for slot in site.slots) or "none"
+            raise ValueError(f"{robot} flies at height {height}: the site has {known}")
+        chosen[robot] = slot
+    require_apart(chosen.values(), setup.errors)
+    return {robot: Place(slot.height, slot.landing_point_m) for robot, slot in chosen.items()}
+
+
+def wide_fence(configured: Fence) -> Fence:
+    """What is left of a fence that is off: a square around the origin; the heights stay."""
+    half_m = WIDE_FENCE_M / 2.0
+    corners = ((-half_m, -half_m), (half_m, -half_m), (half_m, half_m), (-half_m, half_m))
+    return Fence(corners, configured.buffer_m, configured.floor_m, configured.ceiling_m)
+
+
+# Files
+
+
+@dataclass(frozen=True, slots=True)
+class SiteSlot:
+    """A place in the flight: its height's number, where it starts, and where it lands, (x, y)."""
+
+    height: int
+    pad_m: tuple[float, ...]
+    landing_point_m: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.height < 0:
+            raise ValueError(f"height = {self.height}: must be 0 or above")
+        for name in ("pad_m", "landing_point_m"):
+            point_m = getattr(self, name)
+            if len(point_m) != 2 or not all(map(math.isfinite, point_m)):
+                raise ValueError(f"{name} = {list(point_m)}: must be [x, y]")
+
+
+@dataclass(frozen=True, slots=True)
+class SavedSite:
+    """A place to fly at.
+
+    Raises ValueError if two slots have one height, or robots could not start or land there.
+    """
+
+    origin: Origin
+    fence: Fence
+    slots: tuple[SiteSlot, ...]
+
+    def __post_init__(self) -> None:
+        for i, slot in enumerate(self.slots):
+            if not self.fence.distance_m(*slot.pad_m) > 0.0:
+                raise ValueError(f"height {slot.height}: pad_m = {list(slot.pad_m)}: must be "
+                                 "inside the fence")  # fmt: skip
+            if not self.fence.distance_m(*slot.landing_point_m) >= self.fence.buffer_m:
+                raise ValueError(
+                    f"height {slot.height}: landing_point_m = {list(slot.landing_point_m)}: must "
+                    f"be inside the fence, at least buffer_m = {self.fence.buffer_m:g} from its "
+                    "line"
+                )
+            for other in self.slots[:i]:
+                if other.height == slot.height:
+                    raise ValueError(f"height {slot.height}: two slots have it")
+
+    def slot(self, height: int) -> SiteSlot | None:
+        """The slot with that height."""
+        return next((slot for slot in self.slots if slot.height == height), None)
+
+
+def require_apart(slots: Iterable[SiteSlot], errors: ErrorBudget) -> None:
+    """Raises ValueError if those who start or land at these slots could touch in truth."""
+    places = places_apart(errors.position_m, errors.position_m)
+    for slot, other in itertools.combinations(slots, 2):
+        for name, beside in itertools.product(("pad_m", "landing_point_m"), repeat=2):
+            apart_m = math.dist(getattr(slot, name), getattr(other, beside))
+            if not places.holds(apart_m):
+                raise ValueError(
+                    f"height {slot.height}: {name} = {_written(getattr(slot, name))}: is "
+                    f"{apart_m:.1f} m from {beside} of height {other.height}, {places}"
+                )
+
+
+def site_as_it_stands(
+    setup: FleetSetup,
+    ground: GroundState | None,
+    stands: Mapping[str, Standing],
+    first: Standing | None,
+    toward: Standing | None,
+    *,
+    land_at_pads: bool,
+) -> SavedSite:
+    """The site whose pads are where the robots of `stands` stand now.
+
+    The origin is where `first` stands (see `origin_at`), else the fleet's. Fence, heights and
+    landing points are the fleet's, or the pads are the landing points. Raises ValueError if there
+    is no origin, a robot sits in no slot, or nobody could fly so.
+    """
+    if first is not None:
+        origin = origin_at(first, toward)
+    elif ground is not None and ground.origin is not None:
+        origin = ground.origin
+    else:
+        raise ValueError("the origin is not set: `lpac mission origin` sets it, or use --from")
+    seated = {slot.robot: slot.place for slot in setup.slots if slot.robot}
+    fence = setup.fence if ground is None or ground.fence is None else ground.fence
+    slots = []
+    for robot, its in stands.items():
+        if robot not in seated:
+            raise ValueError(_is_spare(robot))
+        # Without the minus of a zero.
+        x_m, y_m = (round(value, 2) + 0.0 for value in place_m(origin, its.position_deg))
+        _require_inside(robot, (x_m, y_m), fence, lands=land_at_pads)
+        landing_m = (x_m, y_m) if land_at_pads else seated[robot].landing_point_m
+        slots.append(SiteSlot(seated[robot].slot, (x_m, y_m), landing_m))
+    slots.sort(key=lambda slot: slot.height)
+    require_apart(slots, setup.errors)
+    return SavedSite(origin, fence, tuple(slots))
+
+
+class Sites:
+    """The sites of one fleet, in `sites` beside its fleet.toml.
+
+    Every method raises ConfigError or OSError, one line that names the file.
+    """
+
+    def __init__(self, fleet_toml: Path) -> None:
+        self.folder = fleet_toml.parent / "sites"
+
+    def path(self, name: str) -> Path:
+        """The file of a site."""
+        if _NAME.fullmatch(name) is None:
+            raise ConfigError(
+                f"site {name!r}: must be 1 to 32 letters, digits, '-' and '_', and not start with "
+                "'-'"
+            )
+        return self.folder / f"{name}.toml"
+
+    def names(self) -> list[str]:
+        """Of all sites, in alphabetical order."""
+        return sorted(path.stem for path in self.folder.glob("*.toml"))
+
+    def load(self, name: str) -> SavedSite:
+        """A site that was saved."""
+        path = self.path(name)
+        try:
+            mapping = tomllib.loads(path.read_bytes().decode())
+        except FileNotFoundError:
+            known = ", ".join(self.names()) or "none"
+            raise ConfigError(f"{path}: there is no such site; known are {known}") from None
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        except ValueError as error:
+            raise ConfigError(f"{path}: no TOML: {error}") from None
+        return from_mapping(SavedSite, mapping, str(path))
+
+    def require_new(self, name: str) -> None:
+        """Raises ConfigError if there is a site of that name."""
+        path = self.path(name)
+        if path.exists():
+            raise ConfigError(f"{path}: is there already: add --force to replace it")
+
+    def save(self, name: str, site: SavedSite) -> Path:
+        """Write the site's file, at once and for good; returns its path."""
+        path = self.path(name)
+        _write(path, _toml(name, site))
+        return path
+
+    def use(self, name: str) -> None:
+        """Remember that this site is the one in use."""
+        _write(self.folder / _USED, f"{name}\n")
+
+    def used(self) -> str | None:
+        """The site that was used last; None if there was none, or it is gone."""
+        try:
+            name = (self.folder / _USED).read_text().strip()
+        except FileNotFoundError:
+            return None
+        return name if name in self.names() else None
+
+
+def _require_disarmed(robot: str, statuses: Sequence[RobotStatus]) -> None:
+    if not statuses:
+        raise ValueError(f"{robot} is not heard")
+    if statuses[-1].armed:
+        raise ValueError(f"{robot} is armed: land first")
+
+
+def _require_still(robot: str, spread_m: float) -> None:
+    if not spread_m <= MAX_SPREAD_M:
+        raise ValueError(
+            f"{robot}: its position moved by {spread_m:.1f} m, allowed are {MAX_SPREAD_M:g} m: let "
+            "it stand still until its GPS has settled"
+        )
+
+
+def _require_inside(robot: str, place: Point, fence: Fence, *, lands: bool) -> None:
+    inside_m = fence.distance_m(*place)
+    if inside_m > 0.0 and (inside_m >= fence.buffer_m or not lands):
+        return
+    if inside_m > 0.0:
+        where = f"{inside_m:.1f} m inside the fence, must be {fence.buffer_m:g} m to land there"
+    else:
+        where = "outside the fence"
+    raise ValueError(
+        f"{robot} stands at {_written(place)} m, {where}: another --from/--toward, or `lpac "
+        "mission fence set`"
+    )
+
+
+def _is_spare(robot: str) -> str:
+    return f"{robot} sits in no slot, as a spare: `lpac fleet swap` seats it"
+
+
+def _normal(latitude_deg: float, longitude_deg: float) -> tuple[float, float, float]:
+    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
+    cos = math.cos(latitude)
+    return cos * math.cos(longitude), cos * math.sin(longitude), math.sin(latitude)
+
+
+def _compass_deg(angle_deg: float) -> float:
+    # The remainder of a tiny negative angle rounds to 360 itself.
+    heading_deg = angle_deg % 360.0
+    return heading_deg if heading_deg < 360.0 else 0.0
+
+
+def _written(point: Iterable[float]) -> str:
+    return f"({', '.join(f'{value:.1f}' for value in point)})"
+
+
+def _toml(name: str, site: SavedSite) -> str:
+    fence = site.fence
+    lines = [
+        f"# Site {name}: `lpac site save` wrote it, `lpac site use {name}` takes it. All points",
+        "# are (x, y) of the mission frame, m; heights are above the pads.",
+        "",
+        "[origin]",
+        f"latitude_deg = {site.origin.latitude_deg!r}",
+        f"longitude_deg = {site.origin.longitude_deg!r}",
+        f"heading_deg = {site.origin.heading_deg!r}  # of the y axis, clockwise from true north",
+        "",
+        "[fence]",
+        f"vertices_m = [{', '.join(_pair(vertex) for vertex in fence.vertices_m)}]",
+        f"buffer_m = {fence.buffer_m!r}",
+        f"floor_m = {fence.floor_m!r}",
+        f"ceiling_m = {fence.ceiling_m!r}",
+    ]
+    for slot in site.slots:
+        lines += [
+            "",
+            "[[slots]]",
+            f"height = {slot.height}",
+            f"pad_m = {_pair(slot.pad_m)}",
+            f"landing_point_m = {_pair(slot.landing_point_m)}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _pair(point: Iterable[float]) -> str:
+    return f"[{', '.join(repr(float(value)) for value in point)}]"
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = path.with_name(f".{path.name}.new")
+    try:
+        with new.open("w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    finally:
+        new.unlink(missing_ok=True)

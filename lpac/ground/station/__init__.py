@@ -1,0 +1,1 @@
+"""The one process that speaks to the fleet: station, commands, its protocol, server and clients."""

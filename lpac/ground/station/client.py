@@ -1,0 +1,158 @@
+"""How commands, views and scripts speak to the ground process of this machine."""
+
+import asyncio
+import os
+import socket
+import stat
+import tempfile
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterator
+from contextlib import aclosing, contextmanager
+from pathlib import Path
+
+from lpac.ground.station.protocol import (
+    SUBSCRIBE,
+    CommandProgress,
+    CommandReport,
+    Request,
+    ServerMessage,
+    server_message_from_line,
+    to_line,
+)
+
+# The ground process says something at least once a second, unless it hangs.
+_PATIENCE_S = 5.0
+# Worlds are the longest lines.
+MAX_LINE = 1 << 26
+_MAX_PATH = 103  # macOS; Linux has a few more
+
+
+class GroundError(OSError):
+    """No ground process runs for the fleet, it has ended or hangs; the text says what to do."""
+
+
+def socket_path(fleet: str) -> Path:
+    """Where the fleet's ground process listens: for this user alone.
+
+    Raises GroundError if the folder could be somebody else's.
+    """
+    folder = os.environ.get("XDG_RUNTIME_DIR") or _own_folder()
+    path = Path(folder, f"lpac-ground-{fleet}.sock")
+    if len(os.fsencode(path)) > _MAX_PATH:
+        raise GroundError(f"{path}: is too long for a socket: set XDG_RUNTIME_DIR to a short path")
+    return path
+
+
+def command(
+    fleet: str, request: Request, on_progress: Callable[[CommandProgress], None] = lambda _: None
+) -> CommandReport:
+    """Have a command done, and wait for what came of it.
+
+    Whoever leaves before, as by Ctrl-C, abandons what is not ordered yet. Raises GroundError.
+    """
+    with _connected(fleet, to_line(request)) as answers:
+        for told in answers:
+            if isinstance(told, CommandReport):
+                return told
+            if isinstance(told, CommandProgress) and told.text:
+                on_progress(told)
+    raise AssertionError("it ends by a report or an error")
+
+
+@contextmanager
+def subscribe(fleet: str) -> Iterator[Iterator[ServerMessage]]:
+    """What the ground process tells from now on. Raises GroundError, also when it ends."""
+    with _connected(fleet, SUBSCRIBE) as answers:
+        yield answers
+
+
+async def send(fleet: str, request: Request) -> CommandReport:
+    """`command` for views."""
+    async with aclosing(_answers(fleet, to_line(request))) as answers:
+        async for told in answers:
+            if isinstance(told, CommandReport):
+                return told
+    raise AssertionError("it ends by a report or an error")
+
+
+async def listen(fleet: str) -> AsyncIterator[ServerMessage]:
+    """`subscribe` for asyncio."""
+    async with aclosing(_answers(fleet, SUBSCRIBE)) as answers:
+        async for told in answers:
+            yield told
+
+
+@contextmanager
+def _connected(fleet: str, line: bytes) -> Iterator[Iterator[ServerMessage]]:
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(_PATIENCE_S)
+        try:
+            connection.connect(str(socket_path(fleet)))
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise _not_running(fleet) from None
+        except (TimeoutError, BlockingIOError):  # More wait for it than it may have waiting.
+            raise no_answer(fleet) from None
+        with connection.makefile("rb") as lines:
+            yield _read(fleet, connection, line, lines.readline)
+
+
+def _read(
+    fleet: str, connection: socket.socket, line: bytes, readline: Callable[[], bytes]
+) -> Iterator[ServerMessage]:
+    try:
+        connection.sendall(line)
+        while answer := readline():
+            yield server_message_from_line(answer)
+    except TimeoutError:
+        raise no_answer(fleet) from None
+    except ConnectionError:
+        pass
+    raise _ended(fleet)
+
+
+async def _answers(fleet: str, line: bytes) -> AsyncGenerator[ServerMessage]:
+    try:
+        reader, writer = await asyncio.open_unix_connection(socket_path(fleet), limit=MAX_LINE)
+    except (FileNotFoundError, ConnectionRefusedError):
+        raise _not_running(fleet) from None
+    try:
+        writer.write(line)
+        async with asyncio.timeout(_PATIENCE_S):
+            await writer.drain()
+        while True:
+            async with asyncio.timeout(_PATIENCE_S):
+                answer = await reader.readline()
+            if not answer:
+                break
+            yield server_message_from_line(answer)
+    except TimeoutError:
+        raise no_answer(fleet) from None
+    except ConnectionError:
+        pass
+    finally:
+        writer.close()
+    raise _ended(fleet)
+
+
+def _own_folder() -> Path:
+    folder = Path(tempfile.gettempdir(), f"lpac-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise GroundError(f"{folder}: must be a folder of this user alone: remove it")
+    return folder
+
+
+def no_answer(fleet: str) -> GroundError:
+    """It is there, and says nothing."""
+    return GroundError(
+        f"the ground station of fleet {fleet} does not answer: end it, and start `lpac ground` "
+        "again"
+    )
+
+
+def _not_running(fleet: str) -> GroundError:
+    return GroundError(f"no ground station runs for fleet {fleet} here: start `lpac ground`")
+
+
+def _ended(fleet: str) -> GroundError:
+    return GroundError(f"the ground station of fleet {fleet} has ended: start `lpac ground` again")

@@ -1,0 +1,258 @@
+"""What the ground process and its clients say to each other, and its JSON.
+
+The ground process (`lpac ground`) alone speaks to the fleet. Its clients (commands, views, scripts)
+connect to its Unix socket and send one line: a command, or `SUBSCRIBE`. Each line of the answer
+is one JSON object whose only key names its kind, such as {"snapshot": {...}}.
+
+A command is answered by any number of `CommandProgress`, at least one a second, if only an empty
+one, and then one `CommandReport`. A client that leaves before abandons what is not ordered yet. A
+subscription is answered by a `FleetSetup` (again whenever the world changes), what is known of each
+robot's `Explored`, the last `GroundEvent`s, and then a `FleetSnapshot` at 5 Hz or more, and the
+rest as it happens, until the client leaves.
+"""
+
+import dataclasses
+import json
+import re
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+from edge.core.fence import Fence
+from edge.core.schema import ConfigError, from_mapping
+from edge.core.world import MOST_FEATURES, parse_world
+from edge.messages.mission import Origin, Place
+from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
+
+# With a reserve: 5 Hz is promised.
+SNAPSHOT_PERIOD_S = 0.18
+SUBSCRIBE = b"subscribe\n"
+# What the radio takes at once.
+LARGEST_WORLD = 400_000
+_TRIAL = re.compile(r"[A-Za-z0-9_.-]{0,32}")
+
+T = TypeVar("T")
+
+# Commands: `robots` are names, empty for all robots that sit in a slot.
+
+
+@dataclass(frozen=True, slots=True)
+class SetOrigin:
+    """Where the mission frame lies. Refused while one of the robots is armed."""
+
+    origin: Origin
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SetFence:
+    """Where robots may fly; None: each robot's configured fence. Refused while one is armed."""
+
+    fence: Fence | None
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SetWorld:
+    """What the virtual sensors see: a CoverageControl world file's text, and how it is called.
+
+    Refused while one of the robots is armed.
+    """
+
+    text: str
+    name: str
+    robots: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.name.isprintable():
+            raise ValueError(f"name = {self.name!r}: must be printable")
+        if len(self.text) > LARGEST_WORLD:
+            raise ValueError(
+                f"{self.name} has {len(self.text)} characters: must be {LARGEST_WORLD} at most"
+            )
+        features = parse_world(self.text, self.name)
+        if len(features) > MOST_FEATURES:
+            raise ValueError(
+                f"{self.name} has {len(features)} features: must be {MOST_FEATURES} at most"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class SetPlaces:
+    """Who flies and lands where, by the robots' names; all others stay where they are.
+
+    Who sat in one of these slots sits in none. Refused while one of the robots is armed.
+    """
+
+    places: dict[str, Place]
+
+
+@dataclass(frozen=True, slots=True)
+class Enable:
+    """Let robots run their checks, and fly; or with `on` False no more: what flies then holds."""
+
+    on: bool = True
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Takeoff:
+    """One after another, `interval_s` apart, the highest first; done when all are at their heights.
+
+    With `abort_on_failure` nobody else takes off once one has failed.
+    """
+
+    robots: tuple[str, ...] = ()
+    interval_s: float = 2.0
+    abort_on_failure: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.interval_s <= 600.0:
+            raise ValueError(f"interval_s = {self.interval_s}: must be from 0 to 600")
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Fly the mission, from hold."""
+
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyCommand:
+    """Hold, return to the landing points, or land. `wait`: done only when all have landed.
+
+    Anybody may command hold; robots of a return land from the lowest height to the highest.
+    """
+
+    action: Literal["hold", "return", "land"]
+    robots: tuple[str, ...] = ()
+    wait: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Resume:
+    """Withdraw hold, return or land; who flew this trial's mission before flies it again."""
+
+    robots: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RobotCommand:
+    """Order of one kind to each robot: hand over to a pilot, take back, disarm, kill.
+
+    Unlike elsewhere, no robots are none.
+    """
+
+    kind: Literal["pilot", "rejoin", "disarm", "kill"]
+    robots: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NextTrial:
+    """The next trial, called `trial`, or numbered on: explored maps and mailboxes are reset.
+
+    Refused while a robot flies its mission.
+    """
+
+    trial: str = ""
+    robots: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if _TRIAL.fullmatch(self.trial) is None:
+            raise ValueError(
+                f"trial = {self.trial!r}: must be at most 32 letters, digits, '.', '-' and '_'"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class TakeCommand:
+    """Take the command of the fleet from whoever has it."""
+
+
+Request = (
+    SetOrigin | SetFence | SetWorld | SetPlaces | Enable | Takeoff | Start | SafetyCommand
+    | Resume | RobotCommand | NextTrial | TakeCommand
+)  # fmt: skip
+
+# Answers
+
+
+@dataclass(frozen=True, slots=True)
+class CommandProgress:
+    """Something became known of one robot (its name) while a command runs; "" is the fleet.
+
+    Each robot's result is told so, too, as soon as it is known. Without a text it tells only that
+    the ground process is there.
+    """
+
+    robot: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotResult:
+    """What one robot did; `text` is how, or why not."""
+
+    robot: str
+    done: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class CommandReport:
+    """The end of a command: each addressed robot's result, and what concerns no single one.
+
+    `problem` is "" unless nothing was done at all.
+    """
+
+    results: tuple[RobotResult, ...] = ()
+    problem: str = ""
+
+    @property
+    def done(self) -> bool:
+        """Whether every addressed robot did it."""
+        return not self.problem and all(result.done for result in self.results)
+
+
+ServerMessage = (
+    FleetSetup | FleetSnapshot | GroundEvent | Explored | CommandProgress | CommandReport
+)
+
+_REQUESTS: dict[str, type[Request]] = {
+    "origin": SetOrigin, "fence": SetFence, "world": SetWorld, "places": SetPlaces,
+    "enable": Enable, "takeoff": Takeoff, "start": Start,
+    "safety_command": SafetyCommand, "resume": Resume, "robot_command": RobotCommand,
+    "next_trial": NextTrial, "take_command": TakeCommand,
+}  # fmt: skip
+_ANSWERS: dict[str, type[ServerMessage]] = {
+    "setup": FleetSetup, "snapshot": FleetSnapshot, "event": GroundEvent, "explored": Explored,
+    "progress": CommandProgress, "report": CommandReport,
+}  # fmt: skip
+_NAMES = {kind: name for name, kind in (*_REQUESTS.items(), *_ANSWERS.items())}
+
+
+def to_line(message: Request | ServerMessage) -> bytes:
+    """The message as one line of JSON."""
+    mapping = {_NAMES[type(message)]: dataclasses.asdict(message)}
+    return json.dumps(mapping, separators=(",", ":")).encode() + b"\n"
+
+
+def request_from_line(line: bytes) -> Request:
+    """Raises ConfigError that says what is wrong with it."""
+    return _from_line(_REQUESTS, line)
+
+
+def server_message_from_line(line: bytes) -> ServerMessage:
+    """Raises ConfigError that says what is wrong with it."""
+    return _from_line(_ANSWERS, line)
+
+
+def _from_line(kinds: dict[str, type[T]], line: bytes) -> T:
+    try:
+        mapping = json.loads(line)
+    except (ValueError, RecursionError):
+        raise ConfigError("ground: not JSON") from None
+    if not isinstance(mapping, dict) or len(mapping) != 1 or not kinds.keys() >= mapping.keys():
+        raise ConfigError(f"ground: one of {', '.join(kinds)} is expected")
+    ((name, fields),) = mapping.items()
+    return from_mapping(kinds[name], fields, name)

@@ -1,0 +1,767 @@
+"""What a ground station wants of its fleet, and who commands it.
+
+Pure: time is passed in, messages are handed in, and what is to be published is asked for. One
+thread at a time.
+
+Of several stations one commands: its name is the `operator` of the state that the robots obey, and
+it alone changes that state. The others observe. Only hold is everybody's: an observer publishes
+the commander's own state with hold in it and the next sequence, until the commander says so itself.
+"""
+
+import math
+import re
+from collections import Counter, deque
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import TypeVar
+
+from edge.messages.mission import (
+    ON_GROUND,
+    ORDER_LIFETIME_S,
+    FlightState,
+    GroundState,
+    Order,
+    OrderKind,
+    OrderResult,
+    Place,
+    RobotStatus,
+    SafetyAction,
+    is_over_landing_point,
+    waiting_to_land,
+    world_id,
+)
+from lpac.analysis.snapshot import EventKind, FleetSetup, FleetSnapshot, GroundEvent
+from lpac.ground.station.heard import HeardRobots
+
+# Before it says anything, a station listens: who commands, whom do the robots obey?
+LISTEN_S = 0.7
+# A commander that was silent for longer is gone.
+COMMANDER_SILENT_S = 2.0
+# ... also if robots say so, who hear what this station may not.
+_ROBOTS_HEAR_NOBODY_S = 1.0
+_OVERTAKEN_S = 1.0
+# Who restarts knows of its robots only when it has heard them for a while.
+_GATHER_S = 3.0
+# Robots that heard this station's name a moment ago have heard another one of that name, unless it
+# was an observer's hold: that ends before this time.
+_SPOKE_S = 0.6
+_NAME_TAKEN_S = 3.0
+_LATELY_S = 10.0
+# A robot refuses an order that expires later than the lifetime, or not after one that it obeyed.
+_EXPIRY_MARGIN_S = 0.5
+_LATER_S = 1e-3
+_EVENTS_KEPT = 200
+_RESULTS_KEPT = 1000
+_AT_PLACE_M = 0.01
+# As a robot says it of a world whose text it has.
+_UNUSABLE_WORLD = "world cannot be used"
+
+_S = FlightState
+T = TypeVar("T")
+
+
+class NameTakenError(ValueError):
+    """Another station has this one's name; the text says what to do."""
+
+
+def is_down(status: RobotStatus) -> bool:
+    """Whether it stands on the ground, disarmed as far as it knows; or lies there, killed."""
+    if status.state is FlightState.FAULT:
+        return status.armed is False
+    return status.state in ON_GROUND and not status.armed
+
+
+class Station:
+    """One ground station. `state` is what the fleet is told, by whoever commands it.
+
+    It is None as long as nobody was heard to say anything.
+    """
+
+    def __init__(self, setup: FleetSetup, now_s: float, unix_now_s: float) -> None:
+        self.state: GroundState | None = None
+        self.commands = False
+        # What became of orders, by their id.
+        self.results: dict[str, OrderResult] = {}
+        # What another station did that ends this one's running commands; "" if nothing.
+        self.interruption = ""
+        self._now_s, self._unix_now_s = now_s, unix_now_s
+        self._setup = setup
+        self._worlds = {setup.world_id: setup.world}
+        # By robot id: what each said last.
+        self._worlds_of_robots: dict[int, str] = {}
+        self._robots = HeardRobots(
+            setup.robots,
+            lambda robot, text: self.tell("presence", robot, text),
+            lambda robot, text: self.tell("state", robot, text),
+        )
+        self._began_s = now_s
+        self._heard_s = now_s  # when the commander was
+        self._obeyed_since_s: float | None = None
+        self._decided = False
+        self._ahead_since_s: dict[int, float] = {}
+        # The hold that this station asks for while another commands, and of whom; None: of all.
+        self._asked: GroundState | None = None
+        self._asked_of: frozenset[int] | None = None
+        self._orders: dict[str, tuple[Order, float]] = {}
+        self._orders_made = 0
+        self._expiries_s: dict[tuple[int, int], float] = {}
+        # Kills of second programs of one robot: nobody waits for their answers.
+        self._more_kills: list[tuple[Order, float]] = []
+        self._orders_prefix = f"{setup.operator}-{int(unix_now_s * 1e3)}"
+        self._arrived: set[int] = set()
+        self._remembered: GroundState | None = None
+        self._events: deque[GroundEvent] = deque(maxlen=_EVENTS_KEPT)
+        self._new_events: list[GroundEvent] = []
+
+    # What it knows
+
+    @property
+    def now_s(self) -> float:
+        """The time of what happened last."""
+        return self._now_s
+
+    @property
+    def age_s(self) -> float:
+        """How long it has been there, s."""
+        return self._now_s - self._began_s
+
+    @property
+    def listened(self) -> bool:
+        """Whether it has listened long enough to know who commands."""
+        if self.state is not None or self._decided:
+            return True
+        return self.age_s >= LISTEN_S and self._obeyed_since_s is None
+
+    @property
+    def operator(self) -> str:
+        """This station's name."""
+        return self._setup.operator
+
+    @property
+    def commander(self) -> str:
+        """Who commands, or did last; "" if nobody does yet."""
+        if self.state is not None:
+            return self.state.operator
+        statuses = self.statuses().values()
+        newest = max(statuses, key=lambda status: status.obeyed_sequence, default=None)
+        return "" if newest is None else newest.operator
+
+    @property
+    def commander_age_s(self) -> float:
+        """How long ago the commander was heard, by this station or by a robot, s.
+
+        0 if that is this station, or nobody.
+        """
+        commander = self.commander
+        if self.commands or not commander:
+            return 0.0
+        heard_s = self._began_s if self.state is None else self._heard_s
+        own_s = self._now_s - heard_s
+        if self._asked is not None and self.state is not None:
+            # The robots hear this station, in the commander's name.
+            return own_s
+        told_s = [
+            status.ground_age_s
+            for status in self.statuses().values()
+            if status.operator == commander and status.ground_age_s is not None
+        ]
+        return min(told_s if told_s and self.state is None else [own_s, *told_s])
+
+    @property
+    def world_id(self) -> str:
+        """The fleet's world: what it is told, or else what most robots have."""
+        told = None if self.state is None else self.state.world_id
+        return told or _commonest(self._worlds_of_robots.values()) or self._setup.world_id
+
+    @property
+    def setup(self) -> FleetSetup:
+        """As it is now: the world, and who sits where, change."""
+        setup, world = self._setup, self.world_id
+        if world != setup.world_id:
+            # A wrong text would be shown as if it were the robots'.
+            setup = replace(setup, world=self._worlds.get(world, ""), world_id=world)
+        places = {} if self.state is None else self.state.places
+        if not places:
+            return setup
+        names = self._robots.names
+        seated = {place.slot: (names.get(int(r), ""), place) for r, place in places.items()}
+        slots = []
+        for slot in setup.slots:
+            robot, place = slot.robot, slot.place
+            if slot.place.slot in seated:
+                robot, place = seated[slot.place.slot]
+            elif robot and str(setup.robots[robot]) in places:
+                robot = ""  # It was given another place.
+            slots.append(replace(slot, place=place, robot=robot))
+        return replace(setup, slots=tuple(slots))
+
+    @property
+    def flying(self) -> tuple[str, ...]:
+        """The robots that sit in a slot, in the order of the slots."""
+        return tuple(slot.robot for slot in self.setup.slots if slot.robot)
+
+    def statuses(self) -> dict[int, RobotStatus]:
+        """The newest of each robot that was heard within `FRESH_S`, by robot id."""
+        return self._robots.statuses(self._now_s)
+
+    def status(self, name: str) -> RobotStatus | None:
+        """The robot's newest, if it was heard within `FRESH_S`."""
+        return self._robots.status(self._setup.robots[name], self._now_s)
+
+    def lately(self, name: str) -> RobotStatus | None:
+        """The robot's newest, if it was heard within 10 s: a bad link is silent for seconds."""
+        last = self._robots.last(self._setup.robots[name], self._now_s)
+        return last[0] if last is not None and last[1] <= _LATELY_S else None
+
+    def is_duplicate(self, name: str) -> bool:
+        """Whether two programs say that they are this robot."""
+        return self._robots.is_duplicate(self._setup.robots[name])
+
+    def snapshot(self, running: tuple[str, ...] = ()) -> FleetSnapshot:
+        """All of it, for the clients; `running` are the commands that run."""
+        return FleetSnapshot(
+            unix_time_s=self._unix_now_s,
+            commander=self.commander,
+            ground=self.state,
+            robots=self._robots.snapshots(self._now_s),
+            running=running,
+            commander_age_s=self.commander_age_s,
+        )
+
+    # Events
+
+    def tell(self, kind: EventKind, robot: str, text: str, operator: str = "") -> None:
+        """Keep an event for the clients."""
+        trial = "" if self.state is None else self.state.trial
+        event = GroundEvent(self._unix_now_s, kind, robot, text, operator, trial)
+        self._events.append(event)
+        self._new_events.append(event)
+
+    @property
+    def last_events(self) -> tuple[GroundEvent, ...]:
+        """The last of them, in order."""
+        return tuple(self._events)
+
+    def new_events(self) -> list[GroundEvent]:
+        """Those since the last call."""
+        events, self._new_events = self._new_events, []
+        return events
+
+    # What it hears
+
+    def set_time(self, now_s: float, unix_now_s: float) -> None:
+        """It is now so late; everything else follows."""
+        self._now_s, self._unix_now_s = now_s, unix_now_s
+
+    def hear_status(self, status: RobotStatus) -> None:
+        """A robot's status came. One that is not of this fleet is nobody's."""
+        if self._robots.hear(status, self._now_s, self._unix_now_s):
+            self._worlds_of_robots[status.robot_id] = status.world_id
+            self._settle_orders(status)
+            self._look_who_is_obeyed(status)
+
+    def _settle_orders(self, status: RobotStatus) -> None:
+        answers = {answer.order_id: answer for answer in status.orders}
+        for order_id, (order, _) in list(self._orders.items()):
+            if order.robot_id != status.robot_id:
+                continue
+            if status.boot_nonce != order.boot_nonce:
+                self._settle(OrderResult(order_id, False, "its program has started again"))
+            elif order_id in answers:
+                self._settle(answers[order_id])
+            elif status.uptime_s > order.expires_at_uptime_s:
+                self._settle(OrderResult(order_id, False, "it did not answer"))
+
+    def _settle(self, result: OrderResult) -> None:
+        del self._orders[result.order_id]
+        self.results[result.order_id] = result
+        while len(self.results) > _RESULTS_KEPT:
+            del self.results[next(iter(self.results))]
+
+    def _look_who_is_obeyed(self, status: RobotStatus) -> None:
+        """A robot may obey what this station does not know of: its former life, or another one."""
+        state = self.state
+        obeyed = status.obeyed_sequence, status.operator
+        own = status.operator == self.operator
+        # Who obeys a station that is gone does so no longer than it takes to hear this one.
+        heard = own or _hears_ground(status)
+        if not self.commands or state is None or obeyed <= _rank(state) or not heard:
+            self._ahead_since_s.pop(status.robot_id, None)
+            return
+        # An observer's hold, or another commander, mostly comes here too.
+        since_s = self._ahead_since_s.setdefault(status.robot_id, self._now_s)
+        if self._now_s - since_s <= _OVERTAKEN_S:
+            return
+        if own:
+            self.state = replace(state, sequence=status.obeyed_sequence + 1)
+            return
+        self._step_down(status.operator)
+        self._tell_commander(status.operator)
+        # What the other one wants is not known.
+        self.state, self._decided = None, True
+
+    def _step_down(self, operator: str) -> None:
+        """Another station commands from now on."""
+        self.commands = False
+        self._ahead_since_s.clear()
+        self.interruption = f"{operator} commands the fleet"
+        for order, _ in tuple(self._orders.values()):
+            if order.kind != "kill":
+                self._settle(OrderResult(order.order_id, False, self.interruption))
+
+    def hear_state(self, state: GroundState) -> None:
+        """Another station's state came. Raises NameTakenError if it has this one's name."""
+        if state.operator == self.operator:
+            self._hear_own_name(state)
+            return
+        before = self.state
+        silent = not self.commands and self.commander_age_s > COMMANDER_SILENT_S
+        if before is not None and _rank(state) < _rank(before) and not silent:
+            return
+        if before is None or before.operator != state.operator:
+            if self.commands:
+                self._step_down(state.operator)
+            self._tell_commander(state.operator)
+        elif before.sequence != state.sequence:
+            by = state.safety_action_by if _is_safer(before, state) else ""
+            self._tell_changes(before, state, by or state.operator)
+        self.state, self.commands, self._heard_s = state, False, self._now_s
+        if self._asked is not None and state.sequence >= self._asked.sequence:
+            asked = _held(state, self._asked_of, self.operator)
+            held = _holds(state, self._asked_of)
+            self._asked = None if held else replace(asked, sequence=state.sequence + 1)
+
+    def _hear_own_name(self, state: GroundState) -> None:
+        """It is an observer's hold, or somebody else has this name."""
+        own = self.state
+        by_observer = state.safety_action_by not in ("", self.operator)
+        if not self.commands or own is None:
+            # An observer that goes on with the state of this station's former life soon ends.
+            if not by_observer:
+                raise self._name_taken()
+            return
+        if state.sequence < own.sequence or (state.sequence == own.sequence and not by_observer):
+            return
+        if not by_observer:
+            raise self._name_taken()
+        after = replace(_with_hold_of(own, state), sequence=state.sequence + 1)
+        self._tell_changes(own, after, state.safety_action_by)
+        self.interruption = f"{state.safety_action_by} commands hold"
+        self.state = after
+
+    def _name_taken(self) -> NameTakenError:
+        return NameTakenError(
+            f"another ground station commands this fleet as {self.operator}: give this one "
+            "another name with --name"
+        )
+
+    def _tell_commander(self, operator: str) -> None:
+        self.tell("commander", "", f"{operator} commands the fleet", operator)
+
+    def _tell_changes(self, before: GroundState, after: GroundState, by: str) -> None:
+        for text in changes_in_words(before, after):
+            self.tell("command", "", text, by)
+
+    def tick(self) -> None:
+        """Time has passed: see who fell silent, and what is to be done by itself."""
+        self._robots.look(self._now_s)
+        for order_id, (_, made_s) in list(self._orders.items()):
+            if self._now_s - made_s > ORDER_LIFETIME_S + 1.0:
+                self._settle(OrderResult(order_id, False, "it did not answer"))
+        self._more_kills = [
+            (order, made_s)
+            for order, made_s in self._more_kills
+            if self._now_s - made_s <= ORDER_LIFETIME_S
+        ]
+        self._listen()
+        if self._asked is not None:
+            self._end_asking(self._asked)
+        if self.commands:
+            self._bring_home()
+
+    def _listen(self) -> None:
+        """Find out who commands robots that obey somebody; take those that were left alone.
+
+        Raises NameTakenError if that is somebody else of this name.
+        """
+        obeyed = {s.operator for s in self.statuses().values() if s.operator}
+        if self.state is not None or self._decided or not obeyed:
+            self._obeyed_since_s = None
+            return
+        if self._obeyed_since_s is None:
+            self._obeyed_since_s = self._now_s
+        listened_s = self._now_s - self._obeyed_since_s
+        if listened_s < LISTEN_S:
+            return
+        if self._own_name_age_s() < _SPOKE_S:
+            if listened_s > _NAME_TAKEN_S:
+                raise self._name_taken()
+            return
+        self._decided = True
+        # The robots' ages tell of a commander that this station does not hear, but they do.
+        if obeyed == {self.operator} or self.commander_age_s > _ROBOTS_HEAR_NOBODY_S:
+            self.take_command()
+
+    def _own_name_age_s(self) -> float:
+        """How long ago a robot heard a station of this name; infinite if none does, s."""
+        lasts = (self._robots.last(robot, self._now_s) for robot in self.statuses())
+        return min(
+            (
+                status.ground_age_s + age_s
+                for status, age_s in filter(None, lasts)
+                if status.operator == self.operator and status.ground_age_s is not None
+            ),
+            default=math.inf,
+        )
+
+    # Who commands
+
+    def take_command(self) -> None:
+        """Command from now on, with what the fleet is told already."""
+        if self.commands:
+            return
+        before = self._known_state()
+        obeyed = self._greatest_obeyed()
+        by = before.safety_action_by or before.operator
+        self.state = replace(
+            before,
+            sequence=max(before.sequence, obeyed) + 1,
+            operator=self.operator,
+            safety_action_by="" if by == self.operator or before.safety_action == "none" else by,
+        )
+        self.commands = True
+        self._asked = None
+        self._tell_commander(self.operator)
+
+    def _greatest_obeyed(self) -> int:
+        return max((s.obeyed_sequence for s in self.statuses().values()), default=0)
+
+    def _known_state(self) -> GroundState:
+        """What the fleet is told, by whoever was heard, or as it is remembered or seen."""
+        if self.state is not None:
+            return self.state
+        obeyed = [(s.obeyed_sequence, s.operator) for s in self.statuses().values() if s.operator]
+        remembered = self._remembered
+        if remembered is not None and _rank(remembered) == max(obeyed, default=None):
+            return remembered
+        return self._state_of_robots()
+
+    def remember(self, state: GroundState) -> None:
+        """What the last process said: it counts if robots still obey just that."""
+        self._remembered = state
+
+    def _state_of_robots(self) -> GroundState:
+        """What the robots were told by a station that is not heard, as far as they show it."""
+        statuses = [s for s in self.statuses().values() if s.operator]
+        idle = {str(s.robot_id): False for s in statuses if s.state is _S.IDLE}
+        # Who is not heard yet may be in the air.
+        enabled = bool(statuses) and len(idle) < len(self._setup.robots)
+        # Of two fences that as many have, the configured one is not what the ground asked for.
+        fences = sorted((s.fence for s in statuses), key=lambda fence: fence == self._setup.fence)
+        fence = _commonest(fences)
+        return GroundState(
+            sequence=0,
+            operator=self.commander or self.operator,
+            origin=_commonest(s.origin for s in statuses),
+            enabled=enabled,
+            robot_enabled=idle if enabled else {},
+            fence=None if fence == self._setup.fence else fence,
+            places=self._places_of(statuses),
+            world_id=_commonest(s.world_id for s in statuses),
+            trial=_commonest(s.trial for s in statuses) or "",
+        )
+
+    def _places_of(self, statuses: Iterable[RobotStatus]) -> dict[str, Place]:
+        """The places of those that do not have their configured one."""
+        setup = self._setup
+        configured = {setup.robots[s.robot]: s.place for s in setup.slots if s.robot}
+        places = {}
+        for status in statuses:
+            above_m = status.slot_height_m - setup.base_height_m
+            try:
+                place = Place(max(0, round(above_m / setup.slot_spacing_m)), status.landing_point_m)
+            except ValueError:  # It says what no place is.
+                continue
+            known = configured.get(status.robot_id)
+            if known is None or known.slot != place.slot or not _is_at(status, known):
+                places[str(status.robot_id)] = place
+        return places
+
+    # What it wants
+
+    def change(self, **changes: object) -> int:
+        """Want something else of the fleet; the state's sequence. Takes the command."""
+        self.take_command()
+        assert self.state is not None
+        after = replace(self.state, **changes)  # type: ignore[arg-type]
+        if after != self.state:
+            self.state = replace(after, sequence=self.state.sequence + 1)
+        return self.state.sequence
+
+    def safety_action(
+        self, safety_action: SafetyAction, robots: Collection[int] | None = None
+    ) -> int:
+        """Ask the fleet, or these robots alone, to hold,
+        return or land; "none" withdraws it. The sequence."""
+        self.take_command()
+        assert self.state is not None
+        these = frozenset(self._robots.names if robots is None else robots)
+        self._arrived -= these
+        if robots is None:
+            return self.change(
+                safety_action=safety_action,
+                safety_action_by="",
+                robot_safety_actions={},
+                waiting=(),
+            )
+        asked: dict[str, SafetyAction] = dict.fromkeys(map(str, sorted(robots)), safety_action)
+        asked = {
+            r: c
+            for r, c in (self.state.robot_safety_actions | asked).items()
+            if c != self.state.safety_action
+        }
+        waiting = tuple(r for r in self.state.waiting if r not in these)
+        return self.change(safety_action_by="", robot_safety_actions=asked, waiting=waiting)
+
+    def hold(self, robots: Collection[int] | None = None) -> int:
+        """Hold, whoever commands; the sequence that says so."""
+        lost = self.commander_age_s > COMMANDER_SILENT_S
+        if self.commands or not self.commander or lost:
+            return self._hold_as_commander(robots)
+        state = self._asked or self._known_state()
+        sequence = max(state.sequence, self._greatest_obeyed()) + 1
+        asked_of: frozenset[int] | None = frozenset() if self._asked is None else self._asked_of
+        self._asked_of = None if robots is None or asked_of is None else asked_of | set(robots)
+        self._asked = replace(_held(state, self._asked_of, self.operator), sequence=sequence)
+        return sequence
+
+    def _hold_as_commander(self, robots: Collection[int] | None) -> int:
+        self.safety_action("hold", robots)
+        assert self.state is not None
+        # Robots may obey somebody who took over without being heard here.
+        others = (s for s in self.statuses().values() if s.operator != self.operator)
+        beyond = max((s.obeyed_sequence for s in others), default=0) + 1
+        self.state = replace(self.state, sequence=max(self.state.sequence, beyond))
+        return self.state.sequence
+
+    def _end_asking(self, asked: GroundState) -> None:
+        """The commander takes the hold up, or is gone, or is out of reach of this station."""
+        if self.commander_age_s > COMMANDER_SILENT_S:
+            self.take_command()
+            self.change(
+                safety_action=asked.safety_action,
+                safety_action_by="",
+                robot_safety_actions=asked.robot_safety_actions,
+                waiting=asked.waiting,
+            )
+        elif self.state is None and all(
+            s.obeyed_sequence >= asked.sequence for s in self.statuses().values() if s.operator
+        ):
+            self._asked = None
+
+    def _bring_home(self) -> None:
+        """Who returns and is over its landing point waits while somebody lower still flies home."""
+        state = self.state
+        assert state is not None
+        asked_home = {r for r in self._robots.names if state.safety_action_for(r) == "return"}
+        returning = asked_home.union(state.waiting)
+        if not returning:
+            return
+        statuses = {r: s for r, s in self.statuses().items() if r in returning}
+        self._arrived |= {r for r, status in statuses.items() if is_over_landing_point(status)}
+        waiting = waiting_to_land(statuses, self._arrived)
+        # Who is not heard, or may have somebody below who was not heard yet, waits on.
+        waiting |= {r for r in state.waiting if self.age_s < _GATHER_S or r not in statuses}
+        asked: dict[str, SafetyAction] = {
+            r: c for r, c in state.robot_safety_actions.items() if int(r) not in returning
+        }
+        for robot in sorted(returning):
+            if robot in waiting:
+                asked[str(robot)] = "hold"
+            elif state.safety_action != "return":
+                asked[str(robot)] = "return"
+        self.change(robot_safety_actions=asked, waiting=tuple(sorted(waiting)))
+
+    def set_world(self, text: str) -> int:
+        """Want that world of the robots; the sequence."""
+        self.remember_world(text)
+        return self.change(world_id=world_id(text))
+
+    def hear_world(self, text: str) -> None:
+        """Another station sends it to the robots; what nobody flies over is not kept."""
+        if world_id(text) in (self.world_id, *self._worlds_of_robots.values()):
+            self.remember_world(text)
+
+    def remember_world(self, text: str) -> None:
+        """It may be the one that the robots have."""
+        self._worlds[world_id(text)] = text
+
+    # Orders
+
+    def order(self, kind: OrderKind, name: str, trial: str = "") -> str | None:
+        """Order something once; the order's id, for `results`. None if the robot was never heard.
+
+        One that was silent since counts its uptime on.
+        """
+        last = self._robots.last(self._setup.robots[name], self._now_s)
+        if last is None:
+            return None
+        order = self._new_order(kind, *last, trial)
+        self._orders[order.order_id] = order, self._now_s
+        if kind == "kill":
+            others = self._robots.others(order.robot_id, self._now_s)
+            self._more_kills += [(self._new_order(kind, *o, trial), self._now_s) for o in others]
+        return order.order_id
+
+    def _new_order(self, kind: OrderKind, status: RobotStatus, age_s: float, trial: str) -> Order:
+        """For the program that said the status so long ago."""
+        self._orders_made += 1
+        program = status.robot_id, status.boot_nonce
+        expiry_s = max(
+            status.uptime_s + age_s + ORDER_LIFETIME_S - _EXPIRY_MARGIN_S,
+            self._expiries_s.get(program, -math.inf) + _LATER_S,
+        )
+        self._expiries_s[program] = expiry_s
+        return Order(
+            order_id=f"{self._orders_prefix}-{self._orders_made}",
+            robot_id=status.robot_id,
+            boot_nonce=status.boot_nonce,
+            kind=kind,
+            expires_at_uptime_s=expiry_s,
+            operator=self.operator,
+            trial=trial,
+        )
+
+    def withdraw(self, order_id: str) -> None:
+        """Say an order no more, if it is open."""
+        self._orders.pop(order_id, None)
+
+    # What is to be published, a few times a second
+
+    def published_state(self) -> GroundState | None:
+        """None: nothing is."""
+        state = self.state if self.commands else self._asked
+        return None if state is None else replace(state, unix_time_s=self._unix_now_s)
+
+    def published_orders(self) -> tuple[Order, ...]:
+        """Those that are not answered."""
+        return tuple(order for order, _ in (*self._orders.values(), *self._more_kills))
+
+    def published_world(self) -> str | None:
+        """The world's text, while a robot on the ground lacks it, and may have use for it."""
+        wanted = self.state.world_id if self.commands and self.state else None
+        text = None if wanted is None else self._worlds.get(wanted)
+        if text is None:
+            return None
+        lacking = any(
+            s.world_id != wanted
+            and s.state in ON_GROUND
+            and not any(_UNUSABLE_WORLD in why for why in s.not_taken)
+            for s in self.statuses().values()
+        )
+        return text if lacking else None
+
+
+def changes_in_words(before: GroundState, after: GroundState) -> list[str]:
+    """What the ground wants that it did not want before, for people."""
+    words: list[str] = []
+    if (before.safety_action, before.robot_safety_actions) != (
+        after.safety_action,
+        after.robot_safety_actions,
+    ):
+        if _is_safer(before, after):
+            words.append(
+                next(
+                    c
+                    for c in (after.safety_action, *after.robot_safety_actions.values())
+                    if c != "none"
+                )
+            )
+        else:
+            words.append("resume")
+    if (before.enabled, before.robot_enabled) != (after.enabled, after.robot_enabled):
+        words.append("enable" if after.enabled or any(after.robot_enabled.values()) else "disable")
+    words += [
+        name
+        for name in ("origin", "fence", "places")
+        if getattr(before, name) != getattr(after, name)
+    ]
+    if before.world_id != after.world_id:
+        words.append(f"world {after.world_id}")
+    if before.trial != after.trial:
+        words.append(f"trial {after.trial}")
+    return words
+
+
+def next_trial(trial: str) -> str:
+    """The name after this one: "t1", "t2", ..."""
+    match = re.fullmatch(r"(.*?)(\d+)", trial)
+    if match is None:
+        return f"{trial}2" if trial else "t1"
+    return f"{match[1]}{int(match[2]) + 1}"
+
+
+def _rank(state: GroundState) -> tuple[int, str]:
+    """Of two states, robots obey that of the greater rank."""
+    return state.sequence, state.operator
+
+
+def _hears_ground(status: RobotStatus) -> bool:
+    """Whether somebody still says what the robot obeys."""
+    return status.ground_age_s is not None and status.ground_age_s <= _ROBOTS_HEAR_NOBODY_S
+
+
+def _commonest(values: Iterable[T | None]) -> T | None:
+    """What most say, of those that say anything; of equals the first."""
+    said = Counter(value for value in values if value)
+    return next((value for value, _ in said.most_common(1)), None)
+
+
+def _is_at(status: RobotStatus, place: Place) -> bool:
+    return math.dist(status.landing_point_m, place.landing_point_m) < _AT_PLACE_M
+
+
+def _held(state: GroundState, robots: Collection[int] | None, by: str) -> GroundState:
+    """The state with a hold of these robots, None: of all; and nothing else of it."""
+    if robots is None:
+        return replace(
+            state, safety_action="hold", robot_safety_actions={}, safety_action_by=by, waiting=()
+        )
+    held: dict[str, SafetyAction] = dict.fromkeys(map(str, sorted(robots)), "hold")
+    waiting = tuple(robot for robot in state.waiting if robot not in robots)
+    return replace(
+        state,
+        robot_safety_actions=state.robot_safety_actions | held,
+        safety_action_by=by,
+        waiting=waiting,
+    )
+
+
+def _holds(state: GroundState, robots: Collection[int] | None) -> bool:
+    """Whether the state has that hold."""
+    if robots is None:
+        return state.safety_action == "hold" and set(state.robot_safety_actions.values()) <= {
+            "hold"
+        }
+    return all(state.safety_action_for(robot) == "hold" for robot in robots)
+
+
+def _with_hold_of(state: GroundState, asked: GroundState) -> GroundState:
+    """The state with the hold that another station asks for."""
+    held = {
+        int(robot)
+        for robot, safety_action in asked.robot_safety_actions.items()
+        if safety_action == "hold"
+    }
+    held = held.difference(asked.waiting)
+    return _held(state, None if asked.safety_action == "hold" else held, asked.safety_action_by)
+
+
+def _is_safer(before: GroundState, after: GroundState) -> bool:
+    """Whether more is asked to hold, to return or to land than before."""
+    if after.safety_action not in ("none", before.safety_action):
+        return True
+    return any(
+        c != "none" and before.safety_action_for(int(r)) != c
+        for r, c in after.robot_safety_actions.items()
+    )

@@ -1,0 +1,128 @@
+"""What the ground tells, kept for programs that go step by step."""
+
+import threading
+import time
+from collections.abc import Callable, Collection
+from types import TracebackType
+from typing import Self
+
+from edge.messages.mission import RobotStatus
+from lpac.analysis.snapshot import FRESH_S, FleetSetup, FleetSnapshot
+from lpac.ground.station.client import no_answer, subscribe
+
+_PATIENCE_S = 5.0
+
+
+class GroundSubscriber:
+    """Keeps the newest of what the ground tells, in a thread of its own; a context.
+
+    What waits raises GroundError once the ground has ended. Any thread may call anything.
+    """
+
+    def __init__(self, fleet: str) -> None:
+        self.fleet = fleet
+        self._changed = threading.Condition()
+        self._setup: FleetSetup | None = None
+        self._snapshot: FleetSnapshot | None = None
+        self._error: Exception | None = None
+        self._leaving = False
+        self._thread = threading.Thread(target=self._run, name="lookout", daemon=True)
+
+    def __enter__(self) -> Self:
+        """Comes back with the first picture. Raises GroundError if there is no ground."""
+        self._thread.start()
+        if not self.wait_for(lambda _: True, _PATIENCE_S):
+            self._leaving = True
+            raise no_answer(self.fleet)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._leaving = True
+        # It notices with the next picture; if there comes none, it is left behind.
+        self._thread.join(1.0)
+
+    @property
+    def setup(self) -> FleetSetup:
+        """What seldom changes."""
+        assert self._setup is not None
+        return self._setup
+
+    @property
+    def snapshot(self) -> FleetSnapshot:
+        """The fleet as it was told last."""
+        assert self._snapshot is not None
+        return self._snapshot
+
+    def wait_for(self, condition: Callable[[FleetSnapshot], bool], timeout_s: float) -> bool:
+        """Wait until `condition` holds of a picture; False if that took too long."""
+        deadline_s = time.monotonic() + timeout_s
+        with self._changed:
+            while True:
+                if self._error is not None:
+                    raise self._error
+                if self._setup and self._snapshot and condition(self._snapshot):
+                    return True
+                if not self._changed.wait(max(0.0, deadline_s - time.monotonic())):
+                    return False
+
+    def fresh_snapshot(self) -> FleetSnapshot:
+        """The fleet as it is told from now on. Raises GroundError if nothing comes."""
+        asked_unix_s = time.time()
+        if not self.wait_for(lambda snapshot: snapshot.unix_time_s >= asked_unix_s, _PATIENCE_S):
+            raise no_answer(self.fleet)
+        return self.snapshot
+
+    def gather(self, robots: Collection[str], duration_s: float) -> dict[str, list[RobotStatus]]:
+        """What these robots say from now on, each status once.
+
+        For `duration_s`, and `FRESH_S` more for one of which nothing came; [] if that is silent.
+        """
+        heard: dict[str, dict[tuple[int, int], RobotStatus]] = {robot: {} for robot in robots}
+        began_s = time.monotonic()
+
+        def take(snapshot: FleetSnapshot) -> bool:
+            passed_s = time.monotonic() - began_s
+            for robot in snapshot.robots:
+                status, age_s = robot.status, robot.age_s
+                if robot.name in heard and status and age_s is not None and age_s <= passed_s:
+                    heard[robot.name][status.boot_nonce, status.sequence] = status
+            return passed_s >= duration_s and all(heard.values())
+
+        self.wait_for(take, duration_s + FRESH_S)
+        return {robot: list(statuses.values()) for robot, statuses in heard.items()}
+
+    def _run(self) -> None:
+        try:
+            with subscribe(self.fleet) as told:
+                for message in told:
+                    if self._leaving:
+                        return
+                    with self._changed:
+                        if isinstance(message, FleetSetup):
+                            self._setup = message
+                        elif isinstance(message, FleetSnapshot):
+                            self._snapshot = message
+                            self._changed.notify_all()
+        except (OSError, ValueError) as error:
+            with self._changed:
+                self._error = error
+                self._changed.notify_all()
+
+
+def addressed(setup: FleetSetup, robots: Collection[str]) -> tuple[str, ...]:
+    """The robots that a command addresses: these, or all that sit in a slot; in the fleet's order.
+
+    Raises ValueError for a name that is unknown, or if there is nobody.
+    """
+    for name in robots:
+        if name not in setup.robots:
+            raise ValueError(f"robot {name!r} is unknown; known are {', '.join(setup.robots)}")
+    chosen = set(robots) or {site.robot for site in setup.slots if site.robot}
+    if not chosen:
+        raise ValueError(f"no robot of fleet {setup.fleet} sits in a slot")
+    return tuple(name for name in setup.robots if name in chosen)

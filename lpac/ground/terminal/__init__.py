@@ -1,0 +1,1 @@
+"""`lpac watch`: the fleet in a terminal."""

@@ -1,0 +1,214 @@
+"""What `lpac watch` says above and below its table; nothing here has a clock or a terminal."""
+
+from collections.abc import Iterable, Sequence
+
+from edge.messages.mission import GroundState
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.ground.alarms import Alarm, Severity
+from lpac.ground.station.protocol import CommandReport
+from lpac.ground.terminal.lines import Line, Span, direction, duration, fit, line, plain, some
+from lpac.ground.terminal.table import ID, MARKS, columns, fence_size, heading, in_order, table_row
+
+_OTHER_KEYS = {
+    "l": "land", "r": "resume", "Enter": "robot", "a": "alarms", "?": "help", "q": "quit",
+}  # fmt: skip
+KEYS: Line = (
+    Span(" h HOLD  ", "strong"),
+    *(
+        span
+        for key, does in _OTHER_KEYS.items()
+        for span in (Span(f" {key} ", "strong"), Span(f"{does}  ", "faint"))
+    ),
+)
+HELP = (
+    "Keys",
+    "h      HOLD the whole fleet, at once, in every view",
+    "l      land the whole fleet where it is (asks; y is yes)",
+    "r      resume: withdraw hold, return and land, and fly on (asks; y is yes)",
+    "c      take the command of the fleet from another station (asks; y is yes)",
+    "j k    next and previous robot, as the arrows",
+    "Enter  everything about the robot; again, or Esc: back",
+    "H L    there: hold it at once, land it (asks); elsewhere as h and l",
+    "a      all alarms",
+    "t      light or dark: for the sun, for the night",
+    "q      quit; the fleet is not touched",
+    "",
+    "!      critical: act now.  *  warning: look into it.  -  note: good to know.",
+    "       Robots with ! and * are on top. A robot that is not heard is faint.",
+    "",
+    "x y h  in the mission frame; height above its own takeoff point",
+    "feat   age of the features that its policy asks from",
+    "neigh  how many it hears, mean rate and worst age of their messages",
+    "lag    lateness of its loops in the last minute, 99th percentile",
+    "link   age of what it said last",
+    "fence  distance from the fence's line, inside it",
+)
+
+
+def header(
+    setup: FleetSetup, snapshot: FleetSnapshot, mission_s: float | None, width: int
+) -> list[Line]:
+    """Three lines about the fleet. `mission_s` is how long this trial's mission has been flown."""
+    ground = snapshot.ground
+    clock = "" if mission_s is None else f"mission {duration(mission_s)}"
+    who = _commander(setup, snapshot)
+    trial = "" if ground is None or not ground.trial else f"trial {ground.trial}"
+    first = _spaced(Span(setup.fleet, "strong"), who, Span(trial))
+    return [
+        (*line(width - len(clock) - 1, *first), Span(" " + clock, "strong")),
+        line(
+            width,
+            *_spaced(
+                _enabled(ground),
+                _safety_action(setup, ground),
+                *_running(snapshot),
+                _fence(setup, ground),
+            ),
+        ),
+        line(width, *_spaced(*_field(setup, snapshot))),
+    ]
+
+
+def _spaced(*spans: Span) -> list[Span]:
+    return [part for span in spans if span.text for part in (span, Span("  "))][:-1]
+
+
+def _commander(setup: FleetSetup, snapshot: FleetSnapshot) -> Span:
+    if not snapshot.commander:
+        return Span(f"nobody commands (this is {setup.operator})", "warning")
+    if snapshot.commander == setup.operator:
+        return Span(f"{setup.operator} commands")
+    return Span(f"{snapshot.commander} commands, {setup.operator} observes", "foreign")
+
+
+def _enabled(ground: GroundState | None) -> Span:
+    if ground is None:
+        return Span("not enabled")
+    others = sum(enabled != ground.enabled for enabled in ground.robot_enabled.values())
+    but = f" but {others}" if others else ""
+    return Span(f"ENABLED{but}", "busy") if ground.enabled else Span(f"not enabled{but}")
+
+
+def _safety_action(setup: FleetSetup, ground: GroundState | None) -> Span:
+    if ground is None:
+        return Span("")
+    names = {str(robot_id): name for name, robot_id in setup.robots.items()}
+    asked = [] if ground.safety_action == "none" else [ground.safety_action.upper()]
+    for safety_action in ("hold", "return", "land", "none"):
+        who = [
+            names.get(r, r)
+            for r, c in ground.robot_safety_actions.items()
+            if c == safety_action != ground.safety_action
+        ]
+        if who:
+            asked.append(
+                f"{'FLY' if safety_action == 'none' else safety_action.upper()} {some(who, 16)}"
+            )
+    by = ground.safety_action_by or ground.operator
+    return Span(f"{', '.join(asked)} by {by}", "calm") if asked else Span("no hold")
+
+
+def _running(snapshot: FleetSnapshot) -> list[Span]:
+    return [Span(f"now: {', '.join(snapshot.running)}", "busy")] if snapshot.running else []
+
+
+def _field(setup: FleetSetup, snapshot: FleetSnapshot) -> Iterable[Span]:
+    ground = snapshot.ground
+    origin = None if ground is None else ground.origin
+    if origin is None:
+        yield Span("no origin", "warning")
+    else:
+        yield Span(
+            f"origin {origin.latitude_deg:.5f} {origin.longitude_deg:.5f} "
+            f"{direction(origin.heading_deg)}"
+        )
+    yield Span(f"bundle {setup.bundle_id[:ID]}")
+    world = setup.world_id if ground is None or ground.world_id is None else ground.world_id
+    yield Span(f"world {world[:ID]}")
+
+
+def _fence(setup: FleetSetup, ground: GroundState | None) -> Span:
+    asked = None if ground is None else ground.fence
+    return Span(f"fence {fence_size(asked or setup.fence)}")
+
+
+def alarm_lines(alarms: Sequence[Alarm], width: int) -> list[Line]:
+    """The alarms, those of several robots with the same text in one line."""
+    robots: dict[tuple[Severity, str], list[str]] = {}
+    for severity, robot, text in alarms:
+        robots.setdefault((severity, text), []).append(robot or "fleet")
+    who = 14
+    return [
+        line(
+            width,
+            Span(f"{MARKS[severity]} ", severity),
+            Span(f"{fit(some(names, who), who)} ", "" if severity == "note" else severity),
+            Span(text, "" if severity == "note" else severity),
+        )
+        for (severity, text), names in robots.items()
+    ]
+
+
+def few_alarms(alarms: Sequence[Alarm], width: int, height: int) -> list[Line]:
+    """As many as there is room for, and how many more there are."""
+    lines = alarm_lines(alarms, width)
+    if not lines:
+        return [line(width, Span("no alarms", "good"))]
+    if len(lines) > height:
+        hidden = len(lines) - height + 1
+        lines = [*lines[: height - 1], line(width, Span(f"  {hidden} more: a shows all", "faint"))]
+    return lines
+
+
+def lost(setup: FleetSetup | None, text: str, lost_s: float, width: int) -> list[Line]:
+    """Above what was known last, when there is no ground process; `text` is why."""
+    then = "hold, then land where they are."
+    if setup is not None:
+        hold_s = setup.ground_timeout_s
+        land_s = hold_s + setup.ground_lost_land_s
+        then = f"hold after {hold_s:g} s, land where they are after {land_s:g} s."
+    texts = (
+        f"NO GROUND STATION for {duration(lost_s)}",
+        f"{text[:1].upper()}{text[1:]}.",
+        f"Robots that hear none: {then}",
+        "This view comes back by itself; it shows what was known last.",
+    )
+    return [line(width, Span(f" {fit(text, width - 1)}", "banner")) for text in texts]
+
+
+# What came of a key
+
+
+def outcome(word: str, report: CommandReport) -> Span:
+    """Who did it, and first who did not and why."""
+    if report.problem:
+        return Span(f"{word} NOT DONE: {report.problem}", "critical")
+    who: dict[tuple[bool, str], list[str]] = {}
+    for result in report.results:
+        who.setdefault((result.done, result.text), []).append(result.robot)
+    parts = [
+        f"{'' if done else 'NOT '}{_whom(names, report)}: {text}"
+        for (done, text), names in sorted(who.items(), key=lambda item: item[0][0])
+    ]
+    return Span(f"{word}: {'; '.join(parts) or 'nobody'}", "good" if report.done else "critical")
+
+
+def _whom(names: Sequence[str], report: CommandReport) -> str:
+    everybody = len(names) == len(report.results) > 4
+    return f"all {len(names)}" if everybody else some(names, 16)
+
+
+def all_of_it(
+    setup: FleetSetup, snapshot: FleetSnapshot, alarms: Sequence[Alarm], width: int
+) -> str:
+    """What the view shows of a fleet, as plain text."""
+    shown = columns(setup, width)
+    rows = in_order(setup, snapshot, alarms)
+    lines = [
+        *header(setup, snapshot, None, width),
+        *alarm_lines(alarms, width),
+        line(width),
+        *heading(shown),
+        *(table_row(shown, row) for row in rows),
+    ]
+    return plain(lines)

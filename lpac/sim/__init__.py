@@ -1,0 +1,1 @@
+"""Simulators: point robots, a PX4-like vehicle, fleets of processes, robot computers."""

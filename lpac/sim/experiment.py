@@ -1,0 +1,209 @@
+"""One simulated flight: who flies what, over which world; and what came out."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from edge.core import F32, F64
+from edge.core.coverage import coverage_cost
+from edge.core.frames import ModelScale
+from edge.core.perception import PerceptionParameters
+from edge.core.wire import MAX_ROBOT_ID
+from edge.core.world import Feature, random_features, rasterize
+from edge.policy.bundle import Bundle, BundleError
+from edge.policy.lpac.graphs import Policy
+from edge.robot.pac import PacParameters
+from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
+from lpac.sim.medium import Medium
+from lpac.sim.swarm import Swarm
+from lpac.sim.vehicles import PointVehicles
+
+Controller = Literal["lpac"] | BaselineName
+
+# The paper's field tests: 32 m x 32 m for a world of 512 x 512 model units.
+FIELD_SCALE = ModelScale(env_scale=16.0, velocity_scale=0.25)
+
+MAX_ROBOTS = MAX_ROBOT_ID + 1
+SAMPLE_S = 0.2
+SAMPLES_PER_COST = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """A flight to simulate; everything random in it follows from `seed`.
+
+    Without `features` the world has `random_feature_count` Gaussian ones; without `starts_m`,
+    one position in the mission frame per robot, they start anywhere in the world.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    controller: Controller = "lpac"
+    robots: int = 10
+    seed: int = 0
+    duration_s: float = 60.0
+    features: tuple[Feature, ...] | None = None
+    random_feature_count: int = 10
+    starts_m: tuple[tuple[float, float], ...] | None = None
+    scale: ModelScale = FIELD_SCALE
+    loss: float = 0.0
+    delay_s: float = 0.0
+    max_message_age_s: float = 0.8
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.robots <= MAX_ROBOTS:
+            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
+        if self.seed < 0:
+            raise ValueError(f"seed = {self.seed}: must be at least 0")
+        if self.starts_m is not None and len(self.starts_m) != self.robots:
+            raise ValueError(f"starts_m: {len(self.starts_m)} positions for {self.robots} robots")
+        if not 0.0 < self.duration_s < np.inf:
+            raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
+        if self.random_feature_count < 0:
+            raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
+        if not 0.0 <= self.max_message_age_s < np.inf:
+            raise ValueError(
+                f"max_message_age_s = {self.max_message_age_s}: must be at least 0 and finite"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedFlight:
+    """What a simulated flight was like; times in s, positions in m of the mission frame.
+
+    `time_s` (T,) and `positions_m` (T, N, 2) sample the flight; `cost_time_s` (C,) and `cost` (C,)
+    are the coverage cost J at fewer of these times, from the start to the end.
+    """
+
+    scenario: Scenario
+    bundle_id: str
+    perception: PerceptionParameters
+    features: tuple[Feature, ...]
+    importance: F32
+    time_s: F64
+    positions_m: F64
+    cost_time_s: F64
+    cost: F64
+    messages: dict[str, int]
+
+    @property
+    def normalized_cost(self) -> F64:
+        """Cost (C,) over the initial cost; all 0 over a world without importance."""
+        return self.cost / self.cost[0] if self.cost[0] > 0.0 else np.zeros_like(self.cost)
+
+    def summary(self) -> dict[str, Any]:
+        """The flight as JSON-ready values; nothing in it depends on the machine's speed."""
+        scenario = self.scenario
+        return {
+            "controller": scenario.controller,
+            "bundle_id": self.bundle_id,
+            "robots": scenario.robots,
+            "seed": scenario.seed,
+            "duration_s": scenario.duration_s,
+            "scale": {
+                "env_scale": scenario.scale.env_scale,
+                "velocity_scale": scenario.scale.velocity_scale,
+            },
+            "link": {
+                "loss": scenario.loss,
+                "delay_s": scenario.delay_s,
+                "max_message_age_s": scenario.max_message_age_s,
+            },
+            "messages": self.messages,
+            "cost": {
+                "initial": self.cost[0],
+                "final": self.cost[-1],
+                "final_normalized": self.normalized_cost[-1],
+            },
+            "cost_curve": {
+                "time_s": self.cost_time_s.tolist(),
+                "normalized_cost": self.normalized_cost.tolist(),
+            },
+            "final_positions_m": self.positions_m[-1].tolist(),
+        }
+
+
+def fly(
+    scenario: Scenario, bundle: Bundle, progress: Callable[[float], None] | None = None
+) -> SimulatedFlight:
+    """Simulate `scenario`; `bundle` flies it, or gives a baseline the sizes of its perception.
+
+    `progress` is called with the simulated time. Raises BundleError for a bundle without
+    perception, ValueError for impossible link parameters.
+    """
+    perception, training = bundle.manifest.perception, bundle.manifest.training
+    if perception is None:
+        raise BundleError(f"bundle {bundle.manifest.name!r} has no perception: it cannot fly")
+    seeds = np.random.SeedSequence(scenario.seed).spawn(4)
+    world_rng, start_rng, clock_rng, medium_rng = (np.random.default_rng(seed) for seed in seeds)
+    features = scenario.features
+    if features is None:
+        features = random_features(world_rng, scenario.random_feature_count, perception.world_size)
+    importance = rasterize(
+        features, perception.world_size, training.idf_truncation, training.idf_norm
+    )
+    starts_m = _starts_m(scenario, perception.world_size, start_rng)
+    max_speed_m_s = training.max_speed * scenario.scale.velocity_scale
+    swarm: Swarm | BaselineSwarm
+    if scenario.controller == "lpac":
+        swarm = Swarm(
+            policy=Policy(bundle),
+            importance=importance,
+            positions_m=starts_m,
+            parameters=PacParameters(
+                scale=scenario.scale,
+                max_speed_m_s=max_speed_m_s,
+                max_message_age_s=scenario.max_message_age_s,
+            ),
+            medium=Medium(
+                range_m=perception.communication_range / scenario.scale.env_scale,
+                loss=scenario.loss,
+                delay_s=scenario.delay_s,
+                rng=medium_rng,
+            ),
+            rng=clock_rng,
+        )
+    else:
+        swarm = BaselineSwarm(
+            make_baseline(scenario.controller, importance, perception, scenario.robots),
+            PointVehicles(starts_m, perception.world_size / scenario.scale.env_scale),
+            scenario.scale,
+            max_speed_m_s,
+        )
+    times_s = _sample_times_s(scenario.duration_s)
+    positions, costs = [], {}
+    for sample, positions_m in enumerate(swarm.run(times_s)):
+        time_s = times_s[sample]
+        positions.append(positions_m)
+        if sample % SAMPLES_PER_COST == 0 or time_s == times_s[-1]:
+            model_positions = scenario.scale.position_to_model(positions_m)
+            costs[time_s] = coverage_cost(importance, model_positions)
+        if progress:
+            progress(time_s)
+    return SimulatedFlight(
+        scenario=scenario,
+        bundle_id=bundle.id,
+        perception=perception,
+        features=features,
+        importance=importance,
+        time_s=np.array(times_s),
+        positions_m=np.array(positions),
+        cost_time_s=np.array(list(costs)),
+        cost=np.array(list(costs.values())),
+        messages=swarm.message_counts(),
+    )
+
+
+def _sample_times_s(duration_s: float) -> list[float]:
+    """From 0 to the duration, every SAMPLE_S and at its end."""
+    samples = math.ceil(duration_s / SAMPLE_S - 1e-9)
+    return [*(sample * SAMPLE_S for sample in range(samples)), duration_s]
+
+
+def _starts_m(scenario: Scenario, world_size: int, rng: np.random.Generator) -> F64:
+    if scenario.starts_m is not None:
+        return np.array(scenario.starts_m)
+    return scenario.scale.position_to_mission_m(rng.uniform(0.0, world_size, (scenario.robots, 2)))

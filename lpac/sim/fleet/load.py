@@ -1,0 +1,83 @@
+"""How many robots this machine carries: found out within seconds, by work like theirs.
+
+As a program, `python -m lpac.sim.fleet.load BUNDLE` is one of the workers that measure.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
+
+from edge.policy.bundle import load_bundle
+from lpac.sim.experiment import Scenario, fly
+
+# A robot's program takes as much of a processor, with its vehicle, as so many units of work a
+# second; a PX4 takes 0.2 to 0.35 of a core where a program and a simulated vehicle take 0.09.
+_UNITS_PER_S = {"mavlink": 3.0, "px4": 10.0}
+
+# The rest is for what comes at once: programs that start, and what else the machine does.
+_SHARE_TO_USE = 0.55
+_ROUNDS = 5
+_ROUND_S = 0.4
+_MAX_WORKERS = 8
+# Two robots that share a process fly for two seconds.
+_UNIT = Scenario(robots=2, duration_s=2.0)
+
+
+def robots_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> float:
+    """How many robots fly on this machine without falling behind, beside what runs on it now.
+
+    Works for two seconds on every core that this process may use.
+
+    Raises OSError or BundleError for a bundle that cannot be loaded.
+    """
+    load_bundle(bundle)
+    return _SHARE_TO_USE * _units_per_s(bundle) / _UNITS_PER_S[vehicle]
+
+
+def _units_per_s(bundle: Path) -> float:
+    """What all cores do together; the median of rounds, so that a moment's load does not count."""
+    with ExitStack() as stack:
+        workers = [
+            stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-m", "lpac.sim.fleet.load", str(bundle)],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                )
+            )
+            for _ in range(min(len(os.sched_getaffinity(0)), _MAX_WORKERS))
+        ]  # fmt: skip
+        for worker in workers:
+            assert worker.stdout is not None
+            worker.stdout.readline()
+        for worker in workers:
+            assert worker.stdin is not None
+            worker.stdin.close()
+        rounds = [json.load(worker.stdout) for worker in workers if worker.stdout is not None]
+    return statistics.median(map(sum, zip(*rounds, strict=True)))
+
+
+def _work(bundle_path: Path) -> None:
+    """Say when ready, wait for the end of stdin, and say the units a second of each round."""
+    bundle = load_bundle(bundle_path)
+    fly(_UNIT, bundle)
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    sys.stdin.read()
+    units_per_s = []
+    for _ in range(_ROUNDS):
+        began_s, units = time.monotonic(), 0
+        while (past_s := time.monotonic() - began_s) < _ROUND_S:
+            fly(_UNIT, bundle)
+            units += 1
+        units_per_s.append(units / past_s)
+    json.dump(units_per_s, sys.stdout)
+
+
+if __name__ == "__main__":
+    _work(Path(sys.argv[1]))

@@ -1,0 +1,127 @@
+"""The vehicles of a simulated fleet: where their robots reach them, and where they really were."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import NamedTuple, Protocol, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F64
+from lpac.sim.ports import free_ports
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Vehicle
+
+
+class AutopilotAddress(NamedTuple):
+    """Where a robot's program reaches its vehicle, as MAVSDK has it, and the vehicle's id."""
+
+    url: str
+    system_id: int
+
+
+class VehicleError(ValueError):
+    """A vehicle cannot start, or has ended; the text says which, why, and what to do."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrueTrack:
+    """Where one vehicle really was: `time_s` (T,), ascending, is `time.monotonic()`.
+
+    `position_m` (T, 3) is north, east, down from the world's origin; `airborne` (T,).
+    """
+
+    time_s: F64
+    position_m: F64
+    airborne: npt.NDArray[np.bool_]
+
+
+class Vehicles(Protocol):
+    """A context in which the vehicles run."""
+
+    autopilots: tuple[AutopilotAddress, ...]
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...
+
+    def require_running(self) -> None:
+        """Raises VehicleError if one has ended."""
+
+    def tracks(self) -> tuple[TrueTrack, ...]:
+        """What they did so far, each."""
+
+    def forget(self) -> None:
+        """Keep of each only where it is."""
+
+    def lost_s(self) -> float:
+        """By how much they fell behind real time, s."""
+
+
+class SimulatedVehicles:
+    """`lpac.sim.px4` vehicles, which a thread of this process flies.
+
+    Tests do to `vehicles` what they want to happen to them, while holding `stepped`.
+    """
+
+    def __init__(self, vehicles: Sequence[Px4Vehicle]) -> None:
+        self.vehicles = tuple(vehicles)
+        ports = free_ports(len(self.vehicles))
+        links = [Px4Link(v, system_id=i + 1) for i, v in enumerate(self.vehicles)]
+        self._server = Px4Server(
+            [Instance(link, 0, port) for link, port in zip(links, ports, strict=True)]
+        )
+        self.autopilots = tuple(
+            AutopilotAddress(f"udpin://127.0.0.1:{port}", i + 1) for i, port in enumerate(ports)
+        )
+        self.stepped = self._server.stepped
+        self._began_s = math.nan
+
+    def __enter__(self) -> Self:
+        self._server.__enter__()
+        with self.stepped:
+            self.stepped.wait_for(lambda: self._server.started_s > 0.0)
+            self._began_s = self._server.started_s
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._server.__exit__(kind, error, traceback)
+
+    def require_running(self) -> None:
+        """They end with this process."""
+
+    def tracks(self) -> tuple[TrueTrack, ...]:
+        """All of the same times."""
+        with self.stepped:
+            truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
+        return tuple(
+            TrueTrack(
+                time_s=self._server.started_s + np.array([entry.time_s for entry in truth]),
+                position_m=np.array([entry.position_m for entry in truth]).reshape(-1, 3),
+                airborne=np.array([not entry.landed for entry in truth], np.bool_),
+            )
+            for truth in truths
+        )
+
+    def forget(self) -> None:
+        """Keep of each only where it is."""
+        with self.stepped:
+            for vehicle in self.vehicles:
+                del vehicle.truth[:-1]
+
+    def lost_s(self) -> float:
+        """Time that this process was held up for, and that the vehicles left out."""
+        return self._server.started_s - self._began_s

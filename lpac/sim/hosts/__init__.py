@@ -1,0 +1,1 @@
+"""Robot computers on this machine: containers with a system, an SSH server and a vehicle each."""

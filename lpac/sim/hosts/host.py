@@ -1,0 +1,289 @@
+"""One robot's computer on this machine, with a simulated PX4, and what may befall it."""
+
+import contextlib
+import math
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+import uuid
+from pathlib import Path
+
+import numpy as np
+
+from lpac.sim.fleet.processes import ORIGIN, WORLD
+from lpac.sim.hosts.rack import Rack, children
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.server import Instance, Px4Server
+from lpac.sim.px4.vehicle import Px4Vehicle
+
+# Three releases of an image fit.
+DISK_MB = 640
+BOOT_WITHIN_S = 60.0
+RUN_WITHIN_S = 60.0
+MAVLINK_PORT = 14551
+
+_PADS_APART_M = 8.0
+_PADS_IN_ROW = 5
+_PX4_PORT = 14550
+_BOARD_UID = 0x4D30303534  # the same on all boards
+
+# In the rack: name, address with prefix, MAC address, state of the link.
+_WIRE = """
+ip netns add "$1"
+ip -n "$1" link set lo up
+ip -n "$1" link add wlan0 address "$3" type veth peer name "$1" netns air
+ip -n "$1" address add "$2" dev wlan0
+ip -n "$1" link set wlan0 up
+ip -n air link set "$1" master bridge "$4"
+"""
+_FORMAT = """
+cd /run
+! mountpoint -q "$1/root" || umount "$1/root"
+! mountpoint -q "$1" || umount "$1"
+mkdir -p "$1"
+mount -t tmpfs -o "size=$2m,mode=755" "$1" "$1"
+cd "$1"
+mkdir upper work root
+mount -t overlay -o "lowerdir=/run/base,upperdir=upper,workdir=work" "$1" root
+"""
+
+
+class SimulatedHost:
+    """One robot's computer and vehicle; `RobotHosts` makes it.
+
+    `vehicle` is its PX4: whoever commands it or sets more than one of its fields holds `stepped`.
+    It is another object after every `power_on`, with the parameters of the one before.
+    """
+
+    def __init__(self, rack: Rack, folder: Path, robot_id: int, key: str) -> None:
+        self.robot_id = robot_id
+        self.name = f"r{robot_id}"
+        self.address = str(rack.network[10 + robot_id])
+        self.pad_m = (
+            _PADS_APART_M * ((robot_id - 1) % _PADS_IN_ROW),
+            _PADS_APART_M * (0.5 + (robot_id - 1) // _PADS_IN_ROW),
+        )
+        self._rack = rack
+        self._console = folder / f"{self.name}.console"
+        private = folder / f"{self.name}.host_key"
+        self.host_key = new_key(private)
+        # Path -> mode and text: what tells this host from the others.
+        self._files = {
+            "etc/machine-id": (0o444, uuid.uuid4().hex + "\n"),
+            "etc/ssh/ssh_host_ed25519_key": (0o600, private.read_text()),
+            "etc/ssh/ssh_host_ed25519_key.pub": (0o644, self.host_key + "\n"),
+            "root/.ssh/authorized_keys": (0o600, key + "\n"),
+        }
+        private.unlink()
+        self._connected = True
+        self._process: subprocess.Popen[bytes] | None = None
+        self._booting: socket.socket | None = None
+        self._server: Px4Server | None = None
+        self._parameters: dict[str, int | float] = {"MAV_SYS_ID": robot_id}
+        self.vehicle = self._new_vehicle()
+
+    @property
+    def root(self) -> Path:
+        """Its disk as seen from here, also while it is off."""
+        return self._rack.path(f"run/{self.name}/root")
+
+    @property
+    def stepped(self) -> threading.Condition:
+        """Raises RuntimeError while the host is off."""
+        if self._server is None:
+            raise RuntimeError(f"{self.name} is off")
+        return self._server.stepped
+
+    def run(self, command: str, *, timeout_s: float = RUN_WITHIN_S) -> str:
+        """What a shell command prints on the host, as root, through its systemd, not its network.
+
+        Raises RuntimeError with what it printed unless it returns 0; TimeoutExpired.
+        """
+        # Its own systemd runs it: what merely enters its namespaces keeps this machine's
+        # privileges, and could set this machine's clock.
+        done = subprocess.run(
+            [
+                "nsenter", f"--target={self._leader()}", "--all", "env", "-i",
+                "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+                "systemd-run", "--quiet", "--wait", "--pipe", "--property=KillMode=process",
+                "--property=WorkingDirectory=/root", "--setenv=HOME=/root",
+                # systemd-run would put its own variables in.
+                "/bin/sh", "-c", command.replace("$", "$$"),
+            ],
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=timeout_s,
+            check=False,
+        )  # fmt: skip
+        if done.returncode:
+            said = (done.stdout + done.stderr).strip()
+            raise RuntimeError(f"{self.name}: {command!r} returned {done.returncode}: {said}")
+        return done.stdout
+
+    # Mishaps
+
+    def cut(self) -> None:
+        """Nothing passes between the host and the network any more, also after `power_on`."""
+        self._connect(False)
+
+    def heal(self) -> None:
+        """The network is there again."""
+        self._connect(True)
+
+    def fill_disk(self) -> None:
+        """No block is free any more."""
+        disk = self._disk()
+        with (disk / "filler").open("wb") as file:
+            size = 0
+            while free := (found := os.statvfs(disk)).f_bavail * found.f_frsize:
+                # Whoever writes just now may have taken some of it.
+                with contextlib.suppress(OSError):
+                    os.posix_fallocate(file.fileno(), size, free)
+                    size += free
+
+    def free_disk(self) -> None:
+        """Undo `fill_disk`."""
+        (self._disk() / "filler").unlink(missing_ok=True)
+
+    def power_off(self) -> None:
+        """All that runs on it, and its PX4, is gone at once; others hear nothing of that.
+
+        Raises RuntimeError if it is off.
+        """
+        if self._process is None:
+            raise RuntimeError(f"{self.name} is off")
+        self._set_port("down")
+        self._parameters = dict(self.vehicle.parameters)
+        self.stop_vehicle()
+        with contextlib.suppress(RuntimeError):
+            os.kill(self._leader(), signal.SIGKILL)
+        self.ended()
+        self._rack.sh('ip -n air link delete "$1"; ip netns delete "$1"', self.name)
+
+    def power_on(self) -> None:
+        """Boot from the same disk; returns once the system is up. Raises OSError if it is not."""
+        self.switch_on()
+        self.await_boot()
+
+    def reset(self) -> None:
+        """A new disk, a new PX4 and a network that works, as at the start. It reboots for that."""
+        if self._process is not None:
+            self.power_off()
+        self._connected = True
+        self._parameters = {"MAV_SYS_ID": self.robot_id}
+        self.format()
+        self.power_on()
+
+    # For RobotHosts: the steps of that
+
+    def format(self) -> None:
+        """Give it a new disk, while it is off."""
+        self._rack.sh(_FORMAT, self.name, str(DISK_MB))
+        for path, (mode, text) in self._files.items():
+            file = self.root / path
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            file.unlink(missing_ok=True)
+            file.touch(mode)
+            file.write_text(text)
+
+    def switch_on(self) -> None:
+        """Begin to boot, with the vehicle running."""
+        if self._process is not None:
+            raise RuntimeError(f"{self.name} is on")
+        self._rack.sh(
+            _WIRE, self.name, f"{self.address}/{self._rack.network.prefixlen}",
+            f"02:00:00:00:{self._rack.number:02x}:{self.robot_id:02x}",
+            "up" if self._connected else "down",
+        )  # fmt: skip
+        self.vehicle = self._new_vehicle()
+        link = Px4Link(
+            self.vehicle,
+            system_id=int(self._parameters["MAV_SYS_ID"]),
+            hardware_uid=_BOARD_UID,
+        )
+        server = Px4Server([Instance(link, _PX4_PORT, MAVLINK_PORT)])
+        with self._rack.in_network(self.name):
+            self._server = server.__enter__()
+        self._booting = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        machine = f"lpac-{self._rack.number}-{self.name}"
+        self._booting.bind(f"\0{machine}")
+        self._process = self._rack.start(
+            self.name, self._console,
+            "env", f"NOTIFY_SOCKET=@{machine}",
+            "systemd-nspawn", "--quiet", "--boot", "--notify-ready=yes", "--register=no",
+            "--keep-unit", "--link-journal=no", "--resolv-conf=off", "--timezone=off",
+            "--console=pipe", f"--machine={machine}", "--hostname=m0054",
+            f"--network-namespace-path=/run/netns/{self.name}",
+            f"--directory=/run/{self.name}/root",
+        )  # fmt: skip
+
+    def await_boot(self) -> None:
+        """Returns once the system is up. Raises OSError if it does not come up."""
+        assert self._booting and self._process
+        until_s = time.monotonic() + BOOT_WITHIN_S
+        with self._booting:
+            self._booting.settimeout(0.5)
+            while time.monotonic() < until_s and self._process.poll() is None:
+                with contextlib.suppress(TimeoutError):
+                    if "READY=1" in self._booting.recv(4096).decode().split("\n"):
+                        return
+        raise OSError(f"{self.name} does not boot: see {self._console}")
+
+    def stop_vehicle(self) -> None:
+        """End the PX4."""
+        if self._server is not None:
+            self._server.__exit__(None, None, None)
+            self._server = None
+
+    def ended(self) -> None:
+        """Wait until the system, which was killed, is gone."""
+        if self._process is not None:
+            self._process.wait()
+            self._process = None
+        if self._booting is not None:
+            self._booting.close()
+
+    def _new_vehicle(self) -> Px4Vehicle:
+        to_mission = ORIGIN.frame().relative_to(WORLD.latitude_deg, WORLD.longitude_deg)
+        place_m = np.array([*self.pad_m, 0.0])
+        north_m, east_m, _ = to_mission.mission_to_local(place_m).tolist()
+        vehicle = Px4Vehicle(
+            seed=self.robot_id, start_m=(north_m, east_m), heading_rad=math.radians(
+                ORIGIN.heading_deg), origin=WORLD,
+        )  # fmt: skip
+        vehicle.gps_bias_m = np.zeros(3)
+        vehicle.parameters.update(self._parameters)
+        return vehicle
+
+    def _disk(self) -> Path:
+        return self._rack.path(f"run/{self.name}")
+
+    def _connect(self, connected: bool) -> None:
+        self._connected = connected
+        if self._process is not None:
+            self._set_port("up" if connected else "down")
+
+    def _set_port(self, state: str) -> None:
+        self._rack.sh('ip -n air link set "$1" "$2"', self.name, state)
+
+    def _leader(self) -> int:
+        """The host's process 1. Raises RuntimeError while the host is off."""
+        containers = children(self._process.pid) if self._process else []
+        leaders = [leader for container in containers for leader in children(container)]
+        if len(leaders) != 1:
+            raise RuntimeError(f"{self.name} is off")
+        return leaders[0]
+
+
+def new_key(private: Path) -> str:
+    """Make an SSH key pair; what comes back is the public one, as in authorized_keys."""
+    public = private.with_name(f"{private.name}.pub")
+    private.unlink(missing_ok=True)
+    public.unlink(missing_ok=True)
+    subprocess.run(
+        ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "lpac", "-f", str(private)],
+        stdin=subprocess.DEVNULL,
+        check=True,
+    )
+    return " ".join(public.read_text().split()[:2])

@@ -1,0 +1,180 @@
+"""Robot computers on this machine: each boots its own systemd and sshd, and has a simulated PX4.
+
+A host is what a VOXL2 is to software: Ubuntu 18.04, a disk of its own, an address in a network that
+it shares with the others and with this machine, MAVLink at 127.0.0.1:14551. What it is not: its
+clock is this machine's (it cannot be set), its kernel too, and memory limits are not enforced.
+"""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Self, overload
+
+import numpy as np
+
+from edge.core.world import format_world, random_features
+from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.hosts.base import base_tree, require_tools
+from lpac.sim.hosts.host import MAVLINK_PORT, SimulatedHost, new_key
+from lpac.sim.hosts.rack import Rack
+
+__all__ = ["SimulatedHost", "SimulatedHosts"]
+
+MAX_HOSTS = 20
+FIELD_M = 32.0
+
+Say = Callable[[str], None]
+
+
+class SimulatedHosts(Sequence[SimulatedHost]):
+    """A context in which hosts r1, r2, ... run, the last `spares` of them without a slot.
+
+    `folder` then holds `fleet_toml`, a complete description of them for `lpac fleet`, with
+    ssh_config, keys and world.env beside it. `fleet` is a name that no other hosts have now.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        folder: Path,
+        *,
+        image: Path,
+        bundle: Path,
+        spares: int = 0,
+        say: Say = lambda _: None,
+    ) -> None:
+        """Starts nothing. `image` and `bundle` are what the fleet is to fly; they are not read.
+
+        Raises NoHostsError (a ValueError) if this machine cannot run robot hosts, ValueError for
+        a number that cannot be.
+        """
+        if not 1 <= count <= MAX_HOSTS:
+            raise ValueError(f"hosts = {count}: must be from 1 to {MAX_HOSTS}")
+        if not 0 <= spares < count:
+            raise ValueError(f"spares = {spares}: must be from 0 to {count - 1}")
+        require_tools()
+        self.folder = folder.resolve()
+        self.fleet_toml = self.folder / "fleet.toml"
+        self.ssh_config = self.folder / "ssh_config"
+        self.known_hosts = self.folder / "known_hosts"
+        self.fleet = ""
+        self._count, self._spares = count, spares
+        self._image, self._bundle = image.resolve(), bundle.resolve()
+        self._say = say
+        self._hosts: list[SimulatedHost] = []
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Boot all. Raises NoHostsError as above, OSError if a host does not come up."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        base = base_tree(self._say)
+        with ExitStack() as stack:
+            stack.callback(self._ended)
+            rack = stack.enter_context(Rack(base))
+            self.fleet = f"hosts-{rack.number}-{os.getpid()}"
+            key = new_key(self.folder / "id_ed25519")
+            self._hosts = [
+                SimulatedHost(rack, self.folder, robot_id, key)
+                for robot_id in range(1, self._count + 1)
+            ]
+            for host in self._hosts:
+                stack.callback(host.stop_vehicle)
+                host.format()
+                host.switch_on()
+            self._write_files()
+            for host in self._hosts:
+                host.await_boot()
+                self._say(f"{host.name} is up at {host.address}")
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stack.__exit__(kind, error, traceback)
+
+    @overload
+    def __getitem__(self, index: int) -> SimulatedHost: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[SimulatedHost]: ...
+    def __getitem__(self, index: int | slice) -> SimulatedHost | list[SimulatedHost]:
+        return self._hosts[index]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def _ended(self) -> None:
+        for host in self._hosts:
+            host.ended()
+
+    def _write_files(self) -> None:
+        world_size = round(FIELD_M * FIELD_SCALE.env_scale)
+        features = random_features(np.random.default_rng(0), 10, world_size)
+        (self.folder / "world.env").write_text(format_world(features))
+        self.known_hosts.write_text(
+            "".join(f"{host.address} {host.host_key}\n" for host in self._hosts)
+        )
+        self.ssh_config.write_text(
+            "".join(f"Host {host.name}\n  HostName {host.address}\n" for host in self._hosts)
+            + "Host *\n"
+            f'  IdentityFile "{self.folder / "id_ed25519"}"\n'
+            "  IdentitiesOnly yes\n"
+            f'  UserKnownHostsFile "{self.known_hosts}"\n'
+            "  GlobalKnownHostsFile /dev/null\n"
+            "  StrictHostKeyChecking yes\n"
+        )
+        self.fleet_toml.write_text(self._fleet_toml())
+
+    def _fleet_toml(self) -> str:
+        low_m, high_m = -2.0, FIELD_M + 2.0
+        flying = self._hosts[: self._count - self._spares]
+        robots = "".join(
+            f'\n[robots.{host.name}]\nhost = "{host.address}"\nrobot_id = {host.robot_id}\n'
+            for host in self._hosts
+        )
+        slots = "".join(
+            f'\n[[slots]]\nrobot = "{host.name}"\npad_m = {list(host.pad_m)}\n'
+            f"landing_point_m = {list(host.pad_m)}\n"
+            for host in flying
+        )
+        return f"""\
+fleet = "{self.fleet}"
+image = {json.dumps(str(self._image))}
+bundle = {json.dumps(str(self._bundle))}
+world = "world.env"
+
+[ssh]
+config = "ssh_config"
+
+[robot]
+on_stop = "land"
+
+[robot.autopilot]
+url = "udpin://127.0.0.1:{MAVLINK_PORT}"
+
+[robot.policy]
+env_scale = {FIELD_SCALE.env_scale}
+velocity_scale = {FIELD_SCALE.velocity_scale}
+
+[robot.fence]
+vertices_m = [[{low_m}, {low_m}], [{high_m}, {low_m}], [{high_m}, {high_m}], [{low_m}, {high_m}]]
+buffer_m = 1.5
+floor_m = 2.0
+ceiling_m = {7.0 + 4.5 * len(flying)}
+
+[robot.limits]
+max_speed_m_s = 1.25
+max_climb_m_s = 2.0
+max_acceleration_m_s2 = 2.0
+lag_s = 1.3
+
+[robot.failsafe]
+rc = "none"
+parameters = "set"
+{robots}{slots}"""

@@ -1,0 +1,87 @@
+"""Which failsafe of several acts, and when."""
+
+import math
+from collections.abc import Mapping
+
+from lpac.sim.px4.modes import (
+    ACTION_MODES,
+    DELAYED,
+    NO_TAKEOVER,
+    FailsafeAction,
+    FailsafeCause,
+    Px4Mode,
+)
+
+
+class Failsafe:
+    """What PX4 does of all that has gone wrong. `action` is what it does now."""
+
+    def __init__(self) -> None:
+        self.action = FailsafeAction.NONE
+        self._wanted: dict[FailsafeCause, FailsafeAction] = {}
+        self._acts_at_s = -math.inf
+        self._taken_over = False
+
+    @property
+    def is_active(self) -> bool:
+        """Whether it decides the mode."""
+        return self.action > FailsafeAction.WARN
+
+    def reset(self) -> None:
+        """The vehicle was armed or disarmed."""
+        self.action = FailsafeAction.NONE
+        self._wanted = {}
+        self._taken_over = False
+
+    def take_over(self) -> bool:
+        """Somebody asks for a mode; whether that ends a failsafe which was active."""
+        ends = self.is_active and not self._taken_over
+        self._taken_over = self._taken_over or ends
+        return ends
+
+    def decide(
+        self,
+        wanted: Mapping[FailsafeCause, FailsafeAction],
+        now_s: float,
+        delay_s: float,
+        *,
+        intended_mode: Px4Mode,
+        position_valid: bool,
+    ) -> FailsafeCause:
+        """Set `action`; returns whose it is, any cause if there is none.
+
+        `wanted` is what each cause calls for. `delay_s` is COM_FAIL_ACT_T: for so long the vehicle
+        holds, for somebody to take it over.
+        """
+        if not any(wanted.values()):
+            self._wanted, self.action = {}, FailsafeAction.NONE
+            return next(iter(wanted))
+        for cause, action in wanted.items():
+            if action >= FailsafeAction.HOLD > self._wanted.get(cause, FailsafeAction.NONE):
+                self._taken_over = False
+                if (
+                    cause in DELAYED
+                    and self.action <= FailsafeAction.HOLD
+                    and now_s >= self._acts_at_s
+                ):
+                    self._acts_at_s = now_s + delay_s
+        self._wanted = dict(wanted)
+        worst = max(wanted, key=lambda cause: wanted[cause])
+        action = wanted[worst]
+        if (
+            action in (FailsafeAction.RETURN, FailsafeAction.LAND)
+            and worst in DELAYED
+            and now_s < self._acts_at_s
+        ):
+            action = FailsafeAction.HOLD
+        if wanted[worst] is FailsafeAction.RETURN and intended_mode in (
+            Px4Mode.LAND,
+            Px4Mode.RETURN,
+        ):
+            action = FailsafeAction.WARN
+        if action in ACTION_MODES and self._taken_over and worst not in NO_TAKEOVER:
+            action = FailsafeAction.WARN
+        if action in ACTION_MODES and not position_valid:
+            action = FailsafeAction.DESCEND
+        self.action = action
+        return worst

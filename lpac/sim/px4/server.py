@@ -1,0 +1,125 @@
+"""Runs simulated vehicles in real time and lets them talk over UDP, all in one thread."""
+
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+
+from lpac.sim.px4.link import Px4Link
+
+STEP_S = 0.02
+# A process that was held up catches up so much; time beyond that is left out.
+MAX_LATENESS_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Instance:
+    """A vehicle's link and its ports; PX4's are 14580 + i to listen and 14540 + i to send to."""
+
+    link: Px4Link
+    listen_port: int
+    client_port: int
+
+
+class Px4Server:
+    """A context in which the vehicles run.
+
+    Another thread that commands a vehicle, or sets more than one of its fields, holds `stepped`.
+    `started_s` is the `time.monotonic()` of the vehicles' time 0, later by what had to be left out.
+    """
+
+    def __init__(self, instances: Sequence[Instance], *, host: str = "127.0.0.1") -> None:
+        self.stepped = threading.Condition()
+        self.started_s = 0.0
+        self._host = host
+        self._instances = tuple(instances)
+        self._sockets: list[socket.socket] = []
+        self._selector = selectors.DefaultSelector()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="px4-server")
+
+    def __enter__(self) -> "Px4Server":
+        """Raises OSError if a port is taken."""
+        for instance in self._instances:
+            udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._sockets.append(udp)
+            udp.setblocking(False)
+            try:
+                udp.bind((self._host, instance.listen_port))
+            except OSError:
+                self._close()
+                raise
+            self._selector.register(udp, selectors.EVENT_READ, instance.link)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._close()
+
+    def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until `condition` holds after a step; False if that took too long."""
+        with self.stepped:
+            return self.stepped.wait_for(condition, timeout_s)
+
+    def _close(self) -> None:
+        self._selector.close()
+        for udp in self._sockets:
+            udp.close()
+
+    def _run(self) -> None:
+        self.started_s = time.monotonic()
+        next_step_s = self.started_s + STEP_S
+        while not self._stop.is_set():
+            now_s = time.monotonic()
+            if now_s < next_step_s:
+                self._receive(next_step_s - now_s)
+                continue
+            # Who is always late must hear, too: for want of setpoints the vehicles would land.
+            self._receive(0.0)
+            left_out_s = max(0.0, now_s - next_step_s - MAX_LATENESS_S)
+            self.started_s += left_out_s
+            next_step_s += left_out_s + STEP_S
+            with self.stepped:
+                self._step()
+                self.stepped.notify_all()
+
+    def _receive(self, timeout_s: float) -> None:
+        for key, _ in self._selector.select(timeout_s):
+            assert isinstance(key.fileobj, socket.socket)
+            with self.stepped:
+                self._drain(key.fileobj, key.data)
+
+    @staticmethod
+    def _drain(udp: socket.socket, link: Px4Link) -> None:
+        while True:
+            try:
+                datagram = udp.recv(2048)
+            except BlockingIOError:
+                return
+            except ConnectionRefusedError:
+                # An earlier datagram found nobody listening.
+                continue
+            link.receive(datagram)
+
+    def _step(self) -> None:
+        for instance, udp in zip(self._instances, self._sockets, strict=True):
+            instance.link.vehicle.step(STEP_S)
+            for datagram in instance.link.due():
+                self._send(udp, datagram, instance.client_port)
+
+    def _send(self, udp: socket.socket, datagram: bytes, port: int) -> None:
+        try:
+            udp.sendto(datagram, (self._host, port))
+        except (BlockingIOError, ConnectionRefusedError):
+            # UDP: what nobody takes is lost.
+            return

@@ -1,0 +1,966 @@
+"""A PX4-like multicopter: modes, refusals, failsafes and flight; no socket and no clock.
+
+World frame: north, east, down from `WorldOrigin`, m; the ground is at down = 0. The vehicle knows
+its position with an error: a GPS bias and slow noise, and with `Errors` much more. Its local frame
+starts at the estimator's origin, which is neither the launch point nor its height.
+
+Times of the estimator, of checks and of failsafes are those that a real PX4 v1.17 was seen with, by
+its own clock: tests/sim/test_px4_recordings.py compares them.
+"""
+
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from edge.core import F64
+from lpac.sim.px4 import checks
+from lpac.sim.px4.checks import Component, HealthReport, HealthReporter, Level, Problem, Px4Event
+from lpac.sim.px4.errors import GPS_VERTICAL, Errors, draw_bias_m
+from lpac.sim.px4.estimator import NOISE_M, Estimator
+from lpac.sim.px4.failsafe import Failsafe
+from lpac.sim.px4.modes import (
+    ACTION_MODES,
+    CAN_LEAVE_GROUND,
+    CUSTOM_MODES,
+    FENCE_ACTIONS,
+    LINK_LOSS_ACTIONS,
+    NEED_POSITION,
+    OFFBOARD_LOSS_ACTIONS,
+    PILOTED,
+    PREVENT_ARMING,
+    FailsafeAction,
+    FailsafeCause,
+    MavResult,
+    Px4Mode,
+)
+from lpac.sim.px4.parameters import PARAMETERS
+from lpac.sim.px4.world import FencePolygon, WorldOrigin
+
+GRAVITY_M_S2 = 9.81
+# Share of the wind that its change pushes the vehicle with, 1/s, and how soon control makes up.
+DRAG_PER_S = 0.3
+WIND_COMPENSATION_S = 5.0
+CHECKS_PERIOD_S = 0.1
+SENSOR_TIMEOUT_S = 1.0
+BATTERY_TIMEOUT_S = 5.0
+# After disarming: the log ends, and the estimator finds that nothing moves. After arming: it finds
+# that something does.
+LOG_ENDS_S = 3.4
+AT_REST_AFTER_S = 2.3
+MOVES_AFTER_S = 0.5
+VERTICAL_DRIFT_M_S = 0.04
+VERTICAL_DRIFT_TIME_S = 20.0
+YAW_RATE_RAD_S = 1.0
+LANDED_AFTER_S = 1.0
+IN_AIR_AFTER_S = 0.9
+STOPPED_M_S = 0.15
+ARRIVED_M = 0.3
+SLOW_DESCENT_BELOW_M = 5.0
+TRUTH_PERIOD_S = 0.04
+# Four cells: empty, and from there to full. What motors take, and all else.
+EMPTY_V, FULL_ABOVE_EMPTY_V = 14.0, 2.8
+HOVER_A, IDLE_A = 12.0, 0.5
+# What PX4 takes the pack's resistance for.
+ASSUMED_OHM = 0.02
+# What the receiver of PX4's own simulator says of itself.
+GPS_ACCURACY_M, GPS_ACCURACY_M_S, GPS_SATELLITES = (0.9, 1.78), 0.4, 10
+# How old a fix is when it is told.
+GPS_LAG_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Airframe:
+    """How the vehicle answers to commands.
+
+    `offboard_velocity_lag_s` holds for bare velocity setpoints: 1 m/s for 10 s covers 8.7 m, as
+    measured. PX4's own modes also feed the acceleration forward and answer within `lag_s`.
+    """
+
+    lag_s: float = 0.3
+    offboard_velocity_lag_s: float = 1.3
+    max_airspeed_m_s: float = 15.0
+    endurance_s: float = 1200.0
+
+
+@dataclass(frozen=True, slots=True)
+class Px4Setpoint:
+    """An offboard setpoint in the local frame; NaN where an axis is not commanded.
+
+    position_m (3,), velocity_m_s (3,): north, east, down. yaw_rad: NaN keeps the heading.
+    """
+
+    position_m: F64
+    velocity_m_s: F64
+    yaw_rad: float = math.nan
+
+
+class SimulatedSensor(Enum):
+    """What a driver may die of."""
+
+    GPS = "gps"
+    BAROMETER = "barometer"
+    COMPASS = "compass"
+    BATTERY = "battery"
+
+
+_ARMED_BY, _DISARMED_BY = 9489139, 16017271
+_BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
+_ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
+_TAKEOFF_DETECTED, _LANDING_DETECTED, _LANDING_ORDERED = 4277609, 9844908, 3322590
+_FUSION_STOPPED, _FUSION_STARTED = 14699175, 15292483
+# Each with a cause, and without.
+_FAILSAFE_ACTS, _FAILSAFE_HOLDS, _FAILSAFE_WARNS = (
+    (9751178, 14605264),
+    (13704694, 4502496),
+    (8557551, 13277401),
+)
+_POSITION_FAILSAFE, _TAKEN_OVER = 12770418, 961599
+_BATTERY_WARNINGS = {2: 12216659, 3: 2474944, 4: 51327}
+# PX4's numbers of actions and causes, in events.
+_ACTIONS = {
+    FailsafeAction.POSCTL: 2,
+    FailsafeAction.HOLD: 5,
+    FailsafeAction.RETURN: 6,
+    FailsafeAction.LAND: 7,
+    FailsafeAction.DESCEND: 8,
+    FailsafeAction.STOP_MOTORS: 10,
+}
+_CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LOST: 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What is really so at one time: world frame, m and m/s."""
+
+    time_s: float
+    position_m: tuple[float, float, float]
+    velocity_m_s: tuple[float, float, float]
+    mode: Px4Mode
+    armed: bool
+    landed: bool
+
+
+class Px4Vehicle:
+    """One vehicle; deterministic for a seed, its steps and its commands.
+
+    Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
+    deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m` (3,)
+    (its fix is off by that much at once, and the estimator must see what to make of it),
+    `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
+    and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
+    any more), `battery_remaining` (0 to 1), `rc_connected`.
+    `truth` grows by one entry every 0.04 s.
+    """
+
+    def __init__(
+        self,
+        *,
+        seed: int,
+        start_m: tuple[float, float] = (0.0, 0.0),
+        heading_rad: float = 0.0,
+        origin: WorldOrigin | None = None,
+        airframe: Airframe | None = None,
+        ready_after_s: float | None = None,
+        errors: Errors | None = None,
+    ) -> None:
+        """`start_m` is north and east. Health becomes good `ready_after_s` after the start.
+
+        It is drawn from 3 to 6 s unless given; so are the GPS bias, 1 to 5 m horizontally, and the
+        place of the estimator's origin. Without `errors` the bias stays as it is, the compass is
+        right, the air stands still and a voltage does not sag.
+        """
+        self._rng = np.random.default_rng(seed)
+        self._world = origin or WorldOrigin()
+        self._airframe = airframe or Airframe()
+        drawn_ready_s = float(self._rng.uniform(3.0, 6.0))
+        bearing_rad, share = self._rng.uniform(0.0, math.tau), self._rng.uniform()
+        self.gps_bias_m: F64 = np.array(
+            [*draw_bias_m(share, bearing_rad), self._rng.uniform(-1.5, 1.5)]
+        )
+        self._errors = errors
+        self._walk_m: F64 = np.zeros(3)
+        self._compass_rad = 0.0
+        self.parameters: dict[str, int | float] = dict(PARAMETERS)
+        self.fence: tuple[FencePolygon, ...] = ()
+        self.truth: list[Truth] = []
+
+        self.time_s = 0.0
+        self.position_m: F64 = np.array([*start_m, 0.0])
+        self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
+        self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0
+
+        self.wind_m_s: F64 = np.zeros(3)
+        self.gust_m_s = 0.0
+        self._gust = self.air_m_s = self.compensated_wind_m_s = np.zeros(3)
+        self.battery_remaining, self._battery_warning = 1.0, 1
+
+        self.gps_lost = self.estimate_frozen = False
+        self.gps_jump_m: F64 = np.zeros(3)
+        self.gps_told_m: float | None = None
+        self._frozen: tuple[F64, F64] | None = None
+        self.dead_sensors: set[SimulatedSensor] = set()
+        self._dead_since_s: dict[SimulatedSensor, float] = {}
+        self.estimator = Estimator(
+            drawn_ready_s if ready_after_s is None else ready_after_s,
+            NOISE_M * self._rng.standard_normal(3),
+        )
+        self._vertical_drift_m_s = 0.0
+        self.estimator_origin_m: F64 = self.estimated_position_m + self._rng.normal(
+            0.0, (1.0, 1.0, 0.5)
+        )
+
+        self.armed = self._took_off = False
+        self.mode = self.intended_mode = self._mode_after_disarm = Px4Mode.HOLD
+        self._mode_commands = 0
+        self.landed = True
+        self.home_m: F64 | None = None
+        self._armed_at_s = 0.0
+        self._lift_began_s: float | None = None
+        self._on_ground_since_s, self._off_ground_since_s = -math.inf, math.inf
+        self._takeoff_down_m = 0.0
+        self._hold_m: F64 | None = None
+
+        self._setpoint: Px4Setpoint | None = None
+        self._setpoint_at_s = -math.inf
+        self.rc_connected = self._rc_at_arming = self._outside_fence = False
+        self._sticks_m_s: F64 = np.zeros(3)
+        self._ground_station_at_s = -math.inf
+        self._fence_latch = -1
+        self.failsafe = Failsafe()
+        self._disarmed_at_s: float | None = None
+        self._reporter = HealthReporter()
+        self._events: list[Px4Event] = []
+
+    # What the vehicle believes
+
+    @property
+    def estimated_position_m(self) -> F64:
+        """(3,), world frame: where the vehicle takes itself to be."""
+        if self._frozen is not None:
+            return self._frozen[0]
+        return self.position_m + self.gps_bias_m + self._walk_m + self.estimator.error_m
+
+    @property
+    def estimated_velocity_m_s(self) -> F64:
+        """(3,), world frame: how fast the vehicle takes itself to be."""
+        return self.velocity_m_s if self._frozen is None else self._frozen[1]
+
+    @property
+    def estimated_heading_rad(self) -> float:
+        """Where the vehicle takes its nose to point."""
+        return self.heading_rad + self._compass_rad
+
+    @property
+    def local_position_m(self) -> F64:
+        """(3,): the estimate from the estimator's origin, north, east, down."""
+        return self.estimated_position_m - self.estimator_origin_m
+
+    @property
+    def global_position(self) -> tuple[float, float, float]:
+        """The estimate: latitude and longitude, deg, height above mean sea level, m."""
+        return self._world.to_global(self.estimated_position_m)
+
+    @property
+    def global_fix(self) -> tuple[float, float, float]:
+        """What the receiver takes its place to be: latitude and longitude, deg, and height, m.
+
+        It errs as the estimate does, which follows it, and has noise besides; it comes late.
+        """
+        noise_m = np.zeros(3) if self._errors is None else self._errors.fix_m(self.time_s)
+        late_m = self.position_m - GPS_LAG_S * self.velocity_m_s
+        fix_m = late_m + self.gps_bias_m + self._walk_m + noise_m + self.gps_jump_m
+        return self._world.to_global(fix_m)
+
+    @property
+    def gps_accuracy_m(self) -> tuple[float, float, float]:
+        """What the receiver says of its fix: horizontally and vertically, m, and m/s."""
+        accuracy_m = GPS_ACCURACY_M
+        if self._errors is not None:
+            accuracy_m = self._errors.gps_accuracy_m(self.time_s)
+        if self.gps_told_m is not None:
+            accuracy_m = self.gps_told_m, GPS_VERTICAL * self.gps_told_m
+        return *accuracy_m, GPS_ACCURACY_M_S
+
+    @property
+    def gps_satellites(self) -> int:
+        """How many the receiver sees, if it sees any."""
+        return GPS_SATELLITES if self._errors is None else self._errors.satellites(self.time_s)
+
+    @property
+    def global_origin(self) -> tuple[float, float, float]:
+        """The estimator's origin: latitude and longitude, deg, height above mean sea level, m."""
+        return self._world.to_global(self.estimator_origin_m)
+
+    @property
+    def global_home(self) -> tuple[float, float, float] | None:
+        """Home in the same terms, None before there is one."""
+        return None if self.home_m is None else self._world.to_global(self.home_m)
+
+    @property
+    def position_valid(self) -> bool:
+        """Whether the estimator vouches for its position."""
+        return self.estimator.position_valid
+
+    def silent_s(self, sensor: SimulatedSensor) -> float:
+        """For how long a driver has been dead; below 0 if it is not."""
+        return self.time_s - self._dead_since_s.get(sensor, math.inf)
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the estimator holds its position since nothing moves."""
+        if self.armed:
+            return self.time_s - self._armed_at_s < MOVES_AFTER_S
+        return self._disarmed_at_s is None or self.time_s - self._disarmed_at_s > AT_REST_AFTER_S
+
+    @property
+    def health(self) -> HealthReport | None:
+        """What PX4 found wrong when it reported last; None in the first seconds."""
+        return self._reporter.published
+
+    @property
+    def current_a(self) -> float:
+        """What the battery gives."""
+        loss = 0.0 if self._errors is None else self._errors.thrust_loss
+        return IDLE_A + (HOVER_A * (1.0 + loss) if self.armed and not self.landed else 0.0)
+
+    @property
+    def voltage_v(self) -> float:
+        """Of the whole battery, as it is under its load."""
+        sag_v = 0.0 if self._errors is None else self.current_a * self._errors.resistance_ohm
+        return EMPTY_V + FULL_ABOVE_EMPTY_V * self.battery_remaining - sag_v
+
+    @property
+    def battery_told(self) -> float:
+        """What PX4 takes to be left, 0 to 1: by a voltage that sags more than it knows."""
+        if self._errors is None:
+            return self.battery_remaining
+        unknown_v = self.current_a * (self._errors.resistance_ohm - ASSUMED_OHM)
+        return max(0.0, self.battery_remaining - unknown_v / FULL_ABOVE_EMPTY_V)
+
+    @property
+    def rc_heard(self) -> bool:
+        """Whether somebody's remote control is on, and heard."""
+        is_stale = self._errors is not None and self._errors.is_remote_control_stale(self.time_s)
+        return self.rc_connected and not is_stale
+
+    @property
+    def battery_warning(self) -> int:
+        """MAV_BATTERY_CHARGE_STATE: 1 is well, 2 low, 3 critical, 4 emergency."""
+        told, parameters = self.battery_told, self.parameters
+        if told >= parameters["BAT_LOW_THR"]:
+            return 1
+        return 2 + (told < parameters["BAT_CRIT_THR"]) + (told < parameters["BAT_EMERGEN_THR"])
+
+    @property
+    def armable(self) -> bool:
+        """Whether the checks before arming pass, in the mode that is set."""
+        return self._checks().can_arm(self.mode)
+
+    def take_events(self) -> list[Px4Event]:
+        """What the vehicle has to say since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def _say(self, number: int, level: Level, text: str = "", arguments: bytes = b"") -> None:
+        self._events.append(Px4Event(number, level, arguments, text, level))
+
+    # What a client commands
+
+    def arm(self, *, force: bool = False) -> MavResult:
+        """Arm; TEMPORARILY_REJECTED unless every check passes or, as no client can, by force."""
+        if self.armed:
+            return MavResult.ACCEPTED
+        self._run_checks()
+        if not (force or self._reporter.newest.can_arm(self.mode)):
+            text = "Arming denied: Resolve system health failures first\t"
+            self._say(_ARMING_DENIED, Level.CRITICAL, text)
+            return MavResult.TEMPORARILY_REJECTED
+        self.armed = True
+        self._armed_at_s = self.time_s
+        self._took_off = False
+        self._lift_began_s = None
+        self._rc_at_arming = self.rc_connected
+        self.failsafe.reset()
+        self.home_m = self.estimated_position_m
+        text = "Armed by external command\t"
+        self._say(_ARMED_BY, Level.INFO, text, bytes([_BY_COMMAND]))
+        return MavResult.ACCEPTED
+
+    def disarm(self, *, force: bool = False, reason: int = _BY_COMMAND) -> MavResult:
+        """Disarm; TEMPORARILY_REJECTED in the air, unless by force: then the vehicle falls."""
+        if not self.armed:
+            return MavResult.ACCEPTED
+        if not self.landed and not force:
+            self._say(_DISARMING_DENIED, Level.CRITICAL, "Disarming denied: not landed\t")
+            return MavResult.TEMPORARILY_REJECTED
+        self.armed = False
+        self._disarmed_at_s = self.time_s
+        self.failsafe.reset()
+        self._set_intended_mode(self._mode_after_disarm)
+        self.mode = self.intended_mode
+        self._say(_DISARMED_BY, Level.INFO, "Disarmed\t", bytes([reason]))
+        return MavResult.ACCEPTED
+
+    def set_mode(self, mode: Px4Mode) -> MavResult:
+        """Ask for a mode: it is on after the next step.
+
+        TEMPORARILY_REJECTED in the air, where the vehicle lacks what the mode needs. LAND is always
+        taken: without a position the vehicle descends.
+        """
+        if self.armed and mode is not Px4Mode.LAND:
+            self._run_checks()
+            if not self._reporter.newest.can_run(mode):
+                return MavResult.TEMPORARILY_REJECTED
+        if mode is Px4Mode.TAKEOFF:
+            self._takeoff_down_m = self._home_down_m() - self.parameters["MIS_TAKEOFF_ALT"]
+        if mode is Px4Mode.LAND:
+            self._say(_LANDING_ORDERED, Level.INFO, "Landing at current position\t")
+        if self.failsafe.take_over():
+            self._say(_TAKEN_OVER, Level.INFO)
+        self._set_intended_mode(mode)
+        return MavResult.ACCEPTED
+
+    def run_prearm_checks(self) -> MavResult:
+        """Run the checks before arming and tell all that they find."""
+        self._run_checks(asked=True)
+        return MavResult.ACCEPTED
+
+    def take_off(self, altitude_m: float) -> MavResult:
+        """Climb to a height above mean sea level, m; NaN takes MIS_TAKEOFF_ALT above home."""
+        result = self.set_mode(Px4Mode.TAKEOFF)
+        if result is MavResult.ACCEPTED and not math.isnan(altitude_m):
+            self._takeoff_down_m = self._world.altitude_m - altitude_m
+        return result
+
+    def offboard(self, setpoint: Px4Setpoint) -> None:
+        """A setpoint of the stream that OFFBOARD needs."""
+        self._setpoint, self._setpoint_at_s = setpoint, self.time_s
+
+    def ground_station_heartbeat(self) -> None:
+        """A ground station was heard."""
+        self._ground_station_at_s = self.time_s
+
+    # What a test does to it
+
+    def pilot(
+        self, mode: Px4Mode = Px4Mode.POSCTL, stick_velocity_m_s: Sequence[float] = ()
+    ) -> MavResult:
+        """A pilot switches on the remote control, to `mode`, and holds the sticks.
+
+        `stick_velocity_m_s` is north, east, down; empty means centred.
+        """
+        self.rc_connected = True
+        result = self.set_mode(mode)
+        self.move_sticks(stick_velocity_m_s)
+        return result
+
+    def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
+        """Sticks alone take the vehicle only where COM_RC_OVERRIDE allows it."""
+        self._sticks_m_s = np.array([*velocity_m_s] or [0.0] * 3)
+        if self.mode in PILOTED:
+            # It stays where the sticks are let go, not where they were let go before.
+            self._hold_m = None
+        bit = 2 if self.mode is Px4Mode.OFFBOARD else 1
+        override = int(self.parameters["COM_RC_OVERRIDE"]) & bit
+        if self.mode not in PILOTED and override and self.rc_connected and self._sticks_m_s.any():
+            self.set_mode(Px4Mode.POSCTL)
+
+    def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
+        """The estimator starts over from another origin: local positions jump, global ones stay."""
+        self.estimator_origin_m = self.estimator_origin_m + np.array([north_m, east_m, down_m])
+
+    # Time
+
+    def step(self, dt_s: float) -> None:
+        """One step of time; 0.02 s suits the model."""
+        if not self.estimate_frozen:
+            self._frozen = None
+        elif self._frozen is None:
+            self._frozen = self.estimated_position_m, self.velocity_m_s
+        self.time_s += dt_s
+        self._watch_sensors()
+        self._estimate(dt_s)
+        self.air_m_s = self.wind_m_s + self._gust
+        if self._errors is not None:
+            self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m
+            self._compass_rad = self._errors.heading_rad(self.time_s)
+            self.air_m_s = self.air_m_s + self._errors.wind_m_s(self.time_s)
+        if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
+            self.home_m = self.estimated_position_m
+        if self.armed:
+            drain = 1.0 if self._errors is None else self._errors.drain
+            drained = drain * self.current_a / (IDLE_A + HOVER_A) * dt_s
+            self.battery_remaining = max(
+                0.0, self.battery_remaining - drained / self._airframe.endurance_s
+            )
+            self._apply_failsafes()
+        else:
+            self._enter(self.intended_mode)
+        if self.time_s - self._reporter.checked_at_s >= CHECKS_PERIOD_S - 1e-9:
+            self._run_checks()
+        self._move(dt_s)
+        self._watch_ground()
+        if not self.truth or self.time_s - self.truth[-1].time_s >= TRUTH_PERIOD_S - 1e-9:
+            self._record_truth()
+
+    def _estimate(self, dt_s: float) -> None:
+        draws = self._rng.standard_normal(10)
+        has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
+        self.estimator.step(self.time_s, dt_s, has_gps, self.gps_jump_m, draws[:6])
+        decay = dt_s / VERTICAL_DRIFT_TIME_S
+        self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + VERTICAL_DRIFT_M_S * float(
+            draws[6]
+        ) * math.sqrt(2.0 * decay)
+        decay = dt_s / WIND_COMPENSATION_S
+        self._gust = self._gust * (1.0 - decay) + self.gust_m_s * draws[7:10] * math.sqrt(
+            2.0 * decay
+        )
+
+    def _watch_sensors(self) -> None:
+        if self.dead_sensors or self._dead_since_s:
+            self._dead_since_s = {
+                sensor: self._dead_since_s.get(sensor, self.time_s) for sensor in self.dead_sensors
+            }
+
+    # Checks
+
+    def _run_checks(self, *, asked: bool = False) -> None:
+        used_gps = Component.GPS in self._reporter.newest.present
+        self._events += self._reporter.update(self._checks(), self.time_s, asked=asked)
+        if not self.armed and not self.estimator.has_gps and not self.position_valid:
+            self.home_m = None
+        uses_gps = self.estimator.uses_gps
+        if self.armed and uses_gps is not used_gps:
+            number = _FUSION_STARTED if uses_gps else _FUSION_STOPPED
+            text = f"GNSS data fusion {'started' if uses_gps else 'stopped'}\t"
+            self._say(number, Level.INFO, text)
+
+    def _checks(self) -> HealthReport:
+        """All that is wrong now, in PX4's order."""
+        parameters = self.parameters
+        is_there = {
+            Component.BAROMETER,
+            Component.BATTERY,
+            Component.LOCAL_POSITION_ESTIMATE,
+            Component.COMPASS,
+            Component.ACCELEROMETER,
+            Component.GYROSCOPE,
+        }
+        if self.estimator.uses_gps:
+            is_there.add(Component.GPS)
+        if (
+            self.armed
+            or self._disarmed_at_s is None
+            or self.time_s - self._disarmed_at_s < LOG_ENDS_S
+        ):
+            is_there.add(Component.LOGGING)
+        if self.rc_heard:
+            is_there.add(Component.REMOTE_CONTROL)
+        if not self._ground_station_lost():
+            is_there.add(Component.COMMUNICATION_LINKS)
+        disabled = int(parameters["COM_RC_IN_MODE"]) == 4
+        required = int(parameters["NAV_DLL_ACT"]) > 0
+        # In flight a battery does not get better.
+        self._battery_warning = max(
+            self.battery_warning, self._battery_warning if self.armed else 1
+        )
+        battery = (None, checks.BATTERY_LOW, checks.BATTERY_CRITICAL, checks.BATTERY_EMERGENCY)
+        found = (
+            (self.silent_s(SimulatedSensor.BAROMETER) > SENSOR_TIMEOUT_S, checks.NO_BAROMETER),
+            (self.silent_s(SimulatedSensor.COMPASS) > SENSOR_TIMEOUT_S, checks.NO_COMPASS),
+            (not self.estimator.has_gps and not self.armed, checks.GPS_FIX_TOO_LOW),
+            (self.mode in PREVENT_ARMING and not self.armed, checks.MODE_PREVENTS_ARMING),
+            (not self.estimator.has_attitude, checks.NO_ATTITUDE),
+            (not self.position_valid, checks.NO_LOCAL_POSITION),
+            (not self.position_valid, checks.NO_GLOBAL_POSITION),
+            (True, checks.NO_MISSION),
+            (not self._offboard_signal(), checks.NO_OFFBOARD_SIGNAL),
+            (self.home_m is None and self.estimator.is_ready, checks.NO_HOME),
+            (
+                not self.rc_heard,
+                checks.MANUAL_CONTROL_DISABLED if disabled else checks.NO_MANUAL_CONTROL,
+            ),
+            (True, battery[self._battery_warning - 1]),
+            (self.silent_s(SimulatedSensor.BATTERY) > BATTERY_TIMEOUT_S, checks.BATTERY_SILENT),
+            (parameters["GF_ACTION"] > 0 and self._is_outside_fence(), checks.FENCE_BREACHED),
+            (
+                self._ground_station_lost(),
+                checks.GROUND_STATION_REQUIRED if required else checks.NO_GROUND_STATION,
+            ),
+        )
+        problems: tuple[Problem, ...] = tuple(p for is_so, p in found if is_so and p is not None)
+        return HealthReport(problems, frozenset(is_there))
+
+    # Modes
+
+    def _offboard_signal(self) -> bool:
+        """Whether setpoints come, and the vehicle knows what it needs to follow them."""
+        fresh = self.time_s - self._setpoint_at_s <= self.parameters["COM_OF_LOSS_T"]
+        return fresh and self.position_valid
+
+    def _ground_station_lost(self) -> bool:
+        return self.time_s - self._ground_station_at_s > self.parameters["COM_DL_LOSS_T"]
+
+    def _set_intended_mode(self, mode: Px4Mode) -> None:
+        self._mode_commands += 1
+        self.intended_mode = mode
+        if mode not in PREVENT_ARMING and mode is not Px4Mode.TAKEOFF:
+            self._mode_after_disarm = mode
+
+    def _enter(self, mode: Px4Mode) -> None:
+        if mode is not self.mode:
+            self.mode = mode
+            self._hold_m = None
+
+    def _apply_failsafes(self) -> None:
+        causes = {
+            FailsafeCause.OFFBOARD_LOST: self._on_offboard_loss(),
+            FailsafeCause.MANUAL_CONTROL_LOST: self._on_manual_control_loss(),
+            FailsafeCause.GROUND_STATION_LOST: self._on_ground_station_loss(),
+            FailsafeCause.BATTERY: self._on_battery(),
+            FailsafeCause.BATTERY_SILENT: self._on_silent_battery(),
+            FailsafeCause.GEOFENCE: self._on_geofence(),
+            FailsafeCause.POSITION_LOST: self._on_position_loss(),
+        }
+        before = self.failsafe.action
+        cause = self.failsafe.decide(
+            causes,
+            self.time_s,
+            self.parameters["COM_FAIL_ACT_T"],
+            intended_mode=self.intended_mode,
+            position_valid=self.position_valid,
+        )
+        action = self.failsafe.action
+        if action > before:
+            self._tell_failsafe(cause, causes[cause], action)
+        if action is FailsafeAction.STOP_MOTORS:
+            self.disarm(force=True, reason=_BY_FAILSAFE)
+            return
+        self._enter(ACTION_MODES.get(action, self.intended_mode))
+
+    def _tell_failsafe(
+        self, cause: FailsafeCause, wanted: FailsafeAction, action: FailsafeAction
+    ) -> None:
+        self._run_checks()
+        self._events += self._reporter.before_failsafe(self.time_s)
+        main, sub = CUSTOM_MODES[self.intended_mode]
+        mode = struct.pack("<I", main << 16 | sub << 24)
+        told = self.battery_warning + 1 if cause is FailsafeCause.BATTERY else _CAUSES.get(cause, 0)
+        generic, told_cause = not told, bytes([told] if told else [])
+        if action is FailsafeAction.WARN and cause is FailsafeCause.BATTERY:
+            level = Level.WARNING if self.battery_warning == 2 else Level.CRITICAL
+            self._say(_BATTERY_WARNINGS[self.battery_warning], level)
+        elif action is FailsafeAction.WARN:
+            self._say(_FAILSAFE_WARNS[generic], Level.WARNING, arguments=mode + told_cause)
+        elif action is FailsafeAction.HOLD and wanted is not FailsafeAction.HOLD:
+            wait_s = round(self.parameters["COM_FAIL_ACT_T"])
+            text = f"Failsafe activated: entering Hold for {wait_s} seconds\t"
+            arguments = mode + struct.pack("<BH", _ACTIONS[wanted], wait_s) + told_cause
+            self._say(_FAILSAFE_HOLDS[generic], Level.CRITICAL, text, arguments)
+        else:
+            number = (
+                _FAILSAFE_ACTS[generic]
+                if action is not FailsafeAction.DESCEND
+                else _POSITION_FAILSAFE
+            )
+            arguments = mode + bytes([_ACTIONS[action]]) + told_cause
+            self._say(number, Level.CRITICAL, "Failsafe activated\t", arguments)
+
+    def _on_offboard_loss(self) -> FailsafeAction:
+        if self.intended_mode is not Px4Mode.OFFBOARD or self._offboard_signal():
+            return FailsafeAction.NONE
+        if not self.position_valid:
+            return FailsafeAction.DESCEND
+        setting = int(self.parameters["COM_OBL_RC_ACT"])
+        if setting in OFFBOARD_LOSS_ACTIONS:
+            return OFFBOARD_LOSS_ACTIONS[setting]
+        if self.rc_connected:
+            return FailsafeAction.POSCTL
+        return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_RCL_ACT"]), FailsafeAction.NONE)
+
+    def _on_manual_control_loss(self) -> FailsafeAction:
+        excepted = {Px4Mode.HOLD: 2, Px4Mode.OFFBOARD: 4}.get(self.intended_mode, 0)
+        if (
+            not self._rc_at_arming
+            or self.rc_heard
+            or int(self.parameters["COM_RC_IN_MODE"]) == 4
+            or int(self.parameters["COM_RCL_EXCEPT"]) & excepted
+        ):
+            return FailsafeAction.NONE
+        return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_RCL_ACT"]), FailsafeAction.NONE)
+
+    def _on_ground_station_loss(self) -> FailsafeAction:
+        if not self._ground_station_lost():
+            return FailsafeAction.NONE
+        return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_DLL_ACT"]), FailsafeAction.NONE)
+
+    def _on_battery(self) -> FailsafeAction:
+        setting, warning = int(self.parameters["COM_LOW_BAT_ACT"]), self.battery_warning
+        if warning == 1:
+            return FailsafeAction.NONE
+        if warning == 2 or setting not in (2, 3):
+            return FailsafeAction.WARN
+        return FailsafeAction.RETURN if setting == 3 and warning == 3 else FailsafeAction.LAND
+
+    def _on_silent_battery(self) -> FailsafeAction:
+        is_silent = self.silent_s(SimulatedSensor.BATTERY) > BATTERY_TIMEOUT_S
+        return FailsafeAction.WARN if is_silent else FailsafeAction.NONE
+
+    def _on_geofence(self) -> FailsafeAction:
+        """A breach acts until another mode is asked for; then not until the next breach."""
+        outside = self._is_outside_fence()
+        if outside and not self._outside_fence:
+            self._fence_latch = self._mode_commands
+        self._outside_fence = outside
+        if self._fence_latch != self._mode_commands:
+            return FailsafeAction.NONE
+        return FENCE_ACTIONS.get(int(self.parameters["GF_ACTION"]), FailsafeAction.NONE)
+
+    def _is_outside_fence(self) -> bool:
+        estimate_m = self.estimated_position_m
+        if self.home_m is not None:
+            north_m, east_m, down_m = (estimate_m - self.home_m).tolist()
+            radius_m = self.parameters["GF_MAX_HOR_DIST"]
+            height_m = self.parameters["GF_MAX_VER_DIST"]
+            if 0.0 < radius_m < math.hypot(north_m, east_m) or 0.0 < height_m < -down_m:
+                return True
+        north_m, east_m, _ = estimate_m.tolist()
+        return any(
+            polygon.contains(self._world, north_m, east_m) != polygon.inclusion
+            for polygon in self.fence
+        )
+
+    def _on_position_loss(self) -> FailsafeAction:
+        lost = self.intended_mode in NEED_POSITION and not self.position_valid
+        return FailsafeAction.DESCEND if lost else FailsafeAction.NONE
+
+    # Motion
+
+    def _home_down_m(self) -> float:
+        home_m = self.estimated_position_m if self.home_m is None else self.home_m
+        return float(home_m[2])
+
+    def _move(self, dt_s: float) -> None:
+        if not self.armed:
+            self._fall(dt_s)
+            return
+        velocity_m_s, yaw_rad, lag_s = self._command()
+        velocity_m_s = self._limit(velocity_m_s)
+        on_ground = self.position_m[2] >= 0.0
+        if on_ground and velocity_m_s[2] >= 0.0:
+            velocity_m_s = np.zeros(3)
+        acceleration = (velocity_m_s - self.velocity_m_s) / (lag_s, lag_s, self._airframe.lag_s)
+        parameters = self.parameters
+        acceleration[:2] = _shorten(acceleration[:2], parameters["MPC_ACC_HOR"])
+        if self._compass_rad:
+            # It takes its nose to be where it is not, and so pushes the wrong way.
+            cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
+            north, east = acceleration[:2].tolist()
+            acceleration[:2] = cos * north + sin * east, cos * east - sin * north
+        thrust = 1.0 if self._errors is None else 1.0 - self._errors.thrust_loss
+        acceleration[2] = min(
+            max(acceleration[2], -thrust * parameters["MPC_ACC_UP_MAX"]),
+            parameters["MPC_ACC_DOWN_MAX"],
+        )
+        unmet_m_s = self.air_m_s - self.compensated_wind_m_s
+        if not on_ground:
+            # However slowly it follows a command, it holds against a push as ever.
+            acceleration += unmet_m_s * (DRAG_PER_S * self._airframe.lag_s / lag_s)
+        self.compensated_wind_m_s = self.compensated_wind_m_s + unmet_m_s * (
+            dt_s / WIND_COMPENSATION_S
+        )
+        self.acceleration_m_s2 = acceleration
+        self.velocity_m_s = self.velocity_m_s + acceleration * dt_s
+        self._turn(yaw_rad, dt_s)
+        self._advance(dt_s)
+
+    def _fall(self, dt_s: float) -> None:
+        self.yaw_rate_rad_s = 0.0
+        if self.position_m[2] >= 0.0:
+            self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
+            return
+        self.acceleration_m_s2 = np.array([0.0, 0.0, GRAVITY_M_S2])
+        self.velocity_m_s = self.velocity_m_s + self.acceleration_m_s2 * dt_s
+        self._advance(dt_s)
+
+    def _advance(self, dt_s: float) -> None:
+        self.position_m = self.position_m + self.velocity_m_s * dt_s
+        if self.position_m[2] >= 0.0:
+            self.position_m[2] = 0.0
+            self.velocity_m_s = np.zeros(3)
+
+    def _turn(self, yaw_rad: float, dt_s: float) -> None:
+        if math.isnan(yaw_rad):
+            self.yaw_rate_rad_s = 0.0
+            return
+        error_rad = math.remainder(yaw_rad - self.estimated_heading_rad, math.tau)
+        self.yaw_rate_rad_s = min(max(error_rad / dt_s, -YAW_RATE_RAD_S), YAW_RATE_RAD_S)
+        self.heading_rad = (self.heading_rad + self.yaw_rate_rad_s * dt_s) % math.tau
+
+    def _limit(self, velocity_m_s: F64) -> F64:
+        """The vehicle's own speed limits, the ramp of a takeoff, and what the wind leaves."""
+        parameters = self.parameters
+        horizontal = _shorten(velocity_m_s[:2], parameters["MPC_XY_VEL_MAX"])
+        wind = self.air_m_s[:2]
+        horizontal = _shorten(horizontal - wind, self._airframe.max_airspeed_m_s) + wind
+        down = max(velocity_m_s[2], -parameters["MPC_Z_VEL_MAX_UP"])
+        down = down * self._ramp() if down < 0.0 else min(down, parameters["MPC_Z_VEL_MAX_DN"])
+        if self.position_m[2] >= 0.0:
+            # The first command upwards after spool-up starts the ramp.
+            spooled = self.time_s - self._armed_at_s >= parameters["COM_SPOOLUP_TIME"]
+            if spooled and velocity_m_s[2] < -0.1 and self._lift_began_s is None:
+                self._lift_began_s = self.time_s
+            if velocity_m_s[2] >= -0.1:
+                self._lift_began_s = None
+            horizontal = np.zeros(2)
+        return np.array([horizontal[0], horizontal[1], down])
+
+    def _ramp(self) -> float:
+        if self._lift_began_s is None:
+            return 0.0 if self.position_m[2] >= 0.0 else 1.0
+        ramp_s = self.parameters["MPC_TKO_RAMP_T"]
+        return min(1.0, (self.time_s - self._lift_began_s) / ramp_s) if ramp_s > 0.0 else 1.0
+
+    def _command(self) -> tuple[F64, float, float]:
+        """Velocity, world frame, m/s; yaw, rad or NaN; horizontal lag, s."""
+        lag_s = self._airframe.lag_s
+        if self.landed and self.mode not in CAN_LEAVE_GROUND:
+            return np.zeros(3), math.nan, lag_s
+        if self.mode is Px4Mode.DESCEND:
+            descent = [*self.air_m_s[:2], self.parameters["MPC_LAND_SPEED"]]
+            # Level, it is carried along by the air as fast as that drags it.
+            return np.array(descent), math.nan, 1.0 / DRAG_PER_S
+        if self.mode is Px4Mode.OFFBOARD and self._setpoint is not None:
+            return self._follow(self._setpoint)
+        if self.mode is Px4Mode.TAKEOFF:
+            return self._climb(), math.nan, lag_s
+        if self.mode is Px4Mode.LAND:
+            return self._descend(), math.nan, lag_s
+        if self.mode is Px4Mode.RETURN:
+            return self._return(), math.nan, lag_s
+        if self.mode in PILOTED and self._sticks_m_s.any():
+            return self._sticks_m_s, math.nan, lag_s
+        if self.mode in PILOTED and self.mode is not Px4Mode.POSCTL:
+            return np.array([*self.air_m_s[:2], 0.0]), math.nan, lag_s
+        return self._hold(), math.nan, lag_s
+
+    def _follow(self, setpoint: Px4Setpoint) -> tuple[F64, float, float]:
+        gains = (self.parameters["MPC_XY_P"],) * 2 + (self.parameters["MPC_Z_P"],)
+        error_m = setpoint.position_m - self.local_position_m
+        bare_velocity = np.isnan(error_m)
+        drift = (0.0, 0.0, self._vertical_drift_m_s)
+        command = np.nan_to_num(setpoint.velocity_m_s) + np.where(
+            bare_velocity, drift, gains * np.nan_to_num(error_m)
+        )
+        command[:2] = _shorten(command[:2], self.parameters["MPC_XY_VEL_MAX"])
+        airframe = self._airframe
+        lag_s = airframe.offboard_velocity_lag_s if bare_velocity[0] else airframe.lag_s
+        return command, setpoint.yaw_rad, lag_s
+
+    def _hold(self) -> F64:
+        """Brake, then stay where the vehicle came to rest."""
+        if self._hold_m is None:
+            if math.sqrt(float(self.velocity_m_s @ self.velocity_m_s)) > STOPPED_M_S:
+                return np.zeros(3)
+            self._hold_m = self.estimated_position_m
+        return self._toward(self._hold_m)
+
+    def _climb(self) -> F64:
+        command = self._hold()
+        error_m = float(self.estimated_position_m[2]) - self._takeoff_down_m
+        if error_m < ARRIVED_M and self._took_off:
+            self._set_intended_mode(Px4Mode.HOLD)
+        speed_m_s = min(error_m * self.parameters["MPC_Z_P"], self.parameters["MPC_TKO_SPEED"])
+        command[2] = -speed_m_s
+        return command
+
+    def _descend(self) -> F64:
+        command = self._hold()
+        near = -self.position_m[2] < SLOW_DESCENT_BELOW_M
+        command[2] = self.parameters["MPC_LAND_SPEED" if near else "MPC_Z_VEL_MAX_DN"]
+        return command
+
+    def _return(self) -> F64:
+        """Climb to the return altitude, fly home, land."""
+        assert self.home_m is not None
+        offset_m = self.home_m - self.estimated_position_m
+        height_m = float(offset_m[2])
+        if math.hypot(offset_m[0], offset_m[1]) < 1.0:
+            command = self._toward(self.home_m)
+            near = height_m < SLOW_DESCENT_BELOW_M
+            command[2] = self.parameters["MPC_LAND_SPEED" if near else "MPC_Z_VEL_MAX_DN"]
+            return command
+        return_height_m = self.parameters["RTL_RETURN_ALT"]
+        if height_m < return_height_m - ARRIVED_M:
+            command = self._hold()
+            command[2] = -min(return_height_m - height_m, self.parameters["MPC_Z_VEL_MAX_UP"])
+            return command
+        command = self._toward(self.home_m)
+        command[2] = 0.0
+        return command
+
+    def _toward(self, target_m: F64) -> F64:
+        error_m = target_m - self.estimated_position_m
+        command = np.empty(3)
+        command[:2] = _shorten(
+            self.parameters["MPC_XY_P"] * error_m[:2], self.parameters["MPC_XY_CRUISE"]
+        )
+        command[2] = self.parameters["MPC_Z_P"] * error_m[2]
+        return command
+
+    # Ground
+
+    def _watch_ground(self) -> None:
+        if self.position_m[2] < 0.0:
+            self._on_ground_since_s = math.inf
+            self._off_ground_since_s = min(self._off_ground_since_s, self.time_s)
+            if self.time_s - self._off_ground_since_s < IN_AIR_AFTER_S:
+                return
+            if self.landed and self.armed:
+                self._say(_TAKEOFF_DETECTED, Level.INFO, "Takeoff detected\t")
+            self._took_off = self._took_off or self.armed
+            self.landed = False
+            return
+        self._off_ground_since_s = math.inf
+        if self._lift_began_s is not None and self.armed:
+            return
+        self._on_ground_since_s = min(self._on_ground_since_s, self.time_s)
+        on_ground_s = self.time_s - self._on_ground_since_s
+        if not self.landed and on_ground_s >= LANDED_AFTER_S:
+            self.landed = True
+            self._say(_LANDING_DETECTED, Level.INFO, "Landing detected\t")
+        if self.armed and self.landed:
+            self._disarm_when_idle(on_ground_s - LANDED_AFTER_S)
+
+    def _disarm_when_idle(self, landed_s: float) -> None:
+        parameters = self.parameters
+        armed_s = self.time_s - self._armed_at_s
+        after_landing = 0.0 < parameters["COM_DISARM_LAND"] <= landed_s
+        preflight_s = parameters["COM_DISARM_PRFLT"]
+        if self._took_off and after_landing:
+            self.disarm(reason=_BY_LANDING)
+        elif not self._took_off and 0.0 < preflight_s <= armed_s - parameters["COM_SPOOLUP_TIME"]:
+            self.disarm(reason=_BEFORE_FLIGHT)
+
+    def _record_truth(self) -> None:
+        north_m, east_m, down_m = self.position_m.tolist()
+        v_north, v_east, v_down = self.velocity_m_s.tolist()
+        self.truth.append(
+            Truth(
+                self.time_s,
+                (north_m, east_m, down_m),
+                (v_north, v_east, v_down),
+                self.mode,
+                self.armed,
+                self.landed,
+            )
+        )
+
+
+def _shorten(vector: F64, length: float) -> F64:
+    norm = math.sqrt(float(vector @ vector))
+    return vector if norm <= length else vector * (length / norm)

@@ -1,0 +1,111 @@
+"""What a real PX4's vehicle did, from the log that PX4 writes (ULog)."""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pyulog import ULog
+from pyulog.exceptions import ULogException
+
+from edge.core import F64
+from lpac.sim.px4.world import WorldOrigin
+
+_PLACE, _ATTITUDE, _STATUS = (
+    "vehicle_local_position_groundtruth", "vehicle_attitude_groundtruth", "vehicle_status",
+)  # fmt: skip
+_SETPOINT = "offboard_control_mode"
+_ARMED = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Px4Truth:
+    """What was so; times are PX4's own, s since it started, ascending.
+
+    `position_m` and `velocity_m_s` (T, 3) are north, east, down in the world, heights from where
+    the vehicle stood; `heading_rad` (T,) clockwise from north. `status_s` (S,) are the times from
+    which on `navigation_state` and `armed` (S,) held.
+    """
+
+    time_s: F64
+    position_m: F64
+    velocity_m_s: F64
+    heading_rad: F64
+    status_s: F64
+    navigation_state: npt.NDArray[np.int64]
+    armed: npt.NDArray[np.bool_]
+
+
+def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
+    """All that the logs of one PX4 tell, in the order of their times; None if they tell nothing.
+
+    A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes.
+    """
+    logs = [_topics(path, (_PLACE, _ATTITUDE, _STATUS)) for path in paths]
+    places = [topics[_PLACE] for topics in logs if _PLACE in topics]
+    if not places:
+        return None
+    time_s = _joined([place["timestamp"] for place in places]) * 1e-6
+    order = np.argsort(time_s, kind="stable")
+    starts_m = [
+        world.to_world(float(place["ref_lat"][-1]), float(place["ref_lon"][-1])) for place in places
+    ]
+    position_m = np.stack(
+        [
+            _joined([p["x"] + start_m[0] for p, start_m in zip(places, starts_m, strict=True)]),
+            _joined([p["y"] + start_m[1] for p, start_m in zip(places, starts_m, strict=True)]),
+            _joined([p["z"] for p in places]),
+        ],
+        axis=1,
+    )
+    velocity_m_s = np.stack([_joined([p[axis] for p in places]) for axis in ("vx", "vy", "vz")], 1)
+    statuses = [topics[_STATUS] for topics in logs if _STATUS in topics]
+    status_s = _joined([s["timestamp"] for s in statuses]) * 1e-6
+    status_order = np.argsort(status_s, kind="stable")
+    attitudes = [topics[_ATTITUDE] for topics in logs if _ATTITUDE in topics]
+    return Px4Truth(
+        time_s=time_s[order],
+        position_m=position_m[order],
+        velocity_m_s=velocity_m_s[order],
+        heading_rad=_headings_rad(attitudes, time_s[order]),
+        status_s=status_s[status_order],
+        navigation_state=_joined([s["nav_state"] for s in statuses])[status_order].astype(np.int64),
+        armed=_joined([s["arming_state"] for s in statuses])[status_order] == _ARMED,
+    )
+
+
+def setpoint_times_s(paths: Sequence[Path]) -> F64:
+    """When setpoints came from outside, PX4's time; ascending."""
+    logs = [_topics(path, (_SETPOINT,)) for path in paths]
+    return np.sort(_joined([topics[_SETPOINT]["timestamp"] for topics in logs if topics])) * 1e-6
+
+
+Topic = dict[str, npt.NDArray[Any]]
+
+
+def _topics(path: Path, names: Sequence[str]) -> dict[str, Topic]:
+    """Topics of these names, of their first instances."""
+    try:
+        with path.open("rb") as file:
+            log = ULog(file, [*names])
+    except (OSError, ULogException, struct.error):
+        # Not even its beginning was written.
+        return {}
+    return {data.name: data.data for data in log.data_list if data.multi_id == 0}
+
+
+def _joined(parts: Sequence[npt.NDArray[Any]]) -> F64:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _headings_rad(attitudes: Sequence[Topic], time_s: F64) -> F64:
+    """At these times; 0 where nothing is known."""
+    at_s = _joined([attitude["timestamp"] for attitude in attitudes]) * 1e-6
+    if len(at_s) == 0:
+        return np.zeros(len(time_s))
+    w, x, y, z = (_joined([a[f"q[{i}]"] for a in attitudes]) for i in range(4))
+    headings_rad = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    return np.interp(time_s, at_s, headings_rad)
