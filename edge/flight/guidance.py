@@ -15,7 +15,6 @@ import numpy as np
 from edge.core import F64
 from edge.core.position import PositionQuality
 from edge.core.vehicle import Vector
-from edge.flight.flight import FlightInputs, FlightMemory, Robot, height_m, is_silent
 from edge.flight.safety import (
     MotionLimits,
     approach_speed,
@@ -26,6 +25,7 @@ from edge.flight.safety import (
     leash,
     limit_acceleration,
 )
+from edge.flight.state import FlightInputs, FlightMemory, Robot, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
 
 # PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P).
@@ -69,7 +69,7 @@ def guide(
 ) -> tuple[MissionSetpoint | None, Guidance]:
     """The setpoint of this tick, None when nothing is to be sent, and the memory for the next.
 
-    `flight` is what `flight.step` made of the same inputs; `dt_s` is the time since the last tick.
+    `flight` is what `step.step` made of the same inputs; `dt_s` is the time since the last tick.
     """
     state, limits = flight.state, robot.limits
     if state not in (FlightState.ARMING, *STEERED) or is_silent(flight, inputs.now_s):

@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 
 class FlightState(StrEnum):
-    """Where a robot is in its flight; `flight.TRANSITIONS` tells what leads where."""
+    """Where a robot is in its flight; `flight.transitions` tells what leads where."""
 
     INIT = "init"
     IDLE = "idle"

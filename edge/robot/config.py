@@ -18,10 +18,10 @@ from edge.core.schema import ConfigError, from_mapping
 from edge.core.wire import MAX_ROBOT_ID
 from edge.flight.energy import EnergyParameters
 from edge.flight.failsafe import required
-from edge.flight.flight import FlightParameters, RemoteControlLost, Robot
 from edge.flight.margins import ErrorBudget, Margin
 from edge.flight.preflight import PreflightLimits
 from edge.flight.safety import MotionLimits
+from edge.flight.state import FlightParameters, RemoteControlLost, Robot
 from edge.robot.pac import PacParameters, PayloadType
 
 

@@ -11,18 +11,18 @@ from edge.core.mailbox import Neighbour
 from edge.core.ports import Autopilot, Odometry, Recorder, Sensor
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
-from edge.flight.flight import (
+from edge.flight.guidance import Guidance, MissionSetpoint, guide
+from edge.flight.preflight import HeardStatus
+from edge.flight.safety import Closest, nearest
+from edge.flight.state import (
     FlightInputs,
     FlightMemory,
     Robot,
     exceeds_silence,
     failsafe_acts,
     height_m,
-    step,
 )
-from edge.flight.guidance import Guidance, MissionSetpoint, guide
-from edge.flight.preflight import HeardStatus
-from edge.flight.safety import Closest, nearest
+from edge.flight.step import step
 from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation

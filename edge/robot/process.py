@@ -37,7 +37,7 @@ from edge.drivers.px4.watchdog import Watchdog
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.drivers.world_sensor import WorldSensor
 from edge.drivers.zenoh_link import ZenohLink
-from edge.flight.flight import flown_s
+from edge.flight.state import flown_s
 from edge.messages.mission import FlightState, RobotStatus, explored_to_bytes, to_json, world_id
 from edge.policy.bundle import Manifest, load_bundle
 from edge.policy.lpac.graphs import Policy

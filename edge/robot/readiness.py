@@ -15,8 +15,8 @@ from edge.core.ports import Autopilot, AutopilotSetup, Odometry
 from edge.core.position import PositionJudgement
 from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
-from edge.flight.flight import Robot
 from edge.flight.preflight import HeardStatus, PreflightInputs, failed_checks
+from edge.flight.state import Robot
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig
 

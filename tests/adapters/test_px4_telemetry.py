@@ -14,7 +14,8 @@ from edge.core.position import (
 )
 from edge.core.vehicle import Action, Mode, VehicleState
 from edge.drivers.px4.telemetry import Px4Telemetry
-from edge.flight.flight import FlightInputs, FlightMemory, step
+from edge.flight.state import FlightInputs, FlightMemory
+from edge.flight.step import step
 from edge.messages.mission import FlightState
 from edge.robot.config import load_config
 from tests.conftest import ROOT

@@ -33,18 +33,6 @@ from edge.core.vehicle import (
     VehicleState,
 )
 from edge.flight.energy import Energy
-from edge.flight.flight import (
-    TRANSITIONS,
-    Decision,
-    FlightInputs,
-    FlightMemory,
-    FlightParameters,
-    RemoteControlLost,
-    Robot,
-    Transition,
-    flown_s,
-    step,
-)
 from edge.flight.guidance import (
     Guidance,
     MissionPosition,
@@ -52,7 +40,19 @@ from edge.flight.guidance import (
     MissionVelocity,
     guide,
 )
+from edge.flight.orders import ORDERS
 from edge.flight.safety import Closest, MotionLimits
+from edge.flight.state import (
+    FlightInputs,
+    FlightMemory,
+    FlightParameters,
+    RemoteControlLost,
+    Robot,
+    Tick,
+    flown_s,
+)
+from edge.flight.step import Decision, enter, step
+from edge.flight.transitions import TRANSITIONS, Transition
 from edge.messages.mission import (
     FlightState,
     GroundState,
@@ -358,7 +358,8 @@ class World:
             remote_control=self.remote_control,
         )
 
-    def _decide(self, vehicle: VehicleState) -> Decision:
+    def inputs(self, vehicle: VehicleState) -> FlightInputs:
+        """What the robot knows now, if that is the vehicle's state."""
         self.position = judge(self.position, vehicle, PositionLimits(), self.now_s)
         odometry = None
         fresh = self.now_s - vehicle.position_at_s <= MAX_POSITION_AGE_S
@@ -366,7 +367,7 @@ class World:
             x_m, y_m, height_m = self.position_m.tolist()
             vx, vy, vz = self.velocity_m_s.tolist()
             odometry = Odometry((x_m, y_m, height_m + ZERO_M), (vx, vy, vz))
-        inputs = FlightInputs(
+        return FlightInputs(
             now_s=self.now_s,
             vehicle=vehicle,
             position=self.position,
@@ -383,7 +384,9 @@ class World:
             uptime_s=self.now_s - self.started_s,
             energy=self.energy,
         )
-        before = self.flight
+
+    def _decide(self, vehicle: VehicleState) -> Decision:
+        inputs, before = self.inputs(vehicle), self.flight
         decision = step(self.robot, before, inputs)
         self.flight = decision.flight
         setpoint, self.guidance = guide(self.robot, self.flight, inputs, self.guidance, TICK_S)
@@ -1804,6 +1807,41 @@ def test_the_page_for_people_has_the_same_table() -> None:
     for row, wanted in zip(rows, expected, strict=False):
         assert row == wanted, f"docs/safety.md: {MEND}"
     assert len(rows) == len(expected), f"docs/safety.md: {MEND}"
+
+
+def test_the_page_for_people_says_where_each_order_is_taken() -> None:
+    rows = re.findall(r"^\| (\w+) \| ([^|]*) \| [^|]* \|$", SAFETY_PAGE.read_text(), re.MULTILINE)
+    said = {kind: cell for kind, cell in rows if kind in ORDERS}
+    assert list(said) == list(ORDERS)
+    for kind, rule in ORDERS.items():
+        named = {state for state in FlightState if state.name in re.findall(r"\w+", said[kind])}
+        any_but = said[kind].startswith("any state")
+        assert set(rule.taken_in) == (set(FlightState) - named if any_but else named), kind
+
+
+def test_a_row_does_what_its_fields_say() -> None:
+    """Whatever its condition is: nothing asks which row it was."""
+    world = World()
+    world.fly()
+    t = Tick(ROBOT, replace(world.flight, target_m=(1.0, 2.0, 3.0)), world.inputs(world.heard))
+    assert t.flight.reached
+    row = Transition((FlightState.MISSION,), FlightState.HOLD, "a test wants it", lambda _: "so")
+    plain = enter(row, "so", t)
+    assert (plain.state, plain.reason, plain.alarming) == (FlightState.HOLD, "so", False)
+    assert (plain.reached, plain.target_m, plain.alone_since_s) == (True, None, None)
+    assert not plain.killed
+    full = replace(
+        row, alarm=True, land_by="return", left_alone="yes", looks_anew=True,
+        keeps_target=True, rejoins=True, kills=True,
+    )  # fmt: skip
+    after = enter(full, "so", t)
+    assert (after.alarming, after.land_by, after.killed) == (True, "return", True)
+    assert (after.reached, after.target_m) == (False, (1.0, 2.0, 3.0))
+    assert after.alone_since_s == after.rejoined_at_s == world.now_s
+    in_hold = replace(t, inputs=replace(t.inputs, vehicle=replace(world.heard, mode=Mode.HOLD)))
+    sometimes = replace(row, left_alone="if in hold")
+    assert enter(sometimes, "so", t).alone_since_s is None
+    assert enter(sometimes, "so", in_hold).alone_since_s == world.now_s
 
 
 MEND = "its table of transitions must be what test_flight.table() returns, row by row"

@@ -14,7 +14,6 @@ from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import Vector, VehicleState
-from edge.flight.flight import FlightInputs, FlightMemory, FlightParameters, Robot
 from edge.flight.guidance import (
     Guidance,
     MissionPosition,
@@ -23,6 +22,7 @@ from edge.flight.guidance import (
     guide,
 )
 from edge.flight.safety import MotionLimits
+from edge.flight.state import FlightInputs, FlightMemory, FlightParameters, Robot
 from edge.messages.mission import FlightState
 
 TICK_S = 0.1

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from edge.core import F64
 from edge.core.fence import Fence
-from edge.flight.flight import FlightParameters
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.safety import MotionLimits, keep_inside, limit_acceleration
+from edge.flight.state import FlightParameters
 from lpac.sim.px4.errors import Errors, draw_bias_m
 from tests.core.test_safety import CONTROL_S, SQUARE, Vehicle
 

@@ -1,0 +1,88 @@
+"""What the operator must see of a robot in flight, the gravest first.
+
+Each check gives the text of its alarm, or None; the table of transitions and the orders ask some of
+them, too.
+"""
+
+import math
+
+from edge.flight.state import Tick
+from edge.messages.mission import AIRBORNE, FlightState
+
+# One message of silence is no loss: PX4 tells twice a second.
+_REMOTE_CONTROL_LOST_S = 1.0
+
+
+def reason_if(condition: bool, reason: str) -> str | None:
+    """The reason, if the condition holds."""
+    return reason if condition else None
+
+
+def failsafe(t: Tick) -> str | None:
+    return reason_if(t.failsafe_acts, f"the autopilot's own failsafe acts: {t.mode}")
+
+
+def hovers_alone(t: Tick) -> str | None:
+    limit_s = t.robot.parameters.hover_land_s
+    text = f"hovers, and lands {limit_s:g} s after it began to, if nobody orders or holds it"
+    return reason_if(t.flight.alone_since_s is not None, text)
+
+
+def remote_control_lost(t: Tick) -> str | None:
+    if t.robot.on_remote_control_lost is None or t.inputs.vehicle.remote_control or t.silent:
+        return None
+    # A program that was started in flight has not heard it yet.
+    heard_at_s = t.flight.remote_control_at_s
+    lost_s = t.inputs.now_s - (heard_at_s if heard_at_s > -math.inf else t.flight.since_s)
+    return reason_if(lost_s > _REMOTE_CONTROL_LOST_S, "remote control lost")
+
+
+def position_not_good(t: Tick) -> str | None:
+    position = t.inputs.position
+    return reason_if(not t.knows_place, f"position {position.quality}: {position.text}")
+
+
+def too_close(t: Tick) -> str | None:
+    closest, limit_m = t.inputs.closest, t.robot.parameters.min_separation_m
+    if closest is None or closest.distance_m >= limit_m:
+        return None
+    return f"only {closest.distance_m:.1f} m to robot {closest.robot_id}"
+
+
+def outside(t: Tick) -> str | None:
+    odometry = t.inputs.odometry
+    outside = odometry and t.robot.fence.distance_m(*odometry.position_m[:2]) < 0.0
+    return reason_if(bool(outside), "outside the fence")
+
+
+def battery_low(t: Tick) -> str | None:
+    energy = t.inputs.energy
+    below = battery_below(t, t.robot.parameters.battery_low, "low")
+    return below or (None if energy is None else energy.shortage())
+
+
+def battery_below(t: Tick, share: float, word: str) -> str | None:
+    battery = t.inputs.vehicle.battery
+    return None if battery is None or battery > share else f"battery {word}: {battery:.0%}"
+
+
+def battery_not_known(t: Tick) -> str | None:
+    unknown = t.inputs.vehicle.battery is None and not t.silent
+    return reason_if(unknown, "battery is not known")
+
+
+def ground_lost(t: Tick) -> str | None:
+    return reason_if(not t.ground_heard, "ground lost")
+
+
+def alarms(t: Tick) -> tuple[str, ...]:
+    """What the operator must see, the gravest first."""
+    texts = [t.flight.reason] if t.flight.alarming else []
+    if t.flight.state in (*AIRBORNE, FlightState.PILOT):
+        checks = (
+            failsafe, hovers_alone, remote_control_lost, position_not_good, too_close,
+            outside, battery_low, battery_not_known, ground_lost,
+        )  # fmt: skip
+        texts += [text for check in checks if (text := check(t)) is not None]
+        texts += [f"PX4: {warning.text}" for warning in t.inputs.vehicle.warnings]
+    return tuple(dict.fromkeys(texts))

@@ -1,0 +1,331 @@
+"""What one robot's flight state machine knows: its parameters, memory, a tick's inputs.
+
+`Tick` is all of that together, with what follows from it; the table of transitions, the orders and
+the alarms ask nothing else. Nothing here has a clock or talks to a vehicle.
+
+Heights are above the robot's own takeoff point, which is latched when it is armed (`datum_m`): the
+estimator's zero is not the pad.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from edge.core import F64
+from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
+from edge.core.ports import Odometry
+from edge.core.position import PositionJudgement, PositionQuality
+from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
+from edge.flight.energy import Energy
+from edge.flight.margins import ErrorBudget
+from edge.flight.safety import Closest, MotionLimits
+from edge.messages.mission import (
+    MAX_SLOT,
+    FlightState,
+    GroundState,
+    Order,
+    OrderResult,
+    Place,
+    SafetyAction,
+)
+
+# How long the autopilot may take to go to offboard.
+OFFBOARD_TIMEOUT_S = 4.0
+# What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
+STALE_TELEMETRY_S = 2.0
+_LAPSE_SHARE = 0.9
+
+# Who has it land: the ground, a return that came home, or what cannot wait.
+LandBy = Literal["ground", "return", "safety"]
+RemoteControlLost = Literal["alarm", "hold", "land"]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightParameters:
+    """What one robot's flight is measured by; times in s, distances in m, speeds in m/s.
+
+    The robot flies at `base_height_m + slot * slot_spacing_m`: the policy is planar and GPS errs by
+    metres, so that each robot has a height of its own. `landing_point_m` (x, y) is in the mission
+    frame. `battery_low` and `battery_critical` are remaining shares.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    slot: int
+    landing_point_m: tuple[float, ...]
+    base_height_m: float = 5.0
+    slot_spacing_m: float = 4.5
+    min_separation_m: float = 1.5
+    battery_low: float = 0.25
+    battery_critical: float = 0.15
+    command_timeout_s: float = 0.5
+    ground_timeout_s: float = 3.0
+    ground_lost_land_s: float = 10.0
+    takeoff_timeout_s: float = 15.0
+    hover_land_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.slot <= MAX_SLOT:
+            raise ValueError(f"slot = {self.slot}: must be from 0 to {MAX_SLOT}")
+        if len(self.landing_point_m) != 2 or not all(map(math.isfinite, self.landing_point_m)):
+            raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be [x, y]")
+        for name in (
+            "base_height_m", "slot_spacing_m", "min_separation_m", "command_timeout_s",
+            "ground_timeout_s", "ground_lost_land_s", "takeoff_timeout_s", "hover_land_s",
+        ):  # fmt: skip
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be above 0 and finite")
+        if self.min_separation_m >= self.slot_spacing_m:
+            raise ValueError(
+                f"min_separation_m = {self.min_separation_m}: must be below slot_spacing_m = "
+                f"{self.slot_spacing_m}, or robots at their own heights would stop each other"
+            )
+        if not 0.0 < self.battery_critical < self.battery_low < 1.0:
+            raise ValueError(
+                f"battery_critical = {self.battery_critical}, battery_low = {self.battery_low}: "
+                "must be 0 < battery_critical < battery_low < 1"
+            )
+
+    @property
+    def slot_height_m(self) -> float:
+        """The robot's own height."""
+        return self.base_height_m + self.slot * self.slot_spacing_m
+
+
+@dataclass(frozen=True, slots=True)
+class FlightMemory:
+    """What the machine remembers from tick to tick.
+
+    `target_m` is what TAKEOFF and HOLD keep: x and y of the mission frame, and a height.
+    `reached`: since the state was entered the vehicle was seen as the state needs it: in offboard,
+    in LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`.
+    After a lapse of the control loop nothing is sent before `silent_until_s`, which stays set until
+    the vehicle is in offboard again. `failsafe_at_s` is when the autopilot's own failsafe was last
+    seen to act, `remote_control_at_s` when the remote control was last heard. `alone_since_s` is
+    set while the vehicle hovers for no reason that anybody gave: since when nobody has answered.
+    `armed_by` is whose takeoff order this program armed it by, `disarmed_at_s` when the vehicle was
+    last known to be disarmed.
+    `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
+    """
+
+    state: FlightState = FlightState.INIT
+    reason: str = "program started"
+    alarming: bool = False
+    since_s: float = 0.0
+    tick_at_s: float = -math.inf
+    datum_m: float | None = None
+    target_m: Vector | None = None
+    reached: bool = False
+    silent_until_s: float = -math.inf
+    failsafe_at_s: float = -math.inf
+    remote_control_at_s: float = -math.inf
+    alone_since_s: float | None = None
+    rejoined_at_s: float = -math.inf
+    asked_at_s: float = -math.inf
+    armed_asked: bool = False
+    armed_by: str = ""
+    disarmed_at_s: float = -math.inf
+    landed_since_s: float | None = None
+    land_by: LandBy = "safety"
+    killed: bool = False
+    trial: str = ""
+    obeyed_expiry_s: float = -math.inf
+    answers: tuple[OrderResult, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightInputs:
+    """What one control tick knows.
+
+    `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
+    above sea level, less what that jumped in flight; None when the position is lost or old, or
+    there is no mission origin. `policy_velocity_m_s` (2,) is None when the policy has no fresh
+    answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
+    take off. `failed_checks` are preflight's; None before the first. `not_taken` is what of the
+    ground's state the robot does not fly by, in words. `order` is new in this tick. `energy` is
+    None when the battery is not known.
+    """
+
+    now_s: float
+    vehicle: VehicleState
+    position: PositionJudgement
+    odometry: Odometry | None
+    policy_velocity_m_s: F64 | None
+    neighbours: tuple[Neighbour, ...]
+    closest: Closest | None
+    busy_neighbours: tuple[int, ...]
+    ground: GroundState | None
+    ground_age_s: float
+    failed_checks: tuple[str, ...] | None
+    not_taken: tuple[str, ...]
+    order: Order | None
+    uptime_s: float
+    energy: Energy | None
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """Who flies: what does not change during a flight.
+
+    `on_remote_control_lost`: what a lost remote control does in flight; None if there is none.
+
+    Raises ValueError if the fence leaves no way to the robot's height or to its landing point, or
+    less room for errors than the budget asks for.
+    """
+
+    robot_id: int
+    boot_nonce: int
+    parameters: FlightParameters
+    fence: Fence
+    limits: MotionLimits
+    on_remote_control_lost: RemoteControlLost | None = None
+    errors: ErrorBudget = field(default_factory=ErrorBudget)
+
+    def __post_init__(self) -> None:
+        fence, height_m = self.fence, self.parameters.slot_height_m
+        if not fence.floor_m <= height_m <= fence.ceiling_m:
+            raise ValueError(
+                f"slot = {self.parameters.slot} flies at {height_m:g} m: must be from floor_m = "
+                f"{fence.floor_m:g} to ceiling_m = {fence.ceiling_m:g}; raise ceiling_m, or take "
+                "fewer slots"
+            )
+        x_m, y_m = self.parameters.landing_point_m
+        if not fence.distance_m(x_m, y_m) >= fence.buffer_m:
+            raise ValueError(
+                f"landing_point_m = {[x_m, y_m]}: must be inside the fence, at least buffer_m = "
+                f"{fence.buffer_m:g} from its line"
+            )
+        lowest = self.errors.lowest_height
+        if not lowest.holds(height_m):
+            raise ValueError(f"slot = {self.parameters.slot} flies at {height_m:g} m: {lowest}")
+        buffer = self.errors.fence_buffer(self.limits, self.parameters.command_timeout_s)
+        if not buffer.holds(fence.buffer_m):
+            raise ValueError(f"buffer_m = {fence.buffer_m:g}: {buffer}")
+
+    @property
+    def place(self) -> Place:
+        """Its place in the flight."""
+        return Place(self.parameters.slot, self.parameters.landing_point_m)
+
+    def told(self, ground: GroundState) -> tuple[Fence, Place]:
+        """Fence and place that the ground gives it, or else its own."""
+        fence = self.fence if ground.fence is None else ground.fence
+        return fence, ground.places.get(str(self.robot_id), self.place)
+
+    def assigned(self, ground: GroundState) -> "Robot":
+        """The same with those. Raises ValueError, which the operator reads, if they do not fit."""
+        fence, place = self.told(ground)
+        try:
+            parameters = replace(
+                self.parameters, slot=place.slot, landing_point_m=place.landing_point_m
+            )
+            return replace(self, fence=fence, parameters=parameters)
+        except ValueError as error:
+            raise ValueError(f"the ground's fence or place does not fit: {error}") from None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tick:
+    """Memory and inputs together, and what follows from them."""
+
+    robot: Robot
+    flight: FlightMemory
+    inputs: FlightInputs
+
+    @property
+    def age_s(self) -> float:
+        return self.inputs.now_s - self.flight.since_s
+
+    @property
+    def mode(self) -> Mode | None:
+        return self.inputs.vehicle.mode
+
+    @property
+    def heard_since_entry(self) -> bool:
+        return self.inputs.vehicle.heartbeat_at_s > self.flight.since_s
+
+    @property
+    def silent(self) -> bool:
+        return is_silent(self.flight, self.inputs.now_s)
+
+    @property
+    def safety_action(self) -> SafetyAction:
+        ground = self.inputs.ground
+        if ground is None or not self.ground_heard:
+            return "none"
+        asked = ground.safety_action_for(self.robot.robot_id)
+        enabled = ground.enabled_for(self.robot.robot_id)
+        return "hold" if asked == "none" and not enabled else asked
+
+    @property
+    def ground_heard(self) -> bool:
+        return self.inputs.ground_age_s <= self.robot.parameters.ground_timeout_s
+
+    @property
+    def height_m(self) -> float | None:
+        return height_m(self.flight, self.inputs.odometry)
+
+    @property
+    def knows_place(self) -> bool:
+        """Whether the position is good to fly by."""
+        return self.inputs.position.quality is PositionQuality.GOOD
+
+    @property
+    def lapse_s(self) -> float:
+        """How long the control loop was silent; 0 if it was not, or has just begun."""
+        silence_s = self.inputs.now_s - self.flight.tick_at_s
+        return silence_s if exceeds_silence(self.robot, silence_s) else 0.0
+
+    @property
+    def acts_from_s(self) -> float:
+        """From when on the state's setpoints and commands are sent."""
+        return max(self.flight.since_s, self.flight.silent_until_s)
+
+    @property
+    def could_follow_s(self) -> float:
+        """For how long the autopilot has been able to go to offboard."""
+        return self.inputs.now_s - max(self.acts_from_s, self.flight.failsafe_at_s)
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the autopilot had its time to go to offboard."""
+        return self.could_follow_s > OFFBOARD_TIMEOUT_S
+
+    @property
+    def failsafe_acts(self) -> bool:
+        return failsafe_acts(self.inputs.vehicle)
+
+
+def height_m(flight: FlightMemory, odometry: Odometry | None) -> float | None:
+    """Height above the robot's own takeoff point, m; None when unknown."""
+    if odometry is None or flight.datum_m is None:
+        return None
+    return odometry.position_m[2] - flight.datum_m
+
+
+def flown_s(flight: FlightMemory, vehicle: VehicleState, now_s: float) -> float | None:
+    """How long ago the vehicle was armed, s; None if it is not, or was so before this program."""
+    since_s = now_s - flight.disarmed_at_s
+    return since_s if vehicle.armed and math.isfinite(since_s) else None
+
+
+def failsafe_acts(vehicle: VehicleState) -> bool:
+    """Whether the autopilot's own failsafe has the vehicle: who asks for another mode ends it.
+
+    PX4 v1.14 calls a warning a failsafe, too: then it still does what it is told in offboard.
+    """
+    return vehicle.failsafe is True and vehicle.mode not in (Mode.OFFBOARD, *PILOTED)
+
+
+def exceeds_silence(robot: Robot, silence_s: float) -> bool:
+    """Whether the control loop was silent for too long; not if it has just begun, with inf.
+
+    A little before the watchdog counts, so that what it does is never taken for a pilot's.
+    """
+    return _LAPSE_SHARE * robot.parameters.command_timeout_s < silence_s < math.inf
+
+
+def is_silent(flight: FlightMemory, now_s: float) -> bool:
+    """Whether no setpoint may be sent yet, after a lapse."""
+    return now_s < flight.silent_until_s

@@ -1,0 +1,240 @@
+"""One control tick of the flight state machine: memory and inputs -> memory, and what to ask.
+
+Pure: the caller has the clock, and commands the autopilot.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+from edge.core.vehicle import Action, Mode, Vector, VehicleState
+from edge.flight.alarms import alarms
+from edge.flight.orders import ORDERS, answered, new_order, obeyed, refusal
+from edge.flight.state import (
+    STALE_TELEMETRY_S,
+    FlightInputs,
+    FlightMemory,
+    Robot,
+    Tick,
+    failsafe_acts,
+    is_silent,
+)
+from edge.flight.transitions import TRANSITIONS, Transition
+from edge.messages.mission import ON_GROUND, STEERED, FlightState, OrderKind
+
+_S = FlightState
+
+# PX4 wants a setpoint stream before offboard, and earlier commands are carried out meanwhile.
+_STREAM_S = 0.5
+_ASK_AGAIN_S = 1.0
+_LANDED_DISARM_S = 3.0
+
+
+class Decision(NamedTuple):
+    """A tick's outcome; `new_trial`: the explored map and the mailbox are to be forgotten.
+
+    `taken` is the row of `TRANSITIONS` that led to the state, None if it stays.
+    """
+
+    flight: FlightMemory
+    actions: tuple[Action, ...]
+    alarms: tuple[str, ...]
+    new_trial: bool
+    taken: Transition | None
+
+
+def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
+    """One control tick: at most one transition, and what to ask of the autopilot now."""
+    flight = _look(Tick(robot, flight, inputs))
+    order = new_order(robot, flight, inputs)
+    tick = Tick(robot, flight, inputs)
+    refused = None if order is None else refusal(tick, order)
+    taken = None if order is None or refused is not None else order
+    row, reason = _first_row(tick, None if taken is None else taken.kind)
+    overruled = row is not None and row.order is None
+    if taken is not None and overruled and not ORDERS[taken.kind].moves_nothing:
+        # Something graver came first.
+        taken, refused = None, reason
+    actions: tuple[Action, ...] = ()
+    if row is not None:
+        flight, actions = enter(row, reason, tick), row.actions
+    if order is not None:
+        flight = answered(flight, order, refused)
+    new_trial = False
+    if taken is not None:
+        flight, new_trial = obeyed(flight, taken)
+    tick = Tick(robot, flight, inputs)
+    asked = _ask(tick)
+    flight = replace(
+        flight,
+        tick_at_s=inputs.now_s,
+        target_m=_target_m(tick),
+        asked_at_s=inputs.now_s if asked else flight.asked_at_s,
+        armed_asked=flight.armed_asked or Action.ARM in asked,
+    )
+    return Decision(flight, actions + asked, alarms(tick), new_trial, row)
+
+
+def _look(t: Tick) -> FlightMemory:
+    """The memory, with what this tick's inputs add to it, before any transition."""
+    flight, inputs, now_s = t.flight, t.inputs, t.inputs.now_s
+    vehicle = inputs.vehicle
+    if t.lapse_s > 0.0:
+        flight = replace(flight, silent_until_s=now_s + STALE_TELEMETRY_S)
+    if vehicle.heartbeat_at_s > t.acts_from_s + _STREAM_S and not is_silent(flight, now_s):
+        flight = replace(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
+    if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
+        flight = replace(flight, silent_until_s=-math.inf)
+    landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
+    down = flight.state is _S.LAND and vehicle.in_air is False
+    flight = replace(flight, landed_since_s=landed_since_s if down else None)
+    if failsafe_acts(vehicle):
+        flight = replace(flight, failsafe_at_s=now_s)
+        if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
+            # PX4 goes on landing by itself; if it does not, it is asked again.
+            flight = replace(flight, reached=False, asked_at_s=now_s)
+    if vehicle.connected and vehicle.armed is False:
+        flight = replace(flight, disarmed_at_s=now_s)
+        # What was on its way when arming was called off has arrived by then.
+        looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
+        if flight.state in ON_GROUND and looked:
+            flight = replace(flight, armed_by="")
+    if vehicle.remote_control:
+        flight = replace(flight, remote_control_at_s=now_s)
+    flight = replace(flight, alone_since_s=_alone_since_s(t))
+    if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
+        flight = replace(flight, datum_m=_home_m(inputs))
+    return flight
+
+
+def _alone_since_s(t: Tick) -> float | None:
+    flight, now_s, order = t.flight, t.inputs.now_s, t.inputs.order
+    ordered = order is not None and order.robot_id == t.robot.robot_id
+    taken = flight.state is _S.PILOT and t.mode is not Mode.HOLD
+    if ordered or t.safety_action == "hold" or taken:
+        return None
+    begins = flight.state is _S.HOLD and t.failsafe_acts
+    return now_s if begins and flight.alone_since_s is None else flight.alone_since_s
+
+
+def _as_needed(state: FlightState, vehicle: VehicleState) -> bool:
+    if state is _S.FAULT:
+        return vehicle.armed is False
+    return vehicle.mode is (Mode.LAND if state is _S.LAND else Mode.OFFBOARD)
+
+
+def _first_row(tick: Tick, ordered: OrderKind | None) -> tuple[Transition | None, str]:
+    for row in TRANSITIONS:
+        if tick.flight.state in row.sources and row.order in (None, ordered):
+            reason = row.why(tick)
+            if reason is not None:
+                return row, reason
+    return None, ""
+
+
+def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
+    """The memory with which the row's target begins."""
+    flight, now_s = t.flight, t.inputs.now_s
+    from_offboard = flight.state in (_S.ARMING, *STEERED)
+    stays_offboard = from_offboard and row.target in STEERED and not row.looks_anew
+    in_hold = t.mode is Mode.HOLD
+    alone = row.left_alone == "yes" or (row.left_alone == "if in hold" and in_hold)
+    alone_since_s = now_s if flight.alone_since_s is None else flight.alone_since_s
+    return replace(
+        flight,
+        state=row.target,
+        reason=reason,
+        alarming=row.alarm,
+        since_s=now_s,
+        datum_m=_datum_m(row.target, t),
+        target_m=flight.target_m if row.keeps_target else None,
+        reached=stays_offboard and flight.reached,
+        rejoined_at_s=now_s if row.rejoins else flight.rejoined_at_s,
+        asked_at_s=-math.inf,
+        armed_asked=False,
+        armed_by=_armed_by(row.target, flight),
+        alone_since_s=alone_since_s if alone else None,
+        landed_since_s=None,
+        land_by=row.land_by,
+        killed=flight.killed or row.kills,
+    )
+
+
+def _armed_by(target: FlightState, flight: FlightMemory) -> str:
+    called_off = flight.state is _S.ARMING and not flight.armed_asked
+    return "" if called_off or target in (_S.PREFLIGHT, _S.LANDED) else flight.armed_by
+
+
+def _datum_m(target: FlightState, t: Tick) -> float | None:
+    odometry = t.inputs.odometry
+    if target is _S.TAKEOFF and odometry is not None:
+        return odometry.position_m[2]
+    if target in (_S.LANDED, _S.INIT):
+        return None
+    return t.flight.datum_m
+
+
+def _home_m(inputs: FlightInputs) -> float | None:
+    """For a program that starts in flight, the takeoff point is where the vehicle was armed."""
+    odometry, above_home_m = inputs.odometry, inputs.vehicle.height_above_home_m
+    if odometry is None or above_home_m is None:
+        return None
+    return odometry.position_m[2] - above_home_m
+
+
+def _target_m(t: Tick) -> Vector | None:
+    """Above the takeoff point, or where the vehicle was when it could be told to stay there."""
+    odometry, height, state = t.inputs.odometry, t.height_m, t.flight.state
+    if state not in (_S.TAKEOFF, _S.HOLD):
+        return None
+    target_m = t.flight.target_m
+    if odometry is None or height is None:
+        return target_m
+    # Nobody, or PX4's own failsafe, steered it meanwhile.
+    led_away = t.silent or t.failsafe_acts
+    if target_m is not None and t.knows_place and not led_away:
+        return target_m
+    fence = t.robot.fence
+    # While the position is in doubt, numbers that were good before may be another place now.
+    x_m, y_m = fence.moved_inside_m(*odometry.position_m[:2], fence.buffer_m / 2.0)
+    if state is _S.TAKEOFF:
+        return x_m, y_m, t.robot.parameters.slot_height_m
+    return x_m, y_m, height if target_m is None or led_away else target_m[2]
+
+
+def _ask(t: Tick) -> tuple[Action, ...]:
+    """What the state needs from the autopilot, asked again until it is so; ARM is asked once."""
+    flight, now_s = t.flight, t.inputs.now_s
+    streamed = t.could_follow_s >= _STREAM_S
+    if flight.state is _S.LAND:
+        since_s = flight.landed_since_s
+        if since_s is not None and now_s - since_s > _LANDED_DISARM_S:
+            return _again(t, Action.DISARM)
+        asked_lately = now_s - flight.asked_at_s < t.robot.parameters.hover_land_s
+        if flight.reached or (t.failsafe_acts and (t.mode is Mode.LAND or asked_lately)):
+            return ()
+        return _again(t, Action.LAND)
+    if flight.state is _S.FAULT:
+        return _again(t, Action.KILL) if flight.killed and not flight.reached else ()
+    if flight.state is _S.ARMING and flight.reached:
+        return () if flight.armed_asked else (Action.ARM,)
+    if flight.state in ON_GROUND and t.inputs.vehicle.armed is False:
+        # Where a flight leaves PX4, it would not arm again.
+        stuck = t.heard_since_entry and t.mode in (Mode.OFFBOARD, Mode.LAND, Mode.RETURN)
+        return _again(t, Action.HOLD) if stuck else ()
+    if t.silent and flight.state in STEERED:
+        # Without setpoints it would land. Before a look, a pilot may have it.
+        flies_on = t.mode is Mode.OFFBOARD and t.heard_since_entry
+        return _again(t, Action.HOLD) if flies_on else ()
+    if flight.state in (_S.ARMING, *STEERED) and streamed and not flight.reached:
+        return _again(t, Action.OFFBOARD)
+    return ()
+
+
+def _again(t: Tick, action: Action) -> tuple[Action, ...]:
+    asked_at_s = t.flight.asked_at_s
+    if t.inputs.now_s - asked_at_s < _ASK_AGAIN_S:
+        return ()
+    # A mode is asked for again only after a look: a pilot may have taken the vehicle in between.
+    looked = t.inputs.vehicle.heartbeat_at_s > asked_at_s + _STREAM_S
+    return (action,) if looked or action in (Action.DISARM, Action.KILL) else ()

@@ -1,0 +1,403 @@
+"""The flight state machine as a table: which state leads to which, when, and what that does.
+
+`TRANSITIONS` is the machine, gravest first: in every tick the first row that applies is taken. A
+row says all that it does, so that nothing else asks which row it was. docs/safety.md shows the same
+table to people.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Literal
+
+from edge.core.position import PositionQuality
+from edge.core.vehicle import PILOTED, Action, Mode
+from edge.flight.alarms import (
+    battery_below,
+    battery_low,
+    failsafe,
+    ground_lost,
+    position_not_good,
+    reason_if,
+    remote_control_lost,
+    too_close,
+)
+from edge.flight.state import OFFBOARD_TIMEOUT_S, STALE_TELEMETRY_S, LandBy, Tick
+from edge.messages.mission import AIRBORNE, STEERED, FlightState, OrderKind
+
+_S = FlightState
+
+_ARMING_TIMEOUT_S = 6.0
+_AT_HEIGHT_M = 0.5
+_AT_LANDING_POINT_M = 0.5
+_AT_REST_M_S = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One row: from any of `sources` to `target` when `why` gives a reason; `when` is for people.
+
+    A row with `order` applies only in a tick that obeys such an order. `actions` are asked of the
+    autopilot once. `alarm`: the operator must see the reason for as long as the target lasts.
+    `land_by` is who has it land, if it then lands.
+    `left_alone`: whether the vehicle then hovers for no reason that anybody gave.
+    `looks_anew`: what was seen of a vehicle that this program steers counts no more, though it
+    steers it on. `keeps_target`: the state before goes on to where it was flying. `rejoins`: a
+    pilot's mode is to be ended. `kills`: the motors stop for good.
+    """
+
+    sources: tuple[FlightState, ...]
+    target: FlightState
+    when: str
+    why: Callable[[Tick], str | None]
+    _: KW_ONLY
+    order: OrderKind | None = None
+    actions: tuple[Action, ...] = ()
+    alarm: bool = False
+    land_by: LandBy = "safety"
+    left_alone: Literal["no", "if in hold", "yes"] = "no"
+    looks_anew: bool = False
+    keeps_target: bool = False
+    rejoins: bool = False
+    kills: bool = False
+
+
+def _always(reason: str) -> Callable[[Tick], str | None]:
+    return lambda _: reason
+
+
+def _disarmed(t: Tick) -> str | None:
+    return reason_if(t.inputs.vehicle.armed is False, "disarmed")
+
+
+def _link_lost(t: Tick) -> str | None:
+    lost = not t.inputs.vehicle.connected and not t.silent
+    return reason_if(lost, "the autopilot does not answer")
+
+
+def _disarmed_again(t: Tick) -> str | None:
+    return _disarmed(t) if t.heard_since_entry and not t.flight.killed else None
+
+
+def _armed_before(t: Tick) -> str | None:
+    whose = _armed_by_us(t) or "the vehicle was already armed when this program found it"
+    text = f"{whose}: only observing; rejoin it, or a pilot lands it"
+    return reason_if(t.inputs.vehicle.armed is True, text)
+
+
+def _armed_by_others(t: Tick) -> str | None:
+    if not t.inputs.vehicle.armed or t.flight.armed_asked:
+        return None
+    ours = t.flight.state is not _S.ARMING and _armed_by_us(t)
+    if ours:
+        return f"{ours}: only observing; rejoin it, or a pilot lands it"
+    return "the vehicle is armed, without an order: only observing"
+
+
+def _armed_by_us(t: Tick) -> str:
+    operator = t.flight.armed_by
+    return operator and f"armed by this program, on {operator}'s takeoff order"
+
+
+def _armed_again(t: Tick) -> str | None:
+    answers = t.inputs.vehicle.connected and t.heard_since_entry and not t.flight.killed
+    return _armed_by_others(t) if answers else None
+
+
+def _pilot(t: Tick) -> str | None:
+    # Right after a rejoin, the pilot's mode is the one that the operator wants to end.
+    ending = not t.flight.reached and (
+        t.inputs.now_s - t.flight.rejoined_at_s <= OFFBOARD_TIMEOUT_S
+    )
+    return reason_if(t.mode in PILOTED and not ending, f"a pilot flies it ({t.mode})")
+
+
+def _left_offboard(t: Tick) -> str | None:
+    left = t.flight.reached and t.mode not in (Mode.OFFBOARD, Mode.LAND)
+    return reason_if(left and not t.failsafe_acts, f"the vehicle left offboard for {t.mode}")
+
+
+def _left_land(t: Tick) -> str | None:
+    return reason_if(
+        t.flight.reached and t.mode is not Mode.LAND, f"the vehicle left land for {t.mode}"
+    )
+
+
+def _failsafe_takes(t: Tick) -> str | None:
+    known = t.flight.reached or t.heard_since_entry
+    return failsafe(t) if known and t.mode is not Mode.LAND else None
+
+
+def _lapse(t: Tick) -> str | None:
+    return reason_if(t.lapse_s > 0.0, f"control was silent for {t.lapse_s:.1f} s")
+
+
+def _autopilot_lands(t: Tick) -> str | None:
+    # Else it lands because it was told to, before this state.
+    lapsed = t.flight.silent_until_s > -math.inf and not t.silent
+    by_itself = t.flight.reached or t.overdue or lapsed or t.failsafe_acts
+    return reason_if(t.mode is Mode.LAND and by_itself, "the autopilot lands by itself")
+
+
+def _offboard_refused(t: Tick) -> str | None:
+    refused = t.overdue and not t.flight.reached
+    return reason_if(refused, f"offboard refused{_refusal(t, Action.OFFBOARD)}")
+
+
+def _position_lost(t: Tick) -> str | None:
+    position = t.inputs.position
+    lost = position.quality is PositionQuality.LOST and not t.silent
+    return reason_if(lost, f"position lost: {position.text}")
+
+
+def _on_ground(t: Tick) -> str | None:
+    # Nothing that the ground repeats may lift a vehicle off.
+    return reason_if(t.inputs.vehicle.in_air is False and not t.silent, "it stands on the ground")
+
+
+def _battery_critical(t: Tick) -> str | None:
+    return battery_below(t, t.robot.parameters.battery_critical, "critical")
+
+
+def _ground_lands(t: Tick) -> str | None:
+    return reason_if(t.safety_action == "land", "ground commands land")
+
+
+def _ground_ends_takeoff(t: Tick) -> str | None:
+    return reason_if(
+        t.safety_action in ("land", "return"), f"ground commands {t.safety_action} during takeoff"
+    )
+
+
+def _ground_holds(t: Tick) -> str | None:
+    return reason_if(t.safety_action == "hold", "ground commands hold")
+
+
+def _ground_holds_landing(t: Tick) -> str | None:
+    emergency = t.flight.land_by == "safety" or t.failsafe_acts
+    return None if emergency else _ground_holds(t)
+
+
+def _ground_returns(t: Tick) -> str | None:
+    return reason_if(t.safety_action == "return" and not t.failsafe_acts, "ground commands return")
+
+
+def _ground_returns_landing(t: Tick) -> str | None:
+    return _ground_returns(t) if t.flight.land_by == "ground" else None
+
+
+def _holds_without_remote_control(t: Tick) -> str | None:
+    return remote_control_lost(t) if t.robot.on_remote_control_lost == "hold" else None
+
+
+def _lands_without_remote_control(t: Tick) -> str | None:
+    return remote_control_lost(t) if t.robot.on_remote_control_lost == "land" else None
+
+
+def _ground_long_lost(t: Tick) -> str | None:
+    parameters = t.robot.parameters
+    limit_s = parameters.ground_timeout_s + parameters.ground_lost_land_s
+    lost = t.inputs.ground_age_s > limit_s and not t.silent
+    return reason_if(lost, f"ground lost for {limit_s:g} s")
+
+
+def _battery_low_in_hold(t: Tick) -> str | None:
+    free = t.safety_action == "none" and t.ground_heard and not t.failsafe_acts
+    return battery_low(t) if free else None
+
+
+def _left_alone(t: Tick) -> str | None:
+    since_s, limit_s = t.flight.alone_since_s, t.robot.parameters.hover_land_s
+    if since_s is None or t.silent or t.inputs.vehicle.in_air is not True:
+        return None
+    return reason_if(t.inputs.now_s - since_s > limit_s, f"nobody answered for {limit_s:g} s")
+
+
+def _policy_stale(t: Tick) -> str | None:
+    return reason_if(t.inputs.policy_velocity_m_s is None, "the policy has no fresh answer")
+
+
+def _found(t: Tick) -> str | None:
+    vehicle = t.inputs.vehicle
+    found = vehicle.connected and vehicle.armed is False and t.knows_place
+    return reason_if(found, "autopilot and position found")
+
+
+def _enabled(t: Tick) -> str | None:
+    ground = t.inputs.ground
+    if ground is None or ground.origin is None or not t.ground_heard:
+        return None
+    return reason_if(ground.enabled_for(t.robot.robot_id), "enabled")
+
+
+def _enabled_at_rest(t: Tick) -> str | None:
+    # Until then the operator sees why arming failed, and telemetry that the vehicle is disarmed.
+    return _enabled(t) if t.age_s > STALE_TELEMETRY_S else None
+
+
+def _not_enabled(t: Tick) -> str | None:
+    return reason_if(_enabled(t) is None, "not enabled" if t.ground_heard else "ground lost")
+
+
+def _may_fly_again(t: Tick) -> str | None:
+    return _enabled(t) if t.safety_action == "none" else None
+
+
+def _arming_called_off(t: Tick) -> str | None:
+    if not t.ground_heard:
+        return "ground lost while arming"
+    if t.safety_action != "none":
+        return f"ground commands {t.safety_action} while arming"
+    if not t.knows_place and not t.silent:
+        return f"{position_not_good(t)}, while arming"
+    left = t.flight.reached and t.mode is not Mode.OFFBOARD
+    return _lapse(t) or reason_if(left, f"the vehicle left offboard for {t.mode} while arming")
+
+
+def _arming_failed(t: Tick) -> str | None:
+    for action in (Action.OFFBOARD, Action.ARM):
+        refusal = _refusal(t, action)
+        if refusal:
+            return f"{action} refused{refusal}"
+    return reason_if(t.age_s > _ARMING_TIMEOUT_S, "the autopilot does not arm")
+
+
+def _armed(t: Tick) -> str | None:
+    armed = t.flight.armed_asked and t.inputs.vehicle.armed is True
+    return reason_if(armed and t.inputs.odometry is not None, "armed")
+
+
+def _lift_off_failed(t: Tick) -> str | None:
+    height, parameters = t.height_m, t.robot.parameters
+    climb_s = 2.0 * parameters.slot_height_m / t.robot.limits.max_climb_m_s
+    lifted = t.inputs.vehicle.in_air and height is not None and height > _AT_HEIGHT_M
+    limit_s = parameters.takeoff_timeout_s + (climb_s if lifted else 0.0)
+    return reason_if(t.age_s > limit_s, "takeoff failed: not climbing")
+
+
+def _at_slot(t: Tick) -> str | None:
+    height = t.height_m
+    wanted_m = t.robot.parameters.slot_height_m
+    there = height is not None and height > wanted_m - _AT_HEIGHT_M
+    return reason_if(there and t.inputs.vehicle.in_air is True, f"at its height, {wanted_m:g} m")
+
+
+def _at_landing_point(t: Tick) -> str | None:
+    odometry = t.inputs.odometry
+    if odometry is None:
+        return None
+    away_m = math.dist(odometry.position_m[:2], t.robot.parameters.landing_point_m)
+    speed_m_s = math.hypot(*odometry.velocity_m_s[:2])
+    return reason_if(
+        away_m < _AT_LANDING_POINT_M and speed_m_s < _AT_REST_M_S, "at the landing point"
+    )
+
+
+def _refusal(t: Tick, action: Action) -> str:
+    """ ": reason" of the last command, if it was this one, of this state, and refused."""
+    result = t.inputs.vehicle.result
+    if result is None or result.action is not action or result.accepted:
+        return ""
+    return f": {result.text}" if result.at_s >= t.flight.since_s else ""
+
+
+TRANSITIONS: tuple[Transition, ...] = (
+    Transition(tuple(_S), _S.FAULT, "the operator orders kill",
+               _always("killed by the operator"), order="kill", alarm=True, kills=True),
+    Transition((_S.ARMING, *AIRBORNE, _S.PILOT), _S.PILOT,
+               "the operator orders disarm, on the ground", _always("disarm ordered"),
+               order="disarm", actions=(Action.DISARM,)),
+    # What the vehicle does, whoever made it.
+    Transition((*AIRBORNE, _S.PILOT), _S.LANDED, "the vehicle is disarmed", _disarmed),
+    Transition((_S.FAULT,), _S.INIT, "the vehicle is disarmed, and was not killed",
+               _disarmed_again),
+    Transition((*AIRBORNE, _S.PILOT), _S.FAULT, "the autopilot does not answer", _link_lost,
+               alarm=True),
+    Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED), _S.INIT, "the autopilot does not answer",
+               _link_lost),
+    Transition((_S.ARMING,), _S.INIT, "the autopilot does not answer", _link_lost,
+               actions=(Action.DISARM,)),
+    Transition((_S.INIT,), _S.PILOT, "the vehicle is armed when the program finds it",
+               _armed_before, alarm=True, left_alone="if in hold"),
+    Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED, _S.ARMING), _S.PILOT,
+               "the vehicle is armed, not by this program", _armed_by_others, alarm=True),
+    Transition((_S.FAULT,), _S.PILOT, "the autopilot answers again, armed, and was not killed",
+               _armed_again, alarm=True, left_alone="if in hold"),
+    # A pilot, and the autopilot's own failsafe.
+    Transition(AIRBORNE, _S.PILOT, "a pilot's mode is on", _pilot, alarm=True),
+    Transition(STEERED, _S.HOLD, "the control loop was silent", _lapse, alarm=True,
+               left_alone="yes", looks_anew=True),
+    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD,
+               "the autopilot's own failsafe holds or moves the vehicle", _failsafe_takes,
+               alarm=True, left_alone="yes"),
+    Transition(STEERED, _S.PILOT, "the vehicle left offboard", _left_offboard, alarm=True),
+    Transition((_S.LAND,), _S.PILOT, "the vehicle left land", _left_land, alarm=True),
+    Transition(STEERED, _S.LAND, "the autopilot lands by itself", _autopilot_lands, alarm=True),
+    Transition((_S.HOLD, _S.RETURN), _S.PILOT, "offboard is refused", _offboard_refused,
+               alarm=True, left_alone="if in hold"),
+    # What cannot wait for anybody.
+    Transition(STEERED, _S.LAND, "the position is lost", _position_lost, alarm=True),
+    Transition(STEERED, _S.LAND, "the battery is critical", _battery_critical, alarm=True),
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "it stands on the ground", _on_ground,
+               alarm=True),
+    # The operator gives it away.
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.PILOT, "the operator orders pilot",
+               _always("given to a pilot"), order="pilot", actions=(Action.HOLD,), alarm=True),
+    # The ground holds, returns or lands it.
+    Transition((_S.ARMING,), _S.IDLE, "the ground commands hold, land or return, or is lost; the "
+               "control loop was silent; the vehicle left offboard",
+               _arming_called_off, actions=(Action.DISARM,), alarm=True),
+    Transition((_S.TAKEOFF,), _S.LAND, "the ground commands land or return",
+               _ground_ends_takeoff, land_by="return"),
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "the ground commands land",
+               _ground_lands, land_by="ground"),
+    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, "the ground commands hold",
+               _ground_holds),
+    Transition((_S.LAND,), _S.HOLD, "the ground commands hold, and landing was no emergency",
+               _ground_holds_landing),
+    Transition((_S.HOLD, _S.MISSION), _S.RETURN, "the ground commands return", _ground_returns),
+    Transition((_S.LAND,), _S.RETURN, "the ground commands return, and had commanded land",
+               _ground_returns_landing),
+    # What the robot notices by itself.
+    Transition((_S.MISSION,), _S.HOLD, "a neighbour is too close", too_close, alarm=True),
+    Transition((_S.TAKEOFF, _S.MISSION), _S.HOLD,
+               "the remote control is lost, and rc_lost = hold", _holds_without_remote_control,
+               alarm=True),
+    Transition((_S.TAKEOFF, _S.HOLD, _S.MISSION), _S.LAND,
+               "the remote control is lost, and rc_lost = land", _lands_without_remote_control,
+               alarm=True),
+    Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", ground_lost, alarm=True),
+    Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, "the ground stays lost", _ground_long_lost,
+               alarm=True),
+    Transition((_S.HOLD, _S.PILOT), _S.LAND,
+               "it hovers for no reason that anybody gave, and nobody answers", _left_alone,
+               alarm=True),
+    Transition((_S.MISSION,), _S.RETURN, "the battery is low, or just lasts for the way home",
+               battery_low, alarm=True),
+    Transition((_S.HOLD,), _S.RETURN,
+               "the same, and the ground commands nothing",
+               _battery_low_in_hold, alarm=True),
+    Transition((_S.MISSION,), _S.HOLD, "the policy has no fresh answer", _policy_stale,
+               alarm=True),
+    # The way of a flight.
+    Transition((_S.INIT,), _S.IDLE, "autopilot, position and estimator origin are known", _found),
+    Transition((_S.IDLE,), _S.PREFLIGHT, "the ground enables and has set an origin, after 2 s",
+               _enabled_at_rest),
+    Transition((_S.PREFLIGHT,), _S.IDLE, "the ground does not enable, or is lost", _not_enabled),
+    Transition((_S.PREFLIGHT,), _S.ARMING, "the operator orders takeoff, and the robot is ready",
+               _always("takeoff ordered"), order="takeoff"),
+    Transition((_S.ARMING,), _S.TAKEOFF, "the vehicle is armed", _armed),
+    Transition((_S.ARMING,), _S.IDLE, "offboard or arming is refused, or takes too long",
+               _arming_failed, actions=(Action.DISARM,), alarm=True),
+    Transition((_S.TAKEOFF,), _S.HOLD, "at its height, and the autopilot says in the air",
+               _at_slot, keeps_target=True),
+    Transition((_S.TAKEOFF,), _S.LAND, "it does not climb", _lift_off_failed, alarm=True),
+    Transition((_S.HOLD,), _S.MISSION, "the operator orders start",
+               _always("mission started"), order="start"),
+    Transition((_S.RETURN,), _S.LAND, "at its landing point", _at_landing_point,
+               land_by="return"),
+    Transition((_S.PILOT,), _S.HOLD, "the operator orders rejoin",
+               _always("taken back by the operator"), order="rejoin", rejoins=True),
+    Transition((_S.LANDED,), _S.PREFLIGHT, "enabled, and the ground commands nothing",
+               _may_fly_again),
+)  # fmt: skip
