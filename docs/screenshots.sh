@@ -22,7 +22,7 @@ lpac mission origin 39.9526 -75.1652 30
 lpac mission enable
 # Patient, and begun before the flight: the robots' programs fly in real time.
 address=$(grep -o 'http://[^ ]*' "$out/map.log")
-nice python -m tests.ground.browser "$address" docs/map.png --wait 55 &
+nice python -m tests.process.ground.browser "$address" docs/map.png --wait 55 &
 page=$!
 lpac mission takeoff --interval 1
 lpac mission start

@@ -1,12 +1,6 @@
-"""What many tests share: the shipped policy, and the robot's image."""
+"""What all tests share: their tiers, and the shipped policy."""
 
-import functools
-import os
-import platform
-import shutil
 import signal
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,7 +12,8 @@ from edge.policy.lpac.graphs import Policy
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
 
-BuildImage = Callable[[str], Path]
+# The folders below tests/, each a marker; README.md there says what belongs in which.
+TIERS = ("unit", "sim", "process", "host")
 
 # A busy machine is slow now and then; and whatever fails is to fail again.
 settings.register_profile(
@@ -36,7 +31,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--vehicle",
         choices=("simulated", "px4"),
         default="simulated",
-        help="what tests/sim/test_faults.py flies",
+        help="what tests/process/sim/test_faults.py flies",
     )
     group.addoption(
         "--px4", type=Path, metavar="DIR", help="PX4's build folder, as `make px4_sitl` fills it"
@@ -44,6 +39,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    for tier in TIERS:
+        config.addinivalue_line("markers", f"{tier}: what is in tests/{tier}")
     config.addinivalue_line(
         "markers", "simulated_only(reason): not flown with --vehicle px4, and why"
     )
@@ -51,7 +48,13 @@ def pytest_configure(config: pytest.Config) -> None:
         raise pytest.UsageError("--vehicle px4 needs --px4 with PX4's build folder")
 
 
+@pytest.hookimpl(tryfirst=True)  # before -m chooses by marker
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        tier = item.path.relative_to(ROOT / "tests").parts[0]
+        if tier not in TIERS:
+            raise pytest.UsageError(f"{item.path} is in none of the tiers {', '.join(TIERS)}")
+        item.add_marker(tier)
     if config.getoption("--vehicle") != "px4":
         return
     for item in items:
@@ -67,28 +70,3 @@ def shipped_bundle() -> Bundle:
 @pytest.fixture(scope="session")
 def shipped_policy(shipped_bundle: Bundle) -> Policy:
     return Policy(shipped_bundle)
-
-
-@pytest.fixture(scope="session")
-def build_image() -> BuildImage:
-    """Builds the image for an architecture, if something in it changed; returns its tree."""
-    if os.geteuid() != 0:
-        pytest.skip("needs root: the image is built and entered with chroot")
-    missing = [tool for tool in ("buildah", "mmdebstrap") if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"needs: sudo apt install {' '.join(missing)}")
-
-    @functools.cache
-    def build(architecture: str) -> Path:
-        subprocess.run([ROOT / "deploy" / "docker" / "image.sh", architecture], check=True)
-        return ROOT / "out" / "image" / architecture / "root"
-
-    return build
-
-
-@pytest.fixture(scope="session")
-def amd64_image(build_image: BuildImage) -> Path:
-    """The folder of the image for robot hosts on this machine."""
-    if platform.machine() != "x86_64":
-        pytest.skip("robot hosts are x86-64")
-    return build_image("amd64").parent

@@ -1,8 +1,8 @@
 """MAVLink 2 for one simulated vehicle: datagrams in, datagrams out; no socket and no clock.
 
-What is told, when and in which bits is PX4 v1.17's: tests/sim/test_px4_recordings.py holds it to
-recordings of a real one, on its link to a companion computer. Parameters travel with their bytes in
-the float, an unknown parameter gets no answer, a fence is uploaded as a mission.
+What is told, when and in which bits is PX4 v1.17's: tests/sim/sim/test_px4_recordings.py holds it
+to recordings of a real one, on its link to a companion computer. Parameters travel with their bytes
+in the float, an unknown parameter gets no answer, a fence is uploaded as a mission.
 """
 
 import math

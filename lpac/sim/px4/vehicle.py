@@ -5,7 +5,7 @@ its position with an error: a GPS bias and slow noise, and with `Errors` much mo
 starts at the estimator's origin, which is neither the launch point nor its height.
 
 Times of the estimator, of checks and of failsafes are those that a real PX4 v1.17 was seen with, by
-its own clock: tests/sim/test_px4_recordings.py compares them.
+its own clock: tests/sim/sim/test_px4_recordings.py compares them.
 """
 
 import math

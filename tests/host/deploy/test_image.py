@@ -1,0 +1,248 @@
+"""The robot's image: what is in it, what it was made of, and that it runs."""
+
+import json
+import os
+import re
+import shutil
+import stat
+import subprocess
+import tarfile
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from bench import release
+from lpac.fleet.image import measure, package_of, table
+from tests.conftest import ROOT, SHIPPED
+from tests.host.conftest import BuildImage
+from tests.host.deploy.entering import inside
+
+DOCKER = ROOT / "deploy" / "docker"
+ARCHITECTURES = ("amd64", "arm64")
+ELF_MACHINES = {"amd64": 62, "arm64": 183}
+FORBIDDEN = re.compile(
+    r"(torch|pip|setuptools|wheel|rich|libtorch.*)"  # packages of a workstation
+    r"|(sh|bash|dash|busybox|gcc|g\+\+|cc|cc1|ld|as|make|apt.*|dpkg.*|perl.*)"  # programs
+    r"|.*\.(h|a|pyi)|tests?|ensurepip|idlelib|lib2to3|tkinter"
+)
+
+
+def pinned(lock: Path) -> dict[str, str]:
+    """Package -> version, in a lock of Python packages."""
+    entries = re.findall(r"^([\w.-]+)==(\S+) .*\\\n((?:    --hash=sha256:\w{64}.*\n)+)",
+                         lock.read_text(), re.MULTILINE)  # fmt: skip
+    lines = [line for line in lock.read_text().splitlines() if re.match(r"\w", line)]
+    assert len(entries) == len(lines), "each has hashes"
+    return {canonicalize_name(name): version for name, version, _ in entries}
+
+
+@pytest.mark.parametrize("lock", ["requirements.lock", "build.lock"])
+def test_the_locks_are_what_the_project_asks_for(lock: str) -> None:
+    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    asked = {
+        "requirements.lock": pyproject["project"]["dependencies"],
+        "build.lock": pyproject["build-system"]["requires"],
+    }
+    versions = pinned(DOCKER / lock)
+    for requirement in map(Requirement, asked[lock]):
+        version = versions.get(canonicalize_name(requirement.name))
+        assert version is not None, f"{requirement.name}: run `make lock`"
+        assert requirement.specifier.contains(version), f"{requirement}: run `make lock`"
+
+
+@pytest.fixture(scope="module", params=ARCHITECTURES)
+def tree(request: pytest.FixtureRequest, build_image: BuildImage) -> Path:
+    return build_image(request.param)
+
+
+def test_it_holds_only_what_a_robot_runs(tree: Path) -> None:
+    machine = ELF_MACHINES[tree.parent.name]
+    names, programs = set(), set()
+    for path in tree.rglob("*"):
+        status = path.lstat()
+        names.add(path.name)
+        assert path.exists(), f"{path} points to nothing"
+        assert (status.st_uid, status.st_gid, status.st_mtime) == (0, 0, 0.0), path
+        if stat.S_ISREG(status.st_mode):
+            if status.st_mode & 0o111:
+                programs.add(path.name)
+            with path.open("rb") as file:
+                head = file.read(20)
+            if head.startswith(b"\x7fELF"):
+                assert int.from_bytes(head[18:20], "little") == machine, path
+        if not stat.S_ISLNK(status.st_mode):
+            assert stat.S_IMODE(status.st_mode) in (0o755, 0o644), path
+    assert not {name for name in names if FORBIDDEN.fullmatch(name)}
+    assert {name for name in programs if not name.startswith("ld-linux")} == {"lpac", "python3.11"}
+    assert list((tree / "release").iterdir()) == []
+
+
+def test_it_says_what_it_is_made_of(tree: Path) -> None:
+    versions = json.loads((tree / "usr/share/lpac/versions.json").read_text())
+    assert versions["architecture"] == tree.parent.name
+    locked = pinned(DOCKER / "requirements.lock")
+    wheels = {name.split("-")[0]: name.split("-")[1] for name in versions["wheels"]}
+    assert {canonicalize_name(name): v for name, v in wheels.items()} == locked | {
+        "lpac-edge": tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    }
+    lines = (DOCKER / "debian.lock").read_text().splitlines()
+    packages = {tuple(line.split()) for line in lines if line.startswith(tree.parent.name)}
+    debian = versions["debian"].items()
+    architecture = versions["architecture"]
+    assert {(architecture, n, p["version"], p["sha256"]) for n, p in debian} == packages
+
+
+def test_an_engine_can_load_it(tree: Path) -> None:
+    archive = tree.parents[1] / f"lpac-edge-{tree.parent.name}.tar.gz"
+    with tarfile.open(archive) as tar:
+        files = {m.name: tar.extractfile(m) for m in tar if m.name.endswith(".json")}
+        contents = {name: json.load(file) for name, file in files.items() if file}
+    (entry,) = contents.pop("manifest.json")
+    config = contents[entry["Config"]]
+    assert entry["RepoTags"][0].endswith(f"lpac-edge:{tree.parent.name}")
+    assert config["architecture"] == tree.parent.name
+    assert config["config"]["User"] == "65532:65532"
+    assert config["config"]["Entrypoint"] == ["/usr/bin/lpac"]
+
+
+def test_its_size_is_told(tree: Path) -> None:
+    size = measure(tree.parent)
+    assert size.unpacked_bytes == sum(size.packages.values())
+    text = table(tree.parent, size)
+    assert {"onnxruntime", "numpy", "zenoh", "mavsdk", "Python"} <= set(text.split())
+    with pytest.raises(ValueError, match="run `make image`"):
+        measure(tree)
+
+
+def test_the_bench_sets_it_beside_torch(build_image: BuildImage, tmp_path: Path) -> None:
+    report = release.measure(build_image("arm64").parent)
+    size, torch_mb = measure(build_image("arm64").parent), report.figures["torch_wheel_mb"]
+    assert report.figures["compressed_mb"] > size.compressed_bytes / 1e6
+    assert torch_mb is None or len(report.targets) == 1
+    (note,) = release.measure(tmp_path).notes
+    assert "run `make image`" in note
+
+
+def test_packages_are_told_by_their_paths() -> None:
+    site = PurePosixPath("usr/lib/python3/dist-packages")
+    assert package_of(site / "numpy.libs" / "libgfortran.so.5") == "numpy"
+    assert package_of(site / "numpy-2.4.6.dist-info" / "METADATA") == "numpy"
+    assert package_of(PurePosixPath("usr/lib/python3.11/enum.py")) == "Python"
+    assert package_of(PurePosixPath("lib/aarch64-linux-gnu/libc.so.6")) == "libraries of Debian"
+
+
+def test_it_runs_without_a_user_and_a_place_to_write(
+    build_image: BuildImage, tmp_path: Path
+) -> None:
+    tree = build_image("amd64")
+    if os.uname().machine != "x86_64":
+        pytest.skip("this machine is no x86-64")
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    result = run_inside(tree, tmp_path, "--help")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "robot" in result.stdout
+    result = run_inside(tree, tmp_path, "bundle", "verify", "/release")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "this machine computes the golden outputs" in result.stdout
+    result = run_inside(tree, tmp_path, "robot", "run", "--config", "/release/robot.toml")
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("lpac: /release/robot.toml: cannot be read")
+
+
+def run_inside(tree: Path, release: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = inside(tree, release, "/usr/bin/lpac", *arguments)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=False)
+
+
+class Builder:
+    """The Dockerfile's build stage as a container, after it built the tree in /root_fs."""
+
+    def __init__(self) -> None:
+        certificates = os.environ.get("SSL_CERT_FILE", "/etc/ssl/certs/ca-certificates.crt")
+        secret = ["--secret", f"id=certificates,src={certificates}"]
+        host = buildah("info", "--format", "{{.host.arch}}")
+        # As image.sh calls it: all comes from its cache.
+        image = buildah(
+            "build", "--quiet", "--platform=linux/amd64", "--file=deploy/docker/Dockerfile",
+            "--build-arg=BASE=docker.io/library/debian:bookworm-slim",
+            f"--build-arg=BUILDPLATFORM=linux/{host}", "--isolation=chroot", "--network=host",
+            "--layers", "--pull=never", "--timestamp=0", "--target=build", *secret,
+            "--ignorefile=deploy/docker/Dockerfile.dockerignore", ".",
+        )  # fmt: skip
+        self.container = buildah("from", "--pull-never", image.splitlines()[-1])
+        self.files = Path(buildah("mount", self.container))
+        self.volume = [f"--volume={certificates}:/run/secrets/certificates:ro"]
+
+    def build_root(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = ["buildah", "run", "--isolation=chroot", "--network=host", *self.volume,
+                   self.container, "--", "python3", "/src/deploy/docker/build_root.py"]  # fmt: skip
+        return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+
+
+def buildah(*arguments: str) -> str:
+    result = subprocess.run(
+        ["buildah", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def builder(build_image: BuildImage) -> Iterator[Builder]:
+    build_image("amd64")
+    if buildah("images", "--quiet", "--filter", "reference=lpac-edge") == "":
+        pytest.skip("docker built the image, and buildah knows nothing of it")
+    made = Builder()
+    yield made
+    buildah("rm", made.container)
+
+
+def test_two_builds_are_equal(builder: Builder) -> None:
+    result = builder.build_root("assemble", "amd64", "/fetched", "/again")
+    assert result.returncode == 0, result.stderr
+    first, second = (contents(builder.files / name) for name in ("root_fs", "again"))
+    assert first == second
+
+
+def contents(tree: Path) -> dict[str, tuple[object, ...]]:
+    entries: dict[str, tuple[object, ...]] = {}
+    for path in tree.rglob("*"):
+        status = path.lstat()
+        data = path.read_bytes() if stat.S_ISREG(status.st_mode) else None
+        target = path.readlink() if path.is_symlink() else None
+        entries[str(path.relative_to(tree))] = (status.st_mode, status.st_mtime, target, data)
+    return entries
+
+
+@pytest.mark.parametrize(
+    ("lock", "told"),
+    [("debian.lock", "is not what debian.lock names"), ("requirements.lock", "DO NOT MATCH")],
+)
+def test_nothing_is_built_of_what_the_lock_does_not_name(
+    builder: Builder, lock: str, told: str
+) -> None:
+    folder = builder.files / "src/deploy/docker"
+    kept = {}
+    # One package of each is enough to be fetched.
+    for name, entry in {
+        "debian.lock": r"^amd64 gcc-12-base .*\n",
+        "requirements.lock": r"^annotated-doc==.*\n(    --hash=.*\n)+",
+    }.items():
+        kept[name] = (folder / name).read_text()
+        text = re.search(entry, kept[name], re.MULTILINE)
+        assert text, name
+        # Every hash is of another file than the one that was locked.
+        changed = re.sub(r"[0-9a-f]{64}", "0" * 64, text[0]) if name == lock else text[0]
+        (folder / name).write_text(changed)
+    try:
+        result = builder.build_root("fetch", "amd64", f"/fetched-{lock}")
+    finally:
+        for name, whole in kept.items():
+            (folder / name).write_text(whole)
+    assert result.returncode == 1
+    assert told in result.stderr

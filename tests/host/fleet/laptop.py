@@ -1,0 +1,68 @@
+"""The laptop's side of tests that deploy."""
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Any
+
+from lpac.fleet.config import FleetConfig, RobotHost, load_fleet
+from lpac.fleet.deploy import Deployed, deploy, rollback
+from lpac.fleet.hold import Report
+from lpac.fleet.release import Common, Release, load_common, make_release
+from lpac.fleet.session import connect
+from lpac.sim.hosts.hosts import SimulatedHosts
+from tests.host.fleet.field import unwatched
+
+
+class Laptop:
+    """What an operator has: fleet.toml as it is now, and the releases made from it."""
+
+    def __init__(self, hosts: SimulatedHosts, folder: Path) -> None:
+        self.hosts = hosts
+        self.config: FleetConfig = load_fleet(hosts.fleet_toml)
+        self.common: Common = load_common(self.config)
+        self._folder = folder
+
+    def robot(self, index: int) -> RobotHost:
+        return self.config.robots[self.hosts[index].name]
+
+    def release(self, index: int, common: Common | None = None) -> Release:
+        folder = self._folder / f"release-{len(list(self._folder.iterdir()))}"
+        folder.mkdir()
+        return make_release(self.config, self.robot(index), common or self.common, folder)
+
+    def deploy(
+        self, index: int, release: Release | None = None, report: Report = unwatched
+    ) -> Deployed:
+        release = release or self.release(index)
+        return asyncio.run(deploy(self.config, self.robot(index), release, report))
+
+    def call(self, index: int, function: str, **arguments: object) -> dict[str, Any]:
+        async def one() -> dict[str, Any]:
+            async with connect(self.config, self.robot(index)) as session:
+                return await session.call(function, **arguments)
+
+        return asyncio.run(one())
+
+    def overview(self, index: int) -> dict[str, Any]:
+        """What the robot has; a busy machine may hold up for a moment what its program says."""
+        until_s = time.monotonic() + 60.0
+        while True:
+            found = self.call(index, "overview", directory=self.config.directory)
+            service = found["service"]
+            if service["fresh"] or service["active"] != "active" or time.monotonic() > until_s:
+                return found
+
+    def changed(self) -> Common:
+        """The same with another world file: a release that differs in one file, and versions."""
+        world = self.common.world + b"CircularBND 100 100 20 %.9f\n" % time.monotonic()
+        return self.common._replace(world=world)
+
+    def roll_back(self, index: int) -> str:
+        return asyncio.run(rollback(self.config, self.robot(index), unwatched))
+
+
+def boot_nonce(overview: dict[str, Any]) -> int:
+    assert overview["service"]["fresh"], overview
+    nonce: int = overview["service"]["status"]["boot_nonce"]
+    return nonce

@@ -1,0 +1,270 @@
+"""Deploying to real robot computers: whole and proven, or nothing has changed."""
+
+import asyncio
+import json
+import re
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import onnx
+import pytest
+from onnx import numpy_helper
+
+from edge.policy.bundle import BUNDLE_ID, MANIFEST, make_bundle
+from lpac.fleet.deploy import deploy
+from lpac.fleet.release import make_release
+from lpac.fleet.session import FleetError, RemoteError, UnreachableError, connect
+from lpac.sim.hosts.host import SimulatedHost
+from lpac.sim.hosts.hosts import SimulatedHosts
+from tests.host.fleet.field import armed, await_said, name_robot, running_lpac_fleet, unwatched
+from tests.host.fleet.laptop import Laptop, boot_nonce
+
+
+@pytest.fixture(scope="module")
+def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
+    """r1 and r2 run a first release; r3 is there, whatever it has."""
+    laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
+    for index in range(2):
+        name_robot(hosts, hosts[index])
+        laptop.deploy(index)
+    return laptop
+
+
+def await_true(holds: Callable[[], bool], within_s: float = 120.0) -> None:
+    until_s = time.monotonic() + within_s
+    while not holds():
+        assert time.monotonic() < until_s, "it did not come true"
+        time.sleep(0.05)
+
+
+def await_free(host: SimulatedHost) -> None:
+    """Until nobody holds the robot. To ask mends nothing, as the robot's own `lock` does."""
+    host.run("flock --shared /run/lpac-fleet.lock true")
+
+
+def test_a_second_deploy_sends_nothing_and_disturbs_nothing(laptop: Laptop) -> None:
+    before = boot_nonce(laptop.overview(0))
+    done = laptop.deploy(0)
+    assert (done.summary, done.sent_bytes) == ("unchanged", 0)
+    assert boot_nonce(laptop.overview(0)) == before
+
+
+def test_a_changed_file_travels_alone_and_rollback_brings_the_former_back(laptop: Laptop) -> None:
+    former = laptop.overview(0)["current"]
+    release = laptop.release(0, laptop.changed())
+    done = laptop.deploy(0, release)
+    assert done.release == release.id != former
+    # The world, the lock of versions, and the manifest of 2,000 files.
+    assert done.sent_bytes < 0.01 * release.size_bytes
+    now = laptop.overview(0)
+    assert (now["current"], now["last_good"], now["pending"]) == (release.id, former, None)
+    assert now["service"]["enabled"]
+    assert laptop.roll_back(0) == former
+    assert laptop.overview(0)["current"] == former
+    with pytest.raises(RemoteError, match="no earlier release"):
+        laptop.roll_back(0)
+
+
+@pytest.mark.parametrize("mishap", ["cut", "full"])
+def test_a_transfer_that_breaks_off_leaves_what_runs_and_a_repeat_finishes(
+    laptop: Laptop, mishap: str
+) -> None:
+    host = laptop.hosts[2]
+    host.reset()
+    name_robot(laptop.hosts, host)
+    release = laptop.release(2)
+    seen: list[float] = []
+
+    def at_a_third(step: str, share: float | None) -> None:
+        if step == "image" and share is not None and share >= 0.3 and not seen:
+            seen.append(share)
+            {"cut": host.cut, "full": host.fill_disk}[mishap]()
+
+    with pytest.raises(FleetError) as error:
+        laptop.deploy(2, release, at_a_third)
+    assert seen
+    if mishap == "full":
+        assert "its disk is full" in str(error.value)
+        host.free_disk()
+    else:
+        assert isinstance(error.value, UnreachableError)
+        host.heal()
+    assert laptop.overview(2)["current"] is None
+
+    await_free(host)
+    assert laptop.deploy(2, release).summary == "runs"
+
+
+def test_a_killed_laptop_program_leaves_the_robot_whole_and_free(laptop: Laptop) -> None:
+    host = laptop.hosts[2]
+    host.reset()
+    name_robot(laptop.hosts, host)
+    incoming = host.root / "opt" / "lpac" / "incoming"
+    with running_lpac_fleet(laptop.hosts.fleet_toml, "deploy", "--robots", host.name) as program:
+        await_true(lambda: any(incoming.glob("*/root/usr/lib/*/*")))
+        program.send_signal(signal.SIGKILL)
+        program.communicate()
+    assert laptop.overview(2)["current"] is None
+    await_free(host)
+    assert laptop.deploy(2).summary == "runs"
+
+
+def test_a_full_disk_is_found_before_anything_travels(laptop: Laptop) -> None:
+    host = laptop.hosts[0]
+    before = laptop.overview(0)
+    host.fill_disk()
+    try:
+        with pytest.raises(RemoteError, match=r"the disk has \d+ MB free.*needs \d+ MB"):
+            laptop.deploy(0, laptop.release(0, laptop.changed()))
+        after = laptop.overview(0)
+    finally:
+        host.free_disk()
+    assert after["current"] == before["current"]
+    assert boot_nonce(after) == boot_nonce(before)
+
+
+def test_a_policy_that_does_not_compute_what_torch_computed_is_not_run(laptop: Laptop) -> None:
+    bundle = laptop.common.bundle
+    model = onnx.load_from_string(bundle.files["gnn_1.onnx"])
+    taps = next(tensor for tensor in model.graph.initializer if tensor.name == "taps")
+    taps.CopyFrom(numpy_helper.from_array(1.01 * numpy_helper.to_array(taps), "taps"))
+    files = {n: c for n, c in bundle.files.items() if n not in (MANIFEST, BUNDLE_ID)}
+    broken = make_bundle(bundle.manifest, files | {"gnn_1.onnx": model.SerializeToString()})
+    before = laptop.overview(0)
+    with pytest.raises(RemoteError, match=r"bundle verify on the robot: .*gnn_1\.onnx"):
+        laptop.deploy(0, laptop.release(0, laptop.common._replace(bundle=broken)))
+    after = laptop.overview(0)
+    assert (after["current"], after["pending"]) == (before["current"], None)
+    assert boot_nonce(after) == boot_nonce(before)
+
+
+def test_a_release_that_does_not_run_well_is_taken_back(laptop: Laptop) -> None:
+    before = laptop.overview(0)
+    # Not for a program that is not root's.
+    robot = replace(laptop.robot(0), zenoh_port=22)
+    config = replace(laptop.config, robots={**laptop.config.robots, robot.name: robot})
+    folder = laptop.release(0).folder.with_name("taken-port")
+    folder.mkdir()
+    release = make_release(config, robot, laptop.common, folder)
+    with pytest.raises(RemoteError) as error:
+        asyncio.run(deploy(config, robot, release, unwatched))
+    assert re.search(
+        rf"{release.id} does not run well .*zenoh.*:22.*the robot runs {before['current']} again",
+        str(error.value),
+    ), error.value
+    after = laptop.overview(0)
+    assert (after["current"], after["pending"]) == (before["current"], None)
+    assert after["last_good"] == before["last_good"]
+    assert after["service"]["fresh"]
+
+
+def test_the_robot_finishes_a_switch_without_the_laptop(laptop: Laptop) -> None:
+    host = laptop.hosts[0]
+    release = laptop.release(0, laptop.changed())
+
+    def cut_at_the_switch(step: str, _: float | None) -> None:
+        if step == "health":
+            host.cut()
+
+    with pytest.raises(UnreachableError):
+        laptop.deploy(0, release, cut_at_the_switch)
+    host.heal()
+    await_free(host)
+    after = laptop.overview(0)
+    assert (after["current"], after["pending"]) == (release.id, None)
+    assert after["service"]["fresh"]
+
+
+def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop) -> None:
+    host = laptop.hosts[0]
+    former = laptop.overview(0)["current"]
+    release = laptop.release(0, laptop.changed())
+
+    def lose_power_at_the_switch(step: str, _: float | None) -> None:
+        if step == "health":
+            host.power_off()
+
+    with pytest.raises(UnreachableError):
+        laptop.deploy(0, release, lose_power_at_the_switch)
+    host.power_on()
+    pending = laptop.overview(0)["pending"]
+    assert (pending["release"], pending["former"]) == (release.id, former)
+    assert laptop.deploy(0, release).summary.endswith(f"finished: the robot runs {release.id}")
+    after = laptop.overview(0)
+    assert (after["current"], after["last_good"], after["pending"]) == (release.id, former, None)
+    assert len(after["releases"]) <= 3  # of the seven and more that it has had
+
+
+@pytest.mark.parametrize("program", ["runs", "stopped"])
+def test_an_armed_robot_refuses(laptop: Laptop, program: str) -> None:
+    host, stop = laptop.hosts[1], {"mavlink_port": laptop.robot(1).mavlink_port, "disable": False}
+    laptop.call(1, "start", directory=laptop.config.directory)
+    if program == "stopped":
+        laptop.call(1, "stop", **stop, in_flight=False)
+    before = laptop.overview(1)
+    with armed(host):
+        if program == "runs":
+            await_said(host, '"armed":true')
+        with pytest.raises(RemoteError, match="the vehicle is armed: deploying is refused"):
+            laptop.deploy(1, laptop.release(1, laptop.changed()))
+        with pytest.raises(RemoteError, match="the vehicle is armed: stopping is refused"):
+            laptop.call(1, "stop", **stop, in_flight=False)
+        after = laptop.overview(1)
+        assert after["current"] == before["current"]
+        if program == "runs":
+            assert boot_nonce(after) == boot_nonce(before)
+            laptop.call(1, "stop", **stop, in_flight=True)
+            assert laptop.overview(1)["service"]["active"] == "inactive"
+
+
+def test_an_interrupted_switch_is_not_finished_in_flight(laptop: Laptop) -> None:
+    host = laptop.hosts[1]
+    laptop.call(1, "start", directory=laptop.config.directory)
+    before = laptop.overview(1)
+    pending = {"release": before["current"], "former": None}
+    (host.root / "opt/lpac/pending").write_text(json.dumps(pending))
+    with armed(host):
+        await_said(host, '"armed":true')
+        with pytest.raises(RemoteError, match="the vehicle is armed: deploying is refused"):
+            laptop.deploy(1)
+        after = laptop.overview(1)
+    assert (after["current"], after["pending"]) == (before["current"], pending)
+    assert boot_nonce(after) == boot_nonce(before)
+    (host.root / "opt/lpac/pending").unlink()
+
+
+def test_of_two_operators_the_second_waits(laptop: Laptop) -> None:
+    async def both() -> None:
+        async with connect(laptop.config, laptop.robot(0)) as session:
+            await session.call(
+                "lock", directory=laptop.config.directory, who="alice@field", mavlink_port=14551
+            )
+            with pytest.raises(RemoteError, match="alice@field is changing this robot"):
+                await deploy(laptop.config, laptop.robot(0), laptop.release(0), unwatched)
+
+    asyncio.run(both())
+    assert laptop.deploy(0).summary in ("unchanged", "runs")
+
+
+def test_a_robot_with_another_host_key_gets_nothing(laptop: Laptop) -> None:
+    known = laptop.hosts.known_hosts
+    right = known.read_text()
+    first, second = right.splitlines()[:2]
+    known.write_text(f"{first.split(' ', 1)[0]} {second.split(' ', 1)[1]}\n")
+    try:
+        with pytest.raises(UnreachableError, match="its host key is not the known one"):
+            laptop.deploy(0)
+        known.write_text("")
+        with pytest.raises(UnreachableError, match="its host key is not known"):
+            laptop.deploy(0)
+    finally:
+        known.write_text(right)
+
+
+def test_another_robot_at_the_address_gets_nothing(laptop: Laptop) -> None:
+    stranger = replace(laptop.robot(0), host=laptop.robot(1).host)
+    config = replace(laptop.config, robots={**laptop.config.robots, stranger.name: stranger})
+    with pytest.raises(RemoteError, match="answers r2"):
+        asyncio.run(deploy(config, stranger, laptop.release(0), unwatched))

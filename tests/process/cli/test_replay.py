@@ -1,0 +1,103 @@
+"""`lpac replay` as a user types it."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.policy.bundle import Bundle
+from edge.policy.lpac.graphs import Policy
+from tests.conftest import SHIPPED
+from tests.process.cli.test_cli import error_line, lpac
+from tests.unit.policy.test_replay import Messages, fly
+
+
+@pytest.fixture(scope="module")
+def flown(shipped_policy: Policy) -> Messages:
+    return fly(shipped_policy)
+
+
+def write_log(
+    directory: Path, bundle: Bundle, messages: Messages, bundle_path: Path = SHIPPED
+) -> Path:
+    metadata = FlightMetadata(0, 1, bundle.id, str(bundle_path), "{}", "0.1.0")
+    with contextlib.closing(FlightLog(directory, metadata)) as log:
+        for topic, unix_time_s, message in messages:
+            log.record(topic, unix_time_s, message)
+    return max(directory.glob("*.mcap"))
+
+
+def altered(messages: Messages) -> Messages:
+    """With one velocity that is off by a quarter."""
+    at = max(n for n, (topic, _, _) in enumerate(messages) if topic == "policy")
+    topic, unix_time_s, tick = messages[at]
+    velocity = tick["velocity"] + np.array([0.25, 0.0], np.float32)
+    return [*messages[:at], (topic, unix_time_s, {**tick, "velocity": velocity})]
+
+
+def test_a_flight_is_computed_again(
+    tmp_path: Path, shipped_bundle: Bundle, flown: Messages
+) -> None:
+    half = len(flown) // 2
+    write_log(tmp_path / "a", shipped_bundle, flown[:half])
+    last = write_log(tmp_path / "b", shipped_bundle, flown[half:])
+    last.write_bytes(last.read_bytes()[:-500])  # the robot was killed
+    text = lpac("replay", tmp_path)
+    assert text.returncode == 0, text.stderr
+    for output in ("features", "velocity", "message"):
+        (line,) = [line for line in text.stdout.splitlines() if line.startswith(output)]
+        assert line.split() == [
+            output, "6", "ticks,", "0", "differ,", "largest", "difference", "0"
+        ]  # fmt: skip
+    assert f"{shipped_bundle.id[:12]}: computes what it computed in flight" in text.stdout
+
+    report = json.loads(lpac("replay", tmp_path / "a", last, "--json").stdout)
+    assert report["bundle"] == shipped_bundle.id and report["robots"] == [0]
+    assert report["outputs"]["message"] == {"ticks": 6, "differing": 0, "largest_difference": 0.0}
+
+
+def test_a_difference_is_shown_and_fails(
+    tmp_path: Path, shipped_bundle: Bundle, flown: Messages
+) -> None:
+    log = write_log(tmp_path, shipped_bundle, altered(flown))
+    result = lpac("replay", log)
+    assert "1 differ, largest difference 0.25" in result.stdout
+    assert "not what was computed in flight: velocity by up to 0.25" in error_line(result)
+    result = lpac("replay", log, "--json")
+    assert result.returncode != 0
+    assert json.loads(result.stdout)["outputs"]["velocity"]["differing"] == 1
+
+
+def test_another_place_for_the_bundle(
+    tmp_path: Path, shipped_bundle: Bundle, flown: Messages
+) -> None:
+    log = write_log(tmp_path, shipped_bundle, flown, tmp_path / "on the robot")
+    line = error_line(lpac("replay", log))
+    assert "on the robot: No such file or directory" in line and "give --bundle" in line
+    assert lpac("replay", log, "--bundle", SHIPPED).returncode == 0
+
+
+def test_mistakes_are_one_line(tmp_path: Path, shipped_bundle: Bundle, flown: Messages) -> None:
+    other = dataclasses.replace(shipped_bundle, id="0123456789abcdef" * 4)
+    cases = {
+        "flew with bundle 0123456789ab, and": write_log(tmp_path / "other", other, flown),
+        "no policy ticks": write_log(tmp_path / "idle", shipped_bundle, []),
+        "is not an MCAP file": Path("README.md"),
+        "holds no flight log (*.mcap)": tmp_path / "empty",
+        "absent.mcap": tmp_path / "absent.mcap",
+        "was not written by a robot": tmp_path / "cut.mcap",
+        "images: is (1, 4, 16, 16); the policy needs (1, 4, 32, 32)": write_log(
+            tmp_path / "foreign", shipped_bundle,
+            [(t, s, {**m, "images": np.zeros((1, 4, 16, 16), "f4")}) for t, s, m in flown],
+        ),
+    }  # fmt: skip
+    (tmp_path / "empty").mkdir()
+    shutil.copy(cases["no policy ticks"], tmp_path / "cut.mcap")
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "cut.mcap").read_bytes()[:60])
+    for text, log in cases.items():
+        assert text in error_line(lpac("replay", log)), text

@@ -1,0 +1,519 @@
+"""The radio: real sessions here and in processes of their own."""
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from itertools import permutations
+from typing import Any, Self
+
+import pytest
+import zenoh
+
+from edge.drivers.zenoh_link import LinkError, ZenohLink
+from lpac.sim.ports import free_ports
+from tests.conftest import ROOT
+
+# Robots as a process. A line on its standard input opens them, each further one is answered with
+# what every robot hears and sees, and the end of the input closes them.
+ROBOTS = """
+import json, select, sys
+from contextlib import ExitStack
+from edge.drivers.zenoh_link import ZenohLink
+
+class Robot:
+    def __init__(self, stack, settings):
+        self.heard = {}
+        self.link = stack.enter_context(
+            ZenohLink(fleet="test", subscriptions={"robot/*/message": self.receive}, **settings)
+        )
+
+    def receive(self, key, data):
+        self.heard[key.split("/")[1]] = self.heard.get(key.split("/")[1], 0) + 1
+
+    def seen(self):
+        return {"heard": dict(self.heard), "present": sorted(self.link.present())}
+
+print("started", flush=True)
+sys.stdin.readline()
+with ExitStack() as stack:
+    robots = [Robot(stack, settings) for settings in json.loads(sys.argv[1])]
+    print("open", flush=True)
+    while True:
+        for robot in robots:
+            robot.link.publish("message", json.dumps(robot.seen()).encode().ljust(6000))
+        if select.select([sys.stdin], [], [], 0.05)[0]:
+            if not sys.stdin.readline():
+                break
+            print(json.dumps([robot.seen() for robot in robots]), flush=True)
+"""
+
+
+class Inbox:
+    """The newest data by key, and how many came."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, bytes] = {}
+        self.count = 0
+
+    def __call__(self, key: str, data: bytes) -> None:
+        self.newest[key] = data
+        self.count += 1
+
+    def from_robot(self, robot_id: int) -> dict[str, Any]:
+        seen: dict[str, Any] = json.loads(self.newest.get(f"robot/{robot_id}/message", b"{}"))
+        return seen
+
+
+def endpoint() -> str:
+    (port,) = free_ports(1)
+    return f"tcp/127.0.0.1:{port}"
+
+
+def eventually(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+
+
+def is_present(link: ZenohLink, robot_ids: set[int]) -> bool:
+    return link.present() == robot_ids
+
+
+def has_peers(link: ZenohLink, count: int) -> bool:
+    return link.peers() == count
+
+
+def eventually_hears(sender: ZenohLink, topic: str, data: bytes, key: str, *inboxes: Inbox) -> None:
+    def heard() -> bool:
+        sender.publish(topic, data)
+        return all(inbox.newest.get(key) == data for inbox in inboxes)
+
+    eventually(heard)
+
+
+class Robots:
+    """Robots in a process of their own, one for each of `settings`; `prefix` goes before it."""
+
+    def __init__(self, *settings: dict[str, object], prefix: Sequence[str] = ()) -> None:
+        self.process = subprocess.Popen(
+            [*prefix, sys.executable, "-c", ROBOTS, json.dumps(settings)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self._read()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def open(self) -> Self:
+        self._ask()
+        return self
+
+    def seen(self) -> list[dict[str, Any]]:
+        """For each robot: `heard`, how many messages of whom, and `present`."""
+        answer: list[dict[str, Any]] = json.loads(self._ask())
+        return answer
+
+    def _ask(self) -> str:
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        return self._read()
+
+    def _read(self) -> str:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, "the process ended"
+        return line
+
+
+@contextmanager
+def fleet_of(count: int, **settings: Any) -> Iterator[tuple[list[ZenohLink], list[Inbox]]]:
+    """Robots 0 to count - 1, all of which know robot 0's endpoint alone."""
+    known = endpoint()
+    inboxes = [Inbox() for _ in range(count)]
+    with ExitStack() as stack:
+        links = [
+            stack.enter_context(
+                ZenohLink(
+                    fleet="test",
+                    robot_id=robot_id,
+                    listen=[known if robot_id == 0 else endpoint()],
+                    connect=[] if robot_id == 0 else [known],
+                    subscriptions={"robot/*/message": inbox},
+                    **settings,
+                )
+            )
+            for robot_id, inbox in enumerate(inboxes)
+        ]
+        yield links, inboxes
+
+
+def test_robots_that_know_one_peer_hear_all_others_and_not_themselves() -> None:
+    with fleet_of(3) as (links, inboxes):
+        for sender, link in enumerate(links):
+            others = [inbox for receiver, inbox in enumerate(inboxes) if receiver != sender]
+            data = bytes([sender]) * 20_000
+            eventually_hears(link, "message", data, f"robot/{sender}/message", *others)
+        for robot_id, (link, inbox) in enumerate(zip(links, inboxes, strict=True)):
+            others_ids = {0, 1, 2} - {robot_id}
+            assert set(inbox.newest) == {f"robot/{other}/message" for other in others_ids}
+            eventually(partial(is_present, link, others_ids))
+            eventually(partial(has_peers, link, 2))
+            assert not link.duplicate()
+            assert not link.duplicates()
+            assert link.failures() == 0
+
+
+def test_the_ground_speaks_to_all_robots_and_is_none() -> None:
+    known, commands, statuses = endpoint(), Inbox(), Inbox()
+    with (
+        ZenohLink(
+            fleet="test", robot_id=7, listen=[known], subscriptions={"ground/*": commands}
+        ) as robot,
+        ZenohLink(
+            fleet="test", connect=[known], subscriptions={"robot/*/status": statuses}
+        ) as ground,
+    ):
+        for topic in ("state", "order"):
+            eventually_hears(ground, topic, topic.encode(), f"ground/{topic}", commands)
+        eventually_hears(robot, "status", b"fine", "robot/7/status", statuses)
+        eventually(lambda: ground.present() == {7})
+        assert robot.present() == frozenset()
+
+
+def test_clients_meet_at_the_router_and_find_it_again() -> None:
+    at = endpoint()
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([at]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    heard = Inbox()
+    router = zenoh.open(config)
+    try:
+        with (
+            ZenohLink(fleet="test", robot_id=1, mode="client", connect=[at]) as first,
+            ZenohLink(
+                fleet="test",
+                robot_id=2,
+                mode="client",
+                connect=[at],
+                subscriptions={"robot/*/message": heard},
+            ) as second,
+        ):
+            eventually_hears(first, "message", b"before", "robot/1/message", heard)
+            eventually(lambda: first.present() == {2} and second.present() == {1})
+            eventually(lambda: first.peers() == 1)
+            router.close()  # type: ignore[no-untyped-call]
+            eventually(lambda: not first.present() and not second.present())
+            router = zenoh.open(config)
+            eventually(lambda: first.present() == {2} and second.present() == {1})
+            eventually_hears(first, "message", b"after", "robot/1/message", heard)
+    finally:
+        router.close()  # type: ignore[no-untyped-call]
+
+
+def test_scouting_finds_the_others() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.sendto(b"", ("224.0.0.225", 7446))
+        except OSError:
+            pytest.skip("no interface for multicast")
+    fleet, heard = f"test-{time.time_ns()}", Inbox()
+    with (
+        ZenohLink(fleet=fleet, robot_id=1, scouting=True) as first,
+        ZenohLink(
+            fleet=fleet, robot_id=2, scouting=True, subscriptions={"robot/*/message": heard}
+        ) as second,
+    ):
+        eventually(lambda: first.present() == {2} and second.present() == {1})
+        eventually_hears(first, "message", b"hello", "robot/1/message", heard)
+
+
+def test_peers_start_in_any_order() -> None:
+    late = endpoint()
+    with ZenohLink(fleet="test", robot_id=2, connect=[late]) as early:
+        assert early.present() == frozenset()
+        with ZenohLink(fleet="test", robot_id=1, listen=[late]):
+            eventually(lambda: early.present() == {1})
+
+
+def test_neighbours_join_leave_and_come_back() -> None:
+    with fleet_of(2) as (links, inboxes):
+        known = endpoint()
+        eventually(lambda: links[0].present() == {1} and links[1].present() == {0})
+        with ZenohLink(fleet="test", robot_id=10, listen=[known]) as first:
+            for sequence in (b"first", b"second"):
+                with ZenohLink(
+                    fleet="test",
+                    robot_id=11,
+                    connect=[known],
+                    subscriptions={"robot/*/message": inboxes[0]},
+                ):
+                    eventually(lambda: first.present() == {11})
+                    eventually_hears(first, "message", sequence, "robot/10/message", inboxes[0])
+                eventually(lambda: first.present() == frozenset())
+
+
+def test_a_killed_neighbour_leaves_and_its_successor_is_heard() -> None:
+    with fleet_of(2) as (links, inboxes):
+        known = endpoint()
+        everybody = Inbox()
+        with ZenohLink(
+            fleet="test", robot_id=5, listen=[known], subscriptions={"robot/*/message": everybody}
+        ) as link:
+            for _ in range(2):
+                with Robots({"robot_id": 6, "connect": [known]}).open() as robots:
+                    eventually(lambda: link.present() == {6})
+                    everybody.newest.clear()
+                    eventually(lambda: everybody.from_robot(6))
+                    robots.process.kill()
+                    eventually(lambda: link.present() == frozenset())
+        eventually_hears(links[0], "message", b"still here", "robot/0/message", inboxes[1])
+
+
+def test_messages_flow_again_with_a_process_that_was_stopped() -> None:
+    known, inbox = endpoint(), Inbox()
+    with (
+        ZenohLink(
+            fleet="test", robot_id=1, listen=[known], subscriptions={"robot/*/message": inbox}
+        ) as link,
+        Robots({"robot_id": 2, "connect": [known]}).open() as robots,
+    ):
+
+        def heard_back() -> int:
+            link.publish("message", bytes(20_000))
+            count: int = inbox.from_robot(2).get("heard", {}).get("1", 0)
+            return count
+
+        eventually(heard_back)
+        robots.process.send_signal(signal.SIGSTOP)
+        eventually(lambda: link.present() == frozenset())
+        for _ in range(100):  # a publisher that is not stopped by what the other does not take
+            heard_back()
+        heard_before = heard_back()
+        robots.process.send_signal(signal.SIGCONT)
+        eventually(lambda: link.present() == {2})
+        eventually(lambda: heard_back() > heard_before + 10)
+
+
+def test_two_robots_of_one_id_are_seen_by_both_and_by_the_ground() -> None:
+    with fleet_of(2) as (links, _), ExitStack() as stack:
+        known = endpoint()
+        ground = stack.enter_context(ZenohLink(fleet="test", listen=[known]))
+        first, second, other = (
+            stack.enter_context(ZenohLink(fleet="test", robot_id=robot_id, connect=[known]))
+            for robot_id in (3, 3, 4)
+        )
+        eventually(lambda: first.duplicate() and second.duplicate())
+        eventually(lambda: ground.duplicates() == other.duplicates() == {3})
+        eventually(lambda: first.duplicates() == {3})
+        assert not other.duplicate()
+        assert not ground.duplicate()
+        eventually(lambda: first.present() == {4})
+        second.close()
+        eventually(lambda: not first.duplicate() and not ground.duplicates())
+        assert not links[0].duplicates()
+
+
+def test_a_callback_that_raises_stops_nothing() -> None:
+    known, inbox = endpoint(), Inbox()
+
+    def broken(key: str, data: bytes) -> None:
+        inbox(key, data)
+        raise RuntimeError("broken")
+
+    with (
+        ZenohLink(
+            fleet="test", robot_id=1, listen=[known], subscriptions={"robot/*/message": broken}
+        ) as link,
+        ZenohLink(fleet="test", robot_id=2, connect=[known]) as sender,
+    ):
+        for data in (b"one", b"two"):
+            eventually_hears(sender, "message", data, "robot/2/message", inbox)
+        eventually(lambda: link.failures() == inbox.count >= 2)
+
+
+def test_another_fleet_hears_nothing() -> None:
+    known, inbox, stranger_inbox = endpoint(), Inbox(), Inbox()
+    with (
+        ZenohLink(
+            fleet="ours", robot_id=1, listen=[known], subscriptions={"robot/*/message": inbox}
+        ) as link,
+        ZenohLink(fleet="ours", robot_id=2, connect=[known]) as sender,
+        ZenohLink(
+            fleet="theirs",
+            robot_id=3,
+            connect=[known],
+            subscriptions={"robot/*/message": stranger_inbox},
+        ) as stranger,
+    ):
+        eventually(lambda: stranger.peers() == 2)
+        eventually_hears(sender, "message", b"ours", "robot/2/message", inbox)
+        eventually(lambda: link.present() == {2})
+        assert stranger.present() == frozenset()
+        assert stranger_inbox.count == 0
+
+
+def test_what_cannot_be_opened_is_said_in_one_line() -> None:
+    taken = endpoint()
+
+    def error(**settings: Any) -> str:
+        arguments: dict[str, Any] = {"fleet": "test", "robot_id": 1} | settings
+        with pytest.raises(LinkError) as caught:
+            ZenohLink(**arguments)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    assert error(listen=["udp/[::]:1"]) == "listen = 'udp/[::]:1': must be 'tcp/<host>:<port>'"
+    assert error(connect=["tcp/10.0.0.1"]) == (
+        "connect = 'tcp/10.0.0.1': must be 'tcp/<host>:<port>'"
+    )
+    assert error(fleet="a/*").startswith("fleet = 'a/*': must be")
+    assert error(robot_id=-1).startswith("robot_id = -1: must be")
+    assert "connect" in error(mode="client")
+    with ZenohLink(fleet="test", listen=[taken]):
+        assert taken in error(listen=[taken])
+        assert "another program has this port" in error(listen=[taken])
+    assert "no such address" in error(listen=["tcp/192.0.2.77:7447"])
+    free = endpoint()
+    nobody = error(mode="client", connect=[free])
+    assert free in nobody
+    assert "no router answers" in nobody
+
+
+def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:
+    known, world = endpoint(), b"CircularBND 1.5 2.5 3.5 4.5\n" * 10_000
+    of_robot, of_first, of_second = Inbox(), Inbox(), Inbox()
+    with (
+        ZenohLink(
+            fleet="test", robot_id=1, listen=[known],
+            subscriptions={"ground/world": of_robot, "ground/state": of_robot},
+        ) as robot,
+        ZenohLink(fleet="test", connect=[known], subscriptions={
+            "ground/state": of_first, "robot/*/explored": of_first,
+        }) as first,
+        ZenohLink(
+            fleet="test", connect=[known], subscriptions={"ground/state": of_second}
+        ) as second,
+    ):  # fmt: skip
+        eventually(lambda: robot.peers() == 2 and first.present() == second.present() == {1})
+        eventually_hears(first, "state", b"first", "ground/state", of_robot, of_second)
+        eventually_hears(second, "state", b"second", "ground/state", of_robot, of_first)
+        assert of_second.newest["ground/state"] == b"first"
+        eventually_hears(first, "world", world, "ground/world", of_robot)
+        eventually_hears(robot, "explored", b"cells", "robot/1/explored", of_first)
+        with pytest.raises(KeyError):
+            robot.publish("world", world)
+
+
+def test_close_twice_then_publish() -> None:
+    link = ZenohLink(fleet="test", robot_id=1)
+    link.close()
+    link.close()
+    link.publish("message", b"late")
+    assert link.peers() == 0
+    assert link.present() == frozenset()
+
+
+def test_the_interpreter_exits_after_an_exception() -> None:
+    code = """
+from edge.drivers.zenoh_link import ZenohLink
+with ZenohLink(fleet="test", robot_id=1, connect=["tcp/127.0.0.1:1"]):
+    raise SystemExit(3)
+"""
+    assert (
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False, timeout=120).returncode
+        == 3
+    )
+
+
+def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
+    """Robots 1 and 2 in one network namespace, 3 and 4 in another, and a link between them."""
+    settings: list[dict[str, object]] = [
+        {
+            "robot_id": robot_id,
+            "listen": [f"tcp/10.0.0.{robot_id}:7447"],
+            "connect": [f"tcp/10.0.0.{other}:7447" for other in range(1, robot_id)],
+        }
+        for robot_id in (1, 2, 3, 4)
+    ]
+    isolated = ["unshare", "--user", "--map-root-user", "--net"]
+    if not shutil.which("ip") or subprocess.run([*isolated, "true"], check=False).returncode:
+        pytest.skip("needs network namespaces")
+
+    def enter(robots: Robots) -> list[str]:
+        user = ["nsenter", "--preserve-credentials", "--user", "--net"]
+        return [*user, "--target", str(robots.process.pid)]
+
+    def ip(robots: Robots, command: str) -> None:
+        subprocess.run([*enter(robots), "ip", *command.split()], check=True)
+
+    with (
+        Robots(*settings[:2], prefix=isolated) as near,
+        Robots(*settings[2:], prefix=[*enter(near), "unshare", "--net"]) as far,
+    ):
+        ip(near, f"link add name radio type veth peer name radio netns {far.process.pid}")
+        for robots, addresses in ((near, (1, 2)), (far, (3, 4))):
+            for address in addresses:
+                ip(robots, f"addr add 10.0.0.{address}/24 dev radio")
+            for device in ("lo", "radio"):
+                ip(robots, f"link set {device} up")
+        near.open()
+        far.open()
+
+        def silence(action: str) -> None:
+            """`add` or `del` what swallows the packets from one side to the other."""
+            for robots, others in ((near, (3, 4)), (far, (1, 2))):
+                for other in others:
+                    ip(robots, f"route {action} blackhole 10.0.0.{other}")
+
+        def heard() -> dict[tuple[int, int], int]:
+            return {
+                (receiver, int(sender)): count
+                for receiver, seen in enumerate(near.seen() + far.seen(), start=1)
+                for sender, count in seen["heard"].items()
+            }
+
+        def heard_more(pairs: list[tuple[int, int]]) -> Callable[[], bool]:
+            before = heard()
+
+            def is_more() -> bool:
+                now = heard()
+                return all(now.get(pair, 0) > before.get(pair, 0) + 10 for pair in pairs)
+
+            return is_more
+
+        def present() -> list[list[int]]:
+            return [seen["present"] for seen in near.seen() + far.seen()]
+
+        all_pairs = list(permutations((1, 2, 3, 4), 2))
+        everybody = [[2, 3, 4], [1, 3, 4], [1, 2, 4], [1, 2, 3]]
+        for _ in range(2):
+            eventually(heard_more(all_pairs))
+            eventually(lambda: present() == everybody)
+            silence("add")
+            eventually(lambda: present() == [[2], [1], [4], [3]])
+            # Sooner than the 10 s for which a lost connection may hold a thread.
+            eventually(heard_more([(1, 2), (2, 1), (3, 4), (4, 3)]), timeout_s=5.0)
+            silence("del")
+        eventually(heard_more(all_pairs))
+        silence("add")
+        eventually(lambda: present() == [[2], [1], [4], [3]])
+        for robots in (near, far):
+            robots.process.communicate(timeout=8.0)
+            assert robots.process.returncode == 0

@@ -1,0 +1,522 @@
+"""The live map: who may see it, that it keeps up, and a real browser on it."""
+
+import asyncio
+import json
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import aiohttp
+import pytest
+
+from edge.core.fence import Fence
+from edge.messages.mission import ON_GROUND, FlightState, GroundState
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.ground.map.access import Access, is_loopback, reached_at
+from lpac.ground.map.server import Outbox, serving
+from lpac.ground.map.view import Missions, detail_view
+from lpac.ground.station.client import command, listen
+from lpac.ground.station.protocol import SetOrigin, TakeCommand
+from tests.pretend import FENCE, ORIGIN, PretendedFleet, PretendedRobot, pretended
+from tests.process.ground.browser import PATIENCE_S, Opened, live_map, lpac, opened
+from tests.process.ground.conftest import wait_for_snapshot
+
+TOKEN = "correct-horse"
+HOSTILE = "<img src=x onerror=document.title='owned'> & <b>bold</b>"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PretendedFleet]:
+    """Thirty robots and their ground process; nobody has taken off."""
+    with (
+        pretended(tmp_path_factory.mktemp("fleet"), 30) as robots,
+        lpac("ground", "--fleet", str(robots.fleet_toml), "--name", "alice"),
+    ):
+        yield robots
+
+
+# Who may see it
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "allowed"),
+    [
+        ("127.0.0.1:8300", None, True),
+        ("localhost:8300", "http://localhost:8300", True),
+        ("[::1]:8300", "http://[::1]:8300", True),
+        # Names of others that lead here, and pages of others.
+        ("evil.example:8300", None, False),
+        ("evil.example:8300", "http://evil.example:8300", False),
+        ("127.0.0.1.evil.example", None, False),
+        ("127.0.0.1:8300", "http://evil.example", False),
+        ("127.0.0.1:8300", "http://127.0.0.1:5000", False),
+        ("127.0.0.1:8300", "null", False),
+        ("[::1", None, False),
+        ("", None, False),
+    ],
+)
+def test_only_this_machines_own_page_is_served(
+    host: str, origin: str | None, allowed: bool
+) -> None:
+    refusal = Access(local=True, token=None).refusal(host, origin, ())
+    assert (refusal is None) == allowed
+
+
+def test_beyond_this_machine_a_token_is_asked_for() -> None:
+    assert not is_loopback("0.0.0.0") and not is_loopback("192.168.8.2")
+    assert is_loopback("127.0.0.1") and is_loopback("::1") and is_loopback("localhost")
+    access = Access(local=False, token=TOKEN)
+    host = "192.168.8.2:8300"
+    assert access.refusal(host, None, (None, TOKEN)) is None
+    assert access.refusal(host, f"http://{host}", (TOKEN, None)) is None
+    for tokens in ((None, None), ("", "wrong"), ("corréct-horse", None), (f"{TOKEN} ", None)):
+        assert access.refusal(host, None, tokens) is not None
+    assert access.refusal(host, "http://evil.example", (TOKEN, None)) is not None
+
+
+Ask = Callable[..., Awaitable[aiohttp.ClientResponse]]
+
+
+@asynccontextmanager
+async def asking(
+    fleet: str, *, token: str | None = None, operate: bool = False
+) -> AsyncIterator[tuple[str, aiohttp.ClientSession]]:
+    access = Access(local=True, token=token)
+    async with (
+        serving(fleet, host="127.0.0.1", port=0, access=access, operate=operate) as (address,),
+        # Cookies of addresses are kept, as browsers do.
+        aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session,
+    ):
+        yield address, session
+
+
+def test_what_a_stranger_gets_from_the_server() -> None:
+    async def ask() -> None:
+        async with asking("nobody", token=TOKEN) as (address, session):
+            bare = address.partition("?")[0]
+            for path in ("", "map.js", "map.css", "live", "nothing"):
+                assert (await session.get(bare + path)).status == 403
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                await session.ws_connect(bare + "live")
+            # The address that was printed gives a cookie, and hides the token.
+            page = await session.get(address)
+            assert page.status == 200 and page.url.query_string == ""
+            assert "script-src 'self'" in page.headers["Content-Security-Policy"]
+            assert "http" not in (await page.text()).replace("http-equiv", "")
+            assert (await session.get(bare + "map.js")).content_type == "text/javascript"
+            assert (await session.get(bare + "../live_map.py")).status == 404
+            async with session.ws_connect(bare + "live") as stream:
+                assert (await stream.receive_json())["kind"] == "hello"
+            for headers in ({"Origin": "http://evil.example"}, {"Host": "evil.example"}):
+                assert (await session.get(bare, headers=headers)).status == 403
+                with pytest.raises(aiohttp.WSServerHandshakeError):
+                    await session.ws_connect(bare + "live", headers=headers)
+
+    asyncio.run(ask())
+
+
+def test_on_the_network_the_address_has_a_token(fleet: PretendedFleet) -> None:
+    async def ask(address: str) -> None:
+        async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
+            bare = address.partition("?")[0]
+            assert (await session.get(bare)).status == 403
+            assert (await session.get(address)).status == 200
+            async with session.ws_connect(bare + "live", headers={"Origin": bare[:-1]}) as stream:
+                assert (await stream.receive_json())["kind"] == "hello"
+
+    # It serves as at 0.0.0.0.
+    with live_map(fleet.fleet_toml, "--host", "::") as address:
+        assert len(address.partition("?token=")[2]) >= 16
+        name = urlsplit(address).hostname
+        # One that a tablet can open, unless this machine is on no network.
+        assert name in reached_at("0.0.0.0") and name is not None and not is_loopback(name)
+        asyncio.run(ask(address))
+    assert reached_at("127.0.0.1") == ["127.0.0.1"]
+
+
+def test_a_port_that_is_taken_is_told_in_one_line() -> None:
+    async def ask() -> None:
+        async with asking("nobody") as (address, _):
+            port = int(address.rstrip("/").rpartition(":")[2])
+            access = Access(local=True, token=None)
+            with pytest.raises(OSError, match=f"--port {port}: cannot serve there: .*in use"):
+                async with serving(
+                    "nobody", host="127.0.0.1", port=port, access=access, operate=False
+                ):
+                    pass
+
+    asyncio.run(ask())
+
+
+# What it tells
+
+
+async def until(
+    stream: aiohttp.ClientWebSocketResponse, wanted: Callable[[dict[str, Any]], bool]
+) -> dict[str, Any]:
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            message: dict[str, Any] = await stream.receive_json()
+            if wanted(message):
+                return message
+
+
+def of_kind(kind: str) -> Callable[[dict[str, Any]], bool]:
+    return lambda message: message["kind"] == kind
+
+
+def test_without_a_ground_it_says_so() -> None:
+    async def ask() -> None:
+        async with (
+            asking("nobody") as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            told = await until(stream, lambda m: m["kind"] == "ground" and "lpac" in m["problem"])
+            assert "no ground station runs for fleet nobody" in told["problem"]
+
+    asyncio.run(ask())
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [
+        {"do": "takeoff", "robots": []},
+        {"do": "hold", "robots": ["r3"]},
+        {"do": "kill", "robots": ["r3"]},
+    ],
+)
+def test_a_map_that_only_observes_refuses_every_action(
+    fleet: PretendedFleet, wish: dict[str, Any]
+) -> None:
+    async def ask() -> None:
+        async with (
+            asking(fleet.name) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            await until(stream, of_kind("snapshot"))
+            for nonsense in ("", "[", "[]", '{"do": 3, "robots": []}', '{"do": "land"}'):
+                await stream.send_str(nonsense)
+            await stream.send_json(wish)
+            report = await until(stream, of_kind("report"))
+            assert not report["done"] and "only observes" in report["problem"]
+            snapshot = await until(stream, of_kind("snapshot"))
+            assert snapshot["safety_action"] == "none"
+
+    asyncio.run(ask())
+    assert all(robot.state in ON_GROUND for robot in fleet.robots)
+
+
+def test_kill_is_no_action_of_the_map(fleet: PretendedFleet) -> None:
+    async def ask() -> None:
+        async with (
+            asking(fleet.name, operate=True) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            await stream.send_json({"do": "kill", "robots": ["r3"]})
+            report = await until(stream, of_kind("report"))
+            assert report["problem"] == "there is no such command here"
+
+    asyncio.run(ask())
+
+
+def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
+    fleet: PretendedFleet,
+) -> None:
+    """Five times a second of the ground's own clock, as soon as this machine lets it."""
+
+    async def straight(told_s: list[float]) -> None:
+        async for told in listen(fleet.name):
+            match told:
+                case FleetSnapshot(unix_time_s):
+                    told_s.append(unix_time_s)
+
+    def keeps_up(told_s: list[float], shown_s: list[float]) -> bool:
+        # What was told last may still be on its way.
+        wanted_s = [t_s for t_s in told_s if shown_s and shown_s[0] <= t_s <= shown_s[-1]][-30:]
+        return (
+            len(wanted_s) == 30
+            and len(set(wanted_s) & set(shown_s)) >= 0.9 * len(wanted_s)
+            and (wanted_s[-1] - wanted_s[0]) / (len(wanted_s) - 1) < 0.3
+        )
+
+    async def ask() -> None:
+        told_s: list[float] = []
+        shown_s: list[float] = []
+        async with (
+            asking(fleet.name) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            direct = asyncio.create_task(straight(told_s))
+            async with asyncio.timeout(PATIENCE_S):
+                while not keeps_up(told_s, shown_s):
+                    text = await stream.receive_str()
+                    message = json.loads(text)
+                    if message["kind"] == "snapshot":
+                        assert len(message["robots"]) == 30
+                        assert len(text) < 40_000
+                        shown_s.append(message["unix_time_s"])
+            direct.cancel()
+            await asyncio.gather(direct, return_exceptions=True)
+
+    asyncio.run(ask())
+
+
+def test_a_page_that_takes_nothing_misses_snapshots() -> None:
+    async def ask() -> list[str]:
+        page = Outbox()
+        page.put("setup", "setup")
+        for n in range(1000):
+            page.put(f"snapshot {n}", "snapshot")
+            page.put_each(f"event {n}")
+        return await page.take()
+
+    taken = asyncio.run(ask())
+    assert taken[:2] == ["setup", "snapshot 999"]
+    assert taken[-1] == "event 999" and len(taken) <= 202
+
+
+def snapshot_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> FleetSnapshot:
+    robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
+    status = replace(
+        robot.status(0.0), state=state, trial=trial, armed=state not in ON_GROUND, boot_nonce=7
+    )
+    ground = GroundState(1, "alice", trial=trial)
+    return FleetSnapshot(unix_time_s, "alice", ground, (RobotSnapshot("r1", 1, status, 0.1),))
+
+
+def test_a_page_that_opens_late_has_the_whole_curve() -> None:
+    missions = Missions()
+    waiting, flying = (
+        snapshot_of(state, 100.0) for state in (FlightState.HOLD, FlightState.MISSION)
+    )
+    missions.take(waiting)
+    assert not missions.begins(waiting) and missions.time_s(waiting) is None
+    missions.take(flying)
+    assert missions.begins(flying)
+    curve = missions.begin(flying, 50.0)
+    curve.bound = curve.share(10.0)
+    for n in range(5000):
+        curve.add(0.4 * n, 50.0 - 0.005 * n)
+    view = curve.view()
+    assert view["whole"] and view["began_s"] == 100.0 and view["bound"] == 0.2
+    assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
+    assert len(view["points"]) <= 3000
+    # Hold is part of a mission, landing is not.
+    assert missions.time_s(snapshot_of(FlightState.HOLD, 160.0)) == 60.0
+    assert missions.time_s(snapshot_of(FlightState.LAND, 160.0)) is None
+    assert not missions.begins(snapshot_of(FlightState.MISSION, 170.0))
+    # What was seen of it over another world is nothing to compare with.
+    missions.change_world()
+    assert not missions.begin(snapshot_of(FlightState.MISSION, 180.0), 40.0).whole
+
+
+@pytest.mark.parametrize(
+    ("between", "trial", "anew"),
+    [
+        (snapshot_of(FlightState.HOLD, 110.0), "t1", False),
+        (snapshot_of(FlightState.LANDED, 110.0), "t1", True),
+        (snapshot_of(FlightState.HOLD, 110.0, ""), "t1", True),
+        (snapshot_of(FlightState.HOLD, 110.0), "t2", True),
+    ],
+)
+def test_a_mission_after_another_is_a_new_curve(
+    between: FleetSnapshot, trial: str, anew: bool
+) -> None:
+    missions = Missions()
+    flying = snapshot_of(FlightState.MISSION, 100.0)
+    missions.take(flying)
+    missions.begin(flying, 50.0)
+    missions.take(between)
+    waiting, again = (
+        snapshot_of(state, 120.0, trial) for state in (FlightState.HOLD, FlightState.MISSION)
+    )
+    missions.take(waiting)
+    assert (missions.time_s(waiting) is None) == anew
+    missions.take(again)
+    assert missions.begins(again) == anew
+
+
+def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
+    async def ask(fleet: PretendedFleet) -> None:
+        async with (
+            asking(fleet.name) as (address, session),
+            session.ws_connect(address + "live") as stream,
+        ):
+            # It is not known before a robot says it.
+            await until(stream, lambda m: m["kind"] == "setup" and m["density"] is None)
+            told = await until(stream, of_kind("coverage"))
+            assert told["cost"] is None and not told["cells"]
+            snapshot = await until(stream, of_kind("snapshot"))
+            assert any("no density, no cost" in alarm["text"] for alarm in snapshot["alarms"])
+
+    with pretended(tmp_path, 1) as fleet:
+        fleet.robots[0].world_id = "0123456789ab"
+        with lpac("ground", "--fleet", str(fleet.fleet_toml), "--name", "alice"):
+            asyncio.run(ask(fleet))
+
+
+def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
+    (robot,) = snapshot_of(FlightState.HOLD, 0.0).robots
+    assert robot.status is not None
+    late = replace(robot.status.loops["control"], lateness_p99_ms=math.nan)
+    broken = replace(robot.status, loops={"control": late}, hdop=math.nan)
+    setup = FleetSetup(
+        "f", "alice", {"r1": 1}, (), FENCE, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0
+    )
+    view = detail_view(setup, replace(robot, status=broken))
+    shown = json.loads(json.dumps(view, allow_nan=False))["status"]
+    assert shown["loops"]["control"]["lateness_p99_ms"] is None and shown["hdop"] is None
+
+
+def test_a_buffers_line_does_not_cross_itself() -> None:
+    """Its short edges may be gone."""
+    corners = ((0.0, 0.0), (32.0, 0.0), (32.0, 31.9), (31.9, 32.0), (0.0, 32.0))
+    fence = Fence(corners, buffer_m=1.5, floor_m=2.0, ceiling_m=100.0)
+    assert set(fence.grown_m(-1.5)) == {(1.5, 1.5), (30.5, 1.5), (30.5, 30.5), (1.5, 30.5)}
+
+
+# A real browser
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PretendedFleet]:
+    """Three robots, of which one says things that a careless page would run."""
+    with pretended(tmp_path_factory.mktemp("few"), 3) as robots:
+        robots.robots[2].refuses = HOSTILE
+        yield robots
+
+
+def check_innocence(seen: Opened) -> None:
+    assert seen.errors == []
+    assert seen.hosts == {"127.0.0.1"}
+    assert seen.page.locator("img").count() == 0
+    assert "owned" not in seen.page.title()
+
+
+def test_a_flight_by_clicks(few: PretendedFleet) -> None:
+    with (
+        lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"),
+        live_map(few.fleet_toml, "--operate") as address,
+        opened(address) as seen,
+    ):
+        page = seen.page
+        wait_for_snapshot(few.name)
+        assert command(few.name, SetOrigin(ORIGIN)).done
+        # On a tablet, upright, and on a phone hold is in reach.
+        for width, height in ((768, 1024), (400, 800), (1280, 800)):
+            page.set_viewport_size({"width": width, "height": height})
+            box = page.locator("#hold").bounding_box()
+            assert box is not None and box["x"] >= 0.0 and box["y"] >= 0.0
+            assert box["x"] + box["width"] <= width and box["y"] + box["height"] <= height
+        seen.act("enable")
+        seen.wait_for_states(dict.fromkeys(("r0", "r1", "r2"), "preflight"))
+        # Takeoff asks first; who will not is named, in text.
+        seen.act("takeoff")
+        page.wait_for_selector("#ask >> text=Take off 2 of 3")
+        assert HOSTILE in page.inner_text("#ask")
+        page.click("#ask-no")
+        assert page.is_hidden("#ask")
+        assert seen.state_of("r0") == "preflight"
+        seen.act("takeoff", sure=True)
+        seen.wait_for_states({"r0": "hold", "r1": "hold", "r2": "preflight"})
+        page.wait_for_selector(f"#toasts >> text={HOSTILE}")
+        seen.act("start")
+        seen.wait_for_states({"r0": "mission", "r1": "mission"})
+        assert few.robots[0].trial == page.inner_text("#trial")
+        # The cost, and its bound.
+        page.wait_for_function("() => Number(document.querySelector('#bound').textContent) > 0")
+        page.wait_for_function("() => Number(document.querySelector('#share').textContent) > 0")
+        # One robot, from its drawer.
+        page.click("tr[data-robot=r1]")
+        page.wait_for_selector("#drawer >> text=landing point")
+        page.wait_for_selector("#drawer table td >> text=r0")
+        page.click("#drawer [data-robot-do=hold]")
+        page.wait_for_selector("#drawer .state >> text=hold")
+        seen_states = {"r0": "mission", "r1": "hold"}
+        page.keyboard.press("Escape")
+        seen.wait_for_states(seen_states)
+        # Hold is one key, also while something is asked.
+        seen.act("land")
+        page.wait_for_selector("#ask >> text=Land")
+        page.keyboard.press("h")
+        seen.wait_for_states({"r0": "hold"})
+        page.wait_for_selector("#safety-action >> text=HOLD by alice")
+        page.click("#ask-no")
+        seen.act("resume")
+        seen.wait_for_states({"r0": "mission"})
+        page.click("#hold")
+        seen.wait_for_states({"r0": "hold", "r1": "hold"})
+        seen.act("land", sure=True)
+        seen.wait_for_states({"r0": "landed", "r1": "landed"})
+        check_innocence(seen)
+
+
+def test_the_command_is_taken_by_a_click(few: PretendedFleet, tmp_path: Path) -> None:
+    ground = "ground", "--fleet", str(few.fleet_toml), "--name"
+    with (
+        lpac(*ground, "alice"),
+        live_map(few.fleet_toml, "--operate") as address,
+        opened(address) as seen,
+    ):
+        page = seen.page
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+            with lpac(*ground, "bob"):
+                wait_for_snapshot(few.name)
+                assert command(few.name, TakeCommand()).done
+                seen.act("command")
+                page.wait_for_selector("#ask >> text=Take the command from bob?")
+                page.click("#ask-yes")
+                page.wait_for_selector("#commander >> text=alice")
+                page.wait_for_selector("#command", state="hidden")
+        check_innocence(seen)
+
+
+def test_a_page_that_observes(few: PretendedFleet) -> None:
+    """It has nothing to command with; and it comes back by itself when the ground does."""
+    with live_map(few.fleet_toml) as address, ExitStack() as first:
+        ground = "ground", "--fleet", str(few.fleet_toml), "--name", "alice"
+        first.enter_context(lpac(*ground))
+        with opened(address, theme="dark") as seen:
+            page = seen.page
+            assert page.is_hidden("#bar")
+            assert "lpac mission hold" in page.inner_text("#observing")
+            page.keyboard.press("h")
+            page.wait_for_selector("#toasts >> text=lpac mission hold")
+            below_360 = "async () => (await import('./dom.js')).direction(359.9)"
+            assert page.evaluate(below_360) == "0°"
+            page.click("tr[data-robot=r1]")
+            page.wait_for_selector("#drawer >> text=satellites")
+            assert page.locator("[data-robot-do]:visible").count() == 0
+            page.wait_for_selector("#banner", state="hidden")
+            first.close()
+            page.wait_for_selector("#banner >> text=lpac ground")
+            with lpac(*ground):
+                page.wait_for_selector("#banner", state="hidden")
+                page.wait_for_selector("#link >> text=ground live")
+                assert "HOLD" not in page.inner_text("#safety-action")
+                # Of a world that this laptop does not have.
+                assert command(few.name, SetOrigin(ORIGIN)).done
+                page.keyboard.press("Escape")
+                page.wait_for_selector("#absolute >> text=/e/")
+                known = [robot.world_id for robot in few.robots]
+                for robot in few.robots:
+                    robot.world_id = "feedbeef0000"
+                page.wait_for_selector("#importance >> text=no importance known")
+                costs = [page.inner_text(f"#{name}") for name in ("share", "bound", "absolute")]
+                assert costs == ["\N{EN DASH}"] * 3 and page.is_hidden("#ramp")
+                for robot, world_id in zip(few.robots, known, strict=True):
+                    robot.world_id = world_id
+                page.wait_for_selector("#importance >> text=/^importance/")
+            check_innocence(seen)

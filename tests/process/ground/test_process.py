@@ -1,0 +1,387 @@
+"""`lpac ground` as a real process, over real zenoh, with pretended robots."""
+
+import asyncio
+import math
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from edge.messages.mission import FlightState, world_id
+from lpac.analysis.snapshot import Explored, FleetSnapshot, GroundEvent
+from lpac.cli.ground import load_setup
+from lpac.ground.station import client
+from lpac.ground.station.protocol import (
+    CommandProgress,
+    CommandReport,
+    Enable,
+    NextTrial,
+    Resume,
+    RobotCommand,
+    RobotResult,
+    SafetyCommand,
+    SetOrigin,
+    SetWorld,
+    Start,
+    TakeCommand,
+    Takeoff,
+)
+from tests.pretend import ORIGIN, PretendedFleet, pretended
+from tests.process.ground.conftest import PATIENCE_S, GroundStation, NewStation, all_heard
+
+_S = FlightState
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[PretendedFleet]:
+    """Three robots r0, r1, r2, and r3, a spare."""
+    with pretended(tmp_path, 3, spares=1) as running:
+        yield running
+
+
+def everywhere(snapshot: FleetSnapshot, state: FlightState, count: int = 3) -> bool:
+    return all(r.status and r.status.state is state for r in snapshot.robots[:count])
+
+
+def obeying(snapshot: FleetSnapshot, operator: str) -> bool:
+    return all(r.status and r.status.operator == operator for r in snapshot.robots[:3])
+
+
+def done(report: CommandReport) -> CommandReport:
+    assert report.done, report
+    return report
+
+
+def make_ready(station: GroundStation) -> None:
+    station.wait_for(all_heard)
+    done(station.command(SetOrigin(ORIGIN)))
+    done(station.command(Enable()))
+
+
+def fly(station: GroundStation) -> None:
+    make_ready(station)
+    done(station.command(Takeoff(interval_s=0.0)))
+    done(station.command(Start()))
+
+
+def refusals(report: CommandReport) -> dict[str, str]:
+    return {result.robot: result.text for result in report.results if not result.done}
+
+
+def test_a_whole_flight(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    assert "no mission origin" in station.command(Takeoff()).problem
+    make_ready(station)
+    progress: list[CommandProgress] = []
+    report = station.command(Takeoff(interval_s=0.1), progress.append)
+    assert done(report).results[0] == RobotResult("r0", True, "at its height, 4 m")
+    began = [p.robot for p in progress if p.text == "takes off"]
+    assert began == ["r2", "r1", "r0"], "the highest first"
+    done(station.command(Start()))
+    done(station.command(SafetyCommand("hold")))
+    done(station.command(Resume()))
+    assert everywhere(station.wait_for(lambda p: everywhere(p, _S.MISSION)), _S.MISSION)
+    assert "are armed" in station.command(SetWorld("Uniform 3 1 0 0 9 0 9 9", "w.env")).problem
+    done(station.command(RobotCommand("pilot", ("r1",))))
+    done(station.command(RobotCommand("rejoin", ("r1",))))
+    done(station.command(SafetyCommand("return", wait=True)))
+    done(station.command(NextTrial()))
+    # What brought them down does not keep them there.
+    done(station.command(Takeoff(interval_s=0.0)))
+    done(station.command(SafetyCommand("land", wait=True)))
+    snapshot = station.wait_for(lambda p: p.ground is not None)
+    assert snapshot.ground is not None
+    assert snapshot.ground.trial == "t2"
+
+
+def test_who_joins_late_has_the_state(tmp_path: Path, new_station: NewStation) -> None:
+    text = "CircularBND 100 100 20 5\n"
+    with pretended(tmp_path, 3, absent=[2]) as fleet:
+        station = new_station(fleet.fleet_toml)
+        station.wait_for(lambda p: all(robot.fresh for robot in p.robots[:2]))
+        report = station.command(SetOrigin(ORIGIN))
+        assert refusals(report) == {"r2": "not heard"}
+        assert refusals(station.command(SetWorld(text, "w.env"))) == {"r2": "not heard"}
+        fleet.join(2)
+        station.wait_for(
+            lambda p: all(
+                r.status and r.status.origin == ORIGIN and r.status.world_id == world_id(text)
+                for r in p.robots
+            )
+        )
+
+
+def test_a_station_that_was_killed_goes_on_where_it_was(
+    fleet: PretendedFleet, new_station: NewStation
+) -> None:
+    text = "CircularBND 100 100 20 5\n"
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    # It climbs for as long as the test has a use for it.
+    fleet.robots[2].takeoff_s = math.inf
+    done(station.command(SetWorld(text, "w.env")))
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    takeoff.progress("r2")
+    station.wait_for(lambda p: p.robots[2].status and p.robots[2].status.state is _S.TAKEOFF)
+    station.kill()
+    takeoff.leave()
+    fleet.robots[2].takeoff_s = 1.0
+    station.start()
+    snapshot = station.wait_for(lambda p: p.ground is not None)
+    assert snapshot.ground is not None
+    assert snapshot.ground.origin == ORIGIN
+    assert snapshot.ground.enabled
+    # Nothing half done: what had taken off comes to hold, and nothing else takes off.
+    states = [_S.PREFLIGHT, _S.PREFLIGHT, _S.HOLD]
+    station.wait_for(lambda p: [r.status and r.status.state for r in p.robots[:3]] == states)
+    assert station.setup().world == text
+    done(station.command(Takeoff(interval_s=0.0)))
+    done(station.command(Start()))
+    # What robots do not say is not forgotten either.
+    done(station.command(SafetyCommand("hold")))
+    station.kill()
+    station.start()
+    snapshot = station.wait_for(lambda p: p.ground is not None)
+    assert snapshot.ground is not None
+    assert snapshot.ground.safety_action == "hold"
+    assert "hold is commanded" in station.command(Start()).problem
+    # A memory that is broken is none.
+    station.kill()
+    station.socket_path.with_suffix(".state").write_text("{")
+    station.start()
+    station.wait_for(lambda p: p.ground is not None)
+
+
+def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
+    alice = new_station(fleet.fleet_toml)
+    fly(alice)
+    bob = new_station(fleet.fleet_toml, "bob")
+    assert bob.wait_for(lambda p: p.ground and all_heard(p)).commander == "alice"
+    for request in (SafetyCommand("land"), Start(), NextTrial(), RobotCommand("disarm", ("r0",))):
+        assert bob.command(request).problem == (
+            "alice commands the fleet: `lpac mission command` takes over"
+        )
+    # Anybody may hold.
+    done(bob.command(SafetyCommand("hold")))
+    snapshot = alice.wait_for(lambda p: p.ground and p.ground.safety_action == "hold")
+    assert snapshot.commander == "alice"
+    assert snapshot.ground is not None
+    assert snapshot.ground.safety_action_by == "bob"
+    assert "hold is commanded by bob" in alice.command(Start()).problem
+    done(alice.command(Resume()))
+    assert everywhere(bob.wait_for(lambda p: everywhere(p, _S.MISSION)), _S.MISSION)
+    # Taking over, on purpose, in flight.
+    done(bob.command(TakeCommand()))
+    assert everywhere(alice.wait_for(lambda p: p.commander == "bob"), _S.MISSION)
+    assert "bob commands the fleet" in alice.command(SafetyCommand("return")).problem
+    # Killing is everybody's, too.
+    done(alice.command(RobotCommand("kill", ("r0",))))
+    # With the commander gone, a hold commands.
+    bob.kill()
+    alice.wait_for(lambda p: p.commander_age_s > 2.0)
+    done(alice.command(SafetyCommand("hold", robots=("r1", "r2"))))
+    alice.wait_for(lambda p: p.commander == "alice")
+
+
+def test_another_station_knows_the_world_that_one_sends(
+    fleet: PretendedFleet, new_station: NewStation
+) -> None:
+    text = "CircularBND 100 100 20 5\n"
+    alice = new_station(fleet.fleet_toml)
+    alice.wait_for(all_heard)
+    bob = new_station(fleet.fleet_toml, "bob")
+    # It is sent only until all robots have it: by then bob hears alice.
+    done(alice.command(SetOrigin(ORIGIN)))
+    bob.wait_for(lambda p: p.ground)
+    done(alice.command(SetWorld(text, "w.env")))
+    bob.wait_for(lambda _: bob.setup().world == text)
+    carol = new_station(fleet.fleet_toml, "carol")
+    carol.wait_for(lambda _: not carol.setup().world)
+    assert carol.setup().world_id == world_id(text)
+    # On the same laptop it stays known.
+    bob.kill()
+    bob.start()
+    bob.wait_for(lambda p: p.ground)
+    assert bob.setup().world == text
+
+
+def test_a_ground_that_hangs(
+    fleet: PretendedFleet, new_station: NewStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    subscribed = station.subscribed()
+    next(subscribed)
+    # It is silent for longer than that, and yet a long command goes on.
+    fleet.robots[2].takeoff_s = math.inf
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    assert [takeoff.progress("").text for _ in range(2)] == ["", ""]
+    assert station.process is not None
+    station.process.send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(client, "_PATIENCE_S", 0.5)
+    with pytest.raises(client.GroundError, match="does not answer: end it, and start"):
+        station.command(SafetyCommand("hold"))
+    with pytest.raises(client.GroundError, match="does not answer"):
+        station.told()
+    with pytest.raises(client.GroundError, match="does not answer"):
+        list(subscribed)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(station.runtime))
+    with pytest.raises(client.GroundError, match="does not answer"):
+        asyncio.run(client.send(station.fleet, SafetyCommand("hold")))
+    monkeypatch.undo()
+    station.process.send_signal(signal.SIGCONT)
+    fleet.robots[2].takeoff_s = 1.0
+    # What it was told meanwhile it does.
+    station.wait_for(lambda p: p.ground and p.ground.safety_action == "hold")
+    takeoff.leave()
+
+
+def test_robots_land_when_their_files_say(fleet: PretendedFleet) -> None:
+    text = fleet.fleet_toml.read_text()
+    flight = "battery_critical = 0.2\nground_timeout_s = 4.0\nground_lost_land_s = 30.0\n"
+    fleet.fleet_toml.write_text(text.replace("[robot.flight]\n", f"[robot.flight]\n{flight}"))
+    setup = load_setup(fleet.fleet_toml, "alice").setup
+    assert setup.battery_critical == 0.2
+    assert (setup.ground_timeout_s, setup.ground_lost_land_s) == (4.0, 30.0)
+
+
+def test_two_stations_of_one_name(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    second = station.twin()
+    assert second.returncode == 1
+    assert "another ground station commands this fleet as alice" in second.stderr
+    # Nor is there a second one of the same user.
+    second = station.twin(station.runtime)
+    assert second.returncode == 1
+    assert second.stderr == (f"lpac: `lpac ground` already runs for fleet {fleet.name} here\n")
+    assert station.wait_for(lambda p: obeying(p, "alice")).commander == "alice"
+
+
+def test_another_fleet_is_not_reached(fleet: PretendedFleet, new_station: NewStation) -> None:
+    text = fleet.fleet_toml.read_text()
+    other = fleet.fleet_toml.with_name("other.toml")
+    other.write_text(text.replace(fleet.name, f"{fleet.name}x"))
+    station = new_station(other)
+    report = station.command(SetOrigin(ORIGIN))
+    assert refusals(report) == dict.fromkeys(("r0", "r1", "r2"), "not heard")
+    assert refusals(station.command(RobotCommand("kill", ("r0",)))) == {"r0": "not heard"}
+    assert all(robot.ground is None for robot in fleet.robots)
+
+
+def test_mistakes(fleet: PretendedFleet, new_station: NewStation) -> None:
+    with pytest.raises(client.GroundError, match="no ground station runs for fleet"):
+        client.command(fleet.name, Start())
+    station = new_station(fleet.fleet_toml)
+    assert station.command(Start(robots=("r7",))).problem == (
+        "robot 'r7' is unknown; known are r0, r1, r2, r3"
+    )
+    assert "no robot is named" in station.command(RobotCommand("kill", ())).problem
+    make_ready(station)
+    fleet.robots[1].refuses = "the battery is low: 20 %"
+    report = station.command(Takeoff(interval_s=0.0))
+    assert refusals(report) == {"r1": "not ready: the battery is low: 20 %"}
+    # A spare does not fly by default, but has the state.
+    station.wait_for(lambda _: fleet.robots[3].state is _S.PREFLIGHT)
+
+
+def test_lines_that_are_no_commands(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    for line in (
+        b"", b"\n", b"{}\n", b"[" * 100_000 + b"\n", b'{"takeoff": {"interval_s": "x"}}\n',
+        b"\xff\xfe\n", b'{"snapshot": {}}\n', b"subscribe", b"x" * 1000,
+    ):  # fmt: skip
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(str(station.socket_path))
+            connection.sendall(line)
+            connection.shutdown(socket.SHUT_WR)
+            with connection.makefile("rb") as answers:
+                answers.readline()
+    make_ready(station)
+
+
+def test_who_leaves_abandons_what_is_not_ordered(
+    fleet: PretendedFleet, new_station: NewStation
+) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    takeoff.progress("r2")
+    takeoff.leave()
+    station.wait_for(lambda p: not p.running and fleet.robots[2].state is _S.HOLD)
+    assert [robot.state for robot in fleet.robots[:2]] == [_S.PREFLIGHT] * 2
+    # A hold ends a takeoff, too, and then land is just as quick.
+    takeoff = station.begin(Takeoff(interval_s=60.0))
+    takeoff.progress("r1")
+    done(station.command(SafetyCommand("hold")))
+    assert refusals(takeoff.report())["r0"] == "abandoned: hold"
+    done(station.command(SafetyCommand("land", wait=True)))
+
+
+def test_two_programs_of_one_robot(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    make_ready(station)
+    fleet.duplicate(1)
+    station.wait_for(lambda p: p.robots[1].duplicate)
+    assert refusals(station.command(Takeoff(interval_s=0.0))) == {
+        "r1": "two programs say that they are this robot"
+    }
+
+
+def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) -> None:
+    station = new_station(fleet.fleet_toml)
+    assert station.end(signal.SIGINT) == 0
+    station.start()
+    fly(station)
+    assert station.process is not None
+    station.process.send_signal(signal.SIGINT)
+    station.wait_for(lambda _: "hold after 3 s" in station.log.read_text())
+    assert station.end(signal.SIGINT) == 0
+    assert not station.socket_path.exists()
+    station.start()
+    station.wait_for(lambda p: p.ground and all_heard(p))
+    assert station.process is not None
+    # Its terminal is closed, which is no reason to leave robots in the air alone.
+    station.process.send_signal(signal.SIGHUP)
+    # They are in the air for as long as it has something to say.
+    for robot in fleet.robots:
+        robot.takeoff_s = math.inf
+    done(station.command(SafetyCommand("land")))
+    for robot in fleet.robots:
+        robot.takeoff_s = 1.0
+    assert station.process.wait(PATIENCE_S) == 0
+    assert {robot.state for robot in fleet.robots[:3]} == {_S.LANDED}
+    station.start()
+    assert station.end(signal.SIGTERM) == 0
+    station.start()
+    # What is left of a station that was killed is in nobody's way.
+    station.kill()
+    assert station.socket_path.exists()
+    station.start()
+    subscribed = station.subscribed()
+    next(subscribed)
+    station.kill()
+    with pytest.raises(client.GroundError, match="has ended"):
+        list(subscribed)
+
+
+def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
+    with pretended(tmp_path, 30) as fleet:
+        station = new_station(fleet.fleet_toml)
+        station.wait_for(lambda p: all(robot.fresh for robot in p.robots))
+        # It never reads.
+        with socket.socket(socket.AF_UNIX) as late:
+            late.connect(str(station.socket_path))
+            late.sendall(b"subscribe\n")
+            fly(station)
+            done(station.command(SafetyCommand("hold")))
+        # Maps have no hurry on the radio.
+        station.wait_for(
+            lambda _: (
+                {t.robot for t in station.told() if isinstance(t, Explored)}
+                == set(station.setup().robots)
+            )
+        )
+        assert any(isinstance(t, GroundEvent) and t.kind == "result" for t in station.told())

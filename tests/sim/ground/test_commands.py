@@ -1,0 +1,327 @@
+"""What commands do when somebody else wants something meanwhile, or their client leaves."""
+
+from dataclasses import replace
+
+import pytest
+
+from edge.messages.mission import FlightState, Place
+from lpac.ground.station.protocol import (
+    Enable,
+    NextTrial,
+    Request,
+    Resume,
+    RobotCommand,
+    SafetyCommand,
+    SetFence,
+    SetOrigin,
+    SetPlaces,
+    SetWorld,
+    TakeCommand,
+    Takeoff,
+)
+from tests.pretend import ORIGIN
+from tests.sim.ground.test_station import OTHER_WORLD, WORLD, Field, a_field, pad_m, why_not
+
+_S = FlightState
+TAKEOFF = Takeoff(interval_s=0.0)
+
+
+def two_stations() -> Field:
+    """Alice commands robots that are ready, bob observes."""
+    field = a_field()
+    field.join("bob")
+    field.make_ready()
+    field.run(1.0)
+    return field
+
+
+# A hold keeps robots on the ground, too
+
+
+@pytest.mark.parametrize("by", ["alice", "bob"])
+def test_a_hold_on_the_ground_is_not_withdrawn_by_takeoff(by: str) -> None:
+    field = two_stations()
+    field.done(SafetyCommand("hold"), by)
+    field.run(1.0)
+    who = "" if by == "alice" else " by bob"
+    refusal = f"hold is commanded{who}: `lpac mission resume` withdraws it"
+    assert field.do(TAKEOFF).problem == refusal
+    field.run(5.0)
+    assert field.states() == {_S.PREFLIGHT}
+    field.done(Resume())
+    field.done(TAKEOFF)
+    assert field.states() == {_S.HOLD}
+
+
+def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> None:
+    field = two_stations()
+    field.done(SafetyCommand("hold", robots=("r1",)), "bob")
+    field.run(1.0)
+    assert why_not(field.do(TAKEOFF)) == {
+        "r1": "hold is commanded by bob: `lpac mission resume` withdraws it"
+    }
+    field.done(SafetyCommand("land", robots=("r0", "r2"), wait=True))
+    field.done(Takeoff(robots=("r0",)))
+    state = field.stations["alice"].state
+    assert state is not None
+    assert state.robot_safety_actions == {"1": "hold", "2": "land"}
+    # Asked of all, it is as if all were to be set in motion.
+    field.done(SafetyCommand("land", robots=("r0",), wait=True))
+    assert "`lpac mission resume` withdraws it" in field.do(TAKEOFF).problem
+
+
+def test_who_is_not_heard_may_be_in_the_air() -> None:
+    field = a_field()
+    field.take_off()
+    field.done(SafetyCommand("land", wait=True))
+    field.robots[1].silent = True
+    field.run(12.0)
+    assert "land is commanded" in field.do(TAKEOFF).problem
+    # Who is heard may be asked for by name; the other is to land, still.
+    field.done(Takeoff(interval_s=0.0, robots=("r0", "r2")))
+    state = field.stations["alice"].state
+    assert state is not None
+    assert state.safety_action_for(1) == "land"
+
+
+def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
+    field = Field(2, spares=1)
+    field.join("alice")
+    field.robots[2].silent = True
+    field.run(1.0)
+    field.take_off()
+    field.done(SafetyCommand("land", wait=True))
+    field.done(TAKEOFF)
+    state = field.stations["alice"].state
+    assert state is not None
+    assert (state.safety_action, state.robot_safety_actions) == ("none", {})
+
+
+# A mission that was not started is not resumed
+
+
+def test_a_reset_robot_has_not_begun_the_trial() -> None:
+    field = a_field()
+    field.make_ready()
+    field.done(NextTrial("second"))
+    field.done(TAKEOFF)
+    field.done(SafetyCommand("hold"))
+    report = field.done(Resume())
+    texts = {result.text for result in report.results}
+    assert texts == {"holds: it has not begun this trial; `lpac mission start`"}
+    field.run(5.0)
+    assert field.states() == {_S.HOLD}
+
+
+# What is the fleet's is not changed while one of it flies
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        SetOrigin(replace(ORIGIN, heading_deg=90.0), robots=("r0",)),
+        SetFence(None, robots=("r0",)),
+        SetWorld(OTHER_WORLD, "w", robots=("r0",)),
+        SetPlaces({"r0": Place(1, pad_m(1))}),
+    ],
+)
+def test_who_is_not_addressed_keeps_what_it_has(request_: Request) -> None:
+    field = a_field(2)
+    field.make_ready()
+    field.done(Takeoff(robots=("r1",)))
+    before = field.stations["alice"].state
+    assert field.do(request_).problem == "r1 is armed: land and disarm first"
+    assert field.stations["alice"].state == before
+
+
+def test_a_killed_robot_is_not_in_the_others_way() -> None:
+    field = a_field()
+    field.take_off()
+    field.done(RobotCommand("kill", ("r0",)))
+    field.done(SafetyCommand("land", robots=("r1", "r2"), wait=True))
+    field.done(SetWorld(OTHER_WORLD, "w", robots=("r1", "r2")))
+
+
+def test_the_fleets_world_is_made_known_at_any_time() -> None:
+    field = two_stations()
+    field.done(SetWorld(OTHER_WORLD, "w"))
+    field.leave("bob")
+    field.done(TAKEOFF)
+    bob = field.join("bob")
+    field.run(1.0)
+    assert not bob.setup.world
+    before = field.stations["alice"].state
+    assert "alice commands the fleet" in field.do(SetWorld(WORLD, "w"), "bob").problem
+    field.done(SetWorld(OTHER_WORLD, "w"), "bob")
+    assert bob.setup.world == OTHER_WORLD
+    assert field.stations["alice"].state == before
+
+
+# Whoever takes over has the fleet
+
+
+def test_who_takes_over_has_gathered_its_robots_first() -> None:
+    field = two_stations()
+    # It knows who commands before it has heard every robot.
+    field.join("carol")
+    field.done(TakeCommand(), "carol")
+
+
+def test_who_took_over_is_not_robbed_of_the_command() -> None:
+    for request in (NextTrial(), RobotCommand("disarm", ("r0",)), SafetyCommand("hold"), Enable()):
+        field = two_stations()
+        # It obeys somebody who is gone, and hears nobody: alice waits for it.
+        robot = field.robots[0]
+        assert robot.ground is not None
+        robot.deaf, robot.ground = True, replace(robot.ground, operator="carol")
+        field.run(0.5)
+        waiting = field.begin(request)
+        field.run(1.0)
+        assert waiting.report is None
+        taken = field.begin(TakeCommand(), "bob")
+        field.run(1.0)
+        assert waiting.report is not None
+        assert why_not(waiting.report)["r0"] == "abandoned: bob commands the fleet"
+        robot.deaf = False
+        field.until(lambda taken=taken: taken.report)
+        field.run(15.0)
+        assert [station.commands for station in field.stations.values()] == [False, True]
+
+
+def test_kill_goes_on_whoever_takes_over() -> None:
+    field = two_stations()
+    field.done(TAKEOFF)
+    field.robots[0].deaf = True
+    kill = field.begin(RobotCommand("kill", ("r0",)))
+    field.run(1.0)
+    field.begin(TakeCommand(), "bob")
+    field.run(1.0)
+    field.robots[0].deaf = False
+    field.until(lambda: kill.report)
+    assert kill.report is not None
+    assert kill.report.done
+
+
+def test_anothers_hold_ends_only_what_sets_in_motion() -> None:
+    field = two_stations()
+    field.robots[0].deaf = True
+    again = field.begin(NextTrial())
+    field.done(SafetyCommand("hold", robots=("r1",)), "bob")
+    field.run(1.0)
+    assert again.report is None
+    field.robots[0].deaf = False
+    field.until(lambda: again.report)
+    assert again.report is not None
+    assert again.report.done
+
+
+# A client that leaves
+
+
+def half_resumed() -> Field:
+    """Robots that return are asked to resume, and hold by now."""
+    field = a_field()
+    field.join("bob")
+    field.fly()
+    for robot in field.robots:
+        robot.position_m = (30.0, 30.0, robot.slot_height_m)
+    field.run(0.5)
+    field.done(SafetyCommand("return"))
+    return field
+
+
+def test_who_was_on_its_way_home_goes_on_if_resume_is_abandoned() -> None:
+    field = half_resumed()
+    resume = field.begin(Resume())
+    field.until(lambda: _S.HOLD in field.states())
+    resume.abandon("its client left", withdraw=False)
+    field.land()
+
+
+@pytest.mark.parametrize("by", ["alice", "bob"])
+def test_who_is_told_to_hold_goes_nowhere_if_resume_is_abandoned(by: str) -> None:
+    field = half_resumed()
+    resume = field.begin(Resume())
+    field.run(0.1)
+    field.done(SafetyCommand("hold"), by)
+    field.run(1.0)
+    assert resume.report is not None
+    assert set(why_not(resume.report)) == {"r0", "r1", "r2"}
+    field.run(5.0)
+    assert field.states() == {_S.HOLD}
+
+
+# A status from before the command
+
+
+def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
+    field = a_field()
+    field.take_off()
+    field.done(RobotCommand("pilot", ("r1",)))
+    field.robots[1].state = _S.HOLD
+    field.done(SafetyCommand("land", wait=True))
+    assert field.states() == {_S.LANDED}
+
+
+# Who cannot do it is said so at once, and does not count as done
+
+
+def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
+    field = two_stations()
+    field.done(RobotCommand("kill", ("r1",)))
+    why = "fault: killed by the operator; look at it, then `lpac fleet restart`"
+    assert why_not(field.do(Enable())) == {"r1": why}
+    assert field.done(SafetyCommand("land", wait=True))
+    field.done(Resume())
+    abort = replace(TAKEOFF, abort_on_failure=True)
+    assert why_not(field.do(abort)) == {
+        "r1": why, "r0": "not ordered: r1 failed", "r2": "not ordered: r1 failed",
+    }  # fmt: skip
+    assert field.robots[0].state is field.robots[2].state is _S.PREFLIGHT
+
+
+def test_who_is_not_ready_is_not_done_with_enable() -> None:
+    field = a_field()
+    field.robots[2].refuses = "GPS: 4 satellites"
+    field.done(SetOrigin(ORIGIN))
+    assert why_not(field.do(Enable())) == {"r2": "not ready: GPS: 4 satellites"}
+
+
+def test_who_is_not_enabled_is_not_waited_for() -> None:
+    field = a_field()
+    field.done(SetOrigin(ORIGIN))
+    field.done(Enable(robots=("r0",)))
+    refused = "not enabled: `lpac mission enable`"
+    assert why_not(field.do(TAKEOFF)) == {"r1": refused, "r2": refused}
+
+
+def test_two_holds_at_once_are_both_done() -> None:
+    field = a_field()
+    field.fly()
+    field.robots[1].silent = True
+    first = field.begin(SafetyCommand("hold"))
+    field.run(1.0)
+    field.robots[1].silent = False
+    assert field.do(SafetyCommand("hold")).done
+    assert first.report is not None
+    assert first.report.done
+
+
+def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
+    field = a_field()
+    field.fly()
+    field.done(SafetyCommand("hold", robots=("r0",)))
+    problem = field.do(NextTrial(robots=("r0",))).problem
+    assert problem == "r1, r2 fly the mission: hold or land first"
+
+
+def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    field = a_field()
+    field.fly()
+    hold = field.begin(SafetyCommand("hold", wait=True))
+    monkeypatch.setattr(hold, "_steps", (1 / 0 for _ in range(1)))
+    with pytest.raises(ZeroDivisionError):
+        field.commands["alice"].step()
+    assert hold.report is not None
+    assert hold.report.problem == "a defect of lpac ground ended this command"
+    field.done(SafetyCommand("land", wait=True))

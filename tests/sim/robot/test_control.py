@@ -1,0 +1,558 @@
+"""One robot's control ticks in simulated time: no thread, no socket, a simulated vehicle."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from edge.core import F32
+from edge.core.fence import Fence
+from edge.core.position import PositionQuality
+from edge.core.vehicle import (
+    Action,
+    ActionResult,
+    EstimatorStatus,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    Setpoint,
+    Vector,
+    VehicleState,
+    Velocity,
+)
+from edge.core.world import random_features, rasterize
+from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.drivers.world_sensor import WorldSensor
+from edge.flight.preflight import HeardStatus
+from edge.messages.mission import (
+    FlightState,
+    GroundState,
+    Order,
+    OrderKind,
+    OrderResult,
+    Origin,
+    Place,
+    RobotStatus,
+    to_json,
+)
+from edge.policy.lpac.graphs import Policy
+from edge.robot.config import load_config
+from edge.robot.control import FlightControl, GroundWorld
+from edge.robot.inbox import Inbox
+from edge.robot.navigation import Navigation
+from edge.robot.pac import Pac
+from edge.robot.readiness import Checks
+from lpac.sim.px4.link import Px4Link
+from lpac.sim.px4.modes import MavResult, Px4Mode
+from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
+from tests.robot_rig import ORIGIN, new_vehicle, write_config
+from tests.unit.flight.test_preflight import NEIGHBOUR
+
+FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
+PLACE = Place(slot=1, landing_point_m=(14.0, 12.0))
+ELSEWHERE = dataclasses.replace(ORIGIN, heading_deg=120.0)
+MODES = {
+    Px4Mode.OFFBOARD: Mode.OFFBOARD,
+    Px4Mode.HOLD: Mode.HOLD,
+    Px4Mode.LAND: Mode.LAND,
+    Px4Mode.POSCTL: Mode.POSITION,
+    Px4Mode.TAKEOFF: Mode.TAKEOFF,
+}
+NOT_SET = np.full(3, np.nan)
+
+
+class DirectAutopilot:
+    """An `Autopilot` port that calls the simulated vehicle."""
+
+    def __init__(self, vehicle: Px4Vehicle) -> None:
+        self.vehicle = vehicle
+        self.commands: list[Action] = []
+        self.result: ActionResult | None = None
+
+    def state(self) -> VehicleState:
+        vehicle = self.vehicle
+        return VehicleState(
+            connected=True,
+            system_id=7,
+            position_local_m=vector(vehicle.local_position_m),
+            velocity_local_m_s=vector(vehicle.velocity_m_s),
+            position_at_s=vehicle.time_s,
+            position_changed_at_s=vehicle.time_s,
+            heading_rad=vehicle.heading_rad,
+            origin=GlobalOrigin(*vehicle.global_origin),
+            gps=Gps(0 if vehicle.gps_lost else 3, 14, 0.8, at_s=vehicle.time_s),
+            estimator=EstimatorStatus(vehicle.position_valid, False, vehicle.time_s),
+            height_above_home_m=float(-vehicle.position_m[2]),
+            mode=MODES[vehicle.mode],
+            armed=vehicle.armed,
+            in_air=not vehicle.landed,
+            heartbeat_at_s=vehicle.time_s,
+            battery=vehicle.battery_remaining,
+            result=self.result,
+        )
+
+    def send(self, setpoint: Setpoint) -> Setpoint | None:
+        commanded = np.array(setpoint[0])
+        is_velocity = isinstance(setpoint, Velocity)
+        self.vehicle.offboard(
+            Px4Setpoint(
+                NOT_SET if is_velocity else commanded, commanded if is_velocity else NOT_SET
+            )
+        )
+        return setpoint
+
+    def command(self, action: Action) -> None:
+        self.commands.append(action)
+        match action:
+            case Action.ARM:
+                result = self.vehicle.arm()
+            case Action.DISARM | Action.KILL:
+                result = self.vehicle.disarm(force=action is Action.KILL)
+            case _:
+                result = self.vehicle.set_mode(Px4Mode[action.name])
+        self.result = ActionResult(action, result is MavResult.ACCEPTED, "", self.vehicle.time_s)
+
+
+class ListeningAutopilot(DirectAutopilot):
+    """One that knows of the vehicle what it says by MAVLink."""
+
+    def __init__(self, vehicle: Px4Vehicle) -> None:
+        super().__init__(vehicle)
+        self._link, self._telemetry = Px4Link(vehicle, system_id=7), Px4Telemetry()
+        self._parser: Any = mavlink.MAVLink(None)
+
+    def state(self) -> VehicleState:
+        now_s = self.vehicle.time_s
+        for datagram in self._link.due():
+            for message in self._parser.parse_buffer(datagram) or ():
+                if message.get_type() in self._telemetry.messages:
+                    self._telemetry.hear(message.get_type(), message.to_dict(), now_s)
+        return dataclasses.replace(self._telemetry.state(now_s), system_id=7, result=self.result)
+
+
+class Flown:
+    """A robot whose ground, policy and vehicle a test steps through time."""
+
+    def __init__(
+        self,
+        folder: Path,
+        policy: Policy,
+        autopilot: type[DirectAutopilot] = DirectAutopilot,
+    ) -> None:
+        path = write_config(folder, url="udpin://127.0.0.1:1", endpoint="tcp/127.0.0.1:1")
+        config = load_config(path)
+        self.vehicle = new_vehicle(COM_OBL_RC_ACT=4)
+        self.autopilot = autopilot(self.vehicle)
+        self.records: list[tuple[str, Mapping[str, object]]] = []
+        self.navigation = Navigation(self.autopilot, lambda: self.now_s, config.position)
+        self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
+        world = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
+        self.pac = Pac(
+            robot_id=config.robot_id, boot_epoch=1, policy=policy, sensor=WorldSensor(world, 64),
+            odometry=self.navigation, parameters=config.pac,
+        )  # fmt: skip
+        self.control = FlightControl(
+            robot=config.robot(boot_nonce=11),
+            world_id="configured",
+            autopilot=self.autopilot,
+            navigation=self.navigation,
+            pac=self.pac,
+            inbox=self.inbox,
+            recorder=self,
+            energy=config.energy,
+            unix_clock_s=lambda: self.now_s,
+            started_s=0.0,
+        )
+        self.ground = GroundState(sequence=1, operator="test", origin=ORIGIN, enabled=True)
+        self.failed_checks: tuple[str, ...] = ()
+        self.sent = False
+        self.images: F32 | None = None
+        self._orders = 0
+
+    @property
+    def now_s(self) -> float:
+        return self.vehicle.time_s
+
+    @property
+    def state(self) -> FlightState:
+        return self.control.flight.state
+
+    def record(self, topic: str, _: float, message: Mapping[str, object]) -> None:
+        self.records.append((topic, message))
+
+    def say(self, **changes: Any) -> None:
+        self.ground = dataclasses.replace(self.ground, sequence=self.ground.sequence + 1, **changes)
+
+    def tick(self) -> None:
+        """One tenth of a second of everything."""
+        self.inbox.put_ground(to_json(self.ground), self.now_s, self.now_s)
+        self.look()
+        perceived = self.pac.perceive(self.now_s)
+        self.images = None if perceived is None else perceived.images.copy()
+        self.pac.infer(self.now_s, self.now_s)
+        self.sent = self.control.tick(self.now_s)
+        for _ in range(5):
+            self.vehicle.step(0.02)
+
+    def look(self) -> None:
+        """Preflight's part."""
+        self.control.checks = Checks(self.failed_checks, self.now_s, self.control.assignment)
+
+    def until(self, *states: FlightState) -> None:
+        for _ in range(400):
+            if self.state in states:
+                return
+            self.tick()
+        raise AssertionError(self.control.flight)
+
+    def order(self, kind: OrderKind, trial: str = "") -> OrderResult:
+        self._orders += 1
+        order = Order(
+            order_id=str(self._orders), robot_id=3, boot_nonce=11, kind=kind,
+            expires_at_uptime_s=self.now_s + 9.0, operator="test", trial=trial,
+        )  # fmt: skip
+        self.inbox.put_order(to_json(order))
+        self.tick()
+        return self.control.flight.answers[-1]
+
+    def take_off(self) -> None:
+        self.until(FlightState.PREFLIGHT)
+        assert self.order("takeoff").accepted
+        self.until(FlightState.HOLD)
+
+    def take_off_by_hand(self, height_m: float) -> None:
+        """Somebody flies it, and leaves it to PX4 to hold."""
+        self.vehicle.parameters["MIS_TAKEOFF_ALT"] = height_m
+        self.vehicle.step(0.02)
+        assert self.vehicle.arm() is MavResult.ACCEPTED
+        assert self.vehicle.set_mode(Px4Mode.TAKEOFF) is MavResult.ACCEPTED
+        for _ in range(150):
+            self.tick()
+        self.vehicle.set_mode(Px4Mode.HOLD)
+        self.tick()
+
+    def explore(self, trial: str) -> None:
+        assert self.order("start", trial).accepted
+        for _ in range(60):
+            self.tick()
+        assert self.state is FlightState.MISSION
+
+    def explored(self) -> int:
+        """How much of its surroundings the robot knows, in pixels of its local map."""
+        assert self.images is not None
+        return int((self.images[0, 0] > 0.0).sum())
+
+    def peers(self, *statuses: RobotStatus, age_s: float = 0.1) -> None:
+        """What other robots said of themselves."""
+        at_s = self.now_s - age_s
+        self.control.peers = tuple(HeardStatus(status, at_s, at_s) for status in statuses)
+
+    def odometry(self) -> Vector:
+        odometry = self.navigation.odometry()
+        assert odometry is not None
+        return odometry.position_m
+
+
+def peer(robot_id: int, state: FlightState, position_m: Vector = (100.0, 0.0, 9.0)) -> RobotStatus:
+    return dataclasses.replace(
+        NEIGHBOUR, robot_id=robot_id, state=state, position_m=position_m, origin=ORIGIN
+    )
+
+
+def vector(values: Any) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+@pytest.fixture
+def flown(tmp_path: Path, shipped_policy: Policy) -> Flown:
+    return Flown(tmp_path, shipped_policy)
+
+
+def test_it_flies_what_it_is_told_and_lands(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    assert not flown.sent
+    flown.take_off()
+    assert flown.sent
+    assert abs(-flown.vehicle.position_m[2] - 5.0) < 0.8
+    flown.explore("a")
+    assert np.linalg.norm(flown.vehicle.velocity_m_s[:2]) > 0.2
+    flown.say(safety_action="hold")
+    flown.until(FlightState.HOLD)
+    flown.say(safety_action="return")
+    flown.until(FlightState.LANDED)
+    assert not flown.sent
+    assert not flown.vehicle.armed
+    assert flown.autopilot.commands.count(Action.ARM) == 1
+    flown.say(safety_action="none")
+    flown.take_off()
+    topics = [topic for topic, _ in flown.records]
+    assert topics.count("control") == round(flown.now_s / 0.1)
+    assert topics.count("ground") == flown.ground.sequence
+    answers = [message["answer"] for topic, message in flown.records if topic == "order"]
+    assert answers == [OrderResult(str(number), True) for number in (1, 2, 3)]
+
+
+def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilots(
+    flown: Flown,
+) -> None:
+    flown.take_off()
+    flown.explore("a")
+    now_s = flown.now_s
+    # Late, but the watchdog has not acted.
+    flown.control.look_back(now_s - 0.4, now_s)
+    flown.tick()
+    assert flown.state is FlightState.MISSION
+    flown.vehicle.set_mode(Px4Mode.HOLD)
+    flown.control.look_back(now_s - 0.5, now_s)
+    flown.tick()
+    assert flown.state is FlightState.HOLD
+    assert flown.control.flight.reason.startswith("control was silent for 0.6 s")
+    for _ in range(50):
+        flown.tick()
+    assert flown.state is FlightState.HOLD and flown.vehicle.mode is Px4Mode.OFFBOARD
+
+
+@pytest.mark.parametrize("state", [FlightState.HOLD, FlightState.MISSION, FlightState.RETURN])
+@pytest.mark.parametrize("jump_m", [(0.0, 0.0, 6.0), (0.0, 0.0, -10.0), (5.0, 0.0, -1.3)])
+def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
+    tmp_path: Path, shipped_policy: Policy, state: FlightState, jump_m: Vector
+) -> None:
+    """North, east, down: without a new origin. The vehicle itself has not moved."""
+    flown = Flown(tmp_path, shipped_policy, ListeningAutopilot)
+    flown.take_off()
+    if state is not FlightState.HOLD:
+        flown.explore("a")
+    if state is FlightState.RETURN:
+        flown.say(safety_action="return")
+        flown.until(state)
+    before_m = -flown.vehicle.position_m[2]
+    flown.vehicle.gps_bias_m = np.array(jump_m)
+    qualities = []
+    for _ in range(100 if state is not FlightState.RETURN else 30):
+        flown.tick()
+        assert flown.state is state
+        assert abs(-flown.vehicle.position_m[2] - before_m) < 1.0
+        qualities.append(flown.navigation.position.quality)
+    assert set(qualities) == {PositionQuality.GOOD, PositionQuality.DOUBTFUL}
+    assert abs(flown.odometry()[2] - 5.0) < 0.8
+    doubted = [r["height_m"] for t, r in flown.records[-30:] if t == "control"]
+    assert max(doubted) - min(doubted) < 1.0
+    flown.say(safety_action="land")
+    flown.until(FlightState.LANDED)
+
+
+def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
+    flown.take_off()
+    flown.explore("a")
+    explored = flown.explored()
+    for trial, forgets in (("a", False), ("b", True)):
+        flown.say(safety_action="hold")
+        flown.until(FlightState.HOLD)
+        flown.say(safety_action="none")
+        flown.tick()
+        assert flown.order("start", trial).accepted
+        flown.tick()
+        assert (flown.explored() < 0.9 * explored) is forgets
+        assert flown.control.flight.trial == trial
+
+
+def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
+    def place() -> Origin | None:
+        assert flown.navigation.frame is not None
+        origin = flown.control.assignment.origin
+        assert origin is not None
+        assert flown.navigation.frame.frame_id == origin.frame().frame_id
+        assert flown.pac.frame_id == flown.navigation.frame.frame_id
+        return origin
+
+    flown.take_off()
+    flown.say(origin=ELSEWHERE)
+    flown.tick()
+    assert place() == ORIGIN
+    flown.say(safety_action="land")
+    flown.until(FlightState.LANDED)
+    flown.tick()
+    assert place() == ELSEWHERE
+
+
+def test_a_program_that_starts_in_flight_takes_the_origin_it_hears(flown: Flown) -> None:
+    flown.vehicle.arm(force=True)
+    flown.until(FlightState.PILOT)
+    flown.tick()
+    assert flown.control.assignment.origin == ORIGIN
+    assert not flown.sent
+    assert flown.autopilot.commands == []
+
+
+def flies_by(flown: Flown) -> tuple[Fence, Place, str]:
+    _, robot, world_id = flown.control.assignment
+    return robot.fence, robot.place, world_id
+
+
+def test_fence_and_place_are_taken_up_together_on_the_ground_and_given_back(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    configured = flies_by(flown)
+    flown.say(fence=FENCE, places={"3": PLACE, "4": Place(7, (1.0, 1.0))})
+    # The checks were made for another fence.
+    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+    flown.take_off()
+    assert abs(-flown.vehicle.position_m[2] - 9.5) < 0.8
+    flown.say(fence=None, places={}, origin=ELSEWHERE, world_id="other")
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+    told = flown.control.not_taken
+    kept = ("mission origin", "fence", "place", "world")
+    assert told == tuple(f"in flight: keeps its {what}" for what in kept)
+    assert flown.order("start", "a").reason == "; ".join(told)
+    flown.say(safety_action="land", world_id=None)
+    flown.until(FlightState.LANDED)
+    flown.tick()
+    assert flies_by(flown) == configured
+    assert flown.control.not_taken == ()
+
+
+def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    before = flies_by(flown)
+    for place, problem in (
+        (Place(1, (29.0, 12.0)), "landing_point_m = [29.0, 12.0]: must be inside the fence, at"),
+        (Place(30, (14.0, 12.0)), "slot = 30 flies at 140 m: must be from floor_m = 2 to"),
+    ):
+        flown.say(fence=FENCE, places={"3": place})
+        reason = flown.order("takeoff").reason
+        assert reason.startswith(f"not ready: the ground's fence or place does not fit: {problem}")
+        assert flies_by(flown) == before
+    flown.say(fence=FENCE, places={"3": PLACE})
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+
+
+def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    flown.say(world_id="flat")
+    waiting = "world flat of the ground has not arrived: wait"
+    assert flown.order("takeoff").reason == f"not ready: {waiting}"
+    assert flown.control.not_taken == (waiting,)
+    assert flown.control.wanted_world_id == "flat"
+    assert flown.explored() > 0
+    flown.control.world = GroundWorld("stale", WorldSensor(np.ones((512, 512), np.float32), 64), "")
+    flown.tick()
+    assert flies_by(flown)[2] == "configured"
+    flown.control.world = GroundWorld("flat", None, "world flat: record 1 (X): unknown kind")
+    flown.tick()
+    problem = "the ground's world cannot be used: world flat: record 1 (X): unknown kind"
+    assert flown.control.failed_checks(flown.now_s) == (problem,)
+    assert flown.control.wanted_world_id is None
+    flown.control.world = GroundWorld("flat", WorldSensor(np.zeros((512, 512), np.float32), 64), "")
+    flown.tick()
+    assert flies_by(flown)[2] == "flat"
+    # Its checks, and what it sees, are of the new one.
+    flown.tick()
+    assert flown.control.failed_checks(flown.now_s) == ()
+    assert flown.explored() == 0
+    flown.take_off()
+
+
+def test_a_program_that_starts_in_flight_flies_on_by_what_the_ground_says(flown: Flown) -> None:
+    """What it was configured for is not what its predecessor took off with."""
+    flown.say(fence=FENCE, places={"3": PLACE}, world_id="flat")
+    flown.take_off_by_hand(9.5)
+    assert flies_by(flown) == (FENCE, PLACE, "configured")
+    flown.control.world = GroundWorld("flat", WorldSensor(np.zeros((512, 512), np.float32), 64), "")
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "flat")
+    assert flown.order("rejoin").accepted
+    flown.say(fence=None)
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "flat")
+    assert flown.control.not_taken == ("in flight: keeps its fence",)
+
+
+def test_a_reset_forgets_what_was_seen_and_moves_nothing(flown: Flown) -> None:
+    flown.take_off()
+    flown.explore("a")
+    explored = int(flown.pac.explored().sum())
+    flown.say(safety_action="hold")
+    flown.until(FlightState.HOLD)
+    assert flown.order("reset", "b").accepted
+    flown.tick()
+    assert int(flown.pac.explored().sum()) < explored
+    assert (flown.state, flown.control.flight.trial) == (FlightState.HOLD, "")
+
+
+def test_checks_count_for_their_origin_and_not_for_long(
+    flown: Flown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown.failed_checks = ("GPS is not heard",)
+    flown.until(FlightState.PREFLIGHT)
+    assert flown.order("takeoff").reason == "not ready: GPS is not heard"
+    flown.failed_checks = ()
+    flown.tick()
+    with monkeypatch.context() as slow:
+        slow.setattr(flown, "look", lambda: None)
+        # Preflight is slow: what it found was for the origin before.
+        flown.say(origin=ELSEWHERE)
+        assert flown.order("takeoff").reason == "not ready: the checks are still running"
+        # Nor does it count when that is undone: the vehicle may have the other fence by now.
+        flown.say(origin=ORIGIN)
+        assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    flown.tick()
+    assert flown.control.failed_checks(flown.now_s) == ()
+    monkeypatch.setattr(flown, "look", lambda: None)
+    for _ in range(51):
+        flown.tick()
+    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    assert Action.ARM not in flown.autopilot.commands
+
+
+def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
+    flown.take_off()
+    flown.peers(peer(5, FlightState.TAKEOFF), peer(6, FlightState.HOLD))
+    assert flown.order("start", "a").reason == "robots still taking off: 5"
+    flown.peers(peer(5, FlightState.HOLD))
+    assert flown.order("start", "a").accepted
+
+
+def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_status(flown: Flown) -> None:
+    flown.take_off()
+    x_m, y_m, height_m = flown.odometry()
+    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))
+    assert flown.order("start", "a").reason == "only 1.0 m to robot 5"
+    # What it said two seconds ago tells nothing, nor does a place in another frame.
+    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)), age_s=2.0)
+    assert flown.order("start", "a").accepted
+
+
+@pytest.mark.parametrize("on_stop", [Action.HOLD, Action.LAND])
+def test_what_it_leaves_behind(flown: Flown, on_stop: Action) -> None:
+    leave = flown.control.leave
+    assert leave(on_stop) is None
+    flown.until(FlightState.PREFLIGHT)
+    assert leave(on_stop) is None
+    assert flown.order("takeoff").accepted
+    assert flown.state is FlightState.ARMING
+    assert leave(on_stop) is Action.DISARM
+    flown.until(FlightState.TAKEOFF)
+    assert leave(on_stop) is on_stop
+    flown.until(FlightState.HOLD)
+    assert leave(on_stop) is on_stop
+    flown.explore("a")
+    assert leave(on_stop) is on_stop
+    # The watchdog was first.
+    flown.vehicle.set_mode(Px4Mode.HOLD)
+    assert leave(on_stop) is on_stop
+    # PX4 lands by itself, or a pilot came, and no tick has seen it yet.
+    flown.vehicle.set_mode(Px4Mode.LAND)
+    flown.vehicle.step(0.02)
+    assert leave(on_stop) is None
+    flown.vehicle.pilot()
+    flown.vehicle.step(0.02)
+    assert leave(on_stop) is None
+    flown.until(FlightState.PILOT)
+    assert leave(on_stop) is None

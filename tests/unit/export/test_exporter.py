@@ -1,0 +1,108 @@
+"""From a checkpoint to a bundle on disk: `lpac export`, and the policy that the project ships."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import torch
+import typer
+from typer.testing import CliRunner, Result
+
+from edge.core.perception import PerceptionParameters
+from edge.policy.bundle import load_bundle
+from edge.policy.verify import verify
+from export.checkpoint import CheckpointError
+from export.exporter import export_bundle
+from lpac.cli.export import export
+from tests.conftest import ROOT
+from tests.unit.export.states import random_state
+
+POLICIES = ROOT / "policies"
+NAME = "lpac_l2_k3_n10_512"
+AUTHORS_TAPS = ROOT.parent / "shared" / "data" / "authors_taps"
+
+
+def run(*arguments: str | Path) -> Result:
+    app = typer.Typer()
+    app.command()(export)
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_shipped_policy_is_what_its_checkpoint_gives() -> None:
+    shipped = load_bundle(POLICIES / NAME)
+    bundle = export_bundle(POLICIES / f"{NAME}.pt", POLICIES / f"{NAME}.toml")
+    for name in bundle.manifest.graphs:
+        assert bundle.files[name] == shipped.files[name], name
+    assert bundle.manifest.name == NAME
+    for field in ("geometry", "images", "perception", "training", "opset"):
+        assert getattr(bundle.manifest, field) == getattr(shipped.manifest, field)
+    provenance = shipped.manifest.provenance
+    for file, sha256 in (
+        (provenance.checkpoint, provenance.checkpoint_sha256),
+        (provenance.parameters, provenance.parameters_sha256),
+    ):
+        assert hashlib.sha256((POLICIES / file).read_bytes()).hexdigest() == sha256
+
+
+def test_two_exports_give_the_same_bytes(tmp_path: Path) -> None:
+    torch.save(random_state(), tmp_path / "model.pt")
+    first, second = (
+        export_bundle(tmp_path / "model.pt", POLICIES / f"{NAME}.toml") for _ in range(2)
+    )
+    assert first.files == second.files
+    assert str(tmp_path).encode() not in b"".join(first.files.values())
+
+
+def test_command_writes_a_bundle_that_verifies(tmp_path: Path) -> None:
+    torch.save(random_state(channels=2, image_size=20), tmp_path / "model.pt")
+    for output in (tmp_path / "bundle", tmp_path / "bundle.zip"):
+        result = run(
+            *(tmp_path / "model.pt", "--params", POLICIES / f"{NAME}.toml"),
+            *("-o", output, "--name", "ours"),
+        )
+        assert result.exit_code == 0, result.output
+        bundle = load_bundle(output)
+        assert bundle.manifest.name == "ours"
+        assert bundle.manifest.images
+        assert bundle.manifest.images.channels == ("importance", "obstacles")
+        assert (bundle.manifest.images.size, bundle.manifest.images.features) == (20, 8)
+        assert bundle.manifest.perception == PerceptionParameters(512, 256, 64, 256.0)
+        assert all(check.passed for check in verify(bundle))
+        assert bundle.id in result.output
+        assert "L = 2, K = 1, features 10 -> 16 -> 16" in result.output
+
+
+@pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
+def test_authors_taps_give_a_bundle_without_perception(tmp_path: Path) -> None:
+    result = run(*(AUTHORS_TAPS, "--params", POLICIES / f"{NAME}.toml", "-o", tmp_path / "bundle"))
+    assert result.exit_code == 0, result.output
+    assert "none: this checkpoint has no CNN" in result.output
+    manifest = load_bundle(tmp_path / "bundle").manifest
+    assert manifest.name == "authors_taps"
+    assert manifest.perception is None and manifest.images is None
+    assert manifest.geometry.layers == 5
+
+
+def test_nothing_is_written_when_the_input_is_wrong(tmp_path: Path) -> None:
+    (tmp_path / "model.pt").write_text("not a checkpoint")
+    result = run(
+        *(tmp_path / "model.pt", "--params", POLICIES / f"{NAME}.toml"),
+        *("-o", tmp_path / "bundle"),
+    )
+    assert result.exit_code == 1
+    assert isinstance(result.exception, ValueError)
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "model.pt"]
+
+
+def test_a_network_that_float32_cannot_compute_is_refused(tmp_path: Path) -> None:
+    state = random_state(convolutions=2)
+    # Two equal channels, whose millions cancel each other in exact arithmetic only.
+    for name in state:
+        if ".conv1." in name or (".batch_norm1." in name and state[name].dim()):
+            state[name][1] = state[name][0]
+    linear = state["cnn_backbone.linear_1.weight"].view(8, 8, -1)
+    linear[:, 0] += 1e6
+    linear[:, 1] -= 1e6
+    torch.save(state, tmp_path / "model.pt")
+    with pytest.raises(CheckpointError, match=r"model\.pt: cnn\.onnx: float32 rounding alone"):
+        export_bundle(tmp_path / "model.pt", POLICIES / f"{NAME}.toml")

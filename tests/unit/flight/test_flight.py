@@ -1,0 +1,1975 @@
+"""The state machine flies a scripted vehicle, tick by tick, with guidance in the loop.
+
+Every test with a `world` is a scenario: it runs once as it is, and again with telemetry that is up
+to a second late on top of coming once a second.
+"""
+
+import functools
+import math
+import random
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from inspect import signature
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.core.fence import Fence
+from edge.core.ports import Odometry
+from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
+from edge.core.vehicle import (
+    PILOTED,
+    Action,
+    ActionResult,
+    GlobalOrigin,
+    Gps,
+    Mode,
+    Reason,
+    VehicleState,
+)
+from edge.flight.energy import Energy
+from edge.flight.guidance import (
+    Guidance,
+    MissionPosition,
+    MissionSetpoint,
+    MissionVelocity,
+    guide,
+)
+from edge.flight.orders import ORDERS
+from edge.flight.safety import Closest, MotionLimits
+from edge.flight.state import (
+    FlightInputs,
+    FlightMemory,
+    FlightParameters,
+    RemoteControlLost,
+    Robot,
+    Tick,
+    flown_s,
+)
+from edge.flight.step import Decision, enter, step
+from edge.flight.transitions import TRANSITIONS, Transition
+from edge.messages.mission import (
+    FlightState,
+    GroundState,
+    Order,
+    OrderKind,
+    OrderResult,
+    Origin,
+    SafetyAction,
+)
+from edge.robot.navigation import MAX_POSITION_AGE_S
+from tests.conftest import ROOT
+
+TICK_S = 0.1
+PERIOD_S = 1.0
+ZERO_M = 7.3  # The estimator's zero is not the pad.
+NOT_OURS = (
+    FlightState.INIT,
+    FlightState.IDLE,
+    FlightState.PREFLIGHT,
+    FlightState.LANDED,
+    FlightState.PILOT,
+    FlightState.FAULT,
+)
+ON_GROUND = NOT_OURS[:4]
+AIRBORNE = (
+    FlightState.TAKEOFF,
+    FlightState.HOLD,
+    FlightState.MISSION,
+    FlightState.RETURN,
+    FlightState.LAND,
+)
+SAFETY_PAGE = ROOT / "docs" / "safety.md"
+
+FENCE = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 1.0, 30.0)
+ROBOT = Robot(
+    robot_id=3,
+    boot_nonce=77,
+    parameters=FlightParameters(slot=1, landing_point_m=(10.0, 12.0)),
+    fence=FENCE,
+    limits=MotionLimits(2.0, 1.5, 1.5, 1.3),
+)
+SLOT_M = ROBOT.parameters.slot_height_m
+
+
+class World:
+    """One robot's decisions, a crude PX4, and a ground; `heartbeats` come `latency_s` late."""
+
+    def __init__(self, phase_s: float = 0.35, latency_s: float = 0.1) -> None:
+        self.robot = ROBOT
+        self.now_s = 100.0
+        self.latency_s = latency_s
+        self.next_beat_s = self.now_s + phase_s
+        # The vehicle, as it really is.
+        self.mode = self.intended = Mode.HOLD
+        self.armed = False
+        self.position_m = np.array([16.0, 14.0, 0.0])
+        self.velocity_m_s = np.zeros(3)
+        self.sticks_m_s = np.zeros(3)
+        # What PX4's own failsafe does now, until another mode is asked for.
+        self.failsafe: Mode | None = None
+        self.landed_at_s: float | None = self.now_s
+        self.setpoint: MissionSetpoint | None = None
+        self.setpoint_at_s = -math.inf
+        self.commands: list[Action] = []
+        self.refuses: dict[Action, str] = {}
+        self.heavy = self.stuck = False
+        self.watchdog = True
+        # What is heard of it.
+        self.telemetry = True
+        self.silent_from_s = math.inf
+        self.position_known = True
+        self.accuracy_m = 0.9
+        self.battery: float | None = 0.9
+        self.remote_control: bool | None = True
+        self.energy: Energy | None = None
+        self.beats: list[tuple[float, Mode, bool, bool, bool]] = []
+        self.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0), height_above_home_m=0)
+        # The rest of the inputs.
+        self.ground: GroundState | None = None
+        self.ground_on = True
+        self.ground_at_s = -math.inf
+        self.policy_m_s: np.ndarray | None = np.array([1.0, 0.0])
+        self.closest: Closest | None = None
+        self.busy: tuple[int, ...] = ()
+        self.failed_checks: tuple[str, ...] | None = ()
+        self.not_taken: tuple[str, ...] = ()
+        self.order: Order | None = None
+        self.orders = 0
+        # The program, and what it did.
+        self.restart()
+        self.taken: list[Transition] = []
+        self.reasons: list[str] = []
+        self.taken_s: list[float] = []
+        self.actions: list[tuple[float, Action]] = []
+        self.takeoffs = 0
+
+    def restart(self) -> None:
+        """The robot's program starts anew, and has heard nothing yet."""
+        self.flight, self.guidance, self.position = FlightMemory(), Guidance(), PositionJudgement()
+        self.heard, self.beats = replace(self.heard, mode=None, armed=None, in_air=None), []
+        self.started_s = self.now_s
+
+    # Time
+
+    def tick(self) -> Decision:
+        self._pass(TICK_S)
+        return self._decide(self._hear())
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            self.tick()
+
+    def until(self, state: FlightState, within_s: float) -> None:
+        for _ in range(round(within_s / TICK_S)):
+            self.tick()
+            if self.flight.state is state:
+                return
+        raise AssertionError(f"{self.flight.state}, not {state}: {self.flight.reason}")
+
+    def stop(self, seconds: float) -> None:
+        """The process is stopped and continued: its first ticks know nothing new."""
+        before = self._hear()
+        ground_on, self.ground_on = self.ground_on, False
+        for _ in range(round(seconds / TICK_S)):
+            self._pass(TICK_S)
+            if self.watchdog and self.mode is Mode.OFFBOARD and self._silence_s > 0.5:
+                self.mode = self.intended = Mode.HOLD
+        connected = self.now_s - before.heartbeat_at_s < 2.5
+        self._decide(replace(before, connected=connected))
+        self._pass(TICK_S)
+        self._decide(replace(before, connected=connected))
+        self.ground_on = ground_on
+
+    # The ground
+
+    def enable(self, safety_action: SafetyAction = "none") -> None:
+        self.ground = GroundState(
+            1, "op", Origin(47.0, 8.0, 0.0), enabled=True, safety_action=safety_action
+        )
+
+    def new_order(self, kind: OrderKind, trial: str = "") -> Order:
+        self.orders += 1
+        expires_s = self.now_s - self.started_s + 9.0
+        return Order(f"o{self.orders}", ROBOT.robot_id, 77, kind, expires_s, "op", trial)
+
+    def give(self, order: Order) -> OrderResult:
+        self.order = order
+        self.tick()
+        self.order = None
+        return next(a for a in reversed(self.flight.answers) if a.order_id == order.order_id)
+
+    def obey(self, kind: OrderKind, trial: str = "") -> None:
+        answer = self.give(self.new_order(kind, trial))
+        assert answer.accepted, answer.reason
+
+    def refuse(self, kind: OrderKind) -> str:
+        answer = self.give(self.new_order(kind))
+        assert not answer.accepted
+        return answer.reason
+
+    # A flight's beginning
+
+    def ready(self) -> None:
+        self.enable()
+        self.until(FlightState.PREFLIGHT, 6.0)
+
+    def hover(self) -> None:
+        self.ready()
+        self.obey("takeoff")
+        self.until(FlightState.HOLD, 25.0)
+        self.run(3.0)
+
+    def fly(self) -> None:
+        self.hover()
+        self.obey("start", "first")
+        assert self.flight.state is FlightState.MISSION
+        self.run(1.0)
+
+    def end_failsafe(self) -> None:
+        """What made PX4's own failsafe act is over: the vehicle's mode is again what was asked."""
+        self.failsafe, self.mode = None, self.intended
+
+    def pilot(self, *sticks_m_s: float) -> None:
+        self.failsafe = None
+        self.mode = self.intended = Mode.POSITION
+        self.sticks_m_s = np.array(sticks_m_s or (0.0, 0.0, 0.0))
+
+    def state(self) -> FlightState:
+        return self.flight.state
+
+    @property
+    def height_m(self) -> float:
+        return float(self.position_m[2])
+
+    @property
+    def speed_m_s(self) -> float:
+        return float(np.linalg.norm(self.velocity_m_s))
+
+    # The vehicle
+
+    @property
+    def _silence_s(self) -> float:
+        return self.now_s - self.setpoint_at_s
+
+    def _pass(self, dt_s: float) -> None:
+        self.now_s += dt_s
+        for action in self.commands:
+            text = self._carry_out(action)
+            result = ActionResult(action, not text, text, self.now_s)
+            self.heard = replace(self.heard, result=result)
+        self.commands = []
+        if self.armed and self.intended is Mode.OFFBOARD:
+            # PX4's failsafe, which ends when setpoints come again.
+            self.mode = Mode.OFFBOARD if self._silence_s <= 1.0 else Mode.LAND
+        if self.armed and self.failsafe is not None:
+            self.mode = self.failsafe
+        self._move(dt_s)
+        if self.now_s >= self.next_beat_s:
+            in_air = self.armed and self.height_m > 0.1
+            failsafe = self.armed and self.failsafe is not None
+            beat = (self.next_beat_s, self.mode, self.armed, in_air, failsafe)
+            self.next_beat_s += PERIOD_S
+            if self.telemetry:
+                self.beats.append(beat)
+        if self.ground_on and self.ground is not None:
+            self.ground_at_s = self.now_s
+
+    def _carry_out(self, action: Action) -> str:
+        if action in self.refuses:
+            return self.refuses[action]
+        if action in (Action.OFFBOARD, Action.HOLD, Action.LAND):
+            self.failsafe = None
+        if action is Action.OFFBOARD:
+            if self._silence_s > 0.5:
+                return "no setpoints"
+            self.mode = self.intended = Mode.OFFBOARD
+        elif action is Action.ARM:
+            self.armed = not self.stuck
+        elif action is Action.HOLD:
+            self.mode = self.intended = Mode.HOLD
+        elif action is Action.LAND:
+            self.mode = self.intended = Mode.LAND
+        elif action is Action.DISARM:
+            if self.height_m > 0.0:
+                return "not landed"
+            self.armed = False
+        elif action is Action.KILL:
+            self.armed, self.position_m[2] = False, 0.0
+        return ""
+
+    def _move(self, dt_s: float) -> None:
+        wanted_m_s = np.zeros(3)
+        if self.armed and self.mode is Mode.LAND:
+            wanted_m_s[2] = -0.7
+        elif self.armed and self.mode is Mode.POSITION:
+            wanted_m_s = self.sticks_m_s
+        elif self.armed and self.mode is Mode.OFFBOARD and self.setpoint is not None:
+            if isinstance(self.setpoint, MissionPosition):
+                wanted_m_s = 0.95 * (np.array(self.setpoint.position_m) - self.position_m)
+            else:
+                wanted_m_s = np.array(self.setpoint.velocity_m_s)
+        self.velocity_m_s = self.velocity_m_s + 0.4 * (wanted_m_s - self.velocity_m_s)
+        if self.heavy:
+            self.velocity_m_s[2] = min(self.velocity_m_s[2], 0.0)
+        self.position_m = self.position_m + self.velocity_m_s * dt_s
+        if self.height_m > 0.0:
+            self.landed_at_s = None
+            return
+        self.position_m[2] = 0.0
+        self.velocity_m_s = np.zeros(3)
+        self.landed_at_s = self.now_s if self.landed_at_s is None else self.landed_at_s
+        if self.mode is Mode.LAND and self.now_s - self.landed_at_s > 2.0:
+            self.armed = False
+
+    # The robot
+
+    def _hear(self) -> VehicleState:
+        while self.beats and self.beats[0][0] + self.latency_s <= self.now_s:
+            at_s, mode, armed, in_air, failsafe = self.beats.pop(0)
+            self.heard = replace(
+                self.heard,
+                mode=mode,
+                armed=armed,
+                in_air=in_air,
+                failsafe=failsafe,
+                heartbeat_at_s=at_s,
+            )
+        silence_s = self.now_s - self.heard.heartbeat_at_s
+        return replace(
+            self.heard,
+            connected=silence_s < 2.5,
+            battery=self.battery,
+            position_local_m=(0.0, 0.0, 0.0),
+            position_at_s=min(self.now_s, self.silent_from_s),
+            position_changed_at_s=min(self.now_s, self.silent_from_s),
+            gps=Gps(
+                3 if self.position_known else 0,
+                12,
+                0.8,
+                self.accuracy_m,
+                at_s=min(self.now_s, self.silent_from_s),
+            ),
+            height_above_home_m=self.height_m,
+            remote_control=self.remote_control,
+        )
+
+    def inputs(self, vehicle: VehicleState) -> FlightInputs:
+        """What the robot knows now, if that is the vehicle's state."""
+        self.position = judge(self.position, vehicle, PositionLimits(), self.now_s)
+        odometry = None
+        fresh = self.now_s - vehicle.position_at_s <= MAX_POSITION_AGE_S
+        if fresh and self.position.quality is not PositionQuality.LOST:
+            x_m, y_m, height_m = self.position_m.tolist()
+            vx, vy, vz = self.velocity_m_s.tolist()
+            odometry = Odometry((x_m, y_m, height_m + ZERO_M), (vx, vy, vz))
+        return FlightInputs(
+            now_s=self.now_s,
+            vehicle=vehicle,
+            position=self.position,
+            odometry=odometry,
+            policy_velocity_m_s=self.policy_m_s,
+            neighbours=(),
+            closest=self.closest,
+            busy_neighbours=self.busy,
+            ground=self.ground,
+            ground_age_s=self.now_s - self.ground_at_s,
+            failed_checks=self.failed_checks,
+            not_taken=self.not_taken,
+            order=self.order,
+            uptime_s=self.now_s - self.started_s,
+            energy=self.energy,
+        )
+
+    def _decide(self, vehicle: VehicleState) -> Decision:
+        inputs, before = self.inputs(vehicle), self.flight
+        decision = step(self.robot, before, inputs)
+        self.flight = decision.flight
+        setpoint, self.guidance = guide(self.robot, self.flight, inputs, self.guidance, TICK_S)
+        self._check(before, vehicle, decision, setpoint)
+        self.commands += decision.actions
+        self.actions += [(self.now_s, action) for action in decision.actions]
+        if decision.taken is not None:
+            self.taken.append(decision.taken)
+            self.reasons.append(decision.flight.reason)
+            self.taken_s.append(self.now_s)
+            # No two rows may lead back and forth.
+            assert len(self.taken_s) < 6 or self.now_s - self.taken_s[-6] > 0.7
+        if setpoint is not None:
+            self.setpoint, self.setpoint_at_s = setpoint, self.now_s
+        return decision
+
+    def _check(
+        self,
+        before: FlightMemory,
+        vehicle: VehicleState,
+        decision: Decision,
+        setpoint: MissionSetpoint | None,
+    ) -> None:
+        """What holds in every tick of every flight."""
+        state = decision.flight.state
+        allowed = set(Action)
+        if state in NOT_OURS:
+            assert setpoint is None
+            allowed = {Action.DISARM} if before.state is FlightState.ARMING else set()
+            if decision.flight.killed:
+                allowed.add(Action.KILL)
+            if state in ON_GROUND and vehicle.armed is False:
+                allowed.add(Action.HOLD)
+            if state is FlightState.PILOT and self.order is not None:
+                given: dict[OrderKind, Action] = {"pilot": Action.HOLD, "disarm": Action.DISARM}
+                allowed |= {action for kind, action in given.items() if kind == self.order.kind}
+        assert set(decision.actions) <= allowed
+        if vehicle.mode in PILOTED and before.reached and before.state in AIRBORNE:
+            assert setpoint is None, "a pilot flies it"
+        if setpoint is not None:
+            assert all(math.isfinite(value) for value in setpoint[0])
+        if state is FlightState.ARMING and before.state is not FlightState.ARMING:
+            assert before.state is FlightState.PREFLIGHT
+            assert self.order is not None
+            assert self.order.kind == "takeoff"
+            self.takeoffs += 1
+        if Action.ARM in decision.actions:
+            assert state is FlightState.ARMING
+        arms = sum(action is Action.ARM for _, action in self.actions)
+        assert arms + (Action.ARM in decision.actions) <= self.takeoffs
+
+    def asked(self, action: Action) -> int:
+        return sum(asked is action for _, asked in self.actions)
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+# A whole flight
+
+
+def test_takes_off_flies_returns_lands_and_flies_again(world: World) -> None:
+    world.ready()
+    for trial in ("first", "second"):
+        world.obey("takeoff")
+        world.until(FlightState.TAKEOFF, 8.0)
+        world.until(FlightState.HOLD, 15.0)
+        world.run(3.0)
+        assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
+        world.order = world.new_order("start", trial)
+        assert world.tick().new_trial
+        world.order = None
+        east_m = float(world.position_m[0])
+        world.run(3.0)
+        assert world.position_m[0] > east_m + 2.0
+        world.enable(safety_action="return")
+        world.until(FlightState.LAND, 30.0)
+        assert world.position_m[:2] == pytest.approx(ROBOT.parameters.landing_point_m, abs=0.6)
+        world.until(FlightState.LANDED, 20.0)
+        assert not world.armed
+        world.run(5.0)
+        assert world.state() is FlightState.LANDED
+        world.enable()
+        world.until(FlightState.PREFLIGHT, 1.0)
+    assert world.asked(Action.ARM) == 2
+
+
+def test_the_same_trial_goes_on_after_a_hold(world: World) -> None:
+    world.fly()
+    world.enable(safety_action="hold")
+    world.run(2.0)
+    assert world.state() is FlightState.HOLD
+    world.enable()
+    world.run(3.0)
+    assert world.state() is FlightState.HOLD  # Withdrawing it sets nothing in motion.
+    world.order = world.new_order("start", "first")
+    decision = world.tick()
+    assert decision.flight.state is FlightState.MISSION
+    assert not decision.new_trial
+
+
+# Nothing that repeats arms
+
+
+def test_repeated_ground_states_never_arm(world: World) -> None:
+    for safety_action in ("none", "hold", "return", "land", "none"):
+        world.enable(safety_action=safety_action)
+        world.run(5.0)
+    assert world.state() is FlightState.PREFLIGHT
+    assert world.actions == []
+
+
+def test_a_battery_swap_in_somebodys_hands_does_not_arm(world: World) -> None:
+    world.ready()
+    takeoff = world.new_order("takeoff")
+    world.restart()
+    world.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0))
+    world.until(FlightState.PREFLIGHT, 8.0)
+    answer = world.give(replace(takeoff, boot_nonce=76))
+    assert answer == OrderResult("o1", False, "meant for another start of this robot's program")
+    world.run(10.0)
+    assert world.actions == []
+
+
+def test_a_watchdog_restart_forgets_a_takeoff_that_it_was_told(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    world.run(0.2)
+    world.restart()
+    world.run(20.0)
+    assert world.state() is FlightState.PREFLIGHT
+    assert world.asked(Action.ARM) == 0
+
+
+def test_a_late_gps_fix_does_not_arm(world: World) -> None:
+    world.position_known = False
+    world.enable()
+    world.run(20.0)
+    assert world.state() is FlightState.INIT
+    assert "INIT" in world.refuse("takeoff").upper()
+    world.position_known = True
+    world.until(FlightState.PREFLIGHT, 8.0)
+    world.run(10.0)
+    assert world.actions == []
+
+
+def test_a_repeated_takeoff_order_arms_once(world: World) -> None:
+    world.ready()
+    order = world.new_order("takeoff")
+    for _ in range(60):
+        world.order = order
+        world.tick()
+    world.until(FlightState.HOLD, 20.0)
+    assert world.asked(Action.ARM) == 1
+
+
+def test_a_takeoff_order_counts_no_more_after_others_were_answered(world: World) -> None:
+    world.ready()
+    takeoff = world.new_order("takeoff")
+    assert world.give(takeoff).accepted
+    world.enable(safety_action="hold")
+    world.until(FlightState.IDLE, 1.0)
+    world.enable()
+    world.until(FlightState.PREFLIGHT, 3.0)
+    for _ in range(10):
+        world.refuse("rejoin")
+    assert world.give(takeoff).reason == "older than an order that was obeyed"
+    world.run(10.0)
+    assert world.asked(Action.ARM) == 0
+
+
+# Orders
+
+
+def test_orders_are_refused_with_the_reason(world: World) -> None:
+    world.enable()
+    world.failed_checks = None
+    world.until(FlightState.PREFLIGHT, 6.0)
+    assert world.refuse("takeoff") == "not ready: the checks are still running"
+    world.failed_checks = ("battery 40 %", "GPS: 2-D fix")
+    assert world.refuse("takeoff") == "not ready: battery 40 %; GPS: 2-D fix"
+    world.failed_checks = ()
+    assert world.refuse("start").startswith(
+        "start is taken in hold only, the robot is in preflight"
+    )
+    order = world.new_order("takeoff")
+    late = replace(order, expires_at_uptime_s=world.now_s - world.started_s)
+    assert world.give(late).reason == "expired"
+    for expires_s in (1e9, math.nan, math.inf):
+        far = replace(world.new_order("takeoff"), expires_at_uptime_s=expires_s)
+        assert world.give(far).reason.endswith("too long")
+    world.give(replace(world.new_order("takeoff"), boot_nonce=1))
+    assert "another start" in world.flight.answers[-1].reason
+    world.enable(safety_action="hold")
+    assert world.refuse("takeoff") == "the ground commands hold"
+    answers = world.flight.answers
+    world.order = replace(world.new_order("takeoff"), robot_id=4)
+    world.tick()
+    assert world.flight.answers == answers
+    assert world.actions == []
+
+
+def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: World) -> None:
+    world.hover()
+    world.busy = (4, 7)
+    assert world.refuse("start") == "robots still taking off: 4, 7"
+    world.busy = ()
+    world.policy_m_s = None
+    assert world.refuse("start") == "the policy has no fresh answer"
+    world.policy_m_s = np.zeros(2)
+    world.closest = Closest(4, 1.2)
+    assert world.refuse("start") == "only 1.2 m to robot 4"
+    world.closest = None
+    world.position_m[0] = 33.0
+    assert world.refuse("start").startswith("outside the fence")
+    world.position_m[0], world.position_m[2] = 16.0, SLOT_M - 2.0
+    assert "its height is 9.5 m" in world.refuse("start")
+    world.position_m[2] = SLOT_M
+    world.battery = 0.2
+    assert world.refuse("start") == "battery low: 20%"
+    assert world.state() is FlightState.RETURN
+
+
+def test_only_the_commander_orders_but_anybody_kills(world: World) -> None:
+    world.ready()
+    kinds: tuple[OrderKind, ...] = ("takeoff", "start", "pilot", "rejoin", "reset", "disarm")
+    for kind in kinds:
+        answer = world.give(replace(world.new_order(kind), operator="eve"))
+        assert answer == OrderResult(answer.order_id, False, "op commands, not eve")
+    assert world.actions == []
+    assert world.give(replace(world.new_order("kill"), operator="eve")).accepted
+
+
+def test_without_a_ground_only_kill_is_taken(world: World) -> None:
+    world.run(3.0)
+    assert world.refuse("reset") == "the ground's state is not heard"
+    world.hover()
+    world.ground_on = False
+    world.run(3.5)
+    kinds: tuple[OrderKind, ...] = ("start", "pilot", "reset")
+    for kind in kinds:
+        assert world.refuse(kind) == "the ground's state is not heard"
+    world.obey("kill")
+
+
+def test_one_robot_alone_is_enabled(world: World) -> None:
+    world.enable()
+    assert world.ground is not None
+    world.ground = replace(world.ground, robot_enabled={"3": False})
+    world.run(8.0)
+    assert world.state() is FlightState.IDLE
+    world.ground = replace(world.ground, enabled=False, robot_enabled={"3": True})
+    world.until(FlightState.PREFLIGHT, 6.0)
+    world.obey("takeoff")
+    world.until(FlightState.HOLD, 25.0)
+    world.run(3.0)
+    world.obey("start")
+    world.ground = replace(world.ground, enabled=True, robot_enabled={"3": False})
+    world.tick()
+    assert world.state() is FlightState.HOLD
+
+
+def test_what_the_ground_says_and_the_robot_does_not_fly_by_keeps_it_from_starting(
+    world: World,
+) -> None:
+    world.hover()
+    world.not_taken = ("in flight: keeps its fence", "in flight: keeps its world")
+    assert world.refuse("start") == "in flight: keeps its fence; in flight: keeps its world"
+    world.not_taken = ()
+    world.obey("start")
+
+
+def test_the_next_trial_is_reset_on_the_ground_or_in_hold_and_then_started(world: World) -> None:
+    world.fly()
+    assert world.refuse("reset") == "reset is not taken in mission: mission started"
+    world.enable(safety_action="hold")
+    world.run(2.0)
+    for trial in ("second", "second", "third"):
+        world.order = world.new_order("reset", trial)
+        decision = world.tick()
+        assert decision.new_trial
+        assert decision.flight.state is FlightState.HOLD
+        # Of which it has flown nothing yet.
+        assert decision.flight.trial == ""
+        assert decision.flight.answers[-1].accepted
+    world.enable()
+    world.run(1.0)
+    world.order = world.new_order("start", "third")
+    decision = world.tick()
+    assert decision.flight.state is FlightState.MISSION
+    assert decision.flight.trial == "third"
+
+
+def test_a_reset_is_taken_though_the_state_changes_in_the_same_tick(world: World) -> None:
+    world.hover()
+    world.enable(safety_action="land")
+    world.order = world.new_order("reset", "second")
+    decision = world.tick()
+    assert decision.flight.state is FlightState.LAND
+    assert decision.new_trial
+    assert decision.flight.answers[-1].accepted
+
+
+def test_disarm_stops_the_motors_on_the_ground_only(world: World) -> None:
+    world.ready()
+    assert world.refuse("disarm") == "is not armed"
+    # Before it is heard to be armed.
+    world.obey("takeoff")
+    while not world.flight.armed_asked:
+        world.tick()
+    world.obey("disarm")
+    world.until(FlightState.LANDED, 2.5)
+    world.run(3.0)
+    assert not world.armed
+    world.ready()
+    world.heavy = True
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 6.0)
+    world.run(2.5)
+    world.obey("disarm")
+    assert (world.state(), world.flight.reason) == (FlightState.PILOT, "disarm ordered")
+    world.until(FlightState.LANDED, 2.5)
+    assert not world.armed
+    assert world.height_m == 0.0
+    world.heavy = False
+    world.hover()
+    assert world.refuse("disarm") == "in the air: land it first"
+    world.enable(safety_action="land")
+    assert world.refuse("disarm") == "in the air: land it first"
+    world.until(FlightState.LANDED, 20.0)
+
+
+# Arming
+
+
+def test_takeoff_waits_for_the_vehicle_and_stops_where_it_is_refused(world: World) -> None:
+    for action in (Action.OFFBOARD, Action.ARM):
+        world.ready()
+        world.refuses = {action: "not today"}
+        world.obey("takeoff")
+        world.until(FlightState.IDLE, 7.0)
+        assert f"{action} refused: not today" in world.flight.reason
+        assert world.actions[-1][1] is Action.DISARM
+        world.run(1.5)
+        assert world.state() is FlightState.IDLE
+        assert world.flight.alarming
+    world.refuses = {}
+    world.ready()
+    world.telemetry = False
+    world.until(FlightState.INIT, 6.0)
+
+
+def test_arming_is_called_off(world: World) -> None:
+    world.ready()
+    for safety_action in ("hold", "return", "land"):
+        world.obey("takeoff")
+        world.run(0.4)
+        world.enable(safety_action=safety_action)
+        world.tick()
+        assert world.state() is FlightState.IDLE
+        world.ready()
+    world.ground_on = False
+    world.run(2.5)
+    world.obey("takeoff")
+    world.until(FlightState.IDLE, 1.0)
+    assert world.actions[-1][1] is Action.DISARM
+    world.ground_on = True
+    world.ready()
+    world.obey("takeoff")
+    world.stop(1.0)
+    assert world.state() is FlightState.IDLE
+    world.run(15.0)
+    assert not world.armed
+
+
+def test_a_vehicle_that_does_not_arm_is_left_alone(world: World) -> None:
+    world.ready()
+    world.stuck = True
+    world.obey("takeoff")
+    world.until(FlightState.IDLE, 7.0)
+    assert world.flight.reason == "the autopilot does not arm"
+    world.run(3.0)
+    assert not world.armed
+
+
+def test_the_link_is_lost_while_arming(world: World) -> None:
+    world.ready()
+    world.telemetry = False
+    world.beats = []
+    world.refuses = {Action.OFFBOARD: ""}
+    world.obey("takeoff")
+    world.until(FlightState.INIT, 4.0)
+    assert world.actions[-1][1] is Action.DISARM
+
+
+def test_a_vehicle_that_was_armed_as_the_link_was_lost_is_not_said_to_be_somebodys(
+    world: World,
+) -> None:
+    world.ready()
+    world.obey("takeoff")
+    while not world.flight.armed_asked:
+        world.tick()
+    world.refuses = {Action.DISARM: "did not hear"}
+    world.telemetry, world.beats = False, []
+    world.until(FlightState.INIT, 4.0)
+    world.telemetry = True
+    world.until(FlightState.PILOT, 4.0)
+    assert world.flight.reason.startswith("armed by this program, on op's takeoff order")
+    world.armed = False
+    world.until(FlightState.LANDED, 2.5)
+    world.ready()
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.until(FlightState.PILOT, 2.5)
+    assert world.flight.reason == "the vehicle is armed, without an order: only observing"
+
+
+def test_whoever_arms_by_hand_after_a_flight_that_is_over_is_not_this_program(
+    world: World,
+) -> None:
+    world.fly()
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.enable()
+    assert world.ground is not None
+    world.ground = replace(world.ground, enabled=False)
+    # Meanwhile it came down.
+    world.armed, world.mode, world.intended = False, Mode.HOLD, Mode.HOLD
+    world.position_m[2], world.landed_at_s = 0.0, world.now_s
+    world.telemetry = True
+    world.until(FlightState.IDLE, 6.0)
+    world.run(290.0)
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.until(FlightState.PILOT, 2.5)
+    assert world.flight.reason == "the vehicle is armed, without an order: only observing"
+
+
+def test_how_long_a_vehicle_has_been_in_the_air(world: World) -> None:
+    def flown() -> float | None:
+        return flown_s(world.flight, world.heard, world.now_s)
+
+    world.ready()
+    assert flown() is None
+    world.hover()
+    armed_s = next(at_s for at_s, action in world.actions if action is Action.ARM)
+    world.run(60.0)
+    assert flown() == pytest.approx(world.now_s - armed_s, abs=PERIOD_S + 0.5)
+    # What is not heard any more goes on.
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    assert flown() == pytest.approx(world.now_s - armed_s, abs=PERIOD_S + 0.5)
+    world.telemetry = True
+    world.until(FlightState.PILOT, 4.0)
+    world.restart()
+    world.until(FlightState.PILOT, 4.0)
+    assert flown() is None and world.heard.armed
+    world.armed = False
+    world.until(FlightState.LANDED, 2.5)
+    assert flown() is None
+
+
+def test_somebody_else_arms_meanwhile(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    world.armed, world.mode = True, Mode.POSITION
+    world.intended = Mode.POSITION
+    world.until(FlightState.PILOT, 3.0)
+    assert world.asked(Action.ARM) == 0
+
+
+def test_a_pilot_takes_it_while_arming(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    while not world.flight.reached:
+        world.tick()
+    world.pilot()
+    world.refuses = {Action.ARM: "wrong mode"}
+    world.until(FlightState.IDLE, 4.0)
+    world.run(3.0)
+    assert not world.armed
+    assert world.mode is Mode.POSITION
+
+
+# Takeoff
+
+
+def test_a_takeoff_that_does_not_climb_ends_after_15_s(world: World) -> None:
+    world.ready()
+    world.heavy = True
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 6.0)
+    began_s = world.now_s
+    world.until(FlightState.LAND, 16.0)
+    assert world.now_s - began_s == pytest.approx(15.0, abs=0.3)
+    assert world.flight.reason in world._decide(world._hear()).alarms
+    world.until(FlightState.LANDED, 8.0)
+    assert not world.armed
+
+
+def test_a_takeoff_on_hold_stays_where_it_is_in_the_air_or_on_the_ground(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    while world.height_m < 3.0:
+        world.tick()
+    world.run(2.5 - world.latency_s if world.latency_s < 0.5 else 0.0)
+    world.enable(safety_action="hold")
+    world.tick()
+    assert world.state() is FlightState.HOLD
+    world.enable(safety_action="land")
+    world.until(FlightState.LANDED, 20.0)
+    world.ready()
+    world.heavy = True
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 6.0)
+    world.enable(safety_action="hold")
+    world.until(FlightState.LAND, 3.0)
+    assert world.flight.reason == "it stands on the ground"
+    # Nothing that the ground repeats lifts it off again.
+    world.heavy = False
+    world.enable(safety_action="return")
+    world.until(FlightState.LANDED, 10.0)
+    assert world.height_m == 0.0
+
+
+def test_land_and_return_end_a_takeoff(world: World) -> None:
+    safety_actions: tuple[SafetyAction, ...] = ("land", "return")
+    for safety_action in safety_actions:
+        world.ready()
+        world.obey("takeoff")
+        world.until(FlightState.TAKEOFF, 6.0)
+        world.run(1.0)
+        world.enable(safety_action=safety_action)
+        world.tick()
+        assert world.state() is FlightState.LAND
+        world.until(FlightState.LANDED, 15.0)
+
+
+# Safety commands of the ground
+
+
+def test_the_latest_of_hold_land_and_return_counts(world: World) -> None:
+    world.fly()
+    steps: tuple[tuple[SafetyAction, FlightState], ...] = (
+        ("hold", FlightState.HOLD),
+        ("land", FlightState.LAND),
+        ("hold", FlightState.HOLD),
+        ("return", FlightState.RETURN),
+        ("hold", FlightState.HOLD),
+        ("land", FlightState.LAND),
+        ("return", FlightState.RETURN),
+        ("land", FlightState.LAND),
+    )
+    for safety_action, state in steps:
+        world.enable(safety_action=safety_action)
+        world.tick()
+        assert world.state() is state
+        world.run(0.9)
+        assert world.state() is state
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_changing_ones_mind_quickly_ends_in_what_was_said_last(world: World) -> None:
+    world.fly()
+    said: tuple[tuple[SafetyAction, float], ...] = (
+        ("land", 0.4),
+        ("hold", 0.8),
+        ("land", 0.2),
+        ("hold", 0.6),
+    )
+    for safety_action, seconds in said:
+        world.enable(safety_action=safety_action)
+        world.run(seconds)
+    world.run(5.0)
+    assert world.state() is FlightState.HOLD
+    assert world.mode is Mode.OFFBOARD
+    world.enable(safety_action="land")
+    world.run(0.2)
+    assert world.state() is FlightState.LAND
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_one_robot_alone_is_called_and_disabling_holds(world: World) -> None:
+    world.fly()
+    assert world.ground is not None
+    world.ground = replace(world.ground, robot_safety_actions={"3": "hold"})
+    world.tick()
+    assert world.state() is FlightState.HOLD
+    world.enable()
+    world.obey("start", "first")
+    world.ground = replace(world.ground, enabled=False)
+    world.tick()
+    assert world.state() is FlightState.HOLD
+
+
+def test_after_touchdown_hold_and_return_do_not_lift_it(world: World) -> None:
+    safety_actions: tuple[SafetyAction, ...] = ("hold", "return")
+    for safety_action in safety_actions:
+        world.hover()
+        world.enable(safety_action="land")
+        while world.height_m > 0.0:
+            world.tick()
+        world.run(0.2)
+        world.enable(safety_action=safety_action)
+        world.until(FlightState.LANDED, 12.0)
+        assert world.height_m < 0.5
+        world.enable()
+        world.until(FlightState.PREFLIGHT, 1.0)
+
+
+# Faults in flight
+
+
+def test_a_robot_that_was_knocked_down_in_its_mission_lands(world: World) -> None:
+    world.fly()
+    world.heavy = True
+    while world.height_m > 0.0:
+        world.position_m[2] = max(world.position_m[2] - 0.5, 0.0)
+        world.tick()
+    world.until(FlightState.LAND, 3.0)
+    assert world.flight.alarming
+
+
+def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:
+    world.fly()
+    world.position_m[:2] = (33.0, 16.0)
+    world.enable(safety_action="hold")
+    world.until(FlightState.HOLD, 1.0)
+    assert "outside the fence" in world._decide(world._hear()).alarms
+    world.run(20.0)
+    assert world.position_m[:2] == pytest.approx((31.0, 16.0), abs=0.2)
+
+
+def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
+    world.fly()
+    world.ground_on = False
+    lost_s = world.now_s
+    world.until(FlightState.HOLD, 4.0)
+    assert world.now_s - lost_s == pytest.approx(3.0, abs=0.2)
+    assert "ground lost" in world._decide(world._hear()).alarms
+    world.until(FlightState.LAND, 11.0)
+    assert world.now_s - lost_s == pytest.approx(13.0, abs=0.2)
+    world.ground_on = True
+    world.enable(safety_action="hold")
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_the_ground_comes_back_and_the_robot_waits(world: World) -> None:
+    world.fly()
+    world.enable(safety_action="return")
+    world.run(0.5)
+    world.ground_on = False
+    world.until(FlightState.HOLD, 4.0)
+    world.run(3.0)
+    assert world.state() is FlightState.HOLD
+    world.ground_on = True
+    world.enable()
+    world.run(5.0)
+    assert world.state() is FlightState.HOLD
+
+
+def test_battery_low_returns_and_critical_lands(world: World) -> None:
+    world.fly()
+    world.battery = 0.24
+    decision = world.tick()
+    assert world.state() is FlightState.RETURN
+    assert decision.alarms == ("battery low: 24%",)
+    world.enable(safety_action="hold")
+    world.run(1.0)
+    assert world.state() is FlightState.HOLD
+    world.enable()
+    world.run(0.2)
+    assert world.state() is FlightState.RETURN
+    world.battery = 0.1
+    world.tick()
+    assert world.state() is FlightState.LAND
+    world.enable(safety_action="hold")
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_lost_position_stops_and_then_lands(world: World) -> None:
+    world.fly()
+    world.position_known = False
+    world.run(0.6)
+    assert "position doubtful: GPS has no fix" in world.tick().alarms
+    world.run(1.0)
+    assert world.state() is FlightState.MISSION
+    assert world.speed_m_s < 0.1
+    world.run(0.5)
+    assert world.state() is FlightState.LAND
+    assert "position lost: GPS has no fix" in world.tick().alarms
+    world.position_known = True
+    world.until(FlightState.LANDED, 30.0)
+
+
+@pytest.mark.parametrize(("beat_s_ago", "asked"), [(0.2, [Action.LAND]), (0.9, [])])
+def test_an_autopilot_that_falls_silent_is_stopped_landed_and_given_up(
+    beat_s_ago: float, asked: list[Action]
+) -> None:
+    """When docs/safety.md says, from its last word and its last heartbeat."""
+    after = "0.7 s and 2 s after its last word; FAULT 2.5 s after its last heartbeat, which may "
+    assert f"| {after}come first; PX4 1 s after the last setpoint |" in SAFETY_PAGE.read_text()
+    world = World()
+    world.fly()
+    while not beat_s_ago <= world.now_s - world.heard.heartbeat_at_s < beat_s_ago + TICK_S:
+        world.tick()
+    world.silent_from_s, world.telemetry, world.beats = world.now_s, False, []
+    stopped_s, actions, sent_s = math.inf, len(world.actions), 0.0
+    while world.state() is not FlightState.FAULT:
+        world.tick()
+        silent_s = world.now_s - world.silent_from_s
+        if world.setpoint == MissionVelocity((0.0, 0.0, pytest.approx(0.0, abs=0.5))):
+            stopped_s = min(stopped_s, silent_s)
+        if world.setpoint_at_s == world.now_s:
+            sent_s = silent_s
+    assert 0.6 <= stopped_s <= 0.7 + 1e-6
+    assert [action for _, action in world.actions[actions:]] == asked
+    fault_s = world.now_s - world.heard.heartbeat_at_s
+    assert 2.5 <= fault_s <= 2.6 + 1e-6
+    asked_s = [at_s - world.silent_from_s for at_s, _ in world.actions[actions:]]
+    assert all(2.0 <= at_s <= 2.1 + 1e-6 for at_s in asked_s)
+    world.run(3.0)
+    assert sent_s <= 2.0 and world.setpoint_at_s - world.silent_from_s == sent_s
+    assert len(world.actions) == actions + len(asked)
+
+
+def test_a_glitch_stops_and_the_mission_goes_on(world: World) -> None:
+    world.fly()
+    world.position_known = False
+    world.run(1.5)
+    world.position_known = True
+    world.run(2.9)
+    assert world.state() is FlightState.MISSION and world.speed_m_s < 0.1
+    world.run(2.0)
+    assert world.state() is FlightState.MISSION and world.speed_m_s > 0.5
+    assert world.tick().alarms == ()
+
+
+@pytest.mark.parametrize("state", [FlightState.HOLD, FlightState.TAKEOFF, FlightState.RETURN])
+def test_a_position_in_doubt_is_stood_still_by(world: World, state: FlightState) -> None:
+    if state is FlightState.TAKEOFF:
+        world.ready()
+        world.obey("takeoff")
+        world.until(FlightState.TAKEOFF, 5.0)
+        world.run(3.0)
+    else:
+        world.fly()
+        world.enable(safety_action="hold" if state is FlightState.HOLD else "return")
+        world.run(3.0)
+    assert world.state() is state
+    world.accuracy_m = 7.0
+    world.run(3.0)
+    assert world.state() is state
+    assert world.speed_m_s < 0.1
+    assert "position doubtful: GPS is accurate to 7.0 m only" in world.tick().alarms
+    # The numbers may be another place's now: it is not flown to.
+    place_m = world.position_m.copy()
+    world.position_m[0] += 5.0
+    world.run(1.0)
+    world.accuracy_m = 0.9
+    world.run(5.0)
+    if state is FlightState.HOLD:
+        assert math.dist(world.position_m[:2], (place_m[0] + 5.0, place_m[1])) < 0.5
+    if state is FlightState.TAKEOFF:
+        world.until(FlightState.HOLD, 20.0)
+
+
+def test_a_position_that_stays_in_doubt_lands(world: World) -> None:
+    world.fly()
+    world.accuracy_m = 7.0
+    world.run(59.0)
+    assert world.state() is FlightState.MISSION
+    world.until(FlightState.LAND, 3.0)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_what_px4_warns_of_in_flight_is_an_alarm(world: World) -> None:
+    warning = Reason("commander_failsafe_enter", (0, 7, 4), "failsafe, battery critical: PX4 lands")
+    world.heard = replace(world.heard, warnings=(warning,))
+    world.enable()
+    world.run(1.0)
+    assert world.tick().alarms == ()
+    world.fly()
+    assert world.tick().alarms == ("PX4: failsafe, battery critical: PX4 lands",)
+
+
+def test_a_battery_that_just_lasts_for_the_way_home_returns(world: World) -> None:
+    plenty = Energy(lasts_s=200.0, home_s=150.0, cell_v=3.7, low_cell_v=3.4)
+    for short, said in (
+        (
+            plenty._replace(lasts_s=149.0),
+            "battery lasts 140 s more, home and landing take 150 s",
+        ),
+        (plenty._replace(cell_v=3.31), "battery low under load: 3.31 V per cell"),
+    ):
+        world.energy = plenty
+        world.fly()
+        world.energy = short
+        decision = world.tick()
+        assert world.state() is FlightState.RETURN
+        assert decision.alarms == (said,)
+        world.enable(safety_action="hold")
+        world.run(1.0)
+        assert world.refuse("start") == "the ground commands hold"
+        world.enable()
+        world.run(0.2)
+        assert world.state() is FlightState.RETURN
+        world.until(FlightState.LANDED, 40.0)
+        world.energy = plenty._replace(home_s=None)
+
+
+def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
+    world.fly()
+    world.closest = Closest(9, 1.4)
+    decision = world.tick()
+    assert world.state() is FlightState.HOLD
+    assert decision.alarms == ("only 1.4 m to robot 9",)
+    # On its way home it brakes, but does not flicker between two states.
+    world.enable(safety_action="return")
+    world.run(1.0)
+    assert world.state() is FlightState.RETURN
+
+
+def test_a_lost_remote_control_is_an_alarm_and_what_is_configured(world: World) -> None:
+    reactions: tuple[tuple[RemoteControlLost | None, FlightState], ...] = (
+        (None, FlightState.MISSION),
+        ("alarm", FlightState.MISSION),
+        ("hold", FlightState.HOLD),
+        ("land", FlightState.LAND),
+    )
+    for reaction, state in reactions:
+        world.robot = replace(ROBOT, on_remote_control_lost=reaction)
+        world.fly()
+        world.remote_control = False
+        world.run(0.8)
+        world.remote_control = True  # That was no loss.
+        world.run(0.8)
+        assert world.state() is FlightState.MISSION
+        world.remote_control = False
+        world.run(1.5)
+        assert world.state() is state
+        assert ("remote control lost" in world.tick().alarms) is (reaction is not None)
+        if reaction == "hold":
+            assert world.refuse("start") == "remote control lost"
+        # On its way home it goes on.
+        world.enable(safety_action="none" if reaction == "land" else "return")
+        world.until(FlightState.LANDED, 40.0)
+        world.remote_control = True
+
+
+def test_a_remote_control_of_which_nothing_is_told_any_more_is_lost(world: World) -> None:
+    world.robot = replace(ROBOT, on_remote_control_lost="land")
+    world.fly()
+    world.remote_control = None
+    world.run(0.8)
+    assert world.state() is FlightState.MISSION
+    world.run(0.5)
+    assert (world.state(), world.flight.reason) == (FlightState.LAND, "remote control lost")
+
+
+def test_what_was_not_told_while_the_program_stood_still_is_not_lost(world: World) -> None:
+    world.robot = replace(ROBOT, on_remote_control_lost="land")
+    world.fly()
+    world.remote_control = world.battery = None
+    world.stop(3.0)
+    world.remote_control, world.battery = True, 0.9
+    world.run(4.0)
+    assert world.state() is FlightState.HOLD
+    assert "remote control lost" not in world.tick().alarms
+
+
+def test_a_battery_that_is_not_known_in_flight_is_an_alarm(world: World) -> None:
+    world.fly()
+    assert world.tick().alarms == ()
+    world.battery = None
+    assert world.tick().alarms == ("battery is not known",)
+    assert world.state() is FlightState.MISSION
+
+
+def test_a_stale_policy_holds(world: World) -> None:
+    world.fly()
+    world.policy_m_s = None
+    world.tick()
+    assert world.state() is FlightState.HOLD
+    assert world.flight.alarming
+    world.policy_m_s = np.ones(2)
+    world.run(2.0)
+    assert world.state() is FlightState.HOLD
+
+
+def test_the_autopilot_that_lands_is_left_to_land(world: World) -> None:
+    world.fly()
+    world.mode = world.intended = Mode.LAND
+    world.until(FlightState.LAND, 2.5)
+    world.enable(safety_action="hold")
+    world.until(FlightState.LANDED, 20.0)
+    assert world.asked(Action.OFFBOARD) == 1
+
+
+def test_a_vehicle_that_leaves_offboard_is_not_fought_for(world: World) -> None:
+    world.fly()
+    world.mode = world.intended = Mode.RETURN
+    world.until(FlightState.PILOT, 2.5)
+    world.run(10.0)
+    assert world.state() is FlightState.PILOT
+    assert world.mode is Mode.RETURN
+
+
+def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
+    world.fly()
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.run(3.0)
+    world.telemetry = True
+    world.until(FlightState.PILOT, 4.0)
+    assert world.flight.reason.startswith("armed by this program, on op's takeoff order")
+    world.run(3.0)
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.armed = False
+    world.telemetry = True
+    world.until(FlightState.IDLE, 5.0)
+
+
+def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
+    world.fly()
+    world.pilot()
+    world.until(FlightState.PILOT, 2.5)
+    world.refuses = {Action.OFFBOARD: "sticks"}
+    world.obey("rejoin")
+    world.run(3.5)
+    assert world.state() is FlightState.HOLD
+    world.until(FlightState.PILOT, 2.0)
+    world.mode = world.intended = Mode.HOLD
+    world.run(3.0)
+    world.obey("rejoin")
+    world.until(FlightState.PILOT, 6.0)
+    assert world.flight.reason == "offboard refused: sticks"
+
+
+# The autopilot's own failsafe
+
+
+def test_a_landing_that_the_autopilots_failsafe_interrupts_goes_on(world: World) -> None:
+    # As PX4 v1.17 does with a critical battery: 5.5 s of hold, then it lands.
+    world.hover()
+    world.enable(safety_action="land")
+    world.run(4.0)
+    asked = len(world.actions)
+    world.failsafe = Mode.HOLD
+    world.run(5.5)
+    assert "the autopilot's own failsafe acts: hold" in world.tick().alarms
+    assert world.state() is FlightState.LAND
+    world.enable(safety_action="hold")
+    world.run(0.5)
+    world.failsafe = Mode.LAND
+    world.until(FlightState.LANDED, 20.0)
+    assert len(world.actions) == asked
+
+
+def test_a_landing_is_resumed_when_the_autopilots_failsafe_ends_without_one(world: World) -> None:
+    world.hover()
+    world.enable(safety_action="land")
+    world.run(4.0)
+    world.intended = world.failsafe = Mode.HOLD
+    world.run(4.0)
+    asked, height_m = world.asked(Action.LAND), world.height_m
+    world.end_failsafe()
+    world.run(3.0)
+    assert world.asked(Action.LAND) == asked + 1
+    assert world.height_m < height_m
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_pilot_wins_over_the_autopilots_failsafe(world: World) -> None:
+    safety_actions: tuple[SafetyAction, ...] = ("hold", "land")
+    for safety_action in safety_actions:
+        world.hover()
+        world.enable(safety_action=safety_action)
+        world.run(3.0)
+        world.failsafe = Mode.HOLD
+        world.run(3.0)
+        world.pilot()
+        world.until(FlightState.PILOT, 2.5)
+        world.run(4.0)
+        assert world.mode is Mode.POSITION
+        world.pilot(0.0, 0.0, -1.0)
+        while world.height_m > 0.0:
+            world.tick()
+        world.armed = False
+        world.until(FlightState.LANDED, 2.5)
+
+
+def test_the_autopilots_failsafe_in_a_mission_holds_and_then_lands(world: World) -> None:
+    world.fly()
+    asked = len(world.actions)
+    world.failsafe = Mode.HOLD
+    world.until(FlightState.HOLD, 2.5)
+    assert world.flight.alarming
+    world.run(3.0)
+    # The ground comes after it.
+    world.enable(safety_action="return")
+    world.run(3.0)
+    assert world.state() is FlightState.HOLD
+    assert world.refuse("start") == "the ground commands return"
+    world.enable()
+    assert world.refuse("start") == "the autopilot's own failsafe acts: hold"
+    world.failsafe = Mode.LAND
+    world.until(FlightState.LAND, 2.5)
+    world.until(FlightState.LANDED, 20.0)
+    assert len(world.actions) == asked
+
+
+def test_after_the_autopilots_failsafe_the_robot_holds_or_returns_home(world: World) -> None:
+    world.fly()
+    world.failsafe = Mode.HOLD
+    world.run(4.0)
+    world.position_m[0] += 2.0  # Where it stands then counts.
+    world.run(1.5)
+    at_m = world.position_m.copy()
+    world.end_failsafe()
+    world.run(5.0)
+    assert world.state() is FlightState.HOLD
+    assert world.mode is Mode.OFFBOARD
+    assert world.position_m == pytest.approx(at_m, abs=0.3)
+    world.enable(safety_action="return")
+    world.run(1.5)
+    world.failsafe = Mode.HOLD
+    world.until(FlightState.HOLD, 2.5)
+    world.end_failsafe()
+    world.until(FlightState.RETURN, 2.5)
+    world.until(FlightState.LANDED, 40.0)
+
+
+# Nobody is left hovering
+
+
+def test_a_vehicle_that_the_autopilots_failsafe_holds_for_a_minute_is_landed(world: World) -> None:
+    world.hover()
+    world.failsafe = Mode.HOLD
+    world.run(55.0)
+    assert world.state() is FlightState.HOLD
+    world.until(FlightState.LAND, 8.0)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_landing_that_the_autopilots_failsafe_holds_for_a_minute_is_asked_for_again(
+    world: World,
+) -> None:
+    world.hover()
+    world.enable(safety_action="land")
+    world.run(4.0)
+    world.failsafe = Mode.HOLD
+    world.run(50.0)
+    assert world.mode is Mode.HOLD
+    world.until(FlightState.LANDED, 30.0)
+
+
+def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
+    world.fly()
+    world.stop(3.0)
+    began_s = world.now_s
+    world.run(30.0)
+    world.stop(1.0)  # Another one is no answer.
+    assert world.flight.alarming
+    text = "hovers, and lands 60 s after it began to, if nobody orders or holds it"
+    assert text in world.tick().alarms
+    world.until(FlightState.LAND, 35.0)
+    assert world.now_s - began_s == pytest.approx(60.0, abs=1.0)
+    assert world.flight.reason == "nobody answered for 60 s"
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_after_a_lapse_that_somebody_answers_it_stays(world: World) -> None:
+    def hold() -> None:
+        world.enable(safety_action="hold")
+        world.run(0.5)
+        world.enable()
+
+    for answer in (hold, lambda: world.obey("reset"), lambda: world.refuse("rejoin")):
+        world.fly()
+        world.stop(3.0)
+        world.run(30.0)
+        answer()
+        world.run(65.0)
+        assert world.state() is FlightState.HOLD
+        world.enable(safety_action="land")
+        world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_hold_for_which_somebody_gave_a_reason_lasts(world: World) -> None:
+    world.hover()
+    world.run(65.0)
+    assert world.state() is FlightState.HOLD
+    world.obey("start", "first")
+    world.run(1.0)
+    world.obey("pilot")
+    world.run(65.0)
+    assert (world.state(), world.mode) == (FlightState.PILOT, Mode.HOLD)
+
+
+def test_a_program_that_finds_its_vehicle_in_hold_lands_it_if_nobody_answers(world: World) -> None:
+    world.fly()
+    world.mode = world.intended = Mode.HOLD  # The watchdog's.
+    world.restart()
+    world.until(FlightState.PILOT, 2.5)
+    began_s, actions = world.now_s, list(world.actions)
+    world.run(58.0)
+    assert world.actions == actions
+    world.until(FlightState.LAND, 3.0)
+    assert world.now_s - began_s == pytest.approx(60.0, abs=0.3)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_vehicle_in_hold_that_somebody_has_is_left_to_him(world: World) -> None:
+    def fly_a_little() -> None:
+        world.pilot()
+        world.run(2.5)
+        world.mode = world.intended = Mode.HOLD
+
+    def hold() -> None:
+        world.enable(safety_action="hold")
+        world.run(0.5)
+
+    for answer in (fly_a_little, hold, lambda: world.refuse("takeoff")):
+        world.fly()
+        world.mode = world.intended = Mode.HOLD
+        world.restart()
+        world.until(FlightState.PILOT, 2.5)
+        world.run(30.0)
+        answer()
+        world.run(65.0)
+        assert (world.state(), world.mode) == (FlightState.PILOT, Mode.HOLD)
+        world.mode = world.intended = Mode.LAND
+        world.until(FlightState.LANDED, 20.0)
+
+
+def test_a_vehicle_that_was_armed_in_hold_on_the_ground_is_not_landed(world: World) -> None:
+    world.armed, world.mode, world.intended = True, Mode.HOLD, Mode.HOLD
+    world.until(FlightState.PILOT, 2.5)
+    world.run(65.0)
+    assert world.state() is FlightState.PILOT
+    assert world.actions == []
+
+
+def test_offboard_that_is_refused_after_a_lapse_leaves_nobody_hovering(world: World) -> None:
+    world.fly()
+    world.refuses = {Action.OFFBOARD: "not now"}
+    world.stop(3.0)
+    world.until(FlightState.PILOT, 9.0)
+    world.until(FlightState.LAND, 61.0)
+    world.until(FlightState.LANDED, 20.0)
+
+
+# A lapse of the control loop
+
+
+def test_after_a_lapse_nothing_moves_until_the_operator_resumes(world: World) -> None:
+    world.fly()
+    assert world.speed_m_s > 0.5
+    world.stop(20.0)
+    assert world.state() is FlightState.HOLD
+    assert world.flight.alarming
+    world.run(1.0)
+    world.position_m[0] += 0.4  # Where it stands then counts.
+    at_m = world.position_m.copy()
+    sent_s = world.setpoint_at_s
+    world.run(0.7)
+    assert world.setpoint_at_s == sent_s  # Stale telemetry is worked off first.
+    for _ in range(100):
+        world.tick()
+        assert world.state() is FlightState.HOLD
+        assert world.speed_m_s < 0.2
+    assert world.position_m == pytest.approx(at_m, abs=0.1)
+    assert world.mode is Mode.OFFBOARD
+    world.obey("start", "first")
+    world.run(3.0)
+    assert world.speed_m_s > 0.5
+
+
+def test_just_after_a_lapse_no_order_is_taken(world: World) -> None:
+    world.fly()
+    world.stop(0.8)
+    assert world.refuse("start") == "the control loop was silent just before"
+
+
+def test_after_a_lapse_without_a_watchdog_the_autopilots_landing_goes_on(world: World) -> None:
+    world.fly()
+    world.watchdog = False
+    world.stop(4.0)
+    world.until(FlightState.LAND, 4.0)
+    world.until(FlightState.LANDED, 20.0)
+
+
+def test_after_a_lapse_that_only_the_program_saw_the_vehicle_holds() -> None:
+    world = World()
+    world.fly()
+    world.watchdog = False
+    world.stop(0.6)
+    world.next_beat_s, world.latency_s = world.now_s + 0.05, 0.0
+    world.run(10.0)
+    assert world.asked(Action.HOLD) == 1
+    assert world.state() is FlightState.HOLD
+    assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
+
+
+def test_a_pilot_who_took_it_during_a_lapse_keeps_it(world: World) -> None:
+    world.fly()
+    world.pilot(0.0, 0.5, 0.0)
+    world.stop(3.0)
+    world.until(FlightState.PILOT, 2.5)
+    world.run(5.0)
+    assert world.mode is Mode.POSITION
+
+
+# A pilot
+
+
+def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> None:
+    def start() -> None:
+        world.obey("start", "first")
+        world.run(1.0)
+
+    def hold() -> None:
+        world.enable(safety_action="hold")
+        world.run(1.0)
+
+    def fly_home() -> None:
+        world.enable(safety_action="return")
+        world.run(1.0)
+
+    safety_actions: tuple[SafetyAction, ...] = ("land", "return", "hold", "none")
+    world.hover()
+    for begin, state in (
+        (hold, FlightState.HOLD), (start, FlightState.MISSION), (fly_home, FlightState.RETURN),
+    ):  # fmt: skip
+        begin()
+        assert world.state() is state
+        world.obey("pilot")
+        assert (world.state(), world.flight.reason) == (FlightState.PILOT, "given to a pilot")
+        assert "given to a pilot" in world.tick().alarms
+        # Again is no mistake; and nothing that the ground repeats takes it back.
+        world.obey("pilot")
+        for safety_action in safety_actions:
+            world.enable(safety_action=safety_action)
+            world.run(1.5)
+            assert world.state() is FlightState.PILOT
+            assert world.mode == Mode.HOLD
+        assert world.speed_m_s < 0.1
+        world.obey("rejoin")
+        world.run(3.0)
+        assert world.state() is FlightState.HOLD
+        assert world.mode is Mode.OFFBOARD
+    world.enable(safety_action="land")
+    world.run(1.0)
+    assert world.refuse("pilot") == "pilot is not taken in land: ground commands land"
+
+
+def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> None:
+    world.fly()
+    world.pilot(1.0, 0.0, 0.0)
+    world.until(FlightState.PILOT, 2.5)
+    while world.position_m[0] < 33.0:
+        world.tick()
+    assert world.refuse("rejoin").startswith("outside the fence")
+    world.pilot(-1.0, 0.0, -0.3)
+    while world.position_m[0] > 25.0:
+        world.tick()
+    assert "its height is 9.5 m" in world.refuse("rejoin")
+    world.position_m[2] = SLOT_M
+    world.pilot()
+    world.obey("rejoin")
+    world.run(5.0)
+    assert world.state() is FlightState.HOLD
+    assert world.mode is Mode.OFFBOARD
+    world.obey("start", "first")
+    world.run(1.0)
+    assert world.state() is FlightState.MISSION
+
+
+def test_a_pilot_keeps_a_vehicle_that_was_told_to_land_or_to_stop_landing(world: World) -> None:
+    for safety_action in ("land", "hold"):
+        world.hover()
+        world.enable(safety_action="land")
+        world.run(0.1 if safety_action == "land" else 3.0)
+        world.enable(safety_action=safety_action)
+        world.run(0.9)
+        world.pilot()
+        world.until(FlightState.PILOT, 2.5)
+        world.run(4.0)
+        assert world.mode is Mode.POSITION
+        world.pilot(0.0, 0.0, -1.0)
+        while world.height_m > 0.0:
+            world.tick()
+        world.armed = False
+        world.until(FlightState.LANDED, 2.5)
+        world.enable()
+        world.until(FlightState.PREFLIGHT, 1.0)
+
+
+def test_a_landing_that_somebody_else_ends_is_his(world: World) -> None:
+    world.hover()
+    world.enable(safety_action="land")
+    world.run(3.0)
+    world.mode = world.intended = Mode.HOLD
+    world.until(FlightState.PILOT, 2.5)
+
+
+def test_a_program_that_starts_in_flight_only_observes_until_rejoin(world: World) -> None:
+    world.fly()
+    world.pilot()
+    world.run(2.5)
+    actions = list(world.actions)
+    world.restart()
+    world.until(FlightState.PILOT, 2.0)
+    assert "already armed when this program found it" in world.flight.reason
+    for safety_action in ("none", "hold", "land", "return", "none"):
+        world.enable(safety_action=safety_action)
+        world.run(2.0)
+    world.battery = 0.1
+    world.run(2.0)
+    world.battery = 0.9
+    assert world.state() is FlightState.PILOT
+    assert world.actions == actions
+    world.obey("rejoin")
+    world.until(FlightState.HOLD, 1.0)
+    world.run(4.0)
+    assert world.state() is FlightState.HOLD
+    assert world.height_m == pytest.approx(SLOT_M, abs=0.3)
+
+
+def test_a_vehicle_armed_by_hand_is_only_observed(world: World) -> None:
+    world.ready()
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.until(FlightState.PILOT, 2.5)
+    assert world.refuse("rejoin") in (
+        "position or height is not known",
+        "the vehicle is not in the air",
+    )
+    world.armed = False
+    world.until(FlightState.LANDED, 2.5)
+    world.run(1.0)
+    assert world.actions == []
+
+
+def test_a_ground_that_goes_leaves_preflight(world: World) -> None:
+    world.ready()
+    world.ground_on = False
+    world.until(FlightState.IDLE, 4.0)
+    world.telemetry = False
+    world.until(FlightState.INIT, 4.0)
+
+
+# Kill
+
+
+@pytest.mark.parametrize("state", list(FlightState))
+def test_kill_is_taken_in_every_state(state: FlightState) -> None:
+    world = World()
+    world.hover()
+    world.flight = replace(world.flight, state=state, since_s=world.now_s, reached=True)
+    world.obey("kill")
+    assert world.state() is FlightState.FAULT
+    assert world.actions[-1][1] is Action.KILL
+    world.run(3.0)
+    assert not world.armed
+
+
+def test_a_killed_robot_stays_so_but_kills_nobody_who_arms_it_later(world: World) -> None:
+    world.fly()
+    world.refuses = {Action.KILL: "did not hear"}
+    world.obey("kill")
+    world.run(3.0)
+    assert world.asked(Action.KILL) >= 3
+    world.refuses = {}
+    world.run(4.0)
+    assert not world.armed
+    kills = world.asked(Action.KILL)
+    world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
+    world.run(5.0)
+    assert world.asked(Action.KILL) == kills
+    assert world.state() is FlightState.FAULT
+
+
+# The table
+
+
+def scenarios() -> list[Callable[[World], None]]:
+    return [
+        test
+        for name, test in sorted(globals().items())
+        if name.startswith("test_") and list(signature(test).parameters) == ["world"]
+    ]
+
+
+def test_every_transition_is_taken_in_some_scenario() -> None:
+    reasons = reasons_by_row()
+    assert [row for row in TRANSITIONS if not reasons[row.when, row.target]] == []
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    scenario=st.sampled_from(scenarios()),
+    phase_s=st.floats(0.0, 1.0),
+    latency_s=st.floats(0.0, 1.0),
+)
+def test_late_telemetry_changes_no_outcome(
+    scenario: Callable[[World], None], phase_s: float, latency_s: float
+) -> None:
+    scenario(World(phase_s, latency_s))
+
+
+def test_the_page_for_people_has_the_same_table() -> None:
+    page = SAFETY_PAGE.read_text().splitlines()
+    start = page.index("| From | To | When | The operator reads, for example |") + 2
+    rows = page[start : page.index("", start)]
+    expected = table()
+    for row, wanted in zip(rows, expected, strict=False):
+        assert row == wanted, f"docs/safety.md: {MEND}"
+    assert len(rows) == len(expected), f"docs/safety.md: {MEND}"
+
+
+def test_the_page_for_people_says_where_each_order_is_taken() -> None:
+    rows = re.findall(r"^\| (\w+) \| ([^|]*) \| [^|]* \|$", SAFETY_PAGE.read_text(), re.MULTILINE)
+    said = {kind: cell for kind, cell in rows if kind in ORDERS}
+    assert list(said) == list(ORDERS)
+    for kind, rule in ORDERS.items():
+        named = {state for state in FlightState if state.name in re.findall(r"\w+", said[kind])}
+        any_but = said[kind].startswith("any state")
+        assert set(rule.taken_in) == (set(FlightState) - named if any_but else named), kind
+
+
+def test_a_row_does_what_its_fields_say() -> None:
+    """Whatever its condition is: nothing asks which row it was."""
+    world = World()
+    world.fly()
+    t = Tick(ROBOT, replace(world.flight, target_m=(1.0, 2.0, 3.0)), world.inputs(world.heard))
+    assert t.flight.reached
+    row = Transition((FlightState.MISSION,), FlightState.HOLD, "a test wants it", lambda _: "so")
+    plain = enter(row, "so", t)
+    assert (plain.state, plain.reason, plain.alarming) == (FlightState.HOLD, "so", False)
+    assert (plain.reached, plain.target_m, plain.alone_since_s) == (True, None, None)
+    assert not plain.killed
+    full = replace(
+        row, alarm=True, land_by="return", left_alone="yes", looks_anew=True,
+        keeps_target=True, rejoins=True, kills=True,
+    )  # fmt: skip
+    after = enter(full, "so", t)
+    assert (after.alarming, after.land_by, after.killed) == (True, "return", True)
+    assert (after.reached, after.target_m) == (False, (1.0, 2.0, 3.0))
+    assert after.alone_since_s == after.rejoined_at_s == world.now_s
+    in_hold = replace(t, inputs=replace(t.inputs, vehicle=replace(world.heard, mode=Mode.HOLD)))
+    sometimes = replace(row, left_alone="if in hold")
+    assert enter(sometimes, "so", t).alone_since_s is None
+    assert enter(sometimes, "so", in_hold).alone_since_s == world.now_s
+
+
+MEND = "its table of transitions must be what test_flight.table() returns, row by row"
+
+
+def table() -> list[str]:
+    """The machine as rows of Markdown, in the order of `TRANSITIONS`.
+
+    From, to, when, and what the operator reads: that is from the scenarios, with numbers as "…".
+    """
+    rows = []
+    reasons = reasons_by_row()
+    for row in TRANSITIONS:
+        everywhere = set(row.sources) == set(FlightState)
+        sources = "any" if everywhere else ", ".join(state.name for state in row.sources)
+        said = "; ".join(sorted(reasons[row.when, row.target]))
+        rows.append(f"| {sources} | {row.target.name} | {row.when} | {said} |")
+    return rows
+
+
+@functools.cache
+def reasons_by_row() -> Mapping[tuple[str, FlightState], set[str]]:
+    """The reasons that the scenarios gave for each row, by when it applies and its target."""
+    reasons: dict[tuple[str, FlightState], set[str]] = defaultdict(set)
+    for scenario in scenarios():
+        world = World()
+        scenario(world)
+        for row, reason in zip(world.taken, world.reasons, strict=True):
+            reasons[row.when, row.target].add(re.sub(r"\d+(\.\d+)?", "…", reason))
+    return reasons
+
+
+# Whatever comes
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    begin=st.sampled_from([World.enable, World.ready, World.hover, World.fly]),
+)
+def test_whatever_comes_nothing_raises_or_arms_unasked(
+    seed: int, begin: Callable[[World], None]
+) -> None:
+    """The checks are the world's own, in every tick."""
+    draw = random.Random(seed)
+    world = World(draw.random(), draw.random())
+    begin(world)
+    for _ in range(400):
+        if draw.random() < 0.1:
+            draw.choices(CHANGES, weights=(12, 1, 1, 6, 4, 3, 1, 1))[0](world, draw)
+        world.tick()
+        world.order = None
+
+
+def _order(world: World, draw: random.Random) -> None:
+    kinds: tuple[OrderKind, ...] = (
+        "takeoff", "start", "rejoin", "pilot", "reset", "disarm", "kill",
+    )  # fmt: skip
+    kind = draw.choices(kinds, weights=(30, 20, 10, 5, 5, 5, 1))[0]
+    order = world.new_order(kind, draw.choice(("", "a")))
+    if draw.random() < 0.3:
+        order = replace(order, order_id=f"o{draw.randrange(5)}")
+    if draw.random() < 0.1:
+        order = replace(order, boot_nonce=draw.randrange(100))
+    if draw.random() < 0.1:
+        order = replace(order, expires_at_uptime_s=draw.choice((math.nan, -1.0, 1e9)))
+    world.order = order
+
+
+def _mode(world: World, draw: random.Random) -> None:
+    world.mode = world.intended = draw.choice(list(Mode))
+    world.failsafe = draw.choice((None, None, Mode.HOLD, Mode.LAND, Mode.RETURN))
+
+
+def _arm(world: World, draw: random.Random) -> None:
+    world.armed = draw.random() < 0.5
+
+
+def _ground(world: World, draw: random.Random) -> None:
+    safety_actions: tuple[SafetyAction, ...] = ("none", "none", "none", "hold", "return", "land")
+    world.enable(draw.choice(safety_actions))
+    world.ground_on = draw.random() < 0.9
+
+
+def _surroundings(world: World, draw: random.Random) -> None:
+    world.remote_control = draw.random() < 0.8
+    world.robot = replace(ROBOT, on_remote_control_lost=draw.choice(("alarm", "hold", "land")))
+    world.policy_m_s = draw.choice((None, np.array([draw.uniform(-3, 3), draw.uniform(-3, 3)])))
+    world.closest = draw.choice((None, None, Closest(4, draw.uniform(0.0, 3.0))))
+    world.busy = draw.choice(((), (), (5,)))
+    world.failed_checks = draw.choice(((), (), None, ("x",)))
+    world.battery = draw.choice((0.9, 0.9, 0.2, 0.1))
+    world.energy = draw.choice(
+        (None, Energy(draw.uniform(0, 900), draw.uniform(0, 300), None, 3.4))
+    )
+
+
+def _vehicle(world: World, draw: random.Random) -> None:
+    world.position_known = draw.random() < 0.8
+    world.telemetry = draw.random() < 0.9
+    world.refuses = draw.choice(({}, {}, {Action.OFFBOARD: "no"}, {Action.ARM: "no"}))
+
+
+def _place(world: World, draw: random.Random) -> None:
+    world.position_m = np.array([draw.uniform(-5, 40), draw.uniform(-5, 40), draw.uniform(0, 12)])
+
+
+def _stop(world: World, draw: random.Random) -> None:
+    world.watchdog = draw.random() < 0.5
+    world.stop(draw.choice((0.6, 3.0, 15.0)))
+
+
+CHANGES = (_order, _mode, _arm, _ground, _surroundings, _vehicle, _place, _stop)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"slot": -1}, "slot = -1"),
+        ({"landing_point_m": (1.0,)}, "landing_point_m"),
+        ({"landing_point_m": (1.0, math.nan)}, "landing_point_m"),
+        ({"takeoff_timeout_s": 0.0}, "takeoff_timeout_s = 0.0"),
+        ({"min_separation_m": 4.5}, "min_separation_m = 4.5"),
+        ({"battery_critical": 0.3}, "battery_critical = 0.3"),
+        ({"slot": 20}, "slot = 20"),
+        ({"landing_point_m": (1.0, 12.0)}, "buffer_m = 2"),
+    ],
+)
+def test_parameters_that_cannot_be_flown_are_named(wrong: dict[str, object], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        replace(ROBOT, parameters=replace(ROBOT.parameters, **wrong))  # type: ignore[arg-type]

@@ -1,0 +1,221 @@
+"""What an operator is told at once, and that nothing else is."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.core.fence import Fence
+from edge.messages.mission import FlightState, GroundState, LoopStatus, Origin
+from lpac.analysis.snapshot import FleetSnapshot
+from lpac.ground.alarms import SEVERITIES, Alarm, alarms
+from tests.unit.ground.snapshots import (
+    FENCE,
+    LOOP,
+    ORIGIN,
+    on_ground,
+    robot,
+    setup,
+    snapshot,
+    status,
+)
+
+_S = FlightState
+SETUP = setup(3)
+
+
+def told(seen: FleetSnapshot, before: FleetSnapshot | None = None) -> tuple[Alarm, ...]:
+    return alarms(SETUP, seen, before)
+
+
+def fleet(
+    *, said: dict[str, Any] | None = None, known: dict[str, Any] | None = None
+) -> FleetSnapshot:
+    """Three robots that fly well; r1 is different."""
+    r1 = robot(status(1, **(said or {})), **(known or {}))
+    return snapshot(robot(status(0)), r1, robot(status(2)))
+
+
+def test_nothing_of_a_fleet_that_flies_well() -> None:
+    assert told(fleet(), fleet()) == ()
+
+
+def test_robots_before_enable_are_not_alarming() -> None:
+    seen = snapshot(*(robot(on_ground(i)) for i in range(3)), commander="", ground=None)
+    assert told(seen, seen) == (Alarm("note", "", "nobody commands the fleet yet"),)
+
+
+def test_robots_after_enable_say_why_they_are_not_ready() -> None:
+    robots = [robot(on_ground(i, state=_S.PREFLIGHT)) for i in range(3)]
+    assert told(snapshot(*robots)) == tuple(
+        Alarm("note", f"r{i}", "not ready: GPS sees 3 satellites") for i in range(3)
+    )
+
+
+OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
+
+
+@pytest.mark.parametrize(
+    ("said", "severity", "text"),
+    [
+        ({"alarms": ("position lost", "ground lost")}, "critical", "position lost; ground lost"),
+        ({"state": _S.PILOT, "alarms": ("a pilot flies it",)}, "warning", "a pilot flies it"),
+        ({"battery": 0.15}, "critical", "battery critical: 15%"),
+        ({"battery": 0.3}, "warning", "battery low: 30%"),
+        ({"battery": 0.2, "alarms": ("battery low: 20%",)}, "critical", "battery low: 20%"),
+        ({"bundle_id": "0123456789"}, "warning", "bundle 01234567, not the fleet's 79929121"),
+        ({"world_id": ""}, "warning", "world none, not the fleet's c64e4b1b"),
+        ({"origin": Origin(47.0, 8.0, 0.0)}, "warning", "another origin than the fleet's"),
+        ({"fence": OTHER_FENCE}, "warning", "another fence than the fleet's"),
+        ({"not_taken": ("fence: not in flight",)}, "warning", "fence: not in flight"),
+        # Of one difference there is one alarm.
+        ({"origin": Origin(47.0, 8.0, 0.0), "not_taken": ("in flight: keeps its mission origin",)},
+         "warning", "in flight: keeps its mission origin"),
+        ({"world_id": "", "not_taken": ("world c64e4b1b of the ground has not arrived: wait",)},
+         "warning", "world c64e4b1b of the ground has not arrived: wait"),
+        ({"alarms": ("a pilot flies it (position)",), "state": _S.PILOT, "remote_control": True},
+         "warning", "a pilot flies it (position)"),
+        ({"alarms": ("remote control lost",), "state": _S.PILOT, "remote_control": False},
+         "critical", "remote control lost"),
+        ({"satellites": 7}, "warning", "GPS sees 7 satellites"),
+        ({"hdop": 2.5}, "warning", "GPS precision (HDOP) is 2.5"),
+        ({"feature_age_s": 1.4}, "warning", "features are 1.4 s old"),
+        ({"feature_age_s": 1.4, "state": _S.HOLD}, "note", "features are 1.4 s old"),
+        ({"feature_age_s": None}, "warning", "has no features to ask the policy with"),
+        ({"neighbour_ages_s": {"0": 0.1}}, "warning", "hears badly: r2"),
+        ({"loops": {"control": replace(LOOP, lateness_p99_ms=80.0)}}, "warning",
+         "its control loop is late by 80 ms"),
+    ],
+)  # fmt: skip
+def test_what_a_robot_says_of_itself(said: dict[str, Any], severity: str, text: str) -> None:
+    assert told(fleet(said=said)) == (Alarm(severity, "r1", text),)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("known", "severity", "text"),
+    [
+        ({"duplicate": True}, "critical", "two programs say that they are this robot: end one"),
+        ({"clock_offset_s": -3.2}, "warning", "its clock is 3 s behind"),
+        ({"rates_hz": {"0": 0.5, "2": 2.5}}, "warning", "hears badly: r0"),
+    ],
+)
+def test_what_the_ground_knows_of_a_robot(known: dict[str, Any], severity: str, text: str) -> None:
+    assert told(fleet(known=known)) == (Alarm(severity, "r1", text),)  # type: ignore[arg-type]
+
+
+def test_a_robot_that_falls_silent_says_nothing_else() -> None:
+    seen = fleet(said={"battery": 0.1, "alarms": ("position lost",)}, known={"age_s": 2.5})
+    text = "not heard any more, last in the air in mission"
+    assert told(seen) == (Alarm("critical", "r1", text),)
+
+
+def test_a_silent_robot_on_the_ground_is_less_grave() -> None:
+    robots = robot(status(0)), robot(on_ground(1), age_s=60.0), robot(status(2))
+    assert told(snapshot(*robots)) == (Alarm("warning", "r1", "not heard any more, last in idle"),)
+
+
+def test_robots_that_were_never_heard_are_one_alarm() -> None:
+    silent = [replace(robot(status(i)), status=None, age_s=None) for i in (1, 2)]
+    (alarm,) = told(snapshot(robot(on_ground(0, failed_checks=())), *silent))
+    assert alarm == ("note", "", "not heard yet: r1 r2")
+    assert told(snapshot(*silent)) == (Alarm("note", "", "no robot is heard yet"),)
+
+
+def test_robots_out_of_range_need_not_be_heard() -> None:
+    far = robot(status(1, position_m=(30.0, 30.0, 4.0), neighbour_ages_s={}))
+    assert told(snapshot(robot(status(0)), far, robot(status(2)))) == ()
+
+
+def test_a_new_state_may_take_a_moment_to_be_obeyed() -> None:
+    hold = GroundState(5, "alice", ORIGIN, enabled=True, safety_action="hold", trial="t1")
+    now = replace(fleet(), ground=hold)
+    assert told(now, fleet()) == ()
+    assert {a.text for a in told(now, now)} == {"does not obey what the ground says"}
+    assert {a.severity for a in told(now, now)} == {"critical"}
+
+
+def test_a_robot_obeys_another_operator() -> None:
+    seen = fleet(said={"operator": "bob"})
+    assert told(seen, seen) == (Alarm("critical", "r1", "obeys bob, not alice"),)
+
+
+def test_loops_that_miss_ticks_or_fail() -> None:
+    def with_loop(loop: LoopStatus) -> FleetSnapshot:
+        return fleet(said={"loops": {"control": loop}})
+
+    missed, failed = replace(LOOP, overruns=3), replace(LOOP, overruns=3, failures=1)
+    assert [a.text for a in told(with_loop(missed), fleet())] == ["its control loop misses ticks"]
+    assert [a.text for a in told(with_loop(failed), with_loop(missed))] == [
+        "its control loop fails"
+    ]
+    assert told(with_loop(failed), with_loop(failed)) == ()
+
+
+def test_nobody_commands_robots_in_the_air() -> None:
+    (alarm,) = told(replace(fleet(), commander="", ground=None))
+    assert alarm == ("critical", "", "nobody commands the fleet, and 3 fly: hold or land them")
+
+
+def test_a_commander_that_fell_silent() -> None:
+    (alarm,) = told(replace(fleet(), commander="bob", commander_age_s=2.5))
+    assert alarm == ("critical", "", "bob commands, but is not heard: hold takes over")
+
+
+def test_a_fleet_whose_files_say_when_a_battery_is_critical() -> None:
+    seen = fleet(said={"battery": 0.22})
+    (alarm,) = alarms(replace(SETUP, battery_critical=0.25), seen)
+    assert alarm == ("critical", "r1", "battery critical: 22%")
+
+
+def test_a_world_that_is_not_here() -> None:
+    (alarm,) = alarms(replace(SETUP, world=""), fleet())
+    assert alarm == (
+        "warning",
+        "",
+        "the robots' world c64e4b1b is not here: no density, no cost; `lpac mission world FILE`",
+    )
+
+
+def test_hold_of_another_station() -> None:
+    held = GroundState(
+        4, "alice", ORIGIN, enabled=True, safety_action="hold", safety_action_by="bob"
+    )
+    assert told(replace(fleet(), ground=held)) == (
+        Alarm("warning", "", "bob asks 3 robots to hold"),
+    )
+
+
+numbers = st.none() | st.floats(0.0, 3.0)
+statuses = st.builds(
+    status,
+    robot_id=st.just(0),
+    state=st.sampled_from(_S),
+    in_air=st.none() | st.booleans(),
+    battery=numbers,
+    hdop=numbers,
+    feature_age_s=numbers,
+    satellites=st.none() | st.integers(0, 20),
+    origin=st.sampled_from([None, ORIGIN, Origin(1.0, 2.0, 3.0)]),
+    fence=st.sampled_from([None, FENCE, Fence(FENCE.vertices_m, 1.0, 0.0, 9.0)]),
+    alarms=st.sampled_from([(), ("ground lost",)]),
+    not_taken=st.sampled_from([(), ("fence: not in flight",)]),
+    obeyed_sequence=st.integers(0, 6),
+)
+
+
+@given(st.lists(statuses, min_size=3, max_size=3), st.lists(numbers, min_size=3, max_size=3))
+def test_the_gravest_comes_first_and_each_once(said: list[Any], ages_s: list[Any]) -> None:
+    robots = [
+        robot(replace(s, robot_id=i), age_s=age_s)
+        for i, (s, age_s) in enumerate(zip(said, ages_s, strict=True))
+    ]
+    found = told(snapshot(*robots), fleet())
+    order = [SEVERITIES.index(alarm.severity) for alarm in found]
+    assert order == sorted(order)
+    assert len(found) == len(set(found))
+    assert all(alarm.text and len(alarm.text.splitlines()) == 1 for alarm in found)
+    silent = {f"r{i}" for i, age_s in enumerate(ages_s) if age_s is None or age_s > 2.0}
+    for name in silent:
+        assert len([alarm for alarm in found if alarm.robot == name]) == 1

@@ -1,0 +1,123 @@
+"""The dependencies point one way, and a robot loads nothing that it does not need."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+OURS = ("edge", "export", "lpac")
+
+_EDGE = {"edge.core", "edge.messages", "edge.flight", "edge.policy", "edge.robot", "edge.drivers"}
+# Part -> the parts of the project that it may import (besides itself).
+ALLOWED = {
+    "edge.core": set(),
+    "edge.messages": {"edge.core"},
+    "edge.flight": {"edge.core", "edge.messages"},
+    "edge.policy": {"edge.core", "edge.messages"},
+    "edge.drivers": {"edge.core", "edge.messages"},
+    "edge.robot": {"edge.core", "edge.messages", "edge.flight", "edge.policy"},
+    "edge.robot.process": _EDGE,
+    "export": {"edge.core", "edge.policy"},
+    "lpac.shipped": set(),
+    "lpac.analysis": _EDGE,
+    "lpac.ground": {*_EDGE, "lpac.analysis"},
+    "lpac.fleet": {*_EDGE, "lpac.shipped"},
+    "lpac.sim": {*_EDGE, "lpac.analysis", "lpac.ground"},
+    "lpac.cli": {
+        *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
+        "lpac.ground", "lpac.sim", "lpac.fleet",
+    },
+}  # fmt: skip
+# Third-party packages, and the only files or parts that may import them.
+ONLY_IN = {
+    "onnxruntime": {"edge/policy/lpac/graphs.py"},
+    "torch": {"export/"},
+    "onnx": {"export/"},
+    "matplotlib": {"lpac/sim/", "lpac/analysis/"},
+    "mavsdk": {"edge/drivers/"},
+    "zenoh": {"edge/drivers/"},
+    "mcap": {"edge/drivers/"},
+    "pymavlink": {"lpac/sim/"},
+    "typer": {"lpac/cli/"},
+    "rich": {"lpac/cli/", "lpac/ground/terminal/"},
+    "textual": {"lpac/ground/terminal/"},
+    "aiohttp": {"lpac/ground/map/"},
+    "tomlkit": {"lpac/fleet/"},
+}
+# The core has no clock, thread, file or socket (the mailbox has a lock, for its callers' threads).
+IMPURE = {
+    "asyncio", "io", "logging", "multiprocessing", "os", "pathlib", "random", "shutil", "signal",
+    "socket", "subprocess", "tempfile", "threading", "time",
+}  # fmt: skip
+
+
+def part_of(module: str) -> str:
+    names = module.split(".")
+    parts = (".".join(names[:n]) for n in range(len(names), 0, -1))
+    return next((part for part in parts if part in ALLOWED), names[0])
+
+
+def imports(path: Path, *, only_top_level: bool = False) -> Iterator[str]:
+    tree = ast.parse(path.read_text())
+    for node in tree.body if only_top_level else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from {node.module or "", *(f"{node.module}.{a.name}" for a in node.names)}
+
+
+def sources() -> list[Path]:
+    return sorted(p for part in OURS for p in (ROOT / part).rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_point_one_way(path: Path) -> None:
+    name = path.relative_to(ROOT)
+    own = part_of(".".join(name.with_suffix("").parts))
+    for module in imports(path):
+        if module.split(".")[0] in OURS and module not in ("edge", "lpac"):
+            part = part_of(module)
+            assert part == own or part in ALLOWED.get(own, set()), f"{name} imports {module}"
+        for package, places in ONLY_IN.items():
+            if module.split(".")[0] == package:
+                assert any(str(name).startswith(place) for place in places), (
+                    f"{name} imports {module}"
+                )
+        if own == "edge.core" and not (module.startswith("threading") and name.stem == "mailbox"):
+            assert module.split(".")[0] not in IMPURE, f"{name} imports {module}"
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "lpac" / "cli").glob("*.py")), ids=lambda p: p.name)
+def test_cli_imports_its_parts_only_when_a_command_runs(path: Path) -> None:
+    for module in imports(path, only_top_level=True):
+        assert part_of(module) in ("lpac", "lpac.cli", "lpac.shipped") or module.split(".")[
+            0
+        ] not in {*OURS, "numpy", "rich"}, module
+
+
+def test_robot_process_loads_no_workstation_package() -> None:
+    """Run the policy's whole path, then look at what was imported."""
+    code = """
+import sys
+sys.argv = ["lpac", "bundle", "verify", "policies/lpac_l2_k3_n10_512"]
+import lpac.cli.main, edge.robot.pac
+try:
+    lpac.cli.main.main()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print(sorted({name if name.startswith("lpac.") else name.split(".")[0] for name in sys.modules}))
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    loaded = set(ast.literal_eval(result.stdout.splitlines()[-1]))
+    assert "onnxruntime" in loaded
+    assert loaded.isdisjoint(
+        {"torch", "torch_geometric", "onnx", "matplotlib", "export", "lpac.sim", "lpac.ground"}
+    )
