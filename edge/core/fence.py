@@ -67,17 +67,19 @@ class Fence:
         return float(self.edges().distances_m(np.array([x_m, y_m])).min())
 
     def moved_inside_m(self, x_m: float, y_m: float, depth_m: float) -> tuple[float, float]:
-        """The place itself, or one near it that is at least about `depth_m` inside every line."""
-        edges = self.edges()
+        """The place itself if it is `depth_m` inside every line, else the nearest that is, m.
+
+        `depth_m` is at most `buffer_m`, so that there is one. NaN where x or y is.
+        """
+        if self.distance_m(x_m, y_m) >= depth_m:
+            return x_m, y_m
         place = np.array([x_m, y_m])
-        # In a corner, mending one line's shortfall makes another's: in rounds it converges.
-        for _ in range(100):
-            missing_m = np.maximum(depth_m - edges.distances_m(place), 0.0)
-            if not missing_m.any():
-                break
-            for inward, distance_m in zip(edges.inward, edges.offsets_m, strict=True):
-                place = place + inward * max(depth_m - float(inward @ place - distance_m), 0.0)
-        return float(place[0]), float(place[1])
+        corners = np.array(self.grown_m(-depth_m))
+        sides = np.roll(corners, -1, axis=0) - corners
+        shares = ((place - corners) * sides).sum(axis=1) / (sides**2).sum(axis=1)
+        nearest = corners + np.clip(shares, 0.0, 1.0)[:, None] * sides
+        x_m, y_m = nearest[((nearest - place) ** 2).sum(axis=1).argmin()]
+        return float(x_m), float(y_m)
 
     def grown_m(self, margin_m: float) -> tuple[tuple[float, float], ...]:
         """Corners (x, y) of the polygon whose every line lies `margin_m` further out.

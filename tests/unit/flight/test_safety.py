@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from edge.core import F64
@@ -440,14 +440,25 @@ def test_an_unknown_neighbour_stops_the_robot_and_hides_no_other() -> None:
     assert nearest((0.0, 0.0, 0.0), others) == Closest(2, 9.0)
 
 
+# In so acute a corner whoever moves inside one line after the other hardly gets on.
+@example(
+    fence=Fence(((1.46, -51.75), (10.96, -35.5), (15.0, 0.0)), 0.5, floor_m=3.0, ceiling_m=6.0),
+    x_m=0.0,
+    y_m=14.0,
+)
 @settings(deadline=None)
 @given(fences(), number(-60.0, 60.0), number(-60.0, 60.0))
-def test_a_place_is_moved_inside_only_if_it_is_not(fence: Fence, x_m: float, y_m: float) -> None:
+def test_a_place_is_moved_inside_only_if_it_is_not_and_no_further_than_needed(
+    fence: Fence, x_m: float, y_m: float
+) -> None:
     depth_m = fence.buffer_m / 2.0
     moved = fence.moved_inside_m(x_m, y_m, depth_m)
     if fence.distance_m(x_m, y_m) >= depth_m:
         assert moved == (x_m, y_m)
-    assert fence.distance_m(*moved) > 0.0
+    assert fence.distance_m(*moved) >= depth_m - 1e-9
+    # Of a convex area the nearest place is the only one from which all of it lies beyond.
+    back = np.array([x_m, y_m]) - moved
+    assert ((np.array(fence.grown_m(-depth_m)) - moved) @ back <= 1e-6).all()
 
 
 def test_who_is_above_keeps_a_robot_below() -> None:
