@@ -15,6 +15,7 @@ from typing import Literal
 
 from edge.policy.bundle import load_bundle
 from lpac.sim.experiment import Scenario, fly
+from lpac.sim.programs import python_program
 
 # A robot's program takes as much of a processor, with its vehicle, as so many units of work a
 # second; a PX4 takes 0.2 to 0.35 of a core where a program and a simulated vehicle take 0.09.
@@ -46,7 +47,7 @@ def _units_per_s(bundle: Path) -> float:
         workers = [
             stack.enter_context(
                 subprocess.Popen(
-                    [sys.executable, "-m", "lpac.sim.fleet.load", str(bundle)],
+                    python_program("lpac.sim.fleet.load", str(bundle)),
                     stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
                 )
             )

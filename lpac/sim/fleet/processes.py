@@ -5,7 +5,6 @@ import math
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -29,6 +28,7 @@ from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.fleet.vehicles import AutopilotAddress, SimulatedVehicles, Vehicles
 from lpac.sim.operator import Operator, Say
 from lpac.sim.ports import free_ports
+from lpac.sim.programs import python_program
 from lpac.sim.px4.errors import Errors
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.px4.world import WorldOrigin
@@ -150,8 +150,8 @@ class RobotProcess:
             self._first_start_unix_s = time.time()
         with (self.folder / "robot.log").open("wb" if first else "ab") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "lpac.cli.main", "robot", "run",
-                 "--config", str(self.folder / "robot.toml")],
+                python_program("lpac.cli.main", "robot", "run",
+                               "--config", str(self.folder / "robot.toml")),
                 stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
                 # Ctrl-C is for the launcher alone, which lands the vehicles first.
                 process_group=0,
