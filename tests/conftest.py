@@ -1,6 +1,8 @@
 """What all tests share: their tiers, and the shipped policy."""
 
 import signal
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,23 @@ SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
 
 # The folders below tests/, each a marker; README.md there says what belongs in which.
 TIERS = ("unit", "sim", "process", "host")
+
+# What no test in unit/ and sim/ does, as Python's audit events name it.
+OTHERS_ONLY = {
+    "socket.bind": "uses a socket", "socket.connect": "uses a socket",
+    "socket.sendto": "uses a socket", "socket.getaddrinfo": "asks for an address",
+    "subprocess.Popen": "starts a process", "os.fork": "starts a process",
+    "os.posix_spawn": "starts a process", "time.sleep": "waits in real time",
+}  # fmt: skip
+_running: list[str] = []  # the test in unit/ or sim/ that runs now
+
+
+def _refuse_outside_world(event: str, _: tuple[object, ...]) -> None:
+    if _running and event in OTHERS_ONLY:
+        pytest.fail(f"{_running[0]} {OTHERS_ONLY[event]}: it belongs in tests/process")
+
+
+sys.addaudithook(_refuse_outside_world)
 
 # A busy machine is slow now and then; and whatever fails is to fail again.
 settings.register_profile(
@@ -60,6 +79,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         for marker in item.iter_markers("simulated_only"):
             item.add_marker(pytest.mark.skip(reason=marker.args[0]))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    if item.get_closest_marker("unit") or item.get_closest_marker("sim"):
+        _running.append(item.nodeid)
+    try:
+        return (yield)
+    finally:
+        _running.clear()
 
 
 @pytest.fixture(scope="session")

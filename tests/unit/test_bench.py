@@ -7,7 +7,7 @@ from rich.console import Console
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
-from bench import closed_loop, footprint, policy, position, scaling
+from bench import closed_loop, policy, position, scaling
 from bench.report import Report
 
 
@@ -36,13 +36,6 @@ def test_policy(tmp_path):
         assert figures["slower_than_edge"][policy.EDGE]["median"] == 1.0
     cnn = result["figures"]["cnn"]
     assert sum(operator["flop"] for operator in cnn["operators"]) == cnn["flop"] > 30e6
-
-
-def test_footprint(tmp_path):
-    result = kept(footprint.measure(runs=1), tmp_path)
-    check_frame(result, "footprint", targets=2)
-    for kind in (footprint.EDGE, footprint.TORCH):
-        assert {"first_tick_s", "rss"} <= result["figures"][kind].keys()
 
 
 def test_scaling(tmp_path):

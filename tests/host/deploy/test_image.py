@@ -9,17 +9,17 @@ import subprocess
 import tarfile
 import tomllib
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from bench import release
-from lpac.fleet.image import measure, package_of, table
+from lpac.fleet.image import measure, table
 from tests.conftest import ROOT, SHIPPED
 from tests.host.conftest import BuildImage
 from tests.host.deploy.entering import inside
+from tests.unit.deploy.test_image import pinned
 
 DOCKER = ROOT / "deploy" / "docker"
 ARCHITECTURES = ("amd64", "arm64")
@@ -29,29 +29,6 @@ FORBIDDEN = re.compile(
     r"|(sh|bash|dash|busybox|gcc|g\+\+|cc|cc1|ld|as|make|apt.*|dpkg.*|perl.*)"  # programs
     r"|.*\.(h|a|pyi)|tests?|ensurepip|idlelib|lib2to3|tkinter"
 )
-
-
-def pinned(lock: Path) -> dict[str, str]:
-    """Package -> version, in a lock of Python packages."""
-    entries = re.findall(r"^([\w.-]+)==(\S+) .*\\\n((?:    --hash=sha256:\w{64}.*\n)+)",
-                         lock.read_text(), re.MULTILINE)  # fmt: skip
-    lines = [line for line in lock.read_text().splitlines() if re.match(r"\w", line)]
-    assert len(entries) == len(lines), "each has hashes"
-    return {canonicalize_name(name): version for name, version, _ in entries}
-
-
-@pytest.mark.parametrize("lock", ["requirements.lock", "build.lock"])
-def test_the_locks_are_what_the_project_asks_for(lock: str) -> None:
-    pyproject = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    asked = {
-        "requirements.lock": pyproject["project"]["dependencies"],
-        "build.lock": pyproject["build-system"]["requires"],
-    }
-    versions = pinned(DOCKER / lock)
-    for requirement in map(Requirement, asked[lock]):
-        version = versions.get(canonicalize_name(requirement.name))
-        assert version is not None, f"{requirement.name}: run `make lock`"
-        assert requirement.specifier.contains(version), f"{requirement}: run `make lock`"
 
 
 @pytest.fixture(scope="module", params=ARCHITECTURES)
@@ -125,14 +102,6 @@ def test_the_bench_sets_it_beside_torch(build_image: BuildImage, tmp_path: Path)
     assert torch_mb is None or len(report.targets) == 1
     (note,) = release.measure(tmp_path).notes
     assert "run `make image`" in note
-
-
-def test_packages_are_told_by_their_paths() -> None:
-    site = PurePosixPath("usr/lib/python3/dist-packages")
-    assert package_of(site / "numpy.libs" / "libgfortran.so.5") == "numpy"
-    assert package_of(site / "numpy-2.4.6.dist-info" / "METADATA") == "numpy"
-    assert package_of(PurePosixPath("usr/lib/python3.11/enum.py")) == "Python"
-    assert package_of(PurePosixPath("lib/aarch64-linux-gnu/libc.so.6")) == "libraries of Debian"
 
 
 def test_it_runs_without_a_user_and_a_place_to_write(

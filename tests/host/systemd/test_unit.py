@@ -4,7 +4,6 @@ import dataclasses
 import json
 import re
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -28,48 +27,6 @@ from tests.conftest import ROOT, SHIPPED
 UNIT = ROOT / "systemd" / "lpac-robot.service"
 LAND_UNIT = ROOT / "systemd" / "lpac-land.service"
 UNITS = (UNIT, LAND_UNIT)
-# Of systemd 252's scale, 10 the worst. What keeps it from less is what the robot is for, network,
-# and keys that a VOXL2's systemd does not know.
-EXPOSURE = 2.0
-
-needs_analyze = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="needs: sudo apt install systemd"
-)
-
-
-def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["systemd-analyze", *arguments], capture_output=True, text=True, check=False
-    )
-
-
-@needs_analyze
-def test_systemd_knows_every_line_of_the_units(tmp_path: Path) -> None:
-    for program in ("lpac", "python3.11"):
-        path = tmp_path / "usr/bin" / program
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch(0o755)
-    known = Path("lib/systemd/system")
-    shutil.copytree("/" / known, tmp_path / known, symlinks=True)
-    for unit in UNITS:
-        shutil.copy(unit, tmp_path / known)
-    names = [unit.name for unit in UNITS]
-    result = analyze("verify", f"--root={tmp_path}", "--recursive-errors=yes", *names)
-    if "unrecognized option" in result.stderr:
-        pytest.skip("this systemd-analyze is too old to verify below another root")
-    assert (result.stdout, result.stderr, result.returncode) == ("", "", 0)
-
-
-@needs_analyze
-@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
-def test_the_units_may_do_little(unit: Path) -> None:
-    result = analyze("security", "--offline=yes", str(unit))
-    if "unrecognized option" in result.stderr:
-        pytest.skip("this systemd-analyze is too old to judge a file")
-    score = re.search(r"exposure level for \S+: ([\d.]+)", result.stdout)
-    assert score, result
-    print(score[0])
-    assert float(score[1]) <= EXPOSURE, result.stdout
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 """The `lpac` command as a user types it."""
 
+import ast
 import json
 import os
 import platform
@@ -232,3 +233,25 @@ def test_nothing_is_written_into_the_home_folder(tmp_path: Path) -> None:
         env={**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)},
     )  # fmt: skip
     assert list(tmp_path.iterdir()) == []
+
+
+def test_robot_process_loads_no_workstation_package() -> None:
+    """Run the policy's whole path, then look at what was imported."""
+    code = """
+import sys
+sys.argv = ["lpac", "bundle", "verify", "policies/lpac_l2_k3_n10_512"]
+import lpac.cli.main, edge.robot.pac
+try:
+    lpac.cli.main.main()
+except SystemExit as stop:
+    assert not stop.code, stop.code
+print(sorted({name if name.startswith("lpac.") else name.split(".")[0] for name in sys.modules}))
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    loaded = set(ast.literal_eval(result.stdout.splitlines()[-1]))
+    assert "onnxruntime" in loaded
+    assert loaded.isdisjoint(
+        {"torch", "torch_geometric", "onnx", "matplotlib", "export", "lpac.sim", "lpac.ground"}
+    )

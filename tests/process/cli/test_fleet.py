@@ -1,4 +1,4 @@
-"""`lpac fleet` as a user types it, as far as no robot has to answer; and what tables look like."""
+"""`lpac fleet` as a user types it, as far as no robot has to answer."""
 
 import json
 import os
@@ -9,43 +9,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from lpac.cli.fleet_status import State, print_status
-from lpac.fleet.config import FleetConfig, load_fleet
-from lpac.fleet.logs import Entry, parse_entry, readable
-from lpac.fleet.operations import Outcome
-from tests.conftest import ROOT, SHIPPED
+from tests.conftest import ROOT
+from tests.host.fleet.field import lpac_fleet
 from tests.process.cli.test_cli import error_line, lpac
+from tests.unit.cli.test_fleet import write_fleet
 
 needs_ssh = pytest.mark.skipif(shutil.which("ssh") is None, reason="needs OpenSSH's ssh")
-
-EXAMPLE = ROOT / "docs" / "fleet.toml"
-
-
-def write_fleet(folder: Path, port: int, flying: int = 2, spares: int = 1) -> Path:
-    """Robots r1, r2, ... at one port of this machine's addresses, the last ones without a slot."""
-    example = EXAMPLE.read_text()
-    shared = example[example.index("[robot]") : example.index("# The robots:")]
-    shared = shared.replace("ceiling_m = 30.0", "ceiling_m = 60.0")
-    path = folder / "fleet.toml"
-
-    def place(n: int) -> str:
-        at_m = [9 * (n % 4), 2 + 9 * (n // 4)]
-        return f"pad_m = {at_m}\nlanding_point_m = {at_m}\n"
-
-    path.write_text(
-        f'fleet = "test"\nimage = "no image"\nbundle = "{SHIPPED}"\nworld = "world.env"\n{shared}'
-        + "".join(
-            f'[robots.r{n}]\nhost = "127.0.0.{n}"\nport = {port}\nrobot_id = {n}\n'
-            for n in range(1, flying + spares + 1)
-        )
-        + "".join(f'[[slots]]\nrobot = "r{n}"\n{place(n)}' for n in range(1, flying + 1))
-    )
-    (folder / "world.env").write_text("CircularBND 100 100 10 1\n")
-    return path
 
 
 @pytest.fixture
@@ -206,143 +178,16 @@ def test_ctrl_c_ends_all_sessions_in_order(here: Path, times: int) -> None:
     assert not any(map(is_there, begun))
 
 
-def entry(text: object) -> Entry:
-    return parse_entry(json.dumps({"__REALTIME_TIMESTAMP": "1700000000250000", "MESSAGE": text}))
+def test_the_laptop_is_looked_at_and_what_it_lacks_is_named(tmp_path: Path) -> None:
+    fleet = write_fleet(tmp_path, 22)
 
+    def look(**environment: str) -> dict[str, dict[str, str]]:
+        asked = (fleet, "doctor", "--laptop", "--json")
+        shown = lpac_fleet(*asked, environment=environment)
+        return {c["name"]: c for c in json.loads(shown.stdout)["robots"]["laptop"]["checks"]}
 
-@pytest.mark.parametrize(
-    ("message", "shown"),
-    [
-        ("Started LPAC robot.", "Started LPAC robot."),
-        (
-            '{"event": "flight state", "state": "idle", "reason": "all is well", "ticks": 3, '
-            '"level": "info", "timestamp": "2026-11-21T15:28:17.6Z"}',
-            'info flight state state=idle reason="all is well" ticks=3',
-        ),
-        ('{"not": "an event"}', '{"not": "an event"}'),
-        ("{broken", "{broken"),
-        ([*"\N{DEGREE SIGN}".encode(), 255], "\N{DEGREE SIGN}\N{REPLACEMENT CHARACTER}"),
-        (None, ""),
-    ],
-)
-def test_lines_of_a_journal(message: object, shown: str) -> None:
-    time_of_day, _, text = readable(entry(message)).partition(" ")
-    assert text == shown
-    assert len(time_of_day) == 8 and time_of_day.endswith(":20")
-
-
-def test_an_exception_keeps_its_lines() -> None:
-    text = json.dumps({"event": "a loop fails", "level": "error", "exception": "Traceback\n  at 1"})
-    assert readable(entry(text)).split(" ", 1)[1] == "error a loop fails\nTraceback\n  at 1"
-
-
-def test_what_is_no_journal_is_said() -> None:
-    with pytest.raises(ValueError, match="journalctl printed 'bash: nonsense'"):
-        parse_entry("bash: nonsense")
-
-
-# The table
-
-
-@pytest.fixture
-def fleet(tmp_path: Path) -> FleetConfig:
-    return load_fleet(write_fleet(tmp_path, 22, flying=10, spares=1))
-
-
-def overview(**changes: Any) -> dict[str, Any]:
-    service = {
-        "active": "active", "result": "success", "restarts": 0, "installed": True, "fresh": True,
-        "uptime_s": 754.0,
-        "status": {
-            "state": "preflight", "armed": False, "battery": 1.0, "satellites": 14, "peers": 9,
-            "failed_checks": ["ground was not heard"],
-        },
-    } | changes.pop("service", {})  # fmt: skip
-    versions = {"image": "1" * 16, "bundle": "2" * 64, "world": "3" * 12}
-    return {
-        "current": "0123456789abcdef", "pending": None, "versions": versions, "service": service,
-    } | changes  # fmt: skip
-
-
-def printed(
-    fleet: FleetConfig, states: list[State | None], capsys: pytest.CaptureFixture[str]
-) -> tuple[list[str], list[str]]:
-    """The lines of the table, heading and all, and those of the notes."""
-    robots = list(fleet.robots.values())
-    problems = [None if state else "it does not answer [or so]" for state in states]
-    outcomes = [
-        Outcome(*each) for each in zip(robots[: len(states)], states, problems, strict=True)
-    ]
-    print_status(fleet, outcomes)
-    table, _, notes = capsys.readouterr().out.partition("\n\n")
-    return [line.rstrip() for line in table.splitlines()], [
-        line.rstrip() for line in notes.splitlines()
-    ]
-
-
-@pytest.mark.parametrize("width", [80, 100])
-def test_ten_robots_fit_the_terminal(
-    fleet: FleetConfig,
-    width: int,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv("COLUMNS", str(width))
-    states: list[State | None] = [State(overview(), n, 0.02, None) for n in range(10)]
-    table, notes = printed(fleet, [*states, None], capsys)
-    assert max(map(len, table + notes)) <= width
-    assert len(table) == 2 + 11  # the headings take two lines
-    rows = [line.split() for line in table[2:]]
-    assert rows[9] == [
-        "r10", "9", "01234567", "up", "13", "min", "preflight", "no", "100", "%", "14", "9", "1",
-        "+0.0",
-    ]  # fmt: skip
-    assert rows[10] == ["r11", "spare", "see", "below"]
-    assert [line.split(maxsplit=1) for line in notes] == [
-        ["r11", "it does not answer [or so]"],
-        ["all", "image 11111111, bundle 22222222, world 33333333"],
-    ]
-
-
-def test_what_is_not_as_it_should_be_is_noted(
-    fleet: FleetConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
-    other = overview()
-    other["versions"] |= {"world": "4" * 12}
-    failed = {"active": "failed", "result": "exit-code", "fresh": False, "restarts": 5}
-    never = {"active": "inactive", "installed": False, "fresh": False, "status": None}
-    states: list[State | None] = [
-        State(overview(), 0, 0.0, None),
-        State(overview(pending={"release": "fedcba9876543210", "former": None}), 1, -70.0, None),
-        State(other, 2, 0.0, None),
-        State(overview(service=failed), 3, 0.0, "lpac: no such file"),
-        State(overview(current=None, versions=None, service=never), 4, 0.0, None),
-    ]
-    table, notes = printed(fleet, states, capsys)
-    rows = [line.split() for line in table[2:]]
-    assert rows[1][2] == "01234567?" and rows[1][-1] == "-70.0"
-    assert rows[2][2] == "01234567*"
-    assert rows[3][2:] == ["01234567", "failed", "+0.0"]
-    assert rows[4][2:] == ["none", "none", "+0.0"]
-    assert [line.split()[0] for line in notes] == ["r2", "r3", "r4", "r4", "others"]
-    assert "fedcba98 is not confirmed yet" in notes[0]
-    assert notes[1].split("*")[1].strip() == "image 11111111, bundle 22222222, world 44444444"
-    assert notes[2].endswith("lpac: no such file")
-    assert "restarted 5 times" in notes[3]
-
-
-def test_a_configuration_that_was_not_deployed_is_marked(
-    fleet: FleetConfig, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
-    states: list[State | None] = [
-        State(overview(), n, 0.0, None, is_configured=n > 0) for n in range(2)
-    ]
-    table, notes = printed(fleet, states, capsys)
-    assert [line.split()[2] for line in table[2:]] == ["01234567*", "01234567"]
-    assert [line.split()[0] for line in notes] == ["r1", "all"]
-    assert (
-        "its configuration is not the one of fleet.toml: lpac fleet deploy --robots r1"
-        in (notes[0])
-    )
+    checks = look()
+    assert list(checks) == ["tools", "keys", "sleep", "clock", "firewall"]
+    assert checks["tools"]["verdict"] == "ok"
+    tools = look(PATH=str(tmp_path))["tools"]
+    assert (tools["verdict"], tools["found"]) == ("FAILED", "ssh, ssh-keygen, rsync is missing")

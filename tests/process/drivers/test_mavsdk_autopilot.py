@@ -11,16 +11,13 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
-from hypothesis import given
-from hypothesis import strategies as st
 from structlog.testing import capture_logs
 
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
 from edge.drivers.px4.autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
-from edge.drivers.px4.telemetry import Px4Telemetry
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
-from lpac.sim.px4.modes import CUSTOM_MODES, MavResult, Px4Mode
+from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 from tests.conftest import ROOT
@@ -172,34 +169,6 @@ def test_the_whole_state_is_known() -> None:
         assert state.connected
 
 
-@pytest.mark.parametrize(
-    ("px4", "mode"),
-    [
-        (Px4Mode.MANUAL, Mode.MANUAL),
-        (Px4Mode.ALTCTL, Mode.ALTITUDE),
-        (Px4Mode.POSCTL, Mode.POSITION),
-        (Px4Mode.TAKEOFF, Mode.TAKEOFF),
-        (Px4Mode.HOLD, Mode.HOLD),
-        (Px4Mode.RETURN, Mode.RETURN),
-        (Px4Mode.LAND, Mode.LAND),
-        (Px4Mode.DESCEND, Mode.LAND),
-        (Px4Mode.OFFBOARD, Mode.OFFBOARD),
-        (Px4Mode.STABILIZED, Mode.STABILIZED),
-    ],
-)
-def test_modes(px4: Px4Mode, mode: Mode) -> None:
-    telemetry = Px4Telemetry()
-    main, sub = CUSTOM_MODES[px4]
-    heartbeat = {
-        "autopilot": 12,
-        "base_mode": 0,
-        "custom_mode": main << 16 | sub << 24,
-        "system_status": 3,
-    }
-    telemetry.hear("HEARTBEAT", heartbeat, 0.0)
-    assert telemetry.state(0.0).mode is mode
-
-
 def test_position_and_origin_belong_together_when_the_origin_jumps() -> None:
     vehicle = new_vehicle()
     with connected(vehicle) as (autopilot, server):
@@ -276,60 +245,12 @@ def test_two_vehicles_with_one_system_id_are_noticed(uids: tuple[int, int], boot
         assert wait(autopilot, lambda s: s.other_system_ids).other_system_ids == (7,)
 
 
-# What is late is not taken for news
-
-
-@given(
-    st.floats(0.5, 20.0),
-    st.floats(0.0, 0.01),
-    st.lists(st.floats(0.0, 0.02), min_size=20, max_size=20),
-)
-def test_a_backlog_is_as_old_as_it_is(stop_s: float, burst_s: float, jitter_s: list[float]) -> None:
-    """The process stands still, then takes in at once what came meanwhile."""
-    telemetry = Px4Telemetry()
-
-    def hear(vehicle_s: float, now_s: float) -> VehicleState:
-        fields = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
-        telemetry.hear("LOCAL_POSITION_NED", {**fields, "time_boot_ms": vehicle_s * 1e3}, now_s)
-        return telemetry.state(now_s)
-
-    clocks_differ_s = 1234.5
-    now_s = 0.0
-    for step, late_s in enumerate(jitter_s):
-        now_s = clocks_differ_s + step * 0.05 + late_s
-        assert hear(step * 0.05, now_s).position_at_s > now_s - 0.1
-    steps = range(len(jitter_s), len(jitter_s) + round(stop_s / 0.05))
-    continued_s = clocks_differ_s + steps[-1] * 0.05
-    for step in steps:
-        arrived_s = max(continued_s + (step - steps[0]) * burst_s / len(steps), now_s)
-        due_s = clocks_differ_s + step * 0.05
-        assert abs(hear(step * 0.05, arrived_s).position_at_s - due_s) < 0.05
-
-
 def test_a_clock_that_differs_from_now_on_is_no_backlog() -> None:
     vehicle = new_vehicle()
     with connected(vehicle) as (autopilot, server):
         with server.stepped:
             time.sleep(1.5)
         wait(autopilot, lambda s: time.monotonic() - s.position_at_s < 0.2)
-
-
-@pytest.mark.parametrize("fields", [{}, {"x": None, "y": 0.0, "z": 0.0}])
-def test_a_position_that_is_none_changes_nothing(fields: dict[str, float | None]) -> None:
-    telemetry = Px4Telemetry()
-    with pytest.raises((KeyError, TypeError)):
-        telemetry.hear("LOCAL_POSITION_NED", fields, 0.0)
-    assert telemetry.state(0.0) == Px4Telemetry().state(0.0)
-
-
-def test_a_long_text_comes_in_pieces() -> None:
-    telemetry = Px4Telemetry()
-    for piece, text in enumerate(("Preflight Fail: Compass needs calibration be", "fore flight\t")):
-        fields = {"severity": 2, "text": text, "id": 9, "chunk_seq": piece}
-        telemetry.hear("STATUSTEXT", fields, 1.0)
-    (problem,) = telemetry.state(2.0).problems
-    assert problem.text == "Compass needs calibration before flight"
-    assert telemetry.state(60.0).problems == ()
 
 
 # Setpoints

@@ -1,6 +1,5 @@
-"""The ground's log: each thing once, and from the real ground process, which may start again."""
+"""`lpac record` beside a ground process, which may start again."""
 
-import dataclasses
 import itertools
 import math
 import os
@@ -8,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +14,13 @@ import numpy as np
 import pytest
 
 from edge.core.coverage import coverage_cost
-from edge.core.fence import Fence
 from edge.core.world import parse_world, rasterize
 from edge.drivers.flight_log import FlightLogError, read, read_metadata
-from edge.messages.mission import FlightState, GroundState, Origin, Place
-from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent, RobotSnapshot
-from lpac.ground.record import Recording
+from edge.messages.mission import FlightState
 from lpac.ground.station.client import command
 from lpac.ground.station.protocol import (
     Enable,
     SafetyCommand,
-    ServerMessage,
     SetOrigin,
     Start,
     Takeoff,
@@ -34,118 +28,9 @@ from lpac.ground.station.protocol import (
 from tests.conftest import ROOT
 from tests.pretend import ORIGIN, pretended
 from tests.process.ground.conftest import PATIENCE_S, all_heard, wait_for_snapshot
-from tests.unit.analysis.test_coverage import STATUS, model
 
 S = FlightState
 MAGIC = b"\x89MCAP0\r\n"  # at the end of a log that was closed
-FENCE = Fence(((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)), 0.5, 1.0, 20.0)
-WORLD = model()
-SETUP = FleetSetup(
-    fleet="f", operator="ann", robots={"r0": 0, "r1": 1}, slots=(), fence=FENCE,
-    world=WORLD.world, world_id=WORLD.world_id, bundle_id="b", world_size=WORLD.world_size,
-    sensor_size=16, communication_range=64.0, env_scale=WORLD.env_scale,
-    truncation=WORLD.truncation, norm=WORLD.norm,
-)  # fmt: skip
-STATE = GroundState(3, "ann", Origin(47.0, 8.0, 0.0), places={"0": Place(0, (1.0, 2.0))})
-
-
-class Kept:
-    """What a `Recording` records."""
-
-    def __init__(self) -> None:
-        self.entries: list[tuple[str, float, Mapping[str, Any]]] = []
-        self.recording = Recording(lambda *entry: self.entries.append(entry))
-
-    def of(self, topic: str) -> list[Mapping[str, Any]]:
-        return [message for name, _, message in self.entries if name == topic]
-
-
-def snapshot(
-    now_s: float, sequence: int, x_m: float, state: S = S.MISSION, **more: Any
-) -> FleetSnapshot:
-    """Two robots, of which the second was heard 0.1 s ago."""
-    statuses = (
-        dataclasses.replace(
-            STATUS, robot_id=i, sequence=sequence, state=state, armed=state is not S.LANDED,
-            trial="t1", position_m=(x_m, 5.0 + 20.0 * i, 4.0),
-        )
-        for i in range(2)
-    )  # fmt: skip
-    robots = tuple(
-        RobotSnapshot(f"r{i}", i, status, 0.1 * i, 0.5) for i, status in enumerate(statuses)
-    )
-    return FleetSnapshot(now_s, "ann", STATE, robots, **more)
-
-
-def test_each_thing_is_recorded_once() -> None:
-    kept = Kept()
-    event = GroundEvent(99.0, "command", "", "takeoff", "ann", "t1")
-    told: list[tuple[float, ServerMessage]] = [
-        (100.0, SETUP), (100.0, event), (100.0, Explored("r0", "AAAA")),
-        (100.2, snapshot(100.2, 1, 1.0)), (100.4, snapshot(100.4, 1, 1.0)),
-        # The same again from the ground's next process, and something new.
-        (105.0, event), (105.0, Explored("r0", "AAAA")), (105.0, Explored("r0", "AAAB")),
-        (105.2, snapshot(105.2, 2, 2.0)),
-        (166.0, snapshot(166.0, 3, 3.0)),
-    ]  # fmt: skip
-    for now_s, message in told:
-        kept.recording.take(message, now_s)
-    kept.recording.close()
-    assert kept.of("event") == [dataclasses.asdict(event)]
-    assert [e["cells"] for e in kept.of("explored")] == ["AAAA", "AAAB"]
-    assert [s["sequence"] for s in kept.of("state")] == [3]
-    said = [(s["name"], s["sequence"]) for s in kept.of("status")]
-    assert said == [("r0", 1), ("r1", 1), ("r0", 2), ("r1", 2), ("r0", 3), ("r1", 3)]
-    # When they were heard, by the ground's clock.
-    heard = [(at_s, m["heard_at_unix_s"]) for topic, at_s, m in kept.entries if topic == "status"]
-    assert heard[:2] == [(100.2, 100.2), (pytest.approx(100.1), pytest.approx(100.1))]
-    assert {s["clock_offset_s"] for s in kept.of("status")} == {0.5}
-    assert len(kept.of("setup")) == 2  # the second after a minute
-    # No cost for the second picture, which came too soon after the first.
-    assert [at_s for topic, at_s, _ in kept.entries if topic == "cost"] == [100.2, 105.2, 166.0]
-
-
-def test_the_cost_is_normalised_by_each_trials_begin() -> None:
-    kept = Kept()
-    kept.recording.take(SETUP, 0.0)
-    kept.recording.take(snapshot(1.0, 1, 1.0, S.HOLD), 1.0)
-    kept.recording.take(snapshot(2.0, 2, 5.0), 2.0)
-    kept.recording.take(snapshot(3.0, 3, 9.0), 3.0)
-    kept.recording.close()
-    raster = rasterize(parse_world(WORLD.world), WORLD.world_size, 2.0, 1.0)
-    expected = [
-        coverage_cost(raster, np.array([(x_m, 5.0), (x_m, 25.0)]) * WORLD.env_scale)
-        for x_m in (1.0, 5.0, 9.0)
-    ]
-    costs = kept.of("cost")
-    assert [cost["cost"] for cost in costs] == expected
-    assert [cost["initial"] for cost in costs] == [None, expected[1], expected[1]]
-    assert costs[2]["normalized"] == expected[2] / expected[1]
-    assert [cost["flying_mission"] for cost in costs] == [False, True, True]
-    assert {(cost["trial"], cost["robots"]) for cost in costs} == {("t1", ("r0", "r1"))}
-
-
-def test_a_name_that_is_flown_again_begins_anew() -> None:
-    kept = Kept()
-    kept.recording.take(SETUP, 0.0)
-    flown = ((S.MISSION, 1.0), (S.HOLD, 5.0), (S.MISSION, 6.0), (S.LANDED, 7.0), (S.HOLD, 7.0))
-    for second, (state, x_m) in enumerate((*flown, (S.MISSION, 9.0)), 1):
-        kept.recording.take(snapshot(float(second), second, x_m, state), float(second))
-    kept.recording.close()
-    costs = kept.of("cost")
-    first = costs[0]["cost"]
-    # A pause is no new mission; after landing there is a new one.
-    assert [cost["initial"] for cost in costs] == [*[first] * 5, costs[5]["cost"]]
-    assert costs[5]["normalized"] == 1.0 != costs[4]["normalized"]
-
-
-@pytest.mark.parametrize("world", ["", "Circle 1 2"])
-def test_without_a_world_all_else_is_recorded(world: str) -> None:
-    kept = Kept()
-    kept.recording.take(dataclasses.replace(SETUP, world=world), 0.0)
-    kept.recording.take(snapshot(1.0, 1, 1.0), 1.0)
-    kept.recording.close()
-    assert [topic for topic, _, _ in kept.entries] == ["setup", "state", "status", "status"]
 
 
 class Recorder:

@@ -4,10 +4,6 @@ import contextlib
 import dataclasses
 import json
 import math
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -33,7 +29,6 @@ from edge.drivers.flight_log import (
     topic,
 )
 from edge.messages.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
-from tests.conftest import ROOT
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", '{"robot": {"id": 3}}', "0.1.0")
 NOW = 1.7e9
@@ -299,39 +294,6 @@ def test_a_file_that_ends_in_rubbish_is_read_up_to_there(tmp_path: Path) -> None
             assert [message["number"] for _, _, message in read(path)] == numbers
 
 
-CHILD = """
-import sys
-from pathlib import Path
-from edge.drivers.flight_log import FlightLog
-from tests.unit.drivers.test_flight_log import METADATA, NOISE
-
-log = FlightLog(Path(sys.argv[1]), METADATA, sync_period_s=0)
-number = 0
-while True:
-    for _ in range(10):
-        log.record("policy", float(number), {"number": number, "array": NOISE[:1000]})
-        number += 1
-    log.flush()
-    print(number, flush=True)
-"""
-
-
-def test_what_was_flushed_survives_sigkill(tmp_path: Path) -> None:
-    child = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(tmp_path)],
-        cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    with child:
-        assert child.stdout is not None
-        flushed = [int(child.stdout.readline()) for _ in range(20)][-1]
-        child.send_signal(signal.SIGKILL)
-    found = [message["number"] for _, _, message in logged(tmp_path)]
-    assert found[:flushed] == list(range(flushed))
-    with flight_log(tmp_path) as log:  # the next start
-        log.record("policy", NOW, {"number": "next"})
-    assert [m["number"] for _, _, m in read(tmp_path / "robot-3-0002.mcap")] == ["next"]
-
-
 @pytest.mark.parametrize("sync_period_s", [0, 1000])
 def test_the_size_bounds_hold(tmp_path: Path, sync_period_s: int) -> None:
     foreign = [tmp_path / name for name in ("robot-33-0001.mcap", "robot-3-0001.txt")]
@@ -409,36 +371,6 @@ def test_a_message_that_cannot_be_held_costs_only_itself(
     assert log.dropped == 7
     lines = capsys.readouterr().out.splitlines()
     assert len([line for line in lines if "cannot hold a message" in line]) == 3  # one per topic
-
-
-@pytest.mark.parametrize(("limit_bytes", "least"), [(300_000, 5), (50, 0)])
-def test_a_full_disk_stops_the_log_and_nothing_else(
-    tmp_path: Path, limit_bytes: int, least: int
-) -> None:
-    code = """
-import resource, sys
-from pathlib import Path
-from edge.drivers.flight_log import FlightLog
-from tests.unit.drivers.test_flight_log import METADATA, NOISE
-
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
-log = FlightLog(Path(sys.argv[1]), METADATA, sync_period_s=0)
-for number in range(20):
-    log.record("policy", 1.0, {"number": number, "array": NOISE})
-    log.flush()
-assert not log.recording
-log.close()
-"""
-    result = subprocess.run(
-        [sys.executable, "-X", "dev", "-c", code, str(tmp_path), str(limit_bytes)],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert result.stderr == ""
-    (line,) = result.stdout.splitlines()
-    assert "flight log stopped" in line and "File too large" in line
-    found = [message["number"] for _, _, message in logged(tmp_path)]
-    assert found == list(range(len(found))) and len(found) >= least
 
 
 def test_a_directory_that_cannot_be_written(

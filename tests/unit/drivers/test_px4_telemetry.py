@@ -4,6 +4,8 @@ import math
 from typing import NamedTuple
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from edge.core.position import (
     PositionCause,
@@ -18,6 +20,7 @@ from edge.flight.state import FlightInputs, FlightMemory
 from edge.flight.step import step
 from edge.messages.mission import FlightState
 from edge.robot.config import load_config
+from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
 from tests.conftest import ROOT
 from tests.px4_recordings import RECORDINGS, recorded
 
@@ -227,3 +230,76 @@ def test_no_recording_has_a_false_loss(name: str) -> None:
     assert not any(c.judgement.quality is _Q.LOST for c in flown)
     assert {c.judgement.cause for c in flown} <= {None, PositionCause.OLD, PositionCause.GPS_SILENT}
     assert all(c.vehicle.jumped_at_s == float("-inf") for c in flown)
+
+
+@pytest.mark.parametrize(
+    ("px4", "mode"),
+    [
+        (Px4Mode.MANUAL, Mode.MANUAL),
+        (Px4Mode.ALTCTL, Mode.ALTITUDE),
+        (Px4Mode.POSCTL, Mode.POSITION),
+        (Px4Mode.TAKEOFF, Mode.TAKEOFF),
+        (Px4Mode.HOLD, Mode.HOLD),
+        (Px4Mode.RETURN, Mode.RETURN),
+        (Px4Mode.LAND, Mode.LAND),
+        (Px4Mode.DESCEND, Mode.LAND),
+        (Px4Mode.OFFBOARD, Mode.OFFBOARD),
+        (Px4Mode.STABILIZED, Mode.STABILIZED),
+    ],
+)
+def test_modes(px4: Px4Mode, mode: Mode) -> None:
+    telemetry = Px4Telemetry()
+    main, sub = CUSTOM_MODES[px4]
+    heartbeat = {
+        "autopilot": 12,
+        "base_mode": 0,
+        "custom_mode": main << 16 | sub << 24,
+        "system_status": 3,
+    }
+    telemetry.hear("HEARTBEAT", heartbeat, 0.0)
+    assert telemetry.state(0.0).mode is mode
+
+
+@given(
+    st.floats(0.5, 20.0),
+    st.floats(0.0, 0.01),
+    st.lists(st.floats(0.0, 0.02), min_size=20, max_size=20),
+)
+def test_a_backlog_is_as_old_as_it_is(stop_s: float, burst_s: float, jitter_s: list[float]) -> None:
+    """The process stands still, then takes in at once what came meanwhile."""
+    telemetry = Px4Telemetry()
+
+    def hear(vehicle_s: float, now_s: float) -> VehicleState:
+        fields = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
+        telemetry.hear("LOCAL_POSITION_NED", {**fields, "time_boot_ms": vehicle_s * 1e3}, now_s)
+        return telemetry.state(now_s)
+
+    clocks_differ_s = 1234.5
+    now_s = 0.0
+    for k, late_s in enumerate(jitter_s):
+        now_s = clocks_differ_s + k * 0.05 + late_s
+        assert hear(k * 0.05, now_s).position_at_s > now_s - 0.1
+    steps = range(len(jitter_s), len(jitter_s) + round(stop_s / 0.05))
+    continued_s = clocks_differ_s + steps[-1] * 0.05
+    for k in steps:
+        arrived_s = max(continued_s + (k - steps[0]) * burst_s / len(steps), now_s)
+        due_s = clocks_differ_s + k * 0.05
+        assert abs(hear(k * 0.05, arrived_s).position_at_s - due_s) < 0.05
+
+
+@pytest.mark.parametrize("fields", [{}, {"x": None, "y": 0.0, "z": 0.0}])
+def test_a_position_that_is_none_changes_nothing(fields: dict[str, float | None]) -> None:
+    telemetry = Px4Telemetry()
+    with pytest.raises((KeyError, TypeError)):
+        telemetry.hear("LOCAL_POSITION_NED", fields, 0.0)
+    assert telemetry.state(0.0) == Px4Telemetry().state(0.0)
+
+
+def test_a_long_text_comes_in_pieces() -> None:
+    telemetry = Px4Telemetry()
+    for piece, text in enumerate(("Preflight Fail: Compass needs calibration be", "fore flight\t")):
+        fields = {"severity": 2, "text": text, "id": 9, "chunk_seq": piece}
+        telemetry.hear("STATUSTEXT", fields, 1.0)
+    (problem,) = telemetry.state(2.0).problems
+    assert problem.text == "Compass needs calibration before flight"
+    assert telemetry.state(60.0).problems == ()

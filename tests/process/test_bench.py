@@ -1,0 +1,15 @@
+"""The bench of processes runs, at its smallest size; how fast anything is plays no part."""
+
+import pytest
+
+pytest.importorskip("torch_geometric", reason="the benches compare with it")
+
+from bench import footprint
+from tests.unit.test_bench import check_frame, kept
+
+
+def test_footprint(tmp_path):
+    result = kept(footprint.measure(runs=1), tmp_path)
+    check_frame(result, "footprint", targets=2)
+    for kind in (footprint.EDGE, footprint.TORCH):
+        assert {"first_tick_s", "rss"} <= result["figures"][kind].keys()

@@ -1,0 +1,342 @@
+"""Doctor on facts that no robot computer here can have, and on what tools print."""
+
+import copy
+import dataclasses
+import hashlib
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.core.vehicle import Gps
+from edge.flight.margins import ErrorBudget
+from lpac.fleet.config import FleetConfig, SshConfig, load_fleet
+from lpac.fleet.doctor import (
+    ClockOffset,
+    Diagnosis,
+    DoctorCheck,
+    Examination,
+    diagnose,
+    is_configured,
+    judge,
+    on,
+)
+from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
+from lpac.fleet.operations import Outcome
+from lpac.fleet.up import decide, packs
+from tests.conftest import ROOT
+from tests.host.fleet.field import SILENT
+from tests.unit.flight.test_preflight import lines
+
+PING = {"loss": 0.0, "mean_ms": 3.0, "max_ms": 9.0}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> FleetConfig:
+    """The example's three robots and a spare."""
+    text = (ROOT / "docs" / "fleet.toml").read_text()
+    path = tmp_path / "fleet.toml"
+    path.write_text(text.replace("# predecessors = []", 'predecessors = ["old_ros"]'))
+    return load_fleet(path)
+
+
+def well(config: FleetConfig, name: str) -> Examination:
+    """A robot that may fly."""
+    robot = config.robots[name]
+    status = {
+        "state": "idle", "autopilot": True, "system_id": robot.system_id, "peers": 2,
+        "failed_checks": [
+            "ground was not heard: start `lpac ground`, check the radio and the fleet's name",
+            "mission origin is not set: set it on the ground",
+            "place in the fence is not known: it needs the position and the mission origin",
+            "autopilot does not have the fence: wait for the upload, or check the link",
+        ],
+    }  # fmt: skip
+    runs = {"there": True, "active": True, "enabled": True}
+    idle = {"there": False, "active": False, "enabled": False}
+    facts = {
+        "identity": {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id},
+        "current": "0123456789abcdef", "pending": None,
+        "versions": {"image": "i1", "bundle": "b1", "world": "w1"},
+        "robot_toml": hashlib.sha256(config.robot_toml(name).encode()).hexdigest(),
+        "service": {
+            "active": "active", "result": "success", "fresh": True, "enabled": True,
+            "restarts": 0, "status": status,
+        },
+        "heartbeat": None, "kernel": "4.19.125", "systemd": 237, "python": "3.6.9",
+        "rsync": True, "sdk": "1.4.1", "px4": "1.14.0-2.0.94",
+        "disks": [{"path": "/opt", "free_bytes": 20e9, "total_bytes": 60e9}],
+        "memory": {"total_bytes": 8e9, "available_bytes": 6e9},
+        "cpus": 8, "load": 1.5, "hottest_c": 61.0, "synchronized": False,
+        "wifi": [{
+            "name": "wlan0", "connected": True, "network": "field", "signal_dbm": -52.0,
+            "rate_mbit_s": 200.0, "frequency_mhz": 5180.0, "power_save": False,
+        }],
+        "vision_hub": {
+            "en_localhost_mavlink_udp": True, "localhost_udp_port_number": None,
+            "offboard_mode": "off",
+        },
+        "units": {
+            "voxl-px4": {**runs}, "voxl-mavlink-server": {**runs}, "voxl-vision-hub": {**runs},
+            "voxl-microdds-agent": {**idle}, "old_ros": {**idle},
+        },
+        "containers": [],
+    }  # fmt: skip
+    pings = {other: PING for other in ("r1", "r2", "r3") if other != name}
+    return Examination(facts, ClockOffset(0.001, 0.01), "its program says so itself", pings)
+
+
+def judged(config: FleetConfig, change: Any = lambda _: None) -> dict[str, DoctorCheck]:
+    """The checks of r1, with its facts changed."""
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    facts: dict[str, Any] = copy.deepcopy(dict(fleet["r1"].facts))
+    change(facts)
+    fleet["r1"] = fleet["r1"]._replace(facts=facts)
+    return {check.name: check for check in judge(config, config.robots["r1"], fleet)}
+
+
+def put(path: str, value: object) -> Any:
+    def change(facts: dict[str, Any]) -> None:
+        *parents, last = path.split(".")
+        for parent in parents:
+            facts = facts[parent]
+        facts[last] = value
+
+    return change
+
+
+def test_a_robot_that_is_well_may_fly(config: FleetConfig) -> None:
+    checks = judged(config)
+    assert {check.verdict for check in checks.values()} == {"ok"}
+    assert decide(Diagnosis("r1", tuple(checks.values()))) == ("r1", True, ())
+
+
+def test_up_says_how_many_trials_the_packs_are_good_for(config: FleetConfig) -> None:
+    def outcome(name: str, **said: object) -> Outcome[Examination]:
+        examination = well(config, name)
+        facts: dict[str, Any] = copy.deepcopy(dict(examination.facts))
+        facts["service"]["status"] |= said
+        return Outcome(config.robots[name], examination._replace(facts=facts), None)
+
+    full, weak, unknown = packs(
+        config,
+        [
+            outcome("r1", battery=0.95, endurance_s=1000.0),
+            outcome("r2", battery=0.95, endurance_s=400.0),
+            outcome("r3", battery=None, endurance_s=900.0),
+            Outcome(config.robots["r1"], None, "it does not answer"),
+        ],
+        trial_s=60.0,
+    )
+    assert (full.robot, full.share) == ("r1", 0.95)
+    assert full.trials is not None and weak.trials is not None
+    assert 0 < weak.trials < full.trials < 0.7 * 1000.0 / 60.0
+    assert unknown == ("r3", None, 900.0, None)
+
+
+def test_an_accuracy_that_is_too_bad_for_the_landing_points_is_no_go(config: FleetConfig) -> None:
+    """That may pass, or not; nobody is told that he may fly meanwhile."""
+    bad = Gps(3, 14, 0.8, accuracy_m=2.0)
+    (line,) = lines(bad, 0.9, 16.0, ErrorBudget())
+    checks = judged(config, put("service.status.failed_checks", [line]))
+    assert checks["preflight"] == ("preflight", "FAILED", line, "mend what each line says")
+    assert not decide(Diagnosis("r1", tuple(checks.values()))).go
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "verdict"), [(3600.0, "FAILED"), (-0.3, "warning"), (0.0, "ok")]
+)
+def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str) -> None:
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    fleet["r1"] = fleet["r1"]._replace(clock=ClockOffset(ahead_s, 0.01))
+    checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
+    assert checks["clock"].verdict == verdict
+    assert checks["clock"].fix == ("" if verdict == "ok" else "lpac fleet up")
+
+
+def container(**about: object) -> list[dict[str, object]]:
+    plain = {"name": "box", "image": "busybox", "running": True, "restarts": "no",
+             "host_network": False, "devices": False}  # fmt: skip
+    return [plain | about]
+
+
+@pytest.mark.parametrize(
+    ("change", "check", "verdict", "found"),
+    [
+        (put("identity", None), "enrolled", "FAILED", "never enrolled"),
+        (put("identity.robot", "r2"), "enrolled", "FAILED", "answers r2 of fleet demo"),
+        (put("pending", {"release": "a"}), "release", "FAILED", "interrupted"),
+        (put("versions.bundle", "b2"), "release", "FAILED", "that of r2, r3"),
+        (put("robot_toml", "0" * 64), "release", "FAILED", "is not the one of fleet.toml"),
+        (put("service.active", "failed"), "program", "FAILED", "it is failed"),
+        (put("service.fresh", False), "program", "FAILED", "says nothing"),
+        (put("service.restarts", 2), "program", "warning", "restarted 2 times"),
+        (put("service.enabled", False), "program", "warning", "battery swap"),
+        (put("service.status.peers", 1), "program", "warning", "1 of the 2"),
+        (put("systemd", 229), "system", "FAILED", "systemd 229"),
+        (put("python", "3.5.2"), "system", "FAILED", "Python 3.5.2"),
+        (put("kernel", "4.9.1"), "system", "warning", "4.9.1"),
+        (put("rsync", False), "system", "FAILED", "rsync is missing"),
+        (put("hottest_c", 80.0), "processor", "warning", "80 °C"),
+        (put("hottest_c", 91.0), "processor", "FAILED", "91 °C"),
+        (put("memory.available_bytes", 1e8), "memory", "FAILED", "100 of 8000 MB"),
+        (put("wifi", []), "wifi", "skipped", "no wireless interface"),
+        (put("px4", "1.12.3-0.1"), "px4", "FAILED", "older than 1.14"),
+        (put("units.voxl-px4.active", False), "px4", "FAILED", "voxl-px4 does not run"),
+        (put("vision_hub", None), "vision-hub", "skipped", "no voxl-vision-hub"),
+        (put("vision_hub", {"problem": "it is no JSON"}), "vision-hub", "FAILED", "no JSON"),
+        (put("vision_hub.en_localhost_mavlink_udp", False), "vision-hub", "FAILED", "not true"),
+        (
+            put("units.voxl-microdds-agent.active", True),
+            "commanders", "FAILED", "voxl-microdds-agent runs",
+        ),
+        (put("units.old_ros.enabled", True), "commanders", "FAILED", "starts at the next boot"),
+        (put("containers", None), "containers", "warning", "does not answer"),
+        (put("containers", container()), "containers", "ok", "1 run"),
+        (put("containers", container(host_network=True)), "containers", "FAILED", "box (host"),
+        (put("containers", container(devices=True)), "containers", "FAILED", "access to devices"),
+        (put("containers", container(image="me/ros:1")), "containers", "FAILED", "image me/ros"),
+        (
+            put("containers", container(name="old_ros", running=False, restarts="always")),
+            "containers", "FAILED", "(a predecessor) comes back by itself",
+        ),
+        (
+            put("containers", container(name="old_ros", running=False)),
+            "containers", "ok", "0 run",
+        ),
+        (
+            put("service.status.failed_checks", ["autopilot's COM_OBL_RC_ACT = 0; wanted is 4"]),
+            "failsafe", "FAILED", "COM_OBL_RC_ACT = 0",
+        ),
+        (
+            put("service.status.failed_checks", ["checks are still running"]),
+            "failsafe", "warning", "not read",
+        ),
+        (
+            put("service.status.failed_checks", ["GPS has no 3-D fix: wait, or move to open sky"]),
+            "preflight", "warning", "3-D fix",
+        ),
+        (
+            put("service.status.failed_checks", ["battery has 40 %, must have 50 %: charge it"]),
+            "preflight", "FAILED", "battery has 40 %",
+        ),
+        (
+            put("service.status.failed_checks", ["GPS is poor: wait"] * 8),
+            "failsafe", "warning", "there may be more",
+        ),
+    ],
+)  # fmt: skip
+def test_each_fault_is_named_with_its_fix(
+    config: FleetConfig, change: Any, check: str, verdict: str, found: str
+) -> None:
+    one = judged(config, change)[check]
+    assert one.verdict == verdict
+    assert found in one.found
+    assert bool(one.fix) == (verdict in ("FAILED", "warning"))
+
+
+def test_what_was_changed_and_not_deployed_is_no_go(config: FleetConfig) -> None:
+    """A lower ceiling; two robots that were given each other's names. A spare needs none."""
+    text = config.path.read_text()
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    exchanged = re.sub(r"robots\.r([12])", lambda found: f"robots.r{3 - int(found[1])}", text)
+    for changed in (text.replace("ceiling_m = 30.0", "ceiling_m = 29.0"), exchanged):
+        config.path.write_text(changed)
+        now = load_fleet(config.path)
+        checks = {check.name: check for check in judge(now, now.robots["r1"], fleet)}
+        assert checks["release"].verdict == "FAILED"
+        assert checks["release"].fix == "lpac fleet deploy --robots r1"
+    assert is_configured(config, config.robots["r11"], {"robot_toml": None})
+
+
+def test_fixes_are_roots_and_reach_the_robot_as_the_fleet_does(config: FleetConfig) -> None:
+    user = dataclasses.replace(config.robots["r1"], user="voxl", port=2222)
+    assert on(user, "a b", "c") == "lpac fleet exec --robots r1 'sudo a b && sudo c'"
+    ssh = dataclasses.replace(config, ssh=SshConfig("/lab/ssh_config"))
+    silent: list[Outcome[Examination]] = [Outcome(user, None, SILENT)]
+    ((check,),) = (diagnosis.checks for diagnosis in diagnose(ssh, silent))
+    assert check.fix.endswith("try: ssh -F /lab/ssh_config -p 2222 voxl@192.168.8.11")
+
+
+@pytest.mark.parametrize(
+    ("about", "found"),
+    [({"power_save": True}, "power save on"), ({"signal_dbm": -80.0}, "-80 dBm, 200 Mbit/s: weak"),
+     ({"connected": False}, "wlan0 is not connected")],
+)  # fmt: skip
+def test_a_poor_radio(config: FleetConfig, about: dict[str, object], found: str) -> None:
+    wifi = [well(config, "r1").facts["wifi"][0] | about]
+    check = judged(config, put("wifi", wifi))["wifi"]
+    assert check.verdict == "warning"
+    assert found in check.found
+
+
+def test_what_a_stopped_robots_release_says_counts(config: FleetConfig) -> None:
+    fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
+    facts: dict[str, Any] = copy.deepcopy(dict(fleet["r1"].facts))
+    facts["service"] |= {"active": "inactive", "fresh": False, "status": None}
+    facts["heartbeat"] = {"system_id": 1, "autopilot": 12, "armed": False}
+    vehicle = {"explanations": [], "changes": [], "failed": [
+        "ground was not heard: start it",
+        "autopilot's EKF2_HGT_REF = 3 (vision); wanted is 1 (GPS)",
+        "heading is not known: check the compass",
+    ]}  # fmt: skip
+    fleet["r1"] = fleet["r1"]._replace(facts=facts, vehicle=vehicle)
+    checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
+    assert checks["mavlink"].verdict == "ok"
+    assert checks["failsafe"].verdict == "FAILED"
+    assert "EKF2_HGT_REF = 3" in checks["failsafe"].found
+    assert checks["preflight"].verdict == "warning"
+    assert checks["preflight"].found == "heading is not known: check the compass"
+
+
+def test_rsync_version() -> None:
+    assert rsync_version("rsync  version 3.1.2  protocol version 31\n") == (3, 1)
+    assert rsync_version("rsync  version v3.4.1  protocol version 32\n") == (3, 4)
+    assert rsync_version("openrsync: protocol version 29\n") is None
+
+
+UFW = """-P INPUT DROP
+-P FORWARD DROP
+-P OUTPUT ACCEPT
+-N ufw-user-input
+-A INPUT -i lo -j ACCEPT
+-A INPUT -m conntrack --ctstate RELATED,ESTABLISHED -j ACCEPT
+-A INPUT -j ufw-user-input
+-A ufw-user-input -p tcp -m tcp --dport 22 -j ACCEPT
+"""
+
+
+def test_iptables_rules() -> None:
+    assert iptables_blocks(UFW, [7447]) == ["input"]
+    opened = UFW + "-A ufw-user-input -p tcp -m multiport --dports 80,7000:7999 -j ACCEPT\n"
+    assert iptables_blocks(opened, [7447]) == []
+    assert iptables_blocks("-P INPUT ACCEPT\n-P OUTPUT ACCEPT\n", [7447]) == []
+    assert iptables_blocks(
+        "-P OUTPUT ACCEPT\n-A OUTPUT -p tcp --dport 7447 -j REJECT\n", [7447]
+    ) == ["output"]
+
+
+def test_nft_rules() -> None:
+    place = {"family": "inet", "table": "filter"}
+    base = place | {"name": "input", "hook": "input", "policy": "drop"}
+
+    def rule(*expressions: dict[str, Any]) -> dict[str, Any]:
+        return {"rule": place | {"chain": "input", "expr": list(expressions)}}
+
+    def to_port(right: Any) -> dict[str, Any]:
+        left = {"payload": {"protocol": "tcp", "field": "dport"}}
+        return {"match": {"op": "==", "left": left, "right": right}}
+
+    established = {"match": {"op": "in", "left": {"ct": {"key": "state"}}, "right": "established"}}
+    accept = {"accept": None}
+    closed = [{"chain": base}, rule(established, accept), rule(to_port(22), accept)]
+    assert nft_blocks({"nftables": closed}, [7447]) == ["input"]
+    for right in (7447, {"set": [22, 7447]}, {"set": [{"range": [7000, 8000]}]}):
+        opened = [*closed, rule(to_port(right), accept)]
+        assert nft_blocks({"nftables": opened}, [7447]) == []
+    named = {"set": place | {"name": "open", "elem": [22, {"range": [7440, 7450]}]}}
+    opened = [named, *closed, rule(to_port("@open"), accept)]
+    assert nft_blocks({"nftables": opened}, [7447]) == []
+    assert nft_blocks({"nftables": opened}, [7451]) == ["input"]
+    assert nft_blocks({"nftables": []}, [7447]) == []

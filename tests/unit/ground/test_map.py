@@ -1,0 +1,124 @@
+"""The live map: who may see it, and the numbers that it draws."""
+
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from edge.messages.mission import ON_GROUND, FlightState, GroundState
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.ground.map.access import Access, is_loopback
+from lpac.ground.map.view import Missions, detail_view
+from tests.pretend import FENCE, PretendedRobot
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "allowed"),
+    [
+        ("127.0.0.1:8300", None, True),
+        ("localhost:8300", "http://localhost:8300", True),
+        ("[::1]:8300", "http://[::1]:8300", True),
+        # Names of others that lead here, and pages of others.
+        ("evil.example:8300", None, False),
+        ("evil.example:8300", "http://evil.example:8300", False),
+        ("127.0.0.1.evil.example", None, False),
+        ("127.0.0.1:8300", "http://evil.example", False),
+        ("127.0.0.1:8300", "http://127.0.0.1:5000", False),
+        ("127.0.0.1:8300", "null", False),
+        ("[::1", None, False),
+        ("", None, False),
+    ],
+)
+def test_only_this_machines_own_page_is_served(
+    host: str, origin: str | None, allowed: bool
+) -> None:
+    refusal = Access(local=True, token=None).refusal(host, origin, ())
+    assert (refusal is None) == allowed
+
+
+def test_beyond_this_machine_a_token_is_asked_for() -> None:
+    assert not is_loopback("0.0.0.0") and not is_loopback("192.168.8.2")
+    assert is_loopback("127.0.0.1") and is_loopback("::1") and is_loopback("localhost")
+    token = "correct-horse"
+    access = Access(local=False, token=token)
+    host = "192.168.8.2:8300"
+    assert access.refusal(host, None, (None, token)) is None
+    assert access.refusal(host, f"http://{host}", (token, None)) is None
+    for tokens in ((None, None), ("", "wrong"), ("corréct-horse", None), (f"{token} ", None)):
+        assert access.refusal(host, None, tokens) is not None
+    assert access.refusal(host, "http://evil.example", (token, None)) is not None
+
+
+def snapshot_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> FleetSnapshot:
+    robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
+    status = replace(
+        robot.status(0.0), state=state, trial=trial, armed=state not in ON_GROUND, boot_nonce=7
+    )
+    ground = GroundState(1, "alice", trial=trial)
+    return FleetSnapshot(unix_time_s, "alice", ground, (RobotSnapshot("r1", 1, status, 0.1),))
+
+
+def test_a_page_that_opens_late_has_the_whole_curve() -> None:
+    missions = Missions()
+    waiting, flying = (
+        snapshot_of(state, 100.0) for state in (FlightState.HOLD, FlightState.MISSION)
+    )
+    missions.take(waiting)
+    assert not missions.begins(waiting) and missions.time_s(waiting) is None
+    missions.take(flying)
+    assert missions.begins(flying)
+    curve = missions.begin(flying, 50.0)
+    curve.bound = curve.share(10.0)
+    for n in range(5000):
+        curve.add(0.4 * n, 50.0 - 0.005 * n)
+    view = curve.view()
+    assert view["whole"] and view["began_s"] == 100.0 and view["bound"] == 0.2
+    assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
+    assert len(view["points"]) <= 3000
+    # Hold is part of a mission, landing is not.
+    assert missions.time_s(snapshot_of(FlightState.HOLD, 160.0)) == 60.0
+    assert missions.time_s(snapshot_of(FlightState.LAND, 160.0)) is None
+    assert not missions.begins(snapshot_of(FlightState.MISSION, 170.0))
+    # What was seen of it over another world is nothing to compare with.
+    missions.change_world()
+    assert not missions.begin(snapshot_of(FlightState.MISSION, 180.0), 40.0).whole
+
+
+@pytest.mark.parametrize(
+    ("between", "trial", "anew"),
+    [
+        (snapshot_of(FlightState.HOLD, 110.0), "t1", False),
+        (snapshot_of(FlightState.LANDED, 110.0), "t1", True),
+        (snapshot_of(FlightState.HOLD, 110.0, ""), "t1", True),
+        (snapshot_of(FlightState.HOLD, 110.0), "t2", True),
+    ],
+)
+def test_a_mission_after_another_is_a_new_curve(
+    between: FleetSnapshot, trial: str, anew: bool
+) -> None:
+    missions = Missions()
+    flying = snapshot_of(FlightState.MISSION, 100.0)
+    missions.take(flying)
+    missions.begin(flying, 50.0)
+    missions.take(between)
+    waiting, again = (
+        snapshot_of(state, 120.0, trial) for state in (FlightState.HOLD, FlightState.MISSION)
+    )
+    missions.take(waiting)
+    assert (missions.time_s(waiting) is None) == anew
+    missions.take(again)
+    assert missions.begins(again) == anew
+
+
+def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
+    (robot,) = snapshot_of(FlightState.HOLD, 0.0).robots
+    assert robot.status is not None
+    late = replace(robot.status.loops["control"], lateness_p99_ms=math.nan)
+    broken = replace(robot.status, loops={"control": late}, hdop=math.nan)
+    setup = FleetSetup(
+        "f", "alice", {"r1": 1}, (), FENCE, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0
+    )
+    view = detail_view(setup, replace(robot, status=broken))
+    shown = json.loads(json.dumps(view, allow_nan=False))["status"]
+    assert shown["loops"]["control"]["lateness_p99_ms"] is None and shown["hdop"] is None

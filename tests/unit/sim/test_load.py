@@ -1,0 +1,51 @@
+"""What is said of how many robots a machine carries."""
+
+import pytest
+
+from lpac.cli.sim import _as_many_as_carried, _say_if_carried
+from lpac.sim.fleet import load
+from lpac.sim.fleet.processes import Backlog, OverloadError
+from tests.conftest import SHIPPED
+
+# Units of work a second, measured: two cores of a small cloud machine, which flew ten robots with
+# 0.9 cores; and half of that, on which ten fell 88 s behind and five flew well.
+TEN_FLEW, FIVE_FLEW = 62.0, 31.0
+
+
+@pytest.mark.parametrize(("units_per_s", "robots"), [(TEN_FLEW, 10), (FIVE_FLEW, 5), (1.0, 1)])
+def test_as_many_robots_fly_as_the_machine_carries(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    units_per_s: float,
+    robots: int,
+) -> None:
+    monkeypatch.setattr(load, "_units_per_s", lambda _: units_per_s)
+    assert _as_many_as_carried(SHIPPED, "mavlink") == robots
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(f": flying {robots}")
+
+
+def test_who_asks_for_more_is_warned(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
+    assert _say_if_carried(5, SHIPPED, "mavlink") == 5
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("carries about 5 of these robots and vehicles")
+    assert _say_if_carried(6, SHIPPED, "mavlink") == 5
+    (line,) = capsys.readouterr().err.splitlines()
+    assert (
+        "carries about 5 of these robots" in line
+        and "not 6" in line
+        and line.endswith("fewer: -n 5")
+    )
+
+
+@pytest.mark.parametrize(
+    ("robots", "carried", "advice"), [(10, None, 5), (10, 7, 7), (10, 12, 9), (3, 0, 1)]
+)
+def test_who_falls_behind_is_told_what_was_found_out(
+    robots: int, carried: int | None, advice: int
+) -> None:
+    error = OverloadError(Backlog(9.0, 0.0), robots, carried)
+    assert str(error).endswith(f"fly fewer: -n {advice}")
