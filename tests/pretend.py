@@ -24,6 +24,7 @@ from edge.core.perception import EXPLORED_CELLS
 from edge.core.vehicle import Vector
 from edge.core.world import format_world, random_features
 from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.codec import decode, encode
 from edge.messages.mission import (
     ON_GROUND,
     FlightState,
@@ -34,10 +35,9 @@ from edge.messages.mission import (
     Origin,
     RobotStatus,
     explored_to_bytes,
-    from_json,
-    to_json,
     world_id,
 )
+from edge.messages.topics import EXPLORED, ORDER, STATE, STATUS, WORLD
 from edge.policy.bundle import load_bundle
 from lpac.sim.ports import free_ports
 from tests.conftest import SHIPPED
@@ -438,11 +438,9 @@ class PretendedFleet:
             listen=listen or ("tcp/127.0.0.1:0",),
             connect=connect,
             subscriptions={
-                "ground/state": guarded(
-                    lambda data: robot.hear_state(from_json(GroundState, data))
-                ),
-                "ground/order": guarded(lambda data: robot.hear_order(from_json(Order, data))),
-                "ground/world": guarded(lambda data: robot.hear_world(data.decode())),
+                STATE: guarded(lambda data: robot.hear_state(decode(GroundState, data))),
+                ORDER: guarded(lambda data: robot.hear_order(decode(Order, data))),
+                WORLD: guarded(lambda data: robot.hear_world(data.decode())),
             },
         )
         self._stack.callback(link.close)
@@ -460,9 +458,9 @@ class PretendedFleet:
                     robot.step(now_s, now_s - last_s)
                     if robot.silent:
                         continue
-                    said.append((link, "status", to_json(robot.status(now_s))))
+                    said.append((link, STATUS, encode(robot.status(now_s))))
                     if (tick + i) % 4 == 0:
-                        said.append((link, "explored", explored_to_bytes(robot.explored)))
+                        said.append((link, EXPLORED, explored_to_bytes(robot.explored)))
             last_s = now_s
             tick += 1
             for link, topic, data in said:

@@ -9,6 +9,7 @@ import numpy as np
 from edge.core import F64
 
 _LARGEST_FENCE_M = 1e4
+_MOST_VERTICES = 100
 # An angle, rad, below which three vertices lie on one line.
 _STRAIGHT_RAD = 1e-9
 
@@ -17,7 +18,7 @@ _STRAIGHT_RAD = 1e-9
 class Fence:
     """Where the robot may fly: a convex polygon, m, and heights from `floor_m` to `ceiling_m`.
 
-    `vertices_m` are (x, y), three or more, either way round; the last is joined to the first.
+    `vertices_m` are (x, y), 3 to 100, either way round; the last is joined to the first.
     Robots stop `buffer_m` inside the line.
 
     Raises ValueError if the polygon is not convex, has no room within the buffer, or a number is
@@ -30,8 +31,10 @@ class Fence:
     ceiling_m: float
 
     def __post_init__(self) -> None:
-        if len(self.vertices_m) < 3:
-            raise ValueError(f"vertices_m has {len(self.vertices_m)} vertices: must be 3 or more")
+        if not 3 <= len(self.vertices_m) <= _MOST_VERTICES:
+            raise ValueError(
+                f"vertices_m has {len(self.vertices_m)} vertices: must be 3 to {_MOST_VERTICES}"
+            )
         for vertex in self.vertices_m:
             if len(vertex) != 2 or not all(abs(c) <= _LARGEST_FENCE_M for c in vertex):
                 raise ValueError(

@@ -1,9 +1,8 @@
 """The radio of the robots and the ground, over zenoh.
 
-Keys, below `lpac/<fleet>/`: `robot/<id>/message`, `robot/<id>/status`, `robot/<id>/explored`,
-`ground/state`, `ground/order`, `ground/world`, and for presence the liveliness tokens
-`robot/<id>/alive/<session>`, which vanish with the session that declared them: at once if the
-program ends, a second after it stops answering.
+What travels is in `edge.messages.topics`, below the key `lpac/<fleet>/`. Besides, for presence,
+there are the liveliness tokens `robot/<id>/alive/<session>`, which vanish with the session that
+declared them: at once if the program ends, a second after it stops answering.
 
 In peer mode gossip makes a mesh from one known peer, but what only gossip connected is not
 connected again when it alone is lost; scouting does it within some 8 s. So for flight let every
@@ -25,14 +24,11 @@ import structlog
 import zenoh
 
 from edge.core.wire import MAX_ROBOT_ID
+from edge.messages.topics import TOPICS, Sender, Topic
 
 ReceiveCallback = Callable[[str, bytes], None]
 
-_ROBOT_TOPICS = ("message", "status", "explored")
-_GROUND_TOPICS = ("state", "order", "world")
-# Large, or of no hurry: between its fragments goes whatever else is to be sent.
-_PATIENT_TOPICS = ("explored", "world")
-# Of 64 kB each: a world that does not fit in there at once is dropped.
+# Of 64 kB each, for topics that go later: a world that does not fit in there at once is dropped.
 _PATIENT_BATCHES = 8
 _ENDPOINT = re.compile(r"tcp/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
 _TOKEN = re.compile(r"robot/(\d+)/alive/(\w+)")
@@ -72,7 +68,7 @@ class ZenohLink:
         listen: Sequence[str] = (),
         connect: Sequence[str] = (),
         scouting: bool = False,
-        subscriptions: Mapping[str, ReceiveCallback] | None = None,
+        subscriptions: Mapping[Topic, ReceiveCallback] | None = None,
     ) -> None:
         """Open the session.
 
@@ -80,9 +76,10 @@ class ZenohLink:
         free port. A peer opens even if nobody answers, and connects later; a client needs its
         router. `scouting` finds others by multicast.
 
-        `subscriptions` maps patterns like `robot/*/message` to callbacks, which are called with the
-        key below `lpac/<fleet>/` and the data, from zenoh's threads, several at once; what this
-        session publishes is not among it. A callback must only store: a slow one holds up the link.
+        `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
+        and the data, from zenoh's threads, several at once; what this session publishes is not
+        among it, nor what is larger than its topic's limit. A callback must only store: a slow one
+        holds up the link.
 
         Raises LinkError if a setting is wrong, a port is taken or a client finds no router.
         """
@@ -93,6 +90,7 @@ class ZenohLink:
         self._lock = Lock()
         self._tokens: set[tuple[int, str]] = set()
         self._failures: Counter[str] = Counter()
+        self._oversized: Counter[str] = Counter()
         self._session_id = _session_id(robot_id)
         self._session = _open(self._config(mode, listen, connect, scouting))
         try:
@@ -107,16 +105,15 @@ class ZenohLink:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def publish(self, topic: str, data: bytes) -> None:
-        """Send on an own topic: a robot's `message`, `status` or `explored`, the ground's `state`,
-        `order` or `world` (up to some 400 kB).
+    def publish(self, topic: Topic, data: bytes) -> None:
+        """Send on a topic of robots, or of the ground, as this session is one or the other.
 
-        Dropped when the link is congested or closed. Raises KeyError for any other topic.
+        Dropped when the link is congested or closed. Raises KeyError for a topic of the others.
         """
         try:
             self._publishers[topic].put(data)
         except zenoh.ZError as error:
-            self._failed(f"publish {topic}", error)
+            self._failed(f"publish {topic.name}", error)
 
     def present(self) -> frozenset[int]:
         """The other robots whose programs are connected now."""
@@ -192,11 +189,13 @@ class ZenohLink:
             config.insert_json5(key, json.dumps(value))
         return config
 
-    def _declare(self, subscriptions: Mapping[str, ReceiveCallback]) -> dict[str, zenoh.Publisher]:
-        for pattern, callback in subscriptions.items():
+    def _declare(
+        self, subscriptions: Mapping[Topic, ReceiveCallback]
+    ) -> dict[Topic, zenoh.Publisher]:
+        for topic, callback in subscriptions.items():
             self._session.declare_subscriber(
-                self._prefix + pattern,
-                self._guarded(pattern, callback),
+                self._prefix + topic.pattern,
+                self._guarded(topic, callback),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
         liveliness = self._session.liveliness()
@@ -206,31 +205,43 @@ class ZenohLink:
         if self._robot_id is not None:
             # Kept, since a token that nothing refers to is withdrawn.
             self._token = liveliness.declare_token(f"{self._own_prefix}alive/{self._session_id}")
+        own: Sender = "ground" if self._robot_id is None else "robot"
         return {
             topic: self._session.declare_publisher(
-                self._own_prefix + topic,
+                self._own_prefix + topic.name,
                 # The newest counts, at once: nothing queues up.
                 congestion_control=zenoh.CongestionControl.DROP,
                 express=True,
                 priority=(
-                    zenoh.Priority.BACKGROUND
-                    if topic in _PATIENT_TOPICS
-                    else zenoh.Priority.REAL_TIME
+                    zenoh.Priority.REAL_TIME
+                    if topic.priority == "now"
+                    else zenoh.Priority.BACKGROUND
                 ),
                 reliability=zenoh.Reliability.RELIABLE,
             )
-            for topic in (_GROUND_TOPICS if self._robot_id is None else _ROBOT_TOPICS)
+            for topic in TOPICS
+            if topic.sender == own
         }
 
-    def _guarded(self, pattern: str, callback: ReceiveCallback) -> Callable[[zenoh.Sample], None]:
+    def _guarded(self, topic: Topic, callback: ReceiveCallback) -> Callable[[zenoh.Sample], None]:
         def receive(sample: zenoh.Sample) -> None:
             try:
                 key = str(sample.key_expr).removeprefix(self._prefix)
+                if len(sample.payload) > topic.limit_bytes:
+                    self._too_long(key)
+                    return
                 callback(key, sample.payload.to_bytes())
             except Exception as error:
-                self._failed(f"callback {pattern}", error)
+                self._failed(f"callback {topic.pattern}", error)
 
         return receive
+
+    def _too_long(self, key: str) -> None:
+        with self._lock:
+            self._oversized[key] += 1
+            first = self._oversized[key] == 1
+        if first:
+            _log.warning("a message is larger than its topic's limit: not read", key=key)
 
     def _failed(self, what: str, error: Exception) -> None:
         with self._lock:

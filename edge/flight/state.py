@@ -142,7 +142,8 @@ class FlightInputs:
     above sea level, less what that jumped in flight; None when the position is lost or old, or
     there is no mission origin. `policy_velocity_m_s` (2,) is None when the policy has no fresh
     answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
-    take off. `failed_checks` are preflight's; None before the first. `not_taken` is what of the
+    take off. `safety_form` is what a ground asks whose states are not understood.
+    `failed_checks` are preflight's; None before the first. `not_taken` is what of the
     ground's state the robot does not fly by, in words. `order` is new in this tick. `energy` is
     None when the battery is not known.
     """
@@ -157,6 +158,7 @@ class FlightInputs:
     busy_neighbours: tuple[int, ...]
     ground: GroundState | None
     ground_age_s: float
+    safety_form: SafetyAction
     failed_checks: tuple[str, ...] | None
     not_taken: tuple[str, ...]
     order: Order | None
@@ -251,9 +253,9 @@ class Tick:
 
     @property
     def safety_action(self) -> SafetyAction:
-        ground = self.inputs.ground
-        if ground is None or not self.ground_heard:
-            return "none"
+        ground, form = self.inputs.ground, self.inputs.safety_form
+        if form != "none" or ground is None or not self.ground_heard:
+            return form
         asked = ground.safety_action_for(self.robot.robot_id)
         enabled = ground.enabled_for(self.robot.robot_id)
         return "hold" if asked == "none" and not enabled else asked

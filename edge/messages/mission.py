@@ -1,39 +1,67 @@
-"""What the ground and the robots say to each other, and its JSON.
+"""What the ground and the robots say to each other.
 
 Two kinds of message go to the robots. `GroundState` is published again and again, so that nothing
 depends on one packet; what it says can only hold, return or land a robot. An `Order` happens once:
 it names the robot and its boot nonce, and expires. Nothing that repeats can arm a vehicle.
 
-Keys, below `lpac/<fleet>/`: `ground/state`, `ground/order`, `ground/world` (a CoverageControl world
-file's text), `robot/<id>/status`, and `robot/<id>/explored` (see `explored_to_bytes`).
+`edge.messages.topics` lists what travels under which key, `edge.messages.codec` makes bytes of it.
 """
 
-import dataclasses
 import hashlib
-import json
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal, TypeVar
+from functools import cache
+from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 
 from edge.core import Bools
 from edge.core.fence import Fence
 from edge.core.frames import MissionFrame
 from edge.core.perception import EXPLORED_CELLS
 from edge.core.position import PositionCause, PositionQuality
-from edge.core.schema import ConfigError, from_mapping
-from edge.core.vehicle import Vector
+from edge.messages.bounds import (
+    MOST_ROBOTS,
+    MOST_TEXTS,
+    Bound,
+    Count,
+    Degrees,
+    Metres,
+    MetresPerSecond,
+    Milliseconds,
+    Name,
+    Nonce,
+    Precision,
+    Radians,
+    RobotId,
+    RobotKey,
+    Seconds,
+    Sequence,
+    Share,
+    SystemId,
+    Text,
+    UnixSeconds,
+    bounds_of,
+)
 
+# Of what is said now. A message of another version is taken as far as it can be; see the codec.
+VERSION = 3
 ORDER_LIFETIME_S = 10.0
 MAX_SLOT = 1000
 # A mission starts within this distance of the robot's own height.
 AT_SLOT_M = 1.0
 _OVER_LANDING_POINT_M = 1.5
 
-T = TypeVar("T")
+Version = Annotated[int, Meta(ge=0, le=10_000)]
+# What an older program must know of, or else refuse the message: names of fields.
+MustUnderstand = Annotated[tuple[Name, ...], Meta(max_length=20)]
+Texts = Annotated[tuple[Text, ...], Meta(max_length=MOST_TEXTS)]
+Point = tuple[Metres, Metres]
+Vector = tuple[Metres, Metres, Metres]
+_OfRobots = Meta(max_length=MOST_ROBOTS)
 
 
 class FlightState(StrEnum):
@@ -70,9 +98,9 @@ class Origin:
     Raises ValueError if a number is out of its range.
     """
 
-    latitude_deg: float
-    longitude_deg: float
-    heading_deg: float
+    latitude_deg: Degrees
+    longitude_deg: Degrees
+    heading_deg: Degrees
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.heading_deg < 360.0:
@@ -89,7 +117,7 @@ class Place:
     """A robot's place in the flight: its height's `slot`, and where it lands, (x, y), m."""
 
     slot: int
-    landing_point_m: tuple[float, ...]
+    landing_point_m: tuple[Metres, ...]
 
     def __post_init__(self) -> None:
         if not 0 <= self.slot <= MAX_SLOT:
@@ -113,20 +141,24 @@ class GroundState:
     hold in a return only until their way down is free: nobody asked them to.
     """
 
-    sequence: int
-    operator: str
+    sequence: Sequence
+    operator: Name
     origin: Origin | None = None
     enabled: bool = False
-    robot_enabled: dict[str, bool] = field(default_factory=dict)
+    robot_enabled: Annotated[dict[RobotKey, bool], _OfRobots] = field(default_factory=dict)
     safety_action: SafetyAction = "none"
-    safety_action_by: str = ""
-    robot_safety_actions: dict[str, SafetyAction] = field(default_factory=dict)
+    safety_action_by: Name = ""
+    robot_safety_actions: Annotated[dict[RobotKey, SafetyAction], _OfRobots] = field(
+        default_factory=dict
+    )
     fence: Fence | None = None
-    places: dict[str, Place] = field(default_factory=dict)
-    world_id: str | None = None
-    trial: str = ""
-    unix_time_s: float | None = None
-    waiting: tuple[int, ...] = ()
+    places: Annotated[dict[RobotKey, Place], _OfRobots] = field(default_factory=dict)
+    world_id: Name | None = None
+    trial: Name = ""
+    unix_time_s: UnixSeconds | None = None
+    waiting: Annotated[tuple[RobotId, ...], _OfRobots] = ()
+    version: Version = VERSION
+    must_understand: MustUnderstand = ()
 
     def enabled_for(self, robot_id: int) -> bool:
         """Whether one robot may run its checks and fly."""
@@ -151,34 +183,61 @@ class Order:
     motors on the ground only, `kill` anywhere. All but `kill` are the commander's alone.
     """
 
-    order_id: str
-    robot_id: int
-    boot_nonce: int
+    order_id: Name
+    robot_id: RobotId
+    boot_nonce: Nonce
     kind: OrderKind
-    expires_at_uptime_s: float
-    operator: str
-    trial: str = ""
+    expires_at_uptime_s: Seconds
+    operator: Name
+    trial: Name = ""
+    version: Version = VERSION
+    must_understand: MustUnderstand = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SafetyForm:
+    """The part of a `GroundState` that every version of this program obeys: hold and land.
+
+    It never changes. Who cannot understand the rest of a state still takes this.
+    """
+
+    sequence: Sequence
+    operator: Name
+    safety_action: Name
+    robot_safety_actions: Annotated[dict[RobotKey, Name], _OfRobots]
+
+
+@dataclass(frozen=True, slots=True)
+class KillForm:
+    """The part of an `Order` to kill that every version of this program obeys. It never changes."""
+
+    order_id: Name
+    robot_id: RobotId
+    boot_nonce: Nonce
+    kind: Literal["kill"]
+    expires_at_uptime_s: Seconds
+    operator: Name
 
 
 @dataclass(frozen=True, slots=True)
 class OrderResult:
     """A robot's answer to an order; `reason` says why it was refused."""
 
-    order_id: str
+    order_id: Name
     accepted: bool
-    reason: str = ""
+    reason: Text = ""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopStatus:
     """One loop's counts since the start, and its lateness, ms, over the last minute."""
 
-    ticks: int
-    overruns: int
-    failures: int
-    lateness_p50_ms: float
-    lateness_p99_ms: float
-    lateness_max_ms: float
+    ticks: Count
+    overruns: Count
+    failures: Count
+    lateness_p50_ms: Milliseconds
+    lateness_p99_ms: Milliseconds
+    lateness_max_ms: Milliseconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,81 +262,81 @@ class RobotStatus:
     look. Raises ValueError for what must be there and is not finite.
     """
 
-    robot_id: int
-    boot_nonce: int
-    sequence: int
-    uptime_s: float
-    unix_time_s: float
+    robot_id: RobotId
+    boot_nonce: Nonce
+    sequence: Sequence
+    uptime_s: Seconds
+    unix_time_s: UnixSeconds
     state: FlightState
-    reason: str
+    reason: Text
     ready: bool
-    failed_checks: tuple[str, ...]
-    alarms: tuple[str, ...]
-    obeyed_sequence: int
-    operator: str
-    orders: tuple[OrderResult, ...]
-    bundle_id: str
-    world_id: str
-    trial: str
+    failed_checks: Texts
+    alarms: Texts
+    obeyed_sequence: Sequence
+    operator: Name
+    orders: Annotated[tuple[OrderResult, ...], Meta(max_length=MOST_TEXTS)]
+    bundle_id: Name
+    world_id: Name
+    trial: Name
     origin: Origin | None
-    system_id: int | None
-    slot_height_m: float
-    landing_point_m: tuple[float, ...]
+    system_id: SystemId | None
+    slot_height_m: Metres
+    landing_point_m: tuple[Metres, ...]
     position_m: Vector | None
-    velocity_m_s: Vector | None
-    heading_rad: float | None
-    mode: str | None
+    velocity_m_s: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] | None
+    heading_rad: Radians | None
+    mode: Name | None
     armed: bool | None
-    battery: float | None
-    satellites: int | None
-    message_counts: dict[str, int]
-    neighbour_ages_s: dict[str, float]
-    loops: dict[str, LoopStatus]
+    battery: Share | None
+    satellites: Count | None
+    message_counts: Annotated[dict[Name, Count], Meta(max_length=MOST_TEXTS)]
+    neighbour_ages_s: Annotated[dict[RobotKey, Seconds], _OfRobots]
+    loops: Annotated[dict[Name, LoopStatus], Meta(max_length=MOST_TEXTS)]
     fence: Fence | None = None
-    not_taken: tuple[str, ...] = ()
+    not_taken: Texts = ()
     in_air: bool | None = None
-    global_deg: tuple[float, ...] | None = None
-    hdop: float | None = None
-    policy_velocity_m_s: tuple[float, ...] | None = None
-    feature_age_s: float | None = None
-    neighbour_messages: dict[str, int] = field(default_factory=dict)
-    ground_age_s: float | None = None
+    global_deg: tuple[Degrees, Degrees] | None = None
+    hdop: Precision | None = None
+    policy_velocity_m_s: tuple[MetresPerSecond, MetresPerSecond] | None = None
+    feature_age_s: Seconds | None = None
+    neighbour_messages: Annotated[dict[RobotKey, Count], _OfRobots] = field(default_factory=dict)
+    ground_age_s: Seconds | None = None
     position_quality: PositionQuality | None = None
     position_cause: PositionCause | None = None
-    gps_accuracy_m: float | None = None
+    gps_accuracy_m: Precision | None = None
     remote_control: bool | None = None
-    battery_lasts_s: float | None = None
-    home_s: float | None = None
-    endurance_s: float | None = None
-    flown_s: float | None = None
+    battery_lasts_s: Seconds | None = None
+    home_s: Seconds | None = None
+    endurance_s: Seconds | None = None
+    flown_s: Seconds | None = None
+    version: Version = VERSION
 
     def __post_init__(self) -> None:
-        for name, size in (
-            ("position_m", 3), ("velocity_m_s", 3), ("landing_point_m", 2), ("global_deg", 2),
-            ("policy_velocity_m_s", 2),
-        ):  # fmt: skip
+        for name, bound in _status_bounds().items():
             value = getattr(self, name)
-            if value is not None and len(value) != size:
-                raise ValueError(f"{name} = {list(value)}: must be {size} numbers")
-            if value is not None and not all(map(math.isfinite, value)):
-                self._forget(name)
-        for name in (
-            "uptime_s", "unix_time_s", "slot_height_m", "heading_rad", "battery", "hdop",
-            "feature_age_s", "ground_age_s", "gps_accuracy_m",
-            "battery_lasts_s", "home_s", "endurance_s", "flown_s",
-        ):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                self._forget(name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            if value is None or all(map(bound.holds, numbers)):
+                continue
+            if name in _NEVER_NONE:
+                raise ValueError(f"{name} = {value}: must be {bound.least:g} to {bound.greatest:g}")
+            object.__setattr__(self, name, None)
+        if len(self.landing_point_m) != 2:
+            raise ValueError(f"landing_point_m = {list(self.landing_point_m)}: must be 2 numbers")
         ages_s = self.neighbour_ages_s
         if not all(map(math.isfinite, ages_s.values())):
             heard = {robot: age_s for robot, age_s in ages_s.items() if math.isfinite(age_s)}
             object.__setattr__(self, "neighbour_ages_s", heard)
 
-    def _forget(self, name: str) -> None:
-        if name in ("uptime_s", "unix_time_s", "slot_height_m", "landing_point_m"):
-            raise ValueError(f"{name} = {getattr(self, name)}: must be finite")
-        object.__setattr__(self, name, None)
+
+_NEVER_NONE = (
+    "robot_id", "boot_nonce", "sequence", "uptime_s", "unix_time_s", "obeyed_sequence",
+    "slot_height_m", "landing_point_m", "version",
+)  # fmt: skip
+
+
+@cache
+def _status_bounds() -> dict[str, Bound]:
+    return bounds_of(RobotStatus)
 
 
 def is_over_landing_point(status: RobotStatus) -> bool:
@@ -328,17 +387,3 @@ def explored_from_bytes(data: bytes) -> Bools:
         raise ValueError(f"explored has {len(data)} bytes: must be {EXPLORED_CELLS**2 // 8}")
     bits = np.unpackbits(np.frombuffer(data, np.uint8)).astype(np.bool_)
     return bits.reshape(EXPLORED_CELLS, EXPLORED_CELLS)
-
-
-def to_json(message: GroundState | Order | RobotStatus) -> bytes:
-    """The message as one JSON object, UTF-8."""
-    return json.dumps(dataclasses.asdict(message), separators=(",", ":")).encode()
-
-
-def from_json(kind: type[T], data: bytes) -> T:
-    """The message of that kind in `data`. Raises ConfigError that says what is wrong with it."""
-    try:
-        mapping = json.loads(data)
-    except (ValueError, RecursionError):
-        raise ConfigError(f"{kind.__name__}: not JSON") from None
-    return from_mapping(kind, mapping, kind.__name__)

@@ -122,6 +122,7 @@ class FlightControl:
             ),
             ground=ground,
             ground_age_s=ground_age_s,
+            safety_form=self._inbox.safety_form(now_s),
             failed_checks=self.failed_checks(now_s),
             not_taken=self.not_taken,
             order=self._inbox.order(),

@@ -6,20 +6,22 @@ The link's threads only put bytes in; whoever takes something out decodes it.
 import math
 from collections import deque
 from threading import Lock
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-from edge.core.schema import ConfigError
 from edge.flight.preflight import HeardStatus
-from edge.messages.mission import GroundState, Order, RobotStatus, from_json
-
-T = TypeVar("T")
+from edge.messages.codec import MessageError, decode
+from edge.messages.mission import (
+    GroundState,
+    KillForm,
+    Order,
+    RobotStatus,
+    SafetyAction,
+    SafetyForm,
+)
 
 _MOST_ORDERS = 64
 _MOST_STATES = 16
 _STATUS_LIFETIME_S = 3.0
-# What is longer is not of this fleet, and would hold up the loop that decodes it.
-_LONGEST_MESSAGE_BYTES = 65_536
-_LONGEST_WORLD_BYTES = 2**20
 
 
 class _Arrived(NamedTuple):
@@ -44,6 +46,10 @@ class Inbox:
         self._statuses: dict[str, _Arrived] = {}
         self._ground: GroundState | None = None
         self._ground_at_s = -math.inf
+        self._safety_form: SafetyAction = "none"
+        self._safety_form_at_s = -math.inf
+        # Why the newest state of a ground was not understood; "" if it was.
+        self.ground_refusal = ""
         # The ground's wall clock minus this one, None while it is not known.
         self.ground_clock_offset_s: float | None = None
         # The text of the newest world file that the ground sent.
@@ -54,23 +60,18 @@ class Inbox:
 
     def put_ground(self, data: bytes, now_s: float, unix_now_s: float) -> None:
         """A ground's state arrived."""
-        if self._is_short(data):
-            self._grounds.append(_Arrived(data, now_s, unix_now_s))
+        self._grounds.append(_Arrived(data, now_s, unix_now_s))
 
     def put_world(self, data: bytes) -> None:
         """A world file arrived."""
-        if self._is_short(data, _LONGEST_WORLD_BYTES):
-            self.world = data
+        self.world = data
 
     def put_order(self, data: bytes) -> None:
         """An order arrived."""
-        if self._is_short(data):
-            self._orders.append(data)
+        self._orders.append(data)
 
     def put_status(self, key: str, data: bytes, now_s: float, unix_now_s: float) -> None:
         """Another robot's status arrived, with `key`."""
-        if not self._is_short(data):
-            return
         with self._lock:
             self._statuses[key] = _Arrived(data, now_s, unix_now_s)
 
@@ -78,14 +79,41 @@ class Inbox:
         """The ground's newest state and its age, s (infinite if none came). Control thread."""
         while self._grounds:
             arrived = self._grounds.popleft()
-            state = self._decode(GroundState, arrived.data)
-            if state is not None and self._counts(state, arrived.at_s):
+            try:
+                state = decode(GroundState, arrived.data)
+            except MessageError as error:
+                self.malformed += 1
+                self.ground_refusal = str(error)
+                self._take_safety_form(arrived)
+                continue
+            if self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
+                self._safety_form, self.ground_refusal = "none", ""
                 if state.unix_time_s is not None:
                     self.ground_clock_offset_s = state.unix_time_s - arrived.unix_s
         return self._ground, now_s - self._ground_at_s
 
-    def _counts(self, state: GroundState, at_s: float) -> bool:
+    def safety_form(self, now_s: float) -> SafetyAction:
+        """What a ground asks whose states are not understood: hold, land, or none. Control thread.
+
+        The last state that was understood stays, and its age grows.
+        """
+        fresh = now_s - self._safety_form_at_s <= self._ground_timeout_s
+        return self._safety_form if fresh else "none"
+
+    def _take_safety_form(self, arrived: _Arrived) -> None:
+        try:
+            form = decode(SafetyForm, arrived.data)
+        except MessageError:
+            return
+        if not self._counts(form, arrived.at_s):
+            return
+        asked = form.robot_safety_actions.get(str(self._robot_id), form.safety_action)
+        known: dict[str, SafetyAction] = {"hold": "hold", "land": "land"}
+        self._safety_form = known.get(asked, "none")
+        self._safety_form_at_s = arrived.at_s
+
+    def _counts(self, state: GroundState | SafetyForm, at_s: float) -> bool:
         newest = self._ground
         if newest is None or at_s - self._ground_at_s > self._ground_timeout_s:
             return True
@@ -98,10 +126,25 @@ class Inbox:
     def order(self) -> Order | None:
         """The next order for this robot, if one has come. Control thread."""
         while self._orders:
-            order = self._decode(Order, self._orders.popleft())
+            order = self._order(self._orders.popleft())
             if order and order.robot_id == self._robot_id:
                 return order
         return None
+
+    def _order(self, data: bytes) -> Order | None:
+        """An order; of one that is not understood, the form to kill that every version obeys."""
+        try:
+            return decode(Order, data)
+        except MessageError:
+            self.malformed += 1
+        try:
+            form = decode(KillForm, data)
+        except MessageError:
+            return None
+        return Order(
+            form.order_id, form.robot_id, form.boot_nonce, form.kind,
+            form.expires_at_uptime_s, form.operator,
+        )  # fmt: skip
 
     def peers(self, now_s: float) -> tuple[HeardStatus, ...]:
         """The fresh statuses of the other robots. Preflight's thread."""
@@ -112,7 +155,7 @@ class Inbox:
                 if now_s - arrived.at_s <= _STATUS_LIFETIME_S
             }
             arrivals = dict(self._statuses)
-        decoded = {key: self._decode(RobotStatus, a.data) for key, a in arrivals.items()}
+        decoded = {key: self._status(a.data) for key, a in arrivals.items()}
         self.not_understood = tuple(
             f"robot {key.split('/')[1]}" for key, status in decoded.items() if status is None
         )
@@ -122,13 +165,9 @@ class Inbox:
             if status is not None
         )
 
-    def _is_short(self, data: bytes, limit_bytes: int = _LONGEST_MESSAGE_BYTES) -> bool:
-        self.malformed += len(data) > limit_bytes
-        return len(data) <= limit_bytes
-
-    def _decode(self, kind: type[T], data: bytes) -> T | None:
+    def _status(self, data: bytes) -> RobotStatus | None:
         try:
-            return from_json(kind, data)
-        except ConfigError:
+            return decode(RobotStatus, data)
+        except MessageError:
             self.malformed += 1
             return None

@@ -38,7 +38,9 @@ from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_
 from edge.drivers.world_sensor import WorldSensor
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.state import flown_s
-from edge.messages.mission import FlightState, RobotStatus, explored_to_bytes, to_json, world_id
+from edge.messages.codec import encode
+from edge.messages.mission import FlightState, RobotStatus, explored_to_bytes, world_id
+from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
 from edge.policy.bundle import Manifest, load_bundle
 from edge.policy.lpac.graphs import Policy
 from edge.policy.verify import verify
@@ -329,7 +331,7 @@ class _Program:
         tick = self._pac.perceive(now_s)
         if now_s >= self._explored_due_s:
             self._explored_due_s = now_s + _EXPLORED_PERIOD_S
-            self._link.publish("explored", explored_to_bytes(self._pac.explored()))
+            self._link.publish(EXPLORED, explored_to_bytes(self._pac.explored()))
         if tick is not None:
             self._recorder.record(
                 "perception",
@@ -345,7 +347,7 @@ class _Program:
         tick = self._pac.infer(time.monotonic(), time.time())
         if tick is None:
             return
-        self._link.publish("message", tick.message)
+        self._link.publish(MESSAGE, tick.message)
         record = {field.name: getattr(tick, field.name) for field in dataclasses.fields(tick)}
         self._recorder.record("policy", time.time(), record)
 
@@ -389,7 +391,7 @@ class _Program:
     def _status_step(self) -> None:
         now_s, unix_now_s = time.monotonic(), time.time()
         status = self._status(now_s, unix_now_s)
-        self._link.publish("status", to_json(status))
+        self._link.publish(STATUS, encode(status))
         vehicle = self._autopilot.state()
         self._status_text = status_text(
             status,
@@ -482,6 +484,8 @@ class _Program:
             alarms.append("the watchdog has ended: only PX4 notices if this program hangs")
         if not self._recorder.recording:
             alarms.append("the flight log is not written")
+        if self._inbox.ground_refusal:
+            alarms.append(f"the ground is not understood: {self._inbox.ground_refusal}")
         return tuple(alarms)
 
 
@@ -579,16 +583,14 @@ def _open_link(
     on_message: Callable[[str, bytes], None] | None = None,
 ) -> ZenohLink:
     """The radio, with what it hears going into the inbox."""
-    subscriptions: dict[str, Callable[[str, bytes], None]] = {
-        "robot/*/status": lambda key, data: inbox.put_status(
-            key, data, time.monotonic(), time.time()
-        ),
-        "ground/state": lambda _, data: inbox.put_ground(data, time.monotonic(), time.time()),
-        "ground/order": lambda _, data: inbox.put_order(data),
-        "ground/world": lambda _, data: inbox.put_world(data),
+    subscriptions: dict[Topic, Callable[[str, bytes], None]] = {
+        STATUS: lambda key, data: inbox.put_status(key, data, time.monotonic(), time.time()),
+        STATE: lambda _, data: inbox.put_ground(data, time.monotonic(), time.time()),
+        ORDER: lambda _, data: inbox.put_order(data),
+        WORLD: lambda _, data: inbox.put_world(data),
     }
     if on_message is not None:
-        subscriptions["robot/*/message"] = on_message
+        subscriptions[MESSAGE] = on_message
     link = config.link
     return ZenohLink(
         fleet=config.fleet,

@@ -17,10 +17,10 @@ from types import TracebackType
 from typing import NamedTuple, Self
 
 from edge.core.fence import Fence
-from edge.core.schema import ConfigError
 from edge.core.vehicle import PILOTED
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.margins import ErrorBudget
+from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
@@ -33,13 +33,12 @@ from edge.messages.mission import (
     Place,
     RobotStatus,
     SafetyAction,
-    from_json,
     is_over_landing_point,
     is_too_low,
-    to_json,
     waiting_to_land,
     world_id,
 )
+from edge.messages.topics import ORDER, STATE, STATUS, WORLD
 
 PERIOD_S = 0.2
 WORLD_PERIOD_S = 1.0
@@ -98,9 +97,7 @@ class Operator:
             fleet=fleet,
             listen=("tcp/127.0.0.1:0",),
             connect=connect,
-            subscriptions={
-                "robot/*/status": lambda _, data: self._arrived.put((time.monotonic(), data))
-            },
+            subscriptions={STATUS: lambda _, data: self._arrived.put((time.monotonic(), data))},
         )
         self._thread.start()
         return self
@@ -251,8 +248,8 @@ class Operator:
 
     def _take(self, at_s: float, data: bytes) -> None:
         try:
-            status = from_json(RobotStatus, data)
-        except ConfigError as error:
+            status = decode(RobotStatus, data)
+        except MessageError as error:
             self._say(f"a status is malformed: {error}")
             return
         robot = status.robot_id
@@ -287,13 +284,13 @@ class Operator:
         if self.silent:
             return
         if state is not None:
-            self._link.publish("state", to_json(replace(state, unix_time_s=time.time())))
+            self._link.publish(STATE, encode(replace(state, unix_time_s=time.time())))
             lacking = any(s.world_id != state.world_id for s in self.statuses().values())
             if world and lacking and time.monotonic() - self._world_at_s >= WORLD_PERIOD_S:
                 self._world_at_s = time.monotonic()
-                self._link.publish("world", world)
+                self._link.publish(WORLD, world)
         for order in orders:
-            self._link.publish("order", to_json(order))
+            self._link.publish(ORDER, encode(order))
 
 
 # The script

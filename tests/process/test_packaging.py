@@ -31,6 +31,6 @@ def test_a_robot_installs_nothing_that_it_does_not_need() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     names = {re.match(r"[\w-]+", requirement)[0] for requirement in project["dependencies"]}  # type: ignore[index]
     assert names == {
-        "eclipse-zenoh", "geographiclib", "mavsdk", "mcap", "numpy", "onnxruntime",
+        "eclipse-zenoh", "geographiclib", "mavsdk", "mcap", "msgspec", "numpy", "onnxruntime",
         "structlog", "typer",
     }  # fmt: skip

@@ -11,23 +11,22 @@ robot's `Explored`, the last `GroundEvent`s, and then a `FleetSnapshot` at 5 Hz 
 rest as it happens, until the client leaves.
 """
 
-import dataclasses
-import json
 import re
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
+import msgspec
+
 from edge.core.fence import Fence
-from edge.core.schema import ConfigError, from_mapping
 from edge.core.world import MOST_FEATURES, parse_world
+from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import Origin, Place
+from edge.messages.topics import WORLD
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
 
 # With a reserve: 5 Hz is promised.
 SNAPSHOT_PERIOD_S = 0.18
 SUBSCRIBE = b"subscribe\n"
-# What the radio takes at once.
-LARGEST_WORLD = 400_000
 _TRIAL = re.compile(r"[A-Za-z0-9_.-]{0,32}")
 
 T = TypeVar("T")
@@ -65,9 +64,9 @@ class SetWorld:
     def __post_init__(self) -> None:
         if not self.name.isprintable():
             raise ValueError(f"name = {self.name!r}: must be printable")
-        if len(self.text) > LARGEST_WORLD:
+        if len(self.text) > WORLD.limit_bytes:
             raise ValueError(
-                f"{self.name} has {len(self.text)} characters: must be {LARGEST_WORLD} at most"
+                f"{self.name} has {len(self.text)} characters: must be {WORLD.limit_bytes} at most"
             )
         features = parse_world(self.text, self.name)
         if len(features) > MOST_FEATURES:
@@ -231,28 +230,30 @@ _ANSWERS: dict[str, type[ServerMessage]] = {
 _NAMES = {kind: name for name, kind in (*_REQUESTS.items(), *_ANSWERS.items())}
 
 
+_kinds_and_fields = msgspec.json.Decoder(dict[str, msgspec.Raw])
+
+
 def to_line(message: Request | ServerMessage) -> bytes:
     """The message as one line of JSON."""
-    mapping = {_NAMES[type(message)]: dataclasses.asdict(message)}
-    return json.dumps(mapping, separators=(",", ":")).encode() + b"\n"
+    return encode({_NAMES[type(message)]: message}) + b"\n"
 
 
 def request_from_line(line: bytes) -> Request:
-    """Raises ConfigError that says what is wrong with it."""
+    """Raises MessageError that says what is wrong with it."""
     return _from_line(_REQUESTS, line)
 
 
 def server_message_from_line(line: bytes) -> ServerMessage:
-    """Raises ConfigError that says what is wrong with it."""
+    """Raises MessageError that says what is wrong with it."""
     return _from_line(_ANSWERS, line)
 
 
 def _from_line(kinds: dict[str, type[T]], line: bytes) -> T:
     try:
-        mapping = json.loads(line)
-    except (ValueError, RecursionError):
-        raise ConfigError("ground: not JSON") from None
-    if not isinstance(mapping, dict) or len(mapping) != 1 or not kinds.keys() >= mapping.keys():
-        raise ConfigError(f"ground: one of {', '.join(kinds)} is expected")
+        mapping = _kinds_and_fields.decode(line)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise MessageError(f"ground: {error}") from None
+    if len(mapping) != 1 or not kinds.keys() >= mapping.keys():
+        raise MessageError(f"ground: one of {', '.join(kinds)} is expected")
     ((name, fields),) = mapping.items()
-    return from_mapping(kinds[name], fields, name)
+    return decode(kinds[name], fields)

@@ -14,15 +14,15 @@ from contextlib import suppress
 from pathlib import Path
 
 from edge.core.perception import EXPLORED_CELLS
-from edge.core.schema import ConfigError
 from edge.drivers.zenoh_link import ZenohLink
-from edge.messages.mission import GroundState, RobotStatus, from_json, to_json
+from edge.messages.codec import MessageError, decode, encode
+from edge.messages.mission import GroundState, RobotStatus
+from edge.messages.topics import EXPLORED, ORDER, STATE, STATUS, WORLD
 from lpac.analysis.snapshot import Explored, GroundEvent
 from lpac.ground.station.client import MAX_LINE, GroundError, socket_path
 from lpac.ground.station.commands import DEFECT, Commands
 from lpac.ground.station.config import GroundConfig
 from lpac.ground.station.protocol import (
-    LARGEST_WORLD,
     SNAPSHOT_PERIOD_S,
     SUBSCRIBE,
     CommandProgress,
@@ -36,8 +36,6 @@ from lpac.ground.station.station import NameTakenError, Station, is_down
 _WORLD_PERIOD_S = 0.5
 # A client takes it from this that its ground does not hang.
 _WORD_PERIOD_S = 1.0
-# As robots do: what is longer would hold up everything else.
-_LONGEST_MESSAGE_BYTES = 65_536
 # A client that does not read misses pictures, and in the end is left alone.
 _LATE_BYTES = 1 << 20
 _LOST_BYTES = 1 << 25
@@ -101,10 +99,10 @@ class GroundProcess:
             fleet=fleet,
             connect=self._config.connect,
             subscriptions={
-                "robot/*/status": received,
-                "robot/*/explored": received,
-                "ground/state": received,
-                "ground/world": received,
+                STATUS: received,
+                EXPLORED: received,
+                STATE: received,
+                WORLD: received,
             },
         ) as self._link:
             server = await asyncio.start_unix_server(self._serve, self._socket_path, limit=MAX_LINE)
@@ -150,17 +148,14 @@ class GroundProcess:
                 self._explored[name] = data
                 self._send(_explored(name, data))
             return
-        if len(data) > (LARGEST_WORLD if topic == "world" else _LONGEST_MESSAGE_BYTES):
-            self._complain(f"long {key}", name or "", f"{topic} of {len(data)} bytes: not read")
-            return
         try:
             if topic == "state":
-                self._station.hear_state(_state(data))
+                self._station.hear_state(decode(GroundState, data))
             elif topic == "world":
                 self._station.hear_world(data.decode(errors="replace"))
             else:
-                self._station.hear_status(from_json(RobotStatus, data))
-        except ConfigError as error:
+                self._station.hear_status(decode(RobotStatus, data))
+        except MessageError as error:
             # Another version of the program, say.
             self._complain(key, name or "", f"{topic} is not understood: {error}")
             return
@@ -214,13 +209,13 @@ class GroundProcess:
         orders = self._station.published_orders()
         self._published = (None if state is None else state.sequence, len(orders))
         if state is not None:
-            link.publish("state", to_json(state))
+            link.publish(STATE, encode(state))
         for order in orders:
-            link.publish("order", to_json(order))
+            link.publish(ORDER, encode(order))
         world = self._station.published_world()
         if world is not None and now_s - self._world_at_s >= _WORLD_PERIOD_S:
             self._world_at_s = now_s
-            link.publish("world", world.encode())
+            link.publish(WORLD, world.encode())
 
     def _step(self) -> None:
         """Let commands go on, and tell what is new."""
@@ -256,14 +251,14 @@ class GroundProcess:
         self._kept = state
         new = self._state_path.with_suffix(".state-new")
         with suppress(OSError):  # Only the next one misses it.
-            new.write_bytes(to_json(state))
+            new.write_bytes(encode(state))
             new.replace(self._state_path)
 
     def _recall(self) -> None:
         with suppress(OSError, UnicodeDecodeError):
             self._station.remember_world(self._world_path.read_text("utf-8-sig"))
-        with suppress(OSError, ConfigError):
-            self._station.remember(_state(self._state_path.read_bytes()))
+        with suppress(OSError, MessageError):
+            self._station.remember(decode(GroundState, self._state_path.read_bytes()))
 
     # Clients
 
@@ -303,7 +298,7 @@ class GroundProcess:
     ) -> None:
         try:
             request = request_from_line(line)
-        except ConfigError as error:
+        except MessageError as error:
             writer.write(to_line(CommandReport(problem=str(error))))
             return
         self._station.set_time(time.monotonic(), time.time())
@@ -337,15 +332,6 @@ class GroundProcess:
                     return
         finally:
             left.cancel()
-
-
-def _state(data: bytes) -> GroundState:
-    """Raises ConfigError."""
-    state = from_json(GroundState, data)
-    for robot in (*state.robot_enabled, *state.robot_safety_actions, *state.places):
-        if not (robot.isascii() and robot.isdigit()):
-            raise ConfigError(f"GroundState: {robot!r} is no robot's id")
-    return state
 
 
 def _explored(name: str, cells: bytes) -> Explored:

@@ -17,6 +17,7 @@ import pytest
 import zenoh
 
 from edge.drivers.zenoh_link import LinkError, ZenohLink
+from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
 from lpac.sim.ports import free_ports
 from tests.conftest import ROOT
 
@@ -26,12 +27,13 @@ ROBOTS = """
 import json, select, sys
 from contextlib import ExitStack
 from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.topics import MESSAGE
 
 class Robot:
     def __init__(self, stack, settings):
         self.heard = {}
         self.link = stack.enter_context(
-            ZenohLink(fleet="test", subscriptions={"robot/*/message": self.receive}, **settings)
+            ZenohLink(fleet="test", subscriptions={MESSAGE: self.receive}, **settings)
         )
 
     def receive(self, key, data):
@@ -47,7 +49,7 @@ with ExitStack() as stack:
     print("open", flush=True)
     while True:
         for robot in robots:
-            robot.link.publish("message", json.dumps(robot.seen()).encode().ljust(6000))
+            robot.link.publish(MESSAGE, json.dumps(robot.seen()).encode().ljust(6000))
         if select.select([sys.stdin], [], [], 0.05)[0]:
             if not sys.stdin.readline():
                 break
@@ -61,10 +63,14 @@ class Inbox:
     def __init__(self) -> None:
         self.newest: dict[str, bytes] = {}
         self.count = 0
+        # Of what is explored.
+        self.largest = 0
 
     def __call__(self, key: str, data: bytes) -> None:
         self.newest[key] = data
         self.count += 1
+        if key.endswith("explored"):
+            self.largest = max(self.largest, len(data))
 
     def from_robot(self, robot_id: int) -> dict[str, Any]:
         seen: dict[str, Any] = json.loads(self.newest.get(f"robot/{robot_id}/message", b"{}"))
@@ -91,7 +97,9 @@ def has_peers(link: ZenohLink, count: int) -> bool:
     return link.peers() == count
 
 
-def eventually_hears(sender: ZenohLink, topic: str, data: bytes, key: str, *inboxes: Inbox) -> None:
+def eventually_hears(
+    sender: ZenohLink, topic: Topic, data: bytes, key: str, *inboxes: Inbox
+) -> None:
     def heard() -> bool:
         sender.publish(topic, data)
         return all(inbox.newest.get(key) == data for inbox in inboxes)
@@ -154,7 +162,7 @@ def fleet_of(count: int, **settings: Any) -> Iterator[tuple[list[ZenohLink], lis
                     robot_id=robot_id,
                     listen=[known if robot_id == 0 else endpoint()],
                     connect=[] if robot_id == 0 else [known],
-                    subscriptions={"robot/*/message": inbox},
+                    subscriptions={MESSAGE: inbox},
                     **settings,
                 )
             )
@@ -168,7 +176,7 @@ def test_robots_that_know_one_peer_hear_all_others_and_not_themselves() -> None:
         for sender, link in enumerate(links):
             others = [inbox for receiver, inbox in enumerate(inboxes) if receiver != sender]
             data = bytes([sender]) * 20_000
-            eventually_hears(link, "message", data, f"robot/{sender}/message", *others)
+            eventually_hears(link, MESSAGE, data, f"robot/{sender}/message", *others)
         for robot_id, (link, inbox) in enumerate(zip(links, inboxes, strict=True)):
             others_ids = {0, 1, 2} - {robot_id}
             assert set(inbox.newest) == {f"robot/{other}/message" for other in others_ids}
@@ -183,15 +191,16 @@ def test_the_ground_speaks_to_all_robots_and_is_none() -> None:
     known, commands, statuses = endpoint(), Inbox(), Inbox()
     with (
         ZenohLink(
-            fleet="test", robot_id=7, listen=[known], subscriptions={"ground/*": commands}
+            fleet="test",
+            robot_id=7,
+            listen=[known],
+            subscriptions=dict.fromkeys((STATE, ORDER, WORLD), commands),
         ) as robot,
-        ZenohLink(
-            fleet="test", connect=[known], subscriptions={"robot/*/status": statuses}
-        ) as ground,
+        ZenohLink(fleet="test", connect=[known], subscriptions={STATUS: statuses}) as ground,
     ):
-        for topic in ("state", "order"):
-            eventually_hears(ground, topic, topic.encode(), f"ground/{topic}", commands)
-        eventually_hears(robot, "status", b"fine", "robot/7/status", statuses)
+        for topic in (STATE, ORDER):
+            eventually_hears(ground, topic, topic.name.encode(), topic.pattern, commands)
+        eventually_hears(robot, STATUS, b"fine", "robot/7/status", statuses)
         eventually(lambda: ground.present() == {7})
         assert robot.present() == frozenset()
 
@@ -212,17 +221,17 @@ def test_clients_meet_at_the_router_and_find_it_again() -> None:
                 robot_id=2,
                 mode="client",
                 connect=[at],
-                subscriptions={"robot/*/message": heard},
+                subscriptions={MESSAGE: heard},
             ) as second,
         ):
-            eventually_hears(first, "message", b"before", "robot/1/message", heard)
+            eventually_hears(first, MESSAGE, b"before", "robot/1/message", heard)
             eventually(lambda: first.present() == {2} and second.present() == {1})
             eventually(lambda: first.peers() == 1)
             router.close()  # type: ignore[no-untyped-call]
             eventually(lambda: not first.present() and not second.present())
             router = zenoh.open(config)
             eventually(lambda: first.present() == {2} and second.present() == {1})
-            eventually_hears(first, "message", b"after", "robot/1/message", heard)
+            eventually_hears(first, MESSAGE, b"after", "robot/1/message", heard)
     finally:
         router.close()  # type: ignore[no-untyped-call]
 
@@ -236,12 +245,10 @@ def test_scouting_finds_the_others() -> None:
     fleet, heard = f"test-{time.time_ns()}", Inbox()
     with (
         ZenohLink(fleet=fleet, robot_id=1, scouting=True) as first,
-        ZenohLink(
-            fleet=fleet, robot_id=2, scouting=True, subscriptions={"robot/*/message": heard}
-        ) as second,
+        ZenohLink(fleet=fleet, robot_id=2, scouting=True, subscriptions={MESSAGE: heard}) as second,
     ):
         eventually(lambda: first.present() == {2} and second.present() == {1})
-        eventually_hears(first, "message", b"hello", "robot/1/message", heard)
+        eventually_hears(first, MESSAGE, b"hello", "robot/1/message", heard)
 
 
 def test_peers_start_in_any_order() -> None:
@@ -262,10 +269,10 @@ def test_neighbours_join_leave_and_come_back() -> None:
                     fleet="test",
                     robot_id=11,
                     connect=[known],
-                    subscriptions={"robot/*/message": inboxes[0]},
+                    subscriptions={MESSAGE: inboxes[0]},
                 ):
                     eventually(lambda: first.present() == {11})
-                    eventually_hears(first, "message", sequence, "robot/10/message", inboxes[0])
+                    eventually_hears(first, MESSAGE, sequence, "robot/10/message", inboxes[0])
                 eventually(lambda: first.present() == frozenset())
 
 
@@ -274,7 +281,7 @@ def test_a_killed_neighbour_leaves_and_its_successor_is_heard() -> None:
         known = endpoint()
         everybody = Inbox()
         with ZenohLink(
-            fleet="test", robot_id=5, listen=[known], subscriptions={"robot/*/message": everybody}
+            fleet="test", robot_id=5, listen=[known], subscriptions={MESSAGE: everybody}
         ) as link:
             for _ in range(2):
                 with Robots({"robot_id": 6, "connect": [known]}).open() as robots:
@@ -283,20 +290,18 @@ def test_a_killed_neighbour_leaves_and_its_successor_is_heard() -> None:
                     eventually(lambda: everybody.from_robot(6))
                     robots.process.kill()
                     eventually(lambda: link.present() == frozenset())
-        eventually_hears(links[0], "message", b"still here", "robot/0/message", inboxes[1])
+        eventually_hears(links[0], MESSAGE, b"still here", "robot/0/message", inboxes[1])
 
 
 def test_messages_flow_again_with_a_process_that_was_stopped() -> None:
     known, inbox = endpoint(), Inbox()
     with (
-        ZenohLink(
-            fleet="test", robot_id=1, listen=[known], subscriptions={"robot/*/message": inbox}
-        ) as link,
+        ZenohLink(fleet="test", robot_id=1, listen=[known], subscriptions={MESSAGE: inbox}) as link,
         Robots({"robot_id": 2, "connect": [known]}).open() as robots,
     ):
 
         def heard_back() -> int:
-            link.publish("message", bytes(20_000))
+            link.publish(MESSAGE, bytes(20_000))
             count: int = inbox.from_robot(2).get("heard", {}).get("1", 0)
             return count
 
@@ -339,31 +344,29 @@ def test_a_callback_that_raises_stops_nothing() -> None:
 
     with (
         ZenohLink(
-            fleet="test", robot_id=1, listen=[known], subscriptions={"robot/*/message": broken}
+            fleet="test", robot_id=1, listen=[known], subscriptions={MESSAGE: broken}
         ) as link,
         ZenohLink(fleet="test", robot_id=2, connect=[known]) as sender,
     ):
         for data in (b"one", b"two"):
-            eventually_hears(sender, "message", data, "robot/2/message", inbox)
+            eventually_hears(sender, MESSAGE, data, "robot/2/message", inbox)
         eventually(lambda: link.failures() == inbox.count >= 2)
 
 
 def test_another_fleet_hears_nothing() -> None:
     known, inbox, stranger_inbox = endpoint(), Inbox(), Inbox()
     with (
-        ZenohLink(
-            fleet="ours", robot_id=1, listen=[known], subscriptions={"robot/*/message": inbox}
-        ) as link,
+        ZenohLink(fleet="ours", robot_id=1, listen=[known], subscriptions={MESSAGE: inbox}) as link,
         ZenohLink(fleet="ours", robot_id=2, connect=[known]) as sender,
         ZenohLink(
             fleet="theirs",
             robot_id=3,
             connect=[known],
-            subscriptions={"robot/*/message": stranger_inbox},
+            subscriptions={MESSAGE: stranger_inbox},
         ) as stranger,
     ):
         eventually(lambda: stranger.peers() == 2)
-        eventually_hears(sender, "message", b"ours", "robot/2/message", inbox)
+        eventually_hears(sender, MESSAGE, b"ours", "robot/2/message", inbox)
         eventually(lambda: link.present() == {2})
         assert stranger.present() == frozenset()
         assert stranger_inbox.count == 0
@@ -402,30 +405,34 @@ def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:
     with (
         ZenohLink(
             fleet="test", robot_id=1, listen=[known],
-            subscriptions={"ground/world": of_robot, "ground/state": of_robot},
+            subscriptions={WORLD: of_robot, STATE: of_robot},
         ) as robot,
         ZenohLink(fleet="test", connect=[known], subscriptions={
-            "ground/state": of_first, "robot/*/explored": of_first,
+            STATE: of_first, EXPLORED: of_first,
         }) as first,
         ZenohLink(
-            fleet="test", connect=[known], subscriptions={"ground/state": of_second}
+            fleet="test", connect=[known], subscriptions={STATE: of_second}
         ) as second,
     ):  # fmt: skip
         eventually(lambda: robot.peers() == 2 and first.present() == second.present() == {1})
-        eventually_hears(first, "state", b"first", "ground/state", of_robot, of_second)
-        eventually_hears(second, "state", b"second", "ground/state", of_robot, of_first)
+        eventually_hears(first, STATE, b"first", "ground/state", of_robot, of_second)
+        eventually_hears(second, STATE, b"second", "ground/state", of_robot, of_first)
         assert of_second.newest["ground/state"] == b"first"
-        eventually_hears(first, "world", world, "ground/world", of_robot)
-        eventually_hears(robot, "explored", b"cells", "robot/1/explored", of_first)
+        eventually_hears(first, WORLD, world, "ground/world", of_robot)
+        eventually_hears(robot, EXPLORED, b"cells", "robot/1/explored", of_first)
         with pytest.raises(KeyError):
-            robot.publish("world", world)
+            robot.publish(WORLD, world)
+        # What is larger than its topic allows is not even handed on.
+        robot.publish(EXPLORED, bytes(EXPLORED.limit_bytes + 1))
+        eventually_hears(robot, EXPLORED, b"more cells", "robot/1/explored", of_first)
+        assert of_first.largest <= EXPLORED.limit_bytes
 
 
 def test_close_twice_then_publish() -> None:
     link = ZenohLink(fleet="test", robot_id=1)
     link.close()
     link.close()
-    link.publish("message", b"late")
+    link.publish(MESSAGE, b"late")
     assert link.peers() == 0
     assert link.present() == frozenset()
 

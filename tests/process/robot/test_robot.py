@@ -23,6 +23,7 @@ from edge.drivers.flight_log import read as read_log
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.failsafe import PARAMETERS
 from edge.messages.mission import FlightState, Place, explored_from_bytes, world_id
+from edge.messages.topics import EXPLORED
 from edge.policy.bundle import Bundle, make_bundle, write_bundle
 from lpac.sim.operator import Operator
 from lpac.sim.px4.modes import Px4Mode
@@ -214,7 +215,7 @@ def listening(made: Rig, explored: list[int]) -> Iterator[None]:
 
     with ZenohLink(
         fleet=made.config.fleet, listen=("tcp/127.0.0.1:0",), connect=made.config.link.listen,
-        subscriptions={"robot/3/explored": count},
+        subscriptions={EXPLORED: count},
     ):  # fmt: skip
         yield
 

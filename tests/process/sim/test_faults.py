@@ -20,8 +20,10 @@ import numpy as np
 import pytest
 import zenoh
 
-from edge.core.wire import Rejection, decode, encode
-from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus, to_json
+from edge.core import wire
+from edge.core.wire import Rejection
+from edge.messages.codec import encode
+from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus
 from lpac.sim.fleet.processes import ERRORS, ORIGIN, WORLD, Fleet, FleetScenario
 from lpac.sim.operator import Statuses
 from lpac.sim.px4.modes import Px4Mode
@@ -234,7 +236,7 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
                     expires_at_uptime_s=status.uptime_s + ORDER_LIFETIME_S / 2.0,
                     operator=status.operator,
                 )
-                session.put(f"lpac/{grounded.fleet.name}/ground/order", to_json(order))
+                session.put(f"lpac/{grounded.fleet.name}/ground/order", encode(order))
             return all(
                 any(
                     answer.order_id == f"for {status.boot_nonce}"
@@ -317,7 +319,7 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
         key = f"lpac/{rig.fleet.name}/robot/{robot}/message"
         with session.declare_subscriber(key) as subscriber:
             genuine = subscriber.recv().payload.to_bytes()
-        message = decode(
+        message = wire.decode(
             genuine,
             bundle_id=bytes.fromhex(bundle.id),
             frame_id=None,
@@ -329,7 +331,7 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
             Rejection.MAGIC: bytes(len(genuine)),
             Rejection.TRUNCATED: genuine[:-1],
             Rejection.CHECKSUM: genuine[:-1] + bytes([genuine[-1] ^ 1]),
-            Rejection.OTHER_BUNDLE: encode(message, bytes(32), "float16"),
+            Rejection.OTHER_BUNDLE: wire.encode(message, bytes(32), "float16"),
             Rejection.OUTDATED: genuine,
         }
         before = {other: rig.status(other).message_counts for other in rig.flying}

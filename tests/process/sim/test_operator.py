@@ -11,6 +11,7 @@ import pytest
 
 from edge.core.fence import Fence
 from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.codec import decode, encode
 from edge.messages.mission import (
     FlightState,
     GroundState,
@@ -19,15 +20,14 @@ from edge.messages.mission import (
     Origin,
     Place,
     RobotStatus,
-    from_json,
-    to_json,
     world_id,
 )
+from edge.messages.topics import ORDER, STATE, STATUS, WORLD
 from lpac.sim.operator import Operator, OperatorScript, OperatorScriptError
 from lpac.sim.ports import free_ports
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
-STATUS = RobotStatus(
+SAID = RobotStatus(
     robot_id=0, boot_nonce=7, sequence=0, uptime_s=100.0, unix_time_s=0.0, state=FlightState.HOLD,
     reason="", ready=False, failed_checks=(), alarms=(), obeyed_sequence=0, operator="", orders=(),
     bundle_id="", world_id="", trial="", origin=None, system_id=1, slot_height_m=4.0,
@@ -45,18 +45,18 @@ class Talker:
         self.states: list[GroundState] = []
         self.orders: list[Order] = []
         self.worlds: list[str] = []
-        self.status = dataclasses.replace(STATUS, robot_id=robot)
+        self.status = dataclasses.replace(SAID, robot_id=robot)
         self.link = ZenohLink(
             fleet="test", robot_id=robot, listen=(endpoint,),
             subscriptions={
-                "ground/state": self._on_state, "ground/order": self._on_order,
-                "ground/world": self._on_world,
+                STATE: self._on_state, ORDER: self._on_order,
+                WORLD: self._on_world,
             },
         )  # fmt: skip
 
     def say(self, **changes: object) -> None:
         self.status = dataclasses.replace(self.status, **changes)  # type: ignore[arg-type]
-        self.link.publish("status", to_json(self.status))
+        self.link.publish(STATUS, encode(self.status))
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
         with self._changed:
@@ -64,7 +64,7 @@ class Talker:
 
     def _on_state(self, _: str, data: bytes) -> None:
         with self._changed:
-            self.states.append(from_json(GroundState, data))
+            self.states.append(decode(GroundState, data))
             self._changed.notify_all()
 
     def _on_world(self, _: str, data: bytes) -> None:
@@ -74,7 +74,7 @@ class Talker:
 
     def _on_order(self, _: str, data: bytes) -> None:
         with self._changed:
-            self.orders.append(from_json(Order, data))
+            self.orders.append(decode(Order, data))
             self._changed.notify_all()
 
 

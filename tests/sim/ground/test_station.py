@@ -802,7 +802,7 @@ def test_places_that_are_none_end_nothing() -> None:
     field.leave("alice")
     robot = field.robots[0]
     robot.silent = True
-    for height_m in (-1e300, 1e9, 1e300):
+    for height_m in (-1e6, 1e5, 1e6):
         again = field.join("alice")
         for _ in range(30):
             field.step()

@@ -28,6 +28,7 @@ from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
 from edge.flight.preflight import HeardStatus
+from edge.messages.codec import encode
 from edge.messages.mission import (
     FlightState,
     GroundState,
@@ -37,7 +38,6 @@ from edge.messages.mission import (
     Origin,
     Place,
     RobotStatus,
-    to_json,
 )
 from edge.policy.lpac.graphs import Policy
 from edge.robot.config import load_config
@@ -189,7 +189,7 @@ class Flown:
 
     def tick(self) -> None:
         """One tenth of a second of everything."""
-        self.inbox.put_ground(to_json(self.ground), self.now_s, self.now_s)
+        self.inbox.put_ground(encode(self.ground), self.now_s, self.now_s)
         self.look()
         perceived = self.pac.perceive(self.now_s)
         self.images = None if perceived is None else perceived.images.copy()
@@ -215,7 +215,7 @@ class Flown:
             order_id=str(self._orders), robot_id=3, boot_nonce=11, kind=kind,
             expires_at_uptime_s=self.now_s + 9.0, operator="test", trial=trial,
         )  # fmt: skip
-        self.inbox.put_order(to_json(order))
+        self.inbox.put_order(encode(order))
         self.tick()
         return self.control.flight.answers[-1]
 

@@ -138,6 +138,7 @@ class World:
         self.busy: tuple[int, ...] = ()
         self.failed_checks: tuple[str, ...] | None = ()
         self.not_taken: tuple[str, ...] = ()
+        self.safety_form: SafetyAction = "none"
         self.order: Order | None = None
         self.orders = 0
         # The program, and what it did.
@@ -378,6 +379,7 @@ class World:
             busy_neighbours=self.busy,
             ground=self.ground,
             ground_age_s=self.now_s - self.ground_at_s,
+            safety_form=self.safety_form,
             failed_checks=self.failed_checks,
             not_taken=self.not_taken,
             order=self.order,

@@ -65,6 +65,7 @@ def inputs(
         busy_neighbours=(),
         ground=None,
         ground_age_s=0.0,
+        safety_form="none",
         failed_checks=(),
         not_taken=(),
         order=None,

@@ -251,7 +251,7 @@ def test_fence_distance_of_a_square() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"vertices_m": [[0, 0], [1, 0]]}, "vertices_m has 2 vertices: must be 3 or more"),
+        ({"vertices_m": [[0, 0], [1, 0]]}, "vertices_m has 2 vertices: must be 3 to 100"),
         ({"vertices_m": [[0, 0], [9, 0], [9]]}, r"vertices_m has \[9.0\]"),
         ({"vertices_m": [[0, 0], [9, 0], [9, math.nan]]}, r"vertices_m has \[9.0, nan\]"),
         ({"vertices_m": [[0, 0], [9, 9], [18, 18]]}, "convex"),

@@ -1,13 +1,15 @@
 """What came by radio: the newest counts, what is broken is counted, nothing raises."""
 
 import dataclasses
+import json
 import math
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.messages.mission import GroundState, Order, Origin, to_json
+from edge.messages.codec import encode
+from edge.messages.mission import GroundState, Order, Origin
 from edge.robot.inbox import Inbox
 
 STATE = GroundState(sequence=5, operator="anna", origin=Origin(40.0, -75.0, 30.0), enabled=True)
@@ -26,28 +28,28 @@ def test_nothing_heard_is_infinitely_old() -> None:
 
 def test_the_ground_state_ages_until_the_next_comes() -> None:
     inbox = make_inbox()
-    inbox.put_ground(to_json(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), 1.0, 1e9)
     assert inbox.ground(1.5) == (STATE, 0.5)
     assert inbox.ground(3.0) == (STATE, 2.0)
-    inbox.put_ground(to_json(STATE), 3.0, 1e9)
+    inbox.put_ground(encode(STATE), 3.0, 1e9)
     assert inbox.ground(3.0) == (STATE, 0.0)
 
 
 def test_an_older_state_that_arrives_late_does_not_count() -> None:
     inbox = make_inbox()
-    inbox.put_ground(to_json(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), 1.0, 1e9)
     assert inbox.ground(1.0)[0] == STATE
     older = dataclasses.replace(STATE, sequence=4, safety_action="land")
-    inbox.put_ground(to_json(older), 1.5, 1e9)
+    inbox.put_ground(encode(older), 1.5, 1e9)
     assert inbox.ground(1.5) == (STATE, 0.5)
 
 
 def test_a_ground_that_starts_anew_is_heard_once_the_old_one_is_lost() -> None:
     inbox = make_inbox()
-    inbox.put_ground(to_json(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), 1.0, 1e9)
     inbox.ground(1.0)
     anew = GroundState(sequence=0, operator="ben")
-    inbox.put_ground(to_json(anew), 5.0, 1e9)
+    inbox.put_ground(encode(anew), 5.0, 1e9)
     assert inbox.ground(5.0) == (anew, 0.0)
 
 
@@ -56,7 +58,7 @@ def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_count
 
     def hear(now_s: float, *states: GroundState) -> tuple[GroundState | None, float]:
         for state in states:
-            inbox.put_ground(to_json(state), now_s, 1e9)
+            inbox.put_ground(encode(state), now_s, 1e9)
         return inbox.ground(now_s)
 
     ben, cleo = (dataclasses.replace(STATE, operator=name) for name in ("ben", "cleo"))
@@ -76,7 +78,7 @@ def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_count
 def test_orders_for_others_are_passed_over() -> None:
     inbox = make_inbox()
     for robot_id in (1, 3, 2):
-        inbox.put_order(to_json(dataclasses.replace(ORDER, robot_id=robot_id)))
+        inbox.put_order(encode(dataclasses.replace(ORDER, robot_id=robot_id)))
     assert inbox.order() == ORDER
     assert inbox.order() is None
 
@@ -84,7 +86,7 @@ def test_orders_for_others_are_passed_over() -> None:
 @given(st.binary() | st.text().map(str.encode) | st.just(b"[" * 100_000) | st.just(b"{}"))
 def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     inbox = make_inbox()
-    inbox.put_ground(to_json(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), 1.0, 1e9)
     assert inbox.ground(1.0)[0] == STATE
     inbox.put_ground(data, 2.0, 1e9)
     inbox.put_order(data)
@@ -95,15 +97,45 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     assert inbox.malformed == 3
 
 
-def test_what_is_far_too_long_is_not_even_decoded() -> None:
+def newer(message: GroundState | Order, **changes: object) -> bytes:
+    """As a later version says it, which has something that must be understood."""
+    told = json.loads(encode(message))
+    return json.dumps(told | {"version": 9, "must_understand": ["new"]} | changes).encode()
+
+
+def test_a_state_that_is_not_understood_holds_and_lands_and_ages_the_last_one() -> None:
     inbox = make_inbox()
-    long = b"[" + 100_000 * b"1," + b"1]"
-    inbox.put_ground(long, 1.0, 1e9)
-    inbox.put_order(long)
-    inbox.put_status("robot/4/status", long, 1.0, 1e9)
-    inbox.put_world(20 * long)
-    assert inbox.malformed == 4
-    assert inbox.ground(1.0) == (None, math.inf)
+    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    for now_s, action, form in ((1.5, "none", "none"), (2.0, "hold", "hold"),
+                                (3.0, "return", "none"), (4.5, "land", "land")):  # fmt: skip
+        inbox.put_ground(newer(STATE, sequence=6, safety_action=action), now_s, 1e9)
+        # The last one that was understood stays, and ground lost counts on.
+        assert inbox.ground(now_s) == (STATE, now_s - 1.0)
+        assert inbox.safety_form(now_s) == form
+        assert "new: this program is too old to know" in inbox.ground_refusal
+    assert inbox.safety_form(7.6) == "none"
+    inbox.put_ground(newer(STATE, robot_safety_actions={"3": "hold", "4": "land"}), 8.0, 1e9)
+    inbox.ground(8.0)
+    assert inbox.safety_form(8.0) == "hold"
+    again = dataclasses.replace(STATE, sequence=7)
+    inbox.put_ground(encode(again), 8.5, 1e9)
+    assert inbox.ground(8.5) == (again, 0.0)
+    assert (inbox.safety_form(8.5), inbox.ground_refusal) == ("none", "")
+
+
+def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
+    inbox = make_inbox()
+    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.ground(1.0)
+    inbox.put_ground(newer(STATE, sequence=4, safety_action="land"), 1.5, 1e9)
+    inbox.ground(1.5)
+    assert inbox.safety_form(1.5) == "none"
+
+
+def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
+    inbox = make_inbox()
+    inbox.put_order(newer(ORDER))
     assert inbox.order() is None
-    assert inbox.peers(1.0) == ()
-    assert inbox.world is None
+    inbox.put_order(newer(ORDER, kind="kill"))
+    kill = inbox.order()
+    assert kill is not None and (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)

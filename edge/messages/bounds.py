@@ -1,0 +1,65 @@
+"""What numbers, texts and lists in a message may be: decoding refuses everything else.
+
+The bounds are far outside of what a fleet needs, and inside of what costs or breaks anything.
+"""
+
+import math
+import typing
+from typing import Annotated, Any, NamedTuple
+
+from msgspec import Meta
+
+from edge.core.wire import MAX_ROBOT_ID
+
+MOST_ROBOTS = 1000
+MOST_TEXTS = 100
+MOST_LETTERS = 1000
+
+
+RobotId = Annotated[int, Meta(ge=0, le=MAX_ROBOT_ID)]
+# JSON's keys are texts.
+RobotKey = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
+Nonce = Annotated[int, Meta(ge=0, lt=2**48)]
+Sequence = Annotated[int, Meta(ge=-1, le=2**48)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]
+SystemId = Annotated[int, Meta(ge=0, le=255)]
+Name = Annotated[str, Meta(max_length=128)]
+Text = Annotated[str, Meta(max_length=MOST_LETTERS)]
+Metres = Annotated[float, Meta(ge=-1e6, le=1e6)]
+MetresPerSecond = Annotated[float, Meta(ge=-1e4, le=1e4)]
+Radians = Annotated[float, Meta(ge=-100.0, le=100.0)]
+Degrees = Annotated[float, Meta(ge=-720.0, le=720.0)]
+Seconds = Annotated[float, Meta(ge=-1e9, le=1e9)]
+UnixSeconds = Annotated[float, Meta(ge=0.0, le=1e11)]
+Milliseconds = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Share = Annotated[float, Meta(ge=-0.01, le=10.0)]
+Precision = Annotated[float, Meta(ge=0.0, le=1e4)]
+
+
+class Bound(NamedTuple):
+    """A number, or each of a list's, is from `least` to `greatest`."""
+
+    least: float
+    greatest: float
+
+    def holds(self, value: float) -> bool:
+        """Whether it is; NaN is not."""
+        return self.least <= value <= self.greatest
+
+
+def bounds_of(cls: type[Any]) -> dict[str, Bound]:
+    """The bounds of a message's numeric fields, and of its lists of numbers, by name."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    found = {name: _bound(hint) for name, hint in hints.items()}
+    return {name: bound for name, bound in found.items() if bound is not None}
+
+
+def _bound(hint: Any) -> Bound | None:
+    if typing.get_origin(hint) is dict:
+        return None
+    for meta in getattr(hint, "__metadata__", ()):
+        if isinstance(meta, Meta) and (meta.ge is not None or meta.le is not None):
+            least = -math.inf if meta.ge is None else float(meta.ge)
+            return Bound(least, math.inf if meta.le is None else float(meta.le))
+    inner = (_bound(argument) for argument in typing.get_args(hint) if argument is not Ellipsis)
+    return next((bound for bound in inner if bound is not None), None)
