@@ -1,5 +1,7 @@
 """The bench of processes runs, at its smallest size; how fast anything is plays no part."""
 
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
@@ -8,7 +10,7 @@ from bench import footprint
 from tests.unit.test_bench import check_frame, kept
 
 
-def test_footprint(tmp_path):
+def test_footprint(tmp_path: Path) -> None:
     result = kept(footprint.measure(runs=1), tmp_path)
     check_frame(result, "footprint", targets=2)
     for kind in (footprint.EDGE, footprint.TORCH):

@@ -1,6 +1,8 @@
 """Every bench runs, at its smallest size; how fast anything is plays no part."""
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -11,21 +13,22 @@ from bench import closed_loop, policy, position, scaling
 from bench.report import Report
 
 
-def kept(report: Report, folder) -> dict:
+def kept(report: Report, folder: Path) -> dict[str, Any]:
     """The report as a reader of its file finds it, after it was shown."""
     report.show(Console(quiet=True))
     report.write(folder)
-    return json.loads((folder / f"{report.name}.json").read_text())
+    result: dict[str, Any] = json.loads((folder / f"{report.name}.json").read_text())
+    return result
 
 
-def check_frame(result: dict, name: str, targets: int) -> None:
+def check_frame(result: dict[str, Any], name: str, targets: int) -> None:
     assert result["bench"] == name
     assert result["machine"]["packages"]["onnxruntime"]
     assert len(result["targets"]) == targets
     assert all(isinstance(target["met"], bool) for target in result["targets"])
 
 
-def test_policy(tmp_path):
+def test_policy(tmp_path: Path) -> None:
     result = kept(policy.measure(rounds=2, round_s=0.001), tmp_path)
     check_frame(result, "policy", targets=4)
     variants = {policy.EDGE, policy.TRACED, policy.EAGER}
@@ -38,13 +41,13 @@ def test_policy(tmp_path):
     assert sum(operator["flop"] for operator in cnn["operators"]) == cnn["flop"] > 30e6
 
 
-def test_scaling(tmp_path):
+def test_scaling(tmp_path: Path) -> None:
     result = kept(scaling.measure([(1, 0.4, 1), (2, 0.4, 1)]), tmp_path)
     check_frame(result, "scaling", targets=1)
     assert [flight["world_size"] for flight in result["figures"].values()] == [162, 229]
 
 
-def test_closed_loop(tmp_path):
+def test_closed_loop(tmp_path: Path) -> None:
     result = kept(closed_loop.measure(worlds=2, duration_s=0.4, draws=1), tmp_path)
     check_frame(result, "closed_loop", targets=2)
     costs = result["figures"]["normalized_cost"]
@@ -52,7 +55,7 @@ def test_closed_loop(tmp_path):
     assert all(len(cost["by_world"]) == 2 for cost in costs.values())
 
 
-def test_position(tmp_path):
+def test_position(tmp_path: Path) -> None:
     result = kept(position.measure(hours=0.02, flight_s=36.0), tmp_path)
     check_frame(result, "position", targets=2)
     assert result["figures"]["flights"] == 2

@@ -147,7 +147,7 @@ def test_a_vehicle_whose_program_is_gone_is_landed_over_ssh(operator: Operator) 
             r2.vehicle.pilot()
         assert land(1)["problem"] == "a pilot flies it (position): he lands it"
         with r2.stepped:
-            assert r2.vehicle.mode is Px4Mode.POSCTL
+            assert (r2.vehicle.mode, r2.vehicle.armed) == (Px4Mode.POSCTL, True)
             r2.vehicle.set_mode(Px4Mode.HOLD)
             assert r2.stepped.wait_for(lambda: r2.vehicle.mode is Px4Mode.HOLD, 60.0)
         both = operator("land", "--robots", "r1,r2")

@@ -102,7 +102,7 @@ def test_a_vehicle_whose_program_is_gone_is_landed(monkeypatch: pytest.MonkeyPat
             vehicle.pilot()
         assert server.wait_for(lambda: vehicle.mode is Px4Mode.POSCTL, 60.0)
         # PX4 tells it within a second.
-        heard = {}
+        heard: dict[str, object] = {}
         while heard.get("mode") != "position":
             heard = service.hear_heartbeat(port) or {}
         refused(r"^a pilot flies it \(position\): he lands it$")

@@ -219,7 +219,8 @@ def beat(system_id: int, custom_mode: int, armed: bool = True, component: int = 
     """A heartbeat of PX4, as a frame."""
     sender = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component)
     base_mode = 0x1D | (0x80 if armed else 0)
-    return sender.heartbeat_encode(2, 12, base_mode, custom_mode, 4).pack(sender)
+    frame: bytes = sender.heartbeat_encode(2, 12, base_mode, custom_mode, 4).pack(sender)
+    return frame
 
 
 HOLD, LAND, OFFBOARD, POSITION = 0x3040000, 0x6040000, 0x60000, 0x30000

@@ -107,11 +107,16 @@ def elf(machine: int) -> bytes:
 OTHER_MACHINE = 62 if platform.machine() != "x86_64" else 183
 
 
+def as_a_file(build: Path) -> None:
+    shutil.rmtree(build)
+    build.touch()
+
+
 @pytest.mark.parametrize(
     ("spoil", "text"),
     [
         (shutil.rmtree, "there is no such folder"),
-        (lambda b: (shutil.rmtree(b), b.touch()), "is no folder: give the folder"),
+        (as_a_file, "is no folder: give the folder"),
         (lambda b: (b / "bin" / "px4").unlink(), "has no program bin/px4: give the folder"),
         (
             lambda b: ((b / "bin" / "px4").unlink(), (b / "ROMFS").mkdir()),

@@ -147,7 +147,7 @@ class Flown:
         config = load_config(path)
         self.vehicle = new_vehicle(COM_OBL_RC_ACT=4)
         self.autopilot = autopilot(self.vehicle)
-        self.records: list[tuple[str, Mapping[str, object]]] = []
+        self.records: list[tuple[str, Mapping[str, Any]]] = []
         self.navigation = Navigation(self.autopilot, lambda: self.now_s, config.position)
         self.inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         world = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
@@ -306,7 +306,7 @@ def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilot
     # Late, but the watchdog has not acted.
     flown.control.look_back(now_s - 0.4, now_s)
     flown.tick()
-    assert flown.state is FlightState.MISSION
+    assert (flown.state, flown.vehicle.mode) == (FlightState.MISSION, Px4Mode.OFFBOARD)
     flown.vehicle.set_mode(Px4Mode.HOLD)
     flown.control.look_back(now_s - 0.5, now_s)
     flown.tick()

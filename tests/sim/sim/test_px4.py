@@ -62,13 +62,17 @@ def in_offboard(setpoint: Px4Setpoint, *, rc: bool = False, **parameters: int) -
     vehicle.offboard(setpoint)
     assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.ACCEPTED
     run(vehicle, 3.0, setpoint)
-    assert vehicle.mode is Px4Mode.OFFBOARD
+    assert mode_of(vehicle) is Px4Mode.OFFBOARD
     vehicle.offboard(setpoint)
     return vehicle
 
 
 def speed_m_s(vehicle: Px4Vehicle) -> float:
     return float(np.linalg.norm(vehicle.velocity_m_s))
+
+
+def mode_of(vehicle: Px4Vehicle) -> Px4Mode:
+    return vehicle.mode
 
 
 def texts(vehicle: Px4Vehicle) -> list[str]:
@@ -159,7 +163,7 @@ def test_take_off_and_landing_take_as_long_as_measured() -> None:
     assert 8.0 <= run_until(vehicle, lambda: not vehicle.armed, 20.0) <= 19.0
     assert vehicle.landed
     run(vehicle, STEP_S)
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
     assert vehicle.arm() is MavResult.ACCEPTED
 
 
@@ -231,9 +235,9 @@ def test_what_a_lost_stream_leads_to(offboard_loss: int, manual_loss: int, then:
     """At once, without the delay that COM_FAIL_ACT_T puts before other failsafes."""
     vehicle = in_offboard(velocity(1.0), COM_OBL_RC_ACT=offboard_loss, NAV_RCL_ACT=manual_loss)
     run(vehicle, 0.98)
-    assert vehicle.mode is Px4Mode.OFFBOARD
+    assert mode_of(vehicle) is Px4Mode.OFFBOARD
     run(vehicle, 0.12)
-    assert vehicle.mode is then
+    assert mode_of(vehicle) is then
     if then is Px4Mode.OFFBOARD:
         assert vehicle.velocity_m_s[0] == pytest.approx(1.0, abs=0.1)
     if then is Px4Mode.RETURN:
@@ -241,28 +245,28 @@ def test_what_a_lost_stream_leads_to(offboard_loss: int, manual_loss: int, then:
         assert vehicle.velocity_m_s[2] < -0.5
     if then is Px4Mode.LAND:
         run_until(vehicle, lambda: not vehicle.armed, 30.0)
-        assert vehicle.mode is Px4Mode.OFFBOARD
+        assert mode_of(vehicle) is Px4Mode.OFFBOARD
         assert vehicle.arm() is MavResult.TEMPORARILY_REJECTED
 
 
 def test_a_lost_stream_gives_the_vehicle_to_a_pilot_who_is_there() -> None:
     vehicle = in_offboard(velocity(1.0), rc=True)
     run(vehicle, 3.0)
-    assert vehicle.mode is Px4Mode.POSCTL
+    assert mode_of(vehicle) is Px4Mode.POSCTL
     assert speed_m_s(vehicle) < 0.2
 
 
 def test_a_stream_that_comes_back_takes_the_vehicle_along_again() -> None:
     vehicle = in_offboard(velocity(1.0), COM_OBL_RC_ACT=5)
     run(vehicle, 3.0)
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
     run(vehicle, 4.0, velocity(1.0))
-    assert vehicle.mode is Px4Mode.OFFBOARD
+    assert mode_of(vehicle) is Px4Mode.OFFBOARD
     assert vehicle.velocity_m_s[0] > 0.8
     run(vehicle, 3.0)
     vehicle.set_mode(Px4Mode.HOLD)
     run(vehicle, 3.0, velocity(1.0))
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
 
 
 # The pilot
@@ -272,14 +276,14 @@ def test_a_pilot_takes_over_and_the_client_gets_the_vehicle_back() -> None:
     vehicle = in_offboard(velocity(1.0), rc=True)
     assert vehicle.pilot(Px4Mode.POSCTL, (0.0, -2.0, 0.0)) is MavResult.ACCEPTED
     run(vehicle, 3.0, velocity(1.0))
-    assert vehicle.mode is Px4Mode.POSCTL
+    assert mode_of(vehicle) is Px4Mode.POSCTL
     assert vehicle.velocity_m_s == pytest.approx([0.0, -2.0, 0.0], abs=0.1)
     vehicle.move_sticks(())
     run(vehicle, 3.0, velocity(1.0))
     assert speed_m_s(vehicle) < 0.2
     assert vehicle.set_mode(Px4Mode.OFFBOARD) is MavResult.ACCEPTED
     run(vehicle, 1.0, velocity(1.0))
-    assert vehicle.mode is Px4Mode.OFFBOARD
+    assert mode_of(vehicle) is Px4Mode.OFFBOARD
 
 
 def test_a_vehicle_stays_where_the_sticks_were_let_go_last() -> None:
@@ -301,7 +305,7 @@ def test_sticks_alone_leave_offboard_only_where_a_parameter_allows_it(
     vehicle = in_offboard(velocity(1.0), rc=True, COM_RC_OVERRIDE=override)
     vehicle.move_sticks((1.0, 0.0, 0.0))
     run(vehicle, 0.2)
-    assert vehicle.mode is mode
+    assert mode_of(vehicle) is mode
 
 
 @pytest.mark.parametrize(("excepted", "mode"), [(0, Px4Mode.LAND), (4, Px4Mode.OFFBOARD)])
@@ -309,7 +313,7 @@ def test_a_lost_remote_control_counts_unless_excepted(excepted: int, mode: Px4Mo
     vehicle = in_offboard(velocity(0.0), rc=True, COM_RCL_EXCEPT=excepted, NAV_RCL_ACT=3)
     vehicle.rc_connected = False
     run(vehicle, 5.2, velocity(0.0))
-    assert vehicle.mode is mode
+    assert mode_of(vehicle) is mode
 
 
 def test_manual_modes_need_a_remote_control() -> None:
@@ -323,9 +327,9 @@ def test_without_gps_it_descends_where_the_wind_takes_it() -> None:
     vehicle = hovering()
     vehicle.gps_lost = True
     run(vehicle, 4.5)
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
     run(vehicle, 1.0)
-    assert vehicle.mode is Px4Mode.DESCEND
+    assert mode_of(vehicle) is Px4Mode.DESCEND
     vehicle.wind_m_s = np.array([0.0, 1.5, 0.0])
     east_m = vehicle.position_m[1]
     run_until(vehicle, lambda: not vehicle.armed, 30.0)
@@ -344,7 +348,7 @@ def test_a_short_gap_of_gps_passes_unnoticed() -> None:
     run(vehicle, 4.0)
     vehicle.gps_lost = False
     run(vehicle, 3.0)
-    assert vehicle.position_valid and vehicle.mode is Px4Mode.HOLD
+    assert vehicle.position_valid and mode_of(vehicle) is Px4Mode.HOLD
 
 
 def test_a_critical_battery_interrupts_a_landing() -> None:
@@ -355,11 +359,11 @@ def test_a_critical_battery_interrupts_a_landing() -> None:
     run(vehicle, 1.0)
     vehicle.battery_remaining = 0.06
     run(vehicle, 0.1)
-    assert vehicle.mode is Px4Mode.HOLD and vehicle.failsafe.is_active
+    assert mode_of(vehicle) is Px4Mode.HOLD and vehicle.failsafe.is_active
     run(vehicle, 4.8)
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
     run(vehicle, 0.2)
-    assert vehicle.mode is Px4Mode.LAND and vehicle.failsafe.is_active
+    assert mode_of(vehicle) is Px4Mode.LAND and vehicle.failsafe.is_active
 
 
 def test_whoever_asks_for_a_mode_ends_a_failsafe_that_is_not_of_need() -> None:
@@ -367,16 +371,16 @@ def test_whoever_asks_for_a_mode_ends_a_failsafe_that_is_not_of_need() -> None:
     vehicle.parameters["COM_LOW_BAT_ACT"] = 2
     vehicle.battery_remaining = 0.06
     run(vehicle, 6.0)
-    assert vehicle.mode is Px4Mode.LAND
+    assert mode_of(vehicle) is Px4Mode.LAND
     assert vehicle.set_mode(Px4Mode.HOLD) is MavResult.ACCEPTED
     run(vehicle, 1.0)
-    assert vehicle.mode is Px4Mode.HOLD and not vehicle.failsafe.is_active
+    assert mode_of(vehicle) is Px4Mode.HOLD and not vehicle.failsafe.is_active
     vehicle.gps_lost = True
     run(vehicle, 5.2)
-    assert vehicle.mode is Px4Mode.DESCEND
+    assert mode_of(vehicle) is Px4Mode.DESCEND
     vehicle.set_mode(Px4Mode.LAND)
     run(vehicle, 1.0)
-    assert vehicle.mode is Px4Mode.DESCEND and vehicle.failsafe.is_active
+    assert mode_of(vehicle) is Px4Mode.DESCEND and vehicle.failsafe.is_active
 
 
 @pytest.mark.parametrize(
@@ -394,7 +398,7 @@ def test_low_battery(setting: int, remaining: float, mode: Px4Mode) -> None:
     vehicle.parameters["COM_LOW_BAT_ACT"] = setting
     vehicle.battery_remaining = remaining
     run(vehicle, 5.2)
-    assert vehicle.mode is mode
+    assert mode_of(vehicle) is mode
     assert vehicle.battery_remaining < remaining
     assert any("battery" in text.lower() for text in texts(vehicle))
 
@@ -404,9 +408,9 @@ def test_a_silent_ground_station_counts_only_if_a_parameter_says_so() -> None:
     vehicle.parameters["NAV_DLL_ACT"] = 3
     vehicle.ground_station_heartbeat()
     run(vehicle, 9.0)
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
     run(vehicle, 7.0)
-    assert vehicle.mode is Px4Mode.LAND
+    assert mode_of(vehicle) is Px4Mode.LAND
 
 
 @pytest.mark.parametrize("polygon", [False, True])
@@ -420,12 +424,12 @@ def test_the_fence_acts_once_on_a_breach(polygon: bool) -> None:
     else:
         vehicle.parameters["GF_MAX_HOR_DIST"] = 10.0
     run(vehicle, 8.0, velocity(2.0))
-    assert vehicle.mode is Px4Mode.HOLD
+    assert mode_of(vehicle) is Px4Mode.HOLD
     assert vehicle.home_m is not None
     assert 10.0 < (vehicle.estimated_position_m - vehicle.home_m)[0] < 12.0
     vehicle.set_mode(Px4Mode.OFFBOARD)
     run(vehicle, 1.0, velocity(-2.0))
-    assert vehicle.mode is Px4Mode.OFFBOARD
+    assert mode_of(vehicle) is Px4Mode.OFFBOARD
 
 
 # Where it is

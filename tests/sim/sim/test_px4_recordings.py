@@ -321,7 +321,7 @@ def replay(name: str) -> Replay:
 
 def ready_s(real: list[Said]) -> float:
     """When the estimator had its position: with the next check PX4 moved home there."""
-    homes = [s.message.time_usec / 1e6 for s in real if s.name == "HOME_POSITION"]
+    homes: list[float] = [s.message.time_usec / 1e6 for s in real if s.name == "HOME_POSITION"]
     return next(home_s for home_s in homes if home_s > 3.5) - CHECKS_PERIOD_S
 
 

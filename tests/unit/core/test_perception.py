@@ -1,12 +1,14 @@
 """The robot's memory and its images: against plain dense arrays, torch, and by hand."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.core import F32
 from edge.core.perception import (
     TILE_SIZE,
     Perception,
@@ -64,11 +66,12 @@ def test_resize_is_torchs_antialiased_bilinear_one(size: int, new_size: int) -> 
     np.testing.assert_allclose(resized, expected, atol=1e-6)
 
 
-def images_at(position: tuple[float, float], neighbours: list[tuple[float, float]]) -> np.ndarray:
+def images_at(position: tuple[float, float], neighbours: list[tuple[float, float]]) -> F32:
     perception = Perception(PARAMETERS, channels=4, image_size=32)
-    return perception.images(
+    images: F32 = perception.images(
         np.array(position), np.array(neighbours, np.float64).reshape(-1, 2)
     ).copy()[0]
+    return images
 
 
 def test_images_keep_x_and_y_and_left_and_right_apart() -> None:
@@ -149,12 +152,10 @@ def test_window_is_centred_at_the_nearest_cell_corner(
         ({"unknown_importance": -1.0}, "unknown_importance = -1.0"),
     ],
 )
-def test_impossible_parameters_are_named(change: dict[str, float], text: str) -> None:
-    sizes = {
-        "world_size": 512, "local_map_size": 256, "sensor_size": 64, "communication_range": 256.0
-    }  # fmt: skip
+def test_impossible_parameters_are_named(change: dict[str, Any], text: str) -> None:
+    parameters = PerceptionParameters(512, 256, 64, 256.0)
     with pytest.raises(ValueError, match=text):
-        PerceptionParameters(**{**sizes, **change})
+        dataclasses.replace(parameters, **change)
 
 
 @pytest.mark.parametrize("world_size", [512, 300, 40])

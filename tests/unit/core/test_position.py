@@ -45,19 +45,21 @@ class Watch:
     def __init__(self) -> None:
         self.now_s = 100.0
         self.judgement = PositionJudgement()
-        self.run(LIMITS.good_after_s + 2 * TICK_S)
-        assert self.judgement.quality is _Q.GOOD
+        assert self.run(LIMITS.good_after_s + 2 * TICK_S) is _Q.GOOD
 
-    def run(self, seconds: float, **changes: Any) -> None:
+    def run(self, seconds: float, **changes: Any) -> PositionQuality:
+        """How good it is found in the end."""
         for _ in range(round(seconds / TICK_S)):
             self.now_s += TICK_S
             self.look(heard(self.now_s, **changes))
+        return self.judgement.quality
 
-    def look(self, vehicle: VehicleState) -> None:
+    def look(self, vehicle: VehicleState) -> PositionQuality:
         self.judgement = judge(self.judgement, vehicle, LIMITS, self.now_s)
+        return self.judgement.quality
 
 
-WITHOUT = [
+WITHOUT: list[tuple[dict[str, Any], PositionCause, str]] = [
     ({"gps": dataclasses.replace(GPS, fix=0)}, PositionCause.NO_FIX, "GPS has no fix"),
     ({"gps": dataclasses.replace(GPS, fix=2)}, PositionCause.NO_FIX, "GPS has no fix"),
     ({"gps": None}, PositionCause.GPS_SILENT, "nothing new comes from the GPS receiver"),
@@ -74,7 +76,7 @@ WITHOUT = [
     ({"position_local_m": None}, PositionCause.UNKNOWN, "it is not known"),
     ({"origin": None}, PositionCause.UNKNOWN, "it is not known"),
 ]
-POOR = [
+POOR: list[tuple[dict[str, Any], PositionCause, str]] = [
     (
         {"gps": dataclasses.replace(GPS, accuracy_m=5.1)},
         PositionCause.INACCURATE,
@@ -103,16 +105,13 @@ def test_whatever_speaks_against_it_is_doubted_and_forgiven(
     changes: dict[str, Any], cause: PositionCause, text: str
 ) -> None:
     watch = Watch()
-    watch.run(0.4, **changes)
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(0.4, **changes) is _Q.GOOD
     watch.run(0.2, **changes)
     assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, cause)
     assert watch.judgement.text == text
-    watch.run(2.9)
-    assert watch.judgement.quality is _Q.DOUBTFUL
+    assert watch.run(2.9) is _Q.DOUBTFUL
     assert watch.judgement.cause is cause  # Until it is good again, people read why it is not.
-    watch.run(0.3)
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(0.3) is _Q.GOOD
     assert watch.judgement.text == ""
 
 
@@ -121,10 +120,8 @@ def test_no_position_for_two_seconds_is_lost(
     changes: dict[str, Any], cause: PositionCause, text: str
 ) -> None:
     watch = Watch()
-    watch.run(1.9, **changes)
-    assert watch.judgement.quality is _Q.DOUBTFUL
-    watch.run(0.3, **changes)
-    assert watch.judgement.quality is _Q.LOST
+    assert watch.run(1.9, **changes) is _Q.DOUBTFUL
+    assert watch.run(0.3, **changes) is _Q.LOST
 
 
 @pytest.mark.parametrize(("changes", "cause", "text"), POOR)
@@ -132,10 +129,8 @@ def test_a_poor_position_is_lost_after_a_minute(
     changes: dict[str, Any], cause: PositionCause, text: str
 ) -> None:
     watch = Watch()
-    watch.run(60.0, **changes)
-    assert watch.judgement.quality is _Q.DOUBTFUL
-    watch.run(1.0, **changes)
-    assert watch.judgement.quality is _Q.LOST
+    assert watch.run(60.0, **changes) is _Q.DOUBTFUL
+    assert watch.run(1.0, **changes) is _Q.LOST
 
 
 def test_a_position_that_does_not_come_counts_from_the_last_one() -> None:
@@ -155,12 +150,10 @@ def test_a_position_that_does_not_come_counts_from_the_last_one() -> None:
 def test_a_position_that_stands_still_is_no_estimate() -> None:
     watch = Watch()
     frozen_s = watch.now_s
-    watch.run(1.3, position_changed_at_s=frozen_s)
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(1.3, position_changed_at_s=frozen_s) is _Q.GOOD
     watch.run(0.2, position_changed_at_s=frozen_s)
     assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, PositionCause.FROZEN)
-    watch.run(1.6, position_changed_at_s=frozen_s)
-    assert watch.judgement.quality is _Q.LOST
+    assert watch.run(1.6, position_changed_at_s=frozen_s) is _Q.LOST
 
 
 NO_FIX: dict[str, Any] = {"gps": dataclasses.replace(GPS, fix=0)}
@@ -175,10 +168,8 @@ def test_a_fix_that_flickers_is_doubted_until_it_is_steady() -> None:
             watch.run(TICK_S, **changes)
             qualities.append(watch.judgement.quality)
     assert set(qualities[:4]) == {_Q.GOOD} and set(qualities[6:]) == {_Q.DOUBTFUL}
-    watch.run(2.5)
-    assert watch.judgement.quality is _Q.DOUBTFUL
-    watch.run(0.7)
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(2.5) is _Q.DOUBTFUL
+    assert watch.run(0.7) is _Q.GOOD
 
 
 def test_glitches_far_apart_are_none() -> None:
@@ -194,8 +185,7 @@ def test_one_sample_with_a_doubt_does_not_stop_a_robot() -> None:
     watch = Watch()
     told_s = watch.now_s
     watch.run(1.0 / RATES_HZ[230] + TICK_S, estimator=EstimatorStatus(True, True, told_s))
-    watch.run(1.0)
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(1.0) is _Q.GOOD
 
 
 def test_a_pause_of_the_receiver_stops_a_robot_and_does_not_land_it() -> None:
@@ -281,17 +271,14 @@ def test_a_jump_is_doubted_until_it_was_good_for_a_while() -> None:
     jumped_s = watch.now_s
     watch.run(0.6, jumped_at_s=jumped_s)
     assert (watch.judgement.quality, watch.judgement.cause) == (_Q.DOUBTFUL, PositionCause.JUMPED)
-    watch.run(3.2, jumped_at_s=jumped_s)
-    assert watch.judgement.quality is _Q.DOUBTFUL
-    watch.run(0.6, jumped_at_s=jumped_s)
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(3.2, jumped_at_s=jumped_s) is _Q.DOUBTFUL
+    assert watch.run(0.6, jumped_at_s=jumped_s) is _Q.GOOD
 
 
 def test_an_estimator_that_says_nothing_counts_for_nothing() -> None:
     watch = Watch()
     watch.run(5.0, estimator=None)
-    watch.run(5.0, estimator=EstimatorStatus(False, True, watch.now_s - 3.0))
-    assert watch.judgement.quality is _Q.GOOD
+    assert watch.run(5.0, estimator=EstimatorStatus(False, True, watch.now_s - 3.0)) is _Q.GOOD
 
 
 def test_who_did_not_look_does_not_know() -> None:
@@ -299,12 +286,9 @@ def test_who_did_not_look_does_not_know() -> None:
     watch = Watch()
     watch.run(0.3, gps=None)
     watch.now_s += 10.0
-    watch.look(heard(watch.now_s, gps=None))
-    assert watch.judgement.quality is _Q.GOOD
-    watch.run(1.8, gps=None)
-    assert watch.judgement.quality is _Q.DOUBTFUL
-    watch.run(0.4, gps=None)
-    assert watch.judgement.quality is _Q.LOST
+    assert watch.look(heard(watch.now_s, gps=None)) is _Q.GOOD
+    assert watch.run(1.8, gps=None) is _Q.DOUBTFUL
+    assert watch.run(0.4, gps=None) is _Q.LOST
 
 
 STRETCHES = st.lists(
@@ -318,7 +302,9 @@ def test_it_is_doubted_soon_lost_late_and_good_only_after_good_times(
 ) -> None:
     watch = Watch()
     kinds = ["good"] * 40
-    changes = {"good": {}, "poor": POOR[0][0], "none": WITHOUT[0][0]}
+    changes: dict[str, dict[str, Any]] = {
+        "good": {}, "poor": POOR[0][0], "none": WITHOUT[0][0],
+    }  # fmt: skip
     for kind, ticks in stretches:
         for _ in range(ticks):
             before = watch.judgement.quality

@@ -1,7 +1,7 @@
 """What the robot concludes, second by second, from the bytes that a real PX4 v1.17 sent."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import given
@@ -51,9 +51,9 @@ def conclusions(name: str) -> list[Conclusion]:
     return found
 
 
-def changes(name: str, *fields: str) -> list[tuple[float, ...]]:
+def changes(name: str, *fields: str) -> list[tuple[Any, ...]]:
     """When the fields changed, and to what: all but the time in the order asked for."""
-    told: list[tuple[float, ...]] = []
+    told: list[tuple[Any, ...]] = []
     for time_s, vehicle, judgement in conclusions(name):
         values = tuple(
             getattr(judgement if field in ("quality", "cause") else vehicle, field)

@@ -11,6 +11,7 @@ def run_graph(content: bytes, inputs: F32) -> F32:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    output: F32
     (output,) = session.run(None, {session.get_inputs()[0].name: inputs})
     return output
 

@@ -5,6 +5,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,7 +153,7 @@ def test_every_nan_is_found(state: State, tmp_path: Path) -> None:
             assert text == f"{name}: found NaN, expected finite numbers"
 
 
-def changed(name: str, change: Callable[[torch.Tensor], object]) -> Callable[[State], State]:
+def changed(name: str, change: Callable[[torch.Tensor], Any]) -> Callable[[State], State]:
     return lambda state: {**state, name: change(state[name])}
 
 
@@ -269,7 +270,7 @@ def test_torch_files_that_hold_something_else(content: object, line: str, tmp_pa
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_files_that_torch_cannot_read(state: State, tmp_path: Path) -> None:
     torch.save(state, tmp_path / "whole.pt")
-    torch.jit.script(torch.nn.Linear(2, 2)).save(tmp_path / "script.pt")
+    torch.jit.save(torch.jit.script(torch.nn.Linear(2, 2)), tmp_path / "script.pt")
     whole = (tmp_path / "whole.pt").read_bytes()
     (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "empty.pt").write_bytes(b"")

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import onnx
@@ -91,7 +92,7 @@ def assert_graphs_match_lpac(state: State, image_size: int, checkpoint: Checkpoi
     assert relative_error(run_swarm(graphs, checkpoint, swarm), truth) < TOLERANCE
     assert checkpoint.cnn
     with torch.no_grad():
-        features = model.cnn_backbone(images).numpy()
+        features = cast("torch.nn.Module", model.cnn_backbone)(images).numpy()
     assert relative_error(run_graph(graphs[CNN], images.numpy()), features) < TOLERANCE
 
 
@@ -125,8 +126,9 @@ def test_freshly_initialised_reference_matches(tmp_path: Path) -> None:
     torch.manual_seed(3)
     model = reference_lpac(random_state(layers=5, hops=3, latent=256), 16)
     for module in model.modules():
-        if hasattr(module, "reset_parameters"):
-            module.reset_parameters()
+        reset = getattr(module, "reset_parameters", None)
+        if reset is not None:
+            reset()
     state = {name: tensor.detach() for name, tensor in model.state_dict().items()}
     checkpoint = read_state(state, tmp_path)
     assert_graphs_match_torch(checkpoint)
@@ -181,7 +183,7 @@ def test_authors_taps_match_torch_and_tagconv() -> None:
 
 def test_graphs_are_clean(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     checkpoint = read_state(random_state(), tmp_path)
-    shapes = {
+    shapes: dict[str, tuple[list[Any], list[Any]]] = {
         CNN: (["batch", 4, 16, 16], ["batch", 8]),
         "gnn_1.onnx": (["batch", 2, 10], ["batch", 16]),
         "gnn_2.onnx": (["batch", 2, 16], ["batch", 16]),
@@ -216,7 +218,8 @@ def test_graphs_are_clean(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> 
 def _without_weights(model: onnx.ModelProto) -> bytes:
     for tensor in model.graph.initializer:
         tensor.ClearField("raw_data")
-    return model.SerializeToString()
+    rest: bytes = model.SerializeToString()
+    return rest
 
 
 def test_taps_can_be_told_apart(tmp_path: Path) -> None:

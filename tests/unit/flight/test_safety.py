@@ -418,9 +418,12 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
     command, _ = keep_inside(FENCE, a, b, c, LIMITS, False)
     assert np.isfinite(command).all()
     assert usable or not command.any()
-    for other in (Neighbour(1, AT_REST, AT_REST, d), Neighbour(1, a, b, 0.1)):
+    for other in (
+        neighbour(1, *AT_REST, age_s=d),
+        neighbour(1, *a, velocity_m_s=tuple(b), age_s=0.1),
+    ):
         command = brake(a, b, c, [other], 2.0, LIMITS, FENCE)
-        closest = nearest(AT_REST, [other])
+        closest = nearest((0.0, 0.0, 0.0), [other])
         assert np.isfinite(command).all()
         assert usable or not command.any()
         assert closest is None or math.isfinite(closest.distance_m)

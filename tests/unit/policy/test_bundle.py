@@ -95,7 +95,8 @@ def scaled(graph: bytes, tensor: str, part: slice) -> bytes:
     values = numpy_helper.to_array(weight).copy()
     values[part] *= np.float32(1.01)
     weight.CopyFrom(numpy_helper.from_array(values, tensor))
-    return model.SerializeToString()
+    changed: bytes = model.SerializeToString()
+    return changed
 
 
 def weights(bundle: Bundle) -> list[tuple[str, str, slice]]:

@@ -1,6 +1,6 @@
 """The decentralised swarm against the centralised network: torch_geometric, and the reference."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +82,12 @@ def action(state: Mapping[str, object], features: object) -> F32:
     return velocities
 
 
+@pytest.fixture(autouse=True)
+def _without_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
+
+
 def exported(state: State, folder: Path) -> Bundle:
     torch.save(state, folder / "state.pt")
     return export_bundle(folder / "state.pt", PARAMETERS)
@@ -90,7 +96,6 @@ def exported(state: State, folder: Path) -> Bundle:
 @pytest.mark.parametrize("latent", [16, 256])
 @pytest.mark.parametrize("hops", [1, 3])
 @pytest.mark.parametrize("layers", [1, 2, 5])
-@torch.no_grad()
 def test_after_k_l_rounds_the_swarm_is_the_centralised_network(
     layers: int, hops: int, latent: int, tmp_path: Path
 ) -> None:
@@ -117,7 +122,6 @@ def test_after_k_l_rounds_the_swarm_is_the_centralised_network(
 
 
 @pytest.mark.parametrize(("layers", "hops", "latent"), [(1, 1, 16), (2, 3, 256), (5, 3, 256)])
-@torch.no_grad()
 def test_after_k_l_rounds_the_swarm_is_the_reference_librarys_network(
     layers: int, hops: int, latent: int, tmp_path: Path
 ) -> None:
@@ -139,9 +143,7 @@ def test_after_k_l_rounds_the_swarm_is_the_reference_librarys_network(
 
 def lpac_velocities(model: object, images: F32, positions: F32, neighbours: Neighbours) -> F32:
     """CoverageControl's LPAC on the whole swarm, de-normalised as its controller does."""
-    from torch_geometric.data import Data  # noqa: PLC0415
-
-    data = Data(
+    data = pytest.importorskip("torch_geometric.data").Data(
         x=torch.from_numpy(images), pos=torch.from_numpy(positions),
         edge_index=torch.from_numpy(np.array(np.nonzero(neighbours))),
     )  # fmt: skip
@@ -151,7 +153,6 @@ def lpac_velocities(model: object, images: F32, positions: F32, neighbours: Neig
 
 
 @pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
-@torch.no_grad()
 def test_the_authors_network_decentralised_is_their_network(tmp_path: Path) -> None:
     def tensor(name: str) -> object:
         return torch.load(AUTHORS_TAPS / f"{name}.pt", "cpu", weights_only=True)
@@ -223,7 +224,6 @@ class Still:
         return self._seen
 
 
-@torch.no_grad()
 def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: Policy) -> None:
     """Images, mailboxes and encoded messages of ten robots, against LPAC on the whole swarm."""
     random = np.random.default_rng(3)
