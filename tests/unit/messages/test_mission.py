@@ -74,7 +74,8 @@ def test_what_is_no_sane_number_is_said_as_not_known(number: float) -> None:
         "ground_age_s": number, "flown_s": number,
     }  # fmt: skip
     status = dataclasses.replace(STATUS, **odd)
-    assert status == dataclasses.replace(STATUS, **dict.fromkeys(odd))
+    unknown: dict[str, Any] = dict.fromkeys(odd)
+    assert status == dataclasses.replace(STATUS, **unknown)
     assert decode(RobotStatus, encode(status)) == status
     ages_s = {"2": math.nan, "4": 0.2}
     assert dataclasses.replace(STATUS, neighbour_ages_s=ages_s).neighbour_ages_s == {"4": 0.2}
