@@ -12,7 +12,16 @@ from bench import ROOT
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-BENCHES = ("policy", "footprint", "scaling", "closed_loop", "loops", "release", "position")
+BENCHES = (
+    "policy",
+    "footprint",
+    "scaling",
+    "closed_loop",
+    "loops",
+    "release",
+    "position",
+    "command",
+)
 
 
 def main() -> None:

@@ -18,8 +18,9 @@ folder=out/image/$arch
 
 inputs=$({
     echo "$base"
-    find deploy/docker edge lpac/*.py lpac/cli pyproject.toml README.md LICENSE -type f \
-        -not -path '*/__pycache__/*' -not -name lock_debian.py -print0 |
+    # What the Dockerfile copies, and how it is built.
+    find deploy/docker/{Dockerfile*,image.sh} $(sed -n 's/^!//p' deploy/docker/*.dockerignore) \
+        -type f -not -path '*/__pycache__/*' -print0 |
         sort -z | xargs -0 sha256sum
 } | sha256sum)
 if [[ -f $archive && $(cat "$folder/inputs" 2>/dev/null) == "$inputs" ]]; then

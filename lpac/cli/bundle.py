@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(name="bundle", help="Look at a policy bundle; verify or time it on this machine.")
+from lpac.cli.apps import new_app
+
+app = new_app("bundle", "Look at a policy bundle; verify or time it on this machine.")
 
 BundlePath = Annotated[
     Path, typer.Argument(metavar="BUNDLE", help="A bundle's directory or .zip archive.")

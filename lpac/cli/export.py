@@ -5,7 +5,12 @@ from typing import Annotated
 
 import typer
 
+from lpac.cli.apps import new_app
 
+app = new_app()
+
+
+@app.command()
 def export(
     checkpoint: Annotated[
         Path, typer.Argument(help="LPAC state dict (.pt), or the authors' folder of tensors.")

@@ -13,25 +13,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_FLEET, Fleet
 
 if TYPE_CHECKING:
     from lpac.analysis.snapshot import FleetSetup, GroundEvent
     from lpac.ground.station.config import GroundConfig
     from lpac.ground.station.server import GroundProcess
 
+app = new_app()
+
 _AGAIN_S = 5.0
 _LOOK_AGAIN_S = 1.0
 _LONGEST_NAME = 64
 
 
+@app.command()
 def ground(
     fleet: Fleet = DEFAULT_FLEET,
     name: Annotated[
         str, typer.Option("--name", help="This station's name; by default user@host.")
     ] = "",
 ) -> None:
-    """Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map` and `record` need it.
+    """Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.
 
     It sets nothing in motion by itself. Started again, it goes on where the last one was.
     """

@@ -8,11 +8,15 @@ from typing import Annotated
 
 import typer
 
-from lpac.cli.sim import DEFAULT_BUNDLE
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_BUNDLE
+
+app = new_app()
 
 _FORGET_EVERY_S = 60.0
 
 
+@app.command()
 def hosts(
     *,
     count: Annotated[int, typer.Option("--hosts", "-n", help="How many, spares and all.")] = 3,
@@ -25,7 +29,7 @@ def hosts(
         "out/fleet-demo"
     ),
 ) -> None:
-    """Run robot computers (Ubuntu 18.04, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
+    """Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
     from lpac.sim.hosts.hosts import SimulatedHosts
 
     def end(*_: object) -> None:

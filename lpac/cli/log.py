@@ -6,7 +6,9 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(name="log", help="What the robots' and the ground's logs hold.")
+from lpac.cli.apps import new_app
+
+app = new_app("log", "What the robots' and the ground's logs hold.")
 
 
 @app.callback()

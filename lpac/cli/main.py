@@ -1,94 +1,122 @@
-"""The `lpac` command: each sub-command imports its part of the project only when it runs."""
+"""The `lpac` command: `lpac NAME` is in `lpac.cli.NAME`, and is loaded when it is called."""
 
+import importlib
 import os
 import sys
-from typing import Any
-
-import typer
-from typer.core import TyperGroup
-
-# field and field_setup add their commands to fleet's.
-from lpac.cli import (  # noqa: F401
-    bundle,
-    export,
-    field,
-    field_setup,
-    fleet,
-    ground,
-    hosts,
-    live_map,
-    log,
-    mission,
-    replay,
-    report,
-    robot,
-    sim,
-    site,
-    watch,
-)
+from importlib.util import find_spec
+from typing import Annotated, Any
 
 # One process is one robot, or a simulation on one core: BLAS threads would only disturb the loops.
-# numpy reads this when it is first imported, and no sub-command has imported it yet.
+# numpy reads this when it is first imported, and no command has imported it yet.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-# Third-party packages that a plain install, as the robot's is, leaves out -> the extra with them.
+import typer
+
+from lpac.cli.apps import CommandList
+
+# Each command, and what its own help begins with; a test compares them.
+_COMMANDS = {
+    "demo": "Ten robots over an unknown world for 60 s, beside the baselines; makes a figure.",
+    "sim": "Fly a swarm over an unknown world and print how well it covers it.",
+    "hosts": "Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
+    "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",
+    "mission": "Command the fleet, through `lpac ground`.",
+    "watch": "Show fleet and mission, alarms first; h holds all robots, l lands them, ? helps.",
+    "map": "Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.",
+    "site": "Places to fly at: origin, fence, pads and landing points, beside fleet.toml.",
+    "record": "Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs.",
+    "report": "Make figures and one HTML page of flight logs; of several trials, how they repeat.",
+    "replay": "Run the policy again on what flight logs hold, and compare with what it computed.",
+    "fleet": "Deploy to the robots, start and stop them.",
+    "export": "Export a trained torch checkpoint as a bundle that runs without torch.",
+    "bundle": "Look at a policy bundle; verify or time it on this machine.",
+    "robot": "Fly one robot, or check whether it could.",
+    "log": "What the robots' and the ground's logs hold.",
+}
+# The extra that has a command's packages; without one they are in every install.
 _EXTRAS = {
-    "aiohttp": "ground", "matplotlib": "sim", "onnx": "export", "pymavlink": "sim",
-    "pyulog": "sim", "rich": "sim", "textual": "ground", "tomlkit": "fleet", "torch": "export",
-}  # fmt: skip
+    "sim": ("demo", "sim", "hosts"),
+    "ground": ("ground", "mission", "watch", "map", "site", "record", "report"),
+    "fleet": ("fleet",),
+    "export": ("export",),
+}
+_INTERRUPTED = 130
 
 
-class _Commands(TyperGroup):
+class _Lpac(CommandList):
+    """Knows its commands without loading them. A robot has, and lists, few of them."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [name for name in _COMMANDS if find_spec(f"lpac.cli.{name}") is not None]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in _COMMANDS:
+            return None
+        return typer.main.get_command(importlib.import_module(f"lpac.cli.{cmd_name}").app)
+
+    def first_sentence(self, ctx: Any, name: str) -> str:
+        return _COMMANDS[name]
+
     def invoke(self, ctx: Any) -> Any:
-        """Ctrl-C, where a command has nothing to say about it, as while it starts."""
+        """Ctrl-C, where a command has nothing to say about it; and what is not installed."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
             typer.echo("lpac: interrupted", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(_INTERRUPTED) from None
+        except ModuleNotFoundError as error:
+            sys.exit(_what_is_missing(error, ctx.invoked_subcommand))
+
+
+def _what_is_missing(error: ModuleNotFoundError, command: str | None) -> str:
+    """One line. Raises the error if no install of ours would help."""
+    package = (error.name or "").split(".")[0]
+    if package in ("lpac", "export"):
+        return f"lpac: {error.name} is not installed here: this command is the workstation's"
+    extra = next((extra for extra, its in _EXTRAS.items() if command in its), None)
+    if package == "edge" or extra is None:
+        raise error
+    return (
+        f"lpac: {package} is not installed here: `pip install 'lpac-edge[{extra}]'`, "
+        "or `make setup` in the repository"
+    )
 
 
 app = typer.Typer(
     name="lpac",
-    cls=_Commands,
-    help="Decentralised perception-action-communication policies on small drones.",
+    cls=_Lpac,
     no_args_is_help=True,
-    add_completion=False,
+    # A shell with people at it is a workstation's.
+    add_completion=find_spec("lpac.sim") is not None,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.command()(export.export)
-app.command()(sim.sim)
-app.command()(sim.demo)
-app.command()(hosts.hosts)
-app.command()(replay.replay)
-app.add_typer(bundle.app)
-app.add_typer(robot.app)
-app.add_typer(log.app)
-app.add_typer(fleet.app)
-app.command()(ground.ground)
-app.add_typer(mission.app)
-app.add_typer(site.app)
-app.command()(watch.watch)
-app.command("map")(live_map.live_map)
-app.command()(report.record)
-app.command()(report.report)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        typer.echo(f"lpac {version('lpac-edge')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _lpac(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print it, and end."
+        ),
+    ] = False,
+) -> None:
+    """Decentralised perception-action-communication policies on small drones."""
 
 
 def main() -> None:
     """Run `lpac`; a person's mistake ends in one line and a non-zero exit code."""
     try:
         app()
-    except ModuleNotFoundError as error:
-        name = error.name or ""
-        if name.split(".")[0] in ("lpac", "export"):
-            sys.exit(f"lpac: {name} is not installed here: this command is the workstation's")
-        if name not in _EXTRAS:
-            raise
-        extra = _EXTRAS[name]
-        sys.exit(
-            f"lpac: {name} is not installed here: `pip install 'lpac-edge[{extra}]'`, "
-            "or `make setup` in the repository"
-        )
     except (ValueError, OSError) as error:
         sys.exit(f"lpac: {error}")
 

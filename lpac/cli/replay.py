@@ -8,7 +8,12 @@ from typing import Annotated
 
 import typer
 
+from lpac.cli.apps import new_app
 
+app = new_app()
+
+
+@app.command()
 def replay(
     logs: Annotated[
         list[Path], typer.Argument(metavar="LOG...", help="Flight logs, or directories of them.")
@@ -18,7 +23,7 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Run the policy again on the inputs in flight logs, and compare with what it computed then."""
+    """Run the policy again on what flight logs hold, and compare with what it computed."""
     from itertools import chain
 
     from edge.drivers.flight_log import read, read_metadata

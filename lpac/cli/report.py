@@ -1,6 +1,5 @@
 """`lpac record` and `lpac report`: what happened, kept and shown."""
 
-import contextlib
 import json
 import sys
 from datetime import datetime
@@ -9,32 +8,12 @@ from typing import Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+from lpac.cli.apps import new_app
+
+app = new_app()
 
 
-def record(
-    fleet: Fleet = DEFAULT_FLEET,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder; else `logs` beside the fleet's description.")
-    ] = None,
-) -> None:
-    """Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs."""
-    from lpac.fleet.config import load_fleet
-    from lpac.ground.record import record as record_to
-
-    name = load_fleet(fleet).fleet
-    directory = (fleet.parent / "logs") if out is None else out
-    if sys.stdout.isatty():
-        record_to(name, directory, _say, _say)
-    else:
-        record_to(name, directory, _say)
-
-
-def _say(text: str) -> None:
-    with contextlib.suppress(OSError):  # Nobody reads it: no reason to record no more.
-        typer.echo(text)
-
-
+@app.command()
 def report(
     folders: Annotated[
         list[Path],
@@ -59,7 +38,7 @@ def report(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Make figures and one HTML page of a flight's logs; of several trials, how they repeat."""
+    """Make figures and one HTML page of flight logs; of several trials, how they repeat."""
     from lpac.analysis.report import Wanted, examine, write
 
     wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)

@@ -11,7 +11,9 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(name="robot", help="Fly one robot, or check whether it could.")
+from lpac.cli.apps import new_app
+
+app = new_app("robot", "Fly one robot, or check whether it could.")
 
 _END_WITHIN_S = 2.9
 

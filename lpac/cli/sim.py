@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from lpac.shipped import shipped
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_BUNDLE
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -25,9 +26,10 @@ if TYPE_CHECKING:
     from lpac.sim.fleet.processes import Fleet, FleetScenario
     from lpac.sim.operator import Statuses
 
+app = new_app()
+
 DEFAULT_OUT = Path("out/sim")
 DEFAULT_ROBOTS = 10
-DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
 
 
 class Controller(StrEnum):
@@ -54,6 +56,7 @@ class Vehicle(StrEnum):
     PX4 = "px4"
 
 
+@app.command()
 def sim(
     *,
     context: typer.Context,
@@ -162,7 +165,7 @@ def sim(
     )
     if out:
         out.mkdir(parents=True, exist_ok=True)
-    [flight] = _fly([(controller.value, scenario)], bundle)
+    [flight] = fly_points([(controller.value, scenario)], bundle)
     if out:
         from lpac.sim.report import write_flight
 
@@ -179,35 +182,6 @@ def sim(
     typer.echo(f"{controller.value}, {count} robots, seed {seed}: {result}")
     if out:
         typer.echo(f"see {out / 'flight.png'}")
-
-
-def demo(
-    *,
-    out: Annotated[Path, typer.Option(help="Folder for the figure and the flights.")] = Path(
-        "out/demo"
-    ),
-    seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 7,
-) -> None:
-    """Ten robots over an unknown world for 60 s, beside the baselines; makes a figure of it."""
-    from lpac.sim.experiment import Scenario
-    from lpac.sim.report import write_demo
-
-    out.mkdir(parents=True, exist_ok=True)
-    scenarios = [
-        ("LPAC", Scenario(seed=seed)),
-        ("LPAC, 30 % loss", Scenario(seed=seed, loss=0.3)),
-        ("Decentralized CVT", Scenario(seed=seed, controller="decentralized-cvt")),
-        ("Centralized CVT", Scenario(seed=seed, controller="centralized-cvt")),
-        ("Clairvoyant CVT", Scenario(seed=seed, controller="clairvoyant-cvt")),
-    ]
-    names = [name for name, _ in scenarios]
-    flights = dict(zip(names, _fly(scenarios, DEFAULT_BUNDLE), strict=True))
-    write_demo(flights, out)
-    costs = "; ".join(
-        f"{name} {flight.normalized_cost[-1]:.3f}" for name, flight in flights.items()
-    )
-    typer.echo(f"coverage cost after 60 s over initial cost: {costs}")
-    typer.echo(f"see {out / 'demo.png'}")
 
 
 _ONLY_FOR = {
@@ -423,7 +397,9 @@ def _table(title: str, statuses: "Statuses") -> "Table":
     return table
 
 
-def _fly(scenarios: list[tuple[str, "Scenario"]], bundle_path: Path) -> list["SimulatedFlight"]:
+def fly_points(
+    scenarios: list[tuple[str, "Scenario"]], bundle_path: Path
+) -> list["SimulatedFlight"]:
     """Simulate the named scenarios with a progress bar for each, on stderr."""
     from rich.console import Console
     from rich.progress import Progress

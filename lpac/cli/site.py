@@ -5,17 +5,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots
-from lpac.cli.fleet_table import BAD, print_table, styled
-from lpac.cli.ground_report import address, interruptible, looking, measure, print_json, show
+from lpac.cli.apps import new_app
+from lpac.cli.ground_requests import address, interruptible, looking, measure, print_json, show
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots
+from lpac.cli.printing import BAD, print_table, styled
 
 if TYPE_CHECKING:
     from lpac.ground.site import SavedSite
 
-app = typer.Typer(
-    name="site",
-    help="Places to fly at: origin, fence, pads and landing points, in sites/ beside fleet.toml.",
-    no_args_is_help=True,
+app = new_app(
+    "site", "Places to fly at: origin, fence, pads and landing points, beside fleet.toml."
 )
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="The site's name.")]

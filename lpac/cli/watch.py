@@ -10,15 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_FLEET, Fleet
 
 if TYPE_CHECKING:
     from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+
+app = new_app()
 
 # Where there is no terminal, all columns.
 _WIDE = 160
 
 
+@app.command()
 def watch(
     fleet: Fleet = DEFAULT_FLEET,
     once: Annotated[bool, typer.Option("--once", help="Print it once, as plain text.")] = False,
@@ -30,7 +34,7 @@ def watch(
         str, typer.Option("--size", help="Of the screenshot, such as 100x30.", hidden=True)
     ] = "100x30",
 ) -> None:
-    """Show fleet and mission, alarms first; h holds all robots at once, l lands them, ? helps.
+    """Show fleet and mission, alarms first; h holds all robots, l lands them, ? helps.
 
     Without a terminal it prints them once.
     """

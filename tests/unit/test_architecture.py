@@ -91,7 +91,7 @@ def test_imports_point_one_way(path: Path) -> None:
             assert module.split(".")[0] not in IMPURE, f"{name} imports {module}"
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "lpac" / "cli").glob("*.py")), ids=lambda p: p.name)
+@pytest.mark.parametrize("path", sorted((ROOT / "lpac" / "cli").rglob("*.py")), ids=str)
 def test_cli_imports_its_parts_only_when_a_command_runs(path: Path) -> None:
     for module in imports(path, only_top_level=True):
         assert part_of(module) in ("lpac", "lpac.cli", "lpac.shipped") or module.split(".")[

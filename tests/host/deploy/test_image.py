@@ -58,6 +58,18 @@ def test_it_holds_only_what_a_robot_runs(tree: Path) -> None:
     assert list((tree / "release").iterdir()) == []
 
 
+def test_of_our_own_it_holds_edge_and_the_commands_of_a_robot(tree: Path) -> None:
+    site = tree / "usr/lib/python3/dist-packages"
+    assert not (site / "export").exists()
+    assert {str(p.relative_to(site / "lpac")) for p in (site / "lpac").rglob("*.py")} == {
+        "__init__.py", "cli/__init__.py", "cli/apps.py", "cli/bundle.py", "cli/log.py",
+        "cli/main.py", "cli/robot.py",
+    }  # fmt: skip
+    assert {str(p.relative_to(site / "edge")) for p in (site / "edge").rglob("*.py")} == {
+        str(p.relative_to(ROOT / "edge")) for p in (ROOT / "edge").rglob("*.py")
+    }
+
+
 def test_it_says_what_it_is_made_of(tree: Path) -> None:
     versions = json.loads((tree / "usr/share/lpac/versions.json").read_text())
     assert versions["architecture"] == tree.parent.name
@@ -113,7 +125,13 @@ def test_it_runs_without_a_user_and_a_place_to_write(
     shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
     result = run_inside(tree, tmp_path, "--help")
     assert (result.returncode, result.stderr) == (0, "")
-    assert "robot" in result.stdout
+    listed = result.stdout.partition("Commands:")[2]
+    assert re.findall(r"^  (\w+)  ", listed, re.MULTILINE) == ["bundle", "robot", "log"]
+    result = run_inside(tree, tmp_path, "sim")
+    assert result.returncode == 1
+    assert result.stderr == (
+        "lpac: lpac.cli.sim is not installed here: this command is the workstation's\n"
+    )
     result = run_inside(tree, tmp_path, "bundle", "verify", "/release")
     assert (result.returncode, result.stderr) == (0, "")
     assert "this machine computes the golden outputs" in result.stdout

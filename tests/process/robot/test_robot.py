@@ -301,7 +301,7 @@ def hang(self, now_s):
     return tick(self, now_s)
 FlightControl.tick = hang
 import lpac.cli.main
-cli.main.main()
+lpac.cli.main.main()
 """
 
 

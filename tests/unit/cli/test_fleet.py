@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from lpac.cli.fleet_status import State, print_status
+from lpac.cli.fleet.status import State, print_status
 from lpac.fleet.config import FleetConfig, load_fleet
 from lpac.fleet.logs import Entry, parse_entry, readable
 from lpac.fleet.operations import Outcome

@@ -4,9 +4,13 @@ from typing import Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, Fleet
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_FLEET, Fleet
+
+app = new_app()
 
 
+@app.command("map")
 def live_map(
     fleet: Fleet = DEFAULT_FLEET,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8300,

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, Fleet
-from lpac.cli.fleet_table import BAD, FAINT, NOTABLE, styled
-from lpac.cli.ground_report import address, looking
+from lpac.cli.ground_requests import address, looking
+from lpac.cli.options import DEFAULT_FLEET, Fleet
+from lpac.cli.printing import BAD, FAINT, NOTABLE, styled
 
 if TYPE_CHECKING:
     from rich.console import Console, Group

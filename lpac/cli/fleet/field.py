@@ -7,20 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots, app, open_fleet
-from lpac.cli.fleet_table import (
-    BAD,
-    FAINT,
-    GOOD,
-    NOTABLE,
-    print_json,
-    print_notes,
-    print_problems,
-    print_table,
-    require_all,
-    run_for_each,
-    styled,
-)
+from lpac.cli.fleet.progress import print_json, print_problems, require_all, run_for_each
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -36,7 +25,6 @@ _STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}
 # doctor
 
 
-@app.command()
 def doctor(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -137,7 +125,6 @@ def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
 # up
 
 
-@app.command()
 def up(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -211,7 +198,6 @@ def _print_decisions(decisions: "Sequence[GoDecision]", batteries: "Mapping[str,
 # ping
 
 
-@app.command()
 def ping(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Measure the radio: from here to each robot over SSH, and between the robots by ICMP."""
     from lpac.fleet.doctor import measure_radio

@@ -5,12 +5,15 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from lpac.cli.fleet_table import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
+from lpac.cli.fleet.progress import print_json, require_all, run_for_each
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_table, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
 
     from lpac.fleet.config import FleetConfig, RobotHost
+    from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
 
 # Characters of an id that tell it from others.
@@ -38,6 +41,21 @@ class State(NamedTuple):
     clock_offset_s: float
     last_words: str | None
     is_configured: bool | None = None
+
+
+def status(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
+    """Show what each robot has, and how it is."""
+    config, chosen = open_fleet(fleet, robots)
+
+    async def one(robot: "RobotHost", _: "Report") -> "State":
+        return await read_state(config, robot)
+
+    outcomes = run_for_each(chosen, one)
+    if as_json:
+        print_json(config, outcomes, describe)
+    else:
+        print_status(config, outcomes)
+    require_all(outcomes, "reached")
 
 
 async def read_state(config: "FleetConfig", robot: "RobotHost") -> State:

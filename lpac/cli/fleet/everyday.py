@@ -12,26 +12,22 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 
 import typer
 
-from lpac.cli.fleet_status import SHORT, describe, flight, print_status, program, read_state
-from lpac.cli.fleet_table import (
-    BAD,
-    GOOD,
+from lpac.cli.fleet.progress import (
     INTERRUPTED,
     print_json,
-    print_notes,
     print_problems,
-    print_table,
     require_all,
     run_all,
     run_for_each,
-    styled,
     working,
 )
+from lpac.cli.fleet.status import SHORT, flight, program
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.printing import BAD, GOOD, print_notes, print_table, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from lpac.cli.fleet_status import State
     from lpac.fleet.config import FleetConfig, RobotHost
     from lpac.fleet.deploy import Deployed
     from lpac.fleet.hold import Report
@@ -39,31 +35,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-app = typer.Typer(
-    name="fleet", help="Deploy to the robots, start and stop them.", no_args_is_help=True
-)
-
-Fleet = Annotated[
-    Path, typer.Option("--fleet", envvar="LPAC_FLEET", help="The fleet's description, TOML.")
-]
-Robots = Annotated[
-    str | None, typer.Option("--robots", help="Only these robots, such as r1,r3; else all.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 InFlight = Annotated[
     bool, typer.Option("--in-flight", help="Also if the vehicle is armed: it holds or lands then.")
 ]
-DEFAULT_FLEET = Path("fleet.toml")
-
 _COLOURS = ("cyan", "magenta", "yellow", "green", "blue", "bright_cyan", "bright_magenta")
-
-
-def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
-    """The fleet, and the robots that a command addresses. Raises ConfigError."""
-    from lpac.fleet.config import load_fleet, select
-
-    config = load_fleet(path)
-    return config, select(config, robots)
 
 
 # Releases
@@ -76,7 +51,6 @@ class _Deployed(NamedTuple):
     duration_s: float
 
 
-@app.command()
 def deploy(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Bring image, policy and configuration to the robots, prove them there, and run them.
 
@@ -121,7 +95,6 @@ def _deployed_cells(value: _Deployed) -> tuple["str | Text", ...]:
     )
 
 
-@app.command()
 def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Run the release before the present one again. A robot in flight refuses."""
     from lpac.fleet.deploy import rollback as roll_back
@@ -153,7 +126,6 @@ class _Controlled(NamedTuple):
     recovered: str | None
 
 
-@app.command()
 def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Start the robots' programs, now and at every boot. Nothing takes off by that."""
     config, chosen = open_fleet(fleet, robots)
@@ -162,7 +134,6 @@ def start(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson =
     _print_controlled(config, outcomes, "started on", as_json)
 
 
-@app.command()
 def stop(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -183,7 +154,6 @@ def stop(
     _print_controlled(config, outcomes, "stopped on", as_json)
 
 
-@app.command()
 def restart(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
@@ -203,7 +173,6 @@ def restart(
     _print_controlled(config, outcomes, "restarted on", as_json)
 
 
-@app.command()
 def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
     """Land vehicles whose programs are gone, where they are: over SSH, by their PX4.
 
@@ -290,23 +259,6 @@ def _while_somebody_reads() -> Iterator[None]:
         signal.raise_signal(signal.SIGPIPE)
 
 
-@app.command()
-def status(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Show what each robot has, and how it is."""
-    config, chosen = open_fleet(fleet, robots)
-
-    async def one(robot: "RobotHost", _: "Report") -> "State":
-        return await read_state(config, robot)
-
-    outcomes = run_for_each(chosen, one)
-    if as_json:
-        print_json(config, outcomes, describe)
-    else:
-        print_status(config, outcomes)
-    require_all(outcomes, "reached")
-
-
-@app.command()
 @_while_somebody_reads()
 def logs(
     fleet: Fleet = DEFAULT_FLEET,
@@ -356,7 +308,6 @@ def logs(
     require_all(outcomes, "read the journal of")
 
 
-@app.command("exec", context_settings={"allow_interspersed_args": False})
 @_while_somebody_reads()
 def execute_on_all(
     command: Annotated[

@@ -7,16 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots, app, open_fleet
-from lpac.cli.fleet_table import (
-    GOOD,
-    print_json,
-    print_problems,
-    print_table,
-    require_all,
-    run_for_each,
-    styled,
-)
+from lpac.cli.fleet.progress import print_json, print_problems, require_all, run_for_each
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.printing import GOOD, print_table, styled
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -28,7 +21,6 @@ if TYPE_CHECKING:
 _STEP_WIDTH = 14
 
 
-@app.command()
 def enroll(
     name: Annotated[str, typer.Argument(help="The robot's name in the fleet, such as r11.")],
     host: Annotated[
@@ -83,7 +75,6 @@ def enroll(
     typer.echo(f"{name} is enrolled; `lpac fleet doctor --robots {name}` looks at the rest")
 
 
-@app.command()
 def swap(
     failed: Annotated[str, typer.Argument(help="The robot that cannot fly.")],
     spare: Annotated[str, typer.Argument(help="The enrolled robot that is to fly instead.")],
@@ -135,7 +126,6 @@ def swap(
     )
 
 
-@app.command()
 def pull(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
+from lpac.cli.printing import BAD, FAINT, GOOD, new_table, plain, print_notes, styled
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
-    from rich.text import Text
 
     from lpac.fleet.config import FleetConfig, RobotHost
     from lpac.fleet.hold import Report
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-GOOD, BAD, NOTABLE, FAINT = "green", "red", "yellow", "dim"
 # The problem of a robot that was not done when Ctrl-C came.
 INTERRUPTED = "interrupted"
 
@@ -84,34 +84,6 @@ def working(text: str) -> Iterator[None]:
         yield
 
 
-def print_table(
-    headings: Sequence[str], rows: Sequence[Sequence["str | Text"]], right: Sequence[str] = ()
-) -> None:
-    """A table on stdout; the headings in `right` are those of columns of numbers."""
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    table = _new_table(narrow=console.width < 100)
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading in right else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(_plain(cell) if isinstance(cell, str) else cell for cell in row))
-    console.print(table)
-
-
-def print_notes(notes: Sequence[tuple[str, "str | Text"]]) -> None:
-    """Lines of a robot's name and something about it, below a table."""
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    grid = _new_table(narrow=False, heading=False)
-    for name, note in notes:
-        grid.add_row(_plain(name), _plain(note) if isinstance(note, str) else note)
-    if notes:
-        console.print()
-        console.print(grid)
-
-
 def print_problems(outcomes: Sequence["Outcome[T]"]) -> None:
     """Why it was not done, for each robot where it was not."""
     print_notes([(o.robot.name, styled(o.problem, BAD)) for o in outcomes if o.problem is not None])
@@ -145,33 +117,10 @@ def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:
         )
 
 
-def styled(text: str, style: str) -> "Text":
-    """A cell or note in colour; brackets in it mean nothing."""
-    from rich.text import Text
-
-    return Text(text, style)
-
-
-def _plain(text: str) -> "Text":
-    return styled(text, "")
-
-
 def _stderr() -> "Console":
     from rich.console import Console
 
     return Console(stderr=True, highlight=False, markup=False)
-
-
-def _new_table(*, narrow: bool, heading: bool = True) -> "Table":
-    from rich.table import Table
-
-    return Table(
-        box=None,
-        show_header=heading,
-        header_style="bold",
-        pad_edge=False,
-        padding=(0, 1 if narrow else 2, 0, 0),
-    )
 
 
 @dataclass(slots=True)
@@ -224,7 +173,7 @@ class _Progress:
         from rich.progress_bar import ProgressBar
         from rich.text import Text
 
-        table = _new_table(narrow=False, heading=False)
+        table = new_table(narrow=False, heading=False)
         # Of no robots, as after none has come up, there is a table too.
         names = max((len(row.name) for row in self.rows.values()), default=0)
         hosts = max((len(row.host) for row in self.rows.values()), default=0)
@@ -236,7 +185,7 @@ class _Progress:
             if row.outcome is None and row.share is not None:
                 bar = ProgressBar(total=1.0, completed=row.share, width=_BAR_WIDTH)
             table.add_row(
-                _plain(row.name),
+                plain(row.name),
                 styled(row.host, FAINT),
                 styled(row.step, FAINT if row.outcome else ""),
                 bar,

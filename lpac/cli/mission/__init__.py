@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from lpac.cli.fleet import DEFAULT_FLEET, AsJson, Fleet, Robots
-from lpac.cli.ground_report import (
+from lpac.cli.apps import new_app
+from lpac.cli.ground_requests import (
     Addressed,
     address,
     ask,
@@ -16,17 +16,16 @@ from lpac.cli.ground_report import (
     looking,
     measure,
 )
-from lpac.cli.mission_run import run
-from lpac.cli.rehearse import rehearse
+from lpac.cli.mission.rehearse import rehearse
+from lpac.cli.mission.run import run
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots
 
 if TYPE_CHECKING:
     from lpac.ground.site import Point, Standing
     from lpac.ground.station.protocol import Request
 
-app = typer.Typer(
-    name="mission",
-    help="Command the fleet, through `lpac ground`. Done when every robot has answered.",
-    no_args_is_help=True,
+app = new_app(
+    "mission", "Command the fleet, through `lpac ground`. Done when every robot has answered."
 )
 # Negative numbers are no options.
 _NUMBERS = {"ignore_unknown_options": True}
@@ -116,7 +115,7 @@ def _measured(first: "Standing", second: "Standing | None") -> str:
     return f"{text}, its heading is within {first.heading.spread_deg:.1f} deg"
 
 
-fence = typer.Typer(name="fence", help="Where robots may fly.", no_args_is_help=True)
+fence = new_app("fence", "Where robots may fly.")
 app.add_typer(fence)
 
 

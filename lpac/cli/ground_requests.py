@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from lpac.cli.fleet_table import BAD, FAINT, GOOD, print_table, styled
+from lpac.cli.printing import BAD, FAINT, GOOD, print_table, styled
 
 if TYPE_CHECKING:
     from rich.table import Table

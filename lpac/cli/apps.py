@@ -1,0 +1,33 @@
+"""How every command and group of commands of `lpac` is made."""
+
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+_WHOLE_LINE = 1000
+
+
+class CommandList(TyperGroup):
+    """A group of commands whose help lists each with the whole first sentence of its own."""
+
+    def first_sentence(self, ctx: Any, name: str) -> str:
+        """What that command does."""
+        command = self.get_command(ctx, name)
+        assert command is not None
+        return command.get_short_help_str(_WHOLE_LINE)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """typer cuts the sentences off where they would not fit into one line."""
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, self.first_sentence(ctx, name)) for name in self.list_commands(ctx)]
+            )
+
+
+def new_app(name: str | None = None, help: str | None = None) -> typer.Typer:  # noqa: A002
+    """One command, if it gets one, or a group of them; with plain help, since rich is slow."""
+    return typer.Typer(
+        name=name, help=help, cls=CommandList, no_args_is_help=True, add_completion=False,
+        rich_markup_mode=None,
+    )  # fmt: skip

@@ -1,0 +1,27 @@
+"""`lpac fleet`: everything about the robots' computers, for all robots at once."""
+
+from collections.abc import Callable
+
+from lpac.cli.apps import new_app
+from lpac.cli.fleet.everyday import (
+    deploy,
+    execute_on_all,
+    land,
+    logs,
+    restart,
+    rollback,
+    start,
+    stop,
+)
+from lpac.cli.fleet.field import doctor, ping, up
+from lpac.cli.fleet.membership import enroll, pull, swap
+from lpac.cli.fleet.status import status
+
+app = new_app("fleet", "Deploy to the robots, start and stop them.")
+_COMMANDS: tuple[Callable[..., None], ...] = (
+    deploy, rollback, start, stop, restart, land, status, logs,
+    doctor, up, ping, enroll, swap, pull,
+)  # fmt: skip
+for command in _COMMANDS:
+    app.command()(command)
+app.command("exec", context_settings={"allow_interspersed_args": False})(execute_on_all)

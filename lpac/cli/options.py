@@ -1,0 +1,29 @@
+"""Options that several commands have, and what they mean."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lpac.shipped import shipped
+
+if TYPE_CHECKING:
+    from lpac.fleet.config import FleetConfig, RobotHost
+
+Fleet = Annotated[
+    Path, typer.Option("--fleet", envvar="LPAC_FLEET", help="The fleet's description, TOML.")
+]
+Robots = Annotated[
+    str | None, typer.Option("--robots", help="Only these robots, such as r1,r3; else all.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+DEFAULT_FLEET = Path("fleet.toml")
+DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
+
+
+def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
+    """The fleet, and the robots that a command addresses. Raises ConfigError."""
+    from lpac.fleet.config import load_fleet, select
+
+    config = load_fleet(path)
+    return config, select(config, robots)
