@@ -25,6 +25,7 @@ from edge.core.vehicle import Vector
 from edge.core.world import format_world, random_features
 from edge.drivers.zenoh_link import ZenohLink
 from edge.messages.codec import decode, encode
+from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import (
     ON_GROUND,
     FlightState,
@@ -41,6 +42,7 @@ from edge.messages.topics import EXPLORED, ORDER, STATE, STATUS, WORLD
 from edge.policy.bundle import load_bundle
 from lpac.sim.ports import free_ports
 from tests.conftest import SHIPPED
+from tests.said import checks, reason, reasons, refusal
 
 PERIOD_S = 0.25
 WORLD_M = 32.0
@@ -92,7 +94,7 @@ class PretendedRobot:
         self.origin: Origin | None = None
         self.fence = FENCE
         self.trial = ""
-        self.not_taken: tuple[str, ...] = ()
+        self.not_taken: tuple[FailedCheck, ...] = ()
         self.answers: list[OrderResult] = []
         self.ordered: Order | None = None
         self.explored = np.zeros((EXPLORED_CELLS, EXPLORED_CELLS), np.bool_)
@@ -131,7 +133,7 @@ class PretendedRobot:
         if any(answer.order_id == order.order_id for answer in self.answers):
             return
         problem = self._problem(order)
-        self.answers = [*self.answers, OrderResult(order.order_id, not problem, problem)][-8:]
+        self.answers = [*self.answers, OrderResult(order.order_id, refusal(problem))][-8:]
         if problem:
             return
         if order.kind == "takeoff":
@@ -245,11 +247,14 @@ class PretendedRobot:
             self.origin, self.fence = ground.origin, ground.fence or FENCE
             if place is not None:
                 self.slot, self.landing_point_m = place.slot, place.landing_point_m
-            waits = ("world: its text has not come yet",)
-            self.not_taken = waits if wanted["world"][0] != wanted["world"][1] else ()
+            text = "world: its text has not come yet"
+            waits = FailedCheck(CheckCode.WORLD_NOT_ARRIVED, text, settles_by_itself=True)
+            self.not_taken = (waits,) if wanted["world"][0] != wanted["world"][1] else ()
         else:
             self.not_taken = tuple(
-                f"{name}: not in flight" for name, (asked, has) in wanted.items() if asked != has
+                FailedCheck(CheckCode(f"keeps_{name}"), f"{name}: not in flight")
+                for name, (asked, has) in wanted.items()
+                if asked != has
             )
 
     def _away_m(self, place_m: Sequence[float]) -> float:
@@ -313,10 +318,10 @@ class PretendedRobot:
             uptime_s=uptime_s,
             unix_time_s=time.time(),
             state=self.state,
-            reason=self.reason,
+            reason=reason(self.reason),
             ready=ready,
-            failed_checks=failed,
-            alarms=self.alarms if heard or not self.armed else ("ground lost", *self.alarms),
+            failed_checks=checks(*failed),
+            alarms=reasons(*(() if heard or not self.armed else ("ground lost",)), *self.alarms),
             obeyed_sequence=0 if self.ground is None else self.ground.sequence,
             operator="" if self.ground is None else self.ground.operator,
             orders=tuple(self.answers),

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from edge.core.world import format_world, random_features
+from edge.messages.codes import ReasonCode, Refusal, RefusalCode
 from edge.messages.mission import FlightState, Origin, RobotStatus
 from edge.robot.config import RobotConfig, load_config
 from lpac.sim.operator import Operator
@@ -30,12 +30,19 @@ SYSTEM_ID = 7
 # The mission's y axis does not point north, and the vehicle does not stand on its origin.
 ORIGIN = Origin(WorldOrigin().latitude_deg, WorldOrigin().longitude_deg, heading_deg=30.0)
 PAD_M = (12.0, 10.0)
-# Why a robot refuses for a moment: this machine held it up, or a command is still on its way.
-HELD_UP = re.compile(
-    r"the control loop was silent|checks are still running|the ground commands|"
-    r"not in offboard yet|position or height is not known|is not heard|was not answered|expired|"
-    # A program that has just begun has not listened for long enough.
-    r"nothing new comes from the GPS receiver|position lost: it is not known"
+# Why a robot refuses for a moment: this machine held it up, a command is still on its way, or its
+# program has just begun and not listened for long enough.
+HELD_UP = (
+    RefusalCode.CONTROL_SILENT,
+    RefusalCode.CHECKS_RUNNING,
+    RefusalCode.NOT_READY,
+    RefusalCode.POSITION_NOT_GOOD,
+    RefusalCode.PLACE_NOT_KNOWN,
+    RefusalCode.GROUND_COMMANDS,
+    RefusalCode.GROUND_NOT_HEARD,
+    RefusalCode.NOT_IN_OFFBOARD,
+    RefusalCode.NOT_ANSWERED,
+    RefusalCode.EXPIRED,
 )
 
 Changes = dict[str, dict[str, Any]]
@@ -123,16 +130,15 @@ class Rig:
         """Order it; it must be obeyed, but for what lasts a moment."""
         until_s = time.monotonic() + 60.0
         while refusal := self.refusal(kind, trial):
-            assert HELD_UP.search(refusal) and time.monotonic() < until_s, refusal
+            assert refusal.code in HELD_UP and time.monotonic() < until_s, refusal
 
-    def refusal(self, kind: Any, trial: str = "") -> str:
-        """Why an order is refused; "" if it is obeyed."""
+    def refusal(self, kind: Any, trial: str = "") -> Refusal | None:
+        """Why an order is refused; None if it is obeyed."""
         # Who is silent just now cannot be ordered anything.
         self.wait(lambda _: True)
         result = self.operator.result(self.operator.order(kind, self.config.robot_id, trial), 60.0)
         assert result is not None
-        assert result.accepted is not bool(result.reason)
-        return result.reason
+        return result.refusal
 
     def take_off(self) -> None:
         """Until it holds at its height; after a takeoff that this machine held up, once more."""
@@ -140,7 +146,7 @@ class Rig:
         self.wait(lambda status: status.ready)
         self.order("takeoff")
         self.wait(lambda status: status.ready or status.state is FlightState.HOLD)
-        held_up = self.status.reason.startswith("control was silent")
+        held_up = self.status.reason.code is ReasonCode.CONTROL_SILENT
         if held_up:
             self.operator.safety_action("land")
             self.wait_for_state(FlightState.LANDED)

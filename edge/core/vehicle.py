@@ -51,7 +51,7 @@ class ActionResult(NamedTuple):
     at_s: float
 
 
-class Reason(NamedTuple):
+class AutopilotReason(NamedTuple):
     """Why the autopilot refuses or does something: `code` is its own name for it, `text` in words.
 
     `arguments` are the numbers in it, such as which sensor.
@@ -141,8 +141,8 @@ class VehicleState:
     gps: Gps | None = None
     estimator: EstimatorStatus | None = None
     armable: bool | None = None
-    problems: tuple[Reason, ...] = ()
-    warnings: tuple[Reason, ...] = ()
+    problems: tuple[AutopilotReason, ...] = ()
+    warnings: tuple[AutopilotReason, ...] = ()
     remote_control: bool | None = None
     version: str | None = None
     result: ActionResult | None = None

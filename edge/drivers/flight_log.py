@@ -573,6 +573,7 @@ _ROBOT_TOPICS = {
         _object(
             state=_STRING,
             reason=_STRING,
+            reason_code=_STRING,
             height_m=_NUMBER,
             position_m=_list(_NUMBER),
             velocity_m_s=_list(_NUMBER),

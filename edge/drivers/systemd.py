@@ -57,7 +57,7 @@ def status_text(
     text = {
         "monotonic_s": round(monotonic_s, 3),
         "state": status.state,
-        "reason": _short(status.reason),
+        "reason": {"code": status.reason.code, "text": _short(status.reason.text)},
         "armed": status.armed,
         "mode": status.mode,
         "battery": _rounded(status.battery),
@@ -81,7 +81,15 @@ def status_text(
         "trial": _short(status.trial),
         "robot_id": status.robot_id,
         "boot_nonce": status.boot_nonce,
-        "failed_checks": [_short(check) for check in status.failed_checks[:_MOST_CHECKS]],
+        "failed_checks": [
+            {
+                "code": check.code,
+                "text": _short(check.text),
+                "settles_by_itself": check.settles_by_itself,
+            }
+            for check in status.failed_checks[:_MOST_CHECKS]
+        ],
+        "failed_checks_more": max(0, len(status.failed_checks) - _MOST_CHECKS),
     }
     return "STATUS=" + json.dumps(text, separators=(",", ":"))
 

@@ -1,12 +1,14 @@
 """What the operator must see of a robot in flight, the gravest first.
 
-Each check gives the text of its alarm, or None; the table of transitions and the orders ask some of
-them, too.
+Each condition gives the text of its alarm, or None; the table of transitions and the orders ask
+some of them, too.
 """
 
 import math
+from collections.abc import Callable, Mapping
 
 from edge.flight.state import Tick
+from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import AIRBORNE, FlightState
 
 # One message of silence is no loss: PX4 tells twice a second.
@@ -75,14 +77,26 @@ def ground_lost(t: Tick) -> str | None:
     return reason_if(not t.ground_heard, "ground lost")
 
 
-def alarms(t: Tick) -> tuple[str, ...]:
-    """What the operator must see, the gravest first."""
-    texts = [t.flight.reason] if t.flight.alarming else []
+ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
+    ReasonCode.FAILSAFE: failsafe,
+    ReasonCode.HOVERS_ALONE: hovers_alone,
+    ReasonCode.REMOTE_CONTROL_LOST: remote_control_lost,
+    ReasonCode.POSITION_NOT_GOOD: position_not_good,
+    ReasonCode.TOO_CLOSE: too_close,
+    ReasonCode.OUTSIDE_FENCE: outside,
+    ReasonCode.BATTERY_LOW: battery_low,
+    ReasonCode.BATTERY_NOT_KNOWN: battery_not_known,
+    ReasonCode.GROUND_LOST: ground_lost,
+}
+
+
+def alarms(t: Tick) -> tuple[Reason, ...]:
+    """What the operator must see, the gravest first, each text once."""
+    found = [t.flight.reason] if t.flight.alarming else []
     if t.flight.state in (*AIRBORNE, FlightState.PILOT):
-        checks = (
-            failsafe, hovers_alone, remote_control_lost, position_not_good, too_close,
-            outside, battery_low, battery_not_known, ground_lost,
-        )  # fmt: skip
-        texts += [text for check in checks if (text := check(t)) is not None]
-        texts += [f"PX4: {warning.text}" for warning in t.inputs.vehicle.warnings]
-    return tuple(dict.fromkeys(texts))
+        found += [
+            Reason(code, text) for code, condition in ALARMS.items() if (text := condition(t))
+        ]
+        warnings = t.inputs.vehicle.warnings
+        found += [Reason(ReasonCode.PX4, f"PX4: {warning.text}") for warning in warnings]
+    return tuple({alarm.text: alarm for alarm in reversed(found)}.values())[::-1]

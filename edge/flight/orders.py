@@ -9,6 +9,7 @@ from typing import Literal
 
 from edge.flight.alarms import failsafe, position_not_good, remote_control_lost, too_close
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick
+from edge.messages.codes import Refusal, RefusalCode, texts
 from edge.messages.mission import (
     AIRBORNE,
     AT_SLOT_M,
@@ -23,7 +24,7 @@ _S = FlightState
 
 _ANSWERS_KEPT = 8
 
-_Check = Callable[[Tick], str | None]
+_Check = Callable[[Tick], Refusal | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,63 +46,71 @@ class OrderRule:
     trial: Literal["kept", "begins", "forgotten"] = "kept"
 
 
-def _ground_commands(t: Tick) -> str | None:
+def _ground_commands(t: Tick) -> Refusal | None:
     action = t.safety_action
-    return None if action == "none" else f"the ground commands {action}"
+    if action == "none":
+        return None
+    return Refusal(RefusalCode.GROUND_COMMANDS, f"the ground commands {action}")
 
 
-def _cannot_disarm(t: Tick) -> str | None:
+def _cannot_disarm(t: Tick) -> Refusal | None:
     vehicle = t.inputs.vehicle
     arming = t.flight.state is _S.ARMING  # It may be armed before that is heard.
     if vehicle.armed is False and not arming:
-        return "is not armed"
+        return Refusal(RefusalCode.NOT_ARMED, "is not armed")
     if vehicle.in_air:
-        return "in the air: land it first"
+        return Refusal(RefusalCode.IN_THE_AIR, "in the air: land it first")
     known = arming or (vehicle.armed and vehicle.in_air is False)
-    return None if known else "not known to be armed, and on the ground"
+    if known:
+        return None
+    return Refusal(RefusalCode.ARMED_NOT_KNOWN, "not known to be armed, and on the ground")
 
 
-def _not_ready(t: Tick) -> str | None:
+def _not_ready(t: Tick) -> Refusal | None:
     failed = t.inputs.failed_checks
     if failed is None:
-        return "not ready: the checks are still running"
-    return f"not ready: {'; '.join(failed)}" if failed else None
+        return Refusal(RefusalCode.CHECKS_RUNNING, "not ready: the checks are still running")
+    return Refusal(RefusalCode.NOT_READY, f"not ready: {texts(failed)}") if failed else None
 
 
-def _not_in_place(t: Tick) -> str | None:
+def _not_in_place(t: Tick) -> Refusal | None:
     """Why the mission cannot be flown from here."""
     odometry, height = t.inputs.odometry, t.height_m
     vehicle = t.inputs.vehicle
-    if not t.knows_place:
-        return position_not_good(t)
+    if doubtful := position_not_good(t):
+        return Refusal(RefusalCode.POSITION_NOT_GOOD, doubtful)
     if odometry is None or height is None:
-        return "position or height is not known"
+        return Refusal(RefusalCode.PLACE_NOT_KNOWN, "position or height is not known")
     if not (vehicle.armed and vehicle.in_air):
-        return "the vehicle is not in the air"
-    if t.failsafe_acts:
-        return failsafe(t)
+        return Refusal(RefusalCode.NOT_IN_THE_AIR, "the vehicle is not in the air")
+    if acts := failsafe(t):
+        return Refusal(RefusalCode.FAILSAFE, acts)
     slot_height_m = t.robot.parameters.slot_height_m
     if abs(height - slot_height_m) > AT_SLOT_M:
-        return f"at {height:.1f} m; its height is {slot_height_m:g} m (within {AT_SLOT_M:g} m)"
+        return Refusal(
+            RefusalCode.NOT_AT_HEIGHT,
+            f"at {height:.1f} m; its height is {slot_height_m:g} m (within {AT_SLOT_M:g} m)",
+        )
     x_m, y_m, _ = odometry.position_m
     if t.robot.fence.distance_m(x_m, y_m) <= 0.0:
-        return f"outside the fence, at ({x_m:.1f}, {y_m:.1f}) m"
+        return Refusal(RefusalCode.OUTSIDE_FENCE, f"outside the fence, at ({x_m:.1f}, {y_m:.1f}) m")
     return None
 
 
-def _cannot_start(t: Tick) -> str | None:
+def _cannot_start(t: Tick) -> Refusal | None:
     if not t.flight.reached:
-        return "the autopilot is not in offboard yet"
+        return Refusal(RefusalCode.NOT_IN_OFFBOARD, "the autopilot is not in offboard yet")
     if t.inputs.policy_velocity_m_s is None:
-        return "the policy has no fresh answer"
+        return Refusal(RefusalCode.POLICY_STALE, "the policy has no fresh answer")
     if t.inputs.not_taken:
-        return "; ".join(t.inputs.not_taken)
+        return Refusal(RefusalCode.NOT_TAKEN_UP, texts(t.inputs.not_taken))
     if t.robot.on_remote_control_lost in ("hold", "land") and (lost := remote_control_lost(t)):
-        return lost
+        return Refusal(RefusalCode.REMOTE_CONTROL_LOST, lost)
     if t.inputs.busy_neighbours:
         busy = ", ".join(map(str, t.inputs.busy_neighbours))
-        return f"robots still taking off: {busy}"
-    return too_close(t)
+        return Refusal(RefusalCode.OTHERS_TAKE_OFF, f"robots still taking off: {busy}")
+    near = too_close(t)
+    return None if near is None else Refusal(RefusalCode.TOO_CLOSE, near)
 
 
 ORDERS: Mapping[OrderKind, OrderRule] = {
@@ -132,37 +141,44 @@ def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order
     return None if any(a.order_id == order.order_id for a in flight.answers) else order
 
 
-def refusal(t: Tick, order: Order) -> str | None:
+def refusal(t: Tick, order: Order) -> Refusal | None:
     """Why the order is refused; None if it is taken."""
     if order.boot_nonce != t.robot.boot_nonce:
-        return "meant for another start of this robot's program"
+        return Refusal(RefusalCode.OTHER_START, "meant for another start of this robot's program")
     left_s = order.expires_at_uptime_s - t.inputs.uptime_s
     if not 0.0 <= left_s <= ORDER_LIFETIME_S:
-        return "expired" if left_s < 0.0 else f"would be valid for {left_s:.0f} s: too long"
+        if left_s < 0.0:
+            return Refusal(RefusalCode.EXPIRED, "expired")
+        text = f"would be valid for {left_s:.0f} s: too long"
+        return Refusal(RefusalCode.VALID_TOO_LONG, text)
     rule, ground = ORDERS[order.kind], t.inputs.ground
     if rule.from_anybody:
         return None
     if ground is not None and order.operator != ground.operator:
-        return f"{ground.operator} commands, not {order.operator}"
+        return Refusal(
+            RefusalCode.OTHER_COMMANDER, f"{ground.operator} commands, not {order.operator}"
+        )
     first = _first_problem(t, rule.first)
     if first is not None:
         return first
     state, sources = t.flight.state, rule.taken_in
     if state not in sources:
         alone = f"taken in {sources[0]} only, the robot is" if len(sources) == 1 else "not taken"
-        return f"{order.kind} is {alone} in {state}: {t.flight.reason}"
+        return Refusal(
+            RefusalCode.WRONG_STATE, f"{order.kind} is {alone} in {state}: {t.flight.reason.text}"
+        )
     if order.expires_at_uptime_s <= t.flight.obeyed_expiry_s:
-        return "older than an order that was obeyed"
+        return Refusal(RefusalCode.OLDER, "older than an order that was obeyed")
     if t.silent:
-        return "the control loop was silent just before"
+        return Refusal(RefusalCode.CONTROL_SILENT, "the control loop was silent just before")
     if not t.ground_heard:
-        return "the ground's state is not heard"
+        return Refusal(RefusalCode.GROUND_NOT_HEARD, "the ground's state is not heard")
     return _first_problem(t, rule.checks)
 
 
-def answered(flight: FlightMemory, order: Order, refused: str | None) -> FlightMemory:
+def answered(flight: FlightMemory, order: Order, refused: Refusal | None) -> FlightMemory:
     """The memory, with the order's answer in it; `refused` is None if it was obeyed."""
-    answer = OrderResult(order.order_id, refused is None, refused or "")
+    answer = OrderResult(order.order_id, refused)
     expiry_s = flight.obeyed_expiry_s
     if refused is None:
         expiry_s = max(expiry_s, order.expires_at_uptime_s)
@@ -182,5 +198,5 @@ def obeyed(flight: FlightMemory, order: Order) -> tuple[FlightMemory, bool]:
     return replace(flight, trial=order.trial), order.trial != flight.trial
 
 
-def _first_problem(t: Tick, checks: tuple[_Check, ...]) -> str | None:
+def _first_problem(t: Tick, checks: tuple[_Check, ...]) -> Refusal | None:
     return next((problem for check in checks if (problem := check(t)) is not None), None)

@@ -11,6 +11,7 @@ from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.vehicle import Gps, VehicleState
 from edge.flight.failsafe import RemoteControl
 from edge.flight.margins import ErrorBudget, places_apart
+from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin, RobotStatus
 
 # 2026-01-01 UTC. A computer that lost its clock with its battery starts years before.
@@ -96,7 +97,7 @@ class PreflightInputs:
     ground_clock_offset_s: float | None
 
 
-def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[str, ...]:
+def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[FailedCheck, ...]:
     """Every check that fails, one plain line each with what to do; empty means ready."""
     return (
         *_program(inputs, limits),
@@ -106,159 +107,263 @@ def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[str
     )
 
 
-def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
+def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
     if inputs.bundle_problem is not None:
-        yield f"bundle is not verified ({inputs.bundle_problem}): deploy it again"
+        yield FailedCheck(
+            CheckCode.BUNDLE_NOT_VERIFIED,
+            f"bundle is not verified ({inputs.bundle_problem}): deploy it again",
+        )
     if not inputs.unix_now_s >= _EARLIEST_UNIX_S:
-        yield "clock is before 2026: set the time of this robot"
+        yield FailedCheck(
+            CheckCode.CLOCK_NOT_SET, "clock is before 2026: set the time of this robot"
+        )
     age_s = inputs.ground_age_s
     if age_s is None:
-        yield "ground was not heard: start `lpac ground`, check the radio and the fleet's name"
+        yield FailedCheck(
+            CheckCode.GROUND_NOT_HEARD,
+            "ground was not heard: start `lpac ground`, check the radio and the fleet's name",
+        )
     elif not age_s <= limits.max_ground_age_s:
-        yield f"ground was last heard {age_s:.1f} s ago: check the radio"
+        yield FailedCheck(
+            CheckCode.GROUND_SILENT, f"ground was last heard {age_s:.1f} s ago: check the radio"
+        )
     offset_s = inputs.ground_clock_offset_s
     if offset_s is not None and not abs(offset_s) <= limits.max_clock_difference_s:
-        yield f"clock differs from the ground's by {offset_s:.1f} s: set the time of this robot"
+        yield FailedCheck(
+            CheckCode.CLOCK_OFF_GROUND,
+            f"clock differs from the ground's by {offset_s:.1f} s: set the time of this robot",
+        )
 
 
-def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
+def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
     vehicle = inputs.vehicle
     if not vehicle.connected:
         # Whatever was heard before says nothing about now.
         others = ", ".join(map(str, vehicle.other_system_ids))
-        yield (
-            f"autopilot with system id {inputs.system_id} is not connected, but system id {others} "
-            "is: set MAV_SYS_ID or the config"
-            if others
-            else "autopilot is not connected: check its power and the connection's address"
-        )
+        if others:
+            yield FailedCheck(
+                CheckCode.OTHER_AUTOPILOT,
+                f"autopilot with system id {inputs.system_id} is not connected, but system id "
+                f"{others} is: set MAV_SYS_ID or the config",
+            )
+        else:
+            yield FailedCheck(
+                CheckCode.AUTOPILOT_NOT_CONNECTED,
+                "autopilot is not connected: check its power and the connection's address",
+            )
         return
     if vehicle.system_id != inputs.system_id:
-        yield (
+        yield FailedCheck(
+            CheckCode.SYSTEM_ID_WRONG,
             f"autopilot has system id {_or_unknown(vehicle.system_id)}, configured is "
-            f"{inputs.system_id}: check which vehicle this is, set MAV_SYS_ID or the config"
+            f"{inputs.system_id}: check which vehicle this is, set MAV_SYS_ID or the config",
         )
     if is_too_old(vehicle.version):
         oldest = ".".join(map(str, OLDEST))
-        yield f"autopilot has PX4 {vehicle.version}, must have {oldest} or newer: update it"
+        yield FailedCheck(
+            CheckCode.PX4_TOO_OLD,
+            f"autopilot has PX4 {vehicle.version}, must have {oldest} or newer: update it",
+        )
     if vehicle.other_system_ids:
         others = ", ".join(map(str, vehicle.other_system_ids))
-        yield f"other vehicles are on this link (system id {others}): give each its own port"
+        yield FailedCheck(
+            CheckCode.OTHER_VEHICLES,
+            f"other vehicles are on this link (system id {others}): give each its own port",
+        )
     if inputs.rc == "pilot" and not vehicle.remote_control:
-        yield "remote control is not heard, and the config has a pilot: switch it on"
+        yield FailedCheck(
+            CheckCode.REMOTE_CONTROL_NOT_HEARD,
+            "remote control is not heard, and the config has a pilot: switch it on",
+        )
     if vehicle.armed is not False:
         state = "armed" if vehicle.armed else "not known to be disarmed"
-        yield f"vehicle is {state}: disarm it"
+        yield FailedCheck(CheckCode.NOT_DISARMED, f"vehicle is {state}: disarm it")
     yield from _estimate(vehicle, inputs, limits)
     yield from _gps(vehicle.gps, limits)
-    if vehicle.battery is None:
-        yield "battery is not known: check the power module"
-    elif not vehicle.battery >= limits.min_battery:
-        yield (
-            f"battery has {100.0 * vehicle.battery:.0f} %, must have "
-            f"{100.0 * limits.min_battery:.0f} %: charge or change it"
+    yield from _battery(vehicle.battery, limits)
+    yield from _arming(inputs)
+
+
+def _battery(battery: float | None, limits: PreflightLimits) -> Iterator[FailedCheck]:
+    if battery is None:
+        yield FailedCheck(
+            CheckCode.BATTERY_NOT_KNOWN, "battery is not known: check the power module"
         )
+    elif not battery >= limits.min_battery:
+        yield FailedCheck(
+            CheckCode.BATTERY_LOW,
+            f"battery has {100.0 * battery:.0f} %, must have "
+            f"{100.0 * limits.min_battery:.0f} %: charge or change it",
+        )
+
+
+def _arming(inputs: PreflightInputs) -> Iterator[FailedCheck]:
+    vehicle = inputs.vehicle
     if not vehicle.armable:
         reasons = "; ".join(problem.text for problem in vehicle.problems) or "it does not say why"
-        yield f"autopilot would not arm ({reasons}): mend what it names"
+        yield FailedCheck(
+            CheckCode.NOT_ARMABLE, f"autopilot would not arm ({reasons}): mend what it names"
+        )
     if inputs.failsafe_problems is None:
-        yield "autopilot's failsafe parameters were not read: wait, or check the link"
+        yield FailedCheck(
+            CheckCode.FAILSAFE_NOT_READ,
+            "autopilot's failsafe parameters were not read: wait, or check the link",
+            settles_by_itself=True,
+        )
     else:
-        yield from (f"autopilot's {problem}" for problem in inputs.failsafe_problems)
+        for problem in inputs.failsafe_problems:
+            yield FailedCheck(CheckCode.FAILSAFE_WRONG, f"autopilot's {problem}")
     if not inputs.fence_uploaded:
-        yield "autopilot does not have the fence: wait for the upload, or check the link"
+        yield FailedCheck(
+            CheckCode.FENCE_NOT_UPLOADED,
+            "autopilot does not have the fence: wait for the upload, or check the link",
+            settles_by_itself=True,
+        )
 
 
 def _estimate(
     vehicle: VehicleState, inputs: PreflightInputs, limits: PreflightLimits
-) -> Iterator[str]:
+) -> Iterator[FailedCheck]:
     age_s = inputs.now_s - vehicle.position_at_s
     if vehicle.position_local_m is None:
-        yield "position is not known: wait for the autopilot's estimate"
+        yield FailedCheck(
+            CheckCode.POSITION_NOT_KNOWN,
+            "position is not known: wait for the autopilot's estimate",
+            settles_by_itself=True,
+        )
     elif not age_s <= limits.max_position_age_s:
-        yield f"position is {age_s:.1f} s old: check the link to the autopilot"
+        yield FailedCheck(
+            CheckCode.POSITION_OLD,
+            f"position is {age_s:.1f} s old: check the link to the autopilot",
+        )
     elif inputs.position.quality is not PositionQuality.GOOD:
-        yield (
+        yield FailedCheck(
+            CheckCode.POSITION_NOT_GOOD,
             f"position is {inputs.position.quality} ({inputs.position.text}): wait, or move to "
-            "open sky"
+            "open sky",
+            settles_by_itself=True,
         )
     if vehicle.origin is None:
-        yield "estimator's origin is not known: wait for a GPS fix"
+        yield FailedCheck(
+            CheckCode.ESTIMATOR_ORIGIN_NOT_KNOWN,
+            "estimator's origin is not known: wait for a GPS fix",
+            settles_by_itself=True,
+        )
     if vehicle.heading_rad is None:
-        yield "heading is not known: check the compass"
+        yield FailedCheck(
+            CheckCode.HEADING_NOT_KNOWN,
+            "heading is not known: check the compass",
+            settles_by_itself=True,
+        )
 
 
-def _gps(gps: Gps | None, limits: PreflightLimits) -> Iterator[str]:
+def _gps(gps: Gps | None, limits: PreflightLimits) -> Iterator[FailedCheck]:
     if gps is None:
-        yield "GPS is not heard: check the receiver"
+        yield FailedCheck(CheckCode.GPS_NOT_HEARD, "GPS is not heard: check the receiver")
         return
     if gps.fix < _FIX_3D:
-        yield "GPS has no 3-D fix: wait, or move to open sky"
+        yield FailedCheck(
+            CheckCode.GPS_NO_FIX,
+            "GPS has no 3-D fix: wait, or move to open sky",
+            settles_by_itself=True,
+        )
     if gps.satellites < limits.min_satellites:
-        yield (
+        yield FailedCheck(
+            CheckCode.GPS_FEW_SATELLITES,
             f"GPS sees {gps.satellites} satellites, must see {limits.min_satellites}: "
-            "wait, or move to open sky"
+            "wait, or move to open sky",
+            settles_by_itself=True,
         )
     if not gps.hdop <= limits.max_hdop:
-        yield (
+        yield FailedCheck(
+            CheckCode.GPS_IMPRECISE,
             f"GPS precision (HDOP) is {gps.hdop:.1f}, must be at most {limits.max_hdop:g}: "
-            "wait, or move to open sky"
+            "wait, or move to open sky",
+            settles_by_itself=True,
         )
 
 
-def _place(inputs: PreflightInputs) -> Iterator[str]:
+def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     fence = inputs.fence
     if inputs.origin is None:
-        yield "mission origin is not set: set it on the ground"
+        yield FailedCheck(
+            CheckCode.ORIGIN_NOT_SET, "mission origin is not set: set it on the ground"
+        )
     if inputs.position_m is None:
-        yield "place in the fence is not known: it needs the position and the mission origin"
+        yield FailedCheck(
+            CheckCode.PLACE_NOT_KNOWN,
+            "place in the fence is not known: it needs the position and the mission origin",
+        )
     else:
         x_m, y_m, _ = inputs.position_m
         depth_m = fence.distance_m(x_m, y_m)
         if not depth_m >= fence.buffer_m:
-            yield (
+            yield FailedCheck(
+                CheckCode.STANDS_OUTSIDE,
                 f"robot stands {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
-                "carry it there, or check the mission origin"
+                "carry it there, or check the mission origin",
             )
     depth_m = fence.distance_m(*inputs.landing_point_m)
     if not depth_m >= fence.buffer_m:
-        yield (
+        yield FailedCheck(
+            CheckCode.LANDS_OUTSIDE,
             f"landing point lies {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
-            "change it in the config, or on the ground"
+            "change it in the config, or on the ground",
         )
     if not fence.floor_m <= inputs.slot_height_m <= fence.ceiling_m:
-        yield (
+        yield FailedCheck(
+            CheckCode.HEIGHT_OUTSIDE,
             f"slot height is {inputs.slot_height_m:g} m, must be from the floor at "
             f"{fence.floor_m:g} m to the ceiling at {fence.ceiling_m:g} m: "
-            "change it in the config, or on the ground"
+            "change it in the config, or on the ground",
         )
 
 
-def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[str]:
+def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
     others = [heard for heard in inputs.neighbours if heard.status.robot_id != inputs.robot_id]
     if inputs.duplicate_id or len(others) < len(inputs.neighbours):
-        yield f"another program says that it is robot {inputs.robot_id}: stop it, or change its id"
+        yield FailedCheck(
+            CheckCode.DUPLICATE_ID,
+            f"another program says that it is robot {inputs.robot_id}: stop it, or change its id",
+        )
     for robot in inputs.not_understood:
-        yield f"{robot} runs another version of this program: deploy one to all"
+        yield FailedCheck(
+            CheckCode.NOT_UNDERSTOOD,
+            f"{robot} runs another version of this program: deploy one to all",
+        )
     for status, _, heard_at_unix_s in others:
         other = f"robot {status.robot_id}"
         if status.system_id is not None and status.system_id == inputs.system_id:
-            yield f"{other}'s vehicle has the same system id {status.system_id}: set MAV_SYS_ID"
+            yield FailedCheck(
+                CheckCode.SAME_SYSTEM_ID,
+                f"{other}'s vehicle has the same system id {status.system_id}: set MAV_SYS_ID",
+            )
         if status.bundle_id != inputs.bundle_id:
-            yield f"{other} has another bundle: deploy one to all"
+            yield FailedCheck(
+                CheckCode.OTHER_BUNDLE, f"{other} has another bundle: deploy one to all"
+            )
         if status.world_id != inputs.world_id:
-            yield f"{other} has another world: set one on the ground, or deploy it to all"
+            yield FailedCheck(
+                CheckCode.OTHER_WORLD,
+                f"{other} has another world: set one on the ground, or deploy it to all",
+            )
         if inputs.origin is not None and status.origin != inputs.origin:
-            yield f"{other} has another mission origin: set it again on the ground"
+            yield FailedCheck(
+                CheckCode.OTHER_ORIGIN,
+                f"{other} has another mission origin: set it again on the ground",
+            )
         yield from _apart(inputs, status, other)
         offset_s = status.unix_time_s - heard_at_unix_s
         if not abs(offset_s) <= limits.max_clock_difference_s:
-            yield f"{other}'s clock differs by {offset_s:.1f} s: set the time of both"
+            yield FailedCheck(
+                CheckCode.CLOCK_OFF_ROBOT,
+                f"{other}'s clock differs by {offset_s:.1f} s: set the time of both",
+            )
     if not inputs.vehicle.armed:
         yield from _too_late(inputs.errors, [heard.status for heard in others])
 
 
-def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[str]:
+def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[FailedCheck]:
     """Whether somebody took off so long ago that heights above the pad mean another height now."""
     armed = [status for status in others if status.armed]
     known = [(s.robot_id, math.inf if s.flown_s is None else s.flown_s) for s in armed]
@@ -271,22 +376,24 @@ def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[st
             else "since before its program started"
         )
         # In words that stay the same for as long as it lasts.
-        yield (
+        yield FailedCheck(
+            CheckCode.TAKEOFFS_TOO_FAR_APART,
             f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "
-            "until all are down, or raise takeoffs_height_m of [errors]"
+            "until all are down, or raise takeoffs_height_m of [errors]",
         )
 
 
-def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator[str]:
+def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator[FailedCheck]:
     """Whether two robots stay apart in truth, above each other and where they land."""
     errors, gps = inputs.errors, inputs.vehicle.gps
     limit_m = inputs.min_separation_m
     heights = errors.slot_spacing.or_at_least(limit_m, "min_separation_m")
     apart_m = abs(status.slot_height_m - inputs.slot_height_m)
     if not heights.holds(apart_m):
-        yield (
+        yield FailedCheck(
+            CheckCode.HEIGHTS_TOO_NEAR,
             f"{other} flies {apart_m:.1f} m above or below, {heights}: "
-            "change the slots in the config, or on the ground"
+            "change the slots in the config, or on the ground",
         )
     places = places_apart(
         errors.reported_position_m(None if gps is None else gps.accuracy_m),
@@ -296,9 +403,10 @@ def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator
     if not places.holds(apart_m):
         planned = places_apart(errors.position_m, errors.position_m)
         why = "too near for the GPS accuracy that is reported; " if planned.holds(apart_m) else ""
-        yield (
+        yield FailedCheck(
+            CheckCode.LANDINGS_TOO_NEAR,
             f"{other} lands {apart_m:.1f} m away, {places}: "
-            f"{why}change the landing points in the config, or on the ground"
+            f"{why}change the landing points in the config, or on the ground",
         )
 
 

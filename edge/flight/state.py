@@ -20,6 +20,7 @@ from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
 from edge.flight.margins import ErrorBudget
 from edge.flight.safety import Closest, MotionLimits
+from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
     MAX_SLOT,
     FlightState,
@@ -35,6 +36,7 @@ OFFBOARD_TIMEOUT_S = 4.0
 # What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
 STALE_TELEMETRY_S = 2.0
 _LAPSE_SHARE = 0.9
+_STARTED = Reason(ReasonCode.PROGRAM_STARTED, "program started")
 
 # Who has it land: the ground, a return that came home, or what cannot wait.
 LandBy = Literal["ground", "return", "safety"]
@@ -110,7 +112,7 @@ class FlightMemory:
     """
 
     state: FlightState = FlightState.INIT
-    reason: str = "program started"
+    reason: Reason = _STARTED
     alarming: bool = False
     since_s: float = 0.0
     tick_at_s: float = -math.inf
@@ -144,7 +146,7 @@ class FlightInputs:
     answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
     take off. `safety_form` is what a ground asks whose states are not understood.
     `failed_checks` are preflight's; None before the first. `not_taken` is what of the
-    ground's state the robot does not fly by, in words. `order` is new in this tick. `energy` is
+    ground's state the robot does not fly by. `order` is new in this tick. `energy` is
     None when the battery is not known.
     """
 
@@ -159,8 +161,8 @@ class FlightInputs:
     ground: GroundState | None
     ground_age_s: float
     safety_form: SafetyAction
-    failed_checks: tuple[str, ...] | None
-    not_taken: tuple[str, ...]
+    failed_checks: tuple[FailedCheck, ...] | None
+    not_taken: tuple[FailedCheck, ...]
     order: Order | None
     uptime_s: float
     energy: Energy | None

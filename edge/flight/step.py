@@ -20,6 +20,7 @@ from edge.flight.state import (
     is_silent,
 )
 from edge.flight.transitions import TRANSITIONS, Transition
+from edge.messages.codes import Reason, Refusal, RefusalCode
 from edge.messages.mission import ON_GROUND, STEERED, FlightState, OrderKind
 
 _S = FlightState
@@ -38,7 +39,7 @@ class Decision(NamedTuple):
 
     flight: FlightMemory
     actions: tuple[Action, ...]
-    alarms: tuple[str, ...]
+    alarms: tuple[Reason, ...]
     new_trial: bool
     taken: Transition | None
 
@@ -54,7 +55,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     overruled = row is not None and row.order is None
     if taken is not None and overruled and not ORDERS[taken.kind].moves_nothing:
         # Something graver came first.
-        taken, refused = None, reason
+        taken, refused = None, Refusal(RefusalCode.OVERRULED, reason)
     actions: tuple[Action, ...] = ()
     if row is not None:
         flight, actions = enter(row, reason, tick), row.actions
@@ -133,7 +134,7 @@ def _first_row(tick: Tick, ordered: OrderKind | None) -> tuple[Transition | None
 
 
 def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
-    """The memory with which the row's target begins."""
+    """The memory with which the row's target begins; `reason` in words."""
     flight, now_s = t.flight, t.inputs.now_s
     from_offboard = flight.state in (_S.ARMING, *STEERED)
     stays_offboard = from_offboard and row.target in STEERED and not row.looks_anew
@@ -143,7 +144,7 @@ def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
     return replace(
         flight,
         state=row.target,
-        reason=reason,
+        reason=Reason(row.code, reason),
         alarming=row.alarm,
         since_s=now_s,
         datum_m=_datum_m(row.target, t),

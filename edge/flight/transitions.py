@@ -23,9 +23,10 @@ from edge.flight.alarms import (
     too_close,
 )
 from edge.flight.state import OFFBOARD_TIMEOUT_S, STALE_TELEMETRY_S, LandBy, Tick
+from edge.messages.codes import ReasonCode
 from edge.messages.mission import AIRBORNE, STEERED, FlightState, OrderKind
 
-_S = FlightState
+_S, _R = FlightState, ReasonCode
 
 _ARMING_TIMEOUT_S = 6.0
 _AT_HEIGHT_M = 0.5
@@ -35,7 +36,9 @@ _AT_REST_M_S = 0.4
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """One row: from any of `sources` to `target` when `why` gives a reason; `when` is for people.
+    """One row: from any of `sources` to `target` when `why` gives a reason, in words.
+
+    `code` is what machines call the reason, and `when` what people call the row.
 
     A row with `order` applies only in a tick that obeys such an order. `actions` are asked of the
     autopilot once. `alarm`: the operator must see the reason for as long as the target lasts.
@@ -48,6 +51,7 @@ class Transition:
 
     sources: tuple[FlightState, ...]
     target: FlightState
+    code: ReasonCode
     when: str
     why: Callable[[Tick], str | None]
     _: KW_ONLY
@@ -302,102 +306,117 @@ def _refusal(t: Tick, action: Action) -> str:
 
 
 TRANSITIONS: tuple[Transition, ...] = (
-    Transition(tuple(_S), _S.FAULT, "the operator orders kill",
+    Transition(tuple(_S), _S.FAULT, _R.KILLED, "the operator orders kill",
                _always("killed by the operator"), order="kill", alarm=True, kills=True),
-    Transition((_S.ARMING, *AIRBORNE, _S.PILOT), _S.PILOT,
+    Transition((_S.ARMING, *AIRBORNE, _S.PILOT), _S.PILOT, _R.DISARM_ORDERED,
                "the operator orders disarm, on the ground", _always("disarm ordered"),
                order="disarm", actions=(Action.DISARM,)),
     # What the vehicle does, whoever made it.
-    Transition((*AIRBORNE, _S.PILOT), _S.LANDED, "the vehicle is disarmed", _disarmed),
-    Transition((_S.FAULT,), _S.INIT, "the vehicle is disarmed, and was not killed",
+    Transition((*AIRBORNE, _S.PILOT), _S.LANDED, _R.DISARMED, "the vehicle is disarmed", _disarmed),
+    Transition((_S.FAULT,), _S.INIT, _R.DISARMED, "the vehicle is disarmed, and was not killed",
                _disarmed_again),
-    Transition((*AIRBORNE, _S.PILOT), _S.FAULT, "the autopilot does not answer", _link_lost,
-               alarm=True),
-    Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED), _S.INIT, "the autopilot does not answer",
-               _link_lost),
-    Transition((_S.ARMING,), _S.INIT, "the autopilot does not answer", _link_lost,
-               actions=(Action.DISARM,)),
-    Transition((_S.INIT,), _S.PILOT, "the vehicle is armed when the program finds it",
-               _armed_before, alarm=True, left_alone="if in hold"),
-    Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED, _S.ARMING), _S.PILOT,
+    Transition((*AIRBORNE, _S.PILOT), _S.FAULT, _R.AUTOPILOT_SILENT,
+               "the autopilot does not answer", _link_lost, alarm=True),
+    Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED), _S.INIT, _R.AUTOPILOT_SILENT,
+               "the autopilot does not answer", _link_lost),
+    Transition((_S.ARMING,), _S.INIT, _R.AUTOPILOT_SILENT, "the autopilot does not answer",
+               _link_lost, actions=(Action.DISARM,)),
+    Transition((_S.INIT,), _S.PILOT, _R.ARMED_BEFORE,
+               "the vehicle is armed when the program finds it", _armed_before, alarm=True,
+               left_alone="if in hold"),
+    Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED, _S.ARMING), _S.PILOT, _R.ARMED_BY_OTHERS,
                "the vehicle is armed, not by this program", _armed_by_others, alarm=True),
-    Transition((_S.FAULT,), _S.PILOT, "the autopilot answers again, armed, and was not killed",
-               _armed_again, alarm=True, left_alone="if in hold"),
+    Transition((_S.FAULT,), _S.PILOT, _R.ARMED_BEFORE,
+               "the autopilot answers again, armed, and was not killed", _armed_again, alarm=True,
+               left_alone="if in hold"),
     # A pilot, and the autopilot's own failsafe.
-    Transition(AIRBORNE, _S.PILOT, "a pilot's mode is on", _pilot, alarm=True),
-    Transition(STEERED, _S.HOLD, "the control loop was silent", _lapse, alarm=True,
-               left_alone="yes", looks_anew=True),
-    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD,
+    Transition(AIRBORNE, _S.PILOT, _R.PILOT, "a pilot's mode is on", _pilot, alarm=True),
+    Transition(STEERED, _S.HOLD, _R.CONTROL_SILENT, "the control loop was silent", _lapse,
+               alarm=True, left_alone="yes", looks_anew=True),
+    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, _R.FAILSAFE,
                "the autopilot's own failsafe holds or moves the vehicle", _failsafe_takes,
                alarm=True, left_alone="yes"),
-    Transition(STEERED, _S.PILOT, "the vehicle left offboard", _left_offboard, alarm=True),
-    Transition((_S.LAND,), _S.PILOT, "the vehicle left land", _left_land, alarm=True),
-    Transition(STEERED, _S.LAND, "the autopilot lands by itself", _autopilot_lands, alarm=True),
-    Transition((_S.HOLD, _S.RETURN), _S.PILOT, "offboard is refused", _offboard_refused,
-               alarm=True, left_alone="if in hold"),
-    # What cannot wait for anybody.
-    Transition(STEERED, _S.LAND, "the position is lost", _position_lost, alarm=True),
-    Transition(STEERED, _S.LAND, "the battery is critical", _battery_critical, alarm=True),
-    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "it stands on the ground", _on_ground,
+    Transition(STEERED, _S.PILOT, _R.LEFT_OFFBOARD, "the vehicle left offboard", _left_offboard,
                alarm=True),
+    Transition((_S.LAND,), _S.PILOT, _R.LEFT_LAND, "the vehicle left land", _left_land, alarm=True),
+    Transition(STEERED, _S.LAND, _R.AUTOPILOT_LANDS, "the autopilot lands by itself",
+               _autopilot_lands, alarm=True),
+    Transition((_S.HOLD, _S.RETURN), _S.PILOT, _R.OFFBOARD_REFUSED, "offboard is refused",
+               _offboard_refused, alarm=True, left_alone="if in hold"),
+    # What cannot wait for anybody.
+    Transition(STEERED, _S.LAND, _R.POSITION_LOST, "the position is lost", _position_lost,
+               alarm=True),
+    Transition(STEERED, _S.LAND, _R.BATTERY_CRITICAL, "the battery is critical", _battery_critical,
+               alarm=True),
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, _R.ON_GROUND, "it stands on the ground",
+               _on_ground, alarm=True),
     # The operator gives it away.
-    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.PILOT, "the operator orders pilot",
-               _always("given to a pilot"), order="pilot", actions=(Action.HOLD,), alarm=True),
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.PILOT, _R.GIVEN_TO_PILOT,
+               "the operator orders pilot", _always("given to a pilot"), order="pilot",
+               actions=(Action.HOLD,), alarm=True),
     # The ground holds, returns or lands it.
-    Transition((_S.ARMING,), _S.IDLE, "the ground commands hold, land or return, or is lost; the "
-               "control loop was silent; the vehicle left offboard",
-               _arming_called_off, actions=(Action.DISARM,), alarm=True),
-    Transition((_S.TAKEOFF,), _S.LAND, "the ground commands land or return",
+    Transition((_S.ARMING,), _S.IDLE, _R.ARMING_CALLED_OFF,
+               "the ground commands hold, land or return, or is lost; the control loop was silent; "
+               "the vehicle left offboard", _arming_called_off, actions=(Action.DISARM,),
+               alarm=True),
+    Transition((_S.TAKEOFF,), _S.LAND, _R.GROUND_ENDS_TAKEOFF, "the ground commands land or return",
                _ground_ends_takeoff, land_by="return"),
-    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, "the ground commands land",
-               _ground_lands, land_by="ground"),
-    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, "the ground commands hold",
-               _ground_holds),
-    Transition((_S.LAND,), _S.HOLD, "the ground commands hold, and landing was no emergency",
-               _ground_holds_landing),
-    Transition((_S.HOLD, _S.MISSION), _S.RETURN, "the ground commands return", _ground_returns),
-    Transition((_S.LAND,), _S.RETURN, "the ground commands return, and had commanded land",
-               _ground_returns_landing),
+    Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, _R.GROUND_LANDS,
+               "the ground commands land", _ground_lands, land_by="ground"),
+    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, _R.GROUND_HOLDS,
+               "the ground commands hold", _ground_holds),
+    Transition((_S.LAND,), _S.HOLD, _R.GROUND_HOLDS,
+               "the ground commands hold, and landing was no emergency", _ground_holds_landing),
+    Transition((_S.HOLD, _S.MISSION), _S.RETURN, _R.GROUND_RETURNS, "the ground commands return",
+               _ground_returns),
+    Transition((_S.LAND,), _S.RETURN, _R.GROUND_RETURNS,
+               "the ground commands return, and had commanded land", _ground_returns_landing),
     # What the robot notices by itself.
-    Transition((_S.MISSION,), _S.HOLD, "a neighbour is too close", too_close, alarm=True),
-    Transition((_S.TAKEOFF, _S.MISSION), _S.HOLD,
+    Transition((_S.MISSION,), _S.HOLD, _R.TOO_CLOSE, "a neighbour is too close", too_close,
+               alarm=True),
+    Transition((_S.TAKEOFF, _S.MISSION), _S.HOLD, _R.REMOTE_CONTROL_LOST,
                "the remote control is lost, and rc_lost = hold", _holds_without_remote_control,
                alarm=True),
-    Transition((_S.TAKEOFF, _S.HOLD, _S.MISSION), _S.LAND,
+    Transition((_S.TAKEOFF, _S.HOLD, _S.MISSION), _S.LAND, _R.REMOTE_CONTROL_LOST,
                "the remote control is lost, and rc_lost = land", _lands_without_remote_control,
                alarm=True),
-    Transition((_S.MISSION, _S.RETURN), _S.HOLD, "the ground is lost", ground_lost, alarm=True),
-    Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, "the ground stays lost", _ground_long_lost,
+    Transition((_S.MISSION, _S.RETURN), _S.HOLD, _R.GROUND_LOST, "the ground is lost", ground_lost,
                alarm=True),
-    Transition((_S.HOLD, _S.PILOT), _S.LAND,
+    Transition((_S.TAKEOFF, _S.HOLD), _S.LAND, _R.GROUND_LOST, "the ground stays lost",
+               _ground_long_lost, alarm=True),
+    Transition((_S.HOLD, _S.PILOT), _S.LAND, _R.NOBODY_ANSWERED,
                "it hovers for no reason that anybody gave, and nobody answers", _left_alone,
                alarm=True),
-    Transition((_S.MISSION,), _S.RETURN, "the battery is low, or just lasts for the way home",
-               battery_low, alarm=True),
-    Transition((_S.HOLD,), _S.RETURN,
-               "the same, and the ground commands nothing",
+    Transition((_S.MISSION,), _S.RETURN, _R.BATTERY_LOW,
+               "the battery is low, or just lasts for the way home", battery_low, alarm=True),
+    Transition((_S.HOLD,), _S.RETURN, _R.BATTERY_LOW, "the same, and the ground commands nothing",
                _battery_low_in_hold, alarm=True),
-    Transition((_S.MISSION,), _S.HOLD, "the policy has no fresh answer", _policy_stale,
-               alarm=True),
+    Transition((_S.MISSION,), _S.HOLD, _R.POLICY_STALE, "the policy has no fresh answer",
+               _policy_stale, alarm=True),
     # The way of a flight.
-    Transition((_S.INIT,), _S.IDLE, "autopilot, position and estimator origin are known", _found),
-    Transition((_S.IDLE,), _S.PREFLIGHT, "the ground enables and has set an origin, after 2 s",
-               _enabled_at_rest),
-    Transition((_S.PREFLIGHT,), _S.IDLE, "the ground does not enable, or is lost", _not_enabled),
-    Transition((_S.PREFLIGHT,), _S.ARMING, "the operator orders takeoff, and the robot is ready",
-               _always("takeoff ordered"), order="takeoff"),
-    Transition((_S.ARMING,), _S.TAKEOFF, "the vehicle is armed", _armed),
-    Transition((_S.ARMING,), _S.IDLE, "offboard or arming is refused, or takes too long",
-               _arming_failed, actions=(Action.DISARM,), alarm=True),
-    Transition((_S.TAKEOFF,), _S.HOLD, "at its height, and the autopilot says in the air",
-               _at_slot, keeps_target=True),
-    Transition((_S.TAKEOFF,), _S.LAND, "it does not climb", _lift_off_failed, alarm=True),
-    Transition((_S.HOLD,), _S.MISSION, "the operator orders start",
+    Transition((_S.INIT,), _S.IDLE, _R.FOUND, "autopilot, position and estimator origin are known",
+               _found),
+    Transition((_S.IDLE,), _S.PREFLIGHT, _R.ENABLED,
+               "the ground enables and has set an origin, after 2 s", _enabled_at_rest),
+    Transition((_S.PREFLIGHT,), _S.IDLE, _R.NOT_ENABLED, "the ground does not enable, or is lost",
+               _not_enabled),
+    Transition((_S.PREFLIGHT,), _S.ARMING, _R.TAKEOFF_ORDERED,
+               "the operator orders takeoff, and the robot is ready", _always("takeoff ordered"),
+               order="takeoff"),
+    Transition((_S.ARMING,), _S.TAKEOFF, _R.ARMED, "the vehicle is armed", _armed),
+    Transition((_S.ARMING,), _S.IDLE, _R.ARMING_FAILED,
+               "offboard or arming is refused, or takes too long", _arming_failed,
+               actions=(Action.DISARM,), alarm=True),
+    Transition((_S.TAKEOFF,), _S.HOLD, _R.AT_HEIGHT,
+               "at its height, and the autopilot says in the air", _at_slot, keeps_target=True),
+    Transition((_S.TAKEOFF,), _S.LAND, _R.NOT_CLIMBING, "it does not climb", _lift_off_failed,
+               alarm=True),
+    Transition((_S.HOLD,), _S.MISSION, _R.MISSION_STARTED, "the operator orders start",
                _always("mission started"), order="start"),
-    Transition((_S.RETURN,), _S.LAND, "at its landing point", _at_landing_point,
-               land_by="return"),
-    Transition((_S.PILOT,), _S.HOLD, "the operator orders rejoin",
+    Transition((_S.RETURN,), _S.LAND, _R.AT_LANDING_POINT, "at its landing point",
+               _at_landing_point, land_by="return"),
+    Transition((_S.PILOT,), _S.HOLD, _R.TAKEN_BACK, "the operator orders rejoin",
                _always("taken back by the operator"), order="rejoin", rejoins=True),
-    Transition((_S.LANDED,), _S.PREFLIGHT, "enabled, and the ground commands nothing",
+    Transition((_S.LANDED,), _S.PREFLIGHT, _R.ENABLED, "enabled, and the ground commands nothing",
                _may_fly_again),
 )  # fmt: skip

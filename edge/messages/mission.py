@@ -42,10 +42,10 @@ from edge.messages.bounds import (
     Sequence,
     Share,
     SystemId,
-    Text,
     UnixSeconds,
     bounds_of,
 )
+from edge.messages.codes import FailedCheck, Reason, Refusal
 
 # Of what is said now. A message of another version is taken as far as it can be; see the codec.
 VERSION = 3
@@ -58,7 +58,7 @@ _OVER_LANDING_POINT_M = 1.5
 Version = Annotated[int, Meta(ge=0, le=10_000)]
 # What an older program must know of, or else refuse the message: names of fields.
 MustUnderstand = Annotated[tuple[Name, ...], Meta(max_length=20)]
-Texts = Annotated[tuple[Text, ...], Meta(max_length=MOST_TEXTS)]
+FailedChecks = Annotated[tuple[FailedCheck, ...], Meta(max_length=MOST_TEXTS)]
 Point = tuple[Metres, Metres]
 Vector = tuple[Metres, Metres, Metres]
 _OfRobots = Meta(max_length=MOST_ROBOTS)
@@ -221,11 +221,15 @@ class KillForm:
 
 @dataclass(frozen=True, slots=True)
 class OrderResult:
-    """A robot's answer to an order; `reason` says why it was refused."""
+    """A robot's answer to an order: obeyed, unless there is a `refusal`."""
 
     order_id: Name
-    accepted: bool
-    reason: Text = ""
+    refusal: Refusal | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it was obeyed."""
+        return self.refusal is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,10 +272,10 @@ class RobotStatus:
     uptime_s: Seconds
     unix_time_s: UnixSeconds
     state: FlightState
-    reason: Text
+    reason: Reason
     ready: bool
-    failed_checks: Texts
-    alarms: Texts
+    failed_checks: FailedChecks
+    alarms: Annotated[tuple[Reason, ...], Meta(max_length=MOST_TEXTS)]
     obeyed_sequence: Sequence
     operator: Name
     orders: Annotated[tuple[OrderResult, ...], Meta(max_length=MOST_TEXTS)]
@@ -293,7 +297,7 @@ class RobotStatus:
     neighbour_ages_s: Annotated[dict[RobotKey, Seconds], _OfRobots]
     loops: Annotated[dict[Name, LoopStatus], Meta(max_length=MOST_TEXTS)]
     fence: Fence | None = None
-    not_taken: Texts = ()
+    not_taken: FailedChecks = ()
     in_air: bool | None = None
     global_deg: tuple[Degrees, Degrees] | None = None
     hdop: Precision | None = None

@@ -23,6 +23,7 @@ from edge.flight.state import (
     height_m,
 )
 from edge.flight.step import step
+from edge.messages.codes import CheckCode, FailedCheck, Reason
 from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
@@ -84,11 +85,11 @@ class FlightControl:
         self._consumption = Consumption(energy)
         self.energy: Energy | None = None
         self.flight = FlightMemory()
-        self.alarms: tuple[str, ...] = ()
+        self.alarms: tuple[Reason, ...] = ()
         self.checks: Checks | None = None
         self.peers: tuple[HeardStatus, ...] = ()
         self.assignment = Assignment(None, robot, world_id)
-        self.not_taken: tuple[str, ...] = ()
+        self.not_taken: tuple[FailedCheck, ...] = ()
         self.wanted_world_id: str | None = None
         self.world: GroundWorld | None = None
         self.obeyed_sequence = -1
@@ -146,7 +147,9 @@ class FlightControl:
         sent = None if local is None else self._autopilot.send(local)
         if decision.flight.state is not before.state:
             flight = decision.flight
-            _log.info("flight state", state=flight.state, was=before.state, reason=flight.reason)
+            _log.info(
+                "flight state", state=flight.state, was=before.state, reason=flight.reason.text
+            )
         self._record(inputs, setpoint, sent, decision.actions)
         return sent is not None and not failsafe_acts(vehicle)
 
@@ -163,7 +166,7 @@ class FlightControl:
         """How long a full battery lasts, as measured in flight, or else as configured."""
         return self._consumption.endurance_s
 
-    def failed_checks(self, now_s: float) -> tuple[str, ...] | None:
+    def failed_checks(self, now_s: float) -> tuple[FailedCheck, ...] | None:
         """What keeps the robot on the ground; None if nobody looked lately. From any thread."""
         checks = self.checks
         if checks is None or now_s - checks.at_s > _MAX_CHECKS_AGE_S:
@@ -197,28 +200,33 @@ class FlightControl:
         if self._has_flown and not (armed is False and self.flight.state in ON_GROUND):
             fence, place = self._configured.told(ground)
             told = {
-                "mission origin": (origin, now.origin),
-                "fence": (fence, now.robot.fence),
-                "place": (place, now.robot.place),
-                "world": (world_id, now.world_id),
+                CheckCode.KEEPS_ORIGIN: ("mission origin", origin, now.origin),
+                CheckCode.KEEPS_FENCE: ("fence", fence, now.robot.fence),
+                CheckCode.KEEPS_PLACE: ("place", place, now.robot.place),
+                CheckCode.KEEPS_WORLD: ("world", world_id, now.world_id),
             }
             where = "in flight" if armed else "not known to be on the ground"
             self.not_taken = tuple(
-                f"{where}: keeps its {what}" for what, (new, own) in told.items() if new != own
+                FailedCheck(code, f"{where}: keeps its {what}")
+                for code, (what, new, own) in told.items()
+                if new != own
             )
             return
-        robot, sensor, not_taken = now.robot, None, []
+        robot, sensor = now.robot, None
+        not_taken: list[FailedCheck] = []
         try:
             robot = self._configured.assigned(ground)
         except ValueError as error:
-            not_taken.append(str(error))
+            not_taken.append(FailedCheck(CheckCode.FENCE_OR_PLACE_UNFIT, str(error)))
         if world_id != now.world_id:
             arrived = self.world if self.world and self.world.world_id == world_id else None
             if arrived is None:
                 self.wanted_world_id = world_id
-                not_taken.append(f"world {world_id} of the ground has not arrived: wait")
+                text = f"world {world_id} of the ground has not arrived: wait"
+                not_taken.append(FailedCheck(CheckCode.WORLD_NOT_ARRIVED, text, True))
             elif arrived.sensor is None:
-                not_taken.append(f"the ground's world cannot be used: {arrived.problem}")
+                text = f"the ground's world cannot be used: {arrived.problem}"
+                not_taken.append(FailedCheck(CheckCode.WORLD_UNUSABLE, text))
             else:
                 sensor = arrived.sensor
         self.not_taken = tuple(not_taken)
@@ -308,7 +316,8 @@ class FlightControl:
             self._unix_clock_s(),
             {
                 "state": self.flight.state,
-                "reason": self.flight.reason,
+                "reason": self.flight.reason.text,
+                "reason_code": self.flight.reason.code,
                 "position_quality": inputs.position.quality,
                 "position_cause": inputs.position.cause,
                 "height_m": height_m(self.flight, odometry),

@@ -38,7 +38,9 @@ from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_
 from edge.drivers.world_sensor import WorldSensor
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.state import flown_s
+from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import encode
+from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import FlightState, RobotStatus, explored_to_bytes, world_id
 from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
 from edge.policy.bundle import Manifest, load_bundle
@@ -64,6 +66,7 @@ _JOIN_S = 0.3
 _NOBODY = -1
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
+_CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 _log = structlog.get_logger(__name__)
 
@@ -431,7 +434,7 @@ class _Program:
             state=flight.state,
             reason=flight.reason,
             ready=ready,
-            failed_checks=("checks are still running",) if failed_checks is None else failed_checks,
+            failed_checks=_CHECKS_RUNNING if failed_checks is None else failed_checks[:MOST_TEXTS],
             alarms=(*control.alarms, *self._alarms()),
             obeyed_sequence=control.obeyed_sequence,
             operator=control.operator,
@@ -476,16 +479,19 @@ class _Program:
             gps_accuracy_m=None if gps is None else gps.accuracy_m,
         )
 
-    def _alarms(self) -> tuple[str, ...]:
+    def _alarms(self) -> tuple[Reason, ...]:
         alarms = []
         if self._link.duplicate():
-            alarms.append(f"another program says that it is robot {self._config.robot_id}")
+            text = f"another program says that it is robot {self._config.robot_id}"
+            alarms.append(Reason(ReasonCode.DUPLICATE_ID, text))
         if not self._watchdog.alive():
-            alarms.append("the watchdog has ended: only PX4 notices if this program hangs")
+            text = "the watchdog has ended: only PX4 notices if this program hangs"
+            alarms.append(Reason(ReasonCode.WATCHDOG_ENDED, text))
         if not self._recorder.recording:
-            alarms.append("the flight log is not written")
+            alarms.append(Reason(ReasonCode.LOG_NOT_WRITTEN, "the flight log is not written"))
         if self._inbox.ground_refusal:
-            alarms.append(f"the ground is not understood: {self._inbox.ground_refusal}")
+            text = f"the ground is not understood: {self._inbox.ground_refusal}"
+            alarms.append(Reason(ReasonCode.GROUND_NOT_UNDERSTOOD, text))
         return tuple(alarms)
 
 
@@ -504,7 +510,7 @@ class CheckReport(NamedTuple):
     version: str
     explanations: tuple[str, ...]
     changes: tuple[str, ...]
-    failed: tuple[str, ...]
+    failed: tuple[FailedCheck, ...]
 
 
 def check(config: RobotConfig, wait_s: float) -> CheckReport:
@@ -538,12 +544,13 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             ground, ground_age_s = inbox.ground(now_s)
             origin = None if ground is None else ground.origin
             navigation.frame = None if origin is None else origin.frame()
-            robot, unfit = config.robot(boot_nonce=0), ""
+            robot = config.robot(boot_nonce=0)
+            unfit: tuple[FailedCheck, ...] = ()
             if ground is not None:
                 try:
                     robot = robot.assigned(ground)
                 except ValueError as error:
-                    unfit = str(error)
+                    unfit = (FailedCheck(CheckCode.FENCE_OR_PLACE_UNFIT, str(error)),)
             assignment = Assignment(origin, robot, loaded.world_id)
             readiness.prepare(now_s, assignment)
             checks = readiness.checks(
@@ -559,7 +566,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
                 ground_age_s=ground_age_s,
                 ground_clock_offset_s=inbox.ground_clock_offset_s,
             )
-            failed = (*checks.failed, unfit) if unfit else checks.failed
+            failed = (*checks.failed, *unfit)
             if not failed or now_s > until_s:
                 version = in_words(autopilot.state().version)
                 return CheckReport(version, readiness.explanations, readiness.changes, failed)

@@ -17,6 +17,7 @@ from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import HeardStatus, PreflightInputs, failed_checks
 from edge.flight.state import Robot
+from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig
 
@@ -38,7 +39,7 @@ class Assignment(NamedTuple):
 class Checks(NamedTuple):
     """What preflight found at one time, for one assignment: one line for each failed check."""
 
-    failed: tuple[str, ...]
+    failed: tuple[FailedCheck, ...]
     at_s: float
     assignment: Assignment
 
@@ -143,7 +144,8 @@ class Readiness:
         )
         failed = failed_checks(inputs, config.preflight)
         if not watchdog_alive:
-            failed = (*failed, "watchdog has ended: start this robot's program again")
+            text = "watchdog has ended: start this robot's program again"
+            failed = (*failed, FailedCheck(CheckCode.WATCHDOG_ENDED, text))
         return Checks(failed, now_s, assignment)
 
     def _read(self) -> bool:

@@ -231,7 +231,7 @@ def states(trial: Trial) -> Figure:
                 if nonces[k] != nonces[k - 1]:
                     axes.plot(track.time_s[k], row, marker="|", ms=9, color="k", mew=1.5)
         rows = {track.name: row for row, track in enumerate(trial.tracks)}
-        for time_s, robot, _ in trial.alarms:
+        for time_s, robot, *_ in trial.alarms:
             axes.plot(
                 time_s, rows[robot], ls="", marker="v", ms=5, color="#d55e00", mec="w", mew=0.5
             )

@@ -20,6 +20,7 @@ from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.schema import from_mapping
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, read, read_metadata
+from edge.messages.codes import Reason, Refusal
 from edge.messages.mission import FlightState, LoopStatus
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 
@@ -46,7 +47,7 @@ class LoggedStatus:
     trial: str
     armed: bool | None
     position_m: tuple[float, float, float] | None
-    alarms: tuple[str, ...]
+    alarms: tuple[Reason, ...]
     loops: Mapping[str, LoopStatus]
     fence: Fence | None
     battery: float | None
@@ -78,8 +79,7 @@ class Ordered(NamedTuple):
     kind: str
     operator: str
     trial: str
-    accepted: bool
-    reason: str
+    refusal: Refusal | None
 
 
 @dataclass(slots=True)
@@ -205,10 +205,10 @@ class _LogReader:
                 )
             )
         else:
-            answer = message["answer"]
+            refusal = message["answer"]["refusal"]
             order = Ordered(
                 time_s, program[0], message["kind"], message["operator"], message["trial"],
-                answer["accepted"], answer["reason"],
+                refusal and _known(Refusal, refusal, "refusal"),
             )  # fmt: skip
             self._orders.append((program, order))
 
@@ -253,7 +253,7 @@ class _LogReader:
             trial=status["trial"],
             armed=status["armed"],
             position_m=position_m,
-            alarms=tuple(status["alarms"]),
+            alarms=tuple(_known(Reason, alarm, "alarm") for alarm in status["alarms"]),
             loops={
                 name: _known(LoopStatus, loop, name)
                 for name, loop in status["loops"].items()

@@ -5,7 +5,7 @@ from typing import Literal
 
 from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget
-from edge.messages.mission import GroundState, Place, RobotStatus
+from edge.messages.mission import FlightState, GroundState, Place, RobotStatus
 
 # A robot that said nothing for longer is not heard any more.
 FRESH_S = 2.0
@@ -104,7 +104,7 @@ class GroundEvent:
     """Something happened: a command and each of its results, a robot's new state, a new commander.
 
     `robot` is a name, "" for the fleet; `operator` whose command it was, "" if nobody's. `trial` is
-    the mission's name then.
+    the mission's name then, and `state` a robot's new one.
     """
 
     unix_time_s: float
@@ -113,6 +113,7 @@ class GroundEvent:
     text: str
     operator: str = ""
     trial: str = ""
+    state: FlightState | None = None
 
 
 @dataclass(frozen=True, slots=True)

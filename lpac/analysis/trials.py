@@ -17,6 +17,7 @@ import numpy.typing as npt
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.perception import part_in_world, window_corner
+from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import ON_GROUND, FlightState
 from lpac.analysis.coverage import Coverage, in_air
 from lpac.analysis.logs import LoggedStatus, Logs, Received
@@ -115,6 +116,7 @@ class FirstAlarm(NamedTuple):
     time_s: float
     robot: str
     text: str
+    code: ReasonCode
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -387,13 +389,16 @@ def _fence_margin_m(tracks: tuple[RobotTrack, ...], fence: Fence | None) -> floa
 
 
 def _alarms(tracks: tuple[RobotTrack, ...]) -> tuple[FirstAlarm, ...]:
-    first_s: dict[tuple[str, str], float] = {}
+    first_s: dict[tuple[str, Reason], float] = {}
     for track in tracks:
         for said, time_s in zip(track.said, track.time_s.tolist(), strict=True):
-            for text in said.alarms:
-                first_s.setdefault((track.name, text), time_s)
+            for alarm in said.alarms:
+                first_s.setdefault((track.name, alarm), time_s)
     return tuple(
-        sorted(FirstAlarm(time_s, robot, text) for (robot, text), time_s in first_s.items())
+        sorted(
+            FirstAlarm(time_s, robot, alarm.text, alarm.code)
+            for (robot, alarm), time_s in first_s.items()
+        )
     )
 
 
@@ -413,7 +418,8 @@ def _commands(logs: Logs, mission: Mission, from_s: float, to_s: float) -> tuple
         told = [
             CommandEntry(
                 order.time_s - begin_s, order.operator, logs.name(order.robot_id),
-                order.kind if order.accepted else f"{order.kind}: {order.reason}", order.accepted,
+                order.kind if order.refusal is None else f"{order.kind}: {order.refusal.text}",
+                order.refusal is None,
             )
             for order in logs.orders
             if order.robot_id in mission.robots

@@ -1,5 +1,6 @@
 """`lpac robot`: fly one robot, or check whether it could fly."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -74,15 +75,16 @@ def check(
 
     report = check_robot(load_config(config), wait)
     if as_json:
-        typer.echo(json.dumps(report._asdict(), indent=2))
+        failed = [dataclasses.asdict(each) for each in report.failed]
+        typer.echo(json.dumps(report._asdict() | {"failed": failed}, indent=2))
     else:
         typer.echo(report.version)
         for line in report.explanations:
             typer.echo(line)
         for line in report.changes:
             typer.echo(f"set: {line}")
-        for line in report.failed:
-            typer.echo(f"FAILED  {line}")
+        for failed_check in report.failed:
+            typer.echo(f"FAILED  {failed_check.text}")
     if report.failed:
         count = len(report.failed)
         raise ValueError(f"not ready to fly: {count} check{'s' if count > 1 else ''} failed")

@@ -374,6 +374,8 @@ def _live() -> Iterator[tuple[Callable[[str, "Statuses"], None], Callable[[str],
 def _table(title: str, statuses: "Statuses") -> "Table":
     from rich.table import Table
 
+    from edge.messages.codes import texts
+
     table = Table(title=title, title_justify="left")
     for heading, style in (
         ("robot", ""), ("state", "bold"), ("x", ""), ("y", ""), ("height", ""), ("m/s", ""),
@@ -392,7 +394,7 @@ def _table(title: str, statuses: "Statuses") -> "Table":
             f"{speed_m_s:.1f}",
             str(len(status.neighbour_ages_s)),
             "" if status.battery is None else f"{100.0 * status.battery:.0f} %",
-            "; ".join(status.alarms if status.armed else status.failed_checks) or status.reason,
+            texts(status.alarms if status.armed else status.failed_checks) or status.reason.text,
         )
     return table
 

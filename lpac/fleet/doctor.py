@@ -8,10 +8,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+from edge.messages.codes import CheckCode, FailedCheck, texts
 from lpac.fleet.config import FleetConfig, RobotHost
-from lpac.fleet.hold import Report, check_identity, lock
+from lpac.fleet.hold import Report, lock, wrong_identity
 from lpac.fleet.operations import Outcome
-from lpac.fleet.session import FleetError, RemoteError, Session, connect
+from lpac.fleet.session import RemoteError, Session, connect
 
 Verdict = Literal["ok", "skipped", "warning", "FAILED"]
 Facts = Mapping[str, Any]
@@ -34,25 +35,29 @@ _LEAST_PYTHON, _LEAST_SYSTEMD, _LEAST_KERNEL, _LEAST_PX4 = (3, 6), 237, (4, 19),
 
 # Failed checks of the robot's program that only say that no ground commands it yet.
 _GROUND = (
-    "ground ",
-    "mission origin is not set",
-    "place in the fence is not known: it needs",
-    "autopilot does not have the fence",
+    CheckCode.GROUND_NOT_HEARD,
+    CheckCode.GROUND_SILENT,
+    CheckCode.ORIGIN_NOT_SET,
+    CheckCode.PLACE_NOT_KNOWN,
+    CheckCode.FENCE_NOT_UPLOADED,
 )
 _PX4_PARTS = ("voxl-px4", "voxl-mavlink-server", "voxl-vision-hub")
 # What else may command it: the bridges to DDS and ROS that ModalAI ships.
 _COMMANDERS = ("voxl-microdds-agent", "voxl-mpa-to-ros", "voxl-mpa-to-ros2")
-_FAILSAFE = "autopilot's "
-_NOT_READ = "failsafe parameters were not read"
-_RUNNING = "checks are still running"
-_WOULD_NOT_ARM = "autopilot would not arm"
 _NO_AUTOPILOT = (
-    "autopilot is not connected",
-    "autopilot with system id",
-    "autopilot has system id",
+    CheckCode.AUTOPILOT_NOT_CONNECTED,
+    CheckCode.OTHER_AUTOPILOT,
+    CheckCode.SYSTEM_ID_WRONG,
 )
-# The program tells no more than so many.
-_TOLD_CHECKS = 8
+# What other checks of the doctor's say.
+_SAID_ELSEWHERE = (
+    *_NO_AUTOPILOT,
+    CheckCode.FAILSAFE_NOT_READ,
+    CheckCode.FAILSAFE_WRONG,
+    CheckCode.CLOCK_NOT_SET,
+    CheckCode.CLOCK_OFF_GROUND,
+    CheckCode.CLOCK_OFF_ROBOT,
+)
 
 
 class DoctorCheck(NamedTuple):
@@ -259,11 +264,9 @@ def _deploy(robot: RobotHost) -> str:
 def _identity(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
     if facts["identity"] is None:
         return DoctorCheck("enrolled", "FAILED", "it was never enrolled", _enroll(robot))
-    try:
-        check_identity(facts["identity"], config, robot)
-    except FleetError as error:
-        found, _, fix = str(error).partition(": ")
-        return DoctorCheck("enrolled", "FAILED", found, fix)
+    wrong = wrong_identity(facts["identity"], config, robot)
+    if wrong is not None:
+        return DoctorCheck("enrolled", "FAILED", *wrong)
     return DoctorCheck("enrolled", "ok", f"robot id {robot.robot_id} of fleet {config.fleet}")
 
 
@@ -469,7 +472,7 @@ def _mavlink(robot: RobotHost, facts: Facts) -> DoctorCheck:
     status, heartbeat = facts["service"]["status"], facts["heartbeat"]
     runs = facts["service"]["fresh"]
     if runs and not status["autopilot"]:
-        about = [c for c in status["failed_checks"] if c.startswith(_NO_AUTOPILOT)]
+        about = [c.text for c in _checks(status["failed_checks"]) if c.code in _NO_AUTOPILOT]
         return DoctorCheck(
             name, "FAILED", about[0] if about else "the autopilot is silent", _px4_fix(robot)
         )
@@ -592,51 +595,53 @@ def _vehicle(robot: RobotHost, facts: Facts, vehicle: Facts | str) -> Iterator[D
     """PX4's failsafe parameters, and what else keeps the vehicle from taking off."""
     service = facts["service"]
     if service["fresh"]:
-        lines = list(service["status"]["failed_checks"])
-        cut = len(lines) >= _TOLD_CHECKS
+        checks = _checks(service["status"]["failed_checks"])
+        cut = service["status"]["failed_checks_more"] > 0
     elif isinstance(vehicle, str):
         yield DoctorCheck("failsafe", "skipped", vehicle)
         yield DoctorCheck("preflight", "skipped", vehicle)
         return
     else:
-        lines, cut = list(vehicle["failed"]), False
-    lines = [line for line in lines if not line.startswith(_GROUND)]
-    yield _failsafe(robot, lines, cut)
-    # What the other checks already say.
-    others = [
-        line
-        for line in lines
-        if not line.startswith((_FAILSAFE, *_NO_AUTOPILOT)) and "clock" not in line
+        checks, cut = _checks(vehicle["failed"]), False
+    yield _failsafe(robot, checks, cut)
+    yield _preflight([c for c in checks if c.code not in (*_GROUND, *_SAID_ELSEWHERE)], cut)
+
+
+def _checks(told: Sequence[Facts]) -> list[FailedCheck]:
+    """As the robot's program tells them; what this one has no name for is some other check."""
+    return [
+        FailedCheck(CheckCode(each["code"]), each["text"], bool(each["settles_by_itself"]))
+        for each in told
     ]
-    yield _preflight(others, cut)
 
 
-def _failsafe(robot: RobotHost, lines: Sequence[str], cut: bool) -> DoctorCheck:
+def _failsafe(robot: RobotHost, checks: Sequence[FailedCheck], cut: bool) -> DoctorCheck:
     name = "failsafe"
-    silent = any(line.startswith(_NO_AUTOPILOT) or _RUNNING in line for line in lines)
-    about = [line.removeprefix(_FAILSAFE) for line in lines if line.startswith(_FAILSAFE)]
-    if silent or any(_NOT_READ in line for line in about):
+    not_read = (*_NO_AUTOPILOT, CheckCode.CHECKS_RUNNING, CheckCode.FAILSAFE_NOT_READ)
+    if any(check.code in not_read for check in checks):
         return DoctorCheck(name, "warning", "PX4's parameters were not read", "try again")
-    if about:
+    wrong = [check for check in checks if check.code is CheckCode.FAILSAFE_WRONG]
+    if wrong:
         fix = f"{_enroll(robot)} (it sets them, and restarts PX4 if need be)"
-        return DoctorCheck(name, "FAILED", "; ".join(about), fix)
+        return DoctorCheck(name, "FAILED", texts(wrong), fix)
     if cut:
-        found = "not among the first eight failed checks: there may be more"
+        found = "not among the first failed checks: there may be more"
         return DoctorCheck(name, "warning", found, "mend what `preflight` names, then try again")
     return DoctorCheck(name, "ok", "PX4's parameters are as they must be")
 
 
-def _preflight(lines: Sequence[str], cut: bool) -> DoctorCheck:
+def _preflight(checks: Sequence[FailedCheck], cut: bool) -> DoctorCheck:
     name = "preflight"
-    if not lines:
+    if not checks:
         return DoctorCheck(name, "ok", "nothing but the ground's commands is missing")
-    # Before the vehicle stands under open sky, this is how it is.
-    time_mends = [line for line in lines if re.search(r": (wait|check the compass)", line)]
+    # Before the vehicle stands under open sky, this is how it is; PX4 does not arm then.
+    settling = {check.code for check in checks if check.settles_by_itself}
+    may_arm_then = bool(settling - {CheckCode.CHECKS_RUNNING})
     waits = all(
-        line in time_mends or _RUNNING in line or (time_mends and line.startswith(_WOULD_NOT_ARM))
-        for line in lines
+        check.code in settling or (may_arm_then and check.code is CheckCode.NOT_ARMABLE)
+        for check in checks
     )
-    found = "; ".join(lines) + ("; perhaps more" if cut else "")
+    found = texts(checks) + ("; perhaps more" if cut else "")
     if waits:
         return DoctorCheck(name, "warning", found, "wait under open sky, then try again")
     return DoctorCheck(name, "FAILED", found, "mend what each line says")

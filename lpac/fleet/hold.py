@@ -81,13 +81,22 @@ def check_identity(
     identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
 ) -> None:
     """Raises RemoteError if another robot answers at this one's address."""
+    wrong = wrong_identity(identity, config, robot)
+    if wrong is not None:
+        raise RemoteError(": ".join(wrong))
+
+
+def wrong_identity(
+    identity: dict[str, object] | None, config: FleetConfig, robot: RobotHost
+) -> tuple[str, str] | None:
+    """Who answers at the robot's address instead of it, and what to do; None if it does."""
     if identity is None:
-        raise RemoteError(
-            f"it is not enrolled: run `lpac fleet enroll {robot.name} {robot.host}` once"
-        )
+        return "it is not enrolled", f"run `lpac fleet enroll {robot.name} {robot.host}` once"
     wanted = {"fleet": config.fleet, "robot": robot.name, "robot_id": robot.robot_id}
-    if {key: identity.get(key) for key in wanted} != wanted:
-        raise RemoteError(
-            f"at {robot.host} answers {identity.get('robot')} of fleet {identity.get('fleet')} "
-            f"(id {identity.get('robot_id')}): mend the host in {config.path.name}, or enroll it"
-        )
+    if {key: identity.get(key) for key in wanted} == wanted:
+        return None
+    return (
+        f"at {robot.host} answers {identity.get('robot')} of fleet {identity.get('fleet')} "
+        f"(id {identity.get('robot_id')})",
+        f"mend the host in {config.path.name}, or enroll it",
+    )

@@ -11,11 +11,15 @@ T = TypeVar("T")
 
 
 class Outcome(NamedTuple, Generic[T]):
-    """What came of it for one robot: a value, or why there is none."""
+    """What came of it for one robot: a value, or why there is none.
+
+    `interrupted`: Ctrl-C came before it was done.
+    """
 
     robot: RobotHost
     value: T | None
     problem: str | None
+    interrupted: bool = False
 
 
 async def for_each(

@@ -2,10 +2,19 @@
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
+from enum import StrEnum
 from typing import Literal, NamedTuple, TypeVar
 
 from edge.flight.preflight import PreflightLimits
+from edge.messages.codes import (
+    BATTERY_REASONS,
+    FENCE_NOT_TAKEN,
+    ORIGIN_NOT_TAKEN,
+    WORLD_NOT_TAKEN,
+    CheckCode,
+    texts,
+)
 from edge.messages.mission import AIRBORNE, FlightState, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
 from lpac.ground.station.station import COMMANDER_SILENT_S
@@ -33,14 +42,43 @@ _NAMES = 4
 T = TypeVar("T", bound=Hashable)
 
 
+class AlarmCode(StrEnum):
+    """What an alarm is about."""
+
+    # The fleet.
+    NOBODY_COMMANDS = "nobody_commands"
+    COMMANDER_SILENT = "commander_silent"
+    HELD_BY_OTHERS = "held_by_others"
+    WORLD_NOT_HERE = "world_not_here"
+    NOT_HEARD_YET = "not_heard_yet"
+    # One robot.
+    SILENT = "silent"
+    DUPLICATE_ID = "duplicate_id"
+    OWN = "own"
+    NOT_OBEYED = "not_obeyed"
+    BATTERY = "battery"
+    OTHER_BUNDLE = "other_bundle"
+    OTHER_WORLD = "other_world"
+    OTHER_ORIGIN = "other_origin"
+    OTHER_FENCE = "other_fence"
+    NOT_TAKEN = "not_taken"
+    GPS = "gps"
+    FEATURES = "features"
+    NEIGHBOURS = "neighbours"
+    LOOPS = "loops"
+    CLOCK = "clock"
+    NOT_READY = "not_ready"
+
+
 class Alarm(NamedTuple):
     """`critical`: act now; `warning`: look into it; `note`: good to know.
 
-    `robot` is a name, "" for the fleet.
+    `robot` is a name, "" for the fleet. What is `OWN` the robot says itself.
     """
 
     severity: Severity
     robot: str
+    code: AlarmCode
     text: str
 
 
@@ -53,12 +91,13 @@ def alarms(
     ground's state is not obeyed, that loops miss ticks.
     """
     fleet = _Fleet(setup, snapshot, before)
-    found = [Alarm(severity, "", text) for severity, text in _of_fleet(fleet)]
+    found = [Alarm(severity, "", code, text) for severity, code, text in _of_fleet(fleet)]
     found += [
-        Alarm(alarm[0], seen.name, alarm[1])
-        for check in _CHECKS
+        Alarm(alarm[0], seen.name, code, alarm[1])
+        for code, check in _CHECKS.items()
         for seen in fleet.seen
-        if (alarm := check(fleet, seen)) is not None
+        if (code in _OF_THE_SILENT or seen.robot.fresh)
+        and (alarm := check(fleet, seen)) is not None
     ]
     return tuple(sorted(found, key=lambda alarm: SEVERITIES.index(alarm.severity)))
 
@@ -140,30 +179,32 @@ def _most_common(values: Iterable[T]) -> T | None:
     return counts[0][0] if counts else None
 
 
-def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, str]]:
+def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
     ground = fleet.ground
     flying = sum(is_flying(seen.status) for seen in fleet.seen)
     silent = fleet.snapshot.commander_age_s > COMMANDER_SILENT_S
     if flying and not fleet.snapshot.commander:
-        yield "critical", f"nobody commands the fleet, and {flying} fly: hold or land them"
+        text = f"nobody commands the fleet, and {flying} fly: hold or land them"
+        yield "critical", AlarmCode.NOBODY_COMMANDS, text
     if fleet.snapshot.commander and silent:
         text = f"{fleet.snapshot.commander} commands, but is not heard: hold takes over"
-        yield ("critical" if flying else "warning"), text
+        yield ("critical" if flying else "warning"), AlarmCode.COMMANDER_SILENT, text
     if ground is not None and ground.safety_action_by not in ("", ground.operator):
         held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
-        yield "warning", f"{ground.safety_action_by} asks {len(held)} robots to hold"
+        text = f"{ground.safety_action_by} asks {len(held)} robots to hold"
+        yield "warning", AlarmCode.HELD_BY_OTHERS, text
     if not fleet.snapshot.commander and not flying:
-        yield "note", "nobody commands the fleet yet"
+        yield "note", AlarmCode.NOBODY_COMMANDS, "nobody commands the fleet yet"
     if not fleet.setup.world:
         text = f"the robots' world {fleet.setup.world_id[:_ID]} is not here: no density, no cost"
-        yield "warning", f"{text}; `lpac mission world FILE`"
+        yield "warning", AlarmCode.WORLD_NOT_HERE, f"{text}; `lpac mission world FILE`"
     if fleet.seen:
         slots = {site.robot for site in fleet.setup.slots}
         unheard = [r.name for r in fleet.snapshot.robots if r.status is None and r.name in slots]
         if unheard:
-            yield "note", f"not heard yet: {' '.join(unheard)}"
+            yield "note", AlarmCode.NOT_HEARD_YET, f"not heard yet: {' '.join(unheard)}"
     else:
-        yield "note", "no robot is heard yet"
+        yield "note", AlarmCode.NOT_HEARD_YET, "no robot is heard yet"
 
 
 # Of one robot
@@ -190,7 +231,7 @@ def _own(fleet: _Fleet, seen: _Seen) -> _Found:
     # What a pilot flies is in his hands, if they still move it.
     has_pilot = status.state is _S.PILOT and status.remote_control is not False
     grave = is_flying(status) and not has_pilot
-    return ("critical" if grave else "warning"), "; ".join(status.alarms)
+    return ("critical" if grave else "warning"), texts(status.alarms)
 
 
 def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
@@ -210,7 +251,7 @@ def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _battery(fleet: _Fleet, seen: _Seen) -> _Found:
     battery = seen.status.battery
-    told = any("battery" in text for text in seen.status.alarms)
+    told = any(alarm.code in BATTERY_REASONS for alarm in seen.status.alarms)
     if told or battery is None or battery > BATTERY_LOW:
         return None
     if not is_flying(seen.status):
@@ -229,30 +270,30 @@ def _bundle(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _world(fleet: _Fleet, seen: _Seen) -> _Found:
     theirs, ours = seen.status.world_id, fleet.world
-    if theirs == ours or _says_why(seen, "world"):
+    if theirs == ours or _says_why(seen, WORLD_NOT_TAKEN):
         return None
     return "warning", f"world {theirs[:_ID] or 'none'}, not the fleet's {ours[:_ID]}"
 
 
 def _origin(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.origin in (None, fleet.origin) or _says_why(seen, "origin"):
+    if seen.status.origin in (None, fleet.origin) or _says_why(seen, ORIGIN_NOT_TAKEN):
         return None
     return "warning", "another origin than the fleet's"
 
 
 def _fence(fleet: _Fleet, seen: _Seen) -> _Found:
-    if seen.status.fence in (None, fleet.fence) or _says_why(seen, "fence"):
+    if seen.status.fence in (None, fleet.fence) or _says_why(seen, FENCE_NOT_TAKEN):
         return None
     return "warning", "another fence than the fleet's"
 
 
-def _says_why(seen: _Seen, what: str) -> bool:
+def _says_why(seen: _Seen, codes: Collection[CheckCode]) -> bool:
     """Whether it says itself that it does not take the fleet's: that is told, once."""
-    return any(what in text for text in seen.status.not_taken)
+    return any(each.code in codes for each in seen.status.not_taken)
 
 
 def _not_taken(fleet: _Fleet, seen: _Seen) -> _Found:
-    return ("warning", "; ".join(seen.status.not_taken)) if seen.status.not_taken else None
+    return ("warning", texts(seen.status.not_taken)) if seen.status.not_taken else None
 
 
 def _gps(fleet: _Fleet, seen: _Seen) -> _Found:
@@ -324,23 +365,31 @@ def _not_ready(fleet: _Fleet, seen: _Seen) -> _Found:
     if not waits or not fleet.enabled(seen.robot) or not status.failed_checks:
         return None
     more = len(status.failed_checks) - 1
-    return "note", f"not ready: {status.failed_checks[0]}{f' (+ {more})' if more else ''}"
+    return "note", f"not ready: {status.failed_checks[0].text}{f' (+ {more})' if more else ''}"
 
 
 def _graver_in_mission(seen: _Seen) -> Severity:
     return "warning" if seen.status.state is _S.MISSION else "note"
 
 
-def _if_fresh(check: "_Check") -> "_Check":
-    """What a robot said long ago is no news."""
-    return lambda fleet, seen: check(fleet, seen) if seen.robot.fresh else None
-
-
-_Check = Callable[[_Fleet, _Seen], _Found]
 # Within one severity, the gravest first.
-_CHECKS: tuple[_Check, ...] = (
-    _silent, _duplicate, *map(_if_fresh, (
-        _own, _not_obeyed, _battery, _bundle, _world, _origin, _fence, _not_taken, _gps, _features,
-        _neighbours, _loops, _clock, _not_ready,
-    )),
-)  # fmt: skip
+_CHECKS: Mapping[AlarmCode, Callable[[_Fleet, _Seen], _Found]] = {
+    AlarmCode.SILENT: _silent,
+    AlarmCode.DUPLICATE_ID: _duplicate,
+    AlarmCode.OWN: _own,
+    AlarmCode.NOT_OBEYED: _not_obeyed,
+    AlarmCode.BATTERY: _battery,
+    AlarmCode.OTHER_BUNDLE: _bundle,
+    AlarmCode.OTHER_WORLD: _world,
+    AlarmCode.OTHER_ORIGIN: _origin,
+    AlarmCode.OTHER_FENCE: _fence,
+    AlarmCode.NOT_TAKEN: _not_taken,
+    AlarmCode.GPS: _gps,
+    AlarmCode.FEATURES: _features,
+    AlarmCode.NEIGHBOURS: _neighbours,
+    AlarmCode.LOOPS: _loops,
+    AlarmCode.CLOCK: _clock,
+    AlarmCode.NOT_READY: _not_ready,
+}
+# What a robot said long ago is no news for the others.
+_OF_THE_SILENT = (AlarmCode.SILENT, AlarmCode.DUPLICATE_ID)

@@ -8,13 +8,14 @@ import math
 import re
 import time
 import tomllib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.world import parse_world
+from edge.messages.codes import texts
 from edge.messages.mission import FlightState, GroundState, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
@@ -349,7 +350,7 @@ class ScriptRun:
         self._subscriber = subscriber
         self._teller = teller
         self._given: set[str] = set()
-        self._said: set[str] = set()
+        self._said: set[Hashable] = set()
         self._last_start_s: dict[str, float] = {}
 
     def fly(self) -> None:
@@ -465,16 +466,19 @@ class ScriptRun:
             missing = self._not_ready(snapshot)
             # At first everything is missing.
             if time.monotonic() - began_s > min(5.0, step.at_most_s / 2.0):
-                for text in missing:
-                    self._say_once(text)
+                for what, text in missing.items():
+                    self._say_once(what, text)
             return not missing
 
         if not self._subscriber.wait_for(ready, step.at_most_s):
             missing = self._not_ready(self._subscriber.snapshot)
-            raise ScriptError(f"not ready after {step.at_most_s:g} s: {'; '.join(missing)}")
+            raise ScriptError(
+                f"not ready after {step.at_most_s:g} s: {'; '.join(missing.values())}"
+            )
 
-    def _not_ready(self, snapshot: FleetSnapshot) -> list[str]:
-        missing = []
+    def _not_ready(self, snapshot: FleetSnapshot) -> dict[Hashable, str]:
+        """What keeps robots from taking off, in words, by what it is."""
+        missing: dict[Hashable, str] = {}
         statuses = self._statuses(snapshot)
         for name in self.robots:
             status = statuses.get(name)
@@ -484,16 +488,17 @@ class ScriptRun:
                 else "none"
             )
             if status is None:
-                missing.append(f"{name} is not heard")
+                missing[name, "not heard"] = f"{name} is not heard"
             elif safety_action != "none":
-                missing.append(
+                missing[name, safety_action] = (
                     f"{name} is told to {safety_action}: withdraw it by `lpac mission resume`"
                 )
             elif status.state is not _S.PREFLIGHT:
-                missing.append(f"{name} is in {status.state}: {status.reason}")
+                text = f"{name} is in {status.state}: {status.reason.text}"
+                missing[name, status.state, status.reason.code] = text
             elif not status.ready:
-                checks = "; ".join(status.failed_checks) or "its checks are running"
-                missing.append(f"{name}: {checks}")
+                checks = texts(status.failed_checks) or "its checks are running"
+                missing[name, *(check.code for check in status.failed_checks)] = f"{name}: {checks}"
         return missing
 
     def _bring_down(self, request: SafetyCommand) -> None:
@@ -521,13 +526,14 @@ class ScriptRun:
             for name in self.robots:
                 status = statuses.get(name)
                 if status is None:
-                    self._say_once(f"{name} is not heard")
+                    self._say_once((name, "not heard"), f"{name} is not heard")
                     continue
                 given = name in self._given or _asked(snapshot.ground, status.robot_id) != "none"
                 if status.state is not _S.HOLD or given:
                     left_alone.discard(name)
                 if before[name] is _S.MISSION and status.state is not _S.MISSION and not given:
-                    self._say_once(f"{name} left the mission: {status.state}: {status.reason}")
+                    text = f"{name} left the mission: {status.state}: {status.reason.text}"
+                    self._say_once((name, status.state, status.reason.code), text)
                     if status.state is _S.HOLD:
                         left_alone.add(name)
                 before[name] = status.state
@@ -543,7 +549,8 @@ class ScriptRun:
         self._last_start_s[name] = time.monotonic()
         report = self._command(Start((name,)))
         if not report.done:
-            self._say_once(f"{name} is not started again: {_failures(report)}")
+            text = f"{name} is not started again: {_failures(report)}"
+            self._say_once((name, "not started"), text)
 
     def _perturb(self, perturbation: Perturbation) -> None:
         name = perturbation.robot
@@ -599,11 +606,10 @@ class ScriptRun:
                 self._look_for_others(snapshot)
             raise ScriptError(_failures(report))
 
-    def _say_once(self, text: str) -> None:
-        """Say a text unless it differs from one that was said by its numbers only."""
-        kind = re.sub(r"(?<=[ (])-?[\d.]+", "#", text)
-        if kind not in self._said:
-            self._said.add(kind)
+    def _say_once(self, what: Hashable, text: str) -> None:
+        """Say a text unless the same was said in other words, such as other numbers."""
+        if what not in self._said:
+            self._said.add(what)
             self._teller.line(text)
 
 

@@ -6,7 +6,6 @@ what they say of themselves.
 
 import math
 import queue
-import re
 import secrets
 import threading
 import time
@@ -21,6 +20,7 @@ from edge.core.vehicle import PILOTED
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.margins import ErrorBudget
 from edge.messages.codec import MessageError, decode, encode
+from edge.messages.codes import CheckCode, ReasonCode, Refusal, RefusalCode
 from edge.messages.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
@@ -197,7 +197,11 @@ class Operator:
         order_id = secrets.token_hex(6)
         status = self.statuses().get(robot)
         if status is None:
-            self._settle(OrderResult(order_id, False, "the robot is not heard"), kind, robot)
+            self._settle(
+                OrderResult(order_id, Refusal(RefusalCode.NOT_ANSWERED, "the robot is not heard")),
+                kind,
+                robot,
+            )
             return order_id
         with self._changed:
             self._open[order_id] = Order(
@@ -262,7 +266,8 @@ class Operator:
             answer = answers.get(order.order_id)
             restarted = status.boot_nonce != order.boot_nonce
             if answer is None and (restarted or status.uptime_s > order.expires_at_uptime_s):
-                answer = OrderResult(order.order_id, False, "it was not answered")
+                refusal = Refusal(RefusalCode.NOT_ANSWERED, "it was not answered")
+                answer = OrderResult(order.order_id, refusal)
             if answer is not None:
                 self._settle(answer, order.kind, robot)
 
@@ -270,7 +275,8 @@ class Operator:
         with self._changed:
             self._open.pop(result.order_id, None)
             self._results[result.order_id] = result
-            refusal = "" if result.accepted else f"robot {robot} refuses {kind}: {result.reason}"
+            refused = result.refusal
+            refusal = "" if refused is None else f"robot {robot} refuses {kind}: {refused.text}"
             if refusal:
                 self.refusals.append(refusal)
             self._changed.notify_all()
@@ -345,7 +351,7 @@ class OperatorScript:
         self._trial = trial
         self._takeoffs_window_s = takeoffs_window_s
         self._say = say
-        self._said: set[str] = set()
+        self._said: set[tuple[int, CheckCode | ReasonCode]] = set()
         self._last_takeoff_s = -math.inf
         self._last_start_s: dict[int, float] = {}
         self._over_landing_point: set[int] = set()
@@ -407,7 +413,7 @@ class OperatorScript:
         late = [
             f"{robot} (not heard)"
             if status is None
-            else f"{robot} ({status.state}: {status.reason})"
+            else f"{robot} ({status.state}: {status.reason.text})"
             for robot in sorted(self._robots)
             if (status := statuses.get(robot)) is None
             or not done(dict.fromkeys(self._robots, status))
@@ -446,7 +452,8 @@ class OperatorScript:
         if time.monotonic() - self.began_s["preflight"] > _EXPLAIN_AFTER_S:
             for robot, status in sorted(self._operator.statuses().items()):
                 for check in status.failed_checks:
-                    self._say_once(f"robot {robot} is not ready: {check}")
+                    text = f"robot {robot} is not ready: {check.text}"
+                    self._say_once((robot, check.code), text)
 
     def _order_takeoff(self) -> None:
         """The highest first: it climbs past nobody.
@@ -488,7 +495,8 @@ class OperatorScript:
                 continue
             if status.trial == self._trial:
                 self.restarts[robot] += 1
-                self._say_once(f"robot {robot} left the mission: {status.reason}")
+                text = f"robot {robot} left the mission: {status.reason.text}"
+                self._say_once((robot, status.reason.code), text)
             self._last_start_s[robot] = now_s
             self._operator.order("rejoin" if left_alone else "start", robot, self._trial)
 
@@ -501,9 +509,8 @@ class OperatorScript:
         waiting = waiting_to_land(statuses, self._over_landing_point)
         self._operator.safety_action_each("return", dict.fromkeys(waiting, "hold"))
 
-    def _say_once(self, text: str) -> None:
-        """Say a text unless it differs from one that was said by its numbers only."""
-        kind = re.sub(r"(?<=[ (])-?[\d.]+", "#", text.partition(":")[2]) + text.partition(":")[0]
-        if kind not in self._said:
-            self._said.add(kind)
+    def _say_once(self, what: tuple[int, CheckCode | ReasonCode], text: str) -> None:
+        """Of one robot each thing once, whatever the numbers in its words are."""
+        if what not in self._said:
+            self._said.add(what)
             self._say(text)

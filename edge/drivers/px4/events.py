@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from edge.core.vehicle import Mode, Reason
+from edge.core.vehicle import AutopilotReason, Mode
 
 _WARNING, _ERROR = 4, 3
 
@@ -274,14 +274,14 @@ class _Check(NamedTuple):
 
     modes: int
     level: int
-    reason: Reason
+    reason: AutopilotReason
 
 
 class _Told(NamedTuple):
     """What was told once."""
 
     at_s: float
-    reason: Reason
+    reason: AutopilotReason
 
 
 class Px4Events:
@@ -335,7 +335,7 @@ class Px4Events:
             return None
         return (self._last + 1) % _SEQUENCES, self._newest
 
-    def why_not_armed(self, mode: Mode | None) -> tuple[Reason, ...]:
+    def why_not_armed(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
         """Why PX4 would not arm in this mode, the gravest first, by its last report."""
         bits = _bits(mode)
         if self._can_arm & bits == bits:
@@ -345,11 +345,11 @@ class Px4Events:
         # Some that are less grave keep it from arming, too; most only warn.
         return _reasons(errors or checks)
 
-    def told(self, since_s: float) -> tuple[Reason, ...]:
+    def told(self, since_s: float) -> tuple[AutopilotReason, ...]:
         """What PX4 warned of once since then, the newest first."""
         return _reasons(told for told in reversed(self._told) if told.at_s >= since_s)
 
-    def wrong(self, mode: Mode | None) -> tuple[Reason, ...]:
+    def wrong(self, mode: Mode | None) -> tuple[AutopilotReason, ...]:
         """What PX4 finds wrong now that concerns this mode, the gravest first."""
         bits = _bits(mode)
         return _reasons(c for c in self._checks if c.level <= _WARNING and c.modes & bits)
@@ -375,12 +375,14 @@ class Px4Events:
         self._last, self._missing_since_s, self._report = sequence, None, None
 
 
-def to_reason(event: int, arguments: bytes) -> Reason:
+def to_reason(event: int, arguments: bytes) -> AutopilotReason:
     """An event in words; `arguments` are those that it shows, after a check's modes."""
     name = _NAMES.get(event)
     if name is None:
         code = f"0x{event:08x}"
-        return Reason(code, (), f"a reason that this program has no words for: event {code}")
+        return AutopilotReason(
+            code, (), f"a reason that this program has no words for: event {code}"
+        )
     words = _WORDS[name]
     text, types = (words, "") if isinstance(words, str) else words
     values = struct.unpack_from("<" + re.sub("[ACSG]", "B", types), arguments)
@@ -388,12 +390,12 @@ def to_reason(event: int, arguments: bytes) -> Reason:
         _VALUES[kind].get(value, f"{value}") if kind in _VALUES else value
         for kind, value in zip(types, values, strict=True)
     ]
-    return Reason(name, values, text.format(*shown))
+    return AutopilotReason(name, values, text.format(*shown))
 
 
-def without_repetition(reasons: Iterable[Reason]) -> tuple[Reason, ...]:
+def without_repetition(reasons: Iterable[AutopilotReason]) -> tuple[AutopilotReason, ...]:
     """In the same order; of those that read alike, the first."""
-    first: dict[str, Reason] = {}
+    first: dict[str, AutopilotReason] = {}
     for reason in reasons:
         first.setdefault(reason.text, reason)
     return tuple(first.values())
@@ -407,5 +409,5 @@ def _bits(mode: Mode | None) -> int:
     return 1 << _BITS[mode] if mode in _BITS else _ALL_MODES
 
 
-def _reasons(entries: Iterable[_Check | _Told]) -> tuple[Reason, ...]:
+def _reasons(entries: Iterable[_Check | _Told]) -> tuple[AutopilotReason, ...]:
     return without_repetition(entry.reason for entry in entries)

@@ -12,11 +12,11 @@ from threading import Lock
 from typing import Any
 
 from edge.core.vehicle import (
+    AutopilotReason,
     EstimatorStatus,
     GlobalOrigin,
     Gps,
     Mode,
-    Reason,
     Vector,
     VehicleState,
 )
@@ -117,8 +117,8 @@ class Px4Telemetry:
                 state = replace(
                     state, armable=None, battery=None, voltage_v=None, remote_control=None
                 )
-            problems: tuple[Reason, ...] = ()
-            warnings: tuple[Reason, ...] = ()
+            problems: tuple[AutopilotReason, ...] = ()
+            warnings: tuple[AutopilotReason, ...] = ()
             if state.armed:
                 told = self._events.told(self._told_since_s(now_s))
                 warnings = without_repetition((*told, *self._events.wrong(state.mode)))
@@ -151,7 +151,7 @@ class Px4Telemetry:
         with self._lock:
             return self._events.missing()
 
-    def refusal_reasons(self, since_s: float) -> tuple[Reason, ...]:
+    def refusal_reasons(self, since_s: float) -> tuple[AutopilotReason, ...]:
         """Why a command that was sent then was refused: what was told since, and is wrong now."""
         with self._lock:
             told = self._events.told(since_s)
@@ -166,10 +166,10 @@ class Px4Telemetry:
             else since_s
         )
 
-    def _why_not_armed(self, since_s: float) -> tuple[Reason, ...]:
+    def _why_not_armed(self, since_s: float) -> tuple[AutopilotReason, ...]:
         """By PX4's checks; a vehicle that does not tell them may have said it in a text."""
         texts = {text: None for at_s, text in self._texts if at_s >= since_s}
-        said = tuple(Reason("text", (), text) for text in texts)
+        said = tuple(AutopilotReason("text", (), text) for text in texts)
         return self._events.why_not_armed(self._state.mode) or said
 
     def _change(self, **changes: Any) -> None:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
 import typer
 
 from lpac.cli.fleet.progress import (
-    INTERRUPTED,
     print_json,
     print_problems,
     require_all,
@@ -304,7 +303,7 @@ def logs(
     for entry, name in sorted(entries):
         show(entry, name)
     if follow:  # Ctrl-C is how that ends.
-        outcomes = [o._replace(problem=None) if o.problem == INTERRUPTED else o for o in outcomes]
+        outcomes = [o._replace(problem=None) if o.interrupted else o for o in outcomes]
     require_all(outcomes, "read the journal of")
 
 
@@ -320,7 +319,6 @@ def execute_on_all(
 ) -> None:
     """Run a command on the robots, such as `lpac fleet exec --robots r1,r3 -- df -h /`."""
     from lpac.fleet.execute import execute
-    from lpac.fleet.operations import Outcome
 
     config, chosen = open_fleet(fleet, robots)
     label = _labels(chosen)
@@ -344,10 +342,10 @@ def execute_on_all(
         return {"exit_code": exit_code, **written}
 
     outcomes = [
-        Outcome(robot, value, f"exit code {value['exit_code']}")
-        if value is not None and value["exit_code"] != 0
-        else Outcome(robot, value, problem)
-        for robot, value, problem in _run_plainly(chosen, one, label)
+        o._replace(problem=f"exit code {o.value['exit_code']}")
+        if o.value is not None and o.value["exit_code"] != 0
+        else o
+        for o in _run_plainly(chosen, one, label)
     ]
     if as_json:
         print_json(config, outcomes, lambda value: value)
@@ -362,7 +360,7 @@ def _run_plainly(
     """Without a table: the output is what counts. Problems are told on stderr as they come."""
 
     def on_outcome(outcome: "Outcome[T]") -> None:
-        if outcome.problem is not None and outcome.problem != INTERRUPTED:
+        if outcome.problem is not None and not outcome.interrupted:
             typer.echo(label[outcome.robot.name] + outcome.problem, err=True)
 
     return run_all(robots, task, on_outcome)

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# The problem of a robot that was not done when Ctrl-C came.
-INTERRUPTED = "interrupted"
 
 _STEP_WIDTH, _BAR_WIDTH = 10, 16
 
@@ -50,7 +48,7 @@ def run_all(
     except KeyboardInterrupt:
         for robot in robots:
             if robot.name not in finished:
-                keep(Outcome(robot, None, INTERRUPTED))
+                keep(Outcome(robot, None, "interrupted", interrupted=True))
     return [finished[robot.name] for robot in robots]
 
 
@@ -70,8 +68,8 @@ def run_for_each(
         outcomes = run_all(robots, one, lambda o: progress.end(o.robot.name, o.problem))
     steps = {name: row.step for name, row in progress.rows.items()}
     return [
-        o._replace(problem=f"{INTERRUPTED} at {steps[o.robot.name]}")
-        if o.problem == INTERRUPTED and steps[o.robot.name]
+        o._replace(problem=f"interrupted at {steps[o.robot.name]}")
+        if o.interrupted and steps[o.robot.name]
         else o
         for o in outcomes
     ]

@@ -91,7 +91,7 @@ def print_status(config: "FleetConfig", outcomes: Sequence["Outcome[State]"]) ->
     odd = {name: text for name, text in parts.items() if text not in (None, most)}
     silent = ["", styled("see below", BAD), *[""] * (len(_HEADINGS) - 4)]
     rows = []
-    for robot, state, _ in outcomes:
+    for robot, state, *_ in outcomes:
         slot = _slot(config, robot.name)
         place = styled("spare", FAINT) if slot is None else str(slot)
         cells = silent if state is None else _cells(state, robot.name in odd)

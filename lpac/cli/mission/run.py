@@ -173,7 +173,7 @@ class _View:
                 styled(robot.name, ""),
                 styled(status.state.value, style),
                 styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
-                styled(status.reason, FAINT),
+                styled(status.reason.text, FAINT),
             )
         first = Text(f"{self._step or 'script'}: {clock}", "bold")
         return Group(first, Text("Ctrl-C holds the fleet", "bold red"), rows)

@@ -20,6 +20,8 @@ VISION_HUB = "/etc/modalai/voxl-vision-hub.conf"
 
 # How long the program may take, after its start, until its first checks are done.
 _CHECKS_WAIT_S = 8.0
+# Failed checks that mean that it has not looked yet.
+_NOT_SETTLED = ("checks_running", "failsafe_not_read")
 # `lpac robot check` waits so long for the vehicle; the ground will be missing to its end.
 _CHECK_S = 10.0
 
@@ -93,8 +95,8 @@ def _settled(state: Dict[str, Any]) -> Dict[str, Any]:
     """The unit's state once the program has done its first checks, if it runs."""
     until_s = time.monotonic() + _CHECKS_WAIT_S
     while state["fresh"] and time.monotonic() < until_s:
-        checks = " ".join(state["status"]["failed_checks"])
-        if "still running" not in checks and "were not read" not in checks:
+        codes = {check["code"] for check in state["status"]["failed_checks"]}
+        if not codes.intersection(_NOT_SETTLED):
             break
         time.sleep(0.25)
         state = service.service()

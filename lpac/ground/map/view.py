@@ -94,9 +94,9 @@ def _robot_view(
         return view
     return view | {
         "state": status.state,
-        "reason": status.reason,
+        "reason": status.reason.text,
         "ready": status.ready,
-        "failed_checks": list(status.failed_checks),
+        "failed_checks": [check.text for check in status.failed_checks],
         "in_air": in_air(status),
         "position_m": _rounded(status.position_m),
         "yaw_rad": _yaw_rad(status, heading_deg),

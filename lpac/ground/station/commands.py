@@ -7,6 +7,7 @@ and yields whenever it has to wait for what comes next.
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
+from edge.messages.codes import FENCE_NOT_TAKEN, Reason, texts
 from edge.messages.mission import FlightState, OrderKind, RobotStatus, is_too_low, world_id
 from lpac.ground.station.protocol import (
     CommandProgress,
@@ -233,7 +234,7 @@ class CommandTask:
                 elif not assigned and status.state in _NOT_STEERED:
                     self._fail([name], _why(status))
                 elif now_s - obeyed_s[name] > patience_s:
-                    not_taken = "; ".join(status.not_taken) if assigned else ""
+                    not_taken = texts(status.not_taken) if assigned else ""
                     withdraw = isinstance(self.request, SetFence) and self.request.fence is not None
                     help_ = "; `lpac mission fence on` withdraws it" if withdraw else ""
                     self._fail([name], f"{not_taken or _why(status)}{help_}")
@@ -254,7 +255,7 @@ class CommandTask:
             if status.fence == fence:
                 return own
             # A robot's own file may say otherwise than the fleet's.
-            others = not any("fence" in why for why in status.not_taken)
+            others = not any(each.code in FENCE_NOT_TAKEN for each in status.not_taken)
             return own if request.fence is None and others else None
 
         yield from self._take_up(self._station.change(fence=request.fence), effect)
@@ -348,7 +349,7 @@ class CommandTask:
             yield from self._take_up(sequence, _obeying_words(request.action), _OBEY_S)
             return
         yield from self._obeyed(sequence)
-        known: dict[str, str] = {}
+        known: dict[str, tuple[FlightState, Reason]] = {}
         changed_s = station.now_s
         while heard := self._heard():
             for name, status in heard.items():
@@ -356,9 +357,9 @@ class CommandTask:
                     self._settle(name, "on the ground")
                 elif status.state in _NOT_STEERED:
                     self._fail([name], _why(status))
-                elif known.get(name) != status.reason:
-                    known[name], changed_s = status.reason, station.now_s
-                    self._say(name, f"{status.state}: {status.reason}")
+                elif known.get(name) != (status.state, status.reason):
+                    known[name], changed_s = (status.state, status.reason), station.now_s
+                    self._say(name, _state_in_words(status))
                 elif station.now_s - changed_s > _LANDING_S:
                     self._fail([name], _why(status))
             if self._open:
@@ -400,9 +401,9 @@ class CommandTask:
             for name in self._open:
                 answer = self._station.results.get(self._orders[name])
                 if answer is not None:
-                    self._settle(
-                        name, done if answer.accepted else answer.reason, done=answer.accepted
-                    )
+                    refusal = answer.refusal
+                    text = done if refusal is None else refusal.text
+                    self._settle(name, text, done=refusal is None)
             if self._open:
                 yield
 
@@ -524,15 +525,15 @@ class CommandTask:
         status = self._status(name)
         answer = self._station.results.get(self._orders[name])
         late = self._station.now_s - ordered_s > _CLIMB_S
-        if answer is not None and not answer.accepted:
-            self._fail([name], answer.reason)
+        if answer is not None and answer.refusal is not None:
+            self._fail([name], answer.refusal.text)
         elif status is None:
             self._fail([name], "not heard")
         elif late or (answer is not None and status.state not in _CLIMBING):
             if status.state in (_S.HOLD, _S.MISSION):
-                self._settle_up(name, status, status.reason)
+                self._settle_up(name, status, status.reason.text)
             else:
-                self._fail([name], f"{status.state}: {status.reason}")
+                self._fail([name], _state_in_words(status))
 
     def _settle_up(self, name: str, status: RobotStatus, text: str) -> None:
         """Settle who has taken off; who was held up on its way is too low for a mission."""
@@ -560,8 +561,8 @@ class CommandTask:
             for name, status in heard.items():
                 order_id = self._orders.get(name, "")
                 answer = self._station.results.get(order_id)
-                if answer is not None and not answer.accepted:
-                    refusals[name] = answer.reason
+                if answer is not None and answer.refusal is not None:
+                    refusals[name] = answer.refusal.text
                     again_s[name] = now_s + _START_AGAIN_S
                     order_id = ""
                     del self._orders[name]
@@ -589,7 +590,7 @@ class CommandTask:
             if is_down(status):
                 self._settle(name, "on the ground")
             elif status.state not in (_S.HOLD, _S.MISSION):
-                self._fail([name], f"{status.state}: {status.reason}")
+                self._fail([name], _state_in_words(status))
             elif not trial or status.trial != trial:
                 self._settle(name, "holds: it has not begun this trial; `lpac mission start`")
         yield from self._order_start(trial)
@@ -803,11 +804,15 @@ def _obeying_words(safety_action: str) -> Effect:
 
 def _why(status: RobotStatus) -> str:
     """What keeps a robot from what it was told, and what helps."""
-    text = f"{status.state}: {status.reason}"
+    text = _state_in_words(status)
     if status.state is _S.PILOT:
         return f"{text}; `lpac mission rejoin` takes it back"
     if status.state is _S.FAULT and status.armed is False:
         return f"{text}; look at it, then `lpac fleet restart`"
     if status.state is _S.PREFLIGHT and not status.ready:
-        return f"not ready: {'; '.join(status.failed_checks) or 'the checks are still running'}"
+        return f"not ready: {texts(status.failed_checks) or 'the checks are still running'}"
     return text
+
+
+def _state_in_words(status: RobotStatus) -> str:
+    return f"{status.state}: {status.reason.text}"

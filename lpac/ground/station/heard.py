@@ -8,15 +8,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from edge.messages.mission import RobotStatus
+from edge.messages.mission import FlightState, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 
 # Two statuses of one program are at most so far apart, unless it has ended.
 _STATUS_GAP_S = 0.6
 _RATE_WINDOW_S = 3.0
 
-# Of a robot's name and a text, when it comes, falls silent, starts again, or changes its state.
-Tell = Callable[[str, str], None]
+# Of a robot's name and a text, when it comes, falls silent, or starts again.
+TellPresence = Callable[[str, str], None]
+# Of a robot's name, its new state, and a text.
+TellState = Callable[[str, FlightState, str], None]
 
 
 class _HeardStatus(NamedTuple):
@@ -111,7 +113,9 @@ class _Robot:
 class HeardRobots:
     """All robots of the fleet, by their ids, of which `robots` holds each name's."""
 
-    def __init__(self, robots: Mapping[str, int], tell_presence: Tell, tell_state: Tell) -> None:
+    def __init__(
+        self, robots: Mapping[str, int], tell_presence: TellPresence, tell_state: TellState
+    ) -> None:
         self.names = {robot_id: name for name, robot_id in robots.items()}
         self._robots = {id_: _Robot(name, id_) for id_, name in self.names.items()}
         self._tell_presence = tell_presence
@@ -131,7 +135,7 @@ class HeardRobots:
         if before is not None and before.boot_nonce != status.boot_nonce:
             self._tell_presence(robot.name, "its program has started again")
         if before is None or (before.state, before.reason) != (status.state, status.reason):
-            self._tell_state(robot.name, f"{status.state}: {status.reason}")
+            self._tell_state(robot.name, status.state, f"{status.state}: {status.reason.text}")
         self._look_at(robot, now_s)
         return True
 

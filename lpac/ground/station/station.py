@@ -15,6 +15,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
+from edge.messages.codes import CheckCode, Refusal, RefusalCode
 from edge.messages.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
@@ -53,8 +54,6 @@ _LATER_S = 1e-3
 _EVENTS_KEPT = 200
 _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
-# As a robot says it of a world whose text it has.
-_UNUSABLE_WORLD = "world cannot be used"
 
 _S = FlightState
 T = TypeVar("T")
@@ -92,7 +91,7 @@ class Station:
         self._robots = HeardRobots(
             setup.robots,
             lambda robot, text: self.tell("presence", robot, text),
-            lambda robot, text: self.tell("state", robot, text),
+            lambda robot, state, text: self.tell("state", robot, text, state=state),
         )
         self._began_s = now_s
         self._heard_s = now_s  # when the commander was
@@ -230,10 +229,17 @@ class Station:
 
     # Events
 
-    def tell(self, kind: EventKind, robot: str, text: str, operator: str = "") -> None:
+    def tell(
+        self,
+        kind: EventKind,
+        robot: str,
+        text: str,
+        operator: str = "",
+        state: FlightState | None = None,
+    ) -> None:
         """Keep an event for the clients."""
         trial = "" if self.state is None else self.state.trial
-        event = GroundEvent(self._unix_now_s, kind, robot, text, operator, trial)
+        event = GroundEvent(self._unix_now_s, kind, robot, text, operator, trial, state)
         self._events.append(event)
         self._new_events.append(event)
 
@@ -266,11 +272,14 @@ class Station:
             if order.robot_id != status.robot_id:
                 continue
             if status.boot_nonce != order.boot_nonce:
-                self._settle(OrderResult(order_id, False, "its program has started again"))
+                self._refuse(order_id, RefusalCode.STARTED_AGAIN, "its program has started again")
             elif order_id in answers:
                 self._settle(answers[order_id])
             elif status.uptime_s > order.expires_at_uptime_s:
-                self._settle(OrderResult(order_id, False, "it did not answer"))
+                self._refuse(order_id, RefusalCode.NOT_ANSWERED, "it did not answer")
+
+    def _refuse(self, order_id: str, code: RefusalCode, text: str) -> None:
+        self._settle(OrderResult(order_id, Refusal(code, text)))
 
     def _settle(self, result: OrderResult) -> None:
         del self._orders[result.order_id]
@@ -307,7 +316,7 @@ class Station:
         self.interruption = f"{operator} commands the fleet"
         for order, _ in tuple(self._orders.values()):
             if order.kind != "kill":
-                self._settle(OrderResult(order.order_id, False, self.interruption))
+                self._refuse(order.order_id, RefusalCode.INTERRUPTED, self.interruption)
 
     def hear_state(self, state: GroundState) -> None:
         """Another station's state came. Raises NameTakenError if it has this one's name."""
@@ -367,7 +376,7 @@ class Station:
         self._robots.look(self._now_s)
         for order_id, (_, made_s) in list(self._orders.items()):
             if self._now_s - made_s > ORDER_LIFETIME_S + 1.0:
-                self._settle(OrderResult(order_id, False, "it did not answer"))
+                self._refuse(order_id, RefusalCode.NOT_ANSWERED, "it did not answer")
         self._more_kills = [
             (order, made_s)
             for order, made_s in self._more_kills
@@ -656,7 +665,7 @@ class Station:
         lacking = any(
             s.world_id != wanted
             and s.state in ON_GROUND
-            and not any(_UNUSABLE_WORLD in why for why in s.not_taken)
+            and all(each.code is not CheckCode.WORLD_UNUSABLE for each in s.not_taken)
             for s in self.statuses().values()
         )
         return text if lacking else None

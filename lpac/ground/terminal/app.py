@@ -235,9 +235,9 @@ class Watch(App[str]):
 
     def _take_event(self, event: GroundEvent, setup: FleetSetup) -> None:
         """Some are older than this view. A ground that has just started knows of no trial yet."""
-        if event.kind != "state" or not event.trial:
+        if event.state is None or not event.trial:
             return
-        entered = _Entered(FlightState(event.text.partition(":")[0]), event.trial)
+        entered = _Entered(event.state, event.trial)
         if self._mission_tracker.begins(setup.robots[event.robot], entered, event.unix_time_s):
             self._mission = event.trial, event.unix_time_s
 

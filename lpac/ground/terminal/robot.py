@@ -42,9 +42,9 @@ def detail(row: Row, snapshot: FleetSnapshot, alarms: Sequence[Alarm], width: in
     ]
     if status is None:
         return [*lines, _fact("", "it was never heard", width, "faint")]
-    lines += [_fact("not taken", text, width, "warning") for text in status.not_taken]
+    lines += [_fact("not taken", each.text, width, "warning") for each in status.not_taken]
     if status.state in ON_GROUND:
-        lines += [_fact("not ready", text, width) for text in status.failed_checks]
+        lines += [_fact("not ready", each.text, width) for each in status.failed_checks]
     facts = _facts(row, status, snapshot)
     lines += [_fact(name, text, width) for name, text in facts.items() if text]
     return [
@@ -63,7 +63,7 @@ def in_short(row: Row, width: int) -> tuple[Line, Line]:
     margin_m = fence_margin_m(status, row.setup.fence)
     fence = "-" if margin_m is None else f"{margin_m:.1f} m"
     return (
-        line(width, name, Span(status.reason)),
+        line(width, name, Span(status.reason.text)),
         line(
             width,
             Span(" fence margin ", "faint"),
@@ -88,7 +88,7 @@ def _detail_title(robot: RobotSnapshot, width: int) -> Line:
         name,
         Span(f"(robot {robot.robot_id})  ", "faint"),
         Span(state_word(status), state_style(status)),
-        Span(f": {status.reason}"),
+        Span(f": {status.reason.text}"),
     )
     return (
         *line(width - len(heard) - 1, *left),
@@ -105,7 +105,7 @@ def _facts(row: Row, status: RobotStatus, snapshot: FleetSnapshot) -> dict[str, 
         "policy": _policy(status),
         "obeys": _obeys(status, snapshot),
         "orders": "; ".join(
-            "accepted" if order.accepted else f"refused: {order.reason}"
+            "accepted" if order.refusal is None else f"refused: {order.refusal.text}"
             for order in reversed(status.orders)
         ),
         "release": _release(status),

@@ -228,7 +228,7 @@ def _margin(row: Row) -> Span:
 
 
 def _reason(row: Row) -> Span:
-    return Span("" if row.robot.status is None else row.robot.status.reason)
+    return Span("" if row.robot.status is None else row.robot.status.reason.text)
 
 
 # Left to right. At 80 columns, one of them for the scroll bar, all up to `link` have room.

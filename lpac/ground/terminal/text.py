@@ -135,7 +135,7 @@ def _fence(setup: FleetSetup, ground: GroundState | None) -> Span:
 def alarm_lines(alarms: Sequence[Alarm], width: int) -> list[Line]:
     """The alarms, those of several robots with the same text in one line."""
     robots: dict[tuple[Severity, str], list[str]] = {}
-    for severity, robot, text in alarms:
+    for severity, robot, _, text in alarms:
         robots.setdefault((severity, text), []).append(robot or "fleet")
     who = 14
     return [

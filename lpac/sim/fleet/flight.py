@@ -339,7 +339,7 @@ def _robot_flight(
     changes: list[StateChange] = []
     for at_s, status in history:
         if not changes or changes[-1].state is not status.state:
-            changes.append(StateChange(at_s - start_s, status.state, status.reason))
+            changes.append(StateChange(at_s - start_s, status.state, status.reason.text))
     return RobotFlight(
         time_s=np.array([heard.at_s - start_s for heard in placed]),
         position_m=np.array([heard.status.position_m for heard in placed]).reshape(-1, 3),

@@ -2,14 +2,13 @@
 
 import json
 import os
-import re
 import socket
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from edge.messages.codes import CheckCode, FailedCheck, ReasonCode
 from lpac.sim.px4.link import Px4Link
 from tests.robot_rig import (
     ORIGIN,
@@ -21,35 +20,33 @@ from tests.robot_rig import (
     rig,
     write_config,
 )
+from tests.said import codes
 
 
-def failures(result: subprocess.CompletedProcess[str]) -> list[str]:
-    """What did not pass, of a check that said no."""
+def failures(made: Rig, wait_s: float) -> tuple[list[FailedCheck], list[str]]:
+    """What did not pass, of a check that said no; and what PX4 would do when something fails."""
+    result = lpac_robot("check", "--config", made.config_path, "--wait", wait_s, "--json")
     assert result.returncode == 1
-    failed = [
-        line.removeprefix("FAILED  ")
-        for line in result.stdout.splitlines()
-        if line.startswith("FAILED  ")
-    ]
+    report = json.loads(result.stdout)
+    failed = [FailedCheck(**{**each, "code": CheckCode(each["code"])}) for each in report["failed"]]
     assert failed
     plural = "s" if len(failed) > 1 else ""
     assert result.stderr == f"lpac: not ready to fly: {len(failed)} check{plural} failed\n"
-    return failed
+    return failed, report["explanations"]
 
 
 def failures_in_the_end(
-    made: Rig, are_so: Callable[[list[str]], bool]
-) -> tuple[list[str], list[str]]:
-    """What does not pass, and all lines; what is not known yet does not pass either.
+    made: Rig, are_so: Callable[[list[CheckCode | ReasonCode]], bool]
+) -> tuple[list[FailedCheck], list[str]]:
+    """The same; what is not known yet does not pass either.
 
     So on a busy machine it is asked again, and given more time.
     """
     for wait_s in (4, 15, 60):
-        result = lpac_robot("check", "--config", made.config_path, "--wait", wait_s)
-        failed = failures(result)
-        if are_so(failed):
+        failed, explanations = failures(made, wait_s)
+        if are_so(codes(failed)):
             break
-    return failed, result.stdout.splitlines()
+    return failed, explanations
 
 
 def test_check_explains_unsafe_failsafes_and_refuses_them(tmp_path: Path) -> None:
@@ -59,15 +56,14 @@ def test_check_explains_unsafe_failsafes_and_refuses_them(tmp_path: Path) -> Non
         made.operator.enable(ORIGIN)
         before = dict(vehicle.parameters)
         # Only the parameters are wrong.
-        failed, lines = failures_in_the_end(
-            made,
-            lambda failed: all(re.match(r"autopilot's \w+ = ", line) for line in failed),
+        failed, explanations = failures_in_the_end(
+            made, lambda failed: set(failed) == {CheckCode.FAILSAFE_WRONG}
         )
         assert vehicle.parameters == before
-    assert any("COM_OBL_RC_ACT = 0" in line and "must land" in line for line in failed)
-    (dies,) = (line for line in lines if "if this program dies" in line)
-    assert "land" not in dies
-    assert all(line.startswith("autopilot's ") for line in failed), failed
+    assert set(codes(failed)) == {CheckCode.FAILSAFE_WRONG}, failed
+    assert any("COM_OBL_RC_ACT = 0" in check.text for check in failed)
+    # The first tells what the watchdog does, the second PX4 if the program dies.
+    assert "land" not in explanations[1]
 
 
 def test_check_passes_a_good_vehicle_and_says_what_it_set(tmp_path: Path) -> None:
@@ -92,9 +88,8 @@ def test_check_passes_a_good_vehicle_and_says_what_it_set(tmp_path: Path) -> Non
 
 def test_check_without_a_ground_or_on_a_wrong_vehicle(tmp_path: Path) -> None:
     with rig(tmp_path, new_vehicle(), changes={"autopilot": {"system_id": 9}}) as made:
-        failed = failures(lpac_robot("check", "--config", made.config_path, "--wait", 3))
-    assert any(line.startswith("ground was not heard") for line in failed)
-    assert any(line.startswith("autopilot ") for line in failed)
+        failed, _ = failures(made, 3)
+    assert {CheckCode.GROUND_NOT_HEARD, CheckCode.OTHER_AUTOPILOT} <= set(codes(failed))
 
 
 def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
@@ -104,12 +99,10 @@ def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
     with rig(tmp_path, vehicles[0], Px4Link(vehicles[1], system_id=SYSTEM_ID + 1)) as made:
         made.operator.enable(ORIGIN)
         expected = [
-            f"other vehicles are on this link (system id {SYSTEM_ID + 1}): give each its own port",
-            "autopilot's failsafe parameters were not read: wait, or check the link",
-            "autopilot does not have the fence: wait for the upload, or check the link",
-        ]
+            CheckCode.OTHER_VEHICLES, CheckCode.FAILSAFE_NOT_READ, CheckCode.FENCE_NOT_UPLOADED,
+        ]  # fmt: skip
         failed, _ = failures_in_the_end(made, lambda failed: failed == expected)
-    assert failed == expected
+    assert codes(failed) == expected
     for vehicle in vehicles:
         assert {**vehicle.parameters, "MAV_SYS_ID": 1} == {**before, "MAV_SYS_ID": 1}
 

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from edge.drivers.systemd import ServiceManager, status_text
+from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import FlightState, LoopStatus, RobotStatus
+from tests.said import reason, reasons
 
 
 @contextmanager
@@ -63,10 +65,11 @@ def test_a_status_is_one_line_of_ascii_however_long_its_texts_are() -> None:
         ("control", "perception", "policy"), LoopStatus(10**9, 0, 10**9, 0.0, 0.0, 0.0)
     )
     worst = '"\\é\n\0' * 100
+    check = FailedCheck(max(CheckCode, key=len), worst, settles_by_itself=False)
     status = RobotStatus(
         robot_id=65535, boot_nonce=2**48, sequence=1, uptime_s=1.0, unix_time_s=1.0,
-        state=FlightState.PREFLIGHT, reason=worst, ready=False, failed_checks=(worst,) * 50,
-        alarms=(worst,), obeyed_sequence=1, operator=worst, orders=(), bundle_id="b" * 64,
+        state=FlightState.PREFLIGHT, reason=reason(worst), ready=False, failed_checks=(check,) * 50,
+        alarms=reasons(worst), obeyed_sequence=1, operator=worst, orders=(), bundle_id="b" * 64,
         world_id="w" * 12, trial=worst, origin=None, system_id=255, slot_height_m=4.0,
         landing_point_m=(0.0, 0.0), position_m=None, velocity_m_s=None, heading_rad=None,
         mode="offboard", armed=False, battery=1 / 3, satellites=12, message_counts={},
@@ -85,4 +88,5 @@ def test_a_status_is_one_line_of_ascii_however_long_its_texts_are() -> None:
     assert told["state"] == "preflight" and told["armed"] is False and told["battery"] == 0.333
     assert told["loops"]["control"] == {"ticks": 10**9, "failures": 10**9, "age_s": 0.333}
     assert told["loops"]["perception"]["age_s"] is None
-    assert len(told["failed_checks"]) == 8
+    assert [each["code"] for each in told["failed_checks"]] == [check.code] * 8
+    assert told["failed_checks_more"] == 42

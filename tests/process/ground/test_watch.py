@@ -37,6 +37,7 @@ from lpac.ground.terminal.app import Lines, Watch
 from tests.conftest import ROOT
 from tests.pretend import ORIGIN, PretendedFleet
 from tests.process.ground.conftest import PATIENCE_S, wait_for_snapshot
+from tests.said import reason, reasons
 from tests.unit.ground.snapshots import on_ground, robot, setup, snapshot, status
 
 _S = FlightState
@@ -210,10 +211,10 @@ def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
     """To a view that opens late, both flights' events are told."""
 
     async def use() -> None:
-        landed = ((800.0, "mission: mission started"), (900.0, "landed: the vehicle is disarmed"))
+        flown = ((800.0, _S.MISSION), (900.0, _S.LANDED), (935.0, _S.HOLD), (940.0, _S.MISSION))
         events = [
-            GroundEvent(at_s, "state", name, text, trial="t1")
-            for at_s, text in (*landed, (935.0, "hold: at its height"), (940.0, landed[0][1]))
+            GroundEvent(at_s, "state", name, "x", trial="t1", state=state)
+            for at_s, state in flown
             for name in ("r0", "r1")
         ]
         seen_last = snapshot(robot(status(0)), robot(status(1)), unix_time_s=1000.0)
@@ -225,7 +226,7 @@ def test_the_missions_clock_of_a_name_that_is_flown_again() -> None:
 
 @pytest.mark.parametrize("size", [(40, 12), (40, 8)])
 def test_what_is_asked_is_seen_in_a_small_terminal(size: tuple[int, int]) -> None:
-    ill = snapshot(*(robot(status(i, alarms=(f"{i} is lost",))) for i in range(9)))
+    ill = snapshot(*(robot(status(i, alarms=reasons(f"{i} is lost"))) for i in range(9)))
 
     async def use() -> None:
         async with told(setup(9), lambda: ill), watching("field", size) as seen:
@@ -251,10 +252,10 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
         heard(1, position_m=None, velocity_m_s=None, battery=None, satellites=None, mode=None),
         heard(2, battery=1.0, position_m=(-12.3, -123.4, -0.04)),
         robot(on_ground(3), age_s=4000.0),
-        heard(4, reason="世界 " * 40, mode="stabilized"),
+        heard(4, reason=reason("世界 " * 40), mode="stabilized"),
     ]
     flying = [heard(i, position_m=(i, i, 4.0)) for i in range(5, 29)]
-    late = heard(29, alarms=("position lost",))
+    late = heard(29, alarms=reasons("position lost"))
 
     async def use() -> None:
         snapshots = [snapshot(*odd, *flying, late)]

@@ -13,13 +13,14 @@ import pytest
 from edge.core.fence import Fence
 from edge.core.position import PositionJudgement
 from edge.drivers.px4.autopilot import MavsdkAutopilot
-from edge.flight.failsafe import PARAMETERS
+from edge.messages.codes import CheckCode
 from edge.messages.mission import GroundState, Origin
 from edge.robot.config import load_config
 from edge.robot.readiness import Assignment, Checks, Readiness
 from lpac.sim.px4.modes import MavResult
 from lpac.sim.px4.vehicle import Px4Vehicle
 from tests.robot_rig import ORIGIN, SYSTEM_ID, Rig, new_vehicle, rig, write_config
+from tests.said import codes
 
 
 @contextmanager
@@ -62,14 +63,14 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
 
 
 def about_parameters(checks: Checks) -> list[str]:
-    return [line for line in checks.failed if any(name in line for name in PARAMETERS)]
+    return [check.text for check in checks.failed if check.code is CheckCode.FAILSAFE_WRONG]
 
 
 def test_refuse_explains_and_changes_nothing(tmp_path: Path) -> None:
     vehicle = new_vehicle(COM_OBL_RC_ACT=0, NAV_RCL_ACT=0)
     with readiness(tmp_path, vehicle, "refuse") as (asked, _):
         before = dict(vehicle.parameters)
-        assert any("parameters were not read" in line for line in checked(asked).failed)
+        assert CheckCode.FAILSAFE_NOT_READ in codes(checked(asked).failed)
         asked.prepare(time.monotonic(), assignment(asked))
         problems = about_parameters(checked(asked))
         assert any("COM_OBL_RC_ACT = 0" in line and "must land" in line for line in problems)
@@ -116,9 +117,9 @@ def test_the_fence_is_uploaded_with_its_margin_for_each_new_origin(tmp_path: Pat
         assert not made.vehicle.fence
         for heading_deg in (30.0, 200.0):
             origin = dataclasses.replace(ORIGIN, heading_deg=heading_deg)
-            assert any("does not have the fence" in line for line in checked(asked, origin).failed)
+            assert CheckCode.FENCE_NOT_UPLOADED in codes(checked(asked, origin).failed)
             asked.prepare(time.monotonic() + heading_deg, assignment(asked, origin))
-            assert not any("fence: wait" in line for line in checked(asked, origin).failed)
+            assert CheckCode.FENCE_NOT_UPLOADED not in codes(checked(asked, origin).failed)
             (polygon,) = made.vehicle.fence
             transform = origin.frame().relative_to(origin.latitude_deg, origin.longitude_deg)
             # Our fence ends at 34 m, PX4's 5 m further out.
@@ -137,16 +138,16 @@ def test_the_vehicle_gets_the_fence_that_the_ground_sets_and_a_ceiling_to_match(
         configured = assignment(asked)
         asked.prepare(now_s, configured)
         (before,) = made.vehicle.fence
-        assert not any("GF_MAX_VER_DIST" in line for line in checked(asked).failed)
+        assert not any("GF_MAX_VER_DIST" in text for text in about_parameters(checked(asked)))
         fence = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
         ground = GroundState(1, "op", fence=fence)
         higher = configured._replace(robot=configured.robot.assigned(ground))
         failed = checked(asked, assignment=higher).failed
-        assert any("does not have the fence" in line for line in failed)
+        assert CheckCode.FENCE_NOT_UPLOADED in codes(failed)
         asked.prepare(now_s + 3.0, higher)
         checks = checked(asked, assignment=higher)
-        assert not any("fence: wait" in line for line in checks.failed)
-        assert any("GF_MAX_VER_DIST" in line for line in checks.failed)
+        assert CheckCode.FENCE_NOT_UPLOADED not in codes(checks.failed)
+        assert any("GF_MAX_VER_DIST" in text for text in about_parameters(checks))
         assert checks.assignment == higher
         (after,) = made.vehicle.fence
         assert after != before
@@ -164,20 +165,22 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
             time.sleep(0.05)
         asked.prepare(time.monotonic(), assignment(asked))
         assert (vehicle.parameters, vehicle.fence) == (before, ())
-        assert any("vehicle is armed" in line for line in checked(asked).failed)
+        assert CheckCode.NOT_DISARMED in codes(checked(asked).failed)
 
 
 @pytest.mark.parametrize(
-    ("facts", "line"),
+    ("facts", "code"),
     [
-        ({"watchdog_alive": False}, "watchdog has ended"),
-        ({"duplicate": True}, "another program says that it is robot 3"),
-        ({"ground_age_s": float("inf")}, "ground was not heard"),
-        ({"ground_age_s": 9.0}, "ground was last heard 9.0 s ago"),
-        ({"ground_clock_offset_s": 5.0}, "clock differs from the ground's"),
+        ({"watchdog_alive": False}, CheckCode.WATCHDOG_ENDED),
+        ({"duplicate": True}, CheckCode.DUPLICATE_ID),
+        ({"ground_age_s": float("inf")}, CheckCode.GROUND_NOT_HEARD),
+        ({"ground_age_s": 9.0}, CheckCode.GROUND_SILENT),
+        ({"ground_clock_offset_s": 5.0}, CheckCode.CLOCK_OFF_GROUND),
     ],
 )
-def test_what_the_program_knows_itself(tmp_path: Path, facts: dict[str, Any], line: str) -> None:
+def test_what_the_program_knows_itself(
+    tmp_path: Path, facts: dict[str, Any], code: CheckCode
+) -> None:
     url, endpoint = "udpin://127.0.0.1:14551", "tcp/127.0.0.1:7447"
     config = load_config(write_config(tmp_path, url=url, endpoint=endpoint))
     asked = Readiness(
@@ -186,6 +189,6 @@ def test_what_the_program_knows_itself(tmp_path: Path, facts: dict[str, Any], li
     )  # fmt: skip
     checks = checked(asked, **facts)
     assert checks.assignment == assignment(asked)
-    assert any(line in failed for failed in checks.failed)
-    assert not any(line in failed for failed in checked(asked).failed)
-    assert any("cnn.onnx does not fit" in failed for failed in checks.failed)
+    assert code in codes(checks.failed)
+    assert code not in codes(checked(asked).failed)
+    assert CheckCode.BUNDLE_NOT_VERIFIED in codes(checks.failed)

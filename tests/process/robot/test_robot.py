@@ -22,7 +22,8 @@ from edge.core.world import format_world, random_features
 from edge.drivers.flight_log import read as read_log
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.failsafe import PARAMETERS
-from edge.messages.mission import FlightState, Place, explored_from_bytes, world_id
+from edge.messages.codes import CheckCode, ReasonCode, RefusalCode, texts
+from edge.messages.mission import FlightState, OrderKind, Place, explored_from_bytes, world_id
 from edge.messages.topics import EXPLORED
 from edge.policy.bundle import Bundle, make_bundle, write_bundle
 from lpac.sim.operator import Operator
@@ -38,6 +39,7 @@ from tests.robot_rig import (
     program,
     rig,
 )
+from tests.said import codes, why
 from tests.unit.policy.test_bundle import scaled, with_files
 
 PARAM_REQUEST_READ = 20  # MAVLink's message id
@@ -74,7 +76,7 @@ def test_a_day_of_one_robot(tmp_path: Path) -> None:
         with program(made) as again:
             made.wait(lambda status: status.state is FlightState.PILOT and status.uptime_s > 3.0)
             assert vehicle.mode is Px4Mode.HOLD
-            assert any("already armed" in alarm for alarm in made.status.alarms)
+            assert ReasonCode.ARMED_BEFORE in codes(made.status.alarms)
             made.order("rejoin")
             made.wait_for_state(FlightState.HOLD)
             assert made.vehicle_is(lambda v: v.mode is Px4Mode.OFFBOARD)
@@ -127,11 +129,11 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
 
         made.order("start", "a")
         wait_until(lambda: explored[-1] > 1.3 * ONE_LOOK)
-        assert made.refusal("disarm") == "in the air: land it first"
+        assert refused(made, "disarm") is RefusalCode.IN_THE_AIR
         made.order("pilot")
         assert made.vehicle_is(lambda v: v.mode is Px4Mode.HOLD)
-        pilot = FlightState.PILOT, "given to a pilot"
-        made.wait(lambda status: (status.state, status.reason) == pilot)
+        pilot = FlightState.PILOT, ReasonCode.GIVEN_TO_PILOT
+        made.wait(lambda status: (status.state, status.reason.code) == pilot)
         made.order("rejoin")
         made.wait_for_state(FlightState.HOLD)
         made.operator.safety_action("land")
@@ -145,7 +147,7 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
         made.operator.assign()
         made.wait(lambda status: (status.fence, status.slot_height_m) == (made.config.fence, 5.0))
         assert made.status.world_id == world_id(WORLD)
-        assert made.refusal("disarm") == "is not armed"
+        assert refused(made, "disarm") is RefusalCode.NOT_ARMED
         with made.server.stepped:
             vehicle.arm(force=True)
         made.wait_for_state(FlightState.PILOT)
@@ -180,7 +182,7 @@ def obeys_only_who_commands(made: Rig) -> None:
         assert eve.wait_for(lambda statuses: 3 in statuses, PATIENCE_S)
         answer = eve.result(eve.order("takeoff", 3), PATIENCE_S)
         assert answer is not None
-        assert answer.reason == "test commands, not eve"
+        assert why(answer) is RefusalCode.OTHER_COMMANDER
 
 
 def refuses_what_does_not_fit(made: Rig) -> None:
@@ -188,20 +190,27 @@ def refuses_what_does_not_fit(made: Rig) -> None:
     before = made.status
     outside = Place(slot=1, landing_point_m=(50.0, 12.0))
     made.operator.assign(fence=FENCE, places={3: outside}, world="Nonsense 1 2")
-    made.wait(lambda status: "record 1 (Nonsense)" in " ".join(status.not_taken))
-    reason = made.refusal("takeoff")
-    assert "the ground's fence or place does not fit: landing_point_m = [50.0, 12.0]" in reason
-    assert "the ground's world cannot be used: world " in reason
+    unfit = [CheckCode.FENCE_OR_PLACE_UNFIT, CheckCode.WORLD_UNUSABLE]
+    made.wait(lambda status: codes(status.not_taken) == unfit)
+    # What is wrong with them is the fence's, and the world's, own text.
+    told = texts(made.status.not_taken)
+    assert "landing_point_m = [50.0, 12.0]" in told and "record 1 (Nonsense)" in told
+    assert refused(made, "takeoff") is RefusalCode.NOT_READY
     assert (made.status.fence, made.status.world_id) == (before.fence, before.world_id)
+
+
+def refused(made: Rig, kind: OrderKind, trial: str = "") -> RefusalCode | None:
+    refusal = made.refusal(kind, trial)
+    return None if refusal is None else refusal.code
 
 
 def keeps_what_it_has_in_flight(made: Rig) -> None:
     # No world is any world.
-    kept = ("in flight: keeps its fence", "in flight: keeps its place")
+    kept = [CheckCode.KEEPS_FENCE, CheckCode.KEEPS_PLACE]
     made.operator.assign()
-    made.wait(lambda status: status.not_taken == kept)
+    made.wait(lambda status: codes(status.not_taken) == kept)
     assert made.status.fence == FENCE
-    assert made.refusal("start", "a") == "; ".join(kept)
+    assert refused(made, "start", "a") is RefusalCode.NOT_TAKEN_UP
     made.operator.assign(fence=FENCE, places={3: PLACE}, world=WORLD)
     made.wait(lambda status: status.not_taken == ())
 
@@ -287,7 +296,7 @@ def test_a_vehicle_that_does_not_answer_holds_up_neither_status_nor_end(tmp_path
         with program(made) as running:
             made.operator.enable(ORIGIN)
             wait_until(lambda: asked[PARAM_REQUEST_READ] > len(PARAMETERS) + 5)
-            made.wait(lambda status: status.failed_checks == ("checks are still running",))
+            made.wait(lambda status: codes(status.failed_checks) == [CheckCode.CHECKS_RUNNING])
             assert running.end(signal.SIGTERM) == 0
 
 
@@ -381,7 +390,7 @@ def test_a_hung_program_that_systemd_restarts_in_flight_leaves_the_vehicle_in_ho
             assert vehicle.mode is Px4Mode.HOLD
             assert horizontal_speed_m_s(vehicle) < 0.2
             # Nobody answers.
-            made.wait(lambda status: status.reason == "nobody answered for 12 s")
+            made.wait(lambda status: status.reason.code is ReasonCode.NOBODY_ANSWERED)
             assert made.vehicle_is(lambda v: v.landed and not v.armed)
 
 
@@ -411,8 +420,10 @@ def test_a_robot_with_an_altered_policy_says_so_and_does_not_arm(
         made.wait_for_state(FlightState.PREFLIGHT)
         # All else is well by then.
         problem = "action.onnx, swarm of the bundle do not compute"
-        made.wait(lambda s: len(s.failed_checks) == 1 and problem in s.failed_checks[0])
-        assert problem in made.refusal("takeoff")
+        unverified = [CheckCode.BUNDLE_NOT_VERIFIED]
+        made.wait(lambda status: codes(status.failed_checks) == unverified)
+        assert problem in texts(made.status.failed_checks)
+        assert refused(made, "takeoff") is RefusalCode.NOT_READY
         assert not made.status.ready
     assert not any(truth.armed for truth in vehicle.truth)
 
@@ -429,8 +440,8 @@ def test_without_a_vehicle_and_a_log_it_runs_and_says_what_is_missing(tmp_path: 
         status = made.wait(
             lambda status: (
                 status.uptime_s > 3.0
-                and any(line.startswith("autopilot ") for line in status.failed_checks)
-                and "the flight log is not written" in status.alarms
+                and CheckCode.OTHER_AUTOPILOT in codes(status.failed_checks)
+                and ReasonCode.LOG_NOT_WRITTEN in codes(status.alarms)
             )
         )
         assert status.state is FlightState.INIT
@@ -457,6 +468,6 @@ def test_two_programs_that_say_they_are_one_robot_see_each_other(tmp_path: Path)
             fleet=made.config.fleet, robot_id=3, listen=("tcp/127.0.0.1:0",),
             connect=made.config.link.listen,
         ):  # fmt: skip
-            alarm = "another program says that it is robot 3"
-            made.wait(lambda status: alarm in status.alarms and not status.ready)
+            alarm = ReasonCode.DUPLICATE_ID
+            made.wait(lambda status: alarm in codes(status.alarms) and not status.ready)
         made.wait(lambda status: status.ready and not status.alarms)

@@ -8,7 +8,6 @@ machine.
 
 import math
 import os
-import re
 import subprocess
 import sys
 import time
@@ -23,6 +22,7 @@ import numpy as np
 import edge.robot.process
 from edge.core import F32, F64
 from edge.drivers.world_sensor import WorldSensor
+from edge.messages.codes import ReasonCode, texts
 from edge.messages.mission import FlightState, OrderKind, OrderResult, RobotStatus
 from edge.robot.pac import Pac, PolicyTick
 from lpac.cli.robot import run
@@ -42,15 +42,18 @@ PILOT_M_S = 3.0
 STORM_M_S, STORM_M_S2 = 16.0, 4.0
 # A robot that this machine kept waiting, or that passes another which lands, rightly leaves the
 # mission too.
-_BY_ITSELF = re.compile(
-    r"control was silent|the policy has no fresh answer|left offboard for hold|only .* m to robot|"
-    r"taken back"
+_BY_ITSELF = (
+    ReasonCode.CONTROL_SILENT,
+    ReasonCode.POLICY_STALE,
+    ReasonCode.LEFT_OFFBOARD,
+    ReasonCode.TOO_CLOSE,
+    ReasonCode.TAKEN_BACK,
 )
 
 
 def flies_on(status: RobotStatus) -> bool:
     """Whether it flies its mission, or left it for what it rightly leaves it for."""
-    return status.state is _S.MISSION or _BY_ITSELF.search(status.reason) is not None
+    return status.state is _S.MISSION or status.reason.code in _BY_ITSELF
 
 
 class FaultyRobot(RobotProcess):
@@ -129,13 +132,14 @@ class FaultRig:
         while True:
             result = self.operator.result(self.operator.order(kind, robot, "faults"), 60.0)
             assert result is not None, self.told()
-            if not HELD_UP.search(result.reason) or time.monotonic() > until_s:
+            refused = result.refusal
+            if refused is None or refused.code not in HELD_UP or time.monotonic() > until_s:
                 return result
 
-    def told(self) -> dict[int, tuple[str, str, str | None, tuple[str, ...]]]:
+    def told(self) -> dict[int, tuple[str, str, str | None, str]]:
         """What the robots say of themselves, for whoever reads a failure."""
         statuses = sorted(self.operator.statuses().items())
-        return {r: (s.state, s.reason, s.mode, s.failed_checks) for r, s in statuses}
+        return {r: (s.state, s.reason.text, s.mode, texts(s.failed_checks)) for r, s in statuses}
 
     def status(self, robot: int) -> RobotStatus:
         """Its newest status."""

@@ -12,6 +12,7 @@ import pytest
 from edge.core.fence import Fence
 from edge.drivers.zenoh_link import ZenohLink
 from edge.messages.codec import decode, encode
+from edge.messages.codes import Refusal, RefusalCode
 from edge.messages.mission import (
     FlightState,
     GroundState,
@@ -25,11 +26,13 @@ from edge.messages.mission import (
 from edge.messages.topics import ORDER, STATE, STATUS, WORLD
 from lpac.sim.operator import Operator, OperatorScript, OperatorScriptError
 from lpac.sim.ports import free_ports
+from tests.said import reason
 
 ORIGIN = Origin(40.0, -75.0, 30.0)
 SAID = RobotStatus(
     robot_id=0, boot_nonce=7, sequence=0, uptime_s=100.0, unix_time_s=0.0, state=FlightState.HOLD,
-    reason="", ready=False, failed_checks=(), alarms=(), obeyed_sequence=0, operator="", orders=(),
+    reason=reason(""), ready=False, failed_checks=(), alarms=(), obeyed_sequence=0, operator="",
+    orders=(),
     bundle_id="", world_id="", trial="", origin=None, system_id=1, slot_height_m=4.0,
     landing_point_m=(0.0, 0.0), position_m=(0.0, 0.0, 4.0), velocity_m_s=None, heading_rad=None,
     mode=None, armed=True, battery=None, satellites=None, message_counts={}, neighbour_ages_s={},
@@ -125,28 +128,30 @@ def test_an_order_is_repeated_until_it_is_answered() -> None:
         assert (order.order_id, order.robot_id, order.boot_nonce) == (order_id, 0, 7)
         assert (order.kind, order.trial, order.expires_at_uptime_s) == ("start", "trial", 110.0)
         assert operator.ordered(0) and operator.result(order_id) is None
-        accepted = OrderResult(order_id, True)
+        accepted = OrderResult(order_id)
         assert answered(operator, robot, order_id, orders=(accepted,)) == accepted
         assert not operator.ordered(0) and operator.refusals == []
 
 
 @pytest.mark.parametrize(
-    ("answer", "reason"),
+    ("answer", "code"),
     [
-        ({"orders": (OrderResult("?", False, "not ready: no GPS"),)}, "not ready: no GPS"),
-        ({"uptime_s": 110.5}, "it was not answered"),
-        ({"boot_nonce": 8, "uptime_s": 3.0}, "it was not answered"),
+        ({"orders": ()}, RefusalCode.NOT_READY),
+        ({"uptime_s": 110.5}, RefusalCode.NOT_ANSWERED),
+        ({"boot_nonce": 8, "uptime_s": 3.0}, RefusalCode.NOT_ANSWERED),
     ],
     ids=["refused", "expired", "restarted"],
 )
-def test_what_becomes_of_an_order_that_is_not_taken(answer: dict[str, object], reason: str) -> None:
+def test_what_becomes_of_an_order_that_is_not_taken(
+    answer: dict[str, object], code: RefusalCode
+) -> None:
     with talking() as (operator, [robot]):
         order_id = operator.order("takeoff", 0)
         if "orders" in answer:
-            answer = {"orders": (OrderResult(order_id, False, reason),)}
-        result = answered(operator, robot, order_id, **answer)
-        assert result == OrderResult(order_id, False, reason)
-        refusals = [f"robot 0 refuses takeoff: {reason}"]
+            answer = {"orders": (OrderResult(order_id, Refusal(code, "no GPS")),)}
+        refusal = answered(operator, robot, order_id, **answer).refusal
+        assert refusal is not None and refusal.code is code
+        refusals = [f"robot 0 refuses takeoff: {refusal.text}"]
         # Kept a moment after the result.
         assert operator.wait_for(lambda _: operator.refusals == refusals, 60.0)
 
@@ -154,7 +159,8 @@ def test_what_becomes_of_an_order_that_is_not_taken(answer: dict[str, object], r
 def test_nobody_orders_a_robot_that_is_not_heard() -> None:
     with talking() as (operator, _):
         result = operator.result(operator.order("takeoff", 5))
-        assert result is not None and result.reason == "the robot is not heard"
+        assert result is not None and result.refusal is not None
+        assert result.refusal.code is RefusalCode.NOT_ANSWERED
 
 
 def test_the_state_is_repeated_and_its_sequence_grows_with_each_change() -> None:

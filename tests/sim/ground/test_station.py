@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
 from lpac.analysis.snapshot import FleetSetup, FleetSlot, GroundEvent
 from lpac.ground.station.commands import Commands, CommandTask
@@ -498,9 +499,12 @@ def test_a_world_that_cannot_be_used_is_not_sent_for_ever() -> None:
     field.robots[0].deaf = True
     station.set_world(OTHER_WORLD)
     status = field.robots[0].status(field.now_s)
-    for why, text in (("has not arrived: wait", OTHER_WORLD), ("cannot be used: too long", None)):
+    for code, text in (
+        (CheckCode.WORLD_NOT_ARRIVED, OTHER_WORLD),
+        (CheckCode.WORLD_UNUSABLE, None),
+    ):
         field.run(STEP_S)
-        status = replace(status, not_taken=(f"the ground's world {why}",))
+        status = replace(status, not_taken=(FailedCheck(code, "x"),))
         station.hear_status(replace(status, sequence=field.robots[0].sequence + 1))
         field.robots[0].silent = True
         assert station.published_world() == text

@@ -29,6 +29,7 @@ from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
 from edge.flight.preflight import HeardStatus
 from edge.messages.codec import encode
+from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode
 from edge.messages.mission import (
     FlightState,
     GroundState,
@@ -50,6 +51,7 @@ from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 from tests.robot_rig import ORIGIN, new_vehicle, write_config
+from tests.said import checks, codes, why
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
 FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
@@ -168,7 +170,7 @@ class Flown:
             started_s=0.0,
         )
         self.ground = GroundState(sequence=1, operator="test", origin=ORIGIN, enabled=True)
-        self.failed_checks: tuple[str, ...] = ()
+        self.failed_checks: tuple[FailedCheck, ...] = ()
         self.sent = False
         self.images: F32 | None = None
         self._orders = 0
@@ -294,7 +296,7 @@ def test_it_flies_what_it_is_told_and_lands(flown: Flown) -> None:
     assert topics.count("control") == round(flown.now_s / 0.1)
     assert topics.count("ground") == flown.ground.sequence
     answers = [message["answer"] for topic, message in flown.records if topic == "order"]
-    assert answers == [OrderResult(str(number), True) for number in (1, 2, 3)]
+    assert answers == [OrderResult(str(number)) for number in (1, 2, 3)]
 
 
 def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilots(
@@ -311,7 +313,9 @@ def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilot
     flown.control.look_back(now_s - 0.5, now_s)
     flown.tick()
     assert flown.state is FlightState.HOLD
-    assert flown.control.flight.reason.startswith("control was silent for 0.6 s")
+    assert flown.control.flight.reason == Reason(
+        ReasonCode.CONTROL_SILENT, "control was silent for 0.6 s"
+    )
     for _ in range(50):
         flown.tick()
     assert flown.state is FlightState.HOLD and flown.vehicle.mode is Px4Mode.OFFBOARD
@@ -399,22 +403,26 @@ def test_fence_and_place_are_taken_up_together_on_the_ground_and_given_back(flow
     configured = flies_by(flown)
     flown.say(fence=FENCE, places={"3": PLACE, "4": Place(7, (1.0, 1.0))})
     # The checks were made for another fence.
-    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    assert why(flown.order("takeoff")) is RefusalCode.CHECKS_RUNNING
     assert flies_by(flown) == (FENCE, PLACE, "configured")
     flown.take_off()
     assert abs(-flown.vehicle.position_m[2] - 9.5) < 0.8
     flown.say(fence=None, places={}, origin=ELSEWHERE, world_id="other")
     flown.tick()
     assert flies_by(flown) == (FENCE, PLACE, "configured")
-    told = flown.control.not_taken
-    kept = ("mission origin", "fence", "place", "world")
-    assert told == tuple(f"in flight: keeps its {what}" for what in kept)
-    assert flown.order("start", "a").reason == "; ".join(told)
+    kept = (
+        FailedCheck(CheckCode.KEEPS_ORIGIN, "in flight: keeps its mission origin"),
+        FailedCheck(CheckCode.KEEPS_FENCE, "in flight: keeps its fence"),
+        FailedCheck(CheckCode.KEEPS_PLACE, "in flight: keeps its place"),
+        FailedCheck(CheckCode.KEEPS_WORLD, "in flight: keeps its world"),
+    )
+    assert flown.control.not_taken == kept
+    assert why(flown.order("start", "a")) is RefusalCode.NOT_TAKEN_UP
     flown.say(safety_action="land", world_id=None)
     flown.until(FlightState.LANDED)
     flown.tick()
     assert flies_by(flown) == configured
-    assert flown.control.not_taken == ()
+    assert not flown.control.not_taken
 
 
 def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(flown: Flown) -> None:
@@ -425,8 +433,10 @@ def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(fl
         (Place(30, (14.0, 12.0)), "slot = 30 flies at 140 m: must be from floor_m = 2 to"),
     ):
         flown.say(fence=FENCE, places={"3": place})
-        reason = flown.order("takeoff").reason
-        assert reason.startswith(f"not ready: the ground's fence or place does not fit: {problem}")
+        assert why(flown.order("takeoff")) is RefusalCode.NOT_READY
+        (unfit,) = flown.control.not_taken
+        assert unfit.code is CheckCode.FENCE_OR_PLACE_UNFIT
+        assert unfit.text.startswith(f"the ground's fence or place does not fit: {problem}")
         assert flies_by(flown) == before
     flown.say(fence=FENCE, places={"3": PLACE})
     flown.tick()
@@ -436,8 +446,9 @@ def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(fl
 def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown) -> None:
     flown.until(FlightState.PREFLIGHT)
     flown.say(world_id="flat")
-    waiting = "world flat of the ground has not arrived: wait"
-    assert flown.order("takeoff").reason == f"not ready: {waiting}"
+    text = "world flat of the ground has not arrived: wait"
+    waiting = FailedCheck(CheckCode.WORLD_NOT_ARRIVED, text, settles_by_itself=True)
+    assert why(flown.order("takeoff")) is RefusalCode.NOT_READY
     assert flown.control.not_taken == (waiting,)
     assert flown.control.wanted_world_id == "flat"
     assert flown.explored() > 0
@@ -446,7 +457,8 @@ def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown
     assert flies_by(flown)[2] == "configured"
     flown.control.world = GroundWorld("flat", None, "world flat: record 1 (X): unknown kind")
     flown.tick()
-    problem = "the ground's world cannot be used: world flat: record 1 (X): unknown kind"
+    text = "the ground's world cannot be used: world flat: record 1 (X): unknown kind"
+    problem = FailedCheck(CheckCode.WORLD_UNUSABLE, text)
     assert flown.control.failed_checks(flown.now_s) == (problem,)
     assert flown.control.wanted_world_id is None
     flown.control.world = GroundWorld("flat", WorldSensor(np.zeros((512, 512), np.float32), 64), "")
@@ -471,7 +483,7 @@ def test_a_program_that_starts_in_flight_flies_on_by_what_the_ground_says(flown:
     flown.say(fence=None)
     flown.tick()
     assert flies_by(flown) == (FENCE, PLACE, "flat")
-    assert flown.control.not_taken == ("in flight: keeps its fence",)
+    assert codes(flown.control.not_taken) == [CheckCode.KEEPS_FENCE]
 
 
 def test_a_reset_forgets_what_was_seen_and_moves_nothing(flown: Flown) -> None:
@@ -489,32 +501,32 @@ def test_a_reset_forgets_what_was_seen_and_moves_nothing(flown: Flown) -> None:
 def test_checks_count_for_their_origin_and_not_for_long(
     flown: Flown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    flown.failed_checks = ("GPS is not heard",)
+    flown.failed_checks = checks("GPS is not heard")
     flown.until(FlightState.PREFLIGHT)
-    assert flown.order("takeoff").reason == "not ready: GPS is not heard"
+    assert why(flown.order("takeoff")) is RefusalCode.NOT_READY
     flown.failed_checks = ()
     flown.tick()
     with monkeypatch.context() as slow:
         slow.setattr(flown, "look", lambda: None)
         # Preflight is slow: what it found was for the origin before.
         flown.say(origin=ELSEWHERE)
-        assert flown.order("takeoff").reason == "not ready: the checks are still running"
+        assert why(flown.order("takeoff")) is RefusalCode.CHECKS_RUNNING
         # Nor does it count when that is undone: the vehicle may have the other fence by now.
         flown.say(origin=ORIGIN)
-        assert flown.order("takeoff").reason == "not ready: the checks are still running"
+        assert why(flown.order("takeoff")) is RefusalCode.CHECKS_RUNNING
     flown.tick()
     assert flown.control.failed_checks(flown.now_s) == ()
     monkeypatch.setattr(flown, "look", lambda: None)
     for _ in range(51):
         flown.tick()
-    assert flown.order("takeoff").reason == "not ready: the checks are still running"
+    assert why(flown.order("takeoff")) is RefusalCode.CHECKS_RUNNING
     assert Action.ARM not in flown.autopilot.commands
 
 
 def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
     flown.take_off()
     flown.peers(peer(5, FlightState.TAKEOFF), peer(6, FlightState.HOLD))
-    assert flown.order("start", "a").reason == "robots still taking off: 5"
+    assert why(flown.order("start", "a")) is RefusalCode.OTHERS_TAKE_OFF
     flown.peers(peer(5, FlightState.HOLD))
     assert flown.order("start", "a").accepted
 
@@ -523,7 +535,7 @@ def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_status(flown: F
     flown.take_off()
     x_m, y_m, height_m = flown.odometry()
     flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))
-    assert flown.order("start", "a").reason == "only 1.0 m to robot 5"
+    assert why(flown.order("start", "a")) is RefusalCode.TOO_CLOSE
     # What it said two seconds ago tells nothing, nor does a place in another frame.
     flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)), age_s=2.0)
     assert flown.order("start", "a").accepted

@@ -14,6 +14,7 @@ from edge.core.world import format_world, parse_world, random_features, rasteriz
 from edge.messages.mission import FlightState, RobotStatus
 from lpac.analysis.coverage import Coverage, Whereabouts
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
+from tests.said import reason
 
 SIZE, SCALE = 128, 4.0
 S = FlightState
@@ -129,8 +130,9 @@ def test_a_broken_world_is_one_line() -> None:
 
 
 STATUS = RobotStatus(
-    robot_id=0, boot_nonce=1, sequence=1, uptime_s=1.0, unix_time_s=1.0, state=S.IDLE, reason="",
-    ready=True, failed_checks=(), alarms=(), obeyed_sequence=0, operator="", orders=(),
+    robot_id=0, boot_nonce=1, sequence=1, uptime_s=1.0, unix_time_s=1.0, state=S.IDLE,
+    reason=reason(""), ready=True, failed_checks=(), alarms=(), obeyed_sequence=0, operator="",
+    orders=(),
     bundle_id="", world_id="", trial="", origin=None, system_id=1, slot_height_m=4.0,
     landing_point_m=(0.0, 0.0), position_m=(1.0, 2.0, 3.0), velocity_m_s=None, heading_rad=None,
     mode=None, armed=False, battery=None, satellites=None, message_counts={}, neighbour_ages_s={},

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from edge.core.coverage import coverage_cost
 from edge.core.world import format_world, parse_world, random_features, rasterize
 from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, LoopStatus, Order, OrderResult, RobotStatus
 from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import load_bundle
@@ -33,6 +34,7 @@ from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata
 from tests.conftest import SHIPPED
 from tests.pretend import FENCE
+from tests.said import reason, refusal
 from tests.unit.analysis.test_coverage import STATUS
 
 S = FlightState
@@ -139,7 +141,7 @@ class Writer:
                     self._receive(log, robot, status.sequence, at_s)
                     log.flush()
                 order = Order("a", robot, self.nonce, "takeoff", 1.0, "ann", "")
-                answer = OrderResult("a", robot != 2, "" if robot != 2 else "not ready: battery")
+                answer = OrderResult("a", refusal("" if robot != 2 else "not ready: battery"))
                 log.record(
                     "order", BEGAN_S + self.flights[0].begin_s - 4.0 + self.ahead_s[robot],
                     {**dataclasses.asdict(order), "answer": dataclasses.asdict(answer)},
@@ -406,7 +408,9 @@ def test_restarts_and_alarms_are_told(tmp_path: Path) -> None:
 
     def change(status: RobotStatus, at_s: float) -> RobotStatus:
         if status.robot_id == 1 and at_s >= 25.0:
-            return dataclasses.replace(status, alarms=("battery <low>",))
+            return dataclasses.replace(
+                status, alarms=(reason("battery <low>", ReasonCode.BATTERY_LOW),)
+            )
         if status.robot_id == 2 and at_s >= 26.0:
             return dataclasses.replace(status, boot_nonce=99, uptime_s=at_s - 26.0)
         return status
@@ -417,7 +421,7 @@ def test_restarts_and_alarms_are_told(tmp_path: Path) -> None:
     (values,) = found.summary()["trials"]
     assert values["restarts"] == {"r2": 1}
     (alarm,) = values["alarms"]
-    assert (alarm["robot"], alarm["text"]) == ("r1", "battery <low>")
+    assert (alarm["robot"], alarm["code"], alarm["text"]) == ("r1", "battery_low", "battery <low>")
     assert alarm["time_s"] == pytest.approx(5.0, abs=0.01)
     page = write(found, tmp_path / "out", (), lambda *_: None)
     assert "battery <low>" in Page(page.read_text()).text

@@ -84,7 +84,9 @@ def overview(**changes: Any) -> dict[str, Any]:
         "uptime_s": 754.0,
         "status": {
             "state": "preflight", "armed": False, "battery": 1.0, "satellites": 14, "peers": 9,
-            "failed_checks": ["ground was not heard"],
+            "failed_checks": [
+                {"code": "ground_not_heard", "text": "x", "settles_by_itself": False}
+            ],
         },
     } | changes.pop("service", {})  # fmt: skip
     versions = {"image": "1" * 16, "bundle": "2" * 64, "world": "3" * 12}

@@ -149,7 +149,7 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
         "received": {"sender": 1, "sequence": 2, "age_s": 0.1, "rejection": None},
         "control": {"state": FlightState.MISSION, "sent_local": Velocity((1.0, 0.0, 0.0))[0]},
         "status": {"origin": Origin(47.0, 8.0, 0.0)},
-        "order": {**dataclasses.asdict(order), "answer": OrderResult("a", True)},
+        "order": {**dataclasses.asdict(order), "answer": OrderResult("a")},
         "ground": dataclasses.asdict(STATE),
         "vehicle": dataclasses.asdict(state),
         "/pose": {"position_m": (1.0, 2.0, 3.0), "yaw_rad": math.pi / 2},

@@ -18,6 +18,7 @@ from edge.core.vehicle import Action, Mode, VehicleState
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.flight.state import FlightInputs, FlightMemory
 from edge.flight.step import step
+from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import FlightState
 from edge.robot.config import load_config
 from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
@@ -175,8 +176,9 @@ def test_battery_critical_while_landing_is_px4s_own_failsafe() -> None:
 def test_a_landing_that_px4s_own_failsafe_interrupts_is_not_let_go_of() -> None:
     """The program that was recorded let go: "the vehicle left land for hold"."""
     robot = load_config(ROOT / "docs" / "robot.toml").robot(boot_nonce=1)
-    flight = FlightMemory(FlightState.LAND, "at the landing point", since_s=33.4, land_by="return")
-    told: list[tuple[FlightState, tuple[Action, ...], tuple[str, ...]]] = []
+    home = Reason(ReasonCode.AT_LANDING_POINT, "at the landing point")
+    flight = FlightMemory(FlightState.LAND, home, since_s=33.4, land_by="return")
+    told: list[tuple[FlightState, tuple[Action, ...], tuple[Reason, ...]]] = []
     for now_s, vehicle, judgement in conclusions("battery_fast"):
         if now_s < flight.since_s or flight.state is FlightState.LANDED:
             continue
@@ -197,7 +199,9 @@ def test_a_landing_that_px4s_own_failsafe_interrupts_is_not_let_go_of() -> None:
     assert {action for _, actions, _ in told for action in actions} == {Action.LAND}
     assert not any(actions for _, actions, _ in told[20:])
     acting = [
-        alarms for _, _, alarms in told if "the autopilot's own failsafe acts: hold" in alarms
+        alarms
+        for _, _, alarms in told
+        if Reason(ReasonCode.FAILSAFE, "the autopilot's own failsafe acts: hold") in alarms
     ]
     assert 5.0 < TICK_S * len(acting) < 6.0
 

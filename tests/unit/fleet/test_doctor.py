@@ -11,6 +11,7 @@ import pytest
 
 from edge.core.vehicle import Gps
 from edge.flight.margins import ErrorBudget
+from edge.messages.codes import CheckCode, FailedCheck
 from lpac.fleet.config import FleetConfig, SshConfig, load_fleet
 from lpac.fleet.doctor import (
     ClockOffset,
@@ -29,6 +30,8 @@ from tests.conftest import ROOT
 from tests.host.fleet.field import SILENT
 from tests.unit.flight.test_preflight import lines
 
+_C = CheckCode
+
 PING = {"loss": 0.0, "mean_ms": 3.0, "max_ms": 9.0}
 
 
@@ -41,17 +44,23 @@ def config(tmp_path: Path) -> FleetConfig:
     return load_fleet(path)
 
 
+def failed(code: CheckCode, text: str = "x", *, settles: bool = False) -> dict[str, Any]:
+    """One failed check as the robot's program tells it, in words that say nothing."""
+    return dataclasses.asdict(FailedCheck(code, text, settles))
+
+
 def well(config: FleetConfig, name: str) -> Examination:
     """A robot that may fly."""
     robot = config.robots[name]
     status = {
         "state": "idle", "autopilot": True, "system_id": robot.system_id, "peers": 2,
         "failed_checks": [
-            "ground was not heard: start `lpac ground`, check the radio and the fleet's name",
-            "mission origin is not set: set it on the ground",
-            "place in the fence is not known: it needs the position and the mission origin",
-            "autopilot does not have the fence: wait for the upload, or check the link",
+            failed(_C.GROUND_NOT_HEARD),
+            failed(_C.ORIGIN_NOT_SET),
+            failed(_C.PLACE_NOT_KNOWN),
+            failed(_C.FENCE_NOT_UPLOADED, settles=True),
         ],
+        "failed_checks_more": 0,
     }  # fmt: skip
     runs = {"there": True, "active": True, "enabled": True}
     idle = {"there": False, "active": False, "enabled": False}
@@ -106,6 +115,11 @@ def put(path: str, value: object) -> Any:
     return change
 
 
+def says(*checks: dict[str, Any]) -> Any:
+    """Its program says that these checks failed."""
+    return put("service.status.failed_checks", list(checks))
+
+
 def test_a_robot_that_is_well_may_fly(config: FleetConfig) -> None:
     checks = judged(config)
     assert {check.verdict for check in checks.values()} == {"ok"}
@@ -139,7 +153,8 @@ def test_an_accuracy_that_is_too_bad_for_the_landing_points_is_no_go(config: Fle
     """That may pass, or not; nobody is told that he may fly meanwhile."""
     bad = Gps(3, 14, 0.8, accuracy_m=2.0)
     (line,) = lines(bad, 0.9, 16.0, ErrorBudget())
-    checks = judged(config, put("service.status.failed_checks", [line]))
+    told = [failed(_C.LANDINGS_TOO_NEAR, line)]
+    checks = judged(config, put("service.status.failed_checks", told))
     assert checks["preflight"] == ("preflight", "FAILED", line, "mend what each line says")
     assert not decide(Diagnosis("r1", tuple(checks.values()))).go
 
@@ -205,26 +220,25 @@ def container(**about: object) -> list[dict[str, object]]:
             put("containers", container(name="old_ros", running=False)),
             "containers", "ok", "0 run",
         ),
+        (says(failed(_C.FAILSAFE_WRONG, "COM_X = 0")), "failsafe", "FAILED", "COM_X = 0"),
+        (says(failed(_C.FAILSAFE_NOT_READ)), "failsafe", "warning", "not read"),
+        (says(failed(_C.CHECKS_RUNNING, settles=True)), "failsafe", "warning", "not read"),
+        (says(failed(_C.CHECKS_RUNNING, settles=True)), "preflight", "warning", "x"),
+        (says(failed(_C.AUTOPILOT_NOT_CONNECTED)), "failsafe", "warning", "not read"),
+        (says(failed(_C.CLOCK_OFF_ROBOT)), "preflight", "ok", "nothing but the ground"),
+        (says(failed(_C.GPS_NO_FIX, settles=True)), "preflight", "warning", "x"),
+        (says(failed(_C.BATTERY_LOW, "40 %")), "preflight", "FAILED", "40 %"),
+        (says(failed(_C.NOT_ARMABLE)), "preflight", "FAILED", "x"),
         (
-            put("service.status.failed_checks", ["autopilot's COM_OBL_RC_ACT = 0; wanted is 4"]),
-            "failsafe", "FAILED", "COM_OBL_RC_ACT = 0",
+            says(failed(_C.NOT_ARMABLE), failed(_C.GPS_NO_FIX, settles=True)),
+            "preflight", "warning", "x",
         ),
         (
-            put("service.status.failed_checks", ["checks are still running"]),
-            "failsafe", "warning", "not read",
+            says(failed(_C.NOT_ARMABLE), failed(_C.CHECKS_RUNNING, settles=True)),
+            "preflight", "FAILED", "x",
         ),
-        (
-            put("service.status.failed_checks", ["GPS has no 3-D fix: wait, or move to open sky"]),
-            "preflight", "warning", "3-D fix",
-        ),
-        (
-            put("service.status.failed_checks", ["battery has 40 %, must have 50 %: charge it"]),
-            "preflight", "FAILED", "battery has 40 %",
-        ),
-        (
-            put("service.status.failed_checks", ["GPS is poor: wait"] * 8),
-            "failsafe", "warning", "there may be more",
-        ),
+        (says({**failed(_C.OTHER), "code": "of_a_newer_program"}), "preflight", "FAILED", "x"),
+        (put("service.status.failed_checks_more", 1), "failsafe", "warning", "there may be more"),
     ],
 )  # fmt: skip
 def test_each_fault_is_named_with_its_fix(
@@ -277,9 +291,9 @@ def test_what_a_stopped_robots_release_says_counts(config: FleetConfig) -> None:
     facts["service"] |= {"active": "inactive", "fresh": False, "status": None}
     facts["heartbeat"] = {"system_id": 1, "autopilot": 12, "armed": False}
     vehicle = {"explanations": [], "changes": [], "failed": [
-        "ground was not heard: start it",
-        "autopilot's EKF2_HGT_REF = 3 (vision); wanted is 1 (GPS)",
-        "heading is not known: check the compass",
+        failed(_C.GROUND_NOT_HEARD),
+        failed(_C.FAILSAFE_WRONG, "autopilot's EKF2_HGT_REF = 3 (vision); wanted is 1 (GPS)"),
+        failed(_C.HEADING_NOT_KNOWN, "no heading", settles=True),
     ]}  # fmt: skip
     fleet["r1"] = fleet["r1"]._replace(facts=facts, vehicle=vehicle)
     checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
@@ -287,7 +301,7 @@ def test_what_a_stopped_robots_release_says_counts(config: FleetConfig) -> None:
     assert checks["failsafe"].verdict == "FAILED"
     assert "EKF2_HGT_REF = 3" in checks["failsafe"].found
     assert checks["preflight"].verdict == "warning"
-    assert checks["preflight"].found == "heading is not known: check the compass"
+    assert checks["preflight"].found == "no heading"
 
 
 def test_rsync_version() -> None:

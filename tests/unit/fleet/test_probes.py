@@ -1,5 +1,6 @@
 """What the robot's tools print, read on the robot: any numbers and names, cut off anywhere."""
 
+import dataclasses
 import json
 import math
 from typing import Any
@@ -8,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lpac.fleet import doctor
+from edge.messages.codes import CheckCode, FailedCheck
 from lpac.fleet.on_robot import probes, service
-from tests.conftest import ROOT
 
 NAMES = st.from_regex(r"[a-z][a-z0-9-]{0,14}", fullmatch=True)
 ANYTHING = st.text(max_size=200)
@@ -205,12 +205,16 @@ def test_a_clock_is_set_by_its_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set_to == [1020.0]
 
 
-@pytest.mark.parametrize(
-    "words",
-    [*doctor._GROUND, *doctor._NO_AUTOPILOT, doctor._FAILSAFE, doctor._NOT_READ, doctor._RUNNING,
-     doctor._WOULD_NOT_ARM],
-)  # fmt: skip
-def test_doctor_sorts_the_programs_checks_by_words_that_it_says(words: str) -> None:
-    """Reworded there alone, a fault would pass for something that only takes a while."""
-    said = [ROOT / "edge" / name for name in ("flight/preflight.py", "robot/process.py")]
-    assert any(words in path.read_text() for path in said)
+def test_a_program_is_waited_for_until_it_has_looked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By codes that it really says."""
+    told = [*map(CheckCode, probes._NOT_SETTLED), CheckCode.GPS_NO_FIX]
+    assert CheckCode.OTHER not in told
+
+    def said(code: CheckCode) -> dict[str, Any]:
+        check = dataclasses.asdict(FailedCheck(code, "x"))
+        return {"fresh": True, "status": {"failed_checks": [check]}}
+
+    states = iter([said(code) for code in told[1:]])
+    monkeypatch.setattr(service, "service", lambda: next(states))
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    assert probes._settled(said(told[0])) == said(CheckCode.GPS_NO_FIX)

@@ -25,10 +25,10 @@ from edge.core.vehicle import (
     PILOTED,
     Action,
     ActionResult,
+    AutopilotReason,
     GlobalOrigin,
     Gps,
     Mode,
-    Reason,
     VehicleState,
 )
 from edge.flight.energy import Energy
@@ -52,6 +52,14 @@ from edge.flight.state import (
 )
 from edge.flight.step import Decision, enter, step
 from edge.flight.transitions import TRANSITIONS, Transition
+from edge.messages.codes import (
+    CheckCode,
+    FailedCheck,
+    Reason,
+    ReasonCode,
+    Refusal,
+    RefusalCode,
+)
 from edge.messages.mission import (
     FlightState,
     GroundState,
@@ -96,6 +104,11 @@ ROBOT = Robot(
 SLOT_M = ROBOT.parameters.slot_height_m
 
 
+def codes(decision: Decision) -> list[ReasonCode]:
+    """Its alarms."""
+    return [alarm.code for alarm in decision.alarms]
+
+
 class World:
     """One robot's decisions, a crude PX4, and a ground; `heartbeats` come `latency_s` late."""
 
@@ -136,8 +149,8 @@ class World:
         self.policy_m_s: np.ndarray | None = np.array([1.0, 0.0])
         self.closest: Closest | None = None
         self.busy: tuple[int, ...] = ()
-        self.failed_checks: tuple[str, ...] | None = ()
-        self.not_taken: tuple[str, ...] = ()
+        self.failed_checks: tuple[FailedCheck, ...] | None = ()
+        self.not_taken: tuple[FailedCheck, ...] = ()
         self.safety_form: SafetyAction = "none"
         self.order: Order | None = None
         self.orders = 0
@@ -145,6 +158,7 @@ class World:
         self.restart()
         self.taken: list[Transition] = []
         self.reasons: list[str] = []
+        self.said = ""
         self.taken_s: list[float] = []
         self.actions: list[tuple[float, Action]] = []
         self.takeoffs = 0
@@ -170,7 +184,7 @@ class World:
             self.tick()
             if self.flight.state is state:
                 return
-        raise AssertionError(f"{self.flight.state}, not {state}: {self.flight.reason}")
+        raise AssertionError(f"{self.flight.state}, not {state}: {self.flight.reason.text}")
 
     def stop(self, seconds: float) -> None:
         """The process is stopped and continued: its first ticks know nothing new."""
@@ -206,12 +220,14 @@ class World:
 
     def obey(self, kind: OrderKind, trial: str = "") -> None:
         answer = self.give(self.new_order(kind, trial))
-        assert answer.accepted, answer.reason
+        assert answer.accepted, answer.refusal
 
-    def refuse(self, kind: OrderKind) -> str:
-        answer = self.give(self.new_order(kind))
-        assert not answer.accepted
-        return answer.reason
+    def refuse(self, kind: OrderKind) -> RefusalCode:
+        """The robot refuses it: why."""
+        refusal = self.give(self.new_order(kind)).refusal
+        assert refusal is not None
+        self.said = refusal.text
+        return refusal.code
 
     # A flight's beginning
 
@@ -242,6 +258,10 @@ class World:
 
     def state(self) -> FlightState:
         return self.flight.state
+
+    @property
+    def why(self) -> tuple[FlightState, ReasonCode]:
+        return self.flight.state, self.flight.reason.code
 
     @property
     def height_m(self) -> float:
@@ -397,7 +417,7 @@ class World:
         self.actions += [(self.now_s, action) for action in decision.actions]
         if decision.taken is not None:
             self.taken.append(decision.taken)
-            self.reasons.append(decision.flight.reason)
+            self.reasons.append(decision.flight.reason.text)
             self.taken_s.append(self.now_s)
             # No two rows may lead back and forth.
             assert len(self.taken_s) < 6 or self.now_s - self.taken_s[-6] > 0.7
@@ -510,7 +530,9 @@ def test_a_battery_swap_in_somebodys_hands_does_not_arm(world: World) -> None:
     world.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0))
     world.until(FlightState.PREFLIGHT, 8.0)
     answer = world.give(replace(takeoff, boot_nonce=76))
-    assert answer == OrderResult("o1", False, "meant for another start of this robot's program")
+    assert answer.refusal == Refusal(
+        RefusalCode.OTHER_START, "meant for another start of this robot's program"
+    )
     world.run(10.0)
     assert world.actions == []
 
@@ -530,7 +552,7 @@ def test_a_late_gps_fix_does_not_arm(world: World) -> None:
     world.enable()
     world.run(20.0)
     assert world.state() is FlightState.INIT
-    assert "INIT" in world.refuse("takeoff").upper()
+    assert world.refuse("takeoff") is RefusalCode.WRONG_STATE
     world.position_known = True
     world.until(FlightState.PREFLIGHT, 8.0)
     world.run(10.0)
@@ -557,7 +579,9 @@ def test_a_takeoff_order_counts_no_more_after_others_were_answered(world: World)
     world.until(FlightState.PREFLIGHT, 3.0)
     for _ in range(10):
         world.refuse("rejoin")
-    assert world.give(takeoff).reason == "older than an order that was obeyed"
+    assert world.give(takeoff).refusal == Refusal(
+        RefusalCode.OLDER, "older than an order that was obeyed"
+    )
     world.run(10.0)
     assert world.asked(Action.ARM) == 0
 
@@ -569,23 +593,31 @@ def test_orders_are_refused_with_the_reason(world: World) -> None:
     world.enable()
     world.failed_checks = None
     world.until(FlightState.PREFLIGHT, 6.0)
-    assert world.refuse("takeoff") == "not ready: the checks are still running"
-    world.failed_checks = ("battery 40 %", "GPS: 2-D fix")
-    assert world.refuse("takeoff") == "not ready: battery 40 %; GPS: 2-D fix"
-    world.failed_checks = ()
-    assert world.refuse("start").startswith(
-        "start is taken in hold only, the robot is in preflight"
+    assert world.refuse("takeoff") is RefusalCode.CHECKS_RUNNING
+    assert world.said == "not ready: the checks are still running"
+    world.failed_checks = (
+        FailedCheck(CheckCode.BATTERY_LOW, "battery 40 %"),
+        FailedCheck(CheckCode.GPS_NO_FIX, "GPS: 2-D fix"),
     )
+    assert world.refuse("takeoff") is RefusalCode.NOT_READY
+    assert world.said == "not ready: battery 40 %; GPS: 2-D fix"
+    world.failed_checks = ()
+    assert world.refuse("start") is RefusalCode.WRONG_STATE
+    assert world.said.startswith("start is taken in hold only, the robot is in preflight")
     order = world.new_order("takeoff")
     late = replace(order, expires_at_uptime_s=world.now_s - world.started_s)
-    assert world.give(late).reason == "expired"
+    assert world.give(late).refusal == Refusal(RefusalCode.EXPIRED, "expired")
     for expires_s in (1e9, math.nan, math.inf):
         far = replace(world.new_order("takeoff"), expires_at_uptime_s=expires_s)
-        assert world.give(far).reason.endswith("too long")
+        refusal = world.give(far).refusal
+        assert refusal is not None and refusal.code is RefusalCode.VALID_TOO_LONG
+        assert refusal.text.endswith("too long")
     world.give(replace(world.new_order("takeoff"), boot_nonce=1))
-    assert "another start" in world.flight.answers[-1].reason
+    refusal = world.flight.answers[-1].refusal
+    assert refusal is not None and refusal.code is RefusalCode.OTHER_START
     world.enable(safety_action="hold")
-    assert world.refuse("takeoff") == "the ground commands hold"
+    assert world.refuse("takeoff") is RefusalCode.GROUND_COMMANDS
+    assert world.said == "the ground commands hold"
     answers = world.flight.answers
     world.order = replace(world.new_order("takeoff"), robot_id=4)
     world.tick()
@@ -596,21 +628,27 @@ def test_orders_are_refused_with_the_reason(world: World) -> None:
 def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: World) -> None:
     world.hover()
     world.busy = (4, 7)
-    assert world.refuse("start") == "robots still taking off: 4, 7"
+    assert world.refuse("start") is RefusalCode.OTHERS_TAKE_OFF
+    assert world.said == "robots still taking off: 4, 7"
     world.busy = ()
     world.policy_m_s = None
-    assert world.refuse("start") == "the policy has no fresh answer"
+    assert world.refuse("start") is RefusalCode.POLICY_STALE
+    assert world.said == "the policy has no fresh answer"
     world.policy_m_s = np.zeros(2)
     world.closest = Closest(4, 1.2)
-    assert world.refuse("start") == "only 1.2 m to robot 4"
+    assert world.refuse("start") is RefusalCode.TOO_CLOSE
+    assert world.said == "only 1.2 m to robot 4"
     world.closest = None
     world.position_m[0] = 33.0
-    assert world.refuse("start").startswith("outside the fence")
+    assert world.refuse("start") is RefusalCode.OUTSIDE_FENCE
+    assert world.said.startswith("outside the fence")
     world.position_m[0], world.position_m[2] = 16.0, SLOT_M - 2.0
-    assert "its height is 9.5 m" in world.refuse("start")
+    assert world.refuse("start") is RefusalCode.NOT_AT_HEIGHT
+    assert "its height is 9.5 m" in world.said
     world.position_m[2] = SLOT_M
     world.battery = 0.2
-    assert world.refuse("start") == "battery low: 20%"
+    assert world.refuse("start") is RefusalCode.OVERRULED
+    assert world.said == "battery low: 20%"
     assert world.state() is FlightState.RETURN
 
 
@@ -619,20 +657,20 @@ def test_only_the_commander_orders_but_anybody_kills(world: World) -> None:
     kinds: tuple[OrderKind, ...] = ("takeoff", "start", "pilot", "rejoin", "reset", "disarm")
     for kind in kinds:
         answer = world.give(replace(world.new_order(kind), operator="eve"))
-        assert answer == OrderResult(answer.order_id, False, "op commands, not eve")
+        assert answer.refusal == Refusal(RefusalCode.OTHER_COMMANDER, "op commands, not eve")
     assert world.actions == []
     assert world.give(replace(world.new_order("kill"), operator="eve")).accepted
 
 
 def test_without_a_ground_only_kill_is_taken(world: World) -> None:
     world.run(3.0)
-    assert world.refuse("reset") == "the ground's state is not heard"
+    assert world.refuse("reset") is RefusalCode.GROUND_NOT_HEARD
     world.hover()
     world.ground_on = False
     world.run(3.5)
     kinds: tuple[OrderKind, ...] = ("start", "pilot", "reset")
     for kind in kinds:
-        assert world.refuse(kind) == "the ground's state is not heard"
+        assert world.refuse(kind) is RefusalCode.GROUND_NOT_HEARD
     world.obey("kill")
 
 
@@ -657,15 +695,19 @@ def test_what_the_ground_says_and_the_robot_does_not_fly_by_keeps_it_from_starti
     world: World,
 ) -> None:
     world.hover()
-    world.not_taken = ("in flight: keeps its fence", "in flight: keeps its world")
-    assert world.refuse("start") == "in flight: keeps its fence; in flight: keeps its world"
+    world.not_taken = (
+        FailedCheck(CheckCode.KEEPS_FENCE, "in flight: keeps its fence"),
+        FailedCheck(CheckCode.KEEPS_WORLD, "in flight: keeps its world"),
+    )
+    assert world.refuse("start") is RefusalCode.NOT_TAKEN_UP
+    assert world.said == "in flight: keeps its fence; in flight: keeps its world"
     world.not_taken = ()
     world.obey("start")
 
 
 def test_the_next_trial_is_reset_on_the_ground_or_in_hold_and_then_started(world: World) -> None:
     world.fly()
-    assert world.refuse("reset") == "reset is not taken in mission: mission started"
+    assert world.refuse("reset") is RefusalCode.WRONG_STATE
     world.enable(safety_action="hold")
     world.run(2.0)
     for trial in ("second", "second", "third"):
@@ -696,7 +738,7 @@ def test_a_reset_is_taken_though_the_state_changes_in_the_same_tick(world: World
 
 def test_disarm_stops_the_motors_on_the_ground_only(world: World) -> None:
     world.ready()
-    assert world.refuse("disarm") == "is not armed"
+    assert world.refuse("disarm") is RefusalCode.NOT_ARMED
     # Before it is heard to be armed.
     world.obey("takeoff")
     while not world.flight.armed_asked:
@@ -711,15 +753,15 @@ def test_disarm_stops_the_motors_on_the_ground_only(world: World) -> None:
     world.until(FlightState.TAKEOFF, 6.0)
     world.run(2.5)
     world.obey("disarm")
-    assert (world.state(), world.flight.reason) == (FlightState.PILOT, "disarm ordered")
+    assert world.why == (FlightState.PILOT, ReasonCode.DISARM_ORDERED)
     world.until(FlightState.LANDED, 2.5)
     assert not world.armed
     assert world.height_m == 0.0
     world.heavy = False
     world.hover()
-    assert world.refuse("disarm") == "in the air: land it first"
+    assert world.refuse("disarm") is RefusalCode.IN_THE_AIR
     world.enable(safety_action="land")
-    assert world.refuse("disarm") == "in the air: land it first"
+    assert world.refuse("disarm") is RefusalCode.IN_THE_AIR
     world.until(FlightState.LANDED, 20.0)
 
 
@@ -732,7 +774,9 @@ def test_takeoff_waits_for_the_vehicle_and_stops_where_it_is_refused(world: Worl
         world.refuses = {action: "not today"}
         world.obey("takeoff")
         world.until(FlightState.IDLE, 7.0)
-        assert f"{action} refused: not today" in world.flight.reason
+        assert world.flight.reason == Reason(
+            ReasonCode.ARMING_FAILED, f"{action} refused: not today"
+        )
         assert world.actions[-1][1] is Action.DISARM
         world.run(1.5)
         assert world.state() is FlightState.IDLE
@@ -771,7 +815,7 @@ def test_a_vehicle_that_does_not_arm_is_left_alone(world: World) -> None:
     world.stuck = True
     world.obey("takeoff")
     world.until(FlightState.IDLE, 7.0)
-    assert world.flight.reason == "the autopilot does not arm"
+    assert world.flight.reason.code is ReasonCode.ARMING_FAILED
     world.run(3.0)
     assert not world.armed
 
@@ -798,13 +842,13 @@ def test_a_vehicle_that_was_armed_as_the_link_was_lost_is_not_said_to_be_somebod
     world.until(FlightState.INIT, 4.0)
     world.telemetry = True
     world.until(FlightState.PILOT, 4.0)
-    assert world.flight.reason.startswith("armed by this program, on op's takeoff order")
+    assert world.why == (FlightState.PILOT, ReasonCode.ARMED_BEFORE)
     world.armed = False
     world.until(FlightState.LANDED, 2.5)
     world.ready()
     world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
     world.until(FlightState.PILOT, 2.5)
-    assert world.flight.reason == "the vehicle is armed, without an order: only observing"
+    assert world.why == (FlightState.PILOT, ReasonCode.ARMED_BY_OTHERS)
 
 
 def test_whoever_arms_by_hand_after_a_flight_that_is_over_is_not_this_program(
@@ -824,7 +868,7 @@ def test_whoever_arms_by_hand_after_a_flight_that_is_over_is_not_this_program(
     world.run(290.0)
     world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
     world.until(FlightState.PILOT, 2.5)
-    assert world.flight.reason == "the vehicle is armed, without an order: only observing"
+    assert world.why == (FlightState.PILOT, ReasonCode.ARMED_BY_OTHERS)
 
 
 def test_how_long_a_vehicle_has_been_in_the_air(world: World) -> None:
@@ -906,7 +950,7 @@ def test_a_takeoff_on_hold_stays_where_it_is_in_the_air_or_on_the_ground(world: 
     world.until(FlightState.TAKEOFF, 6.0)
     world.enable(safety_action="hold")
     world.until(FlightState.LAND, 3.0)
-    assert world.flight.reason == "it stands on the ground"
+    assert world.flight.reason.code is ReasonCode.ON_GROUND
     # Nothing that the ground repeats lifts it off again.
     world.heavy = False
     world.enable(safety_action="return")
@@ -1017,7 +1061,7 @@ def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:
     world.position_m[:2] = (33.0, 16.0)
     world.enable(safety_action="hold")
     world.until(FlightState.HOLD, 1.0)
-    assert "outside the fence" in world._decide(world._hear()).alarms
+    assert ReasonCode.OUTSIDE_FENCE in codes(world._decide(world._hear()))
     world.run(20.0)
     assert world.position_m[:2] == pytest.approx((31.0, 16.0), abs=0.2)
 
@@ -1028,7 +1072,7 @@ def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
     lost_s = world.now_s
     world.until(FlightState.HOLD, 4.0)
     assert world.now_s - lost_s == pytest.approx(3.0, abs=0.2)
-    assert "ground lost" in world._decide(world._hear()).alarms
+    assert ReasonCode.GROUND_LOST in codes(world._decide(world._hear()))
     world.until(FlightState.LAND, 11.0)
     assert world.now_s - lost_s == pytest.approx(13.0, abs=0.2)
     world.ground_on = True
@@ -1055,7 +1099,7 @@ def test_battery_low_returns_and_critical_lands(world: World) -> None:
     world.battery = 0.24
     decision = world.tick()
     assert world.state() is FlightState.RETURN
-    assert decision.alarms == ("battery low: 24%",)
+    assert decision.alarms == (Reason(ReasonCode.BATTERY_LOW, "battery low: 24%"),)
     world.enable(safety_action="hold")
     world.run(1.0)
     assert world.state() is FlightState.HOLD
@@ -1073,13 +1117,15 @@ def test_a_lost_position_stops_and_then_lands(world: World) -> None:
     world.fly()
     world.position_known = False
     world.run(0.6)
-    assert "position doubtful: GPS has no fix" in world.tick().alarms
+    doubtful = Reason(ReasonCode.POSITION_NOT_GOOD, "position doubtful: GPS has no fix")
+    assert doubtful in world.tick().alarms
     world.run(1.0)
     assert world.state() is FlightState.MISSION
     assert world.speed_m_s < 0.1
     world.run(0.5)
     assert world.state() is FlightState.LAND
-    assert "position lost: GPS has no fix" in world.tick().alarms
+    lost = Reason(ReasonCode.POSITION_LOST, "position lost: GPS has no fix")
+    assert lost in world.tick().alarms
     world.position_known = True
     world.until(FlightState.LANDED, 30.0)
 
@@ -1145,7 +1191,8 @@ def test_a_position_in_doubt_is_stood_still_by(world: World, state: FlightState)
     world.run(3.0)
     assert world.state() is state
     assert world.speed_m_s < 0.1
-    assert "position doubtful: GPS is accurate to 7.0 m only" in world.tick().alarms
+    text = "position doubtful: GPS is accurate to 7.0 m only"
+    assert Reason(ReasonCode.POSITION_NOT_GOOD, text) in world.tick().alarms
     # The numbers may be another place's now: it is not flown to.
     place_m = world.position_m.copy()
     world.position_m[0] += 5.0
@@ -1168,13 +1215,16 @@ def test_a_position_that_stays_in_doubt_lands(world: World) -> None:
 
 
 def test_what_px4_warns_of_in_flight_is_an_alarm(world: World) -> None:
-    warning = Reason("commander_failsafe_enter", (0, 7, 4), "failsafe, battery critical: PX4 lands")
+    warning = AutopilotReason(
+        "commander_failsafe_enter", (0, 7, 4), "failsafe, battery critical: PX4 lands"
+    )
     world.heard = replace(world.heard, warnings=(warning,))
     world.enable()
     world.run(1.0)
     assert world.tick().alarms == ()
     world.fly()
-    assert world.tick().alarms == ("PX4: failsafe, battery critical: PX4 lands",)
+    text = "PX4: failsafe, battery critical: PX4 lands"
+    assert world.tick().alarms == (Reason(ReasonCode.PX4, text),)
 
 
 def test_a_battery_that_just_lasts_for_the_way_home_returns(world: World) -> None:
@@ -1191,10 +1241,10 @@ def test_a_battery_that_just_lasts_for_the_way_home_returns(world: World) -> Non
         world.energy = short
         decision = world.tick()
         assert world.state() is FlightState.RETURN
-        assert decision.alarms == (said,)
+        assert decision.alarms == (Reason(ReasonCode.BATTERY_LOW, said),)
         world.enable(safety_action="hold")
         world.run(1.0)
-        assert world.refuse("start") == "the ground commands hold"
+        assert world.refuse("start") is RefusalCode.GROUND_COMMANDS
         world.enable()
         world.run(0.2)
         assert world.state() is FlightState.RETURN
@@ -1207,7 +1257,7 @@ def test_a_neighbour_too_close_holds_and_alarms(world: World) -> None:
     world.closest = Closest(9, 1.4)
     decision = world.tick()
     assert world.state() is FlightState.HOLD
-    assert decision.alarms == ("only 1.4 m to robot 9",)
+    assert decision.alarms == (Reason(ReasonCode.TOO_CLOSE, "only 1.4 m to robot 9"),)
     # On its way home it brakes, but does not flicker between two states.
     world.enable(safety_action="return")
     world.run(1.0)
@@ -1232,9 +1282,10 @@ def test_a_lost_remote_control_is_an_alarm_and_what_is_configured(world: World) 
         world.remote_control = False
         world.run(1.5)
         assert world.state() is state
-        assert ("remote control lost" in world.tick().alarms) is (reaction is not None)
+        lost = ReasonCode.REMOTE_CONTROL_LOST in codes(world.tick())
+        assert lost is (reaction is not None)
         if reaction == "hold":
-            assert world.refuse("start") == "remote control lost"
+            assert world.refuse("start") is RefusalCode.REMOTE_CONTROL_LOST
         # On its way home it goes on.
         world.enable(safety_action="none" if reaction == "land" else "return")
         world.until(FlightState.LANDED, 40.0)
@@ -1248,7 +1299,7 @@ def test_a_remote_control_of_which_nothing_is_told_any_more_is_lost(world: World
     world.run(0.8)
     assert world.state() is FlightState.MISSION
     world.run(0.5)
-    assert (world.state(), world.flight.reason) == (FlightState.LAND, "remote control lost")
+    assert world.why == (FlightState.LAND, ReasonCode.REMOTE_CONTROL_LOST)
 
 
 def test_what_was_not_told_while_the_program_stood_still_is_not_lost(world: World) -> None:
@@ -1259,14 +1310,14 @@ def test_what_was_not_told_while_the_program_stood_still_is_not_lost(world: Worl
     world.remote_control, world.battery = True, 0.9
     world.run(4.0)
     assert world.state() is FlightState.HOLD
-    assert "remote control lost" not in world.tick().alarms
+    assert ReasonCode.REMOTE_CONTROL_LOST not in codes(world.tick())
 
 
 def test_a_battery_that_is_not_known_in_flight_is_an_alarm(world: World) -> None:
     world.fly()
     assert world.tick().alarms == ()
     world.battery = None
-    assert world.tick().alarms == ("battery is not known",)
+    assert codes(world.tick()) == [ReasonCode.BATTERY_NOT_KNOWN]
     assert world.state() is FlightState.MISSION
 
 
@@ -1306,7 +1357,7 @@ def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
     world.run(3.0)
     world.telemetry = True
     world.until(FlightState.PILOT, 4.0)
-    assert world.flight.reason.startswith("armed by this program, on op's takeoff order")
+    assert world.why == (FlightState.PILOT, ReasonCode.ARMED_BEFORE)
     world.run(3.0)
     world.telemetry = False
     world.until(FlightState.FAULT, 6.0)
@@ -1328,7 +1379,7 @@ def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
     world.run(3.0)
     world.obey("rejoin")
     world.until(FlightState.PILOT, 6.0)
-    assert world.flight.reason == "offboard refused: sticks"
+    assert world.flight.reason.code is ReasonCode.OFFBOARD_REFUSED
 
 
 # The autopilot's own failsafe
@@ -1342,7 +1393,7 @@ def test_a_landing_that_the_autopilots_failsafe_interrupts_goes_on(world: World)
     asked = len(world.actions)
     world.failsafe = Mode.HOLD
     world.run(5.5)
-    assert "the autopilot's own failsafe acts: hold" in world.tick().alarms
+    assert ReasonCode.FAILSAFE in codes(world.tick())
     assert world.state() is FlightState.LAND
     world.enable(safety_action="hold")
     world.run(0.5)
@@ -1395,9 +1446,9 @@ def test_the_autopilots_failsafe_in_a_mission_holds_and_then_lands(world: World)
     world.enable(safety_action="return")
     world.run(3.0)
     assert world.state() is FlightState.HOLD
-    assert world.refuse("start") == "the ground commands return"
+    assert world.refuse("start") is RefusalCode.GROUND_COMMANDS
     world.enable()
-    assert world.refuse("start") == "the autopilot's own failsafe acts: hold"
+    assert world.refuse("start") is RefusalCode.FAILSAFE
     world.failsafe = Mode.LAND
     world.until(FlightState.LAND, 2.5)
     world.until(FlightState.LANDED, 20.0)
@@ -1457,10 +1508,10 @@ def test_after_a_lapse_that_nobody_answers_it_lands(world: World) -> None:
     world.stop(1.0)  # Another one is no answer.
     assert world.flight.alarming
     text = "hovers, and lands 60 s after it began to, if nobody orders or holds it"
-    assert text in world.tick().alarms
+    assert Reason(ReasonCode.HOVERS_ALONE, text) in world.tick().alarms
     world.until(FlightState.LAND, 35.0)
     assert world.now_s - began_s == pytest.approx(60.0, abs=1.0)
-    assert world.flight.reason == "nobody answered for 60 s"
+    assert world.flight.reason.code is ReasonCode.NOBODY_ANSWERED
     world.until(FlightState.LANDED, 20.0)
 
 
@@ -1574,7 +1625,7 @@ def test_after_a_lapse_nothing_moves_until_the_operator_resumes(world: World) ->
 def test_just_after_a_lapse_no_order_is_taken(world: World) -> None:
     world.fly()
     world.stop(0.8)
-    assert world.refuse("start") == "the control loop was silent just before"
+    assert world.refuse("start") is RefusalCode.CONTROL_SILENT
 
 
 def test_after_a_lapse_without_a_watchdog_the_autopilots_landing_goes_on(world: World) -> None:
@@ -1630,8 +1681,8 @@ def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> Non
         begin()
         assert world.state() is state
         world.obey("pilot")
-        assert (world.state(), world.flight.reason) == (FlightState.PILOT, "given to a pilot")
-        assert "given to a pilot" in world.tick().alarms
+        assert world.why == (FlightState.PILOT, ReasonCode.GIVEN_TO_PILOT)
+        assert ReasonCode.GIVEN_TO_PILOT in codes(world.tick())
         # Again is no mistake; and nothing that the ground repeats takes it back.
         world.obey("pilot")
         for safety_action in safety_actions:
@@ -1646,7 +1697,7 @@ def test_the_operator_gives_it_to_a_pilot_and_takes_it_back(world: World) -> Non
         assert world.mode is Mode.OFFBOARD
     world.enable(safety_action="land")
     world.run(1.0)
-    assert world.refuse("pilot") == "pilot is not taken in land: ground commands land"
+    assert world.refuse("pilot") is RefusalCode.WRONG_STATE
 
 
 def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> None:
@@ -1655,11 +1706,11 @@ def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> N
     world.until(FlightState.PILOT, 2.5)
     while world.position_m[0] < 33.0:
         world.tick()
-    assert world.refuse("rejoin").startswith("outside the fence")
+    assert world.refuse("rejoin") is RefusalCode.OUTSIDE_FENCE
     world.pilot(-1.0, 0.0, -0.3)
     while world.position_m[0] > 25.0:
         world.tick()
-    assert "its height is 9.5 m" in world.refuse("rejoin")
+    assert world.refuse("rejoin") is RefusalCode.NOT_AT_HEIGHT
     world.position_m[2] = SLOT_M
     world.pilot()
     world.obey("rejoin")
@@ -1706,7 +1757,7 @@ def test_a_program_that_starts_in_flight_only_observes_until_rejoin(world: World
     actions = list(world.actions)
     world.restart()
     world.until(FlightState.PILOT, 2.0)
-    assert "already armed when this program found it" in world.flight.reason
+    assert world.why == (FlightState.PILOT, ReasonCode.ARMED_BEFORE)
     for safety_action in ("none", "hold", "land", "return", "none"):
         world.enable(safety_action=safety_action)
         world.run(2.0)
@@ -1726,10 +1777,7 @@ def test_a_vehicle_armed_by_hand_is_only_observed(world: World) -> None:
     world.ready()
     world.armed, world.mode, world.intended = True, Mode.POSITION, Mode.POSITION
     world.until(FlightState.PILOT, 2.5)
-    assert world.refuse("rejoin") in (
-        "position or height is not known",
-        "the vehicle is not in the air",
-    )
+    assert world.refuse("rejoin") in (RefusalCode.PLACE_NOT_KNOWN, RefusalCode.NOT_IN_THE_AIR)
     world.armed = False
     world.until(FlightState.LANDED, 2.5)
     world.run(1.0)
@@ -1829,9 +1877,16 @@ def test_a_row_does_what_its_fields_say() -> None:
     world.fly()
     t = Tick(ROBOT, replace(world.flight, target_m=(1.0, 2.0, 3.0)), world.inputs(world.heard))
     assert t.flight.reached
-    row = Transition((FlightState.MISSION,), FlightState.HOLD, "a test wants it", lambda _: "so")
+    row = Transition(
+        (FlightState.MISSION,),
+        FlightState.HOLD,
+        ReasonCode.OTHER,
+        "a test wants it",
+        lambda _: "so",
+    )
     plain = enter(row, "so", t)
-    assert (plain.state, plain.reason, plain.alarming) == (FlightState.HOLD, "so", False)
+    assert (plain.state, plain.reason) == (FlightState.HOLD, Reason(ReasonCode.OTHER, "so"))
+    assert not plain.alarming
     assert (plain.reached, plain.target_m, plain.alone_since_s) == (True, None, None)
     assert not plain.killed
     full = replace(
@@ -1936,7 +1991,7 @@ def _surroundings(world: World, draw: random.Random) -> None:
     world.policy_m_s = draw.choice((None, np.array([draw.uniform(-3, 3), draw.uniform(-3, 3)])))
     world.closest = draw.choice((None, None, Closest(4, draw.uniform(0.0, 3.0))))
     world.busy = draw.choice(((), (), (5,)))
-    world.failed_checks = draw.choice(((), (), None, ("x",)))
+    world.failed_checks = draw.choice(((), (), None, (FailedCheck(CheckCode.OTHER, "x"),)))
     world.battery = draw.choice((0.9, 0.9, 0.2, 0.1))
     world.energy = draw.choice(
         (None, Energy(draw.uniform(0, 900), draw.uniform(0, 300), None, 3.4))

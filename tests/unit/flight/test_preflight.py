@@ -10,7 +10,7 @@ from edge.core.fence import Fence
 from edge.core.position import PositionCause, PositionJudgement, PositionQuality
 from edge.core.px4_version import in_words
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.vehicle import GlobalOrigin, Gps, Mode, Reason, VehicleState
+from edge.core.vehicle import AutopilotReason, GlobalOrigin, Gps, Mode, VehicleState
 from edge.flight.margins import ErrorBudget
 from edge.flight.preflight import (
     HeardStatus,
@@ -18,8 +18,10 @@ from edge.flight.preflight import (
     PreflightLimits,
     failed_checks,
 )
+from edge.messages.codes import CheckCode, Reason, ReasonCode
 from edge.messages.mission import FlightState, Origin, RobotStatus
 
+_C = CheckCode
 UNIX_S = 1_790_000_000.0
 ORIGIN = Origin(47.4, 8.5, 90.0)
 LIMITS = PreflightLimits()
@@ -46,7 +48,7 @@ NEIGHBOUR = RobotStatus(
     uptime_s=60.0,
     unix_time_s=UNIX_S,
     state=FlightState.IDLE,
-    reason="",
+    reason=Reason(ReasonCode.OTHER, ""),
     ready=True,
     failed_checks=(),
     alarms=(),
@@ -99,75 +101,160 @@ READY = PreflightInputs(
 )
 
 # What is wrong with the inputs, and the one line that says so.
-INPUTS: list[tuple[dict[str, Any], str]] = [
-    ({"bundle_problem": "cnn differs"}, "bundle is not verified (cnn differs): deploy it again"),
-    ({"unix_now_s": 1_500_000_000.0}, "clock is before 2026: set the time of this robot"),
-    ({"ground_age_s": None}, "ground was not heard: start"),
-    ({"ground_age_s": 3.1}, "ground was last heard 3.1 s ago: check the radio"),
-    ({"ground_clock_offset_s": -7.0}, "clock differs from the ground's by -7.0 s: set the time"),
-    ({"system_id": 9}, "autopilot has system id 1, configured is 9: check which vehicle this is"),
-    ({"rc": "pilot"}, "remote control is not heard, and the config has a pilot: switch it on"),
-    ({"not_understood": ("robot 4",)}, "robot 4 runs another version of this program"),
-    ({"failsafe_problems": None}, "autopilot's failsafe parameters were not read"),
-    ({"failsafe_problems": ("COM_OF_LOSS_T = 1",)}, "autopilot's COM_OF_LOSS_T = 1"),
-    ({"fence_uploaded": False}, "autopilot does not have the fence: wait for the upload"),
-    ({"origin": None}, "mission origin is not set: set it on the ground"),
-    ({"position_m": None}, "place in the fence is not known"),
-    ({"position_m": (1.0, 8.0, 0.0)}, "robot stands 1.0 m inside the fence, must be 2 m inside"),
-    ({"position_m": (-1.0, 8.0, 0.0)}, "robot stands 1.0 m outside it, must be 2 m inside"),
-    ({"position_m": (math.nan, 8.0, 0.0)}, "robot stands nan m outside it"),
-    ({"landing_point_m": (31.5, 8.0)}, "landing point lies 0.5 m inside the fence, must be 2 m"),
-    ({"slot_height_m": 2.0}, "slot height is 2 m, must be from the floor at 3 m to the ceiling"),
-    ({"slot_height_m": 26.0}, "slot height is 26 m"),
-    ({"duplicate_id": True}, "another program says that it is robot 1: stop it"),
-    ({"robot_id": 2}, "another program says that it is robot 2"),
-    ({"bundle_id": "c"}, "robot 2 has another bundle: deploy one to all"),
-    ({"world_id": "v"}, "robot 2 has another world: set one on the ground"),
-    ({"origin": Origin(47.4, 8.5, 91.0)}, "robot 2 has another mission origin"),
-    ({"slot_height_m": 6.0}, "robot 2 flies 3.5 m above or below, must be 4.5 m (heights err by"),
+INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
+    (
+        {"bundle_problem": "cnn differs"},
+        _C.BUNDLE_NOT_VERIFIED,
+        "bundle is not verified (cnn differs): deploy it again",
+    ),
+    (
+        {"unix_now_s": 1_500_000_000.0},
+        _C.CLOCK_NOT_SET,
+        "clock is before 2026: set the time of this robot",
+    ),
+    ({"ground_age_s": None}, _C.GROUND_NOT_HEARD, "ground was not heard: start"),
+    ({"ground_age_s": 3.1}, _C.GROUND_SILENT, "ground was last heard 3.1 s ago: check the radio"),
+    (
+        {"ground_clock_offset_s": -7.0},
+        _C.CLOCK_OFF_GROUND,
+        "clock differs from the ground's by -7.0 s: set the time",
+    ),
+    (
+        {"system_id": 9},
+        _C.SYSTEM_ID_WRONG,
+        "autopilot has system id 1, configured is 9: check which vehicle this is",
+    ),
+    (
+        {"rc": "pilot"},
+        _C.REMOTE_CONTROL_NOT_HEARD,
+        "remote control is not heard, and the config has a pilot: switch it on",
+    ),
+    (
+        {"not_understood": ("robot 4",)},
+        _C.NOT_UNDERSTOOD,
+        "robot 4 runs another version of this program",
+    ),
+    (
+        {"failsafe_problems": None},
+        _C.FAILSAFE_NOT_READ,
+        "autopilot's failsafe parameters were not read",
+    ),
+    (
+        {"failsafe_problems": ("COM_OF_LOSS_T = 1",)},
+        _C.FAILSAFE_WRONG,
+        "autopilot's COM_OF_LOSS_T = 1",
+    ),
+    (
+        {"fence_uploaded": False},
+        _C.FENCE_NOT_UPLOADED,
+        "autopilot does not have the fence: wait for the upload",
+    ),
+    ({"origin": None}, _C.ORIGIN_NOT_SET, "mission origin is not set: set it on the ground"),
+    ({"position_m": None}, _C.PLACE_NOT_KNOWN, "place in the fence is not known"),
+    (
+        {"position_m": (1.0, 8.0, 0.0)},
+        _C.STANDS_OUTSIDE,
+        "robot stands 1.0 m inside the fence, must be 2 m inside",
+    ),
+    (
+        {"position_m": (-1.0, 8.0, 0.0)},
+        _C.STANDS_OUTSIDE,
+        "robot stands 1.0 m outside it, must be 2 m inside",
+    ),
+    ({"position_m": (math.nan, 8.0, 0.0)}, _C.STANDS_OUTSIDE, "robot stands nan m outside it"),
+    (
+        {"landing_point_m": (31.5, 8.0)},
+        _C.LANDS_OUTSIDE,
+        "landing point lies 0.5 m inside the fence, must be 2 m",
+    ),
+    (
+        {"slot_height_m": 2.0},
+        _C.HEIGHT_OUTSIDE,
+        "slot height is 2 m, must be from the floor at 3 m to the ceiling",
+    ),
+    ({"slot_height_m": 26.0}, _C.HEIGHT_OUTSIDE, "slot height is 26 m"),
+    ({"duplicate_id": True}, _C.DUPLICATE_ID, "another program says that it is robot 1: stop it"),
+    ({"robot_id": 2}, _C.DUPLICATE_ID, "another program says that it is robot 2"),
+    ({"bundle_id": "c"}, _C.OTHER_BUNDLE, "robot 2 has another bundle: deploy one to all"),
+    ({"world_id": "v"}, _C.OTHER_WORLD, "robot 2 has another world: set one on the ground"),
+    ({"origin": Origin(47.4, 8.5, 91.0)}, _C.OTHER_ORIGIN, "robot 2 has another mission origin"),
+    (
+        {"slot_height_m": 6.0},
+        _C.HEIGHTS_TOO_NEAR,
+        "robot 2 flies 3.5 m above or below, must be 4.5 m (heights err by",
+    ),
     (
         {"landing_point_m": (8.1, 8.0)},
+        _C.LANDINGS_TOO_NEAR,
         "robot 2 lands 7.9 m away, must be 8 m (positions err by 4 m and 4 m): change the landing",
     ),
-    ({"min_separation_m": 5.0}, "robot 2 flies 4.5 m above or below, must be 5 m (min_separ"),
+    (
+        {"min_separation_m": 5.0},
+        _C.HEIGHTS_TOO_NEAR,
+        "robot 2 flies 4.5 m above or below, must be 5 m (min_separ",
+    ),
     (
         {"neighbours": (HeardStatus(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
+        _C.CLOCK_OFF_ROBOT,
         "robot 2's clock differs by 30.0 s: set the time of both",
     ),
 ]
 # In the place of a position that is missing or old.
-POSITIONS: list[tuple[dict[str, Any], str]] = [
+POSITIONS: list[tuple[dict[str, Any], CheckCode, str]] = [
     (
         {"position": PositionJudgement(PositionQuality.DOUBTFUL, PositionCause.GLITCH)},
+        _C.POSITION_NOT_GOOD,
         "position is doubtful (the autopilot's estimator takes the GPS for wrong): wait, or move",
     ),
     (
         {"position": PositionJudgement(PositionQuality.LOST, PositionCause.NO_FIX)},
+        _C.POSITION_NOT_GOOD,
         "position is lost (GPS has no fix): wait, or move to open sky",
     ),
 ]
-VEHICLES: list[tuple[dict[str, Any], str]] = [
-    ({"connected": False}, "autopilot is not connected: check its power"),
-    ({"system_id": None}, "autopilot has system id not known, configured is 1"),
-    ({"other_system_ids": (4, 6)}, "other vehicles are on this link (system id 4, 6)"),
-    ({"version": "1.13.3"}, "autopilot has PX4 1.13.3, must have 1.14 or newer: update it"),
-    ({"armed": True}, "vehicle is armed: disarm it"),
-    ({"armed": None}, "vehicle is not known to be disarmed: disarm it"),
-    ({"position_local_m": None}, "position is not known: wait"),
-    ({"position_at_s": 99.0}, "position is 1.0 s old: check the link"),
-    ({"origin": None}, "estimator's origin is not known: wait for a GPS fix"),
-    ({"heading_rad": None}, "heading is not known: check the compass"),
-    ({"gps": None}, "GPS is not heard: check the receiver"),
-    ({"gps": Gps(2, 14, 0.8)}, "GPS has no 3-D fix: wait"),
-    ({"gps": Gps(3, 5, 0.8)}, "GPS sees 5 satellites, must see 8: wait"),
-    ({"gps": Gps(3, 14, math.nan)}, "GPS precision (HDOP) is nan, must be at most 2"),
-    ({"battery": None}, "battery is not known: check the power module"),
-    ({"battery": 0.3}, "battery has 30 %, must have 50 %: charge or change it"),
+VEHICLES: list[tuple[dict[str, Any], CheckCode, str]] = [
     (
-        {"armable": False, "problems": (Reason("check_mag_missing", (0,), "no mag"),)},
+        {"connected": False},
+        _C.AUTOPILOT_NOT_CONNECTED,
+        "autopilot is not connected: check its power",
+    ),
+    ({"system_id": None}, _C.SYSTEM_ID_WRONG, "autopilot has system id not known, configured is 1"),
+    (
+        {"other_system_ids": (4, 6)},
+        _C.OTHER_VEHICLES,
+        "other vehicles are on this link (system id 4, 6)",
+    ),
+    (
+        {"version": "1.13.3"},
+        _C.PX4_TOO_OLD,
+        "autopilot has PX4 1.13.3, must have 1.14 or newer: update it",
+    ),
+    ({"armed": True}, _C.NOT_DISARMED, "vehicle is armed: disarm it"),
+    ({"armed": None}, _C.NOT_DISARMED, "vehicle is not known to be disarmed: disarm it"),
+    ({"position_local_m": None}, _C.POSITION_NOT_KNOWN, "position is not known: wait"),
+    ({"position_at_s": 99.0}, _C.POSITION_OLD, "position is 1.0 s old: check the link"),
+    (
+        {"origin": None},
+        _C.ESTIMATOR_ORIGIN_NOT_KNOWN,
+        "estimator's origin is not known: wait for a GPS fix",
+    ),
+    ({"heading_rad": None}, _C.HEADING_NOT_KNOWN, "heading is not known: check the compass"),
+    ({"gps": None}, _C.GPS_NOT_HEARD, "GPS is not heard: check the receiver"),
+    ({"gps": Gps(2, 14, 0.8)}, _C.GPS_NO_FIX, "GPS has no 3-D fix: wait"),
+    ({"gps": Gps(3, 5, 0.8)}, _C.GPS_FEW_SATELLITES, "GPS sees 5 satellites, must see 8: wait"),
+    (
+        {"gps": Gps(3, 14, math.nan)},
+        _C.GPS_IMPRECISE,
+        "GPS precision (HDOP) is nan, must be at most 2",
+    ),
+    ({"battery": None}, _C.BATTERY_NOT_KNOWN, "battery is not known: check the power module"),
+    ({"battery": 0.3}, _C.BATTERY_LOW, "battery has 30 %, must have 50 %: charge or change it"),
+    (
+        {"armable": False, "problems": (AutopilotReason("check_mag_missing", (0,), "no mag"),)},
+        _C.NOT_ARMABLE,
         "autopilot would not arm (no mag): mend",
     ),
-    ({"armable": None}, "autopilot would not arm (it does not say why)"),
+    ({"armable": None}, _C.NOT_ARMABLE, "autopilot would not arm (it does not say why)"),
 ]
 
 
@@ -177,45 +264,63 @@ def test_a_robot_that_is_ready_fails_no_check() -> None:
     assert failed_checks(alone, LIMITS) == ()
 
 
-@pytest.mark.parametrize(("change", "said"), [*INPUTS, *POSITIONS])
-def test_whatever_is_wrong_is_named_alone(change: dict[str, Any], said: str) -> None:
+@pytest.mark.parametrize(("change", "code", "said"), [*INPUTS, *POSITIONS])
+def test_whatever_is_wrong_is_named_alone(
+    change: dict[str, Any], code: CheckCode, said: str
+) -> None:
     (failed,) = failed_checks(dataclasses.replace(READY, **change), LIMITS)
-    assert failed.startswith(said)
+    assert failed.code is code
+    assert failed.text.startswith(said)
 
 
-@pytest.mark.parametrize(("change", "said"), VEHICLES)
+@pytest.mark.parametrize(("change", "code", "said"), VEHICLES)
 def test_whatever_is_wrong_with_the_vehicle_is_named_alone(
-    change: dict[str, Any], said: str
+    change: dict[str, Any], code: CheckCode, said: str
 ) -> None:
     vehicle = dataclasses.replace(VEHICLE, **change)
     (failed,) = failed_checks(dataclasses.replace(READY, vehicle=vehicle), LIMITS)
-    assert failed.startswith(said)
+    assert failed.code is code
+    assert failed.text.startswith(said)
 
 
-@pytest.mark.parametrize(("change", "said"), INPUTS)
-def test_everything_that_is_wrong_at_once_is_named(change: dict[str, Any], said: str) -> None:
-    for vehicle_change, vehicle_said in VEHICLES:
+def test_what_settles_under_open_sky_is_marked() -> None:
+    settling = set()
+    changes = [change for change, _, _ in INPUTS + POSITIONS]
+    changes += [{"vehicle": dataclasses.replace(VEHICLE, **change)} for change, _, _ in VEHICLES]
+    for change in changes:
+        failed = failed_checks(dataclasses.replace(READY, **change), LIMITS)
+        settling |= {each.code for each in failed if each.settles_by_itself}
+    assert settling == {
+        _C.FAILSAFE_NOT_READ, _C.FENCE_NOT_UPLOADED, _C.POSITION_NOT_KNOWN, _C.POSITION_NOT_GOOD,
+        _C.ESTIMATOR_ORIGIN_NOT_KNOWN, _C.HEADING_NOT_KNOWN, _C.GPS_NO_FIX,
+        _C.GPS_FEW_SATELLITES, _C.GPS_IMPRECISE,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "code", "said"), INPUTS)
+def test_everything_that_is_wrong_at_once_is_named(
+    change: dict[str, Any], code: CheckCode, said: str
+) -> None:
+    for vehicle_change, vehicle_code, _ in VEHICLES:
         if vehicle_change.get("connected") is False or (
             "system_id" in change and "system_id" in vehicle_change
         ):
             continue
         vehicle = dataclasses.replace(VEHICLE, **vehicle_change)
         failed = failed_checks(dataclasses.replace(READY, vehicle=vehicle, **change), LIMITS)
-        assert len(failed) == 2
-        for text in (said, vehicle_said):
-            assert any(line.startswith(text) for line in failed)
+        assert sorted(each.code for each in failed) == sorted((code, vehicle_code)), said
 
 
 def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
     lost = dataclasses.replace(VEHICLE, connected=False, battery=0.1, armed=True)
     (failed,) = failed_checks(dataclasses.replace(READY, vehicle=lost), LIMITS)
-    assert failed.startswith("autopilot is not connected")
+    assert failed.code is _C.AUTOPILOT_NOT_CONNECTED
 
 
 def test_a_neighbour_without_an_origin_has_not_ours() -> None:
     neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, origin=None), 99.8, UNIX_S)
     (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
-    assert failed.startswith("robot 2 has another mission origin")
+    assert failed.code is _C.OTHER_ORIGIN
 
 
 def in_the_air(*flown_s: float | None) -> tuple[HeardStatus, ...]:
@@ -232,11 +337,13 @@ def in_the_air(*flown_s: float | None) -> tuple[HeardStatus, ...]:
 
 
 def test_nobody_follows_those_who_took_off_long_ago() -> None:
-    def said(*flown_s: float | None, **changed: Any) -> tuple[str, ...]:
+    def said(*flown_s: float | None, **changed: Any) -> list[str]:
         inputs = dataclasses.replace(READY, neighbours=in_the_air(*flown_s))
-        return failed_checks(dataclasses.replace(inputs, **changed), LIMITS)
+        failed = failed_checks(dataclasses.replace(inputs, **changed), LIMITS)
+        assert {each.code for each in failed} <= {_C.TAKEOFFS_TOO_FAR_APART, _C.NOT_DISARMED}
+        return [each.text for each in failed]
 
-    assert said(49.9, 10.0) == ()
+    assert said(49.9, 10.0) == []
     (line,) = said(30.0, 63.0)
     assert line == (
         "robot 3 has been in the air for more than 50 s: heights have walked since then; wait "
@@ -250,7 +357,7 @@ def test_nobody_follows_those_who_took_off_long_ago() -> None:
             heard._replace(status=dataclasses.replace(heard.status, slot_height_m=20.0 + 5.0 * i))
             for i, heard in enumerate(in_the_air(63.0, 63.0))
         )
-        assert said(errors=patient, neighbours=wide) == ()
+        assert said(errors=patient, neighbours=wide) == []
     # Who is in the air himself took off with them.
     (line,) = said(63.0, 63.0, vehicle=dataclasses.replace(VEHICLE, armed=True))
     assert line == "vehicle is armed: disarm it"
@@ -258,7 +365,7 @@ def test_nobody_follows_those_who_took_off_long_ago() -> None:
 
 def lines(
     own: Gps, its_accuracy_m: float | None, landing_x_m: float, errors: ErrorBudget
-) -> tuple[str, ...]:
+) -> list[str]:
     """What fails if the robot lands at (8, 8), and its neighbour beside it."""
     neighbour = dataclasses.replace(
         NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
@@ -266,13 +373,15 @@ def lines(
     heard = HeardStatus(neighbour, 99.8, UNIX_S)
     vehicle = dataclasses.replace(VEHICLE, gps=own)
     inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
-    return failed_checks(inputs, LIMITS)
+    failed = failed_checks(inputs, LIMITS)
+    assert {each.code for each in failed} <= {_C.LANDINGS_TOO_NEAR}
+    return [each.text for each in failed]
 
 
 def test_a_receiver_that_reports_worse_than_the_budget_wants_more_room() -> None:
     good, bad = Gps(3, 14, 0.8, accuracy_m=0.02), Gps(3, 14, 0.8, accuracy_m=2.0)
     budget = ErrorBudget()
-    assert lines(good, 0.02, 16.0, budget) == ()
+    assert lines(good, 0.02, 16.0, budget) == []
     # A good report alone makes nothing legal.
     (line,) = lines(good, 0.02, 15.9, budget)
     assert "must be 8 m (positions err by 4 m and 4 m): change" in line
@@ -290,7 +399,7 @@ def test_a_receiver_that_reports_worse_than_the_budget_wants_more_room() -> None
 def test_receivers_with_corrections_stand_nearer_as_long_as_they_report_it() -> None:
     rtk = ErrorBudget(gps_m=0.1)
     fixed = Gps(6, 20, 0.6, accuracy_m=0.02)
-    assert lines(fixed, 0.02, 10.2, rtk) == ()
+    assert lines(fixed, 0.02, 10.2, rtk) == []
     (line,) = lines(fixed, 0.02, 10.1, rtk)
     assert "robot 2 lands 2.1 m away, must be 2.2 m" in line
     for own, its_accuracy_m in (

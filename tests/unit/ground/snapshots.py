@@ -4,8 +4,10 @@ from dataclasses import replace
 from typing import Any
 
 from edge.core.fence import Fence
+from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, GroundState, LoopStatus, Origin, Place, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSlot, FleetSnapshot, RobotSnapshot
+from tests.said import checks, reason
 
 ORIGIN = Origin(47.397742, 8.545594, 30.0)
 FENCE = Fence(((-2.0, -2.0), (34.0, -2.0), (34.0, 34.0), (-2.0, 34.0)), 1.5, 2.0, 100.0)
@@ -27,7 +29,8 @@ def status(robot_id: int, **changes: Any) -> RobotStatus:
     """A robot that flies its mission well."""
     well = RobotStatus(
         robot_id=robot_id, boot_nonce=7, sequence=9, uptime_s=30.0, unix_time_s=1e9,
-        state=FlightState.MISSION, reason="mission started", ready=False, failed_checks=(),
+        state=FlightState.MISSION, reason=reason("mission started", ReasonCode.MISSION_STARTED),
+        ready=False, failed_checks=(),
         alarms=(), obeyed_sequence=4, operator="alice", orders=(), bundle_id="7992912100000000",
         world_id="c64e4b1b0000", trial="t1", origin=ORIGIN, system_id=1, slot_height_m=4.0,
         landing_point_m=(2.0, 2.0), position_m=(5.0 * robot_id, 12.0, 4.0),
@@ -44,10 +47,11 @@ def on_ground(robot_id: int, **changes: Any) -> RobotStatus:
     return status(
         robot_id,
         **{
-            "state": FlightState.IDLE, "reason": "autopilot and position found", "armed": False,
+            "state": FlightState.IDLE, "armed": False,
+            "reason": reason("autopilot and position found", ReasonCode.FOUND),
             "in_air": False, "mode": "hold", "origin": None, "position_m": None,
             "feature_age_s": None, "neighbour_ages_s": {},
-            "failed_checks": ("GPS sees 3 satellites",), "satellites": 3, "hdop": None,
+            "failed_checks": checks("GPS sees 3 satellites"), "satellites": 3, "hdop": None,
         }
         | changes,
     )  # fmt: skip

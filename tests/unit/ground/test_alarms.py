@@ -8,9 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.fence import Fence
+from edge.messages.codes import CheckCode, FailedCheck, ReasonCode
 from edge.messages.mission import FlightState, GroundState, LoopStatus, Origin
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.alarms import SEVERITIES, Alarm, alarms
+from lpac.ground.alarms import SEVERITIES, Alarm, AlarmCode, Severity, alarms
+from tests.said import checks, reason, reasons
 from tests.unit.ground.snapshots import (
     FENCE,
     LOOP,
@@ -22,7 +24,7 @@ from tests.unit.ground.snapshots import (
     status,
 )
 
-_S = FlightState
+_S, _C = FlightState, AlarmCode
 SETUP = setup(3)
 
 
@@ -44,13 +46,15 @@ def test_nothing_of_a_fleet_that_flies_well() -> None:
 
 def test_robots_before_enable_are_not_alarming() -> None:
     seen = snapshot(*(robot(on_ground(i)) for i in range(3)), commander="", ground=None)
-    assert told(seen, seen) == (Alarm("note", "", "nobody commands the fleet yet"),)
+    assert told(seen, seen) == (
+        Alarm("note", "", _C.NOBODY_COMMANDS, "nobody commands the fleet yet"),
+    )
 
 
 def test_robots_after_enable_say_why_they_are_not_ready() -> None:
     robots = [robot(on_ground(i, state=_S.PREFLIGHT)) for i in range(3)]
     assert told(snapshot(*robots)) == tuple(
-        Alarm("note", f"r{i}", "not ready: GPS sees 3 satellites") for i in range(3)
+        Alarm("note", f"r{i}", _C.NOT_READY, "not ready: GPS sees 3 satellites") for i in range(3)
     )
 
 
@@ -58,69 +62,149 @@ OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
 
 
 @pytest.mark.parametrize(
-    ("said", "severity", "text"),
+    ("said", "severity", "code", "text"),
     [
-        ({"alarms": ("position lost", "ground lost")}, "critical", "position lost; ground lost"),
-        ({"state": _S.PILOT, "alarms": ("a pilot flies it",)}, "warning", "a pilot flies it"),
-        ({"battery": 0.15}, "critical", "battery critical: 15%"),
-        ({"battery": 0.3}, "warning", "battery low: 30%"),
-        ({"battery": 0.2, "alarms": ("battery low: 20%",)}, "critical", "battery low: 20%"),
-        ({"bundle_id": "0123456789"}, "warning", "bundle 01234567, not the fleet's 79929121"),
-        ({"world_id": ""}, "warning", "world none, not the fleet's c64e4b1b"),
-        ({"origin": Origin(47.0, 8.0, 0.0)}, "warning", "another origin than the fleet's"),
-        ({"fence": OTHER_FENCE}, "warning", "another fence than the fleet's"),
-        ({"not_taken": ("fence: not in flight",)}, "warning", "fence: not in flight"),
+        (
+            {"alarms": reasons("position lost", "ground lost")},
+            "critical",
+            _C.OWN,
+            "position lost; ground lost",
+        ),
+        (
+            {"state": _S.PILOT, "alarms": reasons("a pilot flies it")},
+            "warning",
+            _C.OWN,
+            "a pilot flies it",
+        ),
+        ({"battery": 0.15}, "critical", _C.BATTERY, "battery critical: 15%"),
+        ({"battery": 0.3}, "warning", _C.BATTERY, "battery low: 30%"),
+        (
+            {"battery": 0.2, "alarms": (reason("battery low: 20%", ReasonCode.BATTERY_LOW),)},
+            "critical",
+            _C.OWN,
+            "battery low: 20%",
+        ),
+        (
+            {"bundle_id": "0123456789"},
+            "warning",
+            _C.OTHER_BUNDLE,
+            "bundle 01234567, not the fleet's 79929121",
+        ),
+        ({"world_id": ""}, "warning", _C.OTHER_WORLD, "world none, not the fleet's c64e4b1b"),
+        (
+            {"origin": Origin(47.0, 8.0, 0.0)},
+            "warning",
+            _C.OTHER_ORIGIN,
+            "another origin than the fleet's",
+        ),
+        ({"fence": OTHER_FENCE}, "warning", _C.OTHER_FENCE, "another fence than the fleet's"),
+        (
+            {"not_taken": (FailedCheck(CheckCode.KEEPS_FENCE, "fence: not in flight"),)},
+            "warning",
+            _C.NOT_TAKEN,
+            "fence: not in flight",
+        ),
         # Of one difference there is one alarm.
-        ({"origin": Origin(47.0, 8.0, 0.0), "not_taken": ("in flight: keeps its mission origin",)},
-         "warning", "in flight: keeps its mission origin"),
-        ({"world_id": "", "not_taken": ("world c64e4b1b of the ground has not arrived: wait",)},
-         "warning", "world c64e4b1b of the ground has not arrived: wait"),
-        ({"alarms": ("a pilot flies it (position)",), "state": _S.PILOT, "remote_control": True},
-         "warning", "a pilot flies it (position)"),
-        ({"alarms": ("remote control lost",), "state": _S.PILOT, "remote_control": False},
-         "critical", "remote control lost"),
-        ({"satellites": 7}, "warning", "GPS sees 7 satellites"),
-        ({"hdop": 2.5}, "warning", "GPS precision (HDOP) is 2.5"),
-        ({"feature_age_s": 1.4}, "warning", "features are 1.4 s old"),
-        ({"feature_age_s": 1.4, "state": _S.HOLD}, "note", "features are 1.4 s old"),
-        ({"feature_age_s": None}, "warning", "has no features to ask the policy with"),
-        ({"neighbour_ages_s": {"0": 0.1}}, "warning", "hears badly: r2"),
-        ({"loops": {"control": replace(LOOP, lateness_p99_ms=80.0)}}, "warning",
-         "its control loop is late by 80 ms"),
+        (
+            {
+                "origin": Origin(47.0, 8.0, 0.0),
+                "not_taken": (
+                    FailedCheck(CheckCode.KEEPS_ORIGIN, "in flight: keeps its mission origin"),
+                ),
+            },
+            "warning",
+            _C.NOT_TAKEN,
+            "in flight: keeps its mission origin",
+        ),
+        (
+            {
+                "world_id": "",
+                "not_taken": (
+                    FailedCheck(
+                        CheckCode.WORLD_NOT_ARRIVED,
+                        "world c64e4b1b of the ground has not arrived: wait",
+                    ),
+                ),
+            },
+            "warning",
+            _C.NOT_TAKEN,
+            "world c64e4b1b of the ground has not arrived: wait",
+        ),
+        (
+            {
+                "alarms": reasons("a pilot flies it (position)"),
+                "state": _S.PILOT,
+                "remote_control": True,
+            },
+            "warning",
+            _C.OWN,
+            "a pilot flies it (position)",
+        ),
+        (
+            {"alarms": reasons("remote control lost"), "state": _S.PILOT, "remote_control": False},
+            "critical",
+            _C.OWN,
+            "remote control lost",
+        ),
+        ({"satellites": 7}, "warning", _C.GPS, "GPS sees 7 satellites"),
+        ({"hdop": 2.5}, "warning", _C.GPS, "GPS precision (HDOP) is 2.5"),
+        ({"feature_age_s": 1.4}, "warning", _C.FEATURES, "features are 1.4 s old"),
+        ({"feature_age_s": 1.4, "state": _S.HOLD}, "note", _C.FEATURES, "features are 1.4 s old"),
+        ({"feature_age_s": None}, "warning", _C.FEATURES, "has no features to ask the policy with"),
+        ({"neighbour_ages_s": {"0": 0.1}}, "warning", _C.NEIGHBOURS, "hears badly: r2"),
+        (
+            {"loops": {"control": replace(LOOP, lateness_p99_ms=80.0)}},
+            "warning",
+            _C.LOOPS,
+            "its control loop is late by 80 ms",
+        ),
     ],
-)  # fmt: skip
-def test_what_a_robot_says_of_itself(said: dict[str, Any], severity: str, text: str) -> None:
-    assert told(fleet(said=said)) == (Alarm(severity, "r1", text),)  # type: ignore[arg-type]
+)
+def test_what_a_robot_says_of_itself(
+    said: dict[str, Any], severity: Severity, code: AlarmCode, text: str
+) -> None:
+    assert told(fleet(said=said)) == (Alarm(severity, "r1", code, text),)
 
 
 @pytest.mark.parametrize(
-    ("known", "severity", "text"),
+    ("known", "severity", "code", "text"),
     [
-        ({"duplicate": True}, "critical", "two programs say that they are this robot: end one"),
-        ({"clock_offset_s": -3.2}, "warning", "its clock is 3 s behind"),
-        ({"rates_hz": {"0": 0.5, "2": 2.5}}, "warning", "hears badly: r0"),
+        (
+            {"duplicate": True},
+            "critical",
+            _C.DUPLICATE_ID,
+            "two programs say that they are this robot: end one",
+        ),
+        ({"clock_offset_s": -3.2}, "warning", _C.CLOCK, "its clock is 3 s behind"),
+        ({"rates_hz": {"0": 0.5, "2": 2.5}}, "warning", _C.NEIGHBOURS, "hears badly: r0"),
     ],
 )
-def test_what_the_ground_knows_of_a_robot(known: dict[str, Any], severity: str, text: str) -> None:
-    assert told(fleet(known=known)) == (Alarm(severity, "r1", text),)  # type: ignore[arg-type]
+def test_what_the_ground_knows_of_a_robot(
+    known: dict[str, Any], severity: Severity, code: AlarmCode, text: str
+) -> None:
+    assert told(fleet(known=known)) == (Alarm(severity, "r1", code, text),)
 
 
 def test_a_robot_that_falls_silent_says_nothing_else() -> None:
-    seen = fleet(said={"battery": 0.1, "alarms": ("position lost",)}, known={"age_s": 2.5})
+    seen = fleet(said={"battery": 0.1, "alarms": reasons("position lost")}, known={"age_s": 2.5})
     text = "not heard any more, last in the air in mission"
-    assert told(seen) == (Alarm("critical", "r1", text),)
+    assert told(seen) == (Alarm("critical", "r1", _C.SILENT, text),)
 
 
 def test_a_silent_robot_on_the_ground_is_less_grave() -> None:
     robots = robot(status(0)), robot(on_ground(1), age_s=60.0), robot(status(2))
-    assert told(snapshot(*robots)) == (Alarm("warning", "r1", "not heard any more, last in idle"),)
+    assert told(snapshot(*robots)) == (
+        Alarm("warning", "r1", _C.SILENT, "not heard any more, last in idle"),
+    )
 
 
 def test_robots_that_were_never_heard_are_one_alarm() -> None:
     silent = [replace(robot(status(i)), status=None, age_s=None) for i in (1, 2)]
     (alarm,) = told(snapshot(robot(on_ground(0, failed_checks=())), *silent))
-    assert alarm == ("note", "", "not heard yet: r1 r2")
-    assert told(snapshot(*silent)) == (Alarm("note", "", "no robot is heard yet"),)
+    assert alarm == ("note", "", _C.NOT_HEARD_YET, "not heard yet: r1 r2")
+    assert told(snapshot(*silent)) == (
+        Alarm("note", "", _C.NOT_HEARD_YET, "no robot is heard yet"),
+    )
 
 
 def test_robots_out_of_range_need_not_be_heard() -> None:
@@ -138,7 +222,7 @@ def test_a_new_state_may_take_a_moment_to_be_obeyed() -> None:
 
 def test_a_robot_obeys_another_operator() -> None:
     seen = fleet(said={"operator": "bob"})
-    assert told(seen, seen) == (Alarm("critical", "r1", "obeys bob, not alice"),)
+    assert told(seen, seen) == (Alarm("critical", "r1", _C.NOT_OBEYED, "obeys bob, not alice"),)
 
 
 def test_loops_that_miss_ticks_or_fail() -> None:
@@ -155,18 +239,28 @@ def test_loops_that_miss_ticks_or_fail() -> None:
 
 def test_nobody_commands_robots_in_the_air() -> None:
     (alarm,) = told(replace(fleet(), commander="", ground=None))
-    assert alarm == ("critical", "", "nobody commands the fleet, and 3 fly: hold or land them")
+    assert alarm == (
+        "critical",
+        "",
+        _C.NOBODY_COMMANDS,
+        "nobody commands the fleet, and 3 fly: hold or land them",
+    )
 
 
 def test_a_commander_that_fell_silent() -> None:
     (alarm,) = told(replace(fleet(), commander="bob", commander_age_s=2.5))
-    assert alarm == ("critical", "", "bob commands, but is not heard: hold takes over")
+    assert alarm == (
+        "critical",
+        "",
+        _C.COMMANDER_SILENT,
+        "bob commands, but is not heard: hold takes over",
+    )
 
 
 def test_a_fleet_whose_files_say_when_a_battery_is_critical() -> None:
     seen = fleet(said={"battery": 0.22})
     (alarm,) = alarms(replace(SETUP, battery_critical=0.25), seen)
-    assert alarm == ("critical", "r1", "battery critical: 22%")
+    assert alarm == ("critical", "r1", _C.BATTERY, "battery critical: 22%")
 
 
 def test_a_world_that_is_not_here() -> None:
@@ -174,6 +268,7 @@ def test_a_world_that_is_not_here() -> None:
     assert alarm == (
         "warning",
         "",
+        _C.WORLD_NOT_HERE,
         "the robots' world c64e4b1b is not here: no density, no cost; `lpac mission world FILE`",
     )
 
@@ -183,7 +278,7 @@ def test_hold_of_another_station() -> None:
         4, "alice", ORIGIN, enabled=True, safety_action="hold", safety_action_by="bob"
     )
     assert told(replace(fleet(), ground=held)) == (
-        Alarm("warning", "", "bob asks 3 robots to hold"),
+        Alarm("warning", "", _C.HELD_BY_OTHERS, "bob asks 3 robots to hold"),
     )
 
 
@@ -199,8 +294,8 @@ statuses = st.builds(
     satellites=st.none() | st.integers(0, 20),
     origin=st.sampled_from([None, ORIGIN, Origin(1.0, 2.0, 3.0)]),
     fence=st.sampled_from([None, FENCE, Fence(FENCE.vertices_m, 1.0, 0.0, 9.0)]),
-    alarms=st.sampled_from([(), ("ground lost",)]),
-    not_taken=st.sampled_from([(), ("fence: not in flight",)]),
+    alarms=st.sampled_from([(), reasons("ground lost")]),
+    not_taken=st.sampled_from([(), checks("fence: not in flight")]),
     obeyed_sequence=st.integers(0, 6),
 )
 

@@ -31,6 +31,7 @@ from lpac.ground.site import (
     turn_deg,
     wide_fence,
 )
+from tests.said import reason
 
 FENCE = Fence(((-2.0, -2.0), (34.0, -2.0), (34.0, 34.0), (-2.0, 34.0)), 1.5, 2.0, 30.0)
 SITE = SavedSite(
@@ -47,7 +48,7 @@ longitudes = st.floats(-180.0, 180.0)
 def status(position_deg: tuple[float, float] | None, heading_deg: float | None) -> RobotStatus:
     return RobotStatus(
         robot_id=1, boot_nonce=1, sequence=1, uptime_s=1.0, unix_time_s=1.0,
-        state=FlightState.IDLE, reason="", ready=False, failed_checks=(), alarms=(),
+        state=FlightState.IDLE, reason=reason(""), ready=False, failed_checks=(), alarms=(),
         obeyed_sequence=0, operator="", orders=(), bundle_id="", world_id="", trial="",
         origin=None, system_id=None, slot_height_m=4.0, landing_point_m=(4.0, 4.0),
         position_m=None, velocity_m_s=None,

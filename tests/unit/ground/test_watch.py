@@ -11,7 +11,7 @@ from rich.cells import cell_len
 
 from edge.messages.mission import FlightState, GroundState
 from lpac.analysis.snapshot import RobotSnapshot
-from lpac.ground.alarms import Alarm, alarms
+from lpac.ground.alarms import Alarm, AlarmCode, alarms
 from lpac.ground.station.protocol import (
     CommandReport,
     RobotResult,
@@ -21,6 +21,7 @@ from lpac.ground.terminal.robot import detail, in_short
 from lpac.ground.terminal.table import Row, columns, heading, in_order, table_row
 from lpac.ground.terminal.text import all_of_it, few_alarms, header, outcome
 from tests.pretend import ORIGIN
+from tests.said import reason, reasons
 from tests.unit.ground.snapshots import robot, setup, snapshot, status
 
 _S = FlightState
@@ -38,7 +39,7 @@ odd_statuses = st.builds(
     robot_id=st.just(1),
     state=st.sampled_from(_S),
     ready=st.booleans(),
-    reason=st.text(),
+    reason=st.builds(reason, st.text()),
     mode=st.none() | st.text(max_size=12),
     battery=odd_numbers,
     satellites=st.none() | st.integers(-1, 100000),
@@ -123,8 +124,8 @@ def test_safety_action_of_single_robots() -> None:
 
 
 def test_alarms_of_many_robots_with_one_text_are_one_line() -> None:
-    told = [Alarm("critical", f"r{i}", "ground lost") for i in range(30)]
-    told += [Alarm("note", f"r{i}", f"battery low: {i}%") for i in range(9)]
+    told = [Alarm("critical", f"r{i}", AlarmCode.OWN, "ground lost") for i in range(30)]
+    told += [Alarm("note", f"r{i}", AlarmCode.BATTERY, f"battery low: {i}%") for i in range(9)]
     lines = ["".join(s.text for s in line).rstrip() for line in few_alarms(told, 60, 4)]
     assert lines == [
         "! r0 r1 r2 +27   ground lost",
@@ -148,7 +149,11 @@ def test_outcome_says_first_who_did_not() -> None:
 
 def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:
     seen = snapshot(*(robot(status(i)) for i in range(4)))
-    told = [Alarm("critical", "r3", "x"), Alarm("warning", "r2", "x"), Alarm("note", "r1", "x")]
+    told = [
+        Alarm("critical", "r3", AlarmCode.OWN, "x"),
+        Alarm("warning", "r2", AlarmCode.OWN, "x"),
+        Alarm("note", "r1", AlarmCode.OWN, "x"),
+    ]
     rows = in_order(setup(4), seen, told)
     assert [row.robot.name for row in rows] == ["r3", "r2", "r0", "r1"]
     rows = in_order(setup(4), seen, told[1:], {"r3": "critical"})
@@ -156,7 +161,7 @@ def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:
 
 
 def test_what_is_printed_once() -> None:
-    seen = snapshot(robot(status(0)), robot(status(1, alarms=("position lost",))))
+    seen = snapshot(robot(status(0)), robot(status(1, alarms=reasons("position lost"))))
     text = all_of_it(setup(2), seen, alarms(setup(2), seen), 80)
     assert text.splitlines()[3] == "! r1             position lost"
     assert text.splitlines()[-2].startswith("! r1   mission    90  14 offboard   5.0  12.0")

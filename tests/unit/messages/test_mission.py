@@ -26,18 +26,21 @@ from edge.messages.mission import (
     explored_from_bytes,
     explored_to_bytes,
 )
+from tests.said import checks, reason, refusal
 
 FENCE = Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0)), 2.0, 1.0, 30.0)
 STATUS = RobotStatus(
     robot_id=3, boot_nonce=2**47, sequence=9, uptime_s=12.5, unix_time_s=1.8e9,
-    state=FlightState.HOLD, reason="at its height", ready=False, failed_checks=("a", "b"),
+    state=FlightState.HOLD, reason=reason("at its height"), ready=False,
+    failed_checks=checks("a", "b"),
     alarms=(), obeyed_sequence=4, operator="anna",
-    orders=(OrderResult("1", accepted=False, reason="expired"),),
+    orders=(OrderResult("1", refusal("expired")),),
     bundle_id="ab", world_id="cd", trial="t1", origin=Origin(40.0, -75.0, 359.0), system_id=1,
     slot_height_m=8.0, landing_point_m=(1.0, 2.0), position_m=(1.0, 2.0, 3.0),
     velocity_m_s=None, heading_rad=0.1, mode="offboard", armed=True, battery=0.5, satellites=12,
     message_counts={"accepted": 4}, neighbour_ages_s={"2": 0.1},
-    loops={"control": LoopStatus(1, 0, 0, 0.1, 0.2, 0.3)}, fence=FENCE, not_taken=("in flight",),
+    loops={"control": LoopStatus(1, 0, 0, 0.1, 0.2, 0.3)}, fence=FENCE,
+    not_taken=checks("in flight"),
     in_air=True, global_deg=(40.0, -75.0), hdop=0.8, policy_velocity_m_s=(0.1, -0.2),
     feature_age_s=0.1, neighbour_messages={"2": 40}, ground_age_s=0.1, flown_s=63.5,
 )  # fmt: skip

@@ -93,7 +93,7 @@ export class Drawer {
     this.fill("Checks and alarms", [
       ...(ON_GROUND.includes(s.state) ? [
         ["ready", s.ready ? "yes" : "no"],
-        ...s.failed_checks.map((text) => ["fails", text, "bad", `fails ${text}`]),
+        ...s.failed_checks.map(({ text }) => ["fails", text, "bad", `fails ${text}`]),
       ] : []),
       ...(own.length ? [] : [["alarms", "none"]]),
       ...own.map((a) => ["alarm", a.text, a.severity === "note" ? "" : "bad", `alarm ${a.text}`]),

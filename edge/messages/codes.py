@@ -1,0 +1,246 @@
+"""Codes for machines, words for people: why a robot does not do something, and why it did.
+
+Whoever decides by one of these reads its `code`; its `text` is for people and may say the same in
+other words tomorrow.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Self
+
+from edge.messages.bounds import MOST_LETTERS, Text
+
+
+class _Code(StrEnum):
+    """A newer program may say what this one has no name for: that is its member OTHER."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Self | None:
+        return cls["OTHER"] if isinstance(value, str) else None
+
+
+class CheckCode(_Code):
+    """What keeps a robot on the ground."""
+
+    OTHER = "other"
+    CHECKS_RUNNING = "checks_running"
+    # The program, its clock and its ground.
+    BUNDLE_NOT_VERIFIED = "bundle_not_verified"
+    WATCHDOG_ENDED = "watchdog_ended"
+    CLOCK_NOT_SET = "clock_not_set"
+    CLOCK_OFF_GROUND = "clock_off_ground"
+    GROUND_NOT_HEARD = "ground_not_heard"
+    GROUND_SILENT = "ground_silent"
+    # The vehicle.
+    AUTOPILOT_NOT_CONNECTED = "autopilot_not_connected"
+    OTHER_AUTOPILOT = "other_autopilot"
+    SYSTEM_ID_WRONG = "system_id_wrong"
+    PX4_TOO_OLD = "px4_too_old"
+    OTHER_VEHICLES = "other_vehicles"
+    REMOTE_CONTROL_NOT_HEARD = "remote_control_not_heard"
+    NOT_DISARMED = "not_disarmed"
+    BATTERY_NOT_KNOWN = "battery_not_known"
+    BATTERY_LOW = "battery_low"
+    NOT_ARMABLE = "not_armable"
+    FAILSAFE_NOT_READ = "failsafe_not_read"
+    FAILSAFE_WRONG = "failsafe_wrong"
+    FENCE_NOT_UPLOADED = "fence_not_uploaded"
+    # Its estimate.
+    POSITION_NOT_KNOWN = "position_not_known"
+    POSITION_OLD = "position_old"
+    POSITION_NOT_GOOD = "position_not_good"
+    ESTIMATOR_ORIGIN_NOT_KNOWN = "estimator_origin_not_known"
+    HEADING_NOT_KNOWN = "heading_not_known"
+    GPS_NOT_HEARD = "gps_not_heard"
+    GPS_NO_FIX = "gps_no_fix"
+    GPS_FEW_SATELLITES = "gps_few_satellites"
+    GPS_IMPRECISE = "gps_imprecise"
+    # Where it stands, flies and lands.
+    ORIGIN_NOT_SET = "origin_not_set"
+    PLACE_NOT_KNOWN = "place_not_known"
+    STANDS_OUTSIDE = "stands_outside"
+    LANDS_OUTSIDE = "lands_outside"
+    HEIGHT_OUTSIDE = "height_outside"
+    # The other robots.
+    DUPLICATE_ID = "duplicate_id"
+    NOT_UNDERSTOOD = "not_understood"
+    SAME_SYSTEM_ID = "same_system_id"
+    OTHER_BUNDLE = "other_bundle"
+    OTHER_WORLD = "other_world"
+    OTHER_ORIGIN = "other_origin"
+    HEIGHTS_TOO_NEAR = "heights_too_near"
+    LANDINGS_TOO_NEAR = "landings_too_near"
+    CLOCK_OFF_ROBOT = "clock_off_robot"
+    TAKEOFFS_TOO_FAR_APART = "takeoffs_too_far_apart"
+    # What of the ground's state it does not take up: in flight, or because it cannot.
+    KEEPS_ORIGIN = "keeps_origin"
+    KEEPS_FENCE = "keeps_fence"
+    KEEPS_PLACE = "keeps_place"
+    KEEPS_WORLD = "keeps_world"
+    FENCE_OR_PLACE_UNFIT = "fence_or_place_unfit"
+    WORLD_NOT_ARRIVED = "world_not_arrived"
+    WORLD_UNUSABLE = "world_unusable"
+
+
+# What a robot says of the ground's fence, world or origin that it does not take up.
+FENCE_NOT_TAKEN = (CheckCode.KEEPS_FENCE, CheckCode.FENCE_OR_PLACE_UNFIT)
+WORLD_NOT_TAKEN = (
+    CheckCode.KEEPS_WORLD,
+    CheckCode.WORLD_NOT_ARRIVED,
+    CheckCode.WORLD_UNUSABLE,
+)
+ORIGIN_NOT_TAKEN = (CheckCode.KEEPS_ORIGIN,)
+
+
+@dataclass(frozen=True, slots=True)
+class FailedCheck:
+    """One thing that keeps a robot on the ground, and what to do about it.
+
+    `settles_by_itself`: under open sky and with time it mostly ends without anybody.
+    """
+
+    code: CheckCode
+    text: Text
+    settles_by_itself: bool = False
+
+    def __post_init__(self) -> None:
+        _shorten(self)
+
+
+class ReasonCode(_Code):
+    """What leads a robot from one state to another, or alarms its operator."""
+
+    OTHER = "other"
+    PROGRAM_STARTED = "program_started"
+    # Orders.
+    KILLED = "killed"
+    DISARM_ORDERED = "disarm_ordered"
+    GIVEN_TO_PILOT = "given_to_pilot"
+    TAKEOFF_ORDERED = "takeoff_ordered"
+    MISSION_STARTED = "mission_started"
+    TAKEN_BACK = "taken_back"
+    # The vehicle.
+    DISARMED = "disarmed"
+    AUTOPILOT_SILENT = "autopilot_silent"
+    ARMED_BEFORE = "armed_before"
+    ARMED_BY_OTHERS = "armed_by_others"
+    PILOT = "pilot"
+    LEFT_OFFBOARD = "left_offboard"
+    LEFT_LAND = "left_land"
+    AUTOPILOT_LANDS = "autopilot_lands"
+    FAILSAFE = "failsafe"
+    OFFBOARD_REFUSED = "offboard_refused"
+    ARMING_FAILED = "arming_failed"
+    ARMED = "armed"
+    PX4 = "px4"
+    # What the robot notices.
+    CONTROL_SILENT = "control_silent"
+    POSITION_LOST = "position_lost"
+    POSITION_NOT_GOOD = "position_not_good"
+    BATTERY_CRITICAL = "battery_critical"
+    BATTERY_LOW = "battery_low"
+    BATTERY_NOT_KNOWN = "battery_not_known"
+    ON_GROUND = "on_ground"
+    TOO_CLOSE = "too_close"
+    OUTSIDE_FENCE = "outside_fence"
+    REMOTE_CONTROL_LOST = "remote_control_lost"
+    NOBODY_ANSWERED = "nobody_answered"
+    HOVERS_ALONE = "hovers_alone"
+    POLICY_STALE = "policy_stale"
+    FOUND = "found"
+    AT_HEIGHT = "at_height"
+    NOT_CLIMBING = "not_climbing"
+    AT_LANDING_POINT = "at_landing_point"
+    # The ground.
+    ENABLED = "enabled"
+    NOT_ENABLED = "not_enabled"
+    GROUND_LOST = "ground_lost"
+    GROUND_HOLDS = "ground_holds"
+    GROUND_RETURNS = "ground_returns"
+    GROUND_LANDS = "ground_lands"
+    GROUND_ENDS_TAKEOFF = "ground_ends_takeoff"
+    ARMING_CALLED_OFF = "arming_called_off"
+    # The program itself.
+    DUPLICATE_ID = "duplicate_id"
+    WATCHDOG_ENDED = "watchdog_ended"
+    LOG_NOT_WRITTEN = "log_not_written"
+    GROUND_NOT_UNDERSTOOD = "ground_not_understood"
+
+
+# Alarms that tell of the battery.
+BATTERY_REASONS = (
+    ReasonCode.BATTERY_CRITICAL,
+    ReasonCode.BATTERY_LOW,
+    ReasonCode.BATTERY_NOT_KNOWN,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a robot is in its state, or what its operator must see."""
+
+    code: ReasonCode
+    text: Text
+
+    def __post_init__(self) -> None:
+        _shorten(self)
+
+
+class RefusalCode(_Code):
+    """Why an order is not obeyed."""
+
+    OTHER = "other"
+    OTHER_START = "other_start"
+    EXPIRED = "expired"
+    VALID_TOO_LONG = "valid_too_long"
+    OTHER_COMMANDER = "other_commander"
+    WRONG_STATE = "wrong_state"
+    OLDER = "older"
+    CONTROL_SILENT = "control_silent"
+    GROUND_NOT_HEARD = "ground_not_heard"
+    GROUND_COMMANDS = "ground_commands"
+    OVERRULED = "overruled"
+    NOT_READY = "not_ready"
+    CHECKS_RUNNING = "checks_running"
+    NOT_ARMED = "not_armed"
+    IN_THE_AIR = "in_the_air"
+    ARMED_NOT_KNOWN = "armed_not_known"
+    POSITION_NOT_GOOD = "position_not_good"
+    PLACE_NOT_KNOWN = "place_not_known"
+    NOT_IN_THE_AIR = "not_in_the_air"
+    FAILSAFE = "failsafe"
+    NOT_AT_HEIGHT = "not_at_height"
+    OUTSIDE_FENCE = "outside_fence"
+    NOT_IN_OFFBOARD = "not_in_offboard"
+    POLICY_STALE = "policy_stale"
+    NOT_TAKEN_UP = "not_taken_up"
+    REMOTE_CONTROL_LOST = "remote_control_lost"
+    OTHERS_TAKE_OFF = "others_take_off"
+    TOO_CLOSE = "too_close"
+    # What the ground says of an order that no robot answered.
+    STARTED_AGAIN = "started_again"
+    NOT_ANSWERED = "not_answered"
+    INTERRUPTED = "interrupted"
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why an order is not obeyed."""
+
+    code: RefusalCode
+    text: Text
+
+    def __post_init__(self) -> None:
+        _shorten(self)
+
+
+def texts(said: Iterable[FailedCheck | Reason]) -> str:
+    """All of their words, on one line."""
+    return "; ".join(each.text for each in said)
+
+
+def _shorten(said: FailedCheck | Reason | Refusal) -> None:
+    """Longer texts are not taken by whoever hears them."""
+    if len(said.text) > MOST_LETTERS:
+        object.__setattr__(said, "text", f"{said.text[: MOST_LETTERS - 4]} ...")

@@ -1,0 +1,32 @@
+"""What robots say in tests: words for which nothing needs a code."""
+
+from collections.abc import Iterable
+
+from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, Refusal, RefusalCode
+from edge.messages.mission import OrderResult
+
+
+def reason(text: str, code: ReasonCode = ReasonCode.OTHER) -> Reason:
+    return Reason(code, text)
+
+
+def reasons(*texts: str) -> tuple[Reason, ...]:
+    return tuple(reason(text) for text in texts)
+
+
+def checks(*texts: str) -> tuple[FailedCheck, ...]:
+    return tuple(FailedCheck(CheckCode.OTHER, text) for text in texts)
+
+
+def refusal(text: str) -> Refusal | None:
+    """None if there is nothing to say."""
+    return Refusal(RefusalCode.OTHER, text) if text else None
+
+
+def codes(said: Iterable[FailedCheck | Reason]) -> list[CheckCode | ReasonCode]:
+    return [each.code for each in said]
+
+
+def why(answer: OrderResult) -> RefusalCode | None:
+    """Why an order was refused; None if it was obeyed."""
+    return None if answer.refusal is None else answer.refusal.code
