@@ -1,5 +1,6 @@
 """The geofence: a convex polygon in the mission frame, with a floor and a ceiling."""
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -103,12 +104,7 @@ class Fence:
 
     def edges(self) -> "Edges":
         """The lines of its polygon."""
-        corners = np.array(self.vertices_m)
-        along = np.roll(corners, -1, axis=0) - corners
-        along = along / np.hypot(along[:, :1], along[:, 1:])
-        left = np.stack([-along[:, 1], along[:, 0]], axis=1)
-        inward = left if _area(corners) > 0.0 else -left
-        return Edges(inward, (inward * corners).sum(axis=1))
+        return _edges(self.vertices_m)
 
 
 class Edges(NamedTuple):
@@ -120,6 +116,19 @@ class Edges(NamedTuple):
     def distances_m(self, point_m: F64) -> F64:
         """(n,): how far inside each edge's line a point (2,) is."""
         return self.inward @ point_m - self.offsets_m
+
+
+@functools.lru_cache(maxsize=64)  # asked for many times in each tick of the control loop
+def _edges(vertices_m: tuple[tuple[float, ...], ...]) -> Edges:
+    corners = np.array(vertices_m)
+    along = np.roll(corners, -1, axis=0) - corners
+    along = along / np.hypot(along[:, :1], along[:, 1:])
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    inward = left if _area(corners) > 0.0 else -left
+    edges = Edges(inward, (inward * corners).sum(axis=1))
+    for shared in edges:
+        shared.flags.writeable = False
+    return edges
 
 
 def _cut(corners: F64, inward: F64, offset_m: float) -> F64:
