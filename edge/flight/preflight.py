@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from edge.core.fence import Fence
 from edge.core.position import PositionJudgement, PositionQuality
@@ -11,8 +10,9 @@ from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.vehicle import Gps, VehicleState
 from edge.flight.failsafe import RemoteControl
 from edge.flight.margins import ErrorBudget, places_apart
+from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
-from edge.messages.mission import Origin, RobotStatus
+from edge.messages.mission import Origin
 
 # 2026-01-01 UTC. A computer that lost its clock with its battery starts years before.
 _EARLIEST_UNIX_S = 1_767_225_600.0
@@ -49,14 +49,6 @@ class PreflightLimits:
                 raise ValueError(f"{name} = {value}: must be finite and above 0")
 
 
-class HeardStatus(NamedTuple):
-    """Another robot's status, and when it came: this robot's monotonic and wall clock, s."""
-
-    status: RobotStatus
-    heard_at_s: float
-    heard_at_unix_s: float
-
-
 @dataclass(frozen=True, slots=True)
 class PreflightInputs:
     """What the checks look at.
@@ -90,7 +82,7 @@ class PreflightInputs:
     landing_point_m: Sequence[float]
     min_separation_m: float
     errors: ErrorBudget
-    neighbours: Sequence[HeardStatus]
+    neighbours: Sequence[HeardBeacon]
     not_understood: Sequence[str]
     rc: RemoteControl
     ground_age_s: float | None
@@ -320,7 +312,7 @@ def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
 
 
 def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
-    others = [heard for heard in inputs.neighbours if heard.status.robot_id != inputs.robot_id]
+    others = [heard for heard in inputs.neighbours if heard.beacon.robot_id != inputs.robot_id]
     if inputs.duplicate_id or len(others) < len(inputs.neighbours):
         yield FailedCheck(
             CheckCode.DUPLICATE_ID,
@@ -331,41 +323,41 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
             CheckCode.NOT_UNDERSTOOD,
             f"{robot} runs another version of this program: deploy one to all",
         )
-    for status, _, heard_at_unix_s in others:
-        other = f"robot {status.robot_id}"
-        if status.system_id is not None and status.system_id == inputs.system_id:
+    for beacon, _, heard_at_unix_s in others:
+        other = f"robot {beacon.robot_id}"
+        if beacon.system_id is not None and beacon.system_id == inputs.system_id:
             yield FailedCheck(
                 CheckCode.SAME_SYSTEM_ID,
-                f"{other}'s vehicle has the same system id {status.system_id}: set MAV_SYS_ID",
+                f"{other}'s vehicle has the same system id {beacon.system_id}: set MAV_SYS_ID",
             )
-        if status.bundle_id != inputs.bundle_id:
+        if beacon.bundle_tag != tag(inputs.bundle_id):
             yield FailedCheck(
                 CheckCode.OTHER_BUNDLE, f"{other} has another bundle: deploy one to all"
             )
-        if status.world_id != inputs.world_id:
+        if beacon.world_tag != tag(inputs.world_id):
             yield FailedCheck(
                 CheckCode.OTHER_WORLD,
                 f"{other} has another world: set one on the ground, or deploy it to all",
             )
-        if inputs.origin is not None and status.origin != inputs.origin:
+        if inputs.origin is not None and beacon.frame_id != inputs.origin.frame().frame_id:
             yield FailedCheck(
                 CheckCode.OTHER_ORIGIN,
                 f"{other} has another mission origin: set it again on the ground",
             )
-        yield from _apart(inputs, status, other)
-        offset_s = status.unix_time_s - heard_at_unix_s
+        yield from _apart(inputs, beacon, other)
+        offset_s = beacon.sent_at_s - heard_at_unix_s
         if not abs(offset_s) <= limits.max_clock_difference_s:
             yield FailedCheck(
                 CheckCode.CLOCK_OFF_ROBOT,
                 f"{other}'s clock differs by {offset_s:.1f} s: set the time of both",
             )
     if not inputs.vehicle.armed:
-        yield from _too_late(inputs.errors, [heard.status for heard in others])
+        yield from _too_late(inputs.errors, [heard.beacon for heard in others])
 
 
-def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[FailedCheck]:
+def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedCheck]:
     """Whether somebody took off so long ago that heights above the pad mean another height now."""
-    armed = [status for status in others if status.armed]
+    armed = [beacon for beacon in others if beacon.armed]
     known = [(s.robot_id, math.inf if s.flown_s is None else s.flown_s) for s in armed]
     robot_id, flown_s = max(known, key=lambda each: each[1], default=(-1, -math.inf))
     window_s = errors.takeoffs_window_s
@@ -383,12 +375,12 @@ def _too_late(errors: ErrorBudget, others: Sequence[RobotStatus]) -> Iterator[Fa
         )
 
 
-def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator[FailedCheck]:
+def _apart(inputs: PreflightInputs, beacon: Beacon, other: str) -> Iterator[FailedCheck]:
     """Whether two robots stay apart in truth, above each other and where they land."""
     errors, gps = inputs.errors, inputs.vehicle.gps
     limit_m = inputs.min_separation_m
     heights = errors.slot_spacing.or_at_least(limit_m, "min_separation_m")
-    apart_m = abs(status.slot_height_m - inputs.slot_height_m)
+    apart_m = abs(beacon.slot_height_m - inputs.slot_height_m)
     if not heights.holds(apart_m):
         yield FailedCheck(
             CheckCode.HEIGHTS_TOO_NEAR,
@@ -397,9 +389,9 @@ def _apart(inputs: PreflightInputs, status: RobotStatus, other: str) -> Iterator
         )
     places = places_apart(
         errors.reported_position_m(None if gps is None else gps.accuracy_m),
-        errors.reported_position_m(status.gps_accuracy_m),
+        errors.reported_position_m(beacon.gps_accuracy_m),
     ).or_at_least(limit_m, "min_separation_m")
-    apart_m = math.dist(status.landing_point_m, inputs.landing_point_m)
+    apart_m = math.dist(beacon.landing_point_m, inputs.landing_point_m)
     if not places.holds(apart_m):
         planned = places_apart(errors.position_m, errors.position_m)
         why = "too near for the GPS accuracy that is reported; " if planned.holds(apart_m) else ""

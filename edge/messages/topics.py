@@ -34,7 +34,7 @@ class Topic:
         return f"robot/*/{self.name}" if self.sender == "robot" else f"ground/{self.name}"
 
 
-MESSAGE = Topic("message", "robot", "AggregatedMessage", 2.5, 2**20, "now", "policy")
+MESSAGE = Topic("message", "robot", "Beacon, AggregatedMessage", 2.5, 2**20, "now", "received")
 STATUS = Topic("status", "robot", "RobotStatus", 2.0, 2**16, "now", "status")
 EXPLORED = Topic("explored", "robot", "bits", 1.0, 2**10, "later", None)
 STATE = Topic("state", "ground", "GroundState", 5.0, 2**16, "now", "ground")

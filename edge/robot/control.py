@@ -12,7 +12,6 @@ from edge.core.ports import Autopilot, Odometry, Recorder, Sensor
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
-from edge.flight.preflight import HeardStatus
 from edge.flight.safety import Closest, nearest
 from edge.flight.state import (
     FlightInputs,
@@ -23,6 +22,7 @@ from edge.flight.state import (
     height_m,
 )
 from edge.flight.step import step
+from edge.messages.beacon import HeardBeacon
 from edge.messages.codes import CheckCode, FailedCheck, Reason
 from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
 from edge.robot.inbox import Inbox
@@ -32,8 +32,8 @@ from edge.robot.readiness import Assignment, Checks
 
 _log = structlog.get_logger(__name__)
 
-# The statuses' period is a quarter of a second.
-_MAX_STATUS_AGE_S = 1.5
+# Beacons come at the policy's rate, or four times a second without it.
+_MAX_BEACON_AGE_S = 1.5
 # Checks that are older say nothing about now.
 _MAX_CHECKS_AGE_S = 5.0
 _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
@@ -50,7 +50,7 @@ class GroundWorld(NamedTuple):
 class FlightControl:
     """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
 
-    Another thread sets `checks`, `peers` (what the other robots say of themselves), and `world` for
+    Another thread sets `checks`, `peers` (the other robots' beacons), and `world` for
     the `wanted_world_id`, whole. `obeyed_sequence` and `operator` are the last ground state's.
     `assignment` is what is flown by, `not_taken` what of the ground's state it is not. `energy` is
     how long the battery lasts, and the way home takes.
@@ -87,7 +87,7 @@ class FlightControl:
         self.flight = FlightMemory()
         self.alarms: tuple[Reason, ...] = ()
         self.checks: Checks | None = None
-        self.peers: tuple[HeardStatus, ...] = ()
+        self.peers: tuple[HeardBeacon, ...] = ()
         self.assignment = Assignment(None, robot, world_id)
         self.not_taken: tuple[FailedCheck, ...] = ()
         self.wanted_world_id: str | None = None
@@ -119,7 +119,7 @@ class FlightControl:
             neighbours=neighbours,
             closest=self._closest(odometry, neighbours),
             busy_neighbours=tuple(
-                peer.status.robot_id for peer in self.peers if peer.status.state in _BUSY
+                peer.beacon.robot_id for peer in self.peers if peer.beacon.state in _BUSY
             ),
             ground=ground,
             ground_age_s=ground_age_s,
@@ -259,19 +259,19 @@ class FlightControl:
     def _neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
         """Whom to keep away from: also robots that are silent since their policy or sensor failed.
 
-        They still tell their place in their status, if not as often.
+        They still tell their place in their beacons.
         """
         heard = self._pac.mailbox.neighbours(now_s)
         known = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
         told = []
-        for status, heard_at_s, _ in self.peers:
+        for beacon, heard_at_s, _ in self.peers:
             age_s = now_s - heard_at_s
-            comparable = status.origin == self.assignment.origin and age_s <= _MAX_STATUS_AGE_S
-            if status.robot_id in known or not comparable:
+            comparable = beacon.frame_id == self._pac.frame_id and age_s <= _MAX_BEACON_AGE_S
+            if beacon.robot_id in known or not comparable:
                 continue
-            if status.position_m is not None and status.velocity_m_s is not None:
+            if beacon.position_m is not None and beacon.velocity_m_s is not None:
                 told.append(
-                    Neighbour(status.robot_id, status.position_m, status.velocity_m_s, age_s)
+                    Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
                 )
         return (*heard, *told)
 

@@ -1,4 +1,4 @@
-"""What came by radio, kept for the loops: the ground's state and orders, and others' statuses.
+"""What came by radio, kept for the loops: the ground's state and orders, and others' beacons.
 
 The link's threads only put bytes in; whoever takes something out decodes it.
 """
@@ -8,20 +8,19 @@ from collections import deque
 from threading import Lock
 from typing import NamedTuple
 
-from edge.flight.preflight import HeardStatus
+from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
     GroundState,
     KillForm,
     Order,
-    RobotStatus,
     SafetyAction,
     SafetyForm,
 )
 
 _MOST_ORDERS = 64
 _MOST_STATES = 16
-_STATUS_LIFETIME_S = 3.0
+_BEACON_LIFETIME_S = 3.0
 
 
 class _Arrived(NamedTuple):
@@ -43,7 +42,9 @@ class Inbox:
         self._lock = Lock()
         self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
         self._orders: deque[bytes] = deque(maxlen=_MOST_ORDERS)
-        self._statuses: dict[str, _Arrived] = {}
+        self._beacons: dict[int, HeardBeacon] = {}
+        # When robots, by what they are called, said what is no beacon of this version.
+        self._strangers: dict[str, float] = {}
         self._ground: GroundState | None = None
         self._ground_at_s = -math.inf
         self._safety_form: SafetyAction = "none"
@@ -54,7 +55,7 @@ class Inbox:
         self.ground_clock_offset_s: float | None = None
         # The text of the newest world file that the ground sent.
         self.world: bytes | None = None
-        # Whose statuses could not be read when `peers` was asked last.
+        # Who said lately what could not be read, as `peers` found it.
         self.not_understood: tuple[str, ...] = ()
         self.malformed = 0
 
@@ -70,10 +71,21 @@ class Inbox:
         """An order arrived."""
         self._orders.append(data)
 
-    def put_status(self, key: str, data: bytes, now_s: float, unix_now_s: float) -> None:
-        """Another robot's status arrived, with `key`."""
+    def put_beacon(self, beacon: Beacon, now_s: float, unix_now_s: float) -> None:
+        """Another robot's beacon arrived."""
         with self._lock:
-            self._statuses[key] = _Arrived(data, now_s, unix_now_s)
+            known = self._beacons.get(beacon.robot_id)
+            late = known is not None and now_s - known.heard_at_s < _BEACON_LIFETIME_S and (
+                beacon.boot_epoch, beacon.sequence
+            ) <= (known.beacon.boot_epoch, known.beacon.sequence)  # fmt: skip
+            if not late:
+                self._beacons[beacon.robot_id] = HeardBeacon(beacon, now_s, unix_now_s)
+
+    def put_stranger(self, name: str, now_s: float) -> None:
+        """A robot's message arrived that could not be read."""
+        with self._lock:
+            self.malformed += 1
+            self._strangers[name] = now_s
 
     def ground(self, now_s: float) -> tuple[GroundState | None, float]:
         """The ground's newest state and its age, s (infinite if none came). Control thread."""
@@ -146,28 +158,18 @@ class Inbox:
             form.expires_at_uptime_s, form.operator,
         )  # fmt: skip
 
-    def peers(self, now_s: float) -> tuple[HeardStatus, ...]:
-        """The fresh statuses of the other robots. Preflight's thread."""
+    def peers(self, now_s: float) -> tuple[HeardBeacon, ...]:
+        """The fresh beacons of the other robots, by robot id."""
         with self._lock:
-            self._statuses = {
-                key: arrived
-                for key, arrived in sorted(self._statuses.items())
-                if now_s - arrived.at_s <= _STATUS_LIFETIME_S
+            self._beacons = {
+                robot_id: heard
+                for robot_id, heard in sorted(self._beacons.items())
+                if now_s - heard.heard_at_s <= _BEACON_LIFETIME_S
             }
-            arrivals = dict(self._statuses)
-        decoded = {key: self._status(a.data) for key, a in arrivals.items()}
-        self.not_understood = tuple(
-            f"robot {key.split('/')[1]}" for key, status in decoded.items() if status is None
-        )
-        return tuple(
-            HeardStatus(status, arrivals[key].at_s, arrivals[key].unix_s)
-            for key, status in decoded.items()
-            if status is not None
-        )
-
-    def _status(self, data: bytes) -> RobotStatus | None:
-        try:
-            return decode(RobotStatus, data)
-        except MessageError:
-            self.malformed += 1
-            return None
+            self._strangers = {
+                name: at_s
+                for name, at_s in sorted(self._strangers.items())
+                if now_s - at_s <= _BEACON_LIFETIME_S
+            }
+            self.not_understood = tuple(self._strangers)
+            return tuple(self._beacons.values())

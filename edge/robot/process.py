@@ -16,7 +16,6 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from importlib.metadata import version
@@ -27,7 +26,6 @@ import structlog
 
 from edge.core.px4_version import in_words
 from edge.core.vehicle import Action
-from edge.core.wire import Rejection, decode
 from edge.core.world import MOST_FEATURES, parse_world, rasterize
 from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.drivers.logs import configure_logging
@@ -38,11 +36,12 @@ from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_
 from edge.drivers.world_sensor import WorldSensor
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.state import flown_s
+from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
 from edge.messages.bounds import MOST_TEXTS
-from edge.messages.codec import encode
+from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import FlightState, RobotStatus, explored_to_bytes, world_id
-from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
+from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD
 from edge.policy.bundle import Manifest, load_bundle
 from edge.policy.lpac.graphs import Policy
 from edge.policy.verify import verify
@@ -57,13 +56,15 @@ from edge.robot.readiness import Assignment, Readiness
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
 _EXPLORED_PERIOD_S = 1.0
+# A status without news; what is new goes at once. A little less, since ticks are never early.
+_STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
+# After as many of the policy's periods without a message, a beacon goes alone.
+_SILENT_TICKS = 1.5
 # A control loop without a tick for longer hangs: the vehicle was told to hold before that.
 _CONTROL_FRESH_S = 1.0
 # On leaving: for the autopilot's answer, and for a loop that hangs.
 _ANSWER_S = 1.2
 _JOIN_S = 0.3
-# Whoever sent it: nobody has this robot id.
-_NOBODY = -1
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
@@ -130,7 +131,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
     if stop.is_set():
         return
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    boot_nonce = secrets.randbits(48)
+    boot_nonce, boot_epoch = secrets.randbits(48), time.time_ns() // 1_000_000
     with ExitStack() as parts:
         service_manager = ServiceManager()
         parts.callback(service_manager.close)
@@ -157,20 +158,19 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
         pac = Pac(
             robot_id=config.robot_id,
-            boot_epoch=time.time_ns() // 1_000_000,
+            boot_epoch=boot_epoch,
             policy=loaded.policy,
             sensor=loaded.sensor,
             odometry=navigation,
             parameters=config.pac,
         )
         # 6. The radio that feeds it.
-        link = parts.enter_context(
-            _open_link(config, inbox, config.robot_id, partial(_receive, pac, loaded, recorder))
-        )
+        link = parts.enter_context(_open_link(config, inbox, config.robot_id, pac, recorder))
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
         program = _Program(
-            config, loaded, autopilot, watchdog, recorder, navigation, inbox, pac, link, boot_nonce
-        )
+            config, loaded, autopilot, watchdog, recorder, navigation, inbox, pac, link,
+            boot_nonce, boot_epoch,
+        )  # fmt: skip
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
         ctypes.CDLL(None).malloc_trim(0)  # What verification took goes back to the system.
@@ -196,28 +196,37 @@ def _open_log(config: RobotConfig, loaded: Loaded, boot_nonce: int) -> FlightLog
     return FlightLog(Path(config.log.folder), metadata, max_total_bytes=max_total_bytes)
 
 
-def _receive(pac: Pac, loaded: Loaded, recorder: FlightLog, key: str, data: bytes) -> None:
-    """A neighbour's message, from the link's threads: to the mailbox, and what came to the log."""
-    unix_now_s = time.time()
-    rejection = pac.receive(data, time.monotonic(), unix_now_s)
-    message = decode(
-        data,
-        bundle_id=loaded.policy.bundle_id,
-        frame_id=None,
-        own_robot_id=_NOBODY,
-        message_size=loaded.policy.manifest.geometry.message_size,
-    )
-    header = None if isinstance(message, Rejection) else message
-    recorder.record(
-        "received",
-        unix_now_s,
-        {
-            "sender": int(key.split("/")[1]),
-            "sequence": header and header.sequence,
-            "age_s": header and unix_now_s - header.sent_at_s,
-            "rejection": rejection,
-        },
-    )
+def _receive(
+    inbox: Inbox, pac: Pac | None, recorder: FlightLog | None, key: str, data: bytes
+) -> None:
+    """A robot's message, from the link's threads: to inbox and mailbox, and what came to the log.
+
+    Raises nothing; who only looks has neither mailbox nor log.
+    """
+    now_s, unix_now_s = time.monotonic(), time.time()
+    sender = int(key.split("/")[1])
+    try:
+        beacon = decode_beacon(data)
+    except MessageError:
+        beacon = None
+    if beacon is None or beacon.robot_id != sender:
+        inbox.put_stranger(f"robot {sender}", now_s)
+    else:
+        inbox.put_beacon(beacon, now_s, unix_now_s)
+    rejection = None
+    if pac is not None and len(data) > BEACON_BYTES:
+        rejection = pac.receive(data[BEACON_BYTES:], now_s, unix_now_s)
+    if recorder is not None:
+        recorder.record(
+            "received",
+            unix_now_s,
+            {
+                "sender": sender,
+                "sequence": beacon and beacon.sequence,
+                "age_s": beacon and unix_now_s - beacon.sent_at_s,
+                "rejection": rejection,
+            },
+        )
 
 
 class _Program:
@@ -235,6 +244,7 @@ class _Program:
         pac: Pac,
         link: ZenohLink,
         boot_nonce: int,
+        boot_epoch: int,
     ) -> None:
         self._config = config
         self._loaded = loaded
@@ -246,6 +256,7 @@ class _Program:
         self._pac = pac
         self._link = link
         self._boot_nonce = boot_nonce
+        self._boot_epoch = boot_epoch
         self._started_s = time.monotonic()
         self._fed_s = -math.inf
         self._control = FlightControl(
@@ -274,6 +285,12 @@ class _Program:
             Loop("log", _PERIOD_S, self._recorder.flush),
         )
         self._sequence = 0
+        # What the ground was told last, and when.
+        self._told: tuple[object, ...] = ()
+        self._told_at_s = -math.inf
+        self._message_lock = threading.Lock()
+        self._message_sequence = 0
+        self._message_at_s = -math.inf
         self._explored_due_s = -math.inf
         self._status_text: str | None = None
 
@@ -350,9 +367,40 @@ class _Program:
         tick = self._pac.infer(time.monotonic(), time.time())
         if tick is None:
             return
-        self._link.publish(MESSAGE, tick.message)
+        self._publish_message(tick.message)
         record = {field.name: getattr(tick, field.name) for field in dataclasses.fields(tick)}
         self._recorder.record("policy", time.time(), record)
+
+    def _publish_message(self, of_policy: bytes = b"") -> None:
+        """To the neighbours: a beacon, and behind it what the policy says, if it does."""
+        control, vehicle = self._control, self._autopilot.state()
+        odometry, now_s = self._navigation.odometry(), time.monotonic()
+        assignment, gps = control.assignment, vehicle.gps
+        parameters = assignment.robot.parameters
+        x_m, y_m = parameters.landing_point_m
+        with self._message_lock:
+            self._message_sequence += 1
+            self._message_at_s = now_s
+            sequence = self._message_sequence
+        beacon = Beacon(
+            robot_id=self._config.robot_id,
+            boot_epoch=self._boot_epoch,
+            sequence=sequence,
+            sent_at_s=time.time(),
+            position_m=odometry and odometry.position_m,
+            velocity_m_s=odometry and odometry.velocity_m_s,
+            state=control.flight.state,
+            armed=vehicle.armed,
+            system_id=vehicle.system_id,
+            gps_accuracy_m=None if gps is None else gps.accuracy_m,
+            flown_s=flown_s(control.flight, vehicle, now_s),
+            slot_height_m=parameters.slot_height_m,
+            landing_point_m=(x_m, y_m),
+            frame_id=self._pac.frame_id,
+            bundle_tag=tag(self._loaded.bundle_id),
+            world_tag=tag(assignment.world_id),
+        )
+        self._link.publish(MESSAGE, encode_beacon(beacon) + of_policy)
 
     def _preflight_step(self) -> None:
         control = self._control
@@ -394,7 +442,13 @@ class _Program:
     def _status_step(self) -> None:
         now_s, unix_now_s = time.monotonic(), time.time()
         status = self._status(now_s, unix_now_s)
-        self._link.publish(STATUS, encode(status))
+        news = _news(status)
+        if news != self._told or now_s - self._told_at_s >= _STATUS_PERIOD_S:
+            self._told, self._told_at_s = news, now_s
+            self._link.publish(STATUS, encode(status))
+        if now_s - self._message_at_s > _SILENT_TICKS / self._config.rates.policy_hz:
+            # The policy is silent, or hangs: neighbours must not lose this robot's place.
+            self._publish_message()
         vehicle = self._autopilot.state()
         self._status_text = status_text(
             status,
@@ -495,6 +549,17 @@ class _Program:
         return tuple(alarms)
 
 
+def _news(status: RobotStatus) -> tuple[object, ...]:
+    """What the ground is to hear of at once if it changes; of texts only what they are about."""
+    return (
+        status.state, status.reason.code, status.ready, status.orders, status.obeyed_sequence,
+        status.operator, status.trial, status.world_id, status.origin, status.fence, status.armed,
+        status.in_air, status.mode, status.position_quality,
+        *(check.code for check in (*status.failed_checks, *status.not_taken)),
+        *(alarm.code for alarm in status.alarms),
+    )  # fmt: skip
+
+
 def _take_alone(config: RobotConfig, parts: ExitStack) -> None:
     """Hold robot and vehicle for this process: another on this machine must not fly them too."""
     parts.enter_context(ProcessLock(f"robot {config.robot_id} of fleet {config.fleet}"))
@@ -587,17 +652,10 @@ def _open_link(
     config: RobotConfig,
     inbox: Inbox,
     robot_id: int | None,
-    on_message: Callable[[str, bytes], None] | None = None,
+    pac: Pac | None = None,
+    recorder: FlightLog | None = None,
 ) -> ZenohLink:
     """The radio, with what it hears going into the inbox."""
-    subscriptions: dict[Topic, Callable[[str, bytes], None]] = {
-        STATUS: lambda key, data: inbox.put_status(key, data, time.monotonic(), time.time()),
-        STATE: lambda _, data: inbox.put_ground(data, time.monotonic(), time.time()),
-        ORDER: lambda _, data: inbox.put_order(data),
-        WORLD: lambda _, data: inbox.put_world(data),
-    }
-    if on_message is not None:
-        subscriptions[MESSAGE] = on_message
     link = config.link
     return ZenohLink(
         fleet=config.fleet,
@@ -606,5 +664,10 @@ def _open_link(
         listen=link.listen,
         connect=link.connect,
         scouting=link.scouting,
-        subscriptions=subscriptions,
+        subscriptions={
+            MESSAGE: partial(_receive, inbox, pac, recorder),
+            STATE: lambda _, data: inbox.put_ground(data, time.monotonic(), time.time()),
+            ORDER: lambda _, data: inbox.put_order(data),
+            WORLD: lambda _, data: inbox.put_world(data),
+        },
     )

@@ -15,8 +15,9 @@ from edge.core.ports import Autopilot, AutopilotSetup, Odometry
 from edge.core.position import PositionJudgement
 from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
-from edge.flight.preflight import HeardStatus, PreflightInputs, failed_checks
+from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Robot
+from edge.messages.beacon import HeardBeacon
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig
@@ -106,7 +107,7 @@ class Readiness:
         assignment: Assignment,
         position: PositionJudgement,
         odometry: Odometry | None,
-        peers: Sequence[HeardStatus],
+        peers: Sequence[HeardBeacon],
         not_understood: Sequence[str],
         duplicate: bool,
         watchdog_alive: bool,

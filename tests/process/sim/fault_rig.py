@@ -397,7 +397,7 @@ def _run(folder: Path) -> None:
             return nothing if (folder / "fail-sensor").exists() else super().view(position)
 
     with patch.multiple(
-        edge.robot, Pac=FailingPac, WorldSensor=FailingSensor, _take_alone=lambda *_: None
+        edge.robot.process, Pac=FailingPac, WorldSensor=FailingSensor, _take_alone=lambda *_: None
     ):
         run(folder / "robot.toml")
 

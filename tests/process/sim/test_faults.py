@@ -23,6 +23,7 @@ import zenoh
 from edge.core import wire
 from edge.core.position import PositionCause
 from edge.core.wire import Rejection
+from edge.messages.beacon import BEACON_BYTES
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus
@@ -322,7 +323,7 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
         with session.declare_subscriber(key) as subscriber:
             genuine = subscriber.recv().payload.to_bytes()
         message = wire.decode(
-            genuine,
+            genuine[BEACON_BYTES:],
             bundle_id=bytes.fromhex(bundle.id),
             frame_id=None,
             own_robot_id=-1,
@@ -333,7 +334,8 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
             Rejection.MAGIC: bytes(len(genuine)),
             Rejection.TRUNCATED: genuine[:-1],
             Rejection.CHECKSUM: genuine[:-1] + bytes([genuine[-1] ^ 1]),
-            Rejection.OTHER_BUNDLE: wire.encode(message, bytes(32), "float16"),
+            Rejection.OTHER_BUNDLE: genuine[:BEACON_BYTES]
+            + wire.encode(message, bytes(32), "float16"),
             Rejection.OUTDATED: genuine,
         }
         before = {other: rig.status(other).message_counts for other in rig.flying}

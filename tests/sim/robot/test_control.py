@@ -27,7 +27,7 @@ from edge.core.vehicle import (
 from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
-from edge.flight.preflight import HeardStatus
+from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode
 from edge.messages.mission import (
@@ -38,7 +38,6 @@ from edge.messages.mission import (
     OrderResult,
     Origin,
     Place,
-    RobotStatus,
 )
 from edge.policy.lpac.graphs import Policy
 from edge.robot.config import load_config
@@ -248,10 +247,10 @@ class Flown:
         assert self.images is not None
         return int((self.images[0, 0] > 0.0).sum())
 
-    def peers(self, *statuses: RobotStatus, age_s: float = 0.1) -> None:
+    def peers(self, *beacons: Beacon, age_s: float = 0.1) -> None:
         """What other robots said of themselves."""
         at_s = self.now_s - age_s
-        self.control.peers = tuple(HeardStatus(status, at_s, at_s) for status in statuses)
+        self.control.peers = tuple(HeardBeacon(beacon, at_s, at_s) for beacon in beacons)
 
     def odometry(self) -> Vector:
         odometry = self.navigation.odometry()
@@ -259,9 +258,13 @@ class Flown:
         return odometry.position_m
 
 
-def peer(robot_id: int, state: FlightState, position_m: Vector = (100.0, 0.0, 9.0)) -> RobotStatus:
+def peer(robot_id: int, state: FlightState, position_m: Vector = (100.0, 0.0, 9.0)) -> Beacon:
     return dataclasses.replace(
-        NEIGHBOUR, robot_id=robot_id, state=state, position_m=position_m, origin=ORIGIN
+        NEIGHBOUR,
+        robot_id=robot_id,
+        state=state,
+        position_m=position_m,
+        frame_id=ORIGIN.frame().frame_id,
     )
 
 
@@ -531,7 +534,7 @@ def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
     assert flown.order("start", "a").accepted
 
 
-def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_status(flown: Flown) -> None:
+def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: Flown) -> None:
     flown.take_off()
     x_m, y_m, height_m = flown.odometry()
     flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))

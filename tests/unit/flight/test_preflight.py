@@ -13,13 +13,13 @@ from edge.core.schema import ConfigError, from_mapping
 from edge.core.vehicle import AutopilotReason, GlobalOrigin, Gps, Mode, VehicleState
 from edge.flight.margins import ErrorBudget
 from edge.flight.preflight import (
-    HeardStatus,
     PreflightInputs,
     PreflightLimits,
     failed_checks,
 )
-from edge.messages.codes import CheckCode, Reason, ReasonCode
-from edge.messages.mission import FlightState, Origin, RobotStatus
+from edge.messages.beacon import Beacon, HeardBeacon, tag
+from edge.messages.codes import CheckCode
+from edge.messages.mission import FlightState, Origin
 
 _C = CheckCode
 UNIX_S = 1_790_000_000.0
@@ -41,37 +41,23 @@ VEHICLE = VehicleState(
     gps=Gps(3, 14, 0.8, accuracy_m=0.9),
     armable=True,
 )
-NEIGHBOUR = RobotStatus(
+NEIGHBOUR = Beacon(
     robot_id=2,
-    boot_nonce=5,
+    boot_epoch=5,
     sequence=9,
-    uptime_s=60.0,
-    unix_time_s=UNIX_S,
-    state=FlightState.IDLE,
-    reason=Reason(ReasonCode.OTHER, ""),
-    ready=True,
-    failed_checks=(),
-    alarms=(),
-    obeyed_sequence=1,
-    operator="",
-    orders=(),
-    bundle_id="b",
-    world_id="w",
-    trial="",
-    origin=ORIGIN,
-    system_id=2,
-    slot_height_m=9.5,
-    landing_point_m=(16.0, 8.0),
+    sent_at_s=UNIX_S,
     position_m=(12.0, 8.0, 0.0),
     velocity_m_s=(0.0, 0.0, 0.0),
-    heading_rad=1.0,
-    mode="hold",
+    state=FlightState.IDLE,
     armed=False,
-    battery=0.9,
-    satellites=14,
-    message_counts={},
-    neighbour_ages_s={},
-    loops={},
+    system_id=2,
+    gps_accuracy_m=None,
+    flown_s=None,
+    slot_height_m=9.5,
+    landing_point_m=(16.0, 8.0),
+    frame_id=ORIGIN.frame().frame_id,
+    bundle_tag=tag("b"),
+    world_tag=tag("w"),
 )
 READY = PreflightInputs(
     now_s=100.0,
@@ -93,7 +79,7 @@ READY = PreflightInputs(
     landing_point_m=(8.0, 8.0),
     min_separation_m=2.0,
     errors=ErrorBudget(),
-    neighbours=(HeardStatus(NEIGHBOUR, 99.8, UNIX_S + 0.2),),
+    neighbours=(HeardBeacon(NEIGHBOUR, 99.8, UNIX_S + 0.2),),
     not_understood=(),
     rc="none",
     ground_age_s=0.4,
@@ -194,7 +180,7 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         "robot 2 flies 4.5 m above or below, must be 5 m (min_separ",
     ),
     (
-        {"neighbours": (HeardStatus(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
+        {"neighbours": (HeardBeacon(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
         _C.CLOCK_OFF_ROBOT,
         "robot 2's clock differs by 30.0 s: set the time of both",
     ),
@@ -318,15 +304,15 @@ def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
 
 
 def test_a_neighbour_without_an_origin_has_not_ours() -> None:
-    neighbour = HeardStatus(dataclasses.replace(NEIGHBOUR, origin=None), 99.8, UNIX_S)
+    neighbour = HeardBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8, UNIX_S)
     (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
     assert failed.code is _C.OTHER_ORIGIN
 
 
-def in_the_air(*flown_s: float | None) -> tuple[HeardStatus, ...]:
+def in_the_air(*flown_s: float | None) -> tuple[HeardBeacon, ...]:
     """Neighbours from robot 2 on, each for so long."""
     return tuple(
-        HeardStatus(
+        HeardBeacon(
             dataclasses.replace(
                 NEIGHBOUR, robot_id=2 + i, system_id=2 + i, state=FlightState.HOLD, armed=True,
                 flown_s=each_s, slot_height_m=9.5 + 4.5 * i, landing_point_m=(16.0 + 8.0 * i, 8.0),
@@ -354,7 +340,7 @@ def test_nobody_follows_those_who_took_off_long_ago() -> None:
     assert line.startswith("robot 3 has been in the air since before its program started: heights")
     for patient in (ErrorBudget(takeoffs_height_m=1.0), ErrorBudget(height_common_m=0.0)):
         wide = tuple(
-            heard._replace(status=dataclasses.replace(heard.status, slot_height_m=20.0 + 5.0 * i))
+            heard._replace(beacon=dataclasses.replace(heard.beacon, slot_height_m=20.0 + 5.0 * i))
             for i, heard in enumerate(in_the_air(63.0, 63.0))
         )
         assert said(errors=patient, neighbours=wide) == []
@@ -370,7 +356,7 @@ def lines(
     neighbour = dataclasses.replace(
         NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
     )
-    heard = HeardStatus(neighbour, 99.8, UNIX_S)
+    heard = HeardBeacon(neighbour, 99.8, UNIX_S)
     vehicle = dataclasses.replace(VEHICLE, gps=own)
     inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
     failed = failed_checks(inputs, LIMITS)

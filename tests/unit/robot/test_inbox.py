@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from edge.messages.codec import encode
 from edge.messages.mission import GroundState, Order, Origin
 from edge.robot.inbox import Inbox
+from tests.unit.flight.test_preflight import NEIGHBOUR
 
 STATE = GroundState(sequence=5, operator="anna", origin=Origin(40.0, -75.0, 30.0), enabled=True)
 ORDER = Order("a", 3, 77, "takeoff", 12.0, "anna")
@@ -91,11 +92,10 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     assert inbox.ground(1.0)[0] == STATE
     inbox.put_ground(data, 2.0, 1e9)
     inbox.put_order(data)
-    inbox.put_status("robot/4/status", data, 2.0, 1e9)
     assert inbox.ground(2.0) == (STATE, 1.0)
     assert inbox.order() is None
     assert inbox.peers(2.0) == ()
-    assert inbox.malformed == 3
+    assert inbox.malformed == 2
 
 
 def newer(message: GroundState | Order, **changes: object) -> bytes:
@@ -140,3 +140,27 @@ def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
     inbox.put_order(newer(ORDER, kind="kill"))
     kill = inbox.order()
     assert kill is not None and (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)
+
+
+def test_peers_are_who_was_heard_lately_and_the_newest_counts() -> None:
+    inbox = make_inbox()
+    inbox.put_beacon(NEIGHBOUR, 1.0, 1e9)
+    late = dataclasses.replace(NEIGHBOUR, sequence=8, slot_height_m=50.0)
+    inbox.put_beacon(late, 1.1, 1e9)
+    assert [peer.beacon for peer in inbox.peers(1.2)] == [NEIGHBOUR]
+    restarted = dataclasses.replace(NEIGHBOUR, boot_epoch=6, sequence=1)
+    inbox.put_beacon(restarted, 1.3, 1e9)
+    inbox.put_beacon(dataclasses.replace(NEIGHBOUR, robot_id=1), 2.0, 1e9)
+    assert [peer.beacon.robot_id for peer in inbox.peers(2.5)] == [1, 2]
+    assert [peer.heard_at_s for peer in inbox.peers(4.5)] == [2.0]
+    # Its clock was set back while it was away.
+    inbox.put_beacon(NEIGHBOUR, 5.0, 1e9)
+    assert [peer.beacon for peer in inbox.peers(5.1)] == [NEIGHBOUR]
+
+
+def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
+    inbox = make_inbox()
+    inbox.put_stranger("robot 4", 1.0)
+    for now_s, names in ((2.0, ["robot 4"]), (4.5, [])):
+        assert inbox.peers(now_s) == ()
+        assert list(inbox.not_understood) == names
