@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, Refusal, RefusalCode
 from edge.messages.mission import OrderResult
+from lpac.ground.station.protocol import CommandReport, ProblemCode, ResultCode
 
 
 def reason(text: str, code: ReasonCode = ReasonCode.OTHER) -> Reason:
@@ -30,3 +31,13 @@ def codes(said: Iterable[FailedCheck | Reason]) -> list[CheckCode | ReasonCode]:
 def why(answer: OrderResult) -> RefusalCode | None:
     """Why an order was refused; None if it was obeyed."""
     return None if answer.refusal is None else answer.refusal.code
+
+
+def problem(report: CommandReport) -> ProblemCode | None:
+    """Why nothing of a command was done."""
+    return None if report.problem is None else report.problem.code
+
+
+def not_done(report: CommandReport) -> dict[str, ResultCode]:
+    """By robot, why it did not do it."""
+    return {result.robot: result.code for result in report.results if not result.done}

@@ -7,6 +7,7 @@ some of them, too.
 import math
 from collections.abc import Callable, Mapping
 
+from edge.core.position import PositionQuality
 from edge.flight.state import Tick
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import AIRBORNE, FlightState
@@ -39,9 +40,14 @@ def remote_control_lost(t: Tick) -> str | None:
     return reason_if(lost_s > _REMOTE_CONTROL_LOST_S, "remote control lost")
 
 
-def position_not_good(t: Tick) -> str | None:
-    position = t.inputs.position
-    return reason_if(not t.knows_place, f"position {position.quality}: {position.text}")
+def position_lost(t: Tick) -> str | None:
+    lost = t.inputs.position.quality is PositionQuality.LOST
+    return reason_if(lost, f"position lost: {t.inputs.position.text}")
+
+
+def position_doubtful(t: Tick) -> str | None:
+    doubtful = t.inputs.position.quality is PositionQuality.DOUBTFUL
+    return reason_if(doubtful, f"position doubtful: {t.inputs.position.text}")
 
 
 def too_close(t: Tick) -> str | None:
@@ -81,7 +87,8 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.FAILSAFE: failsafe,
     ReasonCode.HOVERS_ALONE: hovers_alone,
     ReasonCode.REMOTE_CONTROL_LOST: remote_control_lost,
-    ReasonCode.POSITION_NOT_GOOD: position_not_good,
+    ReasonCode.POSITION_LOST: position_lost,
+    ReasonCode.POSITION_DOUBTFUL: position_doubtful,
     ReasonCode.TOO_CLOSE: too_close,
     ReasonCode.OUTSIDE_FENCE: outside,
     ReasonCode.BATTERY_LOW: battery_low,
@@ -91,7 +98,7 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
 
 
 def alarms(t: Tick) -> tuple[Reason, ...]:
-    """What the operator must see, the gravest first, each text once."""
+    """What the operator must see, the gravest first, each thing once."""
     found = [t.flight.reason] if t.flight.alarming else []
     if t.flight.state in (*AIRBORNE, FlightState.PILOT):
         found += [
@@ -99,4 +106,4 @@ def alarms(t: Tick) -> tuple[Reason, ...]:
         ]
         warnings = t.inputs.vehicle.warnings
         found += [Reason(ReasonCode.PX4, f"PX4: {warning.text}") for warning in warnings]
-    return tuple({alarm.text: alarm for alarm in reversed(found)}.values())[::-1]
+    return tuple(dict.fromkeys(found))

@@ -7,7 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from edge.flight.alarms import failsafe, position_not_good, remote_control_lost, too_close
+from edge.flight.alarms import (
+    failsafe,
+    position_doubtful,
+    position_lost,
+    remote_control_lost,
+    too_close,
+)
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick
 from edge.messages.codes import Refusal, RefusalCode, texts
 from edge.messages.mission import (
@@ -77,7 +83,7 @@ def _not_in_place(t: Tick) -> Refusal | None:
     """Why the mission cannot be flown from here."""
     odometry, height = t.inputs.odometry, t.height_m
     vehicle = t.inputs.vehicle
-    if doubtful := position_not_good(t):
+    if doubtful := position_lost(t) or position_doubtful(t):
         return Refusal(RefusalCode.POSITION_NOT_GOOD, doubtful)
     if odometry is None or height is None:
         return Refusal(RefusalCode.PLACE_NOT_KNOWN, "position or height is not known")

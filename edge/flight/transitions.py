@@ -10,14 +10,14 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
-from edge.core.position import PositionQuality
 from edge.core.vehicle import PILOTED, Action, Mode
 from edge.flight.alarms import (
     battery_below,
     battery_low,
     failsafe,
     ground_lost,
-    position_not_good,
+    position_doubtful,
+    position_lost,
     reason_if,
     remote_control_lost,
     too_close,
@@ -149,9 +149,7 @@ def _offboard_refused(t: Tick) -> str | None:
 
 
 def _position_lost(t: Tick) -> str | None:
-    position = t.inputs.position
-    lost = position.quality is PositionQuality.LOST and not t.silent
-    return reason_if(lost, f"position lost: {position.text}")
+    return None if t.silent else position_lost(t)
 
 
 def _on_ground(t: Tick) -> str | None:
@@ -252,8 +250,9 @@ def _arming_called_off(t: Tick) -> str | None:
         return "ground lost while arming"
     if t.safety_action != "none":
         return f"ground commands {t.safety_action} while arming"
-    if not t.knows_place and not t.silent:
-        return f"{position_not_good(t)}, while arming"
+    doubtful = position_lost(t) or position_doubtful(t)
+    if doubtful and not t.silent:
+        return f"{doubtful}, while arming"
     left = t.flight.reached and t.mode is not Mode.OFFBOARD
     return _lapse(t) or reason_if(left, f"the vehicle left offboard for {t.mode} while arming")
 

@@ -137,7 +137,7 @@ class ReasonCode(_Code):
     # What the robot notices.
     CONTROL_SILENT = "control_silent"
     POSITION_LOST = "position_lost"
-    POSITION_NOT_GOOD = "position_not_good"
+    POSITION_DOUBTFUL = "position_doubtful"
     BATTERY_CRITICAL = "battery_critical"
     BATTERY_LOW = "battery_low"
     BATTERY_NOT_KNOWN = "battery_not_known"

@@ -1,5 +1,6 @@
 """How commands speak to the ground, and what a person sees of it: who does what, then a table."""
 
+import dataclasses
 import json
 import sys
 import time
@@ -67,10 +68,11 @@ def show(
     """Print a command's report. Raises ValueError unless all did it."""
     if as_json:
         robots = {
-            r.robot: {"done": r.done, "text": r.text, **details.get(r.robot, {})}
+            r.robot: {"done": r.done, "code": r.code, "text": r.text, **details.get(r.robot, {})}
             for r in report.results
         }
-        print_json({"fleet": to.fleet, "problem": report.problem or None, "robots": robots})
+        problem = report.problem and dataclasses.asdict(report.problem)
+        print_json({"fleet": to.fleet, "problem": problem, "robots": robots})
     elif report.results:
         headings = list(dict.fromkeys(key for its in details.values() for key in its))
         rows: list[list[str | Text]] = [
@@ -83,8 +85,8 @@ def show(
             for r in report.results
         ]
         print_table(("robot", *headings, "result", ""), rows, headings)
-    if report.problem:
-        raise ValueError(f"{name}: {report.problem}")
+    if report.problem is not None:
+        raise ValueError(f"{name}: {report.problem.text}")
     failed = [r.robot for r in report.results if not r.done]
     if failed:
         count = len(report.results)

@@ -86,7 +86,7 @@ def use(
     site = sites.load(name)
     with looking(to) as subscriber, interruptible("site use"):
         report = take_site(to.fleet, site, subscriber.setup, to.robots)
-    if not report.problem:
+    if report.problem is None:
         sites.use(name)
     show(to, report, "site use", as_json=as_json, details={})
 

@@ -25,6 +25,7 @@ from lpac.ground.station.protocol import (
     Enable,
     NextTrial,
     Request,
+    ResultCode,
     Resume,
     RobotCommand,
     RobotResult,
@@ -550,7 +551,8 @@ class ScriptRun:
         report = self._command(Start((name,)))
         if not report.done:
             text = f"{name} is not started again: {_failures(report)}"
-            self._say_once((name, "not started"), text)
+            codes = (report.problem and report.problem.code, *map(_codes, report.results))
+            self._say_once((name, "not started", codes), text)
 
     def _perturb(self, perturbation: Perturbation) -> None:
         name = perturbation.robot
@@ -643,7 +645,9 @@ def take_site(
         ]
         failed = [result for result in its if not result.done]
         results.append(
-            failed[0] if failed else RobotResult(name, True, "has origin, fence and place")
+            failed[0]
+            if failed
+            else RobotResult(name, ResultCode.DONE, "has origin, fence and place")
         )
     return CommandReport(tuple(results))
 
@@ -653,8 +657,14 @@ def _require(report: CommandReport) -> None:
         raise ScriptError(_failures(report))
 
 
+def _codes(result: RobotResult) -> tuple[str | None, ...]:
+    return result.code, result.refusal
+
+
 def _failures(report: CommandReport) -> str:
-    return report.problem or "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)
+    if report.problem is not None:
+        return report.problem.text
+    return "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)
 
 
 def _asked(ground: GroundState | None, robot_id: int) -> str:

@@ -34,6 +34,8 @@ from lpac.ground.station.client import listen, send
 from lpac.ground.station.protocol import (
     CommandReport,
     Enable,
+    Problem,
+    ProblemCode,
     Request,
     Resume,
     SafetyCommand,
@@ -363,16 +365,16 @@ class LiveMap:
 
     async def _act(self, page: Outbox, action: str, robots: tuple[str, ...]) -> None:
         if not self._operate:
-            report = CommandReport(
-                problem="this map only observes: `lpac map --operate` can command"
-            )
+            text = "this map only observes: `lpac map --operate` can command"
+            report = CommandReport(problem=Problem(ProblemCode.MAY_NOT, text))
         elif action not in _ACTIONS:
-            report = CommandReport(problem="there is no such command here")
+            text = "there is no such command here"
+            report = CommandReport(problem=Problem(ProblemCode.NOT_UNDERSTOOD, text))
         else:
             try:
                 report = await send(self._fleet, _ACTIONS[action](robots))
             except (OSError, ValueError) as error:
-                report = CommandReport(problem=str(error))
+                report = CommandReport(problem=Problem(ProblemCode.NO_GROUND, str(error)))
         page.put_each(_text(report_view(action, report)))
 
     def _start(self, work: Any) -> None:

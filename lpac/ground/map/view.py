@@ -127,7 +127,10 @@ def detail_view(setup: FleetSetup, robot: RobotSnapshot) -> Json:
 
 def report_view(action: str, report: CommandReport) -> Json:
     """What came of an action."""
-    return {"kind": "report", "action": action, "done": report.done, **dataclasses.asdict(report)}
+    results = [{"done": result.done, **dataclasses.asdict(result)} for result in report.results]
+    problem = report.problem and dataclasses.asdict(report.problem)
+    said = {"done": report.done, "results": results, "problem": problem}
+    return {"kind": "report", "action": action, **said}
 
 
 @dataclass(slots=True)

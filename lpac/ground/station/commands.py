@@ -7,14 +7,17 @@ and yields whenever it has to wait for what comes next.
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
-from edge.messages.codes import FENCE_NOT_TAKEN, Reason, texts
+from edge.messages.codes import FENCE_NOT_TAKEN, Reason, Refusal, RefusalCode, texts
 from edge.messages.mission import FlightState, OrderKind, RobotStatus, is_too_low, world_id
 from lpac.ground.station.protocol import (
     CommandProgress,
     CommandReport,
     Enable,
     NextTrial,
+    Problem,
+    ProblemCode,
     Request,
+    ResultCode,
     Resume,
     RobotCommand,
     RobotResult,
@@ -29,7 +32,7 @@ from lpac.ground.station.protocol import (
 )
 from lpac.ground.station.station import COMMANDER_SILENT_S, Station, is_down, next_trial
 
-DEFECT = "a defect of lpac ground ended this command"
+DEFECT = Problem(ProblemCode.DEFECT, "a defect of lpac ground ended this command")
 
 _GATHER_S = 3.0
 # Until a robot has obeyed; then, until what it was told shows.
@@ -47,7 +50,10 @@ _START_AGAIN_S = 0.5
 _CLIMB_S = 90.0
 _LANDING_S = 120.0
 
-_S = FlightState
+_S, _C = FlightState, ResultCode
+
+_NOT_HEARD = _C.NOT_HEARD, "not heard"
+_NOT_ENABLED = "not enabled: `lpac mission enable`"
 
 Waits = Generator[None, None, None]
 # What a robot does in words, once it has done what it was told; None before.
@@ -55,7 +61,11 @@ Effect = Callable[[RobotStatus], str | None]
 
 
 class _ProblemError(Exception):
-    """Nothing of the command is done; the text says why."""
+    """Nothing of the command is done."""
+
+    def __init__(self, code: ProblemCode, text: str) -> None:
+        super().__init__(text)
+        self.problem = Problem(code, text)
 
 
 class CommandTask:
@@ -84,9 +94,10 @@ class CommandTask:
             next(self._steps)
         except StopIteration:
             self._end()
-        except _ProblemError as problem:
-            self.report = CommandReport(problem=str(problem))
-            self._station.tell("refusal", "", f"{self.text}: {problem}", self._station.operator)
+        except _ProblemError as error:
+            self.report = CommandReport(problem=error.problem)
+            text = f"{self.text}: {error.problem.text}"
+            self._station.tell("refusal", "", text, self._station.operator)
         except Exception:
             # It goes no further; the others, and the station, do.
             self.report = CommandReport(problem=DEFECT)
@@ -100,7 +111,7 @@ class CommandTask:
         if withdraw:
             for order_id in self._orders.values():
                 self._station.withdraw(order_id)
-        self._fail(self._open, f"abandoned: {why}")
+        self._fail(self._open, _C.ABANDONED, f"abandoned: {why}")
         self._end()
 
     def news(self) -> list[CommandProgress]:
@@ -113,14 +124,15 @@ class CommandTask:
         robots = station.setup.robots
         for name in self.names:
             if name not in robots:
-                raise _ProblemError(f"robot {name!r} is unknown; known are {', '.join(robots)}")
+                text = f"robot {name!r} is unknown; known are {', '.join(robots)}"
+                raise _ProblemError(ProblemCode.UNKNOWN_ROBOT, text)
         urgent = _is_everybodys(self.request) and not isinstance(self.request, TakeCommand)
         while not station.listened or not (urgent or self._are_gathered()):
             yield
         # Who sits in a slot is known only now.
         self.names = _addressed(station, self.request)
         if not self.names:
-            raise _ProblemError("no robot is named, or sits in a slot")
+            raise _ProblemError(ProblemCode.NO_ROBOT, "no robot is named, or sits in a slot")
         do, check = _DO[type(self.request)]
         try:
             self._refuse_observer()
@@ -147,8 +159,9 @@ class CommandTask:
             return
         silent = station.commander_age_s > COMMANDER_SILENT_S
         raise _ProblemError(
+            ProblemCode.OTHER_COMMANDS,
             f"{commander} commands the fleet{', and is silent' if silent else ''}: "
-            "`lpac mission command` takes over"
+            "`lpac mission command` takes over",
         )
 
     # Results
@@ -161,19 +174,28 @@ class CommandTask:
     def _say(self, robot: str, text: str) -> None:
         self._news.append(CommandProgress(robot, text))
 
-    def _settle(self, robot: str, text: str, *, done: bool = True) -> None:
-        self._results[robot] = RobotResult(robot, done, text)
+    def _settle(
+        self,
+        robot: str,
+        text: str,
+        code: ResultCode = ResultCode.DONE,
+        refusal: RefusalCode | None = None,
+    ) -> None:
+        self._results[robot] = RobotResult(robot, code, text, refusal)
         self._say(robot, text)
         self._station.tell(
-            "result" if done else "refusal",
+            "result" if code is _C.DONE else "refusal",
             robot,
             f"{self.text}: {text}",
             self._station.operator,
         )
 
-    def _fail(self, robots: Iterable[str], text: str) -> None:
+    def _fail(self, robots: Iterable[str], code: ResultCode, text: str) -> None:
         for robot in robots:
-            self._settle(robot, text, done=False)
+            self._settle(robot, text, code)
+
+    def _refuse(self, robot: str, refusal: Refusal) -> None:
+        self._settle(robot, refusal.text, _C.REFUSED, refusal.code)
 
     def _end(self) -> None:
         self.report = CommandReport(tuple(self._results[name] for name in self.names))
@@ -186,16 +208,17 @@ class CommandTask:
     def _heard(self) -> dict[str, RobotStatus]:
         """The open ones that are heard; the others have failed."""
         heard = {name: status for name in self._open if (status := self._status(name))}
-        self._fail([name for name in self._open if name not in heard], "not heard")
+        self._fail([name for name in self._open if name not in heard], *_NOT_HEARD)
         return heard
 
     def _obeys(self, status: RobotStatus, sequence: int = 0) -> bool:
         commander = self._station.commander
         return status.operator == commander and status.obeyed_sequence >= sequence
 
-    def _not_obeying(self, status: RobotStatus) -> str:
+    def _not_obeying(self, status: RobotStatus) -> tuple[ResultCode, str]:
         other = status.operator and status.operator != self._station.commander
-        return f"obeys {status.operator}" if other else "does not hear this station"
+        text = f"obeys {status.operator}" if other else "does not hear this station"
+        return _C.NOT_OBEYING, text
 
     def _ids(self) -> list[int]:
         return [self._station.setup.robots[name] for name in self.names]
@@ -213,7 +236,8 @@ class CommandTask:
         armed = [name for name in robots if (s := self._status(name)) and not is_down(s)]
         if armed:
             verb = "is" if len(armed) == 1 else "are"
-            raise _ProblemError(f"{', '.join(armed)} {verb} armed: land and disarm first")
+            text = f"{', '.join(armed)} {verb} armed: land and disarm first"
+            raise _ProblemError(ProblemCode.ARMED, text)
 
     def _take_up(self, sequence: int, effect: Effect, patience_s: float = _TAKE_UP_S) -> Waits:
         """Wait until each robot has obeyed that state, and has taken up what it says."""
@@ -225,19 +249,21 @@ class CommandTask:
             for name, status in heard.items():
                 if not self._obeys(status, sequence):
                     if now_s - began_s > _OBEY_S:
-                        self._fail([name], self._not_obeying(status))
+                        self._fail([name], *self._not_obeying(status))
                     continue
                 obeyed_s.setdefault(name, now_s)
                 how = effect(status)
                 if how is not None:
                     self._settle(name, how)
                 elif not assigned and status.state in _NOT_STEERED:
-                    self._fail([name], _why(status))
+                    self._fail([name], *_why(status))
                 elif now_s - obeyed_s[name] > patience_s:
-                    not_taken = texts(status.not_taken) if assigned else ""
+                    code, text = _why(status)
+                    if assigned and status.not_taken:
+                        code, text = _C.NOT_TAKEN_UP, texts(status.not_taken)
                     withdraw = isinstance(self.request, SetFence) and self.request.fence is not None
                     help_ = "; `lpac mission fence on` withdraws it" if withdraw else ""
-                    self._fail([name], f"{not_taken or _why(status)}{help_}")
+                    self._fail([name], code, f"{text}{help_}")
             if self._open:
                 yield
 
@@ -307,14 +333,14 @@ class CommandTask:
         seated: dict[int, str] = {}
         for name, place in request.places.items():
             if seated.setdefault(place.slot, name) != name:
-                raise _ProblemError(
-                    f"{seated[place.slot]} and {name} would share slot {place.slot}"
-                )
+                text = f"{seated[place.slot]} and {name} would share slot {place.slot}"
+                raise _ProblemError(ProblemCode.SLOT_SHARED, text)
 
     def _refuse_without_origin(self, request: Enable | Takeoff) -> None:
         state = self._station.state
         if (state is None or state.origin is None) and getattr(request, "on", True):
-            raise _ProblemError("no mission origin: set it with `lpac mission origin`")
+            text = "no mission origin: set it with `lpac mission origin`"
+            raise _ProblemError(ProblemCode.NO_ORIGIN, text)
 
     def _enable(self, request: Enable) -> Waits:
         station = self._station
@@ -356,12 +382,12 @@ class CommandTask:
                 if is_down(status):
                     self._settle(name, "on the ground")
                 elif status.state in _NOT_STEERED:
-                    self._fail([name], _why(status))
+                    self._fail([name], *_why(status))
                 elif known.get(name) != (status.state, status.reason):
                     known[name], changed_s = (status.state, status.reason), station.now_s
                     self._say(name, _state_in_words(status))
                 elif station.now_s - changed_s > _LANDING_S:
-                    self._fail([name], _why(status))
+                    self._fail([name], *_why(status))
             if self._open:
                 yield
 
@@ -372,7 +398,7 @@ class CommandTask:
             deaf = {n: s for n, s in heard.items() if not self._obeys(s, sequence)}
             if deaf and self._station.now_s > until_s:
                 for name, status in deaf.items():
-                    self._fail([name], self._not_obeying(status))
+                    self._fail([name], *self._not_obeying(status))
                 deaf = {}
             if not deaf:
                 return
@@ -386,12 +412,12 @@ class CommandTask:
         station.take_command()
         yield from self._obeyed()
         twice = [name for name in self._open if station.is_duplicate(name)]
-        self._fail(twice, "two programs say that they are this robot")
+        self._fail(twice, _C.DUPLICATE_ID, "two programs say that they are this robot")
 
     def _order(self, kind: OrderKind, name: str, trial: str = "") -> None:
         order_id = self._station.order(kind, name, trial)
         if order_id is None:
-            self._fail([name], "not heard")
+            self._fail([name], *_NOT_HEARD)
         else:
             self._orders[name] = order_id
 
@@ -401,9 +427,10 @@ class CommandTask:
             for name in self._open:
                 answer = self._station.results.get(self._orders[name])
                 if answer is not None:
-                    refusal = answer.refusal
-                    text = done if refusal is None else refusal.text
-                    self._settle(name, text, done=refusal is None)
+                    if answer.refusal is None:
+                        self._settle(name, done)
+                    else:
+                        self._refuse(name, answer.refusal)
             if self._open:
                 yield
 
@@ -422,13 +449,13 @@ class CommandTask:
     def _refuse_under_safety_action(self, _: Request) -> None:
         commanded = self._under_safety_action()
         if len(commanded) == len(self.names):
-            raise _ProblemError(commanded[self.names[0]])
+            raise _ProblemError(ProblemCode.UNDER_SAFETY_ACTION, commanded[self.names[0]])
 
     def _check_takeoff(self, request: Takeoff) -> None:
         self._refuse_without_origin(request)
         state = self._station.state
         if state is not None and not any(map(state.enabled_for, self._ids())):
-            raise _ProblemError("not enabled: `lpac mission enable`")
+            raise _ProblemError(ProblemCode.NOT_ENABLED, _NOT_ENABLED)
         if not self._brought_down(self.names):
             self._refuse_under_safety_action(request)
 
@@ -453,7 +480,7 @@ class CommandTask:
             whole = self._brought_down(station.setup.robots)
             station.safety_action("none", None if whole else self._ids())
         for name, why in self._under_safety_action().items():
-            self._fail([name], why)
+            self._fail([name], _C.UNDER_SAFETY_ACTION, why)
         yield from self._reach()
         self._settle_who_does_not_take_off()
         waiting = sorted(self._open, key=self._height_m)
@@ -463,7 +490,7 @@ class CommandTask:
             self._look_at_climbs(ordered_s)
             failed = [result.robot for result in self._results.values() if not result.done]
             if failed and request.abort_on_failure:
-                self._fail(waiting, f"not ordered: {failed[0]} failed")
+                self._fail(waiting, _C.NOT_ORDERED, f"not ordered: {failed[0]} failed")
                 waiting.clear()
             # The highest first: it climbs past nobody.
             if waiting and station.status(waiting[-1]) is None:
@@ -484,11 +511,11 @@ class CommandTask:
             if status.state in (_S.HOLD, _S.MISSION):
                 self._settle_up(name, status, f"already in the air, in {status.state}")
             elif not self._is_enabled(name):
-                self._fail([name], "not enabled: `lpac mission enable`")
+                self._fail([name], _C.NOT_ENABLED, _NOT_ENABLED)
             elif status.state in _NOT_STEERED:
-                self._fail([name], _why(status))
+                self._fail([name], *_why(status))
             elif not status.ready:
-                self._say(name, _why(status))
+                self._say(name, _why(status)[1])
 
     def _is_enabled(self, name: str) -> bool:
         state = self._station.state
@@ -502,7 +529,7 @@ class CommandTask:
         """Whether it was ordered, as the robot is ready; None if that is to be waited for."""
         status = self._status(name)
         if status is None:
-            self._fail([name], "not heard")
+            self._fail([name], *_NOT_HEARD)
         elif self._station.status(name) is None:
             return None
         elif status.state is _S.PREFLIGHT and status.ready:
@@ -510,7 +537,7 @@ class CommandTask:
             self._say(name, "takes off")
             return True
         elif late:
-            self._fail([name], _why(status))
+            self._fail([name], *_why(status))
         else:
             return None
         return False
@@ -526,25 +553,25 @@ class CommandTask:
         answer = self._station.results.get(self._orders[name])
         late = self._station.now_s - ordered_s > _CLIMB_S
         if answer is not None and answer.refusal is not None:
-            self._fail([name], answer.refusal.text)
+            self._refuse(name, answer.refusal)
         elif status is None:
-            self._fail([name], "not heard")
+            self._fail([name], *_NOT_HEARD)
         elif late or (answer is not None and status.state not in _CLIMBING):
             if status.state in (_S.HOLD, _S.MISSION):
                 self._settle_up(name, status, status.reason.text)
             else:
-                self._fail([name], _state_in_words(status))
+                self._fail([name], _C.WRONG_STATE, _state_in_words(status))
 
     def _settle_up(self, name: str, status: RobotStatus, text: str) -> None:
         """Settle who has taken off; who was held up on its way is too low for a mission."""
         low = status.state is _S.HOLD and is_too_low(status)
         if low:
             text += f"; below its height of {status.slot_height_m:g} m: land all, then take off"
-        self._settle(name, text, done=not low)
+        self._settle(name, text, _C.TOO_LOW if low else _C.DONE)
 
     def _start(self, _: Start) -> Waits:
         for name, why in self._under_safety_action().items():
-            self._fail([name], why)
+            self._fail([name], _C.UNDER_SAFETY_ACTION, why)
         yield from self._reach()
         state = self._station.state
         trial = state.trial if state is not None and state.trial else next_trial("")
@@ -555,23 +582,26 @@ class CommandTask:
         """Order it; again, for a while, if a robot refuses because of the moment."""
         until_s = self._station.now_s + _START_S
         again_s: dict[str, float] = {}
-        refusals: dict[str, str] = {}
+        refusals: dict[str, Refusal] = {}
         while heard := self._heard():
             now_s = self._station.now_s
             for name, status in heard.items():
                 order_id = self._orders.get(name, "")
                 answer = self._station.results.get(order_id)
                 if answer is not None and answer.refusal is not None:
-                    refusals[name] = answer.refusal.text
+                    refusals[name] = answer.refusal
                     again_s[name] = now_s + _START_AGAIN_S
                     order_id = ""
                     del self._orders[name]
                 if status.state is _S.MISSION and status.trial == trial:
                     self._settle(name, f"flies the mission, trial {trial}")
                 elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
-                    rule = "" if status.state is _S.HOLD else "start is from hold: "
-                    why = f"{rule}{_why(status)}"
-                    self._fail([name], refusals.get(name, why))
+                    if name in refusals:
+                        self._refuse(name, refusals[name])
+                    else:
+                        rule = "" if status.state is _S.HOLD else "start is from hold: "
+                        code, text = _why(status)
+                        self._fail([name], code, f"{rule}{text}")
                 elif self._station.status(name) is None:
                     until_s = now_s + _START_S
                 elif not order_id and status.state is _S.HOLD and now_s >= again_s.get(name, 0.0):
@@ -590,7 +620,7 @@ class CommandTask:
             if is_down(status):
                 self._settle(name, "on the ground")
             elif status.state not in (_S.HOLD, _S.MISSION):
-                self._fail([name], _state_in_words(status))
+                self._fail([name], _C.WRONG_STATE, _state_in_words(status))
             elif not trial or status.trial != trial:
                 self._settle(name, "holds: it has not begun this trial; `lpac mission start`")
         yield from self._order_start(trial)
@@ -636,7 +666,8 @@ class CommandTask:
         flying = [n for n in robots if (s := self._status(n)) and s.state is _S.MISSION]
         if flying:
             verb = "flies" if len(flying) == 1 else "fly"
-            raise _ProblemError(f"{', '.join(flying)} {verb} the mission: hold or land first")
+            text = f"{', '.join(flying)} {verb} the mission: hold or land first"
+            raise _ProblemError(ProblemCode.ON_MISSION, text)
 
     def _again(self, request: NextTrial) -> Waits:
         yield from self._reach()
@@ -658,7 +689,7 @@ class CommandTask:
                 if self._obeys(status):
                     self._settle(name, f"obeys {station.operator}")
                 elif station.now_s > until_s:
-                    self._fail([name], self._not_obeying(status))
+                    self._fail([name], *self._not_obeying(status))
             if self._open:
                 yield
 
@@ -802,16 +833,17 @@ def _obeying_words(safety_action: str) -> Effect:
     return effect
 
 
-def _why(status: RobotStatus) -> str:
+def _why(status: RobotStatus) -> tuple[ResultCode, str]:
     """What keeps a robot from what it was told, and what helps."""
     text = _state_in_words(status)
     if status.state is _S.PILOT:
-        return f"{text}; `lpac mission rejoin` takes it back"
+        return _C.WRONG_STATE, f"{text}; `lpac mission rejoin` takes it back"
     if status.state is _S.FAULT and status.armed is False:
-        return f"{text}; look at it, then `lpac fleet restart`"
+        return _C.WRONG_STATE, f"{text}; look at it, then `lpac fleet restart`"
     if status.state is _S.PREFLIGHT and not status.ready:
-        return f"not ready: {texts(status.failed_checks) or 'the checks are still running'}"
-    return text
+        checks = texts(status.failed_checks) or "the checks are still running"
+        return _C.NOT_READY, f"not ready: {checks}"
+    return _C.WRONG_STATE, text
 
 
 def _state_in_words(status: RobotStatus) -> str:

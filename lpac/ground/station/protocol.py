@@ -13,6 +13,7 @@ rest as it happens, until the client leaves.
 
 import re
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Literal, TypeVar
 
 import msgspec
@@ -20,6 +21,7 @@ import msgspec
 from edge.core.fence import Fence
 from edge.core.world import MOST_FEATURES, parse_world
 from edge.messages.codec import MessageError, decode, encode
+from edge.messages.codes import RefusalCode
 from edge.messages.mission import Origin, Place
 from edge.messages.topics import WORLD
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
@@ -188,29 +190,76 @@ class CommandProgress:
     text: str
 
 
+class ResultCode(StrEnum):
+    """What came of a command for one robot."""
+
+    DONE = "done"
+    NOT_HEARD = "not_heard"
+    DUPLICATE_ID = "duplicate_id"
+    NOT_OBEYING = "not_obeying"
+    NOT_TAKEN_UP = "not_taken_up"
+    NOT_ENABLED = "not_enabled"
+    NOT_READY = "not_ready"
+    UNDER_SAFETY_ACTION = "under_safety_action"
+    WRONG_STATE = "wrong_state"
+    TOO_LOW = "too_low"
+    REFUSED = "refused"
+    NOT_ORDERED = "not_ordered"
+    ABANDONED = "abandoned"
+
+
 @dataclass(frozen=True, slots=True)
 class RobotResult:
-    """What one robot did; `text` is how, or why not."""
+    """What one robot did; `text` is how, or why not. `refusal` is of an order that it refused."""
 
     robot: str
-    done: bool
+    code: ResultCode
+    text: str
+    refusal: RefusalCode | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether it did it."""
+        return self.code is ResultCode.DONE
+
+
+class ProblemCode(StrEnum):
+    """Why nothing of a command was done."""
+
+    NOT_UNDERSTOOD = "not_understood"
+    NO_GROUND = "no_ground"
+    DEFECT = "defect"
+    MAY_NOT = "may_not"
+    OTHER_COMMANDS = "other_commands"
+    UNKNOWN_ROBOT = "unknown_robot"
+    NO_ROBOT = "no_robot"
+    NO_ORIGIN = "no_origin"
+    NOT_ENABLED = "not_enabled"
+    UNDER_SAFETY_ACTION = "under_safety_action"
+    ARMED = "armed"
+    ON_MISSION = "on_mission"
+    SLOT_SHARED = "slot_shared"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Why nothing of a command was done, and what helps."""
+
+    code: ProblemCode
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class CommandReport:
-    """The end of a command: each addressed robot's result, and what concerns no single one.
-
-    `problem` is "" unless nothing was done at all.
-    """
+    """The end of a command: each addressed robot's result, or why nothing was done at all."""
 
     results: tuple[RobotResult, ...] = ()
-    problem: str = ""
+    problem: Problem | None = None
 
     @property
     def done(self) -> bool:
         """Whether every addressed robot did it."""
-        return not self.problem and all(result.done for result in self.results)
+        return self.problem is None and all(result.done for result in self.results)
 
 
 ServerMessage = (

@@ -27,6 +27,8 @@ from lpac.ground.station.protocol import (
     SUBSCRIBE,
     CommandProgress,
     CommandReport,
+    Problem,
+    ProblemCode,
     ServerMessage,
     request_from_line,
     to_line,
@@ -299,7 +301,9 @@ class GroundProcess:
         try:
             request = request_from_line(line)
         except MessageError as error:
-            writer.write(to_line(CommandReport(problem=str(error))))
+            writer.write(
+                to_line(CommandReport(problem=Problem(ProblemCode.NOT_UNDERSTOOD, str(error))))
+            )
             return
         self._station.set_time(time.monotonic(), time.time())
         try:

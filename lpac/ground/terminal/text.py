@@ -181,8 +181,8 @@ def lost(setup: FleetSetup | None, text: str, lost_s: float, width: int) -> list
 
 def outcome(word: str, report: CommandReport) -> Span:
     """Who did it, and first who did not and why."""
-    if report.problem:
-        return Span(f"{word} NOT DONE: {report.problem}", "critical")
+    if report.problem is not None:
+        return Span(f"{word} NOT DONE: {report.problem.text}", "critical")
     who: dict[tuple[bool, str], list[str]] = {}
     for result in report.results:
         who.setdefault((result.done, result.text), []).append(result.robot)

@@ -8,7 +8,10 @@ from edge.messages.mission import FlightState, Place
 from lpac.ground.station.protocol import (
     Enable,
     NextTrial,
+    Problem,
+    ProblemCode,
     Request,
+    ResultCode,
     Resume,
     RobotCommand,
     SafetyCommand,
@@ -20,7 +23,8 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from tests.pretend import ORIGIN
-from tests.sim.ground.test_station import OTHER_WORLD, WORLD, Field, a_field, pad_m, why_not
+from tests.said import not_done, problem
+from tests.sim.ground.test_station import OTHER_WORLD, WORLD, Field, a_field, pad_m
 
 _S = FlightState
 TAKEOFF = Takeoff(interval_s=0.0)
@@ -44,8 +48,8 @@ def test_a_hold_on_the_ground_is_not_withdrawn_by_takeoff(by: str) -> None:
     field.done(SafetyCommand("hold"), by)
     field.run(1.0)
     who = "" if by == "alice" else " by bob"
-    refusal = f"hold is commanded{who}: `lpac mission resume` withdraws it"
-    assert field.do(TAKEOFF).problem == refusal
+    text = f"hold is commanded{who}: `lpac mission resume` withdraws it"
+    assert field.do(TAKEOFF).problem == Problem(ProblemCode.UNDER_SAFETY_ACTION, text)
     field.run(5.0)
     assert field.states() == {_S.PREFLIGHT}
     field.done(Resume())
@@ -57,9 +61,7 @@ def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> No
     field = two_stations()
     field.done(SafetyCommand("hold", robots=("r1",)), "bob")
     field.run(1.0)
-    assert why_not(field.do(TAKEOFF)) == {
-        "r1": "hold is commanded by bob: `lpac mission resume` withdraws it"
-    }
+    assert not_done(field.do(TAKEOFF)) == {"r1": ResultCode.UNDER_SAFETY_ACTION}
     field.done(SafetyCommand("land", robots=("r0", "r2"), wait=True))
     field.done(Takeoff(robots=("r0",)))
     state = field.stations["alice"].state
@@ -67,7 +69,7 @@ def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> No
     assert state.robot_safety_actions == {"1": "hold", "2": "land"}
     # Asked of all, it is as if all were to be set in motion.
     field.done(SafetyCommand("land", robots=("r0",), wait=True))
-    assert "`lpac mission resume` withdraws it" in field.do(TAKEOFF).problem
+    assert problem(field.do(TAKEOFF)) is ProblemCode.UNDER_SAFETY_ACTION
 
 
 def test_who_is_not_heard_may_be_in_the_air() -> None:
@@ -76,7 +78,7 @@ def test_who_is_not_heard_may_be_in_the_air() -> None:
     field.done(SafetyCommand("land", wait=True))
     field.robots[1].silent = True
     field.run(12.0)
-    assert "land is commanded" in field.do(TAKEOFF).problem
+    assert problem(field.do(TAKEOFF)) is ProblemCode.UNDER_SAFETY_ACTION
     # Who is heard may be asked for by name; the other is to land, still.
     field.done(Takeoff(interval_s=0.0, robots=("r0", "r2")))
     state = field.stations["alice"].state
@@ -130,7 +132,8 @@ def test_who_is_not_addressed_keeps_what_it_has(request_: Request) -> None:
     field.make_ready()
     field.done(Takeoff(robots=("r1",)))
     before = field.stations["alice"].state
-    assert field.do(request_).problem == "r1 is armed: land and disarm first"
+    text = "r1 is armed: land and disarm first"
+    assert field.do(request_).problem == Problem(ProblemCode.ARMED, text)
     assert field.stations["alice"].state == before
 
 
@@ -151,7 +154,7 @@ def test_the_fleets_world_is_made_known_at_any_time() -> None:
     field.run(1.0)
     assert not bob.setup.world
     before = field.stations["alice"].state
-    assert "alice commands the fleet" in field.do(SetWorld(WORLD, "w"), "bob").problem
+    assert problem(field.do(SetWorld(WORLD, "w"), "bob")) is ProblemCode.OTHER_COMMANDS
     field.done(SetWorld(OTHER_WORLD, "w"), "bob")
     assert bob.setup.world == OTHER_WORLD
     assert field.stations["alice"].state == before
@@ -181,7 +184,7 @@ def test_who_took_over_is_not_robbed_of_the_command() -> None:
         taken = field.begin(TakeCommand(), "bob")
         field.run(1.0)
         assert waiting.report is not None
-        assert why_not(waiting.report)["r0"] == "abandoned: bob commands the fleet"
+        assert not_done(waiting.report)["r0"] is ResultCode.ABANDONED
         robot.deaf = False
         field.until(lambda taken=taken: taken.report)
         field.run(15.0)
@@ -246,7 +249,7 @@ def test_who_is_told_to_hold_goes_nowhere_if_resume_is_abandoned(by: str) -> Non
     field.done(SafetyCommand("hold"), by)
     field.run(1.0)
     assert resume.report is not None
-    assert set(why_not(resume.report)) == {"r0", "r1", "r2"}
+    assert set(not_done(resume.report)) == {"r0", "r1", "r2"}
     field.run(5.0)
     assert field.states() == {_S.HOLD}
 
@@ -269,13 +272,15 @@ def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
 def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
     field = two_stations()
     field.done(RobotCommand("kill", ("r1",)))
+    report = field.do(Enable())
+    assert not_done(report) == {"r1": ResultCode.WRONG_STATE}
     why = "fault: killed by the operator; look at it, then `lpac fleet restart`"
-    assert why_not(field.do(Enable())) == {"r1": why}
+    assert report.results[1].text == why
     assert field.done(SafetyCommand("land", wait=True))
     field.done(Resume())
     abort = replace(TAKEOFF, abort_on_failure=True)
-    assert why_not(field.do(abort)) == {
-        "r1": why, "r0": "not ordered: r1 failed", "r2": "not ordered: r1 failed",
+    assert not_done(field.do(abort)) == {
+        "r1": ResultCode.WRONG_STATE, "r0": ResultCode.NOT_ORDERED, "r2": ResultCode.NOT_ORDERED,
     }  # fmt: skip
     assert field.robots[0].state is field.robots[2].state is _S.PREFLIGHT
 
@@ -284,15 +289,15 @@ def test_who_is_not_ready_is_not_done_with_enable() -> None:
     field = a_field()
     field.robots[2].refuses = "GPS: 4 satellites"
     field.done(SetOrigin(ORIGIN))
-    assert why_not(field.do(Enable())) == {"r2": "not ready: GPS: 4 satellites"}
+    assert not_done(field.do(Enable())) == {"r2": ResultCode.NOT_READY}
 
 
 def test_who_is_not_enabled_is_not_waited_for() -> None:
     field = a_field()
     field.done(SetOrigin(ORIGIN))
     field.done(Enable(robots=("r0",)))
-    refused = "not enabled: `lpac mission enable`"
-    assert why_not(field.do(TAKEOFF)) == {"r1": refused, "r2": refused}
+    refused = ResultCode.NOT_ENABLED
+    assert not_done(field.do(TAKEOFF)) == {"r1": refused, "r2": refused}
 
 
 def test_two_holds_at_once_are_both_done() -> None:
@@ -311,8 +316,9 @@ def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
     field = a_field()
     field.fly()
     field.done(SafetyCommand("hold", robots=("r0",)))
-    problem = field.do(NextTrial(robots=("r0",))).problem
-    assert problem == "r1, r2 fly the mission: hold or land first"
+    text = "r1, r2 fly the mission: hold or land first"
+    told = field.do(NextTrial(robots=("r0",))).problem
+    assert told == Problem(ProblemCode.ON_MISSION, text)
 
 
 def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -323,5 +329,5 @@ def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.Monke
     with pytest.raises(ZeroDivisionError):
         field.commands["alice"].step()
     assert hold.report is not None
-    assert hold.report.problem == "a defect of lpac ground ended this command"
+    assert problem(hold.report) is ProblemCode.DEFECT
     field.done(SafetyCommand("land", wait=True))

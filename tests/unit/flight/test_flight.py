@@ -1117,7 +1117,7 @@ def test_a_lost_position_stops_and_then_lands(world: World) -> None:
     world.fly()
     world.position_known = False
     world.run(0.6)
-    doubtful = Reason(ReasonCode.POSITION_NOT_GOOD, "position doubtful: GPS has no fix")
+    doubtful = Reason(ReasonCode.POSITION_DOUBTFUL, "position doubtful: GPS has no fix")
     assert doubtful in world.tick().alarms
     world.run(1.0)
     assert world.state() is FlightState.MISSION
@@ -1192,7 +1192,7 @@ def test_a_position_in_doubt_is_stood_still_by(world: World, state: FlightState)
     assert world.state() is state
     assert world.speed_m_s < 0.1
     text = "position doubtful: GPS is accurate to 7.0 m only"
-    assert Reason(ReasonCode.POSITION_NOT_GOOD, text) in world.tick().alarms
+    assert Reason(ReasonCode.POSITION_DOUBTFUL, text) in world.tick().alarms
     # The numbers may be another place's now: it is not flown to.
     place_m = world.position_m.copy()
     world.position_m[0] += 5.0

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from edge.core.perception import EXPLORED_CELLS
 from edge.core.world import MOST_FEATURES, format_world, random_features
 from edge.messages.codec import MessageError
-from edge.messages.mission import GroundState, Place, explored_from_bytes, explored_to_bytes
+from edge.messages.codes import RefusalCode
+from edge.messages.mission import (
+    FlightState,
+    GroundState,
+    Place,
+    explored_from_bytes,
+    explored_to_bytes,
+)
 from lpac.analysis.snapshot import (
     Explored,
     FleetSetup,
@@ -25,7 +32,10 @@ from lpac.ground.station.protocol import (
     CommandReport,
     Enable,
     NextTrial,
+    Problem,
+    ProblemCode,
     Request,
+    ResultCode,
     Resume,
     RobotCommand,
     RobotResult,
@@ -65,11 +75,14 @@ TOLD: tuple[ServerMessage, ...] = (
           "Uniform 0 0\n", "abc", "bundle", 512, 64, 128.0, 16.0, 2.0, 1.0),
     FleetSnapshot(1e9, "me", GroundState(4, "me", ORIGIN, robot_safety_actions={"1": "hold"}),
             (status_snapshot(), RobotSnapshot("r2", 2)), ("takeoff",), 0.4),
-    GroundEvent(1e9, "state", "r1", "hold: ground commands hold", "me", "t1"),
+    GroundEvent(1e9, "state", "r1", "hold: ground commands hold", "me", "t1", FlightState.HOLD),
     Explored("r1", base64.b64encode(bytes(512)).decode()),
     CommandProgress("r1", "takes off"),
-    CommandReport((RobotResult("r1", True, "ready"), RobotResult("r2", False, "not heard"))),
-    CommandReport(problem="no mission origin"),
+    CommandReport(
+        (RobotResult("r1", ResultCode.DONE, "ready"),
+         RobotResult("r2", ResultCode.REFUSED, "expired", RefusalCode.EXPIRED))
+    ),
+    CommandReport(problem=Problem(ProblemCode.NO_ORIGIN, "no mission origin")),
 )  # fmt: skip
 
 
@@ -165,10 +178,11 @@ def test_a_world_of_more_features_than_robots_take() -> None:
 
 
 def test_a_report_is_done_when_every_robot_is() -> None:
-    ready, refused = RobotResult("r1", True, "ready"), RobotResult("r2", False, "not heard")
+    ready = RobotResult("r1", ResultCode.DONE, "ready")
+    refused = RobotResult("r2", ResultCode.NOT_HEARD, "not heard")
     assert CommandReport((ready,)).done
     assert not CommandReport((ready, refused)).done
-    assert not CommandReport(problem="not enabled").done
+    assert not CommandReport(problem=Problem(ProblemCode.NOT_ENABLED, "not enabled")).done
 
 
 def test_explored_maps_survive() -> None:

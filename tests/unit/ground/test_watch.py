@@ -14,6 +14,9 @@ from lpac.analysis.snapshot import RobotSnapshot
 from lpac.ground.alarms import Alarm, AlarmCode, alarms
 from lpac.ground.station.protocol import (
     CommandReport,
+    Problem,
+    ProblemCode,
+    ResultCode,
     RobotResult,
 )
 from lpac.ground.terminal.lines import Line, age, fit, number, some
@@ -137,14 +140,18 @@ def test_alarms_of_many_robots_with_one_text_are_one_line() -> None:
 
 def test_outcome_says_first_who_did_not() -> None:
     report = CommandReport(
-        (RobotResult("r1", True, "holds"), RobotResult("r2", False, "does not answer"))
+        (
+            RobotResult("r1", ResultCode.DONE, "holds"),
+            RobotResult("r2", ResultCode.REFUSED, "does not answer"),
+        )
     )
     assert outcome("hold", report) == ("hold: NOT r2: does not answer; r1: holds", "critical")
-    everybody = CommandReport(tuple(RobotResult(f"r{i}", True, "holds") for i in range(30)))
-    assert outcome("hold", everybody) == ("hold: all 30: holds", "good")
-    assert (
-        outcome("land", CommandReport(problem="bob commands")).text == "land NOT DONE: bob commands"
+    everybody = CommandReport(
+        tuple(RobotResult(f"r{i}", ResultCode.DONE, "holds") for i in range(30))
     )
+    assert outcome("hold", everybody) == ("hold: all 30: holds", "good")
+    nothing = CommandReport(problem=Problem(ProblemCode.OTHER_COMMANDS, "bob commands"))
+    assert outcome("land", nothing).text == "land NOT DONE: bob commands"
 
 
 def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:

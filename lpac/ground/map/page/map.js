@@ -186,7 +186,7 @@ function answer(yes) {
 
 function showReport({ action, done, results, problem: why }) {
   const refused = groups(results.filter((r) => !r.done), ({ text }) => text);
-  const lines = why ? [why] : [];
+  const lines = why ? [why.text] : [];
   const did = results.filter((r) => r.done).map((r) => r.robot);
   if (did.length && !done) lines.push(`${did.join(", ")}: done`);
   for (const [text, some] of refused) lines.push(`${some.map((r) => r.robot).join(", ")}: ${text}`);
