@@ -5,8 +5,8 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup test lint bench export image lock deploy start stop status fleet-demo screenshots \
-	clean
+.PHONY: help demo fly setup check test lint hooks bench export image lock deploy start stop \
+	status fleet-demo screenshots clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -20,13 +20,22 @@ fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly si
 
 setup: .venv/sim .venv/export .venv/fleet .venv/ground ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control
 
-test: lint ## style, types, and every test
-	.venv/bin/pytest
+# Those that wait for nothing run beside each other, the others fly in real time: one by one.
+QUICK := .venv/bin/pytest --numprocesses auto tests/unit tests/sim
 
-lint: .venv/test ## style and strict types
+check: lint ## style, types, and the quick tests: what a commit has to pass, in two minutes
+	$(QUICK)
+
+test: lint ## style, types, and every test; as root with real robot hosts too: half an hour
+	$(QUICK); quick=$$?; .venv/bin/pytest tests/process tests/host && exit $$quick
+
+lint: .venv/test ## style, and strict types of the product and its tests
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+
+hooks: .venv/test ## each git commit then checks style and types of what it holds
+	.venv/bin/pre-commit install
 
 bench: .venv/test ## measure against torch: a table, and out/bench/*.json
 	$(RUN) bench
