@@ -45,7 +45,7 @@ from edge.messages.bounds import (
     UnixSeconds,
     bounds_of,
 )
-from edge.messages.codes import FailedCheck, Reason, Refusal
+from edge.messages.codes import FailedCheck, Reason, ReasonCode, Refusal
 
 # Of what is said now. A message of another version is taken as far as it can be; see the codec.
 VERSION = 3
@@ -62,6 +62,8 @@ FailedChecks = Annotated[tuple[FailedCheck, ...], Meta(max_length=MOST_TEXTS)]
 Point = tuple[Metres, Metres]
 Vector = tuple[Metres, Metres, Metres]
 _OfRobots = Meta(max_length=MOST_ROBOTS)
+_OfTexts = Meta(max_length=MOST_TEXTS)
+_NO_REASON = Reason(ReasonCode.OTHER, "")
 
 
 class FlightState(StrEnum):
@@ -272,30 +274,30 @@ class RobotStatus:
     uptime_s: Seconds
     unix_time_s: UnixSeconds
     state: FlightState
-    reason: Reason
-    ready: bool
-    failed_checks: FailedChecks
-    alarms: Annotated[tuple[Reason, ...], Meta(max_length=MOST_TEXTS)]
-    obeyed_sequence: Sequence
-    operator: Name
-    orders: Annotated[tuple[OrderResult, ...], Meta(max_length=MOST_TEXTS)]
-    bundle_id: Name
-    world_id: Name
-    trial: Name
-    origin: Origin | None
-    system_id: SystemId | None
     slot_height_m: Metres
     landing_point_m: tuple[Metres, ...]
-    position_m: Vector | None
-    velocity_m_s: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] | None
-    heading_rad: Radians | None
-    mode: Name | None
-    armed: bool | None
-    battery: Share | None
-    satellites: Count | None
-    message_counts: Annotated[dict[Name, Count], Meta(max_length=MOST_TEXTS)]
-    neighbour_ages_s: Annotated[dict[RobotKey, Seconds], _OfRobots]
-    loops: Annotated[dict[Name, LoopStatus], Meta(max_length=MOST_TEXTS)]
+    reason: Reason = _NO_REASON
+    ready: bool = False
+    failed_checks: FailedChecks = ()
+    alarms: Annotated[tuple[Reason, ...], Meta(max_length=MOST_TEXTS)] = ()
+    obeyed_sequence: Sequence = -1
+    operator: Name = ""
+    orders: Annotated[tuple[OrderResult, ...], Meta(max_length=MOST_TEXTS)] = ()
+    bundle_id: Name = ""
+    world_id: Name = ""
+    trial: Name = ""
+    origin: Origin | None = None
+    system_id: SystemId | None = None
+    position_m: Vector | None = None
+    velocity_m_s: tuple[MetresPerSecond, MetresPerSecond, MetresPerSecond] | None = None
+    heading_rad: Radians | None = None
+    mode: Name | None = None
+    armed: bool | None = None
+    battery: Share | None = None
+    satellites: Count | None = None
+    message_counts: Annotated[dict[Name, Count], _OfTexts] = field(default_factory=dict)
+    neighbour_ages_s: Annotated[dict[RobotKey, Seconds], _OfRobots] = field(default_factory=dict)
+    loops: Annotated[dict[Name, LoopStatus], _OfTexts] = field(default_factory=dict)
     fence: Fence | None = None
     not_taken: FailedChecks = ()
     in_air: bool | None = None

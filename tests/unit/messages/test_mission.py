@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from edge.core.fence import Fence
 from edge.messages.codec import MessageError, decode, encode
+from edge.messages.codes import CheckCode, ReasonCode
 from edge.messages.mission import (
     VERSION,
     FlightState,
@@ -200,3 +202,34 @@ def test_hold_land_and_kill_never_change_their_form() -> None:
     assert decode(KillForm, encode(order)).robot_id == order.robot_id
     with pytest.raises(MessageError, match="Invalid enum value 'start'"):
         decode(KillForm, encode(ORDER))
+
+
+RECORDED = Path(__file__).parent / "recorded"
+
+
+def recorded(name: str) -> bytes:
+    """What a program of the version in its name sent; a newer one's is what it might send."""
+    return (RECORDED / f"{name}.json").read_bytes()
+
+
+def test_what_was_recorded_of_this_version_is_what_it_says() -> None:
+    for name, message in (("status-3", STATUS), ("state-3", STATE), ("order-3", ORDER)):
+        assert decode(type(message), recorded(name)) == message
+        assert json.loads(encode(message)).keys() == json.loads(recorded(name)).keys()
+
+
+def test_what_a_newer_program_says_is_understood_as_far_as_it_can_be() -> None:
+    status = decode(RobotStatus, recorded("status-4"))
+    assert (status.state, status.position_m) == (STATUS.state, STATUS.position_m)
+    assert (status.reason.code, status.reason.text) == (ReasonCode.OTHER, "the gust has passed")
+    (check,) = status.failed_checks
+    assert (check.code, check.settles_by_itself) == (CheckCode.OTHER, True)
+    assert status.hdop is None and status.neighbour_messages == {}
+    assert decode(GroundState, recorded("state-4")) == dataclasses.replace(STATE, version=4)
+    assert decode(Order, recorded("order-4")) == dataclasses.replace(ORDER, version=4)
+    with pytest.raises(MessageError, match="no_fly: this program is too old to know"):
+        decode(GroundState, recorded("state-4-must"))
+    assert decode(SafetyForm, recorded("state-4-must")).safety_action == "land"
+    with pytest.raises(MessageError, match="height_m: this program is too old to know"):
+        decode(Order, recorded("kill-4-must"))
+    assert decode(KillForm, recorded("kill-4-must")).robot_id == ORDER.robot_id
