@@ -1,6 +1,5 @@
 """One robot's program as a real process, its vehicle, and the ground that commands it."""
 
-import json
 import math
 import os
 import signal
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from edge.core.world import format_world, random_features
 from edge.messages.codes import ReasonCode, Refusal, RefusalCode
@@ -83,11 +83,8 @@ def write_config(folder: Path, *, url: str, endpoint: str, changes: Changes | No
             top |= keys
         else:
             tables[name] = tables.get(name, {}) | keys
-    lines = [f"{key} = {json.dumps(value)}" for key, value in top.items()]
-    for name, keys in tables.items():
-        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())]
     path = folder / "robot.toml"
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text(tomlkit.dumps(top | tables))
     return path
 
 

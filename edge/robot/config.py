@@ -24,6 +24,37 @@ from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightParameters, RemoteControlLost, Robot
 from edge.robot.pac import PacParameters, PayloadType
 
+# What fleet.toml has too. Each raises ValueError, one line that says what is allowed.
+
+
+def require_name(key: str, name: str) -> None:
+    """Of a fleet, a robot, a site: a part of radio keys and of file names."""
+    if re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,31}", name) is None:
+        raise ValueError(
+            f"{key}{name!r}: must be 1 to 32 letters, digits, '-' and '_', and not start with '-'"
+        )
+
+
+def require_robot_id(robot_id: int) -> None:
+    """Of one robot in its fleet."""
+    if not 0 <= robot_id <= MAX_ROBOT_ID:
+        raise ValueError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
+
+
+def require_system_id(system_id: int) -> None:
+    """PX4's MAV_SYS_ID."""
+    if not 1 <= system_id <= 255:
+        raise ValueError(f"system_id = {system_id}: must be from 1 to 255")
+
+
+def require_url(key: str, url: str) -> None:
+    """Where PX4's datagrams come in."""
+    match = re.fullmatch(r"udpin://[^:/]+:(\d{1,5})", url)
+    if match is None:
+        raise ValueError(f"{key} = {url!r}: must be udpin://ADDRESS:PORT")
+    if not 1 <= int(match[1]) <= 65535:
+        raise ValueError(f"{key} = {url!r}: its port must be from 1 to 65535")
+
 
 @dataclass(frozen=True, slots=True)
 class AutopilotConfig:
@@ -33,17 +64,13 @@ class AutopilotConfig:
     system_id: int
 
     def __post_init__(self) -> None:
-        if re.fullmatch(r"udpin://[^:/]+:\d{1,5}", self.url) is None:
-            raise ValueError(f"url = {self.url!r}: must be udpin://ADDRESS:PORT")
-        if not 1 <= self.port <= 65535:
-            raise ValueError(f"url = {self.url!r}: its port must be from 1 to 65535")
-        if not 1 <= self.system_id <= 255:
-            raise ValueError(f"system_id = {self.system_id}: must be from 1 to 255")
+        require_url("url", self.url)
+        require_system_id(self.system_id)
 
     @property
     def port(self) -> int:
         """The UDP port of `url`."""
-        return int(self.url.rsplit(":", 1)[1])
+        return int(self.url.rpartition(":")[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,12 +185,8 @@ class RobotConfig:
     on_stop: Literal["hold", "land"] = "hold"
 
     def __post_init__(self) -> None:
-        if re.fullmatch(r"[A-Za-z0-9_-]{1,32}", self.fleet) is None:
-            raise ValueError(
-                f"fleet = {self.fleet!r}: must be 1 to 32 letters, digits, '-' and '_'"
-            )
-        if not 0 <= self.robot_id <= MAX_ROBOT_ID:
-            raise ValueError(f"robot_id = {self.robot_id}: must be from 0 to {MAX_ROBOT_ID}")
+        require_name("fleet = ", self.fleet)
+        require_robot_id(self.robot_id)
         if self.flight.command_timeout_s * self.rates.control_hz < 2.0:
             raise ValueError(
                 f"flight: command_timeout_s = {self.flight.command_timeout_s}: must be at least "

@@ -112,7 +112,7 @@ def load_setup(path: Path, operator: str) -> "GroundConfig":
     from edge.messages.mission import Place, world_id
     from edge.policy.bundle import load_bundle
     from lpac.analysis.snapshot import FleetSetup, FleetSlot
-    from lpac.fleet.config import load_fleet
+    from lpac.fleet.settings import load_fleet
     from lpac.ground.station.config import GroundConfig
 
     config = load_fleet(path)

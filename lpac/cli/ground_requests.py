@@ -32,7 +32,7 @@ class Addressed(NamedTuple):
 
 def address(path: Path, robots: str | None) -> Addressed:
     """Whom a command addresses. Raises ConfigError for an unknown robot, or without fleet.toml."""
-    from lpac.fleet.config import load_fleet, select
+    from lpac.fleet.settings import load_fleet, select
 
     config = load_fleet(path)
     chosen = () if robots is None else tuple(robot.name for robot in select(config, robots))

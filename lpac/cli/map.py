@@ -34,7 +34,7 @@ def live_map(
     import secrets
     import webbrowser
 
-    from lpac.fleet.config import load_fleet
+    from lpac.fleet.settings import load_fleet
     from lpac.ground.map.access import Access, is_loopback
     from lpac.ground.map.server import serve
 

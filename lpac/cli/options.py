@@ -8,7 +8,7 @@ import typer
 from lpac.shipped import shipped
 
 if TYPE_CHECKING:
-    from lpac.fleet.config import FleetConfig, RobotHost
+    from lpac.fleet.settings import FleetConfig, RobotHost
 
 Fleet = Annotated[
     Path, typer.Option("--fleet", envvar="LPAC_FLEET", help="The fleet's description, TOML.")
@@ -23,7 +23,7 @@ DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
 
 def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
     """The fleet, and the robots that a command addresses. Raises ConfigError."""
-    from lpac.fleet.config import load_fleet, select
+    from lpac.fleet.settings import load_fleet, select
 
     config = load_fleet(path)
     return config, select(config, robots)

@@ -21,7 +21,7 @@ def record(
     ] = None,
 ) -> None:
     """Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs."""
-    from lpac.fleet.config import load_fleet
+    from lpac.fleet.settings import load_fleet
     from lpac.ground.record import record as record_to
 
     name = load_fleet(fleet).fleet

@@ -38,7 +38,7 @@ def watch(
 
     Without a terminal it prints them once.
     """
-    from lpac.fleet.config import load_fleet
+    from lpac.fleet.settings import load_fleet
 
     name = load_fleet(fleet).fleet
     if screenshot is not None:

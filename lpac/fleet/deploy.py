@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-from lpac.fleet.config import FleetConfig, RobotHost
 from lpac.fleet.hold import Held, Report, hold
 from lpac.fleet.release import Release
 from lpac.fleet.session import FleetError, RemoteError, rsync
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 # Of folders; files keep theirs, which the manifest has.
 _MODES = "--chmod=Du=rwx,Dgo=rx"

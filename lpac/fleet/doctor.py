@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from edge.messages.codes import CheckCode, FailedCheck, texts
-from lpac.fleet.config import FleetConfig, RobotHost
 from lpac.fleet.hold import Report, lock, wrong_identity
 from lpac.fleet.operations import Outcome
 from lpac.fleet.session import RemoteError, Session, connect
+from lpac.fleet.settings import FleetConfig, RobotHost
+from lpac.fleet.writer import robot_toml
 
 Verdict = Literal["ok", "skipped", "warning", "FAILED"]
 Facts = Mapping[str, Any]
@@ -307,7 +308,7 @@ def is_configured(config: FleetConfig, robot: RobotHost, overview: Facts) -> boo
     """
     if config.slot_of(robot.name) is None:
         return True
-    text = config.robot_toml(robot.name)
+    text = robot_toml(config, robot.name)
     return bool(overview["robot_toml"] == hashlib.sha256(text.encode()).hexdigest())
 
 

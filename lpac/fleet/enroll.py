@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from edge.core.schema import ConfigError
-from lpac.fleet.config import FleetConfig, RobotHost, add_robot, load_fleet
 from lpac.fleet.deploy import deploy
 from lpac.fleet.hold import lock
 from lpac.fleet.release import load_common, make_release
@@ -26,6 +25,8 @@ from lpac.fleet.session import (
     explain,
     ssh_command,
 )
+from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
+from lpac.fleet.writer import add_robot
 
 # As ssh-copy-id does it; the key comes on standard input.
 _INSTALL_KEYS = """exec sh -c '
@@ -316,9 +317,7 @@ def _value(
     config: FleetConfig, robot: RobotHost, table: str, key: str, default: object = None
 ) -> object:
     """What robot.toml would have there."""
-    for values in (robot.overrides, config.shared):
-        if key in values.get(table, {}):
-            return values[table][key]
-    if default is None:
+    value = config.values_of(robot).get(table, {}).get(key, default)
+    if value is None:
         raise ConfigError(f"{config.path}: robot.{table}.{key} is missing")
-    return default
+    return value

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 
-from lpac.fleet.config import FleetConfig, RobotHost
 from lpac.fleet.session import UnreachableError, explain, ssh_command
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 # Of a line of output.
 _MOST_BYTES = 1 << 22

@@ -7,8 +7,8 @@ import socket
 from collections.abc import AsyncIterator, Callable
 from typing import Any, NamedTuple
 
-from lpac.fleet.config import FleetConfig, RobotHost
 from lpac.fleet.session import RemoteError, Session, connect
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 # The step, and the share of it that is done where that is known.
 Report = Callable[[str, float | None], None]

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lpac.fleet.config import FleetConfig
 from lpac.fleet.doctor import DoctorCheck
+from lpac.fleet.settings import FleetConfig
 
 _LEAST_RSYNC = (3, 1)
 _TIMEOUT_S = 10.0

@@ -4,8 +4,8 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Generic, NamedTuple, TypeVar
 
-from lpac.fleet.config import RobotHost
 from lpac.fleet.session import FleetError
+from lpac.fleet.settings import RobotHost
 
 T = TypeVar("T")
 

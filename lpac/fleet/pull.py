@@ -7,9 +7,9 @@ import itertools
 from pathlib import Path
 from typing import NamedTuple
 
-from lpac.fleet.config import FleetConfig, RobotHost
 from lpac.fleet.hold import Report, visit
 from lpac.fleet.session import RemoteError, Session, UnreachableError, rsync
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 SUMS = "SHA256SUMS"
 

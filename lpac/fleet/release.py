@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 from edge.core.world import parse_world
 from edge.policy.bundle import Bundle, load_bundle
-from lpac.fleet.config import FleetConfig, RobotHost
+from lpac.fleet.settings import DEFAULT_DIRECTORY, FleetConfig, RobotHost
+from lpac.fleet.writer import robot_toml
 from lpac.shipped import shipped
 
 _UNITS = tuple(shipped(f"systemd/{name}") for name in ("lpac-robot.service", "lpac-land.service"))
@@ -101,9 +102,9 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
     files = {f"bundle/{name}": data for name, data in common.bundle.files.items()}
     files["world.env"] = common.world
     files |= common.units
-    files |= {name: text.encode() for name, text in config.drop_ins(robot).items()}
+    files |= {name: text.encode() for name, text in drop_ins(config, robot).items()}
     if slot is not None:
-        files["robot.toml"] = config.robot_toml(robot.name).encode()
+        files["robot.toml"] = robot_toml(config, robot.name).encode()
     versions = {
         "lpac-edge": version("lpac-edge"),
         "fleet": config.fleet,
@@ -126,6 +127,36 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
     (folder / "manifest.json").chmod(0o644)
     size_bytes = common.image.size_bytes + len(manifest) + sum(map(len, files.values()))
     return Release(hashlib.sha256(manifest).hexdigest()[:16], common.image, folder, size_bytes)
+
+
+def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:
+    """What differs from the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
+    unit, place = [], []
+    if config.directory != DEFAULT_DIRECTORY:
+        current = f"{config.directory}/current"
+        unit = ["ConditionPathExists=", f"ConditionPathExists={current}/robot.toml"]
+        place = [
+            f"RootDirectory={config.directory}/sandbox",
+            # It empties BindPaths too.
+            "BindReadOnlyPaths=",
+            f"BindReadOnlyPaths={current}/root:/",
+            f"BindReadOnlyPaths={current}:/release",
+        ]
+    flies = list(place)
+    if place:
+        flies += [
+            "BindReadOnlyPaths=/run/systemd/notify",
+            "BindPaths=/var/lib/private/lpac:/var/lib/lpac",
+        ]
+    if robot.cpus:
+        flies += ["CPUAffinity=", f"CPUAffinity={' '.join(map(str, robot.cpus))}"]
+    texts = {}
+    for name, service in (("lpac-robot.conf", flies), ("lpac-land.conf", place)):
+        sections = {"[Unit]": unit, "[Service]": service}
+        written = ["\n".join([head, *lines, ""]) for head, lines in sections.items() if lines]
+        if written:
+            texts[name] = "\n".join(written)
+    return texts
 
 
 def _entry(path: Path, info: os.stat_result) -> Entry:

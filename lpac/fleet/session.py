@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from edge.drivers.px4 import raw_mavlink
-from lpac.fleet.config import FleetConfig, RobotHost
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 Say = Callable[[str], None]
 

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from edge.core.schema import ConfigError
-from lpac.fleet.config import FleetConfig, RobotHost, assign, load_fleet, select
 from lpac.fleet.deploy import Deployed, deploy
 from lpac.fleet.hold import Report, check_identity, visit
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import RemoteError, UnreachableError, connect
+from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet, select
+from lpac.fleet.writer import assign
 
 
 class Swapped(NamedTuple):

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from edge.flight.energy import trials
-from lpac.fleet.config import FleetConfig, RobotHost
 from lpac.fleet.doctor import (
     GOOD_CLOCK_OFFSET_S,
     Diagnosis,
@@ -19,6 +18,7 @@ from lpac.fleet.doctor import (
 from lpac.fleet.hold import Report, lock, visit
 from lpac.fleet.operations import Outcome
 from lpac.fleet.session import RemoteError, Session, UnreachableError
+from lpac.fleet.settings import FleetConfig, RobotHost
 
 _ASK_AGAIN_S = 1.0
 

@@ -7,7 +7,6 @@ from what robots say of themselves, averaged over their statuses.
 import itertools
 import math
 import os
-import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from edge.core.fence import Fence
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.messages.mission import GroundState, Origin, Place, RobotStatus
+from edge.robot.config import require_name
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 
 # Beyond these a robot does not stand still, or does not know where it is.
@@ -35,7 +35,6 @@ CLEARLY_FURTHER_M = 1.0
 # `off` leaves a fence of this side around the mission's origin.
 WIDE_FENCE_M = 500.0
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,31}")
 _USED = "used"
 
 Point = tuple[float, float]
@@ -426,11 +425,10 @@ class Sites:
 
     def path(self, name: str) -> Path:
         """The file of a site."""
-        if _NAME.fullmatch(name) is None:
-            raise ConfigError(
-                f"site {name!r}: must be 1 to 32 letters, digits, '-' and '_', and not start with "
-                "'-'"
-            )
+        try:
+            require_name("site ", name)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
         return self.folder / f"{name}.toml"
 
     def names(self) -> list[str]:

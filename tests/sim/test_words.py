@@ -11,8 +11,8 @@ from edge.flight.preflight import failed_checks
 from edge.messages import codes
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import OrderKind, Origin
-from lpac.fleet.config import load_fleet
 from lpac.fleet.doctor import judge
+from lpac.fleet.settings import load_fleet
 from lpac.ground.alarms import alarms
 from lpac.ground.station import commands
 from lpac.ground.station.protocol import (

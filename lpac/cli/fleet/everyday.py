@@ -27,10 +27,10 @@ from lpac.cli.printing import BAD, GOOD, print_notes, print_table, styled
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from lpac.fleet.config import FleetConfig, RobotHost
     from lpac.fleet.deploy import Deployed
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
+    from lpac.fleet.settings import FleetConfig, RobotHost
 
 T = TypeVar("T")
 

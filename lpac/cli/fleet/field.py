@@ -14,10 +14,10 @@ from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_tabl
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from lpac.fleet.config import FleetConfig, RobotHost
     from lpac.fleet.doctor import Diagnosis, Examination, Round
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
+    from lpac.fleet.settings import FleetConfig, RobotHost
     from lpac.fleet.up import Arrival, GoDecision, Pack
 
 _STYLES = {"ok": GOOD, "skipped": FAINT, "warning": NOTABLE, "FAILED": BAD}

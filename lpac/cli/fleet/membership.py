@@ -14,9 +14,9 @@ from lpac.cli.printing import GOOD, print_table, styled
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from lpac.fleet.config import RobotHost
     from lpac.fleet.hold import Report
     from lpac.fleet.pull import Pulled
+    from lpac.fleet.settings import RobotHost
 
 _STEP_WIDTH = 14
 
@@ -84,7 +84,7 @@ def swap(
 
     The failed robot is stopped if it answers; one in flight refuses.
     """
-    from lpac.fleet.config import load_fleet
+    from lpac.fleet.settings import load_fleet
     from lpac.fleet.swap import swap as swap_robots
 
     def report(step: str, share: float | None) -> None:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from lpac.fleet.config import FleetConfig, RobotHost
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
+    from lpac.fleet.settings import FleetConfig, RobotHost
 
 T = TypeVar("T")
 

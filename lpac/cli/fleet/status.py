@@ -12,9 +12,9 @@ from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_notes, print_tabl
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from lpac.fleet.config import FleetConfig, RobotHost
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
+    from lpac.fleet.settings import FleetConfig, RobotHost
 
 # Characters of an id that tell it from others.
 SHORT = 8

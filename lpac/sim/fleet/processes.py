@@ -1,13 +1,11 @@
 """A whole fleet on this machine: vehicles, one `lpac robot run` process each, and an operator."""
 
-import json
 import math
 import os
 import signal
 import subprocess
 import time
 from collections import deque
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,15 +15,17 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from edge.core import F64
-from edge.core.fence import Fence
 from edge.core.frames import LocalTransform
 from edge.core.world import Feature, format_world, random_features
-from edge.flight.margins import ErrorBudget, places_apart
+from edge.flight.margins import places_apart
 from edge.messages.mission import Origin
 from edge.policy.bundle import BundleError, load_bundle
 from edge.robot.config import Rates
+from lpac.fleet.settings import Places
+from lpac.fleet.writer import write_fleet, write_robot
+from lpac.sim.description import ERRORS, fence_around, robot_table
 from lpac.sim.experiment import FIELD_SCALE
-from lpac.sim.fleet.vehicles import AutopilotAddress, SimulatedVehicles, Vehicles
+from lpac.sim.fleet.vehicles import SimulatedVehicles, Vehicles
 from lpac.sim.operator import Operator, Say
 from lpac.sim.ports import free_ports
 from lpac.sim.programs import python_program
@@ -46,14 +46,8 @@ _WHILE_S = 20.0
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
-ERRORS = ErrorBudget()
 # Pads, which are landing points too.
 APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
-_BASE_HEIGHT_M = 5.0
-_SLOT_SPACING_M = ERRORS.slot_spacing.least_m
-# Robots stop half a metre outside the field, with the fence 1.5 m further out.
-_FENCE_BEYOND_FIELD_M = 2.0
-_FENCE_BUFFER_M = 1.5
 # As far inside the field as there is room: what a robot takes its place to be walks.
 _PADS_INSIDE_FIELD_M = (2.0, 1.0, 0.0)
 # How often pads are drawn anew, and pushed apart, before there is no room for them.
@@ -61,7 +55,6 @@ _PAD_DRAWS = 30
 _PAD_PUSHES = 300
 # What rounding and the last push may leave.
 _PAD_SLACK = 1e-3
-_ON_STOP = "land"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,7 +248,7 @@ class Fleet:
         self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
             WORLD.latitude_deg, WORLD.longitude_deg
         )
-        self.fence = _fence(self.field_m, scenario.robots)
+        self.fence = fence_around(self.field_m, scenario.robots)
         self.features = scenario.features
         if self.features is None:
             self.features = random_features(
@@ -440,105 +433,50 @@ class Fleet:
         assert self.features is not None
         self.folder.mkdir(parents=True, exist_ok=True)
         (self.folder / "world.env").write_text(format_world(self.features))
-        for robot, autopilot in zip(self.robots, self.vehicles.autopilots, strict=True):
-            robot.folder.mkdir(parents=True, exist_ok=True)
-            config = _toml(self._config(robot.robot_id, autopilot))
-            (robot.folder / "robot.toml").write_text(config)
-        self.fleet_toml.write_text(
-            "# Made by `lpac sim`: the robots are programs of this machine, without image or SSH.\n"
-            + _toml(self._description())
+        config = write_fleet(
+            self.fleet_toml,
+            "Made by `lpac sim`: the robots are programs of this machine, without image or SSH.",
+            self._description(),
         )
-
-    def _config(self, robot: int, autopilot: AutopilotAddress) -> dict[str, object]:
-        """robot.toml."""
-        own: dict[str, dict[str, object]] = {
-            "policy": {"bundle": str(self._bundle_path), "world": "../../world.env"},
-            "autopilot": {"url": autopilot.url, "system_id": autopilot.system_id},
-            "link": {
-                "listen": [self.endpoints[robot]],
-                "connect": list(self.endpoints[:robot]),
-            },
-            "flight": {"slot": robot, "landing_point_m": self._pad_seen_m(robot)},
-        }
-        shared = self._shared()
-        return {
-            "fleet": self.name,
-            "robot_id": robot,
-            "on_stop": _ON_STOP,
-            **{name: shared.get(name, {}) | own.get(name, {}) for name in {**own, **shared}},
-        }
+        places = Places(str(self._bundle_path), "../../world.env", "logs", "127.0.0.1")
+        for robot in self.robots:
+            write_robot(robot.folder / "robot.toml", config, robot.name, places)
 
     def _description(self) -> dict[str, object]:
         """fleet.toml. No computer has such a host name, so that nobody deploys to this machine."""
-        robots = {
-            f"robots.{robot.name}": {
-                "host": f"{robot.name}.invalid",
-                "address": "127.0.0.1",
-                "zenoh_port": int(endpoint.rpartition(":")[2]),
-                "robot_id": robot.robot_id,
-                "system_id": autopilot.system_id,
-                "mavlink_url": autopilot.url,
-            }
-            for robot, endpoint, autopilot in zip(
-                self.robots, self.endpoints, self.vehicles.autopilots, strict=True
-            )
-        }
-        slots = [
-            {
-                "robot": robot.name,
-                "height": robot.robot_id,
-                "pad_m": self._pad_seen_m(robot.robot_id),
-                "landing_point_m": self._pad_seen_m(robot.robot_id),
-            }
-            for robot in self.robots
-        ]
         return {
             "fleet": self.name,
             "image": "none",
             "bundle": str(self._bundle_path),
             "world": "world.env",
-            "robot": {"on_stop": _ON_STOP},
-            **{f"robot.{name}": table for name, table in self._shared().items()},
-            **robots,
-            "slots": slots,
+            "robot": robot_table(self.fence, self.max_speed_m_s),
+            "robots": {
+                robot.name: {
+                    "host": f"{robot.name}.invalid",
+                    "address": "127.0.0.1",
+                    "zenoh_port": int(endpoint.rpartition(":")[2]),
+                    "robot_id": robot.robot_id,
+                    "system_id": autopilot.system_id,
+                    "mavlink_url": autopilot.url,
+                }
+                for robot, endpoint, autopilot in zip(
+                    self.robots, self.endpoints, self.vehicles.autopilots, strict=True
+                )
+            },
+            "slots": [
+                {
+                    "robot": robot.name,
+                    "height": robot.robot_id,
+                    "pad_m": self._pad_seen_m(robot.robot_id),
+                    "landing_point_m": self._pad_seen_m(robot.robot_id),
+                }
+                for robot in self.robots
+            ],
         }
 
     def _pad_seen_m(self, robot: int) -> list[float]:
         """Where a robot takes its pad to be: mission frame, m."""
         return [round(c, 3) for c in self.landing_points_m[robot].tolist()]
-
-    def _shared(self) -> dict[str, dict[str, object]]:
-        """The tables of robot.toml, as far as all robots have the same."""
-        return {
-            "policy": {
-                "env_scale": FIELD_SCALE.env_scale,
-                "velocity_scale": FIELD_SCALE.velocity_scale,
-            },
-            "flight": {"base_height_m": _BASE_HEIGHT_M, "slot_spacing_m": _SLOT_SPACING_M},
-            "fence": {
-                "vertices_m": [list(vertex) for vertex in self.fence.vertices_m],
-                "buffer_m": self.fence.buffer_m,
-                "floor_m": self.fence.floor_m,
-                "ceiling_m": self.fence.ceiling_m,
-            },
-            "limits": {
-                "max_speed_m_s": self.max_speed_m_s,
-                "max_climb_m_s": 2.0,
-                "max_acceleration_m_s2": 2.0,
-                "lag_s": 1.3,
-            },
-            "failsafe": {"rc": "none", "parameters": "set"},
-        }
-
-
-def _fence(field_m: float, robots: int) -> Fence:
-    low_m, high_m = -_FENCE_BEYOND_FIELD_M, field_m + _FENCE_BEYOND_FIELD_M
-    return Fence(
-        vertices_m=((low_m, low_m), (high_m, low_m), (high_m, high_m), (low_m, high_m)),
-        buffer_m=_FENCE_BUFFER_M,
-        floor_m=_BASE_HEIGHT_M / 2.0,
-        ceiling_m=_BASE_HEIGHT_M + robots * _SLOT_SPACING_M + 2.0,
-    )
 
 
 def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Generator) -> F64 | None:
@@ -567,18 +505,3 @@ def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Gener
             # Less than half of what is missing for either of two: crowds come to rest so.
             places_m = places_m + 0.35 * (offsets_m * shares[..., None]).sum(axis=(0, 2))
     return None
-
-
-def _toml(config: Mapping[str, object]) -> str:
-    """TOML of plain values, of tables and of lists of tables; JSON's values are TOML's too."""
-    top, tables = [], []
-    for name, value in config.items():
-        if isinstance(value, dict):
-            tables.append((f"[{name}]", value))
-        elif isinstance(value, list):
-            tables += [(f"[[{name}]]", entry) for entry in value]
-        else:
-            top.append(f"{name} = {json.dumps(value)}")
-    for heading, table in tables:
-        top += ["", heading, *(f"{key} = {json.dumps(value)}" for key, value in table.items())]
-    return "\n".join(top) + "\n"

@@ -5,7 +5,6 @@ it shares with the others and with this machine, MAVLink at 127.0.0.1:14551. Wha
 clock is this machine's (it cannot be set), its kernel too, and memory limits are not enforced.
 """
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -16,6 +15,8 @@ from typing import Self, overload
 import numpy as np
 
 from edge.core.world import format_world, random_features
+from lpac.fleet.writer import write_fleet
+from lpac.sim.description import fence_around, robot_table
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.hosts.base import base_tree, require_tools
 from lpac.sim.hosts.host import MAVLINK_PORT, SimulatedHost, new_key
@@ -25,6 +26,7 @@ __all__ = ["SimulatedHost", "SimulatedHosts"]
 
 MAX_HOSTS = 20
 FIELD_M = 32.0
+_MAX_SPEED_M_S = 1.25
 
 Say = Callable[[str], None]
 
@@ -129,52 +131,32 @@ class SimulatedHosts(Sequence[SimulatedHost]):
             "  GlobalKnownHostsFile /dev/null\n"
             "  StrictHostKeyChecking yes\n"
         )
-        self.fleet_toml.write_text(self._fleet_toml())
+        write_fleet(
+            self.fleet_toml,
+            "Made by `lpac hosts`, of computers on this machine.",
+            self._description(),
+        )
 
-    def _fleet_toml(self) -> str:
-        low_m, high_m = -2.0, FIELD_M + 2.0
+    def _description(self) -> dict[str, object]:
+        """fleet.toml."""
         flying = self._hosts[: self._count - self._spares]
-        robots = "".join(
-            f'\n[robots.{host.name}]\nhost = "{host.address}"\nrobot_id = {host.robot_id}\n'
-            for host in self._hosts
-        )
-        slots = "".join(
-            f'\n[[slots]]\nrobot = "{host.name}"\npad_m = {list(host.pad_m)}\n'
-            f"landing_point_m = {list(host.pad_m)}\n"
-            for host in flying
-        )
-        return f"""\
-fleet = "{self.fleet}"
-image = {json.dumps(str(self._image))}
-bundle = {json.dumps(str(self._bundle))}
-world = "world.env"
-
-[ssh]
-config = "ssh_config"
-
-[robot]
-on_stop = "land"
-
-[robot.autopilot]
-url = "udpin://127.0.0.1:{MAVLINK_PORT}"
-
-[robot.policy]
-env_scale = {FIELD_SCALE.env_scale}
-velocity_scale = {FIELD_SCALE.velocity_scale}
-
-[robot.fence]
-vertices_m = [[{low_m}, {low_m}], [{high_m}, {low_m}], [{high_m}, {high_m}], [{low_m}, {high_m}]]
-buffer_m = 1.5
-floor_m = 2.0
-ceiling_m = {7.0 + 4.5 * len(flying)}
-
-[robot.limits]
-max_speed_m_s = 1.25
-max_climb_m_s = 2.0
-max_acceleration_m_s2 = 2.0
-lag_s = 1.3
-
-[robot.failsafe]
-rc = "none"
-parameters = "set"
-{robots}{slots}"""
+        robot = robot_table(fence_around(FIELD_M, len(flying)), _MAX_SPEED_M_S)
+        return {
+            "fleet": self.fleet,
+            "image": str(self._image),
+            "bundle": str(self._bundle),
+            "world": "world.env",
+            "ssh": {"config": "ssh_config"},
+            "robot": robot | {"autopilot": {"url": f"udpin://127.0.0.1:{MAVLINK_PORT}"}},
+            "robots": {
+                host.name: {"host": host.address, "robot_id": host.robot_id} for host in self._hosts
+            },
+            "slots": [
+                {
+                    "robot": host.name,
+                    "pad_m": list(host.pad_m),
+                    "landing_point_m": list(host.pad_m),
+                }
+                for host in flying
+            ],
+        }

@@ -5,11 +5,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lpac.fleet.config import FleetConfig, RobotHost, load_fleet
 from lpac.fleet.deploy import Deployed, deploy, rollback
 from lpac.fleet.hold import Report
 from lpac.fleet.release import Common, Release, load_common, make_release
 from lpac.fleet.session import connect
+from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import unwatched
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from lpac.fleet.config import RobotHost, load_fleet
 from lpac.fleet.deploy import deploy
 from lpac.fleet.doctor import (
     DoctorCheck,
@@ -21,6 +20,7 @@ from lpac.fleet.doctor import (
 )
 from lpac.fleet.operations import Outcome, for_each
 from lpac.fleet.release import load_common, make_release
+from lpac.fleet.settings import RobotHost, load_fleet
 from lpac.fleet.up import bring_up
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts

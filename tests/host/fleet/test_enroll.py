@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from lpac.fleet.config import load_fleet
 from lpac.fleet.enroll import _robot
+from lpac.fleet.settings import load_fleet
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata, read
-from lpac.fleet.config import load_fleet
 from lpac.fleet.pull import Pulled, pull
 from lpac.fleet.session import FleetError
+from lpac.fleet.settings import load_fleet
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.host.fleet.field import armed, lpac_fleet, unwatched

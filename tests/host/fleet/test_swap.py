@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from lpac.fleet.config import assign, load_fleet
+from lpac.fleet.settings import load_fleet
 from lpac.fleet.swap import _callers
+from lpac.fleet.writer import assign
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT

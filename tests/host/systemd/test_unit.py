@@ -15,7 +15,9 @@ import pytest
 import tomlkit
 
 from edge.messages.mission import FlightState
-from lpac.fleet.config import FleetConfig, load_fleet
+from lpac.fleet.release import drop_ins
+from lpac.fleet.settings import FleetConfig, load_fleet
+from lpac.fleet.writer import robot_toml
 from lpac.sim.fleet.processes import ORIGIN
 from lpac.sim.hosts.base import NoHostsError
 from lpac.sim.hosts.host import SimulatedHost
@@ -47,7 +49,7 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         shutil.copytree(amd64_image / "root", release / "root", symlinks=True)
         shutil.copytree(SHIPPED, release / "bundle")
         shutil.copy(config.world, release / "world.env")
-        (release / "robot.toml").write_text(config.robot_toml(host.name))
+        (release / "robot.toml").write_text(robot_toml(config, host.name))
         (release.parents[1] / "current").symlink_to("releases/a")
         (release.parents[1] / "sandbox").mkdir()
         for unit in UNITS:
@@ -230,7 +232,7 @@ def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_say
     host: SimulatedHost, config: FleetConfig
 ) -> None:
     elsewhere = dataclasses.replace(config, directory="/data/lpac")
-    for name, text in elsewhere.drop_ins(config.robots[host.name]).items():
+    for name, text in drop_ins(elsewhere, config.robots[host.name]).items():
         path = host.root / f"etc/systemd/system/{Path(name).stem}.service.d" / name
         path.parent.mkdir()
         path.write_text(text)

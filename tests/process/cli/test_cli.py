@@ -218,10 +218,10 @@ def test_what_is_not_installed_is_said_in_one_line() -> None:
 def test_ctrl_c_while_a_program_starts_is_one_line() -> None:
     code = """
 import sys
-import lpac.cli.main, lpac.fleet.config
+import lpac.cli.main, lpac.fleet.settings
 def stopped(_):
     raise KeyboardInterrupt
-lpac.fleet.config.load_fleet = stopped
+lpac.fleet.settings.load_fleet = stopped
 sys.argv = ["lpac", "watch"]
 lpac.cli.main.main()
 """

@@ -27,7 +27,8 @@ from edge.messages.beacon import BEACON_BYTES
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus
-from lpac.sim.fleet.processes import ERRORS, ORIGIN, WORLD, Fleet, FleetScenario
+from lpac.sim.description import ERRORS
+from lpac.sim.fleet.processes import ORIGIN, WORLD, Fleet, FleetScenario
 from lpac.sim.operator import Statuses
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle

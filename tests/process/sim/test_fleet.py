@@ -8,10 +8,10 @@ import shlex
 import signal
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -23,10 +23,11 @@ from edge.drivers.flight_log import read_metadata
 from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.robot.config import load_config
-from lpac.fleet.config import load_fleet
+from lpac.fleet.settings import load_fleet
+from lpac.sim.description import ERRORS
 from lpac.sim.experiment import Scenario
 from lpac.sim.experiment import fly as fly_in_process
-from lpac.sim.fleet.processes import APART_M, ERRORS, Fleet, FleetScenario, SimulatedFleetError
+from lpac.sim.fleet.processes import APART_M, Fleet, FleetScenario, SimulatedFleetError
 from lpac.sim.operator import Operator
 from tests.conftest import ROOT, SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
@@ -275,14 +276,19 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
     assert list(config.robots) == [f"r{i}" for i in range(robots)]
     assert len({robot.host for robot in config.robots.values()}) == robots
     for i, (name, slot) in enumerate(zip(config.robots, config.slots, strict=True)):
-        described = tomllib.loads(config.robot_toml(name))
-        robot = tomllib.loads((fleet.robots[i].folder / "robot.toml").read_text())
+        folder = fleet.robots[i].folder
+        robot = load_config(folder / "robot.toml")
+        its = config.robot_config(name)
         # Where a robot keeps its files is its own matter, and which of its addresses are open.
-        del described["log"]
-        for mapping in (described, robot):
-            del mapping["policy"]["bundle"], mapping["policy"]["world"]
-            mapping["link"]["listen"] = [e.rpartition(":")[2] for e in mapping["link"]["listen"]]
-        assert described == robot
+        assert (robot.policy.bundle, Path(robot.policy.world).resolve()) == (
+            str(SHIPPED), tmp_path / "world.env",
+        )  # fmt: skip
+        assert (robot.log.folder, robot.link.listen) == (
+            str(folder / "logs"), (fleet.endpoints[i],),
+        )  # fmt: skip
+        assert robot.link.connect == its.link.connect == fleet.endpoints[:i]
+        policy = replace(robot.policy, bundle=its.policy.bundle, world=its.policy.world)
+        assert its == replace(robot, policy=policy, log=its.log, link=its.link)
         assert slot.robot == name and slot.height == i
         np.testing.assert_allclose(slot.pad_m, fleet.landing_points_m[i], atol=1e-3)
         assert slot.landing_point_m == slot.pad_m

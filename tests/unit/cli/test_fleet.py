@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from lpac.cli.fleet.status import State, print_status
-from lpac.fleet.config import FleetConfig, load_fleet
 from lpac.fleet.logs import Entry, parse_entry, readable
 from lpac.fleet.operations import Outcome
+from lpac.fleet.settings import FleetConfig, load_fleet
 from tests.conftest import ROOT, SHIPPED
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"

@@ -12,7 +12,6 @@ import pytest
 from edge.core.vehicle import Gps
 from edge.flight.margins import ErrorBudget
 from edge.messages.codes import CheckCode, FailedCheck
-from lpac.fleet.config import FleetConfig, SshConfig, load_fleet
 from lpac.fleet.doctor import (
     ClockOffset,
     Diagnosis,
@@ -25,7 +24,9 @@ from lpac.fleet.doctor import (
 )
 from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
 from lpac.fleet.operations import Outcome
+from lpac.fleet.settings import FleetConfig, SshConfig, load_fleet
 from lpac.fleet.up import decide, packs
+from lpac.fleet.writer import robot_toml
 from tests.conftest import ROOT
 from tests.host.fleet.field import SILENT
 from tests.unit.flight.test_preflight import lines
@@ -68,7 +69,7 @@ def well(config: FleetConfig, name: str) -> Examination:
         "identity": {"fleet": config.fleet, "robot": name, "robot_id": robot.robot_id},
         "current": "0123456789abcdef", "pending": None,
         "versions": {"image": "i1", "bundle": "b1", "world": "w1"},
-        "robot_toml": hashlib.sha256(config.robot_toml(name).encode()).hexdigest(),
+        "robot_toml": hashlib.sha256(robot_toml(config, name).encode()).hexdigest(),
         "service": {
             "active": "active", "result": "success", "fresh": True, "enabled": True,
             "restarts": 0, "status": status,

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from lpac.fleet.config import RobotHost, load_fleet
 from lpac.fleet.operations import for_each
 from lpac.fleet.session import explain
+from lpac.fleet.settings import RobotHost, load_fleet
 from tests.conftest import ROOT
 
 

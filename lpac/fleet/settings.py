@@ -5,31 +5,30 @@ A robot without a slot is a spare. Relative paths are meant from the file's own 
 user's. Every mistake is one line that names the file, the key, the robot and what is allowed.
 """
 
-import fcntl
 import ipaddress
 import itertools
 import math
-import os
 import re
-import stat
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import tomlkit
-from tomlkit.items import InlineTable
-
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.wire import MAX_ROBOT_ID
 from edge.flight.margins import Margin, places_apart
-from edge.robot.config import AutopilotConfig, RobotConfig
+from edge.robot.config import (
+    AutopilotConfig,
+    RobotConfig,
+    require_name,
+    require_robot_id,
+    require_system_id,
+    require_url,
+)
 
 DEFAULT_DIRECTORY = "/opt/lpac"
 _MAX_CPU = 1023
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]{0,31}")
 # These stand on the command lines of ssh, and in files of systemd.
 _HOST = re.compile(r"[A-Za-z0-9_:][A-Za-z0-9_.:-]*")
 _USER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
@@ -117,6 +116,20 @@ class RobotHost:
 
 
 @dataclass(frozen=True, slots=True)
+class Places:
+    """Where a robot finds bundle and world and keeps its logs, and the address it listens on."""
+
+    bundle: str
+    world: str
+    logs: str
+    listen: str
+
+
+# A release lies at /release in the sandbox of the robot's unit.
+IN_RELEASE = Places("bundle", "world.env", "/var/lib/lpac/logs", "0.0.0.0")
+
+
+@dataclass(frozen=True, slots=True)
 class FleetConfig:
     """All of fleet.toml, checked as a whole; `shared` is what all robots' robot.toml have.
 
@@ -149,55 +162,26 @@ class FleetConfig:
         margins = [_robot_config(self, robot, i).free_ground for i, robot in flying]
         return max(margins, default=None)
 
-    def robot_toml(self, name: str) -> str:
-        """The text of the robot's robot.toml, with the paths that its release has in the sandbox.
+    def values_of(self, robot: RobotHost) -> dict[str, Any]:
+        """What the file says of the robot's robot.toml: [robot], and its own values over them."""
+        return _merged(self.shared, robot.overrides)
 
-        The same fleet.toml gives the same text. Raises ConfigError for an unknown robot or a spare.
-        """
+    def robot_mapping(self, name: str, places: Places) -> dict[str, Any]:
+        """The robot's robot.toml, as a mapping. Raises ConfigError for who has none."""
         (robot,) = select(self, name)
         slot = self.slot_of(name)
         if slot is None:
             raise ConfigError(f"{self.path}: robots.{name}: is a spare: it sits in no slot")
-        text = tomlkit.dumps(_robot_mapping(self, robot, slot), sort_keys=True)
-        return f"# Generated from fleet.toml for robot {name}: changes belong there.\n{text}"
+        return _robot_mapping(self, robot, slot, places)
 
     def robot_config(self, name: str) -> RobotConfig:
         """What the robot flies by. Raises ConfigError for an unknown robot or a spare."""
-        return from_mapping(RobotConfig, tomllib.loads(self.robot_toml(name)), str(self.path))
-
-    def drop_ins(self, robot: RobotHost) -> dict[str, str]:
-        """What differs from the units: the texts of lpac-robot.conf and lpac-land.conf, if any."""
-        unit, place = [], []
-        if self.directory != DEFAULT_DIRECTORY:
-            current = f"{self.directory}/current"
-            unit = ["ConditionPathExists=", f"ConditionPathExists={current}/robot.toml"]
-            place = [
-                f"RootDirectory={self.directory}/sandbox",
-                # It empties BindPaths too.
-                "BindReadOnlyPaths=",
-                f"BindReadOnlyPaths={current}/root:/",
-                f"BindReadOnlyPaths={current}:/release",
-            ]
-        flies = list(place)
-        if place:
-            flies += [
-                "BindReadOnlyPaths=/run/systemd/notify",
-                "BindPaths=/var/lib/private/lpac:/var/lib/lpac",
-            ]
-        if robot.cpus:
-            flies += ["CPUAffinity=", f"CPUAffinity={' '.join(map(str, robot.cpus))}"]
-        texts = {}
-        for name, service in (("lpac-robot.conf", flies), ("lpac-land.conf", place)):
-            sections = {"[Unit]": unit, "[Service]": service}
-            written = ["\n".join([head, *lines, ""]) for head, lines in sections.items() if lines]
-            if written:
-                texts[name] = "\n".join(written)
-        return texts
+        return from_mapping(RobotConfig, self.robot_mapping(name, IN_RELEASE), str(self.path))
 
 
 def load_fleet(path: Path) -> FleetConfig:
     """The fleet in the file, its paths made absolute. Raises ConfigError."""
-    return _fleet(path, _read(path))
+    return parse_fleet(path, read_fleet(path))
 
 
 def select(config: FleetConfig, names: str | None) -> list[RobotHost]:
@@ -215,79 +199,6 @@ def select(config: FleetConfig, names: str | None) -> list[RobotHost]:
     if not asked:
         raise ConfigError(f"{config.path}: robots: none is chosen; {known}")
     return [config.robots[name] for name in order if name in asked]
-
-
-def add_robot(
-    path: Path,
-    name: str,
-    host: str,
-    robot_id: int,
-    *,
-    user: str = "root",
-    port: int | None = None,
-    address: str | None = None,
-) -> None:
-    """Add a spare to the file; nothing happens if it has this very robot.
-
-    Raises ConfigError if the file would not be right then, or has another robot of this name;
-    the file is then as it was.
-    """
-    entry: dict[str, Any] = {"host": host, "robot_id": robot_id}
-    entry |= {"user": user} if user != "root" else {}
-    entry |= {"port": port} if port is not None else {}
-    entry |= {"address": address} if address is not None else {}
-
-    def change(text: str) -> str:
-        there = _fleet(path, text).robots.get(name)
-        if there is not None:
-            same = (there.host, there.robot_id, there.user) == (host, robot_id, user)
-            if same and port in (None, there.port) and address in (None, there.address):
-                return text
-            raise ConfigError(
-                f"{path}: robots.{name}: is there already, with host = {there.host!r}, user = "
-                f"{there.user!r}, robot_id = {there.robot_id}: change it in the file, or take "
-                "another name"
-            )
-        before, after = _before_slots(text)
-        table = tomlkit.dumps({"robots": {name: entry}})
-        changed = f"{before}{table}\n{after}" if after else f"{before}{table}"
-        expected = tomllib.loads(text)
-        expected.setdefault("robots", {})[name] = entry
-        try:
-            right = tomllib.loads(changed) == expected
-        except tomllib.TOMLDecodeError:
-            right = False
-        if not right:
-            raise ConfigError(
-                f"{path}: robots.{name}: can only be added where robots are [robots.NAME] tables"
-            )
-        return changed
-
-    _edit(path, change)
-
-
-def assign(path: Path, slot_index: int, robot: str | None) -> None:
-    """Give the slot, counted from 0, to the robot, or free it.
-
-    Raises ConfigError if the file would not be right then; it is then as it was.
-    """
-
-    def change(text: str) -> str:
-        config = _fleet(path, text)
-        if not 0 <= slot_index < len(config.slots):
-            raise ConfigError(f"{path}: slots[{slot_index}]: there are {len(config.slots)} slots")
-        if config.slots[slot_index].robot == robot:
-            return text
-        document = tomlkit.parse(text)
-        slot: Any = document["slots"][slot_index]
-        if "robot" in slot or isinstance(slot, InlineTable):
-            slot["robot"] = robot or ""
-        else:
-            # tomlkit would put it behind the comments that head the next table.
-            slot.value.body.insert(0, (tomlkit.key("robot"), tomlkit.item(robot)))
-        return tomlkit.dumps(document)
-
-    _edit(path, change)
 
 
 # Reading
@@ -319,14 +230,13 @@ class _RobotTable:
             value = getattr(self, name)
             if value is not None and not 1 <= value <= 65535:
                 raise ValueError(f"{name} = {value}: must be from 1 to 65535")
-        if not 0 <= self.robot_id <= MAX_ROBOT_ID:
-            raise ValueError(f"robot_id = {self.robot_id}: must be from 0 to {MAX_ROBOT_ID}")
-        if self.system_id is None and not 1 <= self.robot_id <= 255:
+        require_robot_id(self.robot_id)
+        if self.system_id is not None:
+            require_system_id(self.system_id)
+        elif not 1 <= self.robot_id <= 255:
             raise ValueError(
                 f"system_id is missing: robot_id = {self.robot_id} is not from 1 to 255"
             )
-        if self.system_id is not None and not 1 <= self.system_id <= 255:
-            raise ValueError(f"system_id = {self.system_id}: must be from 1 to 255")
         if self.address is not None and not _is_ipv4(self.address):
             raise ValueError(f"address = {self.address!r}: must be an IPv4 address")
         if self.address is None and not _is_ipv4(self.host):
@@ -335,10 +245,7 @@ class _RobotTable:
                 "robots could reach it"
             )
         if self.mavlink_url is not None:
-            try:
-                AutopilotConfig(self.mavlink_url, system_id=1)
-            except ValueError as error:
-                raise ValueError(f"mavlink_{error}") from None  # its key is `url`
+            require_url("mavlink_url", self.mavlink_url)
         _cpus(self.cpus)
 
 
@@ -358,7 +265,7 @@ class _FleetTable:
     slots: tuple[Slot, ...] = ()
 
     def __post_init__(self) -> None:
-        _check_name("fleet = ", self.fleet)
+        require_name("fleet = ", self.fleet)
         for name in ("image", "bundle", "world"):
             if not getattr(self, name):
                 raise ValueError(f"{name} = '': must be a path")
@@ -371,12 +278,13 @@ class _FleetTable:
             if _UNIT.fullmatch(name) is None:
                 raise ValueError(f"predecessors: {name!r}: must be a container's or unit's name")
         for name in self.robots:
-            _check_name("robots: ", name)
+            require_name("robots: ", name)
 
 
-def _read(path: Path) -> str:
+def read_fleet(path: Path) -> str:
+    """The file's text, its ends of lines as they are. Raises ConfigError."""
     try:
-        # Not read_text, which would change the ends of lines.
+        # Not read_text, which would change them.
         return path.read_bytes().decode()
     except FileNotFoundError as error:
         raise ConfigError(
@@ -388,7 +296,8 @@ def _read(path: Path) -> str:
         raise ConfigError(f"{path}: no TOML: {error}") from None
 
 
-def _fleet(path: Path, text: str) -> FleetConfig:
+def parse_fleet(path: Path, text: str) -> FleetConfig:
+    """The fleet that a file of this text would describe. Raises ConfigError."""
     try:
         mapping = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -462,13 +371,6 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
     )
 
 
-def _check_name(what: str, name: str) -> None:
-    if _NAME.fullmatch(name) is None:
-        raise ValueError(
-            f"{what}{name!r}: must be 1 to 32 letters, digits, '-' and '_', and not start with '-'"
-        )
-
-
 def _is_ipv4(text: str) -> bool:
     try:
         ipaddress.IPv4Address(text)
@@ -538,25 +440,27 @@ def _sitting(slot: Slot) -> str:
 # What robots read, and whether they can fly so
 
 
-def _robot_mapping(config: FleetConfig, robot: RobotHost, slot: Slot) -> dict[str, Any]:
-    """The robot's robot.toml, in that slot. The release lies at /release in the sandbox."""
+def _robot_mapping(
+    config: FleetConfig, robot: RobotHost, slot: Slot, places: Places
+) -> dict[str, Any]:
+    """The robot's robot.toml, in that slot."""
     earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
     own = {
         "fleet": config.fleet,
         "robot_id": robot.robot_id,
-        "policy": {"bundle": "bundle", "world": "world.env"},
+        "policy": {"bundle": places.bundle, "world": places.world},
         "autopilot": {"url": robot.mavlink_url, "system_id": robot.system_id},
         "link": {
-            "listen": [f"tcp/0.0.0.0:{robot.zenoh_port}"],
+            "listen": [f"tcp/{places.listen}:{robot.zenoh_port}"],
             "connect": [
                 f"tcp/{other.address}:{other.zenoh_port}"
                 for other in sorted(earlier, key=lambda other: other.robot_id)
             ],
         },
         "flight": {"slot": slot.height, "landing_point_m": list(slot.landing_point_m)},
-        "log": {"folder": "/var/lib/lpac/logs"},
+        "log": {"folder": places.logs},
     }
-    return _merged(_merged(config.shared, robot.overrides), own)
+    return _merged(config.values_of(robot), own)
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
@@ -619,43 +523,4 @@ def _robot_config(config: FleetConfig, robot: RobotHost, index: int) -> RobotCon
     slot = config.slots[index]
     sits = "in" if slot.robot == robot.name else "if it took"
     where = f"{config.path}: robots.{robot.name}, {sits} slots[{index}]"
-    return from_mapping(RobotConfig, _robot_mapping(config, robot, slot), where)
-
-
-# Editing
-
-
-def _before_slots(text: str) -> tuple[str, str]:
-    """The text up to the first slot and the comment right above it, and the rest."""
-    match = re.search(r"^(?:#.*\n)*\[\[\s*slots\s*\]\]", text, re.MULTILINE)
-    at = match.start() if match else len(text)
-    before = text[:at]
-    gap = "" if before.endswith("\n\n") else "\n" if before.endswith("\n") else "\n\n"
-    return before + gap, text[at:]
-
-
-def _edit(path: Path, change: Callable[[str], str]) -> None:
-    """Replace the file's text, if it is right afterwards, at once and for good."""
-    path = path.resolve()
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    new = path.with_name(f".{path.name}.new")
-    try:
-        # Two commands at once would each write the file without the other's change.
-        fcntl.flock(folder, fcntl.LOCK_EX)
-        text = _read(path)
-        changed = change(text)
-        if changed == text:
-            return
-        _fleet(path, changed)
-        try:
-            with new.open("wb") as file:
-                file.write(changed.encode())
-                file.flush()
-                os.fsync(file.fileno())
-            new.chmod(stat.S_IMODE(path.stat().st_mode))
-            new.replace(path)
-        finally:
-            new.unlink(missing_ok=True)
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    return from_mapping(RobotConfig, _robot_mapping(config, robot, slot, IN_RELEASE), where)

@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 
 from edge.core.schema import ConfigError
 from edge.robot.config import RobotConfig, load_config
-from lpac.fleet.config import FleetConfig, RobotHost, add_robot, assign, load_fleet, select
+from lpac.fleet.release import drop_ins
+from lpac.fleet.settings import FleetConfig, Places, RobotHost, load_fleet, select
+from lpac.fleet.writer import add_robot, assign, robot_toml, write_fleet, write_robot
 from tests.conftest import ROOT, SHIPPED
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"
@@ -47,7 +49,7 @@ def mapping() -> dict[str, Any]:
 def rendered(config: FleetConfig, name: str, folder: Path) -> RobotConfig:
     """What the robot's program reads in its release."""
     path = folder / "robot.toml"
-    path.write_text(config.robot_toml(name))
+    path.write_text(robot_toml(config, name))
     return load_config(path)
 
 
@@ -152,16 +154,16 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert third.policy.bundle == str(tmp_path / "bundle")
     assert third.policy.world == str(tmp_path / "world.env")
     assert third.log.folder == "/var/lib/lpac/logs"
-    assert config.robot_toml("r3").startswith("# Generated from fleet.toml")
-    assert str(tmp_path) not in config.robot_toml("r3")
+    assert robot_toml(config, "r3").startswith("# Generated from fleet.toml")
+    assert str(tmp_path) not in robot_toml(config, "r3")
 
 
 def test_a_spare_and_a_stranger_get_none() -> None:
     config = load_fleet(EXAMPLE)
     with pytest.raises(ConfigError, match=r"robots\.r11: is a spare"):
-        config.robot_toml("r11")
+        robot_toml(config, "r11")
     with pytest.raises(ConfigError, match="'r9' is unknown; known are r1, r2, r3, r11"):
-        config.robot_toml("r9")
+        robot_toml(config, "r9")
 
 
 POSITIVE = st.floats(0.1, 100.0)
@@ -211,7 +213,7 @@ def test_the_same_values_give_the_same_bytes(
     shuffled = _shuffled(mapping(), data)
     config = fleet_of(folder, shuffled)
     for name in ("r1", "r2", "r3"):
-        assert config.robot_toml(name) == load_fleet(EXAMPLE).robot_toml(name)
+        assert robot_toml(config, name) == robot_toml(load_fleet(EXAMPLE), name)
 
 
 def _shuffled(table: dict[str, Any], data: st.DataObject) -> dict[str, Any]:
@@ -221,16 +223,16 @@ def _shuffled(table: dict[str, Any], data: st.DataObject) -> dict[str, Any]:
 
 def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
     config = load_fleet(EXAMPLE)
-    assert config.drop_ins(config.robots["r1"]) == {}
+    assert drop_ins(config, config.robots["r1"]) == {}
     text = example('# cpus = ""', 'cpus = "4-6"')
     config = load_fleet(fleet_file(tmp_path, text))
-    assert config.drop_ins(config.robots["r1"]) == {
+    assert drop_ins(config, config.robots["r1"]) == {
         "lpac-robot.conf": "[Service]\nCPUAffinity=\nCPUAffinity=4 5 6\n"
     }
     text = text.replace('# directory = "/opt/lpac"', 'directory = "/data/lpac"')
     config = load_fleet(fleet_file(tmp_path, text))
-    first = config.drop_ins(config.robots["r1"])
-    second = config.drop_ins(config.robots["r2"])
+    first = drop_ins(config, config.robots["r1"])
+    second = drop_ins(config, config.robots["r2"])
     for name, cpus in (("lpac-robot", "CPUAffinity=\nCPUAffinity=4 5 6\n"), ("lpac-land", "")):
         # What must be repeated is what the unit says, with the other folder.
         unit = (ROOT / "systemd" / f"{name}.service").read_text()
@@ -468,6 +470,38 @@ def test_a_fleet_without_robots_is_one_to_begin_with(tmp_path: Path) -> None:
         select(load_fleet(path), None)
     add_robot(path, "r1", "10.0.0.1", 1)
     assert [robot.host for robot in select(load_fleet(path), None)] == ["10.0.0.1"]
+
+
+# A new file
+
+
+def test_a_new_file_is_the_fleet_that_was_meant(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    written = write_fleet(path, "Made by a test.", mapping())
+    assert path.read_text().startswith("# Made by a test.\n")
+    assert written == load_fleet(path)
+    assert robot_toml(written, "r1") == robot_toml(load_fleet(EXAMPLE), "r1")
+
+
+def test_a_file_that_would_be_wrong_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    tables = mapping()
+    tables["robots"]["r2"]["robot_id"] = 1
+    with pytest.raises(ConfigError, match=r"robots\.r2: robot_id = 1: robot r1 has it too"):
+        write_fleet(path, "", tables)
+    assert not path.exists()
+
+
+def test_a_robot_may_have_its_files_elsewhere(tmp_path: Path) -> None:
+    config = load_fleet(EXAMPLE)
+    places = Places("/policy", "field.env", "kept", "127.0.0.1")
+    write_robot(tmp_path / "r2" / "robot.toml", config, "r2", places)
+    robot = load_config(tmp_path / "r2" / "robot.toml")
+    assert (robot.policy.bundle, robot.policy.world, robot.log.folder) == (
+        "/policy", str(tmp_path / "r2" / "field.env"), str(tmp_path / "r2" / "kept"),
+    )  # fmt: skip
+    assert robot.link.listen == ("tcp/127.0.0.1:7447",)
+    assert robot.link.connect == config.robot_config("r2").link.connect
 
 
 # Edits

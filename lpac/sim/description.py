@@ -1,0 +1,50 @@
+"""What the fleet.toml of a simulated fleet says of all its robots: the field, and how they fly."""
+
+from typing import Any
+
+from edge.core.fence import Fence
+from edge.flight.margins import ErrorBudget
+from lpac.sim.experiment import FIELD_SCALE
+
+ERRORS = ErrorBudget()
+_BASE_HEIGHT_M = 5.0
+_SLOT_SPACING_M = ERRORS.slot_spacing.least_m
+# Robots stop half a metre outside the field, with the fence 1.5 m further out.
+_FENCE_BEYOND_FIELD_M = 2.0
+_FENCE_BUFFER_M = 1.5
+
+
+def fence_around(field_m: float, robots: int) -> Fence:
+    """Around a field that is a square of that side, and above the heights of so many robots."""
+    low_m, high_m = -_FENCE_BEYOND_FIELD_M, field_m + _FENCE_BEYOND_FIELD_M
+    return Fence(
+        vertices_m=((low_m, low_m), (high_m, low_m), (high_m, high_m), (low_m, high_m)),
+        buffer_m=_FENCE_BUFFER_M,
+        floor_m=_BASE_HEIGHT_M / 2.0,
+        ceiling_m=_BASE_HEIGHT_M + robots * _SLOT_SPACING_M + 2.0,
+    )
+
+
+def robot_table(fence: Fence, max_speed_m_s: float) -> dict[str, Any]:
+    """[robot] of fleet.toml: what all robots' robot.toml have alike."""
+    return {
+        "on_stop": "land",
+        "policy": {
+            "env_scale": FIELD_SCALE.env_scale,
+            "velocity_scale": FIELD_SCALE.velocity_scale,
+        },
+        "flight": {"base_height_m": _BASE_HEIGHT_M, "slot_spacing_m": _SLOT_SPACING_M},
+        "fence": {
+            "vertices_m": [list(vertex) for vertex in fence.vertices_m],
+            "buffer_m": fence.buffer_m,
+            "floor_m": fence.floor_m,
+            "ceiling_m": fence.ceiling_m,
+        },
+        "limits": {
+            "max_speed_m_s": max_speed_m_s,
+            "max_climb_m_s": 2.0,
+            "max_acceleration_m_s2": 2.0,
+            "lag_s": 1.3,
+        },
+        "failsafe": {"rc": "none", "parameters": "set"},
+    }
