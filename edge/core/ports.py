@@ -1,10 +1,20 @@
-"""The outside world as the robot sees it; adapters and the simulator implement these."""
+"""The outside world as the robot sees it; drivers and the simulator implement these."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from edge.core import F32, F64
 from edge.core.vehicle import Action, Setpoint, VehicleState
+
+
+class Clock(Protocol):
+    """What time it is. Called from any thread."""
+
+    def monotonic_s(self) -> float:
+        """Time that never jumps, s; by it all ages are told."""
+
+    def unix_s(self) -> float:
+        """The wall clock, s; it may be wrong, and may be set."""
 
 
 class Sensor(Protocol):
@@ -38,7 +48,7 @@ class OdometrySource(Protocol):
         """
 
 
-class Autopilot(Protocol):
+class Vehicle(Protocol):
     """The vehicle. No method waits for it, and none raises."""
 
     def state(self) -> VehicleState:
@@ -58,7 +68,7 @@ class Autopilot(Protocol):
         """
 
 
-class AutopilotSetup(Protocol):
+class VehicleSetup(Protocol):
     """What is done with a vehicle before a flight. Each method waits for it, and may raise OSError.
 
     Called from one thread alone, preflight's.
@@ -74,8 +84,22 @@ class AutopilotSetup(Protocol):
         """Replace PX4's fence by one polygon to stay in: latitude and longitude."""
 
 
+class Watchdog(Protocol):
+    """Holds the vehicle when the control loop hangs."""
+
+    def feed(self, *, flying: bool) -> None:
+        """The control loop lives, and flies the vehicle or not. The control thread's."""
+
+    def alive(self) -> bool:
+        """Whether it watches. Called from any thread."""
+
+
 class Recorder(Protocol):
     """The flight log."""
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
         """Keep one message: plain values, bytes and numpy arrays. Never waits; any thread."""
+
+    @property
+    def recording(self) -> bool:
+        """Whether what is recorded is kept. Any thread."""

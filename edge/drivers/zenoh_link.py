@@ -119,12 +119,12 @@ class ZenohLink:
         """The other robots whose programs are connected now."""
         return frozenset(id_ for id_ in self._others() if id_ != self._robot_id)
 
-    def duplicate(self) -> bool:
-        """Whether another session says that it is this robot.
+    def is_claimed(self, robot_id: int) -> bool:
+        """Whether another session says that it is that robot.
 
         Up to a second after a restart that may be the own former session.
         """
-        return self._robot_id in self._others()
+        return robot_id in self._others()
 
     def duplicates(self) -> frozenset[int]:
         """The robot ids that more than one session claims, the own among them."""

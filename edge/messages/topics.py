@@ -5,7 +5,7 @@ who sends what, sizes and priorities from here, and drops what is larger.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 Sender = Literal["robot", "ground"]
 Priority = Literal["now", "later"]
@@ -42,3 +42,13 @@ ORDER = Topic("order", "ground", "Order", 5.0, 2**12, "now", "order")
 WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 400_000, "later", None)
 
 TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD)
+
+
+class Link(Protocol):
+    """The radio. Called from any thread; nothing waits, and nothing raises."""
+
+    def publish(self, topic: Topic, data: bytes) -> None:
+        """Send to whoever listens; it may be lost."""
+
+    def is_claimed(self, robot_id: int) -> bool:
+        """Whether another program than this one says that it is that robot."""

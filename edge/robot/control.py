@@ -8,7 +8,7 @@ from typing import NamedTuple
 import structlog
 
 from edge.core.mailbox import Neighbour
-from edge.core.ports import Autopilot, Odometry, Recorder, Sensor
+from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
@@ -61,7 +61,7 @@ class FlightControl:
         *,
         robot: Robot,
         world_id: str,
-        autopilot: Autopilot,
+        vehicle: Vehicle,
         navigation: Navigation,
         pac: Pac,
         inbox: Inbox,
@@ -71,7 +71,7 @@ class FlightControl:
         started_s: float,
     ) -> None:
         self._configured = robot
-        self._autopilot = autopilot
+        self._vehicle = vehicle
         self._navigation = navigation
         self._pac = pac
         self._inbox = inbox
@@ -100,7 +100,7 @@ class FlightControl:
 
         Whether the vehicle flies by it: one that PX4's own failsafe has is not to be held.
         """
-        vehicle = self._autopilot.state()
+        vehicle = self._vehicle.state()
         ground, ground_age_s = self._inbox.ground(now_s)
         if ground is not None:
             if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
@@ -139,12 +139,12 @@ class FlightControl:
         if decision.new_trial:
             self._pac.forget()
         for action in decision.actions:
-            self._autopilot.command(action)
+            self._vehicle.command(action)
         dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s
         self._last_tick_s = now_s
         setpoint, self._guidance = guide(robot, decision.flight, inputs, self._guidance, dt_s)
         local = None if setpoint is None else self._navigation.to_local(setpoint, vehicle)
-        sent = None if local is None else self._autopilot.send(local)
+        sent = None if local is None else self._vehicle.send(local)
         if decision.flight.state is not before.state:
             flight = decision.flight
             _log.info(
@@ -183,7 +183,7 @@ class FlightControl:
         """
         if self.flight.state is FlightState.ARMING:
             return Action.DISARM
-        vehicle = self._autopilot.state()
+        vehicle = self._vehicle.state()
         obeys = vehicle.mode in (Mode.OFFBOARD, Mode.HOLD) and not failsafe_acts(vehicle)
         return on_stop if self.flight.state in STEERED and obeys else None
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.frames import LocalTransform, MissionFrame
-from edge.core.ports import Autopilot, Odometry
+from edge.core.ports import Odometry, Vehicle
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
 from edge.core.vehicle import (
     GlobalOrigin,
@@ -44,10 +44,10 @@ class Navigation:
     """
 
     def __init__(
-        self, autopilot: Autopilot, clock_s: Callable[[], float], limits: PositionLimits
+        self, vehicle: Vehicle, clock_s: Callable[[], float], limits: PositionLimits
     ) -> None:
-        """`clock_s` is the monotonic clock of the autopilot's times, s."""
-        self._autopilot = autopilot
+        """`clock_s` is the monotonic clock of the vehicle's times, s."""
+        self._vehicle = vehicle
         self._clock_s = clock_s
         self._limits = limits
         self._fixed: _Fixed | None = None
@@ -64,7 +64,7 @@ class Navigation:
 
         None, too, for an armed vehicle whose takeoff point is not known.
         """
-        vehicle = self._autopilot.state()
+        vehicle = self._vehicle.state()
         estimate = self.estimate(vehicle)
         if estimate is None or (self.datum_m is None and vehicle.armed):
             return None

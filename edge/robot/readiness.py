@@ -11,7 +11,7 @@ from typing import NamedTuple
 import structlog
 
 from edge.core.fence import Fence
-from edge.core.ports import Autopilot, AutopilotSetup, Odometry
+from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement
 from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
@@ -55,14 +55,14 @@ class Readiness:
     def __init__(
         self,
         config: RobotConfig,
-        autopilot: Autopilot,
-        setup: AutopilotSetup,
+        vehicle: Vehicle,
+        setup: VehicleSetup,
         *,
         bundle_id: str,
         bundle_problem: str | None,
     ) -> None:
         self._config = config
-        self._autopilot = autopilot
+        self._vehicle = vehicle
         self._setup = setup
         self._bundle_id = bundle_id
         self._bundle_problem = bundle_problem
@@ -84,7 +84,7 @@ class Readiness:
         if requirements != self._requirements:
             self._requirements, self._parameter_problems = requirements, None
             self._parameters_due_s = -math.inf
-        vehicle = self._autopilot.state()
+        vehicle = self._vehicle.state()
         if not vehicle.connected:
             self._parameters_due_s, self._uploaded = -math.inf, None
             return
@@ -126,7 +126,7 @@ class Readiness:
             bundle_id=self._bundle_id,
             world_id=world_id,
             system_id=config.autopilot.system_id,
-            vehicle=self._autopilot.state(),
+            vehicle=self._vehicle.state(),
             failsafe_problems=self._parameter_problems,
             fence=robot.fence,
             fence_uploaded=origin is not None and self._uploaded == (origin, robot.fence),

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from edge.core.ports import Autopilot, AutopilotSetup
+from edge.core.ports import Vehicle, VehicleSetup
 from edge.core.vehicle import VehicleState
 from edge.flight.failsafe import Requirement, check
 
@@ -35,8 +35,8 @@ class SetupReport(NamedTuple):
 
 
 def set_up(
-    autopilot: Autopilot,
-    setup: AutopilotSetup,
+    autopilot: Vehicle,
+    setup: VehicleSetup,
     requirements: Sequence[Requirement],
     system_id: int,
     wait_s: float,
@@ -74,7 +74,7 @@ def set_up(
     return SetupReport(answers_as, tuple(changes), check(tuple(requirements), after), needs_reboot)
 
 
-def _only_vehicle(autopilot: Autopilot, wait_s: float) -> int:
+def _only_vehicle(autopilot: Vehicle, wait_s: float) -> int:
     """The system id of the one vehicle that is heard."""
     until_s = time.monotonic() + wait_s
     heard_at_s = None

@@ -182,7 +182,7 @@ def test_robots_that_know_one_peer_hear_all_others_and_not_themselves() -> None:
             assert set(inbox.newest) == {f"robot/{other}/message" for other in others_ids}
             eventually(partial(is_present, link, others_ids))
             eventually(partial(has_peers, link, 2))
-            assert not link.duplicate()
+            assert not link.is_claimed(robot_id)
             assert not link.duplicates()
             assert link.failures() == 0
 
@@ -324,14 +324,14 @@ def test_two_robots_of_one_id_are_seen_by_both_and_by_the_ground() -> None:
             stack.enter_context(ZenohLink(fleet="test", robot_id=robot_id, connect=[known]))
             for robot_id in (3, 3, 4)
         )
-        eventually(lambda: first.duplicate() and second.duplicate())
+        eventually(lambda: first.is_claimed(3) and second.is_claimed(3))
         eventually(lambda: ground.duplicates() == other.duplicates() == {3})
         eventually(lambda: first.duplicates() == {3})
-        assert not other.duplicate()
-        assert not ground.duplicate()
+        assert not other.is_claimed(4) and other.is_claimed(3)
+        assert ground.is_claimed(3) and not ground.is_claimed(5)
         eventually(lambda: first.present() == {4})
         second.close()
-        eventually(lambda: not first.duplicate() and not ground.duplicates())
+        eventually(lambda: not first.is_claimed(3) and not ground.duplicates())
         assert not links[0].duplicates()
 
 

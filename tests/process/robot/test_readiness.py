@@ -160,7 +160,7 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
             assert vehicle.arm() is MavResult.ACCEPTED
         before = dict(vehicle.parameters)
         deadline_s = time.monotonic() + 60.0
-        while asked._autopilot.state().armed is not True:
+        while asked._vehicle.state().armed is not True:
             assert time.monotonic() < deadline_s
             time.sleep(0.05)
         asked.prepare(time.monotonic(), assignment(asked))

@@ -19,6 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+import edge.robot.node
 import edge.robot.process
 from edge.core import F32, F64
 from edge.drivers.world_sensor import WorldSensor
@@ -396,8 +397,9 @@ def _run(folder: Path) -> None:
             nothing = np.zeros((0, 0), np.float32)
             return nothing if (folder / "fail-sensor").exists() else super().view(position)
 
-    with patch.multiple(
-        edge.robot.process, Pac=FailingPac, WorldSensor=FailingSensor, _take_alone=lambda *_: None
+    with (
+        patch.object(edge.robot.node, "Pac", FailingPac),
+        patch.multiple(edge.robot.process, WorldSensor=FailingSensor, _take_alone=lambda *_: None),
     ):
         run(folder / "robot.toml")
 

@@ -159,7 +159,7 @@ class Flown:
         self.control = FlightControl(
             robot=config.robot(boot_nonce=11),
             world_id="configured",
-            autopilot=self.autopilot,
+            vehicle=self.autopilot,
             navigation=self.navigation,
             pac=self.pac,
             inbox=self.inbox,
@@ -177,6 +177,10 @@ class Flown:
     @property
     def now_s(self) -> float:
         return self.vehicle.time_s
+
+    @property
+    def recording(self) -> bool:
+        return True
 
     @property
     def state(self) -> FlightState:

@@ -1,0 +1,430 @@
+"""One robot: its parts, and the steps that somebody else times.
+
+Nothing here has a clock, a thread or a socket of its own. On a drone, threads call the steps
+(`edge.robot.process`); in the simulator, one simulated clock does.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from edge.core.ports import Clock, Recorder, Sensor, Vehicle, VehicleSetup, Watchdog
+from edge.core.vehicle import Action
+from edge.flight.state import flown_s
+from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
+from edge.messages.bounds import MOST_TEXTS
+from edge.messages.codec import MessageError, encode
+from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
+from edge.messages.mission import FlightState, LoopStatus, RobotStatus, explored_to_bytes, world_id
+from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Link, Topic
+from edge.policy.bundle import load_bundle
+from edge.policy.lpac.graphs import Policy
+from edge.policy.verify import verify
+from edge.robot.config import RobotConfig
+from edge.robot.control import FlightControl, GroundWorld
+from edge.robot.inbox import Inbox
+from edge.robot.navigation import Navigation
+from edge.robot.pac import Pac
+from edge.robot.readiness import Readiness
+
+_EXPLORED_PERIOD_S = 1.0
+# A status without news; what is new goes at once. A little less, since ticks are never early.
+_STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
+# After as many of the policy's periods without a message, a beacon goes alone.
+_SILENT_TICKS = 1.5
+_CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
+
+
+class RobotError(ValueError):
+    """The robot's program cannot start; the text says why and what to do."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class LoadedPolicy:
+    """A policy that was checked on this CPU; `problem` is why it does not pass, None if it does."""
+
+    policy: Policy
+    bundle_id: str
+    problem: str | None
+
+
+def load_policy(path: Path) -> LoadedPolicy:
+    """Load and verify a bundle. Raises ValueError or OSError that says what is wrong."""
+    bundle = load_bundle(path)
+    if bundle.manifest.perception is None:
+        raise RobotError(f"{path}: the bundle has no perception: it cannot fly")
+    failed = [check.name for check in verify(bundle) if not check.passed]
+    problem = None
+    if failed:
+        problem = f"{', '.join(failed)} of the bundle do not compute torch's golden outputs here"
+    return LoadedPolicy(Policy(bundle), bundle.id, problem)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Ports:
+    """The outside world of one robot.
+
+    `sensor_over` makes a sensor over a world file's text; the second argument is what the text is
+    called in the ValueError that it raises for one that cannot be used.
+    """
+
+    clock: Clock
+    vehicle: Vehicle
+    vehicle_setup: VehicleSetup
+    watchdog: Watchdog
+    recorder: Recorder
+    sensor_over: Callable[[str, str], Sensor]
+
+
+class RobotNode:
+    """One robot. Each `*_step` belongs to one thread; `receive`'s callbacks to any number.
+
+    `link` is what it says goes to; until there is one, nobody hears it. `boot_nonce` and
+    `boot_epoch` tell this start of its program from others; the epoch grows from start to start.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        ports: Ports,
+        policy: LoadedPolicy,
+        world: str,
+        *,
+        boot_nonce: int,
+        boot_epoch: int,
+    ) -> None:
+        """`world` is the text of its world file. Raises ValueError if that cannot be used."""
+        clock = ports.clock
+        self._config = config
+        self._ports = ports
+        self._policy = policy
+        self._boot_nonce = boot_nonce
+        self._boot_epoch = boot_epoch
+        self._started_s = clock.monotonic_s()
+        self._fed_s = -math.inf
+        self.link: Link | None = None
+        # What it knows: its place, its radio mail, its map and messages.
+        self._navigation = Navigation(ports.vehicle, clock.monotonic_s, config.position)
+        self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
+        self._pac = Pac(
+            robot_id=config.robot_id,
+            boot_epoch=boot_epoch,
+            policy=policy.policy,
+            sensor=ports.sensor_over(world, config.policy.world),
+            odometry=self._navigation,
+            parameters=config.pac,
+        )
+        self._control = FlightControl(
+            robot=config.robot(boot_nonce),
+            world_id=world_id(world),
+            vehicle=ports.vehicle,
+            navigation=self._navigation,
+            pac=self._pac,
+            inbox=self._inbox,
+            recorder=ports.recorder,
+            energy=config.energy,
+            unix_clock_s=clock.unix_s,
+            started_s=self._started_s,
+        )
+        self.readiness = Readiness(
+            config,
+            ports.vehicle,
+            ports.vehicle_setup,
+            bundle_id=policy.bundle_id,
+            bundle_problem=policy.problem,
+        )
+        self._statuses = 0
+        # What the ground was told last, and when.
+        self._told: tuple[object, ...] = ()
+        self._told_at_s = -math.inf
+        # Two threads take from it; its `next` cannot be interrupted.
+        self._message_sequence = itertools.count(1)
+        self._message_at_s = -math.inf
+        self._explored_due_s = -math.inf
+
+    # What comes
+
+    @property
+    def subscriptions(self) -> Mapping[Topic, Callable[[str, bytes], None]]:
+        """What it hears: topic -> callback with the key and the data, from any thread."""
+        clock, inbox = self._ports.clock, self._inbox
+        return {
+            MESSAGE: self._receive_message,
+            STATE: lambda _, data: inbox.put_ground(data, clock.monotonic_s(), clock.unix_s()),
+            ORDER: lambda _, data: inbox.put_order(data),
+            WORLD: lambda _, data: inbox.put_world(data),
+        }
+
+    def _receive_message(self, key: str, data: bytes) -> None:
+        """A robot's: to inbox and mailbox, and what came to the log."""
+        now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
+        sender = int(key.split("/")[1])
+        try:
+            beacon = decode_beacon(data)
+        except MessageError:
+            beacon = None
+        if beacon is None or beacon.robot_id != sender:
+            self._inbox.put_stranger(f"robot {sender}", now_s)
+        else:
+            self._inbox.put_beacon(beacon, now_s, unix_now_s)
+        rejection = None
+        if len(data) > BEACON_BYTES:
+            rejection = self._pac.receive(data[BEACON_BYTES:], now_s, unix_now_s)
+        self._ports.recorder.record(
+            "received",
+            unix_now_s,
+            {
+                "sender": sender,
+                "sequence": beacon and beacon.sequence,
+                "age_s": beacon and unix_now_s - beacon.sent_at_s,
+                "rejection": rejection,
+            },
+        )
+
+    # Its steps
+
+    def control_step(self) -> None:
+        """Read the newest of everything, decide, send at most one setpoint; the rate of control."""
+        clock = self._ports.clock
+        flying = self._control.tick(clock.monotonic_s())
+        self._ports.watchdog.feed(flying=flying)
+        now_s = clock.monotonic_s()
+        self._control.look_back(self._fed_s, now_s)
+        self._fed_s = now_s
+
+    def perception_step(self) -> None:
+        """Look at the world; the rate of perception."""
+        now_s = self._ports.clock.monotonic_s()
+        tick = self._pac.perceive(now_s)
+        if now_s >= self._explored_due_s:
+            self._explored_due_s = now_s + _EXPLORED_PERIOD_S
+            self._publish(EXPLORED, explored_to_bytes(self._pac.explored()))
+        if tick is not None:
+            self._ports.recorder.record(
+                "perception",
+                self._ports.clock.unix_s(),
+                {
+                    "images": tick.images.copy(),
+                    "position_feature": tick.position_feature,
+                    "features": tick.features,
+                },
+            )
+
+    def policy_step(self) -> None:
+        """Hear the neighbours, decide where to fly, tell the neighbours; the policy's rate."""
+        tick = self._pac.infer(self._ports.clock.monotonic_s(), self._ports.clock.unix_s())
+        if tick is None:
+            return
+        self._publish_message(tick.message)
+        record = {field.name: getattr(tick, field.name) for field in dataclasses.fields(tick)}
+        self._ports.recorder.record("policy", self._ports.clock.unix_s(), record)
+
+    def _publish_message(self, of_policy: bytes = b"") -> None:
+        """To the neighbours: a beacon, and behind it what the policy says, if it does."""
+        control, vehicle = self._control, self._ports.vehicle.state()
+        odometry, now_s = self._navigation.odometry(), self._ports.clock.monotonic_s()
+        assignment, gps = control.assignment, vehicle.gps
+        parameters = assignment.robot.parameters
+        x_m, y_m = parameters.landing_point_m
+        self._message_at_s = now_s
+        beacon = Beacon(
+            robot_id=self._config.robot_id,
+            boot_epoch=self._boot_epoch,
+            sequence=next(self._message_sequence),
+            sent_at_s=self._ports.clock.unix_s(),
+            position_m=odometry and odometry.position_m,
+            velocity_m_s=odometry and odometry.velocity_m_s,
+            state=control.flight.state,
+            armed=vehicle.armed,
+            system_id=vehicle.system_id,
+            gps_accuracy_m=None if gps is None else gps.accuracy_m,
+            flown_s=flown_s(control.flight, vehicle, now_s),
+            slot_height_m=parameters.slot_height_m,
+            landing_point_m=(x_m, y_m),
+            frame_id=self._pac.frame_id,
+            bundle_tag=tag(self._policy.bundle_id),
+            world_tag=tag(assignment.world_id),
+        )
+        self._publish(MESSAGE, encode_beacon(beacon) + of_policy)
+
+    def preflight_step(self) -> None:
+        """Prepare and check the vehicle, a few times a second; it may wait for the vehicle."""
+        control = self._control
+        self._look_for_world()
+        assignment = control.assignment
+        self.readiness.prepare(self._ports.clock.monotonic_s(), assignment)
+        now_s = self._ports.clock.monotonic_s()
+        peers = self._inbox.peers(now_s)
+        control.peers = peers
+        control.checks = self.readiness.checks(
+            now_s,
+            self._ports.clock.unix_s(),
+            assignment=assignment,
+            position=self._navigation.position,
+            odometry=self._navigation.odometry(),
+            peers=peers,
+            not_understood=self._inbox.not_understood,
+            duplicate=self._is_duplicate(),
+            watchdog_alive=self._ports.watchdog.alive(),
+            ground_age_s=self._inbox.ground_age_s(now_s),
+            ground_clock_offset_s=self._inbox.ground_clock_offset_s,
+        )
+
+    def _look_for_world(self) -> None:
+        """Make a sensor of the world that the ground wants, once that has come."""
+        wanted, data = self._control.wanted_world_id, self._inbox.world
+        if wanted is None or data is None:
+            return
+        text = data.decode("utf-8", "replace")
+        if world_id(text) != wanted:
+            return
+        try:
+            sensor = self._ports.sensor_over(text, f"world {wanted}")
+        except (ValueError, ArithmeticError) as error:
+            self._control.world = GroundWorld(wanted, None, str(error))
+        else:
+            self._control.world = GroundWorld(wanted, sensor, "")
+
+    def status_step(self, loops: Mapping[str, LoopStatus]) -> RobotStatus:
+        """Say how it is to the ground and to the log, a few times a second.
+
+        `loops` are the loops that call the steps, by their names.
+        """
+        now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
+        status = self._status(now_s, unix_now_s, loops)
+        news = _news(status)
+        if news != self._told or now_s - self._told_at_s >= _STATUS_PERIOD_S:
+            self._told, self._told_at_s = news, now_s
+            self._publish(STATUS, encode(status))
+        if now_s - self._message_at_s > _SILENT_TICKS / self._config.rates.policy_hz:
+            # The policy is silent, or hangs: neighbours must not lose this robot's place.
+            self._publish_message()
+        vehicle = self._ports.vehicle.state()
+        for topic, value in (("status", status), ("vehicle", vehicle)):
+            fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+            self._ports.recorder.record(topic, unix_now_s, fields)
+        if status.position_m is not None:
+            yaw_rad = status.heading_rad
+            if yaw_rad is not None and status.origin is not None:
+                # From compass heading to the angle from x, which is right of the mission heading.
+                yaw_rad = math.pi / 2.0 - (yaw_rad - math.radians(status.origin.heading_deg))
+            pose = {"position_m": status.position_m, "yaw_rad": yaw_rad}
+            self._ports.recorder.record("/pose", unix_now_s, pose)
+        return status
+
+    def _status(
+        self, now_s: float, unix_now_s: float, loops: Mapping[str, LoopStatus]
+    ) -> RobotStatus:
+        control, vehicle = self._control, self._ports.vehicle.state()
+        gps = vehicle.gps
+        origin, robot, world = control.assignment
+        flight, failed_checks = control.flight, control.failed_checks(now_s)
+        odometry = self._navigation.odometry()
+        self._statuses += 1
+        ready = flight.state is FlightState.PREFLIGHT and failed_checks == ()
+        neighbours = self._pac.mailbox.neighbours(now_s)
+        policy_velocity_m_s = self._pac.control(now_s)
+        ground_age_s = self._inbox.ground_age_s(now_s)
+        energy = control.energy
+        return RobotStatus(
+            robot_id=robot.robot_id,
+            boot_nonce=self._boot_nonce,
+            sequence=self._statuses,
+            uptime_s=now_s - self._started_s,
+            unix_time_s=unix_now_s,
+            state=flight.state,
+            reason=flight.reason,
+            ready=ready,
+            failed_checks=_CHECKS_RUNNING if failed_checks is None else failed_checks[:MOST_TEXTS],
+            alarms=(*control.alarms, *self._alarms()),
+            obeyed_sequence=control.obeyed_sequence,
+            operator=control.operator,
+            orders=flight.answers,
+            bundle_id=self._policy.bundle_id,
+            world_id=world,
+            trial=flight.trial,
+            origin=origin,
+            system_id=vehicle.system_id,
+            slot_height_m=robot.parameters.slot_height_m,
+            landing_point_m=robot.parameters.landing_point_m,
+            position_m=odometry and odometry.position_m,
+            velocity_m_s=odometry and odometry.velocity_m_s,
+            heading_rad=vehicle.heading_rad,
+            mode=vehicle.mode,
+            armed=vehicle.armed,
+            battery=vehicle.battery,
+            satellites=None if gps is None else gps.satellites,
+            message_counts=self._pac.mailbox.counts(),
+            neighbour_ages_s={str(n.robot_id): round(n.age_s, 3) for n in neighbours},
+            loops=dict(loops),
+            fence=robot.fence,
+            not_taken=control.not_taken,
+            in_air=vehicle.in_air,
+            global_deg=self._navigation.global_deg(vehicle),
+            hdop=gps.hdop if gps is not None and math.isfinite(gps.hdop) else None,
+            policy_velocity_m_s=(
+                None if policy_velocity_m_s is None else tuple(policy_velocity_m_s.tolist())
+            ),
+            feature_age_s=self._pac.feature_age_s(now_s),
+            neighbour_messages={str(r): n for r, n in self._pac.mailbox.accepted().items()},
+            ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
+            remote_control=(
+                bool(vehicle.remote_control) if self._config.failsafe.rc == "pilot" else None
+            ),
+            battery_lasts_s=None if energy is None else energy.lasts_s,
+            home_s=None if energy is None else energy.home_s,
+            endurance_s=control.endurance_s,
+            flown_s=flown_s(flight, vehicle, now_s),
+            position_quality=self._navigation.position.quality,
+            position_cause=self._navigation.position.cause,
+            gps_accuracy_m=None if gps is None else gps.accuracy_m,
+        )
+
+    def _alarms(self) -> tuple[Reason, ...]:
+        alarms = []
+        if self._is_duplicate():
+            text = f"another program says that it is robot {self._config.robot_id}"
+            alarms.append(Reason(ReasonCode.DUPLICATE_ID, text))
+        if not self._ports.watchdog.alive():
+            text = "the watchdog has ended: only PX4 notices if this program hangs"
+            alarms.append(Reason(ReasonCode.WATCHDOG_ENDED, text))
+        if not self._ports.recorder.recording:
+            alarms.append(Reason(ReasonCode.LOG_NOT_WRITTEN, "the flight log is not written"))
+        if self._inbox.ground_refusal:
+            text = f"the ground is not understood: {self._inbox.ground_refusal}"
+            alarms.append(Reason(ReasonCode.GROUND_NOT_UNDERSTOOD, text))
+        return tuple(alarms)
+
+    # Besides
+
+    @property
+    def failed_checks(self) -> tuple[FailedCheck, ...] | None:
+        """What keeps it on the ground; None while the checks are still running."""
+        return self._control.failed_checks(self._ports.clock.monotonic_s())
+
+    def leave(self, on_stop: Action) -> Action | None:
+        """What is to be asked of a vehicle that it flew, when its program ends; None if nothing.
+
+        Once its control step is called no more.
+        """
+        return self._control.leave(on_stop)
+
+    def _publish(self, topic: Topic, data: bytes) -> None:
+        if self.link is not None:
+            self.link.publish(topic, data)
+
+    def _is_duplicate(self) -> bool:
+        return self.link is not None and self.link.is_claimed(self._config.robot_id)
+
+
+def _news(status: RobotStatus) -> tuple[object, ...]:
+    """What the ground is to hear of at once if it changes; of texts only what they are about."""
+    return (
+        status.state, status.reason.code, status.ready, status.orders, status.obeyed_sequence,
+        status.operator, status.trial, status.world_id, status.origin, status.fence, status.armed,
+        status.in_air, status.mode, status.position_quality,
+        *(check.code for check in (*status.failed_checks, *status.not_taken)),
+        *(alarm.code for alarm in status.alarms),
+    )  # fmt: skip
