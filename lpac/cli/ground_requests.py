@@ -108,13 +108,14 @@ def measure(
     subscriber: "GroundSubscriber", robots: Sequence[str], seconds: float
 ) -> dict[str, "Standing"]:
     """Where these robots stand, averaged. Raises ValueError, one line, if one cannot tell."""
+    from lpac.ground.procedure import gather
     from lpac.ground.site import standing
     from lpac.ground.station.subscriber import addressed
 
     names = addressed(subscriber.setup, robots)
     typer.echo(f"listening to {', '.join(names)} for {seconds:g} s", err=True)
     with interruptible("listening"):
-        heard = subscriber.gather(names, seconds)
+        heard = subscriber.carry_out(gather(subscriber, names, seconds))
     return {name: standing(name, heard[name]) for name in names}
 
 

@@ -85,7 +85,7 @@ def use(
     sites = Sites(to.path)
     site = sites.load(name)
     with looking(to) as subscriber, interruptible("site use"):
-        report = take_site(to.fleet, site, subscriber.setup, to.robots)
+        report = subscriber.carry_out(take_site(site, subscriber.setup, to.robots))
     if report.problem is None:
         sites.use(name)
     show(to, report, "site use", as_json=as_json, details={})

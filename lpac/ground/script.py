@@ -6,7 +6,6 @@ sees of the robots what the ground tells. Whoever holds the fleet meanwhile has 
 
 import math
 import re
-import time
 import tomllib
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ from edge.core.world import parse_world
 from edge.messages.codes import texts
 from edge.messages.mission import FlightState, GroundState, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.ground.procedure import Ground, Procedure, Until, fresh_snapshot, gather
 from lpac.ground.site import SavedSite, Sites, origin_at, places_at, standing
-from lpac.ground.station.client import command
 from lpac.ground.station.protocol import (
     CommandReport,
     Enable,
@@ -38,7 +37,7 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from lpac.ground.station.station import is_down
-from lpac.ground.station.subscriber import GroundSubscriber, addressed
+from lpac.ground.station.subscriber import addressed
 
 _S = FlightState
 
@@ -331,55 +330,58 @@ class ScriptError(RuntimeError):
 
 
 class ScriptRun:
-    """One run of a script. `robots` are those that it addresses."""
+    """One run of a script. `robots` are those that it addresses.
+
+    `fly` and `hold` are procedures: whoever has the ground carries them out.
+    """
 
     def __init__(
-        self, script: Script, sites: Sites, subscriber: GroundSubscriber, teller: ScriptListener
+        self, script: Script, sites: Sites, ground: Ground, listener: ScriptListener
     ) -> None:
         """Raises ValueError if the script names a robot that the fleet does not have."""
         try:
-            self.robots = addressed(subscriber.setup, script.robots)
+            self.robots = addressed(ground.setup, script.robots)
             for step in (*script.before, *script.steps):
                 for name in _names(step):
-                    addressed(subscriber.setup, [name])
+                    addressed(ground.setup, [name])
                     if isinstance(step, MissionStep) and name not in self.robots:
                         raise ValueError(f"perturb: robot {name!r} is none of the script's robots")
         except ValueError as error:
             raise ConfigError(f"{script.path}: {error}") from None
         self._script = script
         self._sites = sites
-        self._subscriber = subscriber
-        self._teller = teller
+        self._ground = ground
+        self._listener = listener
         self._given: set[str] = set()
         self._said: set[Hashable] = set()
         self._last_start_s: dict[str, float] = {}
 
-    def fly(self) -> None:
-        """Go through all steps of all trials. Raises ScriptError, and GroundError.
+    def fly(self) -> Procedure[None]:
+        """Go through all steps of all trials. Raises ScriptError.
 
         What flies then flies on: call `hold`, also after a KeyboardInterrupt.
         """
         script = self._script
         for i, step in enumerate(script.before):
-            self._go(step, f"before[{i}]", "")
+            yield from self._go(step, f"before[{i}]", "")
         first = self._first_number()
         for trial in range(1, script.trials + 1):
             count = f"trial {trial} of {script.trials}: " if script.trials > 1 else ""
             self._said.clear()
             self._given.clear()
-            if trial > 1 and not self._teller.may(f"{count}let the robots take off again?"):
+            if trial > 1 and not self._listener.may(f"{count}let the robots take off again?"):
                 raise ScriptError(f"{count}not wanted", hold=False)
-            self._begin_trial(first + trial - 1, count)
+            yield from self._begin_trial(first + trial - 1, count)
             for i, step in enumerate(script.steps):
-                self._go(step, f"steps[{i}]", count)
+                yield from self._go(step, f"steps[{i}]", count)
 
-    def hold(self) -> str:
+    def hold(self) -> Procedure[str]:
         """Hold whoever flies; what came of it, and what to do next, in words."""
         # Who is not heard just now may well be.
-        last = [r.status for r in self._subscriber.snapshot.robots if r.name in self.robots]
+        last = [r.status for r in self._ground.snapshot.robots if r.name in self.robots]
         if all(status is None or is_down(status) for status in last):
             return "nobody is in the air"
-        report = self._command(SafetyCommand("hold", self._script.robots))
+        report = yield SafetyCommand("hold", self._script.robots)
         told = "the fleet is told to hold"
         if not report.done:
             told += f", but {_failures(report)}"
@@ -387,92 +389,92 @@ class ScriptRun:
 
     # Steps
 
-    def _go(self, step: Step, where: str, count: str) -> None:
+    def _go(self, step: Step, where: str, count: str) -> Procedure[None]:
         name = f"{count}{_NAMES[type(step)]}"
         try:
             if isinstance(step, MissionStep):
                 # Its time counts from when all fly it.
-                self._teller.step(f"{count}start", None)
-                self._require_of_flying(Start(self._script.robots))
-            self._teller.step(name, _duration_s(step))
-            self._do(step)
+                self._listener.step(f"{count}start", None)
+                yield from self._require_of_flying(Start(self._script.robots))
+            self._listener.step(name, _duration_s(step))
+            yield from self._do(step)
         except ScriptError as error:
             raise ScriptError(f"{name} ({where}): {error}", hold=error.hold) from None
         except ValueError as error:
             raise ScriptError(f"{name} ({where}): {error}") from None
 
-    def _do(self, step: Step) -> None:
+    def _do(self, step: Step) -> Procedure[None]:
         robots = self._script.robots
         match step:
             case OriginStep():
-                self._set_origin(step)
+                yield from self._set_origin(step)
             case SiteStep():
                 site = self._sites.load(step.name)
-                _require(
-                    take_site(self._subscriber.fleet, site, self._subscriber.setup, self.robots)
-                )
+                _require((yield from take_site(site, self._ground.setup, self.robots)))
                 self._sites.use(step.name)
             case WorldStep():
-                self._require(_set_world(self._script.path, step, robots))
+                yield from self._require(_set_world(self._script.path, step, robots))
             case PreflightStep():
-                self._prepare(step)
+                yield from self._prepare(step)
             case TakeoffStep():
-                self._require_of_flying(Takeoff(robots, step.interval_s, step.abort_on_failure))
+                yield from self._require_of_flying(
+                    Takeoff(robots, step.interval_s, step.abort_on_failure)
+                )
             case MissionStep():
-                self._fly_mission(step)
+                yield from self._fly_mission(step)
             case ReturnStep():
-                self._bring_down(SafetyCommand("return", robots, wait=True))
+                yield from self._bring_down(SafetyCommand("return", robots, wait=True))
             case LandStep():
-                self._bring_down(SafetyCommand("land", robots, wait=True))
+                yield from self._bring_down(SafetyCommand("land", robots, wait=True))
 
     def _first_number(self) -> int:
         """Of the first trial's name: a script that is run again numbers on."""
-        ground = self._subscriber.snapshot.ground
+        ground = self._ground.snapshot.ground
         name = re.escape(self._script.trial)
         match = re.fullmatch(rf"{name}-(\d{{1,6}})", "" if ground is None else ground.trial)
         return 1 if match is None else int(match[1]) + 1
 
-    def _begin_trial(self, number: int, count: str) -> None:
+    def _begin_trial(self, number: int, count: str) -> Procedure[None]:
         trial = f"{self._script.trial}-{number}" if self._script.trial else ""
         name = f"{count}reset maps"
-        self._teller.step(name, None)
+        self._listener.step(name, None)
         try:
-            self._require(NextTrial(trial, self._script.robots))
+            yield from self._require(NextTrial(trial, self._script.robots))
         except ScriptError as error:
             raise ScriptError(f"{name}: {error}") from None
 
-    def _set_origin(self, step: OriginStep) -> None:
+    def _set_origin(self, step: OriginStep) -> Procedure[None]:
         origin = step.given()
         if origin is None:
-            heard = self._subscriber.gather(_names(step), step.average_s)
+            heard = yield from gather(self._ground, _names(step), step.average_s)
             stands = [standing(name, statuses) for name, statuses in heard.items()]
             origin = origin_at(stands[0], stands[1] if len(stands) > 1 else None)
-        self._teller.line(
+        self._listener.line(
             f"origin {origin.latitude_deg:.7f} {origin.longitude_deg:.7f}, heading "
             f"{origin.heading_deg:.1f} deg"
         )
-        self._require(SetOrigin(origin, self._script.robots))
+        yield from self._require(SetOrigin(origin, self._script.robots))
 
-    def _prepare(self, step: PreflightStep) -> None:
-        ground, ids = self._subscriber.snapshot.ground, self._subscriber.setup.robots
+    def _prepare(self, step: PreflightStep) -> Procedure[None]:
+        ground, ids = self._ground.snapshot.ground, self._ground.setup.robots
         if ground and any(
             ground.safety_action_for(ids[r]) in ("return", "land") for r in self.robots
         ):
             # The last trial's end, which keeps robots from flying again.
-            self._require(Resume(self._script.robots))
-        self._require(Enable(True, self._script.robots))
-        began_s = time.monotonic()
+            yield from self._require(Resume(self._script.robots))
+        yield from self._require(Enable(True, self._script.robots))
+        began_s = self._ground.now_s
 
         def ready(snapshot: FleetSnapshot) -> bool:
             missing = self._not_ready(snapshot)
             # At first everything is missing.
-            if time.monotonic() - began_s > min(5.0, step.at_most_s / 2.0):
+            if self._ground.now_s - began_s > min(5.0, step.at_most_s / 2.0):
                 for what, text in missing.items():
                     self._say_once(what, text)
             return not missing
 
-        if not self._subscriber.wait_for(ready, step.at_most_s):
-            missing = self._not_ready(self._subscriber.snapshot)
+        if not (yield Until(ready, step.at_most_s)):
+            missing = self._not_ready(self._ground.snapshot)
             raise ScriptError(
                 f"not ready after {step.at_most_s:g} s: {'; '.join(missing.values())}"
             )
@@ -502,26 +504,26 @@ class ScriptRun:
                 missing[name, *(check.code for check in status.failed_checks)] = f"{name}: {checks}"
         return missing
 
-    def _bring_down(self, request: SafetyCommand) -> None:
-        report = self._command(request)
+    def _bring_down(self, request: SafetyCommand) -> Procedure[None]:
+        report = yield request
         if not report.done:
             # Held, those that land already would stay in the air.
             raise ScriptError(_failures(report), hold=False)
 
     # The mission
 
-    def _fly_mission(self, step: MissionStep) -> None:
+    def _fly_mission(self, step: MissionStep) -> Procedure[None]:
         # An older picture may show robots that have not started yet.
-        self._subscriber.fresh_snapshot()
-        began_s = time.monotonic()
+        yield from fresh_snapshot(self._ground)
+        began_s = self._ground.now_s
         due = step.in_time()
         before = dict.fromkeys(self.robots, _S.MISSION)
         left_alone: set[str] = set()
-        while (left_s := began_s + step.duration_s - time.monotonic()) > 0.0:
-            while due and time.monotonic() - began_s >= due[0].at_s:
-                self._perturb(due.pop(0))
-            free_s = min([left_s, *(began_s + p.at_s - time.monotonic() for p in due)])
-            snapshot = self._subscriber.snapshot
+        while (left_s := began_s + step.duration_s - self._ground.now_s) > 0.0:
+            while due and self._ground.now_s - began_s >= due[0].at_s:
+                yield from self._perturb(due.pop(0))
+            free_s = min([left_s, *(began_s + p.at_s - self._ground.now_s for p in due)])
+            snapshot = self._ground.snapshot
             self._look_for_others(snapshot)
             statuses = self._statuses(snapshot)
             for name in self.robots:
@@ -539,45 +541,45 @@ class ScriptRun:
                         left_alone.add(name)
                 before[name] = status.state
                 if step.restart and name in left_alone and free_s > _START_TAKES_S:
-                    self._start_again(name)
+                    yield from self._start_again(name)
             if len(statuses) == len(self.robots) and all(map(is_down, statuses.values())):
                 raise ScriptError("nobody flies any more")
-            self._subscriber.wait_for(lambda _: False, max(0.0, min(free_s, _PERIOD_S)))
+            yield Until(lambda _: False, max(0.0, min(free_s, _PERIOD_S)))
 
-    def _start_again(self, name: str) -> None:
-        if time.monotonic() - self._last_start_s.get(name, -math.inf) < _START_AGAIN_S:
+    def _start_again(self, name: str) -> Procedure[None]:
+        if self._ground.now_s - self._last_start_s.get(name, -math.inf) < _START_AGAIN_S:
             return
-        self._last_start_s[name] = time.monotonic()
-        report = self._command(Start((name,)))
+        self._last_start_s[name] = self._ground.now_s
+        report = yield Start((name,))
         if not report.done:
             text = f"{name} is not started again: {_failures(report)}"
             codes = (report.problem and report.problem.code, *map(_codes, report.results))
             self._say_once((name, "not started", codes), text)
 
-    def _perturb(self, perturbation: Perturbation) -> None:
+    def _perturb(self, perturbation: Perturbation) -> Procedure[None]:
         name = perturbation.robot
-        self._require_of_flying(RobotCommand(perturbation.do, (name,)))
+        yield from self._require_of_flying(RobotCommand(perturbation.do, (name,)))
         if perturbation.do == "pilot":
             self._given.add(name)
-            self._teller.line(f"{name} is given to a pilot")
+            self._listener.line(f"{name} is given to a pilot")
             return
 
         def holds(snapshot: FleetSnapshot) -> bool:
             status = self._statuses(snapshot).get(name)
             return status is not None and status.state is _S.HOLD
 
-        if not self._subscriber.wait_for(holds, _REJOIN_WITHIN_S):
-            self._look_for_others(self._subscriber.snapshot)
+        if not (yield Until(holds, _REJOIN_WITHIN_S)):
+            self._look_for_others(self._ground.snapshot)
             raise ScriptError(f"{name} does not come to hold")
-        self._require_of_flying(Start((name,)))
+        yield from self._require_of_flying(Start((name,)))
         self._given.discard(name)
-        self._teller.line(f"{name} is back in the mission")
+        self._listener.line(f"{name} is back in the mission")
 
     def _look_for_others(self, snapshot: FleetSnapshot) -> None:
         """The script gives no safety command from takeoff on: if all have one,
         somebody has the fleet."""
         ground = snapshot.ground
-        asked = [_asked(ground, self._subscriber.setup.robots[name]) for name in self.robots]
+        asked = [_asked(ground, self._ground.setup.robots[name]) for name in self.robots]
         if ground is not None and "none" not in asked:
             by = ground.safety_action_by or ground.operator
             raise ScriptError(f"{by} commands {asked[0]}: the fleet is theirs", hold=False)
@@ -592,17 +594,14 @@ class ScriptRun:
             if robot.name in self.robots and robot.status is not None and robot.fresh
         }
 
-    def _command(self, request: Request) -> CommandReport:
-        return command(self._subscriber.fleet, request)
+    def _require(self, request: Request) -> Procedure[None]:
+        _require((yield request))
 
-    def _require(self, request: Request) -> None:
-        _require(self._command(request))
-
-    def _require_of_flying(self, request: Takeoff | Start | RobotCommand) -> None:
+    def _require_of_flying(self, request: Takeoff | Start | RobotCommand) -> Procedure[None]:
         """What fails because somebody has the fleet meanwhile is no failure of the script's."""
-        report = self._command(request)
+        report = yield request
         if not report.done:
-            snapshot = self._subscriber.fresh_snapshot()
+            snapshot = yield from fresh_snapshot(self._ground)
             # On the ground a safety command may be left from the last landing.
             if not all(map(is_down, self._statuses(snapshot).values())):
                 self._look_for_others(snapshot)
@@ -612,16 +611,16 @@ class ScriptRun:
         """Say a text unless the same was said in other words, such as other numbers."""
         if what not in self._said:
             self._said.add(what)
-            self._teller.line(text)
+            self._listener.line(text)
 
 
 def take_site(
-    fleet: str, site: SavedSite, setup: FleetSetup, robots: Collection[str]
-) -> CommandReport:
+    site: SavedSite, setup: FleetSetup, robots: Collection[str]
+) -> Procedure[CommandReport]:
     """Have the robots fly at a site, each at the height that it has.
 
     A place may be impossible within the fence that the robot has still, or the other way round: so
-    what failed is asked for again after the rest. Raises ValueError and GroundError.
+    what failed is asked for again after the rest. Raises ValueError.
     """
     robots = addressed(setup, robots)
     requests: tuple[Request, ...] = (
@@ -632,7 +631,7 @@ def take_site(
     reports: dict[int, CommandReport] = {}
     for i in (0, 1, 2, 0, 1, 2):
         if i not in reports or not reports[i].done:
-            reports[i] = command(fleet, requests[i])
+            reports[i] = yield requests[i]
             if reports[i].problem:
                 return reports[i]
     results = []

@@ -64,10 +64,10 @@ def run(
         view.robots = flight.robots
         try:
             with view.shown():
-                flight.fly()
+                subscriber.carry_out(flight.fly())
                 view.end_step()
         except ScriptError as error:
-            then = f"; {flight.hold()}" if error.hold else ""
+            then = f"; {subscriber.carry_out(flight.hold())}" if error.hold else ""
             problem, code = f"{error}{then}", 1
         except GroundError as error:
             problem, code = f"{error}; robots in the air hold by themselves, and then land", 1
@@ -75,7 +75,7 @@ def run(
             # A question is aborted. A terminal that is gone cannot be written to; rich exits when
             # its pipe breaks.
             why = str(error) if isinstance(error, OSError) else "interrupted"
-            problem, code = f"{why}; {flight.hold()}", 130
+            problem, code = f"{why}; {subscriber.carry_out(flight.hold())}", 130
         else:
             problem, code = "", 0
     typer.echo(f"lpac: {script}: {problem}" if problem else f"{script}: done", err=True)

@@ -4,13 +4,16 @@ import threading
 import time
 from collections.abc import Callable, Collection
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
-from edge.messages.mission import RobotStatus
-from lpac.analysis.snapshot import FRESH_S, FleetSetup, FleetSnapshot
-from lpac.ground.station.client import no_answer, subscribe
+from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
+from lpac.ground.procedure import NothingComesError, Procedure, Until
+from lpac.ground.station.client import command, no_answer, subscribe
+from lpac.ground.station.protocol import CommandReport
 
 _PATIENCE_S = 5.0
+
+T = TypeVar("T")
 
 
 class GroundSubscriber:
@@ -70,31 +73,31 @@ class GroundSubscriber:
                 if not self._changed.wait(max(0.0, deadline_s - time.monotonic())):
                     return False
 
-    def fresh_snapshot(self) -> FleetSnapshot:
-        """The fleet as it is told from now on. Raises GroundError if nothing comes."""
-        asked_unix_s = time.time()
-        if not self.wait_for(lambda snapshot: snapshot.unix_time_s >= asked_unix_s, _PATIENCE_S):
-            raise no_answer(self.fleet)
-        return self.snapshot
+    @property
+    def now_s(self) -> float:
+        """The monotonic clock."""
+        return time.monotonic()
 
-    def gather(self, robots: Collection[str], duration_s: float) -> dict[str, list[RobotStatus]]:
-        """What these robots say from now on, each status once.
+    @property
+    def unix_now_s(self) -> float:
+        """The wall clock."""
+        return time.time()
 
-        For `duration_s`, and `FRESH_S` more for one of which nothing came; [] if that is silent.
-        """
-        heard: dict[str, dict[tuple[int, int], RobotStatus]] = {robot: {} for robot in robots}
-        began_s = time.monotonic()
-
-        def take(snapshot: FleetSnapshot) -> bool:
-            passed_s = time.monotonic() - began_s
-            for robot in snapshot.robots:
-                status, age_s = robot.status, robot.age_s
-                if robot.name in heard and status and age_s is not None and age_s <= passed_s:
-                    heard[robot.name][status.boot_nonce, status.sequence] = status
-            return passed_s >= duration_s and all(heard.values())
-
-        self.wait_for(take, duration_s + FRESH_S)
-        return {robot: list(statuses.values()) for robot, statuses in heard.items()}
+    def carry_out(self, procedure: Procedure[T]) -> T:
+        """Go through a procedure; what it comes to. Raises what it raises, and GroundError."""
+        answer: CommandReport | bool | None = None
+        while True:
+            try:
+                wanted = procedure.send(answer)
+            except StopIteration as done:
+                result: T = done.value
+                return result
+            except NothingComesError:
+                raise no_answer(self.fleet) from None
+            if isinstance(wanted, Until):
+                answer = self.wait_for(wanted.condition, wanted.at_most_s)
+            else:
+                answer = command(self.fleet, wanted)
 
     def _run(self) -> None:
         try:
