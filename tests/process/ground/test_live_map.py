@@ -168,7 +168,7 @@ def test_a_map_that_only_observes_refuses_every_action(
                 await stream.send_str(nonsense)
             await stream.send_json(wish)
             report = await until(stream, of_kind("report"))
-            assert not report["done"] and "only observes" in report["problem"]
+            assert not report["done"] and report["problem"]["code"] == "may_not"
             snapshot = await until(stream, of_kind("snapshot"))
             assert snapshot["safety_action"] == "none"
 
@@ -184,7 +184,7 @@ def test_kill_is_no_action_of_the_map(fleet: PretendedFleet) -> None:
         ):
             await stream.send_json({"do": "kill", "robots": ["r3"]})
             report = await until(stream, of_kind("report"))
-            assert report["problem"] == "there is no such command here"
+            assert report["problem"]["code"] == "not_understood"
 
     asyncio.run(ask())
 
@@ -256,7 +256,7 @@ def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
             told = await until(stream, of_kind("coverage"))
             assert told["cost"] is None and not told["cells"]
             snapshot = await until(stream, of_kind("snapshot"))
-            assert any("no density, no cost" in alarm["text"] for alarm in snapshot["alarms"])
+            assert "world_not_here" in [alarm["code"] for alarm in snapshot["alarms"]]
 
     with pretended(tmp_path, 1) as fleet:
         fleet.robots[0].world_id = "0123456789ab"
