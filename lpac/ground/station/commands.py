@@ -811,6 +811,12 @@ def in_words(request: Request) -> str:
             text = request.kind
         case SetWorld():
             text = f"world {request.name}"
+        case SetPlaces():
+            text = "assign"
+        case NextTrial():
+            text = "again"
+        case TakeCommand():
+            text = "command"
         case _:
             text = type(request).__name__.removeprefix("Set").lower()
     robots: tuple[str, ...] = getattr(request, "robots", ())
