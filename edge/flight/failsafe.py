@@ -22,7 +22,11 @@ _ROUNDING = 1e-6  # A REAL32 parameter holds 0.3 as 0.30000001.
 
 _NO_FAILSAFE = "fly on with the last command: NO FAILSAFE"
 _STOP_MOTORS = "STOP ITS MOTORS and fall"
+_LAND = "land"
 _RETURN = "RETURN to where it was armed, at a height that all robots share"
+_RETURN_AND_LAND = f"{_RETURN}; land when it is nearly empty"
+# What PX4 does after a hold where it puts one first.
+_DELAYED = (_LAND, _RETURN, _RETURN_AND_LAND)
 _OFFBOARD_LOSS = {
     0: "hand over to the sticks, in position mode",
     1: "hand over to the sticks, in altitude mode",
@@ -37,16 +41,16 @@ _LINK_LOSS = {
     0: "do nothing",
     1: "hold",
     2: _RETURN,
-    3: "land",
+    3: _LAND,
     5: _STOP_MOTORS,
     6: _STOP_MOTORS,
 }
-_FENCE = {0: "do nothing", 1: "warn", 2: "hold", 3: _RETURN, 4: _STOP_MOTORS, 5: "land"}
+_FENCE = {0: "do nothing", 1: "warn", 2: "hold", 3: _RETURN, 4: _STOP_MOTORS, 5: _LAND}
 _BATTERY = {
     0: "warn, and fly until it falls",
     1: _RETURN,
-    2: "land",
-    3: f"{_RETURN}; land when it is nearly empty",
+    2: _LAND,
+    3: _RETURN_AND_LAND,
 }
 _REMOTE_CONTROL = {
     0: "only a remote control's sticks count",
@@ -64,9 +68,9 @@ _REMOTE_CONTROL = {
     "while they are silent",
 }
 _HEIGHT = {0: "barometer", 1: "GPS", 2: "range to what is below", 3: "vision"}
-_MOTOR_FAILURE = {0: "warn", 1: "hold", 2: "land", 3: _RETURN, 4: _STOP_MOTORS}
-_PROPELLER = {-1: "do nothing", 0: "warn", 1: _RETURN, 2: "land"}
-_TRAFFIC = {0: "do nothing", 1: "warn", 2: _RETURN, 3: "land", 4: "hold"}
+_MOTOR_FAILURE = {0: "warn", 1: "hold", 2: _LAND, 3: _RETURN, 4: _STOP_MOTORS}
+_PROPELLER = {-1: "do nothing", 0: "warn", 1: _RETURN, 2: _LAND}
+_TRAFFIC = {0: "do nothing", 1: "warn", 2: _RETURN, 3: _LAND, 4: "hold"}
 _REMAINING_TIME = {0: "do nothing", 1: "warn", 3: _RETURN}
 _OVERRIDE = {
     0: "sticks never take over by themselves",
@@ -433,8 +437,7 @@ class _LookUp:
         """The action, after a hold where PX4 puts one before it."""
         action = self.action(name, actions)
         delay_s = self.parameters.get("COM_FAIL_ACT_T")
-        is_delayed = action == "land" or action.startswith(_RETURN)
-        if not is_delayed or (delay_s is not None and delay_s <= 0.1):
+        if action not in _DELAYED or (delay_s is not None and delay_s <= 0.1):
             return action
         return f"hold for {self.number('COM_FAIL_ACT_T')} s, then {action}"
 

@@ -95,6 +95,7 @@ def _robot_view(
     return view | {
         "state": status.state,
         "reason": status.reason.text,
+        "reason_code": status.reason.code,
         "ready": status.ready,
         "failed_checks": [check.text for check in status.failed_checks],
         "in_air": in_air(status),

@@ -14,6 +14,7 @@ from edge.core import F32, F64
 from edge.core.coverage import coverage_cost
 from edge.core.fence import Fence
 from edge.core.world import rasterize
+from edge.messages.codes import Reason
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState, RobotStatus
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.fleet.processes import (
@@ -39,7 +40,7 @@ class StateChange(NamedTuple):
 
     time_s: float
     state: FlightState
-    reason: str
+    reason: Reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,7 +340,7 @@ def _robot_flight(
     changes: list[StateChange] = []
     for at_s, status in history:
         if not changes or changes[-1].state is not status.state:
-            changes.append(StateChange(at_s - start_s, status.state, status.reason.text))
+            changes.append(StateChange(at_s - start_s, status.state, status.reason))
     return RobotFlight(
         time_s=np.array([heard.at_s - start_s for heard in placed]),
         position_m=np.array([heard.status.position_m for heard in placed]).reshape(-1, 3),
@@ -445,7 +446,12 @@ def _robot_summary(robot: RobotFlight) -> dict[str, Any]:
     accepted = counts.pop("accepted", 0)
     return {
         "timeline": [
-            {"time_s": round(time_s, 2), "state": state, "reason": reason}
+            {
+                "time_s": round(time_s, 2),
+                "state": state,
+                "code": reason.code,
+                "reason": reason.text,
+            }
             for time_s, state, reason in robot.changes
         ],
         "restarts": robot.restarts,

@@ -24,8 +24,8 @@ function remark(robot) {
   if (robot.duplicate) return "two programs are this robot";
   if (robot.state === "preflight" && !robot.ready) return robot.failed_checks[0] ?? "";
   if (robot.asked !== "none" && robot.in_air && robot.asked !== robot.state) return `${robot.asked} is asked`;
-  const reason = robot.reason ?? "";
-  return reason.startsWith(robot.state) ? "" : reason;
+  // The state says as much.
+  return robot.reason_code === "mission_started" ? "" : (robot.reason ?? "");
 }
 
 export function showFleet(robots, alarmed, selected, onPick) {
