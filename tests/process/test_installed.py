@@ -1,15 +1,20 @@
 """The wheel in an environment of its own, used from a folder that is not this repository."""
 
 import os
+import signal
 import subprocess
 import sys
 import sysconfig
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.conftest import ROOT, SHIPPED
 
+PATIENCE_S = 60.0
 LOADED_FROM_HERE = "raise SystemExit('a folder of the working directory was imported')"
 
 
@@ -43,11 +48,16 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(lpac: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     return subprocess.run(
-        [lpac, *arguments], cwd=folder, env=environment, capture_output=True, text=True,
+        [lpac, *arguments], cwd=folder, env=environment(folder), capture_output=True, text=True,
         check=False,
     )  # fmt: skip
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """Without this repository; the ground's socket is in the folder."""
+    kept = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    return kept | {"XDG_RUNTIME_DIR": str(folder)}
 
 
 def test_the_policy_is_found(lpac: Path, folder: Path) -> None:
@@ -68,6 +78,45 @@ def test_the_programs_that_it_starts_are_its_own(lpac: Path, folder: Path) -> No
     assert "1 flight logs" in flown.stdout, flown.stderr
     log = (folder / "flight" / "robots" / "0" / "robot.log").read_text()
     assert "working directory was imported" not in log
+    told = run(lpac, folder, "report", "flight/robots")
+    assert told.returncode == 0, told.stderr
+    assert (folder / "flight" / "robots" / "report" / "report.html").exists()
+
+
+def test_a_fleet_is_commanded_seen_and_recorded(lpac: Path, folder: Path) -> None:
+    with ExitStack() as stack:
+        started = stack.enter_context
+        started(program(lpac, folder, "  lpac ground", "sim", "--vehicle", "mavlink", "-n", "1",
+                        "--no-script", "--out", "fleet"))  # fmt: skip
+        fleet = ("--fleet", "fleet/fleet.toml")
+        started(program(lpac, folder, "ground station ann", "ground", "--name", "ann", *fleet))
+        started(program(lpac, folder, "hears the ground", "record", "--out", "logs", *fleet))
+        started(program(lpac, folder, "only observes", "map", "--port", "0", *fleet))
+        until_s = time.monotonic() + PATIENCE_S
+        seen = ""
+        while '"state": "idle"' not in seen:
+            assert time.monotonic() < until_s, seen
+            seen = run(lpac, folder, "watch", "--json", *fleet).stdout
+        told = run(lpac, folder, "mission", "enable", *fleet)
+        assert told.returncode == 1 and "mission origin" in told.stdout + told.stderr, told
+    assert list((folder / "logs").glob("ground-*.mcap"))
+
+
+@contextmanager
+def program(lpac: Path, folder: Path, says: str, *arguments: str) -> Iterator[None]:
+    """It runs, and has said so; Ctrl-C ends it."""
+    with subprocess.Popen(
+        [lpac, *arguments], cwd=folder, env=environment(folder), text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    ) as running:  # fmt: skip
+        try:
+            assert running.stdout is not None
+            assert any(says in line for line in running.stdout)
+            yield
+        finally:
+            running.send_signal(signal.SIGINT)
+            running.communicate(timeout=PATIENCE_S)
+    assert running.returncode == 0
 
 
 @pytest.mark.parametrize(
