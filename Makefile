@@ -20,14 +20,13 @@ fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly si
 
 setup: .venv/sim .venv/export .venv/fleet .venv/ground ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control
 
-# Those that wait for nothing run beside each other, the others fly in real time: one by one.
-QUICK := .venv/bin/pytest --numprocesses auto tests/unit tests/sim
-
 check: lint ## style, types, and the quick tests: what a commit has to pass, in two minutes
-	$(QUICK)
+	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
 
 test: lint ## style, types, and every test; as root with real robot hosts too: half an hour
-	$(QUICK); quick=$$?; .venv/bin/pytest tests/process tests/host && exit $$quick
+	.venv/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+		-m 'not alone and not host'; beside=$$?; \
+		.venv/bin/pytest -m 'alone or host' && exit $$beside
 
 lint: .venv/test ## style, and strict types of the product and its tests
 	.venv/bin/ruff check .

@@ -61,6 +61,9 @@ def pytest_configure(config: pytest.Config) -> None:
     for tier in TIERS:
         config.addinivalue_line("markers", f"{tier}: what is in tests/{tier}")
     config.addinivalue_line(
+        "markers", "alone: flies in real time, or measures: nothing else runs meanwhile"
+    )
+    config.addinivalue_line(
         "markers", "simulated_only(reason): not flown with --vehicle px4, and why"
     )
     if config.getoption("--vehicle") == "px4" and config.getoption("--px4") is None:

@@ -9,6 +9,8 @@ pytest.importorskip("torch_geometric", reason="the benches compare with it")
 from bench import command, footprint
 from tests.unit.test_bench import check_frame, kept
 
+pytestmark = pytest.mark.alone
+
 
 def test_footprint(tmp_path: Path) -> None:
     result = kept(footprint.measure(runs=1), tmp_path)

@@ -220,7 +220,7 @@ def test_operators_mistakes_are_one_line_each(field: Field, tmp_path: Path) -> N
 
 
 def test_without_ground_or_origin_nothing_takes_off(
-    tmp_path: Path, field: Field, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, short_path: Path, field: Field, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "other"
     folder.mkdir()
@@ -229,7 +229,7 @@ def test_without_ground_or_origin_nothing_takes_off(
         why = field.refused("mission", "takeoff", *at)
         assert f"fleet {fleet.name} here: start `lpac ground`" in why
         assert "start `lpac ground`" in field.refused("mission", "rehearse", *at)
-        with ground(tmp_path / "run", fleet, "bob") as environment:
+        with ground(short_path / "run", fleet, "bob") as environment:
             monkeypatch.setenv("XDG_RUNTIME_DIR", environment["XDG_RUNTIME_DIR"])
             assert "no mission origin" in field.refused("mission", "takeoff", *at)
             assert "the origin is not set" in field.refused("mission", "assign", *at)
@@ -324,12 +324,12 @@ def on_terminal(field: Field, answer: str, *arguments: str) -> str:
 
 
 def test_observer_may_hold_and_must_ask_for_the_rest(
-    field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    field: Field, short_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     field.do("mission", "enable")
     field.do("mission", "takeoff", "--interval", "0")
     field.do("mission", "start")
-    with ground(tmp_path / "run", field.fleet, "bob") as environment:
+    with ground(short_path / "run", field.fleet, "bob") as environment:
         monkeypatch.setenv("XDG_RUNTIME_DIR", environment["XDG_RUNTIME_DIR"])
         assert "alice" in field.refused("mission", "land")
         field.do("mission", "hold")

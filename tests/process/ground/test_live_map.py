@@ -340,7 +340,7 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         check_innocence(seen)
 
 
-def test_the_command_is_taken_by_a_click(few: PretendedFleet, tmp_path: Path) -> None:
+def test_the_command_is_taken_by_a_click(few: PretendedFleet, short_path: Path) -> None:
     ground = "ground", "--fleet", str(few.fleet_toml), "--name"
     with (
         lpac(*ground, "alice"),
@@ -349,7 +349,7 @@ def test_the_command_is_taken_by_a_click(few: PretendedFleet, tmp_path: Path) ->
     ):
         page = seen.page
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+            patch.setenv("XDG_RUNTIME_DIR", str(short_path))
             with lpac(*ground, "bob"):
                 wait_for_snapshot(few.name)
                 assert command(few.name, TakeCommand()).done

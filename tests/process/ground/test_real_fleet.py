@@ -42,6 +42,8 @@ from tests.conftest import ROOT, SHIPPED
 from tests.process.ground.browser import live_map, opened
 from tests.said import problem
 
+pytestmark = pytest.mark.alone
+
 _S = FlightState
 NAMES = ("r0", "r1")
 PATIENCE_S = 90.0

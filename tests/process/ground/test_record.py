@@ -80,9 +80,9 @@ def wait_until_all_are_told(fleet: str, state: S) -> None:
 
 
 def test_a_flight_is_recorded_also_when_the_ground_starts_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, short_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(short_path))
     processes: list[subprocess.Popen[Any]] = []
     with pretended(tmp_path, 2) as fleet:
         recorder = Recorder(fleet.fleet_toml)

@@ -14,7 +14,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import pytest
+
 from tests.conftest import ROOT
+
+pytestmark = pytest.mark.alone
 
 # The README has ten robots; more than three would only take longer here.
 ROBOTS = int(os.environ.get("LPAC_WALK_ROBOTS", "3"))

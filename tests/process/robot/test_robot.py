@@ -42,6 +42,8 @@ from tests.robot_rig import (
 from tests.said import codes, why
 from tests.unit.policy.test_bundle import scaled, with_files
 
+pytestmark = pytest.mark.alone
+
 PARAM_REQUEST_READ = 20  # MAVLink's message id
 # Nothing here takes so long unless it is broken.
 PATIENCE_S = 60.0

@@ -38,6 +38,8 @@ from tests.process.sim.fault_rig import FaultRig, FaultyRobot, flies_on, speed_m
 from tests.process.sim.px4_rig import RealVehicle, RealVehicles
 from tests.said import codes, why
 
+pytestmark = pytest.mark.alone
+
 KILLED, NO_GPS, EMPTY, LOW, MANY_FAULTS, FAULTY, STOPPED = range(7)
 # Another vehicle, whose program says that it is robot STOPPED.
 TWIN = 7

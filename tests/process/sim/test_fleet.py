@@ -32,6 +32,8 @@ from lpac.sim.operator import Operator
 from tests.conftest import ROOT, SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
 
+pytestmark = pytest.mark.alone
+
 # Worlds in which the swarm's cost hangs little, by 10 % at most, on the clocks' phases, on the last
 # decimetres of the starts and on the vehicles' lag. In others luck decides.
 SEEDS = (0, 14, 18, 19, 23)

@@ -9,6 +9,8 @@ from lpac.sim.fleet.load import robots_carried
 from lpac.sim.fleet.processes import OVERLOADED_S, Fleet, FleetScenario
 from tests.conftest import SHIPPED
 
+pytestmark = pytest.mark.alone
+
 
 def test_what_a_machine_carries_is_found_out_by_work() -> None:
     assert robots_carried(SHIPPED, "mavlink") > robots_carried(SHIPPED, "px4") / 2.0 > 0.0

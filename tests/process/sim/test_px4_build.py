@@ -29,6 +29,8 @@ from tests.conftest import ROOT
 from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.test_fleet import launched, pid_of, read_until
 
+pytestmark = pytest.mark.alone
+
 STAND_IN = f"""#!{sys.executable}
 import argparse, os, signal, socket, sys, threading, time
 sys.path.insert(0, {str(ROOT)!r})
