@@ -89,6 +89,7 @@ def main() -> None:
     """For systemd, when it has given the robot's program up: `robot.toml` is the argument."""
     (path,) = sys.argv[1:]
     try:
+        # Not as the program reads it: what the program refuses must not keep a vehicle in the air.
         config = tomllib.loads(Path(path).read_text("utf-8"))
         port = int(config["autopilot"]["url"].rsplit(":", 1)[1])
         system_id = int(config["autopilot"]["system_id"])
