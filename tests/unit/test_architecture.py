@@ -23,8 +23,8 @@ ALLOWED = {
     "export": {"edge.core", "edge.policy"},
     "lpac.shipped": set(),
     "lpac.analysis": _EDGE,
-    "lpac.ground": {*_EDGE, "lpac.analysis"},
-    # What describes a fleet, which the simulator describes its fleets with.
+    "lpac.ground": {*_EDGE, "lpac.analysis", "lpac.fleet.settings"},
+    # What describes a fleet; the ground reads it, and the simulator describes its fleets with it.
     "lpac.fleet.settings": _EDGE,
     "lpac.fleet.writer": {*_EDGE, "lpac.fleet.settings"},
     "lpac.fleet": {*_EDGE, "lpac.shipped", "lpac.fleet.settings", "lpac.fleet.writer"},

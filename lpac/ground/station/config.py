@@ -1,8 +1,13 @@
 """What `lpac ground` needs to know of its fleet."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from lpac.analysis.snapshot import FleetSetup
+from edge.core.world import parse_world
+from edge.messages.mission import Place, world_id
+from edge.policy.bundle import load_bundle
+from lpac.analysis.snapshot import FleetSetup, FleetSlot
+from lpac.fleet.settings import load_fleet
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,3 +16,46 @@ class GroundConfig:
 
     setup: FleetSetup
     connect: tuple[str, ...]
+
+
+def load_ground(path: Path, operator: str) -> GroundConfig:
+    """What the ground station needs to know of the fleet. Raises ValueError or OSError."""
+    config = load_fleet(path)
+    seated = next((slot.robot for slot in config.slots if slot.robot), None)
+    if seated is None:
+        raise ValueError(f"{path}: slots: no robot sits in one")
+    robot = config.robot_config(seated)
+    bundle = load_bundle(config.bundle)
+    perception, training = bundle.manifest.perception, bundle.manifest.training
+    if perception is None:
+        raise ValueError(f"{config.bundle}: the bundle has no perception: it cannot fly")
+    world = config.world.read_text("utf-8-sig")
+    parse_world(world, str(config.world))
+    return GroundConfig(
+        setup=FleetSetup(
+            fleet=config.fleet,
+            operator=operator,
+            robots={name: host.robot_id for name, host in config.robots.items()},
+            slots=tuple(
+                FleetSlot(Place(slot.height, slot.landing_point_m), slot.pad_m, slot.robot or "")
+                for slot in config.slots
+            ),
+            fence=robot.fence,
+            world=world,
+            world_id=world_id(world),
+            bundle_id=bundle.id,
+            world_size=perception.world_size,
+            sensor_size=perception.sensor_size,
+            communication_range=perception.communication_range,
+            env_scale=robot.policy.env_scale,
+            truncation=training.idf_truncation,
+            norm=training.idf_norm,
+            base_height_m=robot.flight.base_height_m,
+            slot_spacing_m=robot.flight.slot_spacing_m,
+            errors=robot.errors,
+            battery_critical=robot.flight.battery_critical,
+            ground_timeout_s=robot.flight.ground_timeout_s,
+            ground_lost_land_s=robot.flight.ground_lost_land_s,
+        ),
+        connect=tuple(f"tcp/{host.address}:{host.zenoh_port}" for host in config.robots.values()),
+    )

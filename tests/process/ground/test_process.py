@@ -11,8 +11,8 @@ import pytest
 
 from edge.messages.mission import FlightState, world_id
 from lpac.analysis.snapshot import Explored, FleetSnapshot, GroundEvent
-from lpac.cli.ground import load_setup
 from lpac.ground.station import client
+from lpac.ground.station.config import load_ground
 from lpac.ground.station.protocol import (
     CommandProgress,
     CommandReport,
@@ -241,7 +241,7 @@ def test_robots_land_when_their_files_say(fleet: PretendedFleet) -> None:
     text = fleet.fleet_toml.read_text()
     flight = "battery_critical = 0.2\nground_timeout_s = 4.0\nground_lost_land_s = 30.0\n"
     fleet.fleet_toml.write_text(text.replace("[robot.flight]\n", f"[robot.flight]\n{flight}"))
-    setup = load_setup(fleet.fleet_toml, "alice").setup
+    setup = load_ground(fleet.fleet_toml, "alice").setup
     assert setup.battery_critical == 0.2
     assert (setup.ground_timeout_s, setup.ground_lost_land_s) == (4.0, 30.0)
 
