@@ -17,7 +17,8 @@ from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
 from edge.messages.mission import LoopStatus, RobotStatus
 from lpac.sim.fleet.flight import fly
-from lpac.sim.fleet.processes import Fleet, FleetScenario
+from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.processes import Fleet
 
 LOOPS = ("perception", "policy", "control")
 _FLEET = 10

@@ -18,8 +18,7 @@ from rich.progress import track
 
 from bench.report import Report, Table, Target
 from edge.core.position import PositionJudgement, PositionLimits, PositionQuality, judge
-from edge.drivers.px4.autopilot import RATES_HZ
-from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
 from lpac.sim.px4.errors import Errors
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import Px4Mode

@@ -28,6 +28,7 @@ from edge.core.ports import Sensor, Vehicle
 from edge.core.px4_version import in_words
 from edge.core.vehicle import Action, Setpoint
 from edge.core.world import MOST_FEATURES, parse_world, rasterize
+from edge.drivers.clock import SystemClock
 from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.drivers.logs import configure_logging
 from edge.drivers.process_lock import ProcessLock
@@ -53,18 +54,6 @@ _JOIN_S = 0.3
 _SWITCH_INTERVAL_S = 0.001
 
 _log = structlog.get_logger(__name__)
-
-
-class SystemClock:
-    """The computer's own clocks."""
-
-    def monotonic_s(self) -> float:
-        """Time that never jumps."""
-        return time.monotonic()
-
-    def unix_s(self) -> float:
-        """The wall clock."""
-        return time.time()
 
 
 def _load(config: RobotConfig) -> tuple[LoadedPolicy, str]:

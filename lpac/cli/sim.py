@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lpac.sim.experiment import Scenario, SimulatedFlight
-    from lpac.sim.fleet.processes import Fleet, FleetScenario
+    from lpac.sim.fleet.layout import FleetScenario
+    from lpac.sim.fleet.processes import Fleet
     from lpac.sim.operator import Statuses
 
 app = new_app()
@@ -124,7 +125,7 @@ def sim(
         raise ValueError("--robots auto does nothing with --vehicle point")
     world_features = parse_world(_text(world), str(world)) if world else None
     if vehicle is not Vehicle.POINT:
-        from lpac.sim.fleet.processes import FleetScenario
+        from lpac.sim.fleet.layout import FleetScenario
 
         flown: Literal["mavlink", "px4"] = "mavlink" if vehicle is Vehicle.MAVLINK else "px4"
         if flown == "px4" and px4 is None:

@@ -27,20 +27,10 @@ from mavsdk.plugins.param import Param
 from mavsdk.system import System
 
 from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
-from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
 
 _log = structlog.get_logger(__name__)
 
-# Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
-RATES_HZ = {
-    1: 2.0,  # SYS_STATUS
-    24: 5.0,  # GPS_RAW_INT
-    32: 20.0,  # LOCAL_POSITION_NED
-    33: 5.0,  # GLOBAL_POSITION_INT
-    49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
-    230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
-    245: 5.0,  # EXTENDED_SYS_STATE
-}
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
 
 _AUTOPILOT = 1  # component id

@@ -25,6 +25,16 @@ from edge.drivers.px4.raw_mavlink import mode_name
 
 Fields = Mapping[str, Any]
 
+# Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
+RATES_HZ = {
+    1: 2.0,  # SYS_STATUS
+    24: 5.0,  # GPS_RAW_INT
+    32: 20.0,  # LOCAL_POSITION_NED
+    33: 5.0,  # GLOBAL_POSITION_INT
+    49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
+    230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
+    245: 5.0,  # EXTENDED_SYS_STATE
+}
 # PX4 sends a heartbeat at least every second.
 _CONNECTED_WITHIN_S = 2.5
 # Asked for twice a second; what is older says nothing about now.

@@ -17,15 +17,8 @@ from edge.core.world import rasterize
 from edge.messages.codes import Reason
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState, RobotStatus
 from lpac.sim.experiment import FIELD_SCALE
-from lpac.sim.fleet.processes import (
-    ORIGIN,
-    Backlog,
-    Fleet,
-    FleetScenario,
-    OverloadError,
-    Usage,
-    process_usage,
-)
+from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
 from lpac.sim.fleet.vehicles import TrueTrack, VehicleError
 from lpac.sim.operator import Heard, OperatorScript, OperatorScriptError, Say
 
@@ -196,7 +189,7 @@ def fly(
     FleetError if a robot's program ends before all are heard; OSError, LinkError or VehicleError
     if something cannot start.
     """
-    scenario, operator = fleet.scenario, fleet.operator
+    scenario, operator = fleet.layout.scenario, fleet.operator
     script = OperatorScript(
         operator, robots=range(scenario.robots), origin=ORIGIN, mission_s=scenario.duration_s,
         trial=f"seed {scenario.seed}", say=fleet.say_unless_behind,
@@ -245,7 +238,7 @@ class _Moment(NamedTuple):
             time.monotonic(),
             {
                 robot: heard[-1].status
-                for robot in range(fleet.scenario.robots)
+                for robot in range(fleet.layout.scenario.robots)
                 if (heard := fleet.operator.history(robot))
             },
             tuple(robot.usage() for robot in fleet.robots),
@@ -261,8 +254,8 @@ def _record(
     lateness: Backlog,
     overloaded: bool,
 ) -> FleetFlight:
-    scenario, manifest = fleet.scenario, fleet.bundle.manifest
-    assert manifest.perception is not None and fleet.features is not None
+    scenario, manifest = fleet.layout.scenario, fleet.layout.bundle.manifest
+    assert manifest.perception is not None and fleet.layout.features is not None
     start_s = moments["assemble"].time_s if "assemble" in moments else moments["end"].time_s
     began_s = {name: at_s - start_s for name, at_s in script.began_s.items()}
     began_s["end"] = moments["end"].time_s - start_s
@@ -286,7 +279,7 @@ def _record(
         for robot in range(scenario.robots)
     )
     importance = rasterize(
-        fleet.features,
+        fleet.layout.features,
         manifest.perception.world_size,
         manifest.training.idf_truncation,
         manifest.training.idf_norm,
@@ -298,12 +291,12 @@ def _record(
     return FleetFlight(
         scenario=scenario,
         vehicle="px4" if fleet.simulated is None else "mavlink",
-        bundle_id=fleet.bundle.id,
-        field_m=fleet.field_m,
-        fence=fleet.fence,
+        bundle_id=fleet.layout.bundle.id,
+        field_m=fleet.layout.field_m,
+        fence=fleet.layout.fence,
         importance=importance,
-        pads_m=fleet.pads_m,
-        landing_points_m=fleet.landing_points_m,
+        pads_m=fleet.layout.pads_m,
+        landing_points_m=fleet.layout.landing_points_m,
         robots=robots,
         began_s=began_s,
         problem=problem,
@@ -327,7 +320,7 @@ def _share(first: _Moment, last: _Moment, before: Usage, after: Usage) -> float:
 
 
 def _in_mission_frame(fleet: Fleet, track: TrueTrack, start_s: float) -> TrueTrack:
-    rotation, origin_m = fleet.to_mission.rotation, fleet.to_mission.local_origin_m
+    rotation, origin_m = fleet.layout.to_mission.rotation, fleet.layout.to_mission.local_origin_m
     return TrueTrack(
         track.time_s - start_s, track.position_m @ rotation.T + origin_m, track.airborne
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lpac.sim.fleet.processes import ORIGIN, WORLD
+from lpac.sim.fleet.layout import ORIGIN, WORLD
 from lpac.sim.hosts.rack import Rack, children
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.server import Instance, Px4Server

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from lpac.sim.fleet.processes import Fleet, FleetScenario
+from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 from tests.process.sim.fault_rig import FaultRig, speed_m_s

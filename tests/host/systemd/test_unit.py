@@ -18,7 +18,7 @@ from edge.messages.mission import FlightState
 from lpac.fleet.release import drop_ins
 from lpac.fleet.settings import FleetConfig, load_fleet
 from lpac.fleet.writer import robot_toml
-from lpac.sim.fleet.processes import ORIGIN
+from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.hosts.base import NoHostsError
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts

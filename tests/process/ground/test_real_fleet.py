@@ -37,7 +37,8 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
-from lpac.sim.fleet.processes import ORIGIN, Fleet, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.processes import Fleet
 from tests.conftest import ROOT, SHIPPED
 from tests.process.ground.browser import live_map, opened
 from tests.said import problem
@@ -244,9 +245,9 @@ def test_commands_under_another_fleets_name_reach_nobody(fleet: Fleet, tmp_path:
 
 
 def test_a_robot_that_starts_later_is_told_origin_fence_and_world(fleet: Fleet) -> None:
-    world = format_world(fleet.features or ()) + "CircularBND 100 100 20 5\n"
+    world = format_world(fleet.layout.features or ()) + "CircularBND 100 100 20 5\n"
     with run_ground(fleet) as ground:
-        setup_fence = fleet.fence
+        setup_fence = fleet.layout.fence
         fence = type(setup_fence)(
             vertices_m=((-1.0, -1.0), (33.0, -1.0), (33.0, 33.0), (-1.0, 33.0)),
             buffer_m=1.4, floor_m=setup_fence.floor_m, ceiling_m=setup_fence.ceiling_m,

@@ -27,7 +27,8 @@ from edge.messages.codes import ReasonCode, texts
 from edge.messages.mission import FlightState, OrderKind, OrderResult, RobotStatus
 from edge.robot.pac import Pac, PolicyTick
 from lpac.cli.robot import run
-from lpac.sim.fleet.processes import ORIGIN, Fleet, RobotProcess
+from lpac.sim.fleet.layout import ORIGIN
+from lpac.sim.fleet.processes import Fleet, RobotProcess
 from lpac.sim.fleet.vehicles import SimulatedVehicles
 from lpac.sim.operator import Heard, OperatorScript, Statuses
 from lpac.sim.px4.errors import GREATEST_WIND_M_S
@@ -331,17 +332,17 @@ class FaultRig:
             return self._to_mission_m(self.vehicle(robot).estimated_position_m)
 
     def _to_mission_m(self, place_m: F64) -> F64:
-        return self.fleet.to_mission.local_to_mission(place_m)
+        return self.fleet.layout.to_mission.local_to_mission(place_m)
 
     def inside_m(self, robot: int) -> float:
         """How far inside the fence the vehicle takes itself to be."""
         x_m, y_m, _ = self.estimate_m(robot)
-        return self.fleet.fence.distance_m(x_m, y_m)
+        return self.fleet.layout.fence.distance_m(x_m, y_m)
 
     def outwards(self, robot: int) -> F64:
         """(3,), mission frame, of length 1: towards the nearest side of the fence."""
         x_m, y_m, _ = self.estimate_m(robot)
-        low_m, high_m = np.array(self.fleet.fence.vertices_m)[[0, 2]]
+        low_m, high_m = np.array(self.fleet.layout.fence.vertices_m)[[0, 2]]
         away_m = np.array([x_m - low_m[0], high_m[0] - x_m, y_m - low_m[1], high_m[1] - y_m])
         sides = np.array([(-1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
         outwards: F64 = sides[away_m.argmin()]
@@ -349,7 +350,7 @@ class FaultRig:
 
     def fly_by_hand(self, robot: int, place_m: F64) -> None:
         """A pilot flies it to where its estimate is `place_m` (3,), mission frame, and stops."""
-        goal_m = self.fleet.to_mission.mission_to_local(place_m)
+        goal_m = self.fleet.layout.to_mission.mission_to_local(place_m)
 
         def is_there(vehicle: Px4Vehicle) -> bool:
             offset_m = goal_m - vehicle.estimated_position_m
@@ -365,14 +366,14 @@ class FaultRig:
 
     def push_over_the_fence(self, robot: int) -> None:
         """A storm carries it over the line; then the wind blows on as it is used to."""
-        outwards = self.fleet.to_mission.velocity_to_local(self.outwards(robot))
+        outwards = self.fleet.layout.to_mission.velocity_to_local(self.outwards(robot))
         began_s = self.now_s(robot)
 
         def is_over_the_line(vehicle: Px4Vehicle) -> bool:
             storm_m_s = min(STORM_M_S, STORM_M_S2 * (vehicle.time_s - began_s))
             vehicle.wind_m_s = vehicle.wind_m_s + outwards * storm_m_s - vehicle.air_m_s
             x_m, y_m, _ = self._to_mission_m(vehicle.estimated_position_m)
-            return self.fleet.fence.distance_m(x_m, y_m) < -0.3
+            return self.fleet.layout.fence.distance_m(x_m, y_m) < -0.3
 
         self.wait_vehicle(robot, is_over_the_line)
         with self.simulated.stepped:

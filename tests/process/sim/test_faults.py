@@ -28,7 +28,8 @@ from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus
 from lpac.sim.description import ERRORS
-from lpac.sim.fleet.processes import ORIGIN, WORLD, Fleet, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN, WORLD, FleetScenario
+from lpac.sim.fleet.processes import Fleet
 from lpac.sim.operator import Statuses
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle
@@ -320,7 +321,7 @@ def test_the_policy_raises_and_the_sensor_sees_nothing(
 
 
 def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: FaultRig) -> None:
-    robot, bundle = rig.robot(STOPPED), rig.fleet.bundle
+    robot, bundle = rig.robot(STOPPED), rig.fleet.layout.bundle
     with rig.others_go_on(robot), rogue(rig.fleet) as session:
         key = f"lpac/{rig.fleet.name}/robot/{robot}/message"
         with session.declare_subscriber(key) as subscriber:
@@ -392,10 +393,10 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
             return position_m is not None and math.dist(position_m[:2], truly_m[:2]) < 1.5
 
         rig.wait_status(robot, is_where_it_says)
-        fastest_m_s = 0.5 if state is _S.HOLD else rig.fleet.max_speed_m_s
+        fastest_m_s = 0.5 if state is _S.HOLD else rig.fleet.layout.max_speed_m_s
         assert rig.max_speed_m_s(robot, began_s, axes=2) < fastest_m_s + 0.5
         moved_m = math.dist(rig.truth(robot, began_s)[-1].position_m[:2], began_m[:2])
-        assert moved_m < (1.0 if state is _S.HOLD else 3.0 * rig.fleet.max_speed_m_s)
+        assert moved_m < (1.0 if state is _S.HOLD else 3.0 * rig.fleet.layout.max_speed_m_s)
         # Others fly above and below.
         assert all(
             abs(entry.position_m[2] - began_m[2]) < 1.5 for entry in rig.truth(robot, began_s)
@@ -433,7 +434,7 @@ def test_a_remote_control_is_lost_and_comes_back(rig: FaultRig) -> None:
 
 @pytest.mark.simulated_only("PX4's own vehicle model has no wind that can be set in flight")
 def test_wind_carries_a_robot_over_the_fence(rig: FaultRig) -> None:
-    robot, fence = rig.robot(MANY_FAULTS), rig.fleet.fence
+    robot, fence = rig.robot(MANY_FAULTS), rig.fleet.layout.fence
     with rig.others_go_on(robot):
         heard_s = time.monotonic()
         rig.push_over_the_fence(robot)
@@ -537,7 +538,7 @@ def test_the_battery_is_low(rig: FaultRig) -> None:
         assert [*states][:2] == [_S.RETURN, _S.LAND]
         landed_m = rig.true_position_m(robot)
         # What its receiver errs by has walked since the pad was measured.
-        assert math.dist(landed_m[:2], rig.fleet.pads_m[robot]) < 2.5
+        assert math.dist(landed_m[:2], rig.fleet.layout.pads_m[robot]) < 2.5
 
 
 def test_a_robot_is_killed_by_the_operator(rig: FaultRig) -> None:

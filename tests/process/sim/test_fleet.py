@@ -27,7 +27,8 @@ from lpac.fleet.settings import load_fleet
 from lpac.sim.description import ERRORS
 from lpac.sim.experiment import Scenario
 from lpac.sim.experiment import fly as fly_in_process
-from lpac.sim.fleet.processes import APART_M, Fleet, FleetScenario, SimulatedFleetError
+from lpac.sim.fleet.layout import APART_M, FleetScenario
+from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
 from lpac.sim.operator import Operator
 from tests.conftest import ROOT, SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
@@ -152,12 +153,15 @@ def test_what_a_flight_leaves_behind(flights: Flights) -> None:
 def test_where_a_fleet_stands(tmp_path: Path, seed: int, robots: int) -> None:
     fleet = Fleet(FleetScenario(robots=robots, seed=seed), tmp_path, SHIPPED)
     assert fleet.simulated is not None
-    for places_m in (fleet.pads_m, fleet.landing_points_m):
-        assert min(fleet.fence.distance_m(x, y) for x, y in places_m) > fleet.fence.buffer_m
+    for places_m in (fleet.layout.pads_m, fleet.layout.landing_points_m):
+        assert (
+            min(fleet.layout.fence.distance_m(x, y) for x, y in places_m)
+            > fleet.layout.fence.buffer_m
+        )
         away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
         assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= APART_M
-    np.testing.assert_allclose(fleet.true_positions_m()[:, :2], fleet.pads_m, atol=1e-9)
-    errors_m = np.linalg.norm(fleet.landing_points_m - fleet.pads_m, axis=1)
+    np.testing.assert_allclose(fleet.true_positions_m()[:, :2], fleet.layout.pads_m, atol=1e-9)
+    errors_m = np.linalg.norm(fleet.layout.landing_points_m - fleet.layout.pads_m, axis=1)
     assert np.all((errors_m >= 1.0) & (errors_m <= 5.0))
 
 
@@ -167,7 +171,10 @@ def test_more_robots_than_fit_are_refused_with_how_many_do(tmp_path: Path) -> No
     ) as refused:
         Fleet(FleetScenario(robots=20), tmp_path, SHIPPED)
     (fit,) = re.findall(r": (\d+) fit", str(refused.value))
-    assert Fleet(FleetScenario(robots=int(fit)), tmp_path, SHIPPED).pads_m.shape == (int(fit), 2)
+    assert Fleet(FleetScenario(robots=int(fit)), tmp_path, SHIPPED).layout.pads_m.shape == (
+        int(fit),
+        2,
+    )
     # Twenty that know where they are stand on the same field.
     Fleet(FleetScenario(robots=20, errors=False), tmp_path, SHIPPED)
 
@@ -177,7 +184,7 @@ def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
 ) -> None:
     fleet = Fleet(FleetScenario(robots=1, seed=11), tmp_path, SHIPPED)
     swarm = fly_in_process(Scenario(robots=1, seed=11, duration_s=0.1), shipped_bundle)
-    assert fleet.features == swarm.features
+    assert fleet.layout.features == swarm.features
     assert parse_world((tmp_path / "world.env").read_text()) == swarm.features
 
 
@@ -292,7 +299,7 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
         policy = replace(robot.policy, bundle=its.policy.bundle, world=its.policy.world)
         assert its == replace(robot, policy=policy, log=its.log, link=its.link)
         assert slot.robot == name and slot.height == i
-        np.testing.assert_allclose(slot.pad_m, fleet.landing_points_m[i], atol=1e-3)
+        np.testing.assert_allclose(slot.pad_m, fleet.layout.landing_points_m[i], atol=1e-3)
         assert slot.landing_point_m == slot.pad_m
 
 

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from lpac.sim.fleet.flight import fly, summary_lines
+from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.load import robots_carried
-from lpac.sim.fleet.processes import OVERLOADED_S, Fleet, FleetScenario
+from lpac.sim.fleet.processes import OVERLOADED_S, Fleet
 from tests.conftest import SHIPPED
 
 pytestmark = pytest.mark.alone

@@ -16,7 +16,7 @@ from edge.core.position import (
     judge,
 )
 from edge.core.vehicle import EstimatorStatus, GlobalOrigin, Gps, VehicleState
-from edge.drivers.px4.autopilot import RATES_HZ
+from edge.drivers.px4.telemetry import RATES_HZ
 from tests.conftest import ROOT
 
 LIMITS = PositionLimits()

@@ -1,0 +1,191 @@
+"""One ground: its station and its commands, on a clock and a link that somebody else has.
+
+`lpac ground` runs it on the real clock and the radio (`station.server`), the simulator on its own.
+"""
+
+import base64
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+from edge.core.perception import EXPLORED_CELLS
+from edge.core.ports import Clock
+from edge.messages.codec import MessageError, decode, encode
+from edge.messages.mission import GroundState, RobotStatus
+from edge.messages.topics import EXPLORED, ORDER, STATE, STATUS, WORLD, Link, Topic
+from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot
+from lpac.ground.station.commands import Commands, CommandTask
+from lpac.ground.station.protocol import Request, ServerMessage
+from lpac.ground.station.station import NameTakenError, Station
+
+_WORLD_PERIOD_S = 0.5
+
+
+class GroundListener(Protocol):
+    """Who is told what happens at a ground."""
+
+    def told(self, message: ServerMessage) -> None:
+        """Something new that clients want to hear: a setup, an event, what was explored."""
+
+    def stepped(self) -> None:
+        """Commands went on."""
+
+    def commanded(self, state: GroundState) -> None:
+        """The fleet is told something else, by this station; before robots hear of it."""
+
+
+class GroundNode:
+    """One ground, which one thread calls. `link` is what it says goes to, None as long as none is.
+
+    What raises in it is told as an event: robots that fly need it more than they need what it could
+    not do. Only NameTakenError is raised.
+    """
+
+    def __init__(self, setup: FleetSetup, clock: Clock, listener: GroundListener) -> None:
+        self.station = Station(setup, clock.monotonic_s(), clock.unix_s())
+        self.commands = Commands(self.station)
+        self.link: Link | None = None
+        self._clock = clock
+        self._listener = listener
+        self._names = {f"robot/{robot}": name for name, robot in setup.robots.items()}
+        self._explored: dict[str, bytes] = {}
+        self._told_setup = setup
+        self._kept: GroundState | None = None
+        self._published: tuple[int | None, int] = None, 0
+        self._world_at_s = 0.0
+        self._complained: set[str] = set()
+
+    @property
+    def subscriptions(self) -> Mapping[Topic, Callable[[str, bytes], None]]:
+        """What it hears: topic -> callback with the key and the data, in the node's thread."""
+        return dict.fromkeys((STATUS, EXPLORED, STATE, WORLD), self.receive)
+
+    @property
+    def explored(self) -> tuple[Explored, ...]:
+        """What each robot has explored, as far as it was heard."""
+        return tuple(_explored(name, cells) for name, cells in self._explored.items())
+
+    @property
+    def snapshot(self) -> FleetSnapshot:
+        """The fleet now."""
+        return self.station.snapshot(self.commands.texts)
+
+    def receive(self, key: str, data: bytes) -> None:
+        """Something came. Raises NameTakenError."""
+        self._set_time()
+        try:
+            self._receive(key, data)
+        except NameTakenError:
+            raise
+        except Exception as error:
+            self.survive(key, error)
+
+    def tick(self) -> None:
+        """Time has passed; some five times a second. Raises NameTakenError."""
+        self._set_time()
+        try:
+            self.station.tick()
+            self._step()
+        except NameTakenError:
+            raise
+        except Exception as error:
+            self.survive("tick", error)
+        try:
+            self._publish()
+        except Exception as error:
+            self.survive("publish", error)
+
+    def begin(self, request: Request) -> CommandTask | None:
+        """Begin a command; None if a defect kept it from beginning."""
+        self._set_time()
+        try:
+            task = self.commands.begin(request)
+            self._step()
+        except Exception as error:
+            self.survive("command", error)
+            return None
+        return task
+
+    def abandon(self, task: CommandTask, why: str) -> None:
+        """Whoever wanted it does not any more."""
+        self._set_time()
+        task.abandon(why, withdraw=False)
+        self._step()
+
+    def _set_time(self) -> None:
+        self.station.set_time(self._clock.monotonic_s(), self._clock.unix_s())
+
+    def _receive(self, key: str, data: bytes) -> None:
+        source, _, topic = key.rpartition("/")
+        name = self._names.get(source)
+        if topic == EXPLORED.name:
+            sane = len(data) == EXPLORED_CELLS**2 // 8
+            if name is not None and sane and self._explored.get(name) != data:
+                self._explored[name] = data
+                self._listener.told(_explored(name, data))
+            return
+        try:
+            if topic == STATE.name:
+                self.station.hear_state(decode(GroundState, data))
+            elif topic == WORLD.name:
+                self.station.hear_world(data.decode(errors="replace"))
+            else:
+                self.station.hear_status(decode(RobotStatus, data))
+        except MessageError as error:
+            # Another version of the program, say.
+            self._complain(key, name or "", f"{topic} is not understood: {error}")
+            return
+        if name is None and topic == STATUS.name:
+            self._complain(key, "", f"{source.replace('/', ' ')} is heard, and not in fleet.toml")
+        self._step()
+
+    def _step(self) -> None:
+        """Let commands go on, and tell what is new."""
+        self.commands.step()
+        self._listener.stepped()
+        setup = self.station.setup
+        if setup != self._told_setup:
+            self._told_setup = setup
+            self._listener.told(setup)
+        for event in self.station.new_events():
+            self._listener.told(event)
+        state, orders = self.station.published_state(), self.station.published_orders()
+        if self._published != (None if state is None else state.sequence, len(orders)):
+            # What is new does not wait for its turn.
+            self._publish()
+
+    def _publish(self) -> None:
+        station = self.station
+        if station.commands and station.state is not None and station.state != self._kept:
+            self._kept = station.state
+            self._listener.commanded(station.state)
+        state, orders = station.published_state(), station.published_orders()
+        self._published = (None if state is None else state.sequence, len(orders))
+        if self.link is None:
+            return
+        if state is not None:
+            self.link.publish(STATE, encode(state))
+        for order in orders:
+            self.link.publish(ORDER, encode(order))
+        world, now_s = station.published_world(), self._clock.monotonic_s()
+        if world is not None and now_s - self._world_at_s >= _WORLD_PERIOD_S:
+            self._world_at_s = now_s
+            self.link.publish(WORLD, world.encode())
+
+    def survive(self, what: str, error: Exception) -> None:
+        """Tell of a defect, and go on."""
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(where.filename).name}, line {where.lineno}"
+        text = f"a defect of lpac ground ({what}): {error!r} in {place}"
+        self._complain(f"defect {what}", "", text)
+
+    def _complain(self, key: str, robot: str, text: str) -> None:
+        """Once for each key is enough."""
+        if key not in self._complained:
+            self._complained.add(key)
+            self.station.tell("presence", robot, text)
+
+
+def _explored(name: str, cells: bytes) -> Explored:
+    return Explored(name, base64.b64encode(cells).decode())

@@ -1,0 +1,230 @@
+"""What a simulated fleet is before it runs: its world and field, and where its robots stand."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.frames import LocalTransform
+from edge.core.world import Feature, format_world, random_features
+from edge.flight.margins import places_apart
+from edge.messages.mission import Origin
+from edge.policy.bundle import BundleError, load_bundle
+from lpac.fleet.settings import Places
+from lpac.fleet.writer import write_fleet, write_robot
+from lpac.sim.description import ERRORS, fence_around, robot_table
+from lpac.sim.experiment import FIELD_SCALE
+from lpac.sim.px4.errors import Errors
+from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.px4.world import WorldOrigin
+
+MAX_ROBOTS = 20
+
+# The field is the policy's world; its y axis does not point north, so that mistakes show.
+WORLD = WorldOrigin()
+ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
+
+# Pads, which are landing points too.
+APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
+# As far inside the field as there is room: what a robot takes its place to be walks.
+_PADS_INSIDE_FIELD_M = (2.0, 1.0, 0.0)
+# How often pads are drawn anew, and pushed apart, before there is no room for them.
+_PAD_DRAWS = 30
+_PAD_PUSHES = 300
+# What rounding and the last push may leave.
+_PAD_SLACK = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetScenario:
+    """A flight of a fleet; everything random in it but the timing follows from `seed`.
+
+    The world is that of a `lpac.sim.experiment.Scenario` with the same seed. Without `errors` the
+    simulated vehicles' estimates are off by noise alone, and the air stands still.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    robots: int = 10
+    seed: int = 0
+    duration_s: float = 60.0
+    features: tuple[Feature, ...] | None = None
+    random_feature_count: int = 10
+    errors: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.robots <= MAX_ROBOTS:
+            raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
+        if self.seed < 0:
+            raise ValueError(f"seed = {self.seed}: must be at least 0")
+        if not 0.0 < self.duration_s < math.inf:
+            raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
+        if self.random_feature_count < 0:
+            raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
+
+
+class Layout:
+    """A fleet's world, field, fence and pads, all of which follow from its scenario.
+
+    `pads_m` (N, 2) is where the robots really stand, `landing_points_m` (N, 2) where they return
+    to, both in the mission frame. `vehicles` are simulated ones on those pads; none are drawn with
+    `without_vehicles`, for real ones that know where they are.
+    """
+
+    def __init__(
+        self, scenario: FleetScenario, bundle_path: Path, *, without_vehicles: bool = False
+    ) -> None:
+        """Raises ValueError if there is no room for so many robots; BundleError for a bundle that
+        cannot be loaded, or has no perception."""
+        self.bundle = load_bundle(bundle_path)
+        perception, training = self.bundle.manifest.perception, self.bundle.manifest.training
+        if perception is None:
+            raise BundleError(f"{bundle_path}: the bundle has no perception: it cannot fly")
+        self.scenario = scenario
+        self.bundle_path = bundle_path.resolve()
+        self.field_m = perception.world_size / FIELD_SCALE.env_scale
+        self.max_speed_m_s = training.max_speed * FIELD_SCALE.velocity_scale
+        self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
+            WORLD.latitude_deg, WORLD.longitude_deg
+        )
+        self.fence = fence_around(self.field_m, scenario.robots)
+        self.features = scenario.features
+        if self.features is None:
+            self.features = random_features(
+                # The first of the children that sim.experiment draws from.
+                np.random.default_rng(np.random.SeedSequence(scenario.seed).spawn(1)[0]),
+                scenario.random_feature_count,
+                perception.world_size,
+            )
+        self.vehicles: tuple[Px4Vehicle, ...] = ()
+        if without_vehicles:
+            self.pads_m = self.landing_points_m = self._draw_pads(np.zeros((scenario.robots, 2)))
+        else:
+            self.pads_m, self.landing_points_m, self.vehicles = self._draw_vehicles()
+
+    def to_world_m(self, place_m: F64) -> tuple[float, float]:
+        """North and east, m, of a place (2,) of the mission frame."""
+        north_m, east_m, _ = self.to_mission.mission_to_local(np.array([*place_m, 0.0])).tolist()
+        return north_m, east_m
+
+    def write(self, folder: Path, fleet: str, robots: Mapping[str, Mapping[str, object]]) -> None:
+        """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
+
+        `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
+        """
+        assert self.features is not None
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "world.env").write_text(format_world(self.features))
+        config = write_fleet(
+            folder / "fleet.toml",
+            "Made by `lpac sim`: the robots are programs of this machine, without image or SSH.",
+            {
+                "fleet": fleet,
+                "image": "none",
+                "bundle": str(self.bundle_path),
+                "world": "world.env",
+                "robot": robot_table(self.fence, self.max_speed_m_s),
+                # No computer has such a host name, so that nobody deploys to this machine.
+                "robots": {
+                    name: {
+                        "host": f"{name}.invalid",
+                        "address": "127.0.0.1",
+                        "robot_id": robot_id,
+                        **its,
+                    }
+                    for robot_id, (name, its) in enumerate(robots.items())
+                },
+                "slots": [
+                    {
+                        "robot": name,
+                        "height": robot_id,
+                        "pad_m": self._pad_seen_m(robot_id),
+                        "landing_point_m": self._pad_seen_m(robot_id),
+                    }
+                    for robot_id, name in enumerate(robots)
+                ],
+            },
+        )
+        places = Places(str(self.bundle_path), "../../world.env", "logs", "127.0.0.1")
+        for robot_id, name in enumerate(robots):
+            write_robot(folder / "robots" / str(robot_id) / "robot.toml", config, name, places)
+
+    def _pad_seen_m(self, robot: int) -> list[float]:
+        """Where a robot takes its pad to be: mission frame, m."""
+        return [round(c, 3) for c in self.landing_points_m[robot].tolist()]
+
+    def _draw_vehicles(self) -> tuple[F64, F64, tuple[Px4Vehicle, ...]]:
+        """Pads, landing points, vehicles. A robot lands where it takes its own pad to be."""
+        robots = self.scenario.robots
+        seeds = np.random.SeedSequence([self.scenario.seed, robots]).generate_state(robots).tolist()
+        # Both places of a vehicle and its pad: a vehicle's bias is drawn before it has a place.
+        biases_m = np.zeros((robots, 2))
+        if self.scenario.errors:
+            biases_m = np.array([self._horizontal(Px4Vehicle(seed=s).gps_bias_m) for s in seeds])
+        pads_m = self._draw_pads(biases_m)
+        headings_rad = np.random.default_rng(seeds).uniform(0.0, math.tau, robots).tolist()
+        vehicles = []
+        for seed, pad_m, heading_rad in zip(seeds, pads_m, headings_rad, strict=True):
+            north_m, east_m = self.to_world_m(pad_m)
+            vehicle = Px4Vehicle(
+                seed=seed, start_m=(north_m, east_m), heading_rad=heading_rad, origin=WORLD,
+                errors=Errors(seed, self.scenario.seed) if self.scenario.errors else None,
+            )  # fmt: skip
+            if not self.scenario.errors:
+                vehicle.gps_bias_m = np.zeros(3)
+            vehicles.append(vehicle)
+        return pads_m, pads_m + biases_m, tuple(vehicles)
+
+    def _draw_pads(self, biases_m: F64) -> F64:
+        """Pads (N, 2) apart from each other, both in truth and as the robots see them."""
+        rng = np.random.default_rng([self.scenario.seed, 1])
+        robots, field_m = len(biases_m), self.field_m
+        for inside_m in _PADS_INSIDE_FIELD_M:
+            pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, rng)
+            if pads_m is not None:
+                return pads_m
+        fit = next(
+            fewer
+            for fewer in range(robots - 1, 0, -1)
+            if _pads_apart(biases_m[:fewer], 0.0, field_m, rng) is not None
+        )
+        raise ValueError(
+            f"robots = {robots}: {fit} fit on {field_m:g} x {field_m:g} m, with pads {APART_M:g} m "
+            "apart, which is twice the position error"
+        )
+
+    def _horizontal(self, vector_m: F64) -> F64:
+        """A vector (3,) of the world, along the mission axes: (2,)."""
+        turned: F64 = self.to_mission.velocity_to_mission(vector_m)[:2]
+        return turned
+
+
+def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Generator) -> F64 | None:
+    """Places (N, 2) within a square, `APART_M` from each other, and so with the biases added.
+
+    Drawn in the cells of a grid, then pushed apart; None if they find no room.
+    """
+    robots = len(biases_m)
+    side = math.ceil(math.sqrt(robots))
+    lowest_m, highest_m = np.maximum(low_m, low_m - biases_m), np.minimum(high_m, high_m - biases_m)
+    truth_and_seen_m = np.stack([np.zeros_like(biases_m), biases_m])
+    wanted_m = APART_M * (1.0 + _PAD_SLACK)
+    for _ in range(_PAD_DRAWS):
+        cells = np.stack(np.divmod(rng.permutation(side * side)[:robots], side), axis=1)
+        jittered = cells + rng.uniform(0.0, 1.0, (robots, 2))
+        places_m = low_m + jittered * ((high_m - low_m) / side)
+        for _ in range(_PAD_PUSHES):
+            places_m = np.clip(places_m, lowest_m, highest_m)
+            all_m = truth_and_seen_m + places_m
+            offsets_m = all_m[:, :, None] - all_m[:, None]
+            distances_m = np.linalg.norm(offsets_m, axis=3)
+            distances_m[:, range(robots), range(robots)] = math.inf
+            if distances_m.min() >= APART_M * (1.0 + _PAD_SLACK / 2.0):
+                return places_m
+            shares = np.maximum(wanted_m - distances_m, 0.0) / np.maximum(distances_m, 1e-9)
+            # Less than half of what is missing for either of two: crowds come to rest so.
+            places_m = places_m + 0.35 * (offsets_m * shares[..., None]).sum(axis=(0, 2))
+    return None

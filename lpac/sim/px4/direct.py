@@ -1,0 +1,140 @@
+"""A simulated vehicle behind the robot's ports, in process: no socket, on a simulated clock."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from edge.core.ports import Clock
+from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
+from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
+from lpac.sim.px4.link import FORCE, Px4Link
+from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
+from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.px4.world import FencePolygon
+
+_LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
+# Which fields count; see MAVLink's POSITION_TARGET_TYPEMASK.
+_VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
+_AUTOPILOT = 1
+_REQUEST_AGAIN_S = 1.0
+_COMMANDS: dict[Action, tuple[int, tuple[float, ...]]] = {
+    Action.ARM: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,)),
+    Action.DISARM: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,)),
+    Action.KILL: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE)),
+    Action.LAND: (mavlink.MAV_CMD_NAV_LAND, ()),
+}
+_MODES = {Action.OFFBOARD: Px4Mode.OFFBOARD, Action.HOLD: Px4Mode.HOLD}
+
+
+class DirectVehicle:
+    """A `Vehicle` and its `VehicleSetup`; `step` lets its time pass.
+
+    It says and hears MAVLink, message by message, as over a wire: what the robot knows of it is
+    what PX4 tells, at PX4's rates.
+    """
+
+    def __init__(self, vehicle: Px4Vehicle, system_id: int, clock: Clock) -> None:
+        self.vehicle = vehicle
+        self._system_id = system_id
+        self._clock = clock
+        self._link = Px4Link(vehicle, system_id=system_id)
+        self._telemetry = Px4Telemetry()
+        self._packer: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=191)
+        self._parser: Any = mavlink.MAVLink(None)
+        self._result: ActionResult | None = None
+        self._asked: Action | None = None
+        self._requested_at_s = -_REQUEST_AGAIN_S
+        for message_id, rate_hz in RATES_HZ.items():
+            self._command_long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
+        # Nobody else listens on this link: what the robot does not read costs time alone.
+        for message_id, kind in mavlink.mavlink_map.items():
+            if message_id and kind.msgname not in self._telemetry.messages:
+                self._command_long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, -1.0)
+
+    def step(self, dt_s: float) -> None:
+        """Let the vehicle fly on, and hear what it says."""
+        self.vehicle.step(dt_s)
+        now_s = self._clock.monotonic_s()
+        for datagram in self._link.due():
+            for message in self._parser.parse_buffer(datagram) or ():
+                name = message.get_type()
+                if name == "COMMAND_ACK":
+                    self._hear_answer(message, now_s)
+                elif name in self._telemetry.messages:
+                    self._telemetry.hear(name, message.to_dict(), now_s)
+        if self._telemetry.needs_origin() or now_s - self._requested_at_s >= _REQUEST_AGAIN_S:
+            self._requested_at_s = now_s
+            self._request(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+            self._request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+
+    # The robot's ports
+
+    def state(self) -> VehicleState:
+        """The newest of everything."""
+        state = self._telemetry.state(self._clock.monotonic_s())
+        return replace(state, system_id=self._system_id, result=self._result)
+
+    def send(self, setpoint: Setpoint) -> Setpoint | None:
+        """Send it once."""
+        position_m = velocity_m_s = (0.0, 0.0, 0.0)
+        if isinstance(setpoint, Velocity):
+            mask, velocity_m_s = _VELOCITY_MASK, setpoint.velocity_local_m_s
+        else:
+            mask, position_m = _POSITION_MASK, setpoint.position_local_m
+        self._send(
+            mavlink.MAVLink_set_position_target_local_ned_message(
+                0, self._system_id, _AUTOPILOT, _LOCAL_NED, mask, *position_m, *velocity_m_s,
+                0.0, 0.0, 0.0, 0.0, 0.0,
+            )
+        )  # fmt: skip
+        return setpoint
+
+    def command(self, action: Action) -> None:
+        """Ask for it; what came of it is known after the vehicle's next step."""
+        self._asked = action
+        if action in _MODES:
+            self._command_long(mavlink.MAV_CMD_DO_SET_MODE, 1.0, *CUSTOM_MODES[_MODES[action]])
+        else:
+            number, parameters = _COMMANDS[action]
+            self._command_long(number, *parameters)
+
+    def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
+        """PX4's parameters; None for one that it does not have."""
+        return {name: self.vehicle.parameters.get(name) for name in names}
+
+    def set_parameter(self, name: str, value: int | float) -> None:
+        """Set one."""
+        self.vehicle.parameters[name] = value
+
+    def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
+        """Replace the fence by one polygon to stay in."""
+        self.vehicle.fence = (FencePolygon(True, tuple(vertices_deg)),)
+
+    # What it sends
+
+    def _hear_answer(self, message: Any, now_s: float) -> None:
+        if self._asked is None or message.command in (
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE,
+        ):  # fmt: skip
+            return
+        accepted = message.result == mavlink.MAV_RESULT_ACCEPTED
+        refusal = "" if accepted else f"result {message.result}"
+        self._result = ActionResult(self._asked, accepted, refusal, now_s)
+        self._asked = None
+        # Sooner than the next that is due.
+        self._request(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
+        self._request(mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)
+
+    def _request(self, message_id: int) -> None:
+        self._command_long(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
+
+    def _command_long(self, number: int, *parameters: float) -> None:
+        padded = (*parameters, *(0.0,) * (7 - len(parameters)))
+        self._send(
+            mavlink.MAVLink_command_long_message(self._system_id, _AUTOPILOT, number, 0, *padded)
+        )
+
+    def _send(self, message: Any) -> None:
+        self._link.receive(bytes(message.pack(self._packer)))
