@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from lpac.sim.experiment import Scenario, SimulatedFlight
+    from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.layout import FleetScenario
     from lpac.sim.fleet.processes import Fleet
     from lpac.sim.operator import Statuses
@@ -53,6 +54,7 @@ class Vehicle(StrEnum):
     """What the robots fly."""
 
     POINT = "point"
+    SIMULATED = "simulated"
     MAVLINK = "mavlink"
     PX4 = "px4"
 
@@ -64,8 +66,9 @@ def sim(
     vehicle: Annotated[
         Vehicle,
         typer.Option(
-            help="point: points in simulated time, in this process; mavlink: one process per robot "
-            "in real time, each with a simulated PX4; px4: the same with real PX4s."
+            help="point: points in simulated time; simulated: whole robots with simulated PX4s on "
+            "one simulated clock; mavlink: the same as one process per robot in real time; px4: "
+            "with real PX4s."
         ),
     ] = Vehicle.POINT,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
@@ -121,13 +124,13 @@ def sim(
 
     _require_options_of(context, vehicle)
     count = _robot_count(robots)
-    if count is None and vehicle is Vehicle.POINT:
-        raise ValueError("--robots auto does nothing with --vehicle point")
+    if count is None and vehicle in (Vehicle.POINT, Vehicle.SIMULATED):
+        raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
     world_features = parse_world(_text(world), str(world)) if world else None
     if vehicle is not Vehicle.POINT:
         from lpac.sim.fleet.layout import FleetScenario
 
-        flown: Literal["mavlink", "px4"] = "mavlink" if vehicle is Vehicle.MAVLINK else "px4"
+        flown: Literal["mavlink", "px4"] = "px4" if vehicle is Vehicle.PX4 else "mavlink"
         if flown == "px4" and px4 is None:
             raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
         fleet_scenario = FleetScenario(
@@ -138,6 +141,10 @@ def sim(
             random_feature_count=features,
             errors=errors,
         )
+
+        if vehicle is Vehicle.SIMULATED:
+            _fly_on_clock(fleet_scenario, bundle, as_json, out)
+            return
 
         def prepared() -> int | None:
             """What is wrong with the flight itself has been said by now."""
@@ -191,7 +198,7 @@ _ONLY_FOR = {
     "loss": (Vehicle.POINT,),
     "delay": (Vehicle.POINT,),
     "max_message_age": (Vehicle.POINT,),
-    "errors": (Vehicle.MAVLINK,),
+    "errors": (Vehicle.SIMULATED, Vehicle.MAVLINK),
     "px4": (Vehicle.PX4,),
     "script": (Vehicle.MAVLINK, Vehicle.PX4),
 }
@@ -257,7 +264,7 @@ def _launch(
 
     `prepared` is called before anything starts; it tells how many robots this machine carries.
     """
-    from lpac.sim.fleet.flight import fly, summary_lines
+    from lpac.sim.fleet.flight import fly
     from lpac.sim.fleet.processes import Fleet
 
     # Whoever stops this program means the fleet too.
@@ -266,6 +273,27 @@ def _launch(
         fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
         fleet.carried = prepared()
         flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
+    _show_fleet_flight(flight, as_json, out)
+
+
+def _fly_on_clock(scenario: "FleetScenario", bundle: Path, as_json: bool, out: Path | None) -> None:
+    """Fly whole robots on one simulated clock; exit code 1 unless it ended as it should."""
+    import logging
+
+    import structlog
+
+    from lpac.sim.fleet.clocked import fly_simulated
+
+    # What ten robots say to their own logs is nothing for a person.
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (_, say):
+        flight = fly_simulated(scenario, out or Path(nowhere), bundle, say)
+    _show_fleet_flight(flight, as_json, out)
+
+
+def _show_fleet_flight(flight: "FleetFlight", as_json: bool, out: Path | None) -> None:
+    from lpac.sim.fleet.flight import summary_lines
+
     if out:
         from lpac.sim.fleet.report import write_fleet_flight
 
@@ -276,7 +304,9 @@ def _launch(
         for line in summary_lines(flight):
             typer.echo(line)
         if out:
-            typer.echo(f"see {out / 'flight.png'}; the flight logs are in {out / 'robots'}")
+            logged = any(robot.logs for robot in flight.robots)
+            logs = f"; the flight logs are in {out / 'robots'}" if logged else ""
+            typer.echo(f"see {out / 'flight.png'}{logs}")
     if flight.problem or not flight.all_landed:
         raise typer.Exit(1)
 

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from edge.core.world import rasterize
 from edge.messages.codes import Reason
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState, RobotStatus
 from lpac.sim.experiment import FIELD_SCALE
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import ORIGIN, FleetScenario, Layout
 from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
 from lpac.sim.fleet.vehicles import TrueTrack, VehicleError
 from lpac.sim.operator import Heard, OperatorScript, OperatorScriptError, Say
@@ -26,6 +26,7 @@ COST_PERIOD_S = 1.0
 SEPARATION_PERIOD_S = 0.04
 
 _LOOPS = ("perception", "policy", "control")
+_IN_TIME = Backlog(0.0, 0.0)
 
 
 class StateChange(NamedTuple):
@@ -254,32 +255,89 @@ def _record(
     lateness: Backlog,
     overloaded: bool,
 ) -> FleetFlight:
-    scenario, manifest = fleet.layout.scenario, fleet.layout.bundle.manifest
-    assert manifest.perception is not None and fleet.layout.features is not None
     start_s = moments["assemble"].time_s if "assemble" in moments else moments["end"].time_s
     began_s = {name: at_s - start_s for name, at_s in script.began_s.items()}
     began_s["end"] = moments["end"].time_s - start_s
     # The mission's own figures; of the whole flight where there was none.
     first = moments.get("mission", next(iter(moments.values())))
     last = moments.get("return", moments["end"])
-    mission_s = (began_s["mission"], last.time_s - start_s) if "mission" in began_s else (0.0, 0.0)
-    tracks = [_in_mission_frame(fleet, track, start_s) for track in fleet.vehicles.tracks()]
+    tracks = fleet.vehicles.tracks()
+    return flight_of(
+        fleet.layout,
+        "px4" if fleet.simulated is None else "mavlink",
+        [
+            RobotRecord(
+                history=fleet.operator.history(robot),
+                track=tracks[robot],
+                last=last.statuses.get(robot),
+                restarts=script.restarts[robot],
+                cpu_share=_share(first, last, first.usages[robot], last.usages[robot]),
+                peak_memory_mb=moments["end"].usages[robot].peak_memory_mb,
+                logs=tuple(str(p.relative_to(fleet.folder)) for p in fleet.robots[robot].logs()),
+            )
+            for robot in range(fleet.layout.scenario.robots)
+        ],
+        start_s,
+        began_s,
+        problem=problem,
+        refusals=tuple(fleet.operator.refusals),
+        launcher=(
+            _share(first, last, first.launcher, last.launcher),
+            moments["end"].launcher.peak_memory_mb,
+        ),
+        lateness=lateness,
+        overloaded=overloaded,
+    )
+
+
+class RobotRecord(NamedTuple):
+    """What was noted of one robot, in the clock of whoever noted it."""
+
+    history: tuple[Heard, ...]
+    track: TrueTrack
+    last: RobotStatus | None
+    restarts: int = 0
+    cpu_share: float = 0.0
+    peak_memory_mb: float = 0.0
+    logs: tuple[str, ...] = ()
+
+
+def flight_of(
+    layout: Layout,
+    vehicle: str,
+    records: Sequence[RobotRecord],
+    start_s: float,
+    began_s: Mapping[str, float],
+    *,
+    problem: str | None,
+    refusals: tuple[str, ...] = (),
+    launcher: tuple[float, float] = (0.0, 0.0),
+    lateness: Backlog = _IN_TIME,
+    overloaded: bool = False,
+) -> FleetFlight:
+    """The flight that was noted; `began_s` counts from `start_s` of the records' clock."""
+    manifest = layout.bundle.manifest
+    assert manifest.perception is not None and layout.features is not None
+    mission_s = (0.0, 0.0)
+    if "mission" in began_s:
+        mission_s = began_s["mission"], began_s.get("return", began_s["end"])
+    tracks = [_in_mission_frame(layout, record.track, start_s) for record in records]
     robots = tuple(
         _robot_flight(
-            fleet.operator.history(robot),
+            record.history,
             start_s,
             mission_s,
-            truth=tracks[robot],
-            last=last.statuses.get(robot),
-            restarts=script.restarts[robot],
-            cpu_share=_share(first, last, first.usages[robot], last.usages[robot]),
-            peak_memory_mb=moments["end"].usages[robot].peak_memory_mb,
-            logs=tuple(str(path.relative_to(fleet.folder)) for path in fleet.robots[robot].logs()),
+            truth=track,
+            last=record.last,
+            restarts=record.restarts,
+            cpu_share=record.cpu_share,
+            peak_memory_mb=record.peak_memory_mb,
+            logs=record.logs,
         )
-        for robot in range(scenario.robots)
+        for record, track in zip(records, tracks, strict=True)
     )
     importance = rasterize(
-        fleet.layout.features,
+        layout.features,
         manifest.perception.world_size,
         manifest.training.idf_truncation,
         manifest.training.idf_norm,
@@ -289,26 +347,23 @@ def _record(
     )
     costs = np.array([_costs(importance, robots, at_s) for at_s in cost_time_s.tolist()])
     return FleetFlight(
-        scenario=scenario,
-        vehicle="px4" if fleet.simulated is None else "mavlink",
-        bundle_id=fleet.layout.bundle.id,
-        field_m=fleet.layout.field_m,
-        fence=fleet.layout.fence,
+        scenario=layout.scenario,
+        vehicle=vehicle,
+        bundle_id=layout.bundle.id,
+        field_m=layout.field_m,
+        fence=layout.fence,
         importance=importance,
-        pads_m=fleet.layout.pads_m,
-        landing_points_m=fleet.layout.landing_points_m,
+        pads_m=layout.pads_m,
+        landing_points_m=layout.landing_points_m,
         robots=robots,
         began_s=began_s,
         problem=problem,
-        refusals=tuple(fleet.operator.refusals),
+        refusals=refusals,
         cost_time_s=cost_time_s - mission_s[0],
         cost=costs[:, 0],
         true_cost=costs[:, 1],
         separation=least_separation(tracks),
-        launcher=(
-            _share(first, last, first.launcher, last.launcher),
-            moments["end"].launcher.peak_memory_mb,
-        ),
+        launcher=launcher,
         lateness=lateness,
         overloaded=overloaded,
     )
@@ -319,8 +374,8 @@ def _share(first: _Moment, last: _Moment, before: Usage, after: Usage) -> float:
     return max(0.0, after.cpu_s - before.cpu_s) / max(last.time_s - first.time_s, 1e-9)
 
 
-def _in_mission_frame(fleet: Fleet, track: TrueTrack, start_s: float) -> TrueTrack:
-    rotation, origin_m = fleet.layout.to_mission.rotation, fleet.layout.to_mission.local_origin_m
+def _in_mission_frame(layout: Layout, track: TrueTrack, start_s: float) -> TrueTrack:
+    rotation, origin_m = layout.to_mission.rotation, layout.to_mission.local_origin_m
     return TrueTrack(
         track.time_s - start_s, track.position_m @ rotation.T + origin_m, track.airborne
     )
@@ -508,6 +563,9 @@ def summary_lines(flight: FleetFlight) -> list[str]:
         f"operator: {restarts}; orders refused: {len(flight.refusals)}"
     )
     lines += _loop_lines(flight)
+    if flight.vehicle == "simulated":
+        # On a simulated clock nobody is late, and all of it is one process.
+        return lines
     cpu_shares = [100.0 * robot.cpu_share for robot in robots]
     memory_mb = [robot.peak_memory_mb for robot in robots]
     lines.append(

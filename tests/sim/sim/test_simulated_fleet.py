@@ -12,6 +12,8 @@ from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script
 from lpac.ground.site import Sites
 from lpac.ground.station.protocol import Enable, SafetyCommand, SetOrigin, Start, Takeoff
+from lpac.sim.fleet.clocked import fly_simulated
+from lpac.sim.fleet.flight import FleetFlight, normalized
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.radio import GROUND
@@ -147,3 +149,20 @@ class _Listener(ScriptListener):
 
     def may(self, question: str) -> bool:
         return True
+
+
+def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
+    def flown(name: str) -> FleetFlight:
+        scenario = FleetScenario(robots=3, seed=5, duration_s=10.0)
+        return fly_simulated(scenario, tmp_path / name, SHIPPED)
+
+    flight, again = flown("first"), flown("again")
+    assert flight.all_landed and flight.problem is None
+    assert [change.state for change in flight.robots[0].changes][-4:] == [
+        FlightState.MISSION, FlightState.RETURN, FlightState.LAND, FlightState.LANDED,
+    ]  # fmt: skip
+    assert min(robot.mission_share for robot in flight.robots) > 0.9
+    assert flight.true_fence_margin_m() > 0.0
+    assert flight.separation is not None and flight.separation.distance_m > DRONE_M
+    assert flight.summary() == again.summary()
+    assert normalized(flight.cost)[-1] < 1.0
