@@ -24,9 +24,9 @@ check: lint ## style, types, and the quick tests: what a commit has to pass, in 
 	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
 
 test: lint ## style, types, and every test; as root with real robot hosts too: half an hour
-	.venv/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
-		-m 'not alone and not host'; beside=$$?; \
-		.venv/bin/pytest -m 'alone or host' && exit $$beside
+	.venv/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder \
+		-m 'not alone'; beside=$$?; \
+		.venv/bin/pytest -m alone && exit $$beside
 
 lint: .venv/test ## style, and strict types of the product and its tests
 	.venv/bin/ruff check .

@@ -77,6 +77,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if tier not in TIERS:
             raise pytest.UsageError(f"{item.path} is in none of the tiers {', '.join(TIERS)}")
         item.add_marker(tier)
+        # Side by side run files; but all of host/, which has one image and one rack of computers.
+        group = tier if tier == "host" else item.nodeid.split("::", 1)[0]
+        item.add_marker(pytest.mark.xdist_group(group))
     if config.getoption("--vehicle") != "px4":
         return
     for item in items:

@@ -22,6 +22,8 @@ from tests.host.conftest import BuildImage
 from tests.host.deploy.entering import inside
 from tests.robot_rig import Changes, Rig, new_vehicle, program, rig
 
+pytestmark = pytest.mark.alone
+
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
 # Of ELF's head: 64 bits, little endian, a program or a library, for AArch64.

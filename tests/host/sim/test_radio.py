@@ -20,6 +20,8 @@ from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 from tests.process.sim.fault_rig import FaultRig, speed_m_s
 
+pytestmark = pytest.mark.alone
+
 ROBOTS = 3
 OWN_NETWORK = ("unshare", "--map-root-user", "--net", "sh", "-c")
 LOSE_ALL = ("iptables", "-A", "INPUT", "-i", "lo", "-p", "tcp", "-j", "DROP")
