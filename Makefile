@@ -24,7 +24,7 @@ check: lint ## style, types, and the quick tests: what a commit has to pass, in 
 	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
 
 test: lint ## style, types, and every test; as root with real robot hosts too: half an hour
-	.venv/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadgroup --no-loadscope-reorder \
+	.venv/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder \
 		-m 'not alone'; beside=$$?; \
 		.venv/bin/pytest -m alone && exit $$beside
 

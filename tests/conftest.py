@@ -4,9 +4,11 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.scheduler import LoadFileScheduling
 
 from edge.policy.bundle import Bundle, load_bundle
 from edge.policy.lpac.graphs import Policy
@@ -77,14 +79,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if tier not in TIERS:
             raise pytest.UsageError(f"{item.path} is in none of the tiers {', '.join(TIERS)}")
         item.add_marker(tier)
-        # Side by side run files; but all of host/, which has one image and one rack of computers.
-        group = tier if tier == "host" else item.nodeid.split("::", 1)[0]
-        item.add_marker(pytest.mark.xdist_group(group))
     if config.getoption("--vehicle") != "px4":
         return
     for item in items:
         for marker in item.iter_markers("simulated_only"):
             item.add_marker(pytest.mark.skip(reason=marker.args[0]))
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Side by side run files; all of host/, with its one image and rack, counts as one."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    scheduler = LoadFileScheduling(config, log)
+    file_of = scheduler._split_scope
+    scheduler._split_scope = lambda nodeid: (
+        "tests/host" if nodeid.startswith("tests/host/") else file_of(nodeid)
+    )
+    return scheduler
 
 
 @pytest.hookimpl(wrapper=True)
