@@ -23,10 +23,14 @@ setup: .venv/sim .venv/export .venv/fleet .venv/ground ## install what a worksta
 check: lint ## style, types, and the quick tests: what a commit has to pass, in two minutes
 	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
 
+BY_FILE := --dist loadfile --no-loadscope-reorder
 test: lint ## style, types, and every test; as root with real robot hosts too: half an hour
-	.venv/bin/pytest --numprocesses auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder \
-		-m 'not alone'; beside=$$?; \
-		.venv/bin/pytest -m alone && exit $$beside
+	@failed=0; \
+	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest "$$@" || failed=1; }; \
+	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
+	some --numprocesses 2 $(BY_FILE) -m real_time; \
+	some -m alone; \
+	exit $$failed
 
 lint: .venv/test ## style, and strict types of the product and its tests
 	.venv/bin/ruff check .

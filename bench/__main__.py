@@ -16,6 +16,7 @@ BENCHES = (
     "policy",
     "footprint",
     "scaling",
+    "simulated",
     "closed_loop",
     "loops",
     "release",

@@ -16,8 +16,9 @@ from onnx import TensorProto, helper, shape_inference
 from bench.report import Table
 from bench.timing import interleaved, quartiles, with_quartiles
 from edge.core import F32
-from edge.policy.bundle import CNN, Bundle
-from edge.policy.lpac.graphs import Policy
+from edge.policy.bundle import Bundle
+from edge.policy.lpac.manifest import CNN
+from edge.policy.lpac.policy import LpacPolicy
 
 # Large enough for the peak, small enough for the second-level cache of a small core.
 _GEMM_SIZE = 512
@@ -26,7 +27,7 @@ _PROFILED_RUNS = 200
 
 def measure(bundle: Bundle, images: F32, rounds: int, round_s: float) -> dict[str, Any]:
     """Speed of the CNN, the peak (the faster of two matrix products), and where the time goes."""
-    policy = Policy(bundle)
+    policy = LpacPolicy(bundle)
     flops = _flops(bundle.files[CNN])
     gemm_flop = 2 * _GEMM_SIZE**3
     times = interleaved({"CNN": lambda: policy.image_features(images), **_gemms()}, rounds, round_s)

@@ -10,7 +10,7 @@ from edge.core.ports import Odometry
 from edge.core.wire import encode
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import load_bundle
-from edge.policy.lpac.graphs import Policy
+from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.pac import Pac, PacParameters
 
 
@@ -23,7 +23,7 @@ class _Standing:
 
 def main() -> None:
     """Load the bundle, hear ten neighbours, tick."""
-    policy = Policy(load_bundle(BUNDLE))
+    policy = LpacPolicy(load_bundle(BUNDLE))
     perception = policy.manifest.perception
     assert perception
     importance = np.ones((perception.world_size,) * 2, np.float32)
@@ -35,7 +35,7 @@ def main() -> None:
         odometry=_Standing(),
         parameters=PacParameters(scale=ModelScale(ENV_SCALE, 0.25), max_speed_m_s=1.25),
     )
-    payload = np.zeros(policy.manifest.geometry.message_size, np.float32)
+    payload = np.zeros(policy.message_size, np.float32)
     for number, position_m in enumerate(NEIGHBOURS_M, 1):
         message = AggregatedMessage(
             number, 1, 1, 0.0, position_m, velocity_m_s=(0.0, 0.0, 0.0), frame_id=0, payload=payload

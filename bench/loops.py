@@ -1,38 +1,66 @@
-"""Lateness of a robot's loops: ten robots in flight on this machine, and one beside a busy process.
+"""Robots in flight on this machine: how late their loops are, and what their programs take.
 
-The processes are those of a fleet: each with its radio, autopilot and flight log.
+Ten robots, and one beside busy processes. The processes are those of a fleet: each robot's with its
+radio, autopilot and flight log; its watchdog, a process of its own, is not counted.
 """
 
+import math
 import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
+from bench.usage import Usage, usage
 from edge.messages.mission import LoopStatus, RobotStatus
 from lpac.sim.fleet.flight import fly
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 
 LOOPS = ("perception", "policy", "control")
-_FLEET = 10
-_MISSION_S = 60.0
+
+# Once the mission has begun, all has been loaded that a flight needs.
+_SETTLED_S = 3.0
+_LOOK_EVERY_S = 1.0
 
 
-def measure() -> Report:
-    """Two flights, each with a minute of mission."""
-    progress(f"loops: {_FLEET} robots fly, about two minutes")
-    crowd = _fly(_FLEET)
-    progress("loops: one robot flies beside busy processes, about two minutes")
-    with _busy():
-        disturbed = _fly(1)
-    flights = {f"{_FLEET} robots": crowd, "1 robot, every core busy": disturbed}
+class _Taken(NamedTuple):
+    """What a robot's program takes: `cpu_percent` of one core, by thread; the rest as `Usage`."""
+
+    cpu_percent: dict[str, float]
+    threads: int
+    private_mb: float
+    resident_mb: float
+
+    @property
+    def all_cpu_percent(self) -> float:
+        """All threads together."""
+        return sum(self.cpu_percent.values())
+
+
+class _Flight(NamedTuple):
+    """The robots' last statuses of a mission, and what their programs took in it."""
+
+    statuses: list[RobotStatus]
+    taken: list[_Taken]
+
+
+def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = True) -> Report:
+    """A flight of so many robots; and with `beside_busy` one of a single robot."""
+    progress(f"loops: {robots} robots fly, about two minutes")
+    crowd = _fly(robots, mission_s)
+    flights = {f"{robots} robots": crowd.statuses}
+    if beside_busy:
+        progress("loops: one robot flies beside busy processes, about two minutes")
+        with _busy():
+            flights["1 robot, every core busy"] = _fly(1, mission_s).statuses
     rows = []
     figures: dict[str, Any] = {}
     for name, statuses in flights.items():
@@ -40,6 +68,12 @@ def measure() -> Report:
             of_all = [status.loops[loop] for status in statuses]
             figures.setdefault(name, {})[loop] = _summary(of_all)
             rows.append((name, loop, *_cells(of_all)))
+    figures["taken"] = [each._asdict() for each in crowd.taken]
+    medians = {
+        "processor, % of a core": (median(each.all_cpu_percent for each in crowd.taken), 4.0),
+        "threads": (median(each.threads for each in crowd.taken), 40.0),
+        "private memory, MB": (median(each.private_mb for each in crowd.taken), 45.0),
+    }
     return Report(
         "loops",
         figures,
@@ -48,15 +82,24 @@ def measure() -> Report:
                 "Lateness of the loops, ms: the median robot, and the worst",
                 ("", "loop", "p50", "p99", "max", "ticks left out"),
                 rows,
-            )
+            ),
+            Table(
+                f"What each of {robots} robots' programs takes in flight: the median, the most",
+                ("", "median", "most"),
+                _taken_rows(crowd.taken),
+            ),
         ],
         [
             Target(
                 "worst lateness of a control tick over the watchdog's 0.5 s",
-                max(status.loops["control"].lateness_max_ms for status in crowd) / 500.0,
+                max(status.loops["control"].lateness_max_ms for status in crowd.statuses) / 500.0,
                 1.0,
                 False,
-            )
+            ),
+            *(
+                Target(f"{what} of a robot", figure, limit, at_least=False)
+                for what, (figure, limit) in medians.items()
+            ),
         ],
         [
             "Over the last minute of the mission. The vehicles and the operator share the cores; "
@@ -65,15 +108,55 @@ def measure() -> Report:
     )
 
 
-def _fly(robots: int) -> list[RobotStatus]:
-    """The robots' last statuses of a mission."""
+def _fly(robots: int, mission_s: float) -> _Flight:
+    looks: list[tuple[float, list[Usage]]] = []
+    began_s = looked_s = -math.inf
+
+    def watch(step: str) -> None:
+        nonlocal began_s, looked_s
+        now_s = time.monotonic()
+        if step != "mission":
+            return
+        began_s = now_s if began_s == -math.inf else began_s
+        if now_s - began_s >= _SETTLED_S and now_s - looked_s >= _LOOK_EVERY_S:
+            looked_s = now_s
+            looks.append((now_s, [usage(robot.pid) for robot in fleet.robots]))
+
     with tempfile.TemporaryDirectory() as folder:
-        scenario = FleetScenario(robots=robots, seed=7, duration_s=_MISSION_S)
-        with Fleet(scenario, Path(folder), BUNDLE) as fleet:
-            flight = fly(fleet)
+        scenario = FleetScenario(robots=robots, seed=7, duration_s=mission_s)
+        fleet = Fleet(scenario, Path(folder), BUNDLE)
+        flight = fly(fleet, watch=watch)
     if flight.problem is not None:
         raise RuntimeError(f"the flight did not go as planned: {flight.problem}")
-    return [robot.last for robot in flight.robots if robot.last is not None]
+    statuses = [robot.last for robot in flight.robots if robot.last is not None]
+    (first_s, first), (last_s, last) = looks[0], looks[-1]
+    return _Flight(
+        statuses,
+        [
+            _Taken(
+                {
+                    name: 100.0 * (cpu_s - before.cpu_s.get(name, 0.0)) / (last_s - first_s)
+                    for name, cpu_s in after.cpu_s.items()
+                },
+                *after[1:],
+            )
+            for before, after in zip(first, last, strict=True)
+        ],
+    )
+
+
+def _taken_rows(taken: Sequence[_Taken]) -> list[tuple[str, ...]]:
+    names = sorted({name for each in taken for name in each.cpu_percent})
+    columns = {
+        "processor, % of a core": [each.all_cpu_percent for each in taken],
+        **{f"    {name}": [each.cpu_percent.get(name, 0.0) for each in taken] for name in names},
+        "threads": [float(each.threads) for each in taken],
+        "private memory, MB": [each.private_mb for each in taken],
+        "resident memory, MB": [each.resident_mb for each in taken],
+    }
+    return [
+        (name, f"{median(numbers):.2f}", f"{max(numbers):.2f}") for name, numbers in columns.items()
+    ]
 
 
 @contextmanager

@@ -7,11 +7,11 @@ import numpy as np
 
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
-from edge.core.perception import Perception, RobotMap, neighbours_in_range, window_corner
+from edge.core.perception import RobotMap, RobotMemory, neighbours_in_range, window_corner
 from edge.core.world import random_features, rasterize
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Manifest
-from edge.policy.lpac.graphs import Policy
+from edge.policy.family import Policy
 from edge.robot.pac import Pac, PacParameters
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.medium import Medium
@@ -27,7 +27,7 @@ _EARLIEST_S, _LATEST_S, _SAMPLE_S = 10.0, 60.0, 0.2
 class Moment:
     """One robot in flight with ten neighbours, and everything that its tick takes.
 
-    Positions are in model units. `perception` has seen what the robot has; `robot_map`
+    Positions are in model units. `memory` is of what the robot has seen; `robot_map`
     (world_size, world_size) is the same as one array. `messages` are the neighbours' newest.
     """
 
@@ -36,7 +36,7 @@ class Moment:
     position: F64
     neighbours: F64
     messages: tuple[AggregatedMessage, ...]
-    perception: Perception
+    memory: RobotMemory
     robot_map: F32
 
     @property
@@ -92,11 +92,11 @@ def _positions(messages: Sequence[AggregatedMessage]) -> F64:
     return FIELD_SCALE.position_to_model(positions_m)
 
 
-def _seen_on(path: F64, importance: F32, manifest: Manifest) -> tuple[Perception, F32]:
+def _seen_on(path: F64, importance: F32, manifest: Manifest) -> tuple[RobotMemory, F32]:
     """What a robot remembers that flew along `path` (T, 2)."""
-    parameters, images = manifest.perception, manifest.images
-    assert parameters and images
-    memory = Perception(parameters, len(images.channels), images.size)
+    parameters = manifest.perception
+    assert parameters
+    memory = RobotMemory(parameters)
     robot_map = RobotMap(parameters.world_size, parameters.unknown_importance)
     sensor = WorldSensor(importance, parameters.sensor_size)
     for position in path:

@@ -19,9 +19,11 @@ from bench.torch_robot import Network, PygLayer, TapLayer, TorchRobot, exchange_
 from edge.core import F32
 from edge.core.aggregation import HopBuffer
 from edge.core.wire import decode, encode
-from edge.policy.bundle import ACTION, gnn_graph, load_bundle
-from edge.policy.lpac.graphs import Policy
-from edge.robot.pac import position_feature
+from edge.policy.bundle import load_bundle
+from edge.policy.family import Observation
+from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.manifest import ACTION, gnn_graph
+from edge.policy.lpac.policy import LpacPolicy
 
 EDGE, TRACED, EAGER = "lpac-edge", "torch traced", "torch + PyG eager"
 TOLERANCE = 1e-4
@@ -36,7 +38,7 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Report:
     """
     progress("policy: a flight for the inputs")
     bundle = load_bundle(BUNDLE)
-    policy = Policy(bundle)
+    policy = LpacPolicy(bundle)
     moment = moment_in_flight(policy)
     robot = EdgeRobot(policy, moment)
     eager = load_network(CHECKPOINT, PygLayer)
@@ -95,22 +97,22 @@ def measure(rounds: int = 200, round_s: float = 0.01) -> Report:
 class EdgeRobot:
     """Our tick at a moment of a flight."""
 
-    def __init__(self, policy: Policy, moment: Moment) -> None:
+    def __init__(self, policy: LpacPolicy, moment: Moment) -> None:
         assert policy.manifest.perception
         self._policy = policy
         self._moment = moment
-        self._world_size = policy.manifest.perception.world_size
-        self._hops = HopBuffer(policy.manifest.geometry)
-        self.images = moment.perception.images(moment.position, moment.neighbours).copy()
-        self.features = self._with_position(policy.image_features(self.images))
+        self._hops = HopBuffer(policy.geometry)
+        images = policy.lpac.images
+        assert images
+        self._images = PolicyImages(policy.manifest.perception, len(images.channels), images.size)
+        self._agent = policy.agent()
+        self.images = self._make_images().copy()
+        self.features = self._agent.observe(self._observation()).features
 
     def tick(self) -> Outputs:
         """Velocity (2,) and message (message_size,)."""
-        moment, policy = self._moment, self._policy
-        images = moment.perception.images(moment.position, moment.neighbours)
-        features = self._with_position(policy.image_features(images))
-        self._hops.diffuse(moment.payloads, NEIGHBOURS)
-        return policy.velocity(features, self._hops), self._hops.message(NEIGHBOURS)
+        features = self._agent.observe(self._observation()).features
+        return self._agent.step(features, self._moment.payloads, NEIGHBOURS)
 
     def exchange(self) -> Outputs:
         """The graph neural network alone: x_L (F_L,) and message (message_size,)."""
@@ -131,12 +133,12 @@ class EdgeRobot:
                     bundle_id=policy.bundle_id,
                     frame_id=0,
                     own_robot_id=-1,
-                    message_size=policy.manifest.geometry.message_size,
+                    message_size=policy.message_size,
                 )
 
         return {
             f"decode {NEIGHBOURS} messages": decode_all,
-            "images": lambda: moment.perception.images(moment.position, moment.neighbours),
+            "images": self._make_images,
             "CNN": lambda: policy.image_features(self.images),
             "aggregation": lambda: self._hops.diffuse(moment.payloads, NEIGHBOURS),
             "layers": self._layers,
@@ -147,10 +149,14 @@ class EdgeRobot:
             "whole step: Pac.infer": lambda: moment.robot.infer(moment.now_s, moment.now_s),
         }
 
-    def _with_position(self, image_features: F32) -> F32:
-        return np.concatenate(
-            [image_features, position_feature(self._moment.position, self._world_size)]
+    def _observation(self) -> Observation:
+        moment = self._moment
+        return Observation(
+            moment.position, moment.memory.local_map(moment.position), moment.neighbours
         )
+
+    def _make_images(self) -> F32:
+        return self._images.images(*self._observation())
 
     def _layers(self) -> F32:
         features = self.features
@@ -172,9 +178,9 @@ class _Exchange(nn.Module):
 
 
 def _torch_ticks(
-    eager: Network, taps: Network, moment: Moment, policy: Policy
+    eager: Network, taps: Network, moment: Moment, policy: LpacPolicy
 ) -> dict[str, Callable[[], Outputs]]:
-    perception, images = policy.manifest.perception, policy.manifest.images
+    perception, images = policy.manifest.perception, policy.lpac.images
     assert perception and images
 
     def robot(network: Callable[..., tuple[Tensor, Tensor]]) -> TorchRobot:
@@ -229,7 +235,7 @@ def _compared(
 
 
 def _comparison_table(name: str, figures: dict[str, Any]) -> Table:
-    title = {"tick": "Policy tick", "gnn": "Graph neural network alone"}[name]
+    title = {"tick": "LpacPolicy tick", "gnn": "Graph neural network alone"}[name]
     rows = [
         (variant, with_quartiles(figures["slower_than_edge"][variant]), f"{us['median']:.0f}")
         for variant, us in figures["us"].items()

@@ -20,7 +20,7 @@ import torch
 
 from edge.core import F32
 from edge.core.aggregation import Geometry
-from edge.core.perception import MAP_CHANNELS
+from edge.policy.lpac.images import MAP_CHANNELS
 
 # What a state dict does not hold: torch's default for batch norms, and CoverageControl's slope.
 BATCH_NORM_EPS = 1e-5

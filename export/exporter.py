@@ -6,17 +6,11 @@ from pathlib import Path
 
 import torch
 
-from edge.core.perception import MAP_CHANNELS
-from edge.policy.bundle import (
-    GOLDEN,
-    SCHEMA_VERSION,
-    Bundle,
-    Images,
-    Manifest,
-    Provenance,
-    make_bundle,
-)
-from edge.policy.verify import TOLERANCE, verify
+from edge.policy.bundle import SCHEMA_VERSION, Bundle, Manifest, make_bundle
+from edge.policy.family import TOLERANCE
+from edge.policy.lpac.images import MAP_CHANNELS
+from edge.policy.lpac.manifest import GOLDEN, Images, LpacManifest
+from edge.policy.lpac.policy import LpacPolicy
 from export.checkpoint import CheckpointError, read_checkpoint
 from export.golden import golden_vectors
 from export.graphs import OPSET, build_graphs
@@ -45,23 +39,22 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     manifest = Manifest(
         schema=SCHEMA_VERSION,
         name=name or checkpoint.stem,
-        opset=OPSET,
-        geometry=network.geometry,
-        images=images,
         perception=perception if images else None,
         training=training,
-        provenance=Provenance(
-            checkpoint=checkpoint.name,
-            checkpoint_sha256=network.sha256,
-            parameters=parameters.name,
-            parameters_sha256=hashlib.sha256(parameters.read_bytes()).hexdigest(),
-            exporter=f"lpac-edge {version('lpac-edge')}",
-            torch=torch.__version__,
-        ),
-        files=dict.fromkeys(files, ""),  # make_bundle puts the hashes in
+        # Hashes are sha256.
+        provenance={
+            "checkpoint": checkpoint.name,
+            "checkpoint_sha256": network.sha256,
+            "parameters": parameters.name,
+            "parameters_sha256": hashlib.sha256(parameters.read_bytes()).hexdigest(),
+            "exporter": f"lpac-edge {version('lpac-edge')}",
+            "torch": torch.__version__,
+        },
+        files={},  # make_bundle puts them in
+        parameters=LpacManifest(OPSET, network.geometry, images).parameters,
     )
     bundle = make_bundle(manifest, files)
-    for check in verify(bundle):
+    for check in LpacPolicy(bundle).verify():
         if not check.passed:
             raise CheckpointError(
                 f"{checkpoint}: {check.name}: float32 rounding alone gives a relative error of "

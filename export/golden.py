@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from edge.core import F32, F64
-from edge.core.perception import MAP_CHANNELS, neighbour_maps
-from edge.policy.bundle import ACTION, CNN, gnn_graph
+from edge.policy.lpac.images import MAP_CHANNELS, neighbour_maps
+from edge.policy.lpac.manifest import ACTION, CNN, gnn_graph
 from export import network
 from export.checkpoint import (
     POSITION_SIZE,

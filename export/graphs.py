@@ -15,7 +15,7 @@ import onnx
 from onnx import TensorProto, helper
 
 from edge.core import F32, F64
-from edge.policy.bundle import ACTION, CNN, gnn_graph
+from edge.policy.lpac.manifest import ACTION, CNN, gnn_graph
 from export.checkpoint import (
     BATCH_NORM_EPS,
     LEAKY_RELU_SLOPE,

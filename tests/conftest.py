@@ -4,14 +4,12 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from xdist.scheduler import LoadFileScheduling
 
 from edge.policy.bundle import Bundle, load_bundle
-from edge.policy.lpac.graphs import Policy
+from edge.policy.lpac.policy import LpacPolicy
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
@@ -63,7 +61,10 @@ def pytest_configure(config: pytest.Config) -> None:
     for tier in TIERS:
         config.addinivalue_line("markers", f"{tier}: what is in tests/{tier}")
     config.addinivalue_line(
-        "markers", "alone: flies in real time, or measures: nothing else runs meanwhile"
+        "markers", "real_time: flies robots in real time: one more file does so beside it at most"
+    )
+    config.addinivalue_line(
+        "markers", "alone: measures, or flies very many: nothing else runs meanwhile"
     )
     config.addinivalue_line(
         "markers", "simulated_only(reason): not flown with --vehicle px4, and why"
@@ -86,18 +87,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason=marker.args[0]))
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Side by side run files; all of host/, with its one image and rack, counts as one."""
-    if config.getoption("dist") != "loadfile":
-        return None
-    scheduler = LoadFileScheduling(config, log)
-    file_of = scheduler._split_scope
-    scheduler._split_scope = lambda nodeid: (
-        "tests/host" if nodeid.startswith("tests/host/") else file_of(nodeid)
-    )
-    return scheduler
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
     if item.get_closest_marker("unit") or item.get_closest_marker("sim"):
@@ -114,5 +103,5 @@ def shipped_bundle() -> Bundle:
 
 
 @pytest.fixture(scope="session")
-def shipped_policy(shipped_bundle: Bundle) -> Policy:
-    return Policy(shipped_bundle)
+def shipped_policy(shipped_bundle: Bundle) -> LpacPolicy:
+    return LpacPolicy(shipped_bundle)

@@ -5,9 +5,10 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,39 @@ import numpy as np
 import tomlkit
 
 from edge.core.world import format_world, random_features
-from edge.messages.codes import ReasonCode, Refusal, RefusalCode
-from edge.messages.mission import FlightState, Origin, RobotStatus
+from edge.messages.codes import Refusal, RefusalCode
+from edge.messages.mission import FlightState, OrderKind, Origin, RobotStatus
 from edge.robot.config import RobotConfig, load_config
-from lpac.sim.operator import Operator
+from lpac.fleet.writer import write_fleet
+from lpac.ground.station.client import GroundError
+from lpac.ground.station.client import command as ground_command
+from lpac.ground.station.protocol import (
+    CommandReport,
+    Enable,
+    Request,
+    ResultCode,
+    Resume,
+    SafetyCommand,
+    SetOrigin,
+    Takeoff,
+)
+from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.listener import FleetListener
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.px4.world import WorldOrigin
 from tests.conftest import ROOT, SHIPPED
+from tests.raw_ground import RawGround
 
 SYSTEM_ID = 7
+ROBOT_ID, NAME = 3, "r3"
 # The mission's y axis does not point north, and the vehicle does not stand on its origin.
 ORIGIN = Origin(WorldOrigin().latitude_deg, WorldOrigin().longitude_deg, heading_deg=30.0)
 PAD_M = (12.0, 10.0)
+# Where nobody sits.
+FREE_PAD_M = (24.0, 24.0)
 # Why a robot refuses for a moment: this machine held it up, a command is still on its way, or its
 # program has just begun and not listened for long enough.
 HELD_UP = (
@@ -44,6 +63,10 @@ HELD_UP = (
     RefusalCode.NOT_ANSWERED,
     RefusalCode.EXPIRED,
 )
+
+# What a command fails for a moment for: the robot was out of reach.
+NOT_YET = (ResultCode.NOT_HEARD, ResultCode.NOT_OBEYING)
+MOST_TAKEOFFS = 10
 
 Changes = dict[str, dict[str, Any]]
 
@@ -77,7 +100,7 @@ def write_config(folder: Path, *, url: str, endpoint: str, changes: Changes | No
         },
         "failsafe": {"rc": "none", "parameters": "set"},
     }  # fmt: skip
-    top = {"fleet": f"test-{endpoint.rpartition(':')[2]}", "robot_id": 3}
+    top = {"fleet": f"test-{endpoint.rpartition(':')[2]}", "robot_id": ROBOT_ID}
     for name, keys in (changes or {}).items():
         if name == "":
             top |= keys
@@ -88,8 +111,43 @@ def write_config(folder: Path, *, url: str, endpoint: str, changes: Changes | No
     return path
 
 
+def write_fleet_of(config_path: Path, config: RobotConfig) -> Path:
+    """fleet.toml beside robot.toml: the same robot, as its ground needs to know it."""
+    tables = tomlkit.parse(config_path.read_text()).unwrap()
+    port = int(config.link.listen[0].rpartition(":")[2])
+    robot = {name: keys for name, keys in tables.items() if isinstance(keys, dict)}
+    autopilot = robot.pop("autopilot")
+    for elsewhere in ("link", "log"):
+        robot.pop(elsewhere, None)
+    for keys in (("policy", "bundle"), ("policy", "world"), ("flight", "slot"),
+                 ("flight", "landing_point_m")):  # fmt: skip
+        robot[keys[0]].pop(keys[1], None)
+    path = config_path.with_name("fleet.toml")
+    slots = [
+        {"height": height, "pad_m": list(pad_m), "landing_point_m": list(pad_m)}
+        for height, pad_m in enumerate((PAD_M, FREE_PAD_M))
+    ]
+    slots[0]["robot"] = NAME
+    host = {
+        "host": "r3.invalid", "address": "127.0.0.1", "robot_id": ROBOT_ID, "zenoh_port": port,
+        "system_id": autopilot["system_id"], "mavlink_url": autopilot["url"],
+    }  # fmt: skip
+    write_fleet(
+        path,
+        "One robot of a test.",
+        {
+            "fleet": config.fleet, "image": "none", "bundle": config.policy.bundle,
+            "world": config.policy.world, "robot": robot, "robots": {NAME: host}, "slots": slots,
+        },
+    )  # fmt: skip
+    return path
+
+
 class Rig:
-    """A vehicle that runs, a ground that is heard, and the robot's configuration."""
+    """A vehicle that runs, a ground that is heard, and the robot's configuration.
+
+    `heard` is what the robot says, whoever commands it.
+    """
 
     def __init__(self, config_path: Path, server: Px4Server, links: Sequence[Px4Link]) -> None:
         self.config_path = config_path
@@ -97,59 +155,91 @@ class Rig:
         self.server = server
         self.link = links[0]
         self.vehicle = links[0].vehicle
-        self.operator = Operator(
-            fleet=self.config.fleet, connect=self.config.link.listen, name="test"
-        )
+        self.heard = FleetListener(fleet=self.config.fleet, connect=self.config.link.listen)
+        self.stack = ExitStack()
+        self._ground: GroundProgram | None = None
+
+    @property
+    def ground(self) -> GroundProgram:
+        """Its `lpac ground`, which runs from now on."""
+        if self._ground is None:
+            fleet_toml = write_fleet_of(self.config_path, self.config)
+            program = GroundProgram(fleet_toml, self.config.fleet, "test")
+            self._ground = self.stack.enter_context(program)
+        return self._ground
 
     @property
     def status(self) -> RobotStatus:
         """The robot's newest."""
-        return self.operator.history(self.config.robot_id)[-1].status
+        return self.heard.history(ROBOT_ID)[-1].status
 
     def wait(
         self, condition: Callable[[RobotStatus], object], timeout_s: float = 180.0
     ) -> RobotStatus:
         """Until the robot says so; what it says then."""
-        robot = self.config.robot_id
         found: list[RobotStatus] = []
 
         def is_so(statuses: Mapping[int, RobotStatus]) -> bool:
-            found[:] = [statuses[robot]] if robot in statuses else []
+            found[:] = [statuses[ROBOT_ID]] if ROBOT_ID in statuses else []
             return bool(found and condition(found[0]))
 
-        assert self.operator.wait_for(is_so, timeout_s), found
+        assert self.heard.wait_for(is_so, timeout_s), found
         return found[0]
 
     def wait_for_state(self, state: FlightState) -> None:
         self.wait(lambda status: status.state is state)
 
-    def order(self, kind: Any, trial: str = "") -> None:
-        """Order it; it must be obeyed, but for what lasts a moment."""
-        until_s = time.monotonic() + 60.0
-        while refusal := self.refusal(kind, trial):
-            assert refusal.code in HELD_UP and time.monotonic() < until_s, refusal
+    def command(self, request: Request) -> CommandReport:
+        """Command something that is possible as such; the robot may not do it."""
+        report = self.ground.command(request)
+        assert report.problem is None, report
+        return report
 
-    def refusal(self, kind: Any, trial: str = "") -> Refusal | None:
-        """Why an order is refused; None if it is obeyed."""
+    def do(self, request: Request) -> None:
+        """Command it; it must be done, but for what lasts a moment."""
+        until_s = time.monotonic() + 60.0
+        while not (report := self.command(request)).done:
+            (result,) = report.results
+            for_a_moment = result.refusal in HELD_UP or result.code in NOT_YET
+            assert for_a_moment and time.monotonic() < until_s, report
+
+    def tell(self, request: Request) -> None:
+        """Command it, and do not wait for what comes of it."""
+
+        def command() -> None:
+            with suppress(GroundError):  # The test is over.
+                ground_command(self.config.fleet, request)
+
+        fleet = self.ground.fleet
+        assert fleet == self.config.fleet
+        threading.Thread(target=command, daemon=True).start()
+
+    def refusal(self, kind: OrderKind) -> Refusal | None:
+        """Why the robot refuses an order, which its ground may not even give; None: it obeys."""
         # Who is silent just now cannot be ordered anything.
-        self.wait(lambda _: True)
-        result = self.operator.result(self.operator.order(kind, self.config.robot_id, trial), 60.0)
-        assert result is not None
-        return result.refusal
+        status = self.wait(lambda _: True)
+        with RawGround(self.config.fleet, self.config.link.listen, self.heard) as raw:
+            return raw.order(kind, status).refusal
+
+    def enable(self) -> None:
+        """Origin, and its checks; whatever was commanded before is withdrawn."""
+        self.command(SetOrigin(ORIGIN))
+        told = self.ground.told.snapshot.ground
+        if told is not None and told.safety_action != "none":
+            self.command(Resume())
+        self.tell(Enable())
 
     def take_off(self) -> None:
         """Until it holds at its height; after a takeoff that this machine held up, once more."""
-        self.operator.enable(ORIGIN)
-        self.wait(lambda status: status.ready)
-        self.order("takeoff")
-        self.wait(lambda status: status.ready or status.state is FlightState.HOLD)
-        held_up = self.status.reason.code is ReasonCode.CONTROL_SILENT
-        if held_up:
-            self.operator.safety_action("land")
-            self.wait_for_state(FlightState.LANDED)
-            self.operator.safety_action("none")
-        if held_up or self.status.ready:
-            self.take_off()
+        for _ in range(MOST_TAKEOFFS):
+            self.enable()
+            self.wait(lambda status: status.ready)
+            report = self.command(Takeoff())
+            if report.done:
+                return
+            if self.status.state is FlightState.HOLD:
+                self.do(SafetyCommand("land", wait=True))
+        raise AssertionError(report)
 
     def vehicle_is(
         self, condition: Callable[[Px4Vehicle], object], timeout_s: float = 60.0
@@ -171,7 +261,7 @@ def rig(
     )
     with Px4Server([Instance(link, 0, client_port) for link in links]) as server:
         made = Rig(path, server, links)
-        with made.operator:
+        with made.heard, made.stack:
             yield made
 
 

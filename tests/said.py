@@ -1,7 +1,9 @@
 """What robots say in tests: words for which nothing needs a code."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
+from edge.core import log
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, Refusal, RefusalCode
 from edge.messages.mission import OrderResult
 from lpac.ground.station.protocol import CommandReport, ProblemCode, ResultCode
@@ -22,6 +24,17 @@ def checks(*texts: str) -> tuple[FailedCheck, ...]:
 def refusal(text: str) -> Refusal | None:
     """None if there is nothing to say."""
     return Refusal(RefusalCode.OTHER, text) if text else None
+
+
+@contextmanager
+def lines_said() -> Iterator[list[log.Line]]:
+    """The log lines of this process, as they come."""
+    lines: list[log.Line] = []
+    before = log.listen(lines.append)
+    try:
+        yield lines
+    finally:
+        log.listen(before)
 
 
 def codes(said: Iterable[FailedCheck | Reason]) -> list[CheckCode | ReasonCode]:

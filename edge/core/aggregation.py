@@ -78,9 +78,10 @@ class HopBuffer:
         )
         self._sum = np.zeros(geometry.message_size, np.float32)
         ends = np.cumsum([geometry.hops * size for size in inputs])
+        # Where in the sum each layer's part is; no views, which a copy would tear from it.
         self._parts = tuple(
-            self._sum[end - geometry.hops * size : end].reshape(geometry.hops, size)
-            for end, size in zip(ends, inputs, strict=True)
+            slice(end - geometry.hops * size, end)
+            for end, size in zip(ends.tolist(), inputs, strict=True)
         )
 
     def diffuse(self, payloads: Sequence[F32], degree: int) -> None:
@@ -97,7 +98,7 @@ class HopBuffer:
         else:
             self._sum[:] = 0.0
         for layer, part in zip(self.layers, self._parts, strict=True):
-            layer[0, 1:] = part
+            layer[0, 1:] = self._sum[part].reshape(self._hops, -1)
 
     def message(self, degree: int) -> F32:
         """A new (message_size,) payload: y_kl for k = 0..K-1, times 1/sqrt(degree); 0 if none."""

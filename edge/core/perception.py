@@ -1,9 +1,6 @@
-"""From sensor views to the policy's input images.
+"""From sensor views to what a robot remembers of the world.
 
-LPAC paper (arXiv 2401.04855), section "Perception Module": the robot remembers what it has seen,
-and the policy gets four square images around the robot: importance, the neighbours' relative x
-and y, and obstacles (the outside of the world). All maps are indexed [x, y]; one cell is one
-model unit; positions are in model units.
+All maps are indexed [x, y]; one cell is one model unit; positions are in model units.
 """
 
 import math
@@ -14,12 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F32, F64, Bools
-
-# The images by number of channels, in the order in which CoverageControl stacks them.
-MAP_CHANNELS = {
-    2: ("importance", "obstacles"),
-    4: ("importance", "neighbours_x", "neighbours_y", "obstacles"),
-}
 
 # What a robot has explored is told in this many cells along each side of the world.
 EXPLORED_CELLS = 64
@@ -141,59 +132,6 @@ class RobotMap:
             low = high
 
 
-class Resize:
-    """Bilinear, antialiased resize from `size` to `new_size` cells: A @ x @ A.T for an image x.
-
-    Each row of A (new_size, size) is a triangle as wide as two new cells, cut at the border and
-    summing to one; as torch and torchvision resize.
-    """
-
-    # Rows of A that are multiplied together, without the columns that are zero in all of them.
-    _BAND = 8
-
-    def __init__(self, size: int, new_size: int) -> None:
-        scale = size / new_size
-        centres = (np.arange(new_size) + 0.5) * scale
-        distances = np.abs(np.arange(size) + 0.5 - centres[:, None]) / max(scale, 1.0)
-        weights = np.clip(1.0 - distances, 0.0, None)
-        weights /= weights.sum(axis=1, keepdims=True)
-        self._cumulated = np.concatenate([np.zeros((1, new_size)), weights.T.cumsum(axis=0)])
-        matrix = weights.astype(np.float32)
-        self._transposed = np.ascontiguousarray(matrix.T)
-        self._bands = []
-        for start in range(0, new_size, self._BAND):
-            rows = slice(start, start + self._BAND)
-            used = np.flatnonzero(matrix[rows].any(axis=0))
-            columns = slice(used[0], used[-1] + 1)
-            self._bands.append((rows, columns, matrix[rows, columns].copy()))
-        self._half = np.empty((new_size, size), np.float32)
-
-    def image(self, image: F32, out: F32) -> None:
-        """Resize `image` (size, size) into `out` (new_size, new_size)."""
-        for rows, columns, band in self._bands:
-            np.matmul(band, image[columns], out=self._half[rows])
-        np.matmul(self._half, self._transposed, out=out)
-
-    def interval(self, part: slice) -> F64:
-        """Resize the line (size,) that is 1 in `part` and 0 elsewhere to (new_size,)."""
-        resized: F64 = self._cumulated[part.stop] - self._cumulated[part.start]
-        return resized
-
-
-def neighbour_maps(offsets: F64, communication_range: float, image_size: int) -> F32:
-    """The neighbours' relative x and relative y as two images, (2, image_size, image_size).
-
-    `offsets` (n, 2) are the neighbours' positions relative to the robot, in model units. An image
-    spans twice the range; values are in units of the range and add up within a cell.
-    """
-    scaled = offsets * (image_size / (2.0 * communication_range)) + (image_size / 2.0 - 0.5)
-    cells = np.clip(np.rint(scaled), 0, image_size - 1).astype(np.intp)
-    maps = np.zeros((2, image_size, image_size), np.float32)
-    for axis in range(2):
-        np.add.at(maps[axis], (cells[:, 0], cells[:, 1]), offsets[:, axis] / communication_range)
-    return maps
-
-
 def neighbours_in_range(
     position: F64, others: F64, communication_range: float
 ) -> npt.NDArray[np.bool_]:
@@ -202,21 +140,16 @@ def neighbours_in_range(
     return near
 
 
-class Perception:
-    """One robot's memory of the world, and the images of it that the policy takes.
-
-    Positions outside the world are taken to the nearest point of it, where training kept the
-    robots: the policy never sees an input that it could not have been trained on.
+class RobotMemory:
+    """What one robot has seen of the world.
 
     Not thread-safe: it belongs to the perception thread.
     """
 
-    def __init__(self, parameters: PerceptionParameters, channels: int, image_size: int) -> None:
-        self._parameters = parameters
+    def __init__(self, parameters: PerceptionParameters) -> None:
+        self._world_size = parameters.world_size
         self._map = RobotMap(parameters.world_size, parameters.unknown_importance)
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
-        self._resize = Resize(parameters.local_map_size, image_size)
-        self._images = np.empty((1, channels, image_size, image_size), np.float32)
         # For people: which cells of the coarse raster over the world it has seen.
         self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
 
@@ -228,28 +161,16 @@ class Perception:
         size = view.shape[0]
         corner = window_corner(position, size)
         self._map.insert(view, corner)
-        scale = EXPLORED_CELLS / self._parameters.world_size
+        scale = EXPLORED_CELLS / self._world_size
         x, y = (
             slice(max(math.ceil(low * scale - 0.5), 0), max(math.ceil(high * scale - 0.5), 0))
             for low, high in ((start, start + size) for start in corner)
         )
         self.explored[x, y] = True
 
-    def images(self, position: F64, neighbours: F64) -> F32:
-        """The policy's images, (1, channels, image_size, image_size), valid until the next call.
+    def local_map(self, position: F64) -> F32:
+        """(local_map_size, local_map_size) around `position`, valid until the next call.
 
-        `neighbours` (n, 2) are the positions of the robots in range, in model units.
+        The outside of the world is 0.
         """
-        parameters = self._parameters
-        own = clamp_to_world(position, parameters.world_size)
-        corner = window_corner(own, parameters.local_map_size)
-        self._map.window(corner, self._local)
-        self._resize.image(self._local, out=self._images[0, 0])
-        _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)
-        self._images[0, -1] = 1.0 - np.outer(*map(self._resize.interval, inside))
-        if self._images.shape[1] == len(MAP_CHANNELS[4]):
-            others = clamp_to_world(neighbours, parameters.world_size)
-            self._images[0, 1:3] = neighbour_maps(
-                others - own, parameters.communication_range, self._images.shape[-1]
-            )
-        return self._images
+        return self._map.window(window_corner(position, self._local.shape[0]), self._local)

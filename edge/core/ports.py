@@ -1,9 +1,11 @@
 """The outside world as the robot sees it; drivers and the simulator implement these."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 
 from edge.core import F32, F64
+from edge.core.perception import PerceptionParameters
 from edge.core.vehicle import Action, Setpoint, VehicleState
 
 
@@ -29,6 +31,31 @@ class Sensor(Protocol):
         `perception.window_corner` says. `position` (2,) is the robot's, in model units: where the
         view will be written into the map; a sensor that physically looks down does not need it.
         """
+
+
+# A sensor over a world file's text, of which the second argument says what it is called in the
+# ValueError for one that cannot be used. A sensor that looks at the real world needs no text.
+SensorOver = Callable[[str, str], Sensor]
+
+
+class SensorSetting(NamedTuple):
+    """What a sensor is to show: views of `perception.sensor_size`, as the policy was trained.
+
+    `idf_truncation` (standard deviations) and `idf_norm` (the importance of the most important
+    cell) are those of a world that is computed. `options` are what robot.toml says of the sensor.
+    """
+
+    perception: PerceptionParameters
+    idf_truncation: float
+    idf_norm: float
+    options: Mapping[str, object]
+
+
+class SensorDriver(Protocol):
+    """A type of sensor. What it opens is closed when the robot's program ends."""
+
+    def __call__(self, setting: SensorSetting) -> AbstractContextManager[SensorOver]:
+        """Raises ValueError or OSError, one line, for a sensor that cannot be used."""
 
 
 class Odometry(NamedTuple):
@@ -103,3 +130,33 @@ class Recorder(Protocol):
     @property
     def recording(self) -> bool:
         """Whether what is recorded is kept. Any thread."""
+
+
+class VehicleSetting(NamedTuple):
+    """What robot.toml says of the vehicle."""
+
+    url: str
+    system_id: int
+    options: Mapping[str, object]
+
+
+class OpenVehicle(NamedTuple):
+    """A vehicle that is there, or that is waited for.
+
+    `watchdog` makes one that holds the vehicle so many s after the control loop fell silent, and
+    lands it so many s later.
+    """
+
+    vehicle: Vehicle
+    setup: VehicleSetup
+    watchdog: Callable[[float, float], AbstractContextManager[Watchdog]]
+
+
+class VehicleDriver(Protocol):
+    """A type of vehicle. It is closed when the robot's program ends."""
+
+    def __call__(self, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
+        """Raises ValueError or OSError, one line, also if another program of this machine has it.
+
+        A vehicle that is not there yet is no error.
+        """

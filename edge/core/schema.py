@@ -19,8 +19,9 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
     """Build the dataclass `cls` from `mapping`; nested dataclasses from nested mappings.
 
     `where` names the file, and then the path of keys, in errors. Field types may be bool, int,
-    float, str, Literal, StrEnum, tuple[X, ...], dict[str, X], dataclasses, and unions of one of
-    these with None. The dataclass checks its own values in __post_init__ with a ValueError.
+    float, str, Literal, StrEnum, tuple[X, ...], dict[str, X], dataclasses, unions of one of these
+    with None, and object for anything. The dataclass checks its own values in __post_init__ with a
+    ValueError.
 
     Raises ConfigError for an unknown or missing key, a wrong type or an impossible value.
     """
@@ -45,6 +46,12 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
         raise ConfigError(f"{where}: {error}") from None
 
 
+def no_options(where: str, options: Mapping[str, object]) -> None:
+    """Of a driver that has none. Raises ConfigError that names the first one."""
+    for key in options:
+        raise ConfigError(f"{where}: options: unknown key {key!r}; it has none")
+
+
 @functools.cache
 def _hints(cls: type[Any]) -> dict[str, Any]:
     """They are slow to look up, and statuses are decoded a hundred times a second."""
@@ -58,6 +65,8 @@ def _value(hint: Any, value: object, where: str) -> Any:
             return None
         (hint,) = (argument for argument in arguments if argument is not type(None))
         return _value(hint, value, where)
+    if hint is object:  # whoever takes it looks what it is
+        return value
     if dataclasses.is_dataclass(hint):
         return from_mapping(typing.cast(type[Any], hint), value, where)
     if origin is Literal:

@@ -7,7 +7,7 @@ has its own, see `lpac.ground.record`):
 
 | topic | holds |
 | --- | --- |
-| `perception` | a tick of the perception loop: images, position feature, features |
+| `perception` | a tick of the perception loop: features, and what they were made of |
 | `policy` | a tick of the policy loop: features, neighbours' payloads, velocity, message sent |
 | `received` | a neighbour's message, and why it was refused if it was |
 | `control` | a tick of the control loop: state, position, setpoint, and what was sent of it |
@@ -40,12 +40,13 @@ from threading import Lock
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
-import structlog
+import zstandard
 from mcap.exceptions import InvalidMagic
-from mcap.records import Channel, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
+from edge.core import log
 from edge.core.vehicle import VehicleState
 from edge.messages.mission import GroundState, Order, OrderResult, RobotStatus
 
@@ -54,8 +55,11 @@ _METADATA = "lpac"
 _MESSAGE_OVERHEAD_BYTES = 64
 _CHUNK_OVERHEAD_BYTES = 512
 _SMALLEST_SEGMENT_BYTES = 2**18
-
-_log = structlog.get_logger(__name__)
+# Whoever reads a log may not know who made it: nothing unpacks to more.
+_MOST_MESSAGE_BYTES = 2**22
+_MOST_CHUNK_BYTES = 2**24
+_MOST_UNPACKED_SHARE = 200.0
+_ARRAY_KINDS = "biuf"
 
 
 class FlightLogError(ValueError):
@@ -94,7 +98,7 @@ class FlightMetadata:
         return f"robot-{self.robot_id}"
 
 
-class Topic(NamedTuple):
+class LoggedTopic(NamedTuple):
     """How the messages of a topic are described (`schema`, a JSON schema), and converted to it.
 
     `convert` gets the time, ns, and the message.
@@ -105,7 +109,7 @@ class Topic(NamedTuple):
     convert: Callable[[int, Mapping[str, Any]], Mapping[str, object]]
 
 
-def topic(name: str, kind: type, /, **more: Any) -> Topic:
+def topic(name: str, kind: type, /, **more: Any) -> LoggedTopic:
     """A topic whose messages have the fields of the dataclass `kind`, and `more` (name -> type)."""
     hints = {**typing.get_type_hints(kind), **more}
     return _topic(name, _fields_schema(hints))
@@ -122,7 +126,7 @@ class FlightLog:
         self,
         directory: Path,
         metadata: LogMetadata,
-        topics: Mapping[str, Topic] | None = None,
+        topics: Mapping[str, LoggedTopic] | None = None,
         *,
         max_segment_bytes: int = 2**25,
         max_total_bytes: int = 2**30,
@@ -227,24 +231,26 @@ class FlightLog:
         except Exception as error:  # whatever it is, the others are worth keeping
             self._refuse(topic, repr(error))
             return
-        if len(encoded.data) > self._max_segment_bytes // 2:
-            self._refuse(topic, f"its {len(encoded.data)} bytes would fill a segment")
+        if len(encoded.data) > min(self._max_segment_bytes // 2, _MOST_MESSAGE_BYTES):
+            self._refuse(topic, f"its {len(encoded.data)} bytes are too many")
             return
         if not self._segment.has_room_for(encoded):
             self._segment.close()
             self._begin_segment()
         self._segment.write(encoded)
+        if self._segment.pending_bytes > _MOST_CHUNK_BYTES // 2:
+            self._segment.sync()
 
     def _refuse(self, topic: str, why: str) -> None:
         with self._lock:
             self._dropped += 1
         if topic not in self._refused_topics:
             self._refused_topics.add(topic)
-            _log.error("flight log cannot hold a message", topic=topic, why=why)
+            log.error("flight log cannot hold a message", topic=topic, why=why)
 
     def _report_dropped(self) -> None:
         if self._dropped > self._dropped_reported:
-            _log.warning("flight log dropped messages", dropped=self._dropped)
+            log.warning("flight log dropped messages", dropped=self._dropped)
             self._dropped_reported = self._dropped
 
     def _begin_segment(self) -> None:
@@ -257,7 +263,7 @@ class FlightLog:
                 break
             path.unlink(missing_ok=True)
             del sizes[path]
-            _log.info("flight log deleted its oldest segment", path=str(path), bytes=size)
+            log.info("flight log deleted its oldest segment", path=str(path), bytes=size)
         path = self._directory / f"{name}-{number:04}.mcap"
         self._segment = _Segment(path, self._max_segment_bytes, self._topics)
         self._segment.begin(self._metadata)
@@ -271,7 +277,7 @@ class FlightLog:
             if segment is not None:
                 segment.abandon()
             self._queue.clear()
-            _log.error("flight log stopped", directory=str(self._directory), why=repr(error))
+            log.error("flight log stopped", directory=str(self._directory), why=repr(error))
 
 
 def read_metadata(path: Path) -> FlightMetadata:
@@ -298,34 +304,67 @@ def read(path: Path, *only: str) -> Iterator[tuple[str, float, dict[str, Any]]]:
     off, since the robot was killed or lost its power, is read up to there.
     Arrays are numpy's again, bit by bit, and bytes are bytes.
 
-    Raises FlightLogError if it is no MCAP file, OSError if it cannot be read.
+    Raises FlightLogError if it is no flight log, OSError if it cannot be read.
     """
     topics: dict[int, str] = {}
     for record in _records(path):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
-        elif isinstance(record, Message) and (not only or topics[record.channel_id] in only):
-            message = json.loads(record.data, object_hook=_revive)
-            yield topics[record.channel_id], record.log_time / 10**9, message
+        elif isinstance(record, Message):
+            topic = topics.get(record.channel_id)
+            if topic is None:
+                raise FlightLogError(f"{path}: holds a message of no topic")
+            if not only or topic in only:
+                try:
+                    message = _message(record.data)
+                except (TypeError, ValueError, RecursionError) as error:
+                    raise FlightLogError(f"{path}: {topic}: is not a log's: {error}") from None
+                yield topic, record.log_time / 10**9, message
+
+
+def _message(data: bytes) -> dict[str, Any]:
+    if len(data) > _MOST_MESSAGE_BYTES:
+        raise ValueError(f"has {len(data)} bytes")
+    message = json.loads(data, object_hook=_revive)
+    if not isinstance(message, dict):
+        raise TypeError(f"a {type(message).__name__}")
+    return message
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         # The zeros that a power loss can leave do not pass for data: their checksum is wrong.
-        reader = StreamReader(file, validate_crcs=True, record_size_limit=size).records
+        limit = min(size, _MOST_CHUNK_BYTES)
+        reader = StreamReader(
+            file, emit_chunks=True, validate_crcs=True, record_size_limit=limit
+        ).records
         while True:
             try:
                 record = next(reader)
+                records = _unpacked(record) if isinstance(record, Chunk) else [record]
             except StopIteration:
                 return
+            except FlightLogError as error:
+                raise FlightLogError(f"{path}: {error}") from None
             except InvalidMagic:
                 if file.tell() > 8:
                     return
                 raise FlightLogError(f"{path}: is not an MCAP file") from None
             except Exception:  # mcap's own, struct's, zstandard's: all mean that it breaks off here
                 return
-            yield record
+            yield from records
+
+
+def _unpacked(chunk: Chunk) -> list[McapRecord]:
+    """Raises FlightLogError for what no flight log has, before it takes any memory."""
+    packed, stated = chunk.data, chunk.uncompressed_size
+    if chunk.compression != "zstd":
+        raise FlightLogError(f"is compressed by {chunk.compression!r}, not by 'zstd'")
+    size = max(stated, zstandard.frame_content_size(packed))
+    if size > min(_MOST_CHUNK_BYTES, 2**16 + _MOST_UNPACKED_SHARE * len(packed)):
+        raise FlightLogError(f"{len(packed)} bytes of it would be {size}: is no flight log")
+    return breakup_chunk(chunk, validate_crc=True)
 
 
 class _Encoded(NamedTuple):
@@ -337,7 +376,7 @@ class _Encoded(NamedTuple):
 class _Segment:
     """One file. Raises what the file system raises."""
 
-    def __init__(self, path: Path, max_bytes: int, topics: Mapping[str, Topic]) -> None:
+    def __init__(self, path: Path, max_bytes: int, topics: Mapping[str, LoggedTopic]) -> None:
         self._file = path.open("xb")
         self._max_bytes = max_bytes
         self._topics = topics
@@ -365,6 +404,11 @@ class _Segment:
         size = self._file.tell() + self._pending_bytes + self._summary_bytes
         size += len(encoded.data) + _MESSAGE_OVERHEAD_BYTES + _CHUNK_OVERHEAD_BYTES
         return size <= self._max_bytes
+
+    @property
+    def pending_bytes(self) -> int:
+        """Of the chunk that is not closed."""
+        return self._pending_bytes
 
     def write(self, encoded: _Encoded) -> None:
         channel = self._channels[encoded.topic]
@@ -401,7 +445,9 @@ def _segments(directory: Path, name: str) -> dict[int, Path]:
     return {int(match[1]): path for match, path in matches if match}
 
 
-def _encode(name: str, topic: Topic, unix_time_s: float, message: Mapping[str, object]) -> _Encoded:
+def _encode(
+    name: str, topic: LoggedTopic, unix_time_s: float, message: Mapping[str, object]
+) -> _Encoded:
     """Raises TypeError and ValueError for what JSON cannot hold."""
     whole_s = math.floor(unix_time_s)
     # Times 10**9 as a whole, a float would lose its last digits.
@@ -409,11 +455,19 @@ def _encode(name: str, topic: Topic, unix_time_s: float, message: Mapping[str, o
     if not 0 <= time_ns < 2**63:
         raise ValueError(f"unix_time_s = {unix_time_s}")
     converted = topic.convert(time_ns, message)
-    return _Encoded(name, time_ns, json.dumps(_plain(converted), separators=(",", ":")).encode())
+    return _Encoded(name, time_ns, _to_json(_plain(converted)).encode())
+
+
+_OF_JSON = frozenset({type(None), bool, int, str})
+_to_json = json.JSONEncoder(separators=(",", ":")).encode
 
 
 def _plain(value: object) -> object:
     """`value` as JSON's own types."""
+    # Nearly all that is logged; of anything else it takes much longer to tell what it is.
+    kind = type(value)
+    if kind in _OF_JSON or (kind is float and math.isfinite(value)):  # type: ignore[arg-type]
+        return value
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | str):
@@ -421,7 +475,7 @@ def _plain(value: object) -> object:
     if isinstance(value, float):
         return value if math.isfinite(value) else json.dumps(value)
     if isinstance(value, np.ndarray):
-        if value.dtype.kind not in "biuf":
+        if value.dtype.kind not in _ARRAY_KINDS:
             raise TypeError(f"an array of {value.dtype}")
         return {
             "dtype": value.dtype.str,
@@ -450,8 +504,10 @@ def _base64(data: bytes) -> str:
 def _revive(value: dict[str, Any]) -> object:
     """The array or the bytes that an object of JSON stands for, if it does."""
     if value.keys() == {"dtype", "shape", "data"}:
-        data = binascii.a2b_base64(value["data"])
-        return np.ndarray(value["shape"], np.dtype(value["dtype"]), data)
+        data, dtype = binascii.a2b_base64(value["data"]), np.dtype(value["dtype"])
+        if dtype.kind not in _ARRAY_KINDS:
+            raise ValueError(f"an array of {dtype}")
+        return np.ndarray(value["shape"], dtype, data)
     if value.keys() == {"base64"}:
         return binascii.a2b_base64(value["base64"])
     return value
@@ -545,8 +601,8 @@ def _foxglove_time(time_ns: int) -> dict[str, int]:
     return dict(zip(("sec", "nsec"), divmod(time_ns, 10**9), strict=True))
 
 
-def _topic(name: str, schema: _Schema) -> Topic:
-    return Topic(f"lpac.{name}", json.dumps(schema).encode(), _as_it_is)
+def _topic(name: str, schema: _Schema) -> LoggedTopic:
+    return LoggedTopic(f"lpac.{name}", json.dumps(schema).encode(), _as_it_is)
 
 
 _ROBOT_TOPICS = {
@@ -589,7 +645,7 @@ _ROBOT_TOPICS = {
     "order": topic("Order", Order, answer=OrderResult),
     "ground": topic("Ground", GroundState),
     "vehicle": topic("Vehicle", VehicleState),
-    "/pose": Topic(
+    "/pose": LoggedTopic(
         "foxglove.PoseInFrame",
         json.dumps(
             _object(
@@ -600,7 +656,7 @@ _ROBOT_TOPICS = {
         ).encode(),
         _foxglove_pose,
     ),
-    "/log": Topic(
+    "/log": LoggedTopic(
         "foxglove.Log",
         json.dumps(
             _object(

@@ -1,9 +1,16 @@
 """A sensor that reads a known world: for flights over a virtual importance density function."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+
 import numpy as np
 
 from edge.core import F32, F64
 from edge.core.perception import part_in_world, window_corner
+from edge.core.ports import SensorOver, SensorSetting
+from edge.core.schema import no_options
+from edge.core.world import MOST_FEATURES, parse_world, rasterize
 
 
 class WorldSensor:
@@ -21,3 +28,22 @@ class WorldSensor:
         in_world, in_view = part_in_world(corner, self._size, len(self._importance))
         view[in_view] = self._importance[in_world]
         return view
+
+
+@contextmanager
+def world_sensor(setting: SensorSetting) -> Iterator[SensorOver]:
+    """The type "world" of robot.toml's [sensor]; it has no options. Raises ConfigError."""
+    no_options("sensor", setting.options)
+    yield partial(_sensor_over, setting)
+
+
+def _sensor_over(setting: SensorSetting, text: str, source: str) -> WorldSensor:
+    """A sensor over a world file's text. Raises ValueError, one line with `source`."""
+    perception = setting.perception
+    features = parse_world(text, source)
+    if len(features) > MOST_FEATURES:
+        raise ValueError(f"{source}: has {len(features)} features, at most {MOST_FEATURES} may be")
+    importance = rasterize(
+        features, perception.world_size, setting.idf_truncation, setting.idf_norm
+    )
+    return WorldSensor(importance, perception.sensor_size)

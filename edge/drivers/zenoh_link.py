@@ -2,7 +2,7 @@
 
 What travels is in `edge.messages.topics`, below the key `lpac/<fleet>/`. Besides, for presence,
 there are the liveliness tokens `robot/<id>/alive/<session>`, which vanish with the session that
-declared them: at once if the program ends, a second after it stops answering.
+declared them: at once if the program ends, 1.5 s after it stops answering.
 
 In peer mode gossip makes a mesh from one known peer, but what only gossip connected is not
 connected again when it alone is lost; scouting does it within some 8 s. So for flight let every
@@ -11,33 +11,40 @@ tries again for ever. Never name each other: two sides that connect at once afte
 connected and yet deaf to each other.
 """
 
+import atexit
 import json
 import os
 import re
 import secrets
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from threading import Lock, Thread
 from typing import Literal, Self
 
-import structlog
 import zenoh
 
+from edge.core import log
+from edge.core.schema import no_options
 from edge.core.wire import MAX_ROBOT_ID
-from edge.messages.topics import TOPICS, Sender, Topic
-
-ReceiveCallback = Callable[[str, bytes], None]
+from edge.messages.admission import Admission
+from edge.messages.topics import TOPICS, LinkSetting, ReceiveCallback, Sender, Topic
 
 # Of 64 kB each, for topics that go later: a world that does not fit in there at once is dropped.
 _PATIENT_BATCHES = 8
 _ENDPOINT = re.compile(r"tcp/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
-_TOKEN = re.compile(r"robot/(\d+)/alive/(\w+)")
+_TOKEN = re.compile(r"robot/(\d{1,5})/alive/(\w{1,32})")
+# Of all topics' limits the largest, and what zenoh says besides.
+_MOST_BYTES = max(topic.limit_bytes for topic in TOPICS) + 2**12
+_MOST_TOKENS = 1000
 _CLOSE_TIMEOUT_S = 1.0
+_CLOSE_AT_EXIT_S = 1.5
 
 # zenoh closes TCP sockets with a linger time of 10 s, which holds the closing thread for as long if
 # the other end is out of reach. With zenoh's few threads, two lost neighbours would make a robot
-# deaf to all others. Here each neighbour lost within 10 s may hold one; an idle one costs 10 kB.
-_RUNTIME = "(rx: (worker_threads: 32), net: (worker_threads: 32))"
+# deaf to all others. Here each neighbour lost within 10 s may hold one of those that receive, which
+# find others, too; those that send are none of them.
+_RUNTIME = "(net: (handover: rx), rx: (worker_threads: 16))"
 
 _ADVICE = {
     "Address already in use": "another program has this port; does this robot's already run?",
@@ -45,11 +52,23 @@ _ADVICE = {
     "Unable to connect": "no router answers there; start it, or set mode = 'peer'",
 }
 
-_log = structlog.get_logger(__name__)
-
 
 class LinkError(OSError):
     """The link cannot be opened; the text says which endpoint or setting, and what to do."""
+
+
+def zenoh_link(setting: LinkSetting) -> "ZenohLink":
+    """The type "zenoh" of robot.toml's [link]; it has no options. Raises LinkError, ConfigError."""
+    no_options("link", setting.options)
+    return ZenohLink(
+        fleet=setting.fleet,
+        robot_id=setting.robot_id,
+        mode=setting.mode,
+        listen=setting.listen,
+        connect=setting.connect,
+        scouting=setting.scouting,
+        subscriptions=setting.subscriptions,
+    )
 
 
 class ZenohLink:
@@ -90,7 +109,7 @@ class ZenohLink:
         self._lock = Lock()
         self._tokens: set[tuple[int, str]] = set()
         self._failures: Counter[str] = Counter()
-        self._oversized: Counter[str] = Counter()
+        self._admission = Admission()
         self._session_id = _session_id(robot_id)
         self._session = _open(self._config(mode, listen, connect, scouting))
         try:
@@ -122,7 +141,7 @@ class ZenohLink:
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another session says that it is that robot.
 
-        Up to a second after a restart that may be the own former session.
+        Up to 1.5 s after a restart that may be the own former session.
         """
         return robot_id in self._others()
 
@@ -146,11 +165,13 @@ class ZenohLink:
 
     def close(self) -> None:
         """Leave the radio, within a second or so; again is no error."""
-        # A connection whose other end is out of reach holds it, too; the interpreter can exit
-        # though it is not done.
+        # A connection whose other end is out of reach holds it, too.
         closing = Thread(target=self._close_session, daemon=True)
         closing.start()
         closing.join(_CLOSE_TIMEOUT_S)
+        if closing.is_alive():
+            # What comes back from zenoh into an interpreter that is ending aborts the program.
+            atexit.register(closing.join, _CLOSE_AT_EXIT_S)
 
     def _close_session(self) -> None:
         try:
@@ -177,12 +198,27 @@ class ZenohLink:
             "scouting/delay": 0,
             "scouting/multicast": {"enabled": scouting, **once},
             "scouting/gossip": once,
-            # How soon a lost neighbour is noticed.
-            "transport/link/tx/lease": 1000,
+            # How soon a lost neighbour is noticed, ms; and how many signs of life that is. Whoever
+            # speaks more often, as robots do in flight, sends none besides: with a sign each
+            # quarter of a second, ten robots' took a quarter of a channel's time.
+            "transport/link/tx/lease": 1500,
+            "transport/link/tx/keep_alive": 3,
             "transport/link/tx/queue/size/background": _PATIENT_BATCHES,
             # An attempt that a lost packet holds up is given up soon, and made again.
             "transport/unicast/open_timeout": 2000,
             "transport/unicast/accept_timeout": 2000,
+            # What is larger is never held in memory, and what is larger than its topic allows not
+            # handed on.
+            "transport/link/rx/max_message_size": _MOST_BYTES,
+            "low_pass_filter": [
+                {
+                    "flows": ["ingress"],
+                    "messages": ["put"],
+                    "key_exprs": [self._prefix + topic.pattern],
+                    "size_limit": topic.limit_bytes,
+                }
+                for topic in TOPICS
+            ],
             # 200 MB among ten robots, for no gain.
             "transport/shared_memory/enabled": False,
         }.items():
@@ -195,12 +231,14 @@ class ZenohLink:
         for topic, callback in subscriptions.items():
             self._session.declare_subscriber(
                 self._prefix + topic.pattern,
-                self._guarded(topic, callback),
+                zenoh.handlers.Callback(self._guarded(topic, callback), indirect=False),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
         liveliness = self._session.liveliness()
         liveliness.declare_subscriber(
-            self._prefix + "robot/*/alive/*", self._on_token, history=True
+            self._prefix + "robot/*/alive/*",
+            zenoh.handlers.Callback(self._on_token, indirect=False),
+            history=True,
         )
         if self._robot_id is not None:
             # Kept, since a token that nothing refers to is withdrawn.
@@ -227,28 +265,22 @@ class ZenohLink:
         def receive(sample: zenoh.Sample) -> None:
             try:
                 key = str(sample.key_expr).removeprefix(self._prefix)
-                if len(sample.payload) > topic.limit_bytes:
-                    self._too_long(key)
-                    return
-                callback(key, sample.payload.to_bytes())
+                size, now_s = len(sample.payload), time.monotonic()
+                with self._lock:
+                    admitted = self._admission.admits(topic, key, size, now_s)
+                if admitted:
+                    callback(key, sample.payload.to_bytes())
             except Exception as error:
                 self._failed(f"callback {topic.pattern}", error)
 
         return receive
-
-    def _too_long(self, key: str) -> None:
-        with self._lock:
-            self._oversized[key] += 1
-            first = self._oversized[key] == 1
-        if first:
-            _log.warning("a message is larger than its topic's limit: not read", key=key)
 
     def _failed(self, what: str, error: Exception) -> None:
         with self._lock:
             self._failures[what] += 1
             first = self._failures[what] == 1
         if first:
-            _log.error("link failure", what=what, exc_info=error)
+            log.error("link failure", error, what=what)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         match = _TOKEN.fullmatch(str(sample.key_expr).removeprefix(self._prefix))
@@ -256,10 +288,10 @@ class ZenohLink:
             return
         token = int(match[1]), match[2]
         with self._lock:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._tokens.add(token)
-            else:
+            if sample.kind != zenoh.SampleKind.PUT:
                 self._tokens.discard(token)
+            elif len(self._tokens) < _MOST_TOKENS:
+                self._tokens.add(token)
 
     def _others(self) -> frozenset[int]:
         """The robot ids that other sessions claim."""

@@ -10,6 +10,7 @@ from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.vehicle import Gps, VehicleState
 from edge.flight.failsafe import RemoteControl
 from edge.flight.margins import ErrorBudget, places_apart
+from edge.flight.reach import Reach
 from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
@@ -74,6 +75,7 @@ class PreflightInputs:
     vehicle: VehicleState
     failsafe_problems: Sequence[str] | None
     fence: Fence
+    reach: Reach
     fence_uploaded: bool
     origin: Origin | None
     position: PositionJudgement
@@ -295,6 +297,11 @@ def _place(inputs: PreflightInputs) -> Iterator[FailedCheck]:
                 f"robot stands {_where(depth_m)}, must be {fence.buffer_m:g} m inside: "
                 "carry it there, or check the mission origin",
             )
+        beyond = (
+            inputs.reach.origin_beyond(inputs.position_m),
+            inputs.reach.fence_beyond(fence, inputs.position_m),
+        )
+        yield from (failed for failed in beyond if failed is not None)
     depth_m = fence.distance_m(*inputs.landing_point_m)
     if not depth_m >= fence.buffer_m:
         yield FailedCheck(

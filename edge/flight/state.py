@@ -19,6 +19,7 @@ from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
 from edge.flight.margins import ErrorBudget
+from edge.flight.reach import Reach
 from edge.flight.safety import Closest, MotionLimits
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
@@ -175,7 +176,7 @@ class Robot:
     `on_remote_control_lost`: what a lost remote control does in flight; None if there is none.
 
     Raises ValueError if the fence leaves no way to the robot's height or to its landing point, or
-    less room for errors than the budget asks for.
+    less room for errors than the budget asks for, or is higher than the robot's reach.
     """
 
     robot_id: int
@@ -185,8 +186,14 @@ class Robot:
     limits: MotionLimits
     on_remote_control_lost: RemoteControlLost | None = None
     errors: ErrorBudget = field(default_factory=ErrorBudget)
+    reach: Reach = field(default_factory=Reach)
 
     def __post_init__(self) -> None:
+        if self.fence.ceiling_m > self.reach.ceiling_m:
+            raise ValueError(
+                f"ceiling_m = {self.fence.ceiling_m:g}: must be within the robot's reach, of "
+                f"ceiling_m = {self.reach.ceiling_m:g}"
+            )
         fence, height_m = self.fence, self.parameters.slot_height_m
         if not fence.floor_m <= height_m <= fence.ceiling_m:
             raise ValueError(

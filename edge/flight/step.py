@@ -5,7 +5,7 @@ Pure: the caller has the clock, and commands the autopilot.
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from edge.core.vehicle import Action, Mode, Vector, VehicleState
 from edge.flight.alarms import alarms
@@ -83,12 +83,12 @@ def _look(t: Tick) -> FlightMemory:
     if t.lapse_s > 0.0:
         flight = replace(flight, silent_until_s=now_s + STALE_TELEMETRY_S)
     if vehicle.heartbeat_at_s > t.acts_from_s + _STREAM_S and not is_silent(flight, now_s):
-        flight = replace(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
+        flight = _with(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
     if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
-        flight = replace(flight, silent_until_s=-math.inf)
+        flight = _with(flight, silent_until_s=-math.inf)
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
     down = flight.state is _S.LAND and vehicle.in_air is False
-    flight = replace(flight, landed_since_s=landed_since_s if down else None)
+    flight = _with(flight, landed_since_s=landed_since_s if down else None)
     if failsafe_acts(vehicle):
         flight = replace(flight, failsafe_at_s=now_s)
         if flight.state is _S.LAND and flight.reached and vehicle.mode is not Mode.LAND:
@@ -99,13 +99,19 @@ def _look(t: Tick) -> FlightMemory:
         # What was on its way when arming was called off has arrived by then.
         looked = vehicle.heartbeat_at_s > flight.since_s + STALE_TELEMETRY_S
         if flight.state in ON_GROUND and looked:
-            flight = replace(flight, armed_by="")
+            flight = _with(flight, armed_by="")
     if vehicle.remote_control:
         flight = replace(flight, remote_control_at_s=now_s)
-    flight = replace(flight, alone_since_s=_alone_since_s(t))
+    flight = _with(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
     return flight
+
+
+def _with(flight: FlightMemory, **changes: Any) -> FlightMemory:
+    """The memory with these fields; itself if they are so already, as they mostly are."""
+    same = all(getattr(flight, name) == value for name, value in changes.items())
+    return flight if same else replace(flight, **changes)
 
 
 def _alone_since_s(t: Tick) -> float | None:

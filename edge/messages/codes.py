@@ -62,6 +62,8 @@ class CheckCode(_Code):
     STANDS_OUTSIDE = "stands_outside"
     LANDS_OUTSIDE = "lands_outside"
     HEIGHT_OUTSIDE = "height_outside"
+    ORIGIN_OUT_OF_REACH = "origin_out_of_reach"
+    FENCE_OUT_OF_REACH = "fence_out_of_reach"
     # The other robots.
     DUPLICATE_ID = "duplicate_id"
     NOT_UNDERSTOOD = "not_understood"
@@ -84,13 +86,17 @@ class CheckCode(_Code):
 
 
 # What a robot says of the ground's fence, world or origin that it does not take up.
-FENCE_NOT_TAKEN = (CheckCode.KEEPS_FENCE, CheckCode.FENCE_OR_PLACE_UNFIT)
+FENCE_NOT_TAKEN = (
+    CheckCode.KEEPS_FENCE,
+    CheckCode.FENCE_OR_PLACE_UNFIT,
+    CheckCode.FENCE_OUT_OF_REACH,
+)
 WORLD_NOT_TAKEN = (
     CheckCode.KEEPS_WORLD,
     CheckCode.WORLD_NOT_ARRIVED,
     CheckCode.WORLD_UNUSABLE,
 )
-ORIGIN_NOT_TAKEN = (CheckCode.KEEPS_ORIGIN,)
+ORIGIN_NOT_TAKEN = (CheckCode.KEEPS_ORIGIN, CheckCode.ORIGIN_OUT_OF_REACH)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,10 @@ A topic's key is `lpac/<fleet>/robot/<id>/<name>` or `lpac/<fleet>/ground/<name>
 who sends what, sizes and priorities from here, and drops what is larger.
 """
 
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 Sender = Literal["robot", "ground"]
 Priority = Literal["now", "later"]
@@ -15,8 +17,9 @@ Priority = Literal["now", "later"]
 class Topic:
     """One kind of message.
 
-    `content` names what its bytes are, `rate_hz` is how often one sender says it, `limit_bytes` the
-    largest that is listened to, `logged` the flight log's topic that holds what came or went.
+    `content` names what its bytes are, `rate_hz` is how often one sender says it, `most_hz` how
+    often it is listened to at most, `limit_bytes` the largest that is listened to, `logged` the
+    flight log's topic that holds what came or went.
     Of what is sent at once, "later" goes when nothing else waits.
     """
 
@@ -24,6 +27,7 @@ class Topic:
     sender: Sender
     content: str
     rate_hz: float
+    most_hz: float
     limit_bytes: int
     priority: Priority
     logged: str | None
@@ -34,12 +38,13 @@ class Topic:
         return f"robot/*/{self.name}" if self.sender == "robot" else f"ground/{self.name}"
 
 
-MESSAGE = Topic("message", "robot", "Beacon, AggregatedMessage", 2.5, 2**20, "now", "received")
-STATUS = Topic("status", "robot", "RobotStatus", 2.0, 2**16, "now", "status")
-EXPLORED = Topic("explored", "robot", "bits", 1.0, 2**10, "later", None)
-STATE = Topic("state", "ground", "GroundState", 5.0, 2**16, "now", "ground")
-ORDER = Topic("order", "ground", "Order", 5.0, 2**12, "now", "order")
-WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 400_000, "later", None)
+# A policy may be run faster than the paper's, and a ground orders each robot of a fleet at once.
+MESSAGE = Topic("message", "robot", "Beacon, AggregatedMessage", 2.5, 100, 2**20, "now", "received")
+STATUS = Topic("status", "robot", "RobotStatus", 2.0, 20, 2**16, "now", "status")
+EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
+STATE = Topic("state", "ground", "GroundState", 5.0, 50, 2**16, "now", "ground")
+ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
+WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 10, 400_000, "later", None)
 
 TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD)
 
@@ -52,3 +57,33 @@ class Link(Protocol):
 
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another program than this one says that it is that robot."""
+
+    def peers(self) -> int:
+        """How many others it reaches now."""
+
+
+# Of the key below `lpac/<fleet>/` and the data; from any thread, and it only stores.
+ReceiveCallback = Callable[[str, bytes], None]
+
+
+class LinkSetting(NamedTuple):
+    """What robot.toml says of the radio: see `edge.robot.config.LinkConfig`.
+
+    With `robot_id` None it only listens. `subscriptions` maps topics to callbacks.
+    """
+
+    fleet: str
+    robot_id: int | None
+    mode: Literal["peer", "client"]
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    scouting: bool
+    options: Mapping[str, object]
+    subscriptions: Mapping[Topic, ReceiveCallback]
+
+
+class LinkDriver(Protocol):
+    """A type of radio. It is closed when the robot's program ends."""
+
+    def __call__(self, setting: LinkSetting) -> AbstractContextManager[Link]:
+        """Raises ValueError or OSError, one line, for a setting that cannot be used."""

@@ -1,61 +1,36 @@
-"""A policy as a bundle: ONNX graphs, golden outputs, and a manifest that pins every byte.
+"""A policy as a bundle: its files, and a manifest that says what they are and pins every byte.
 
 On disk a bundle is a directory, or its archive (an uncompressed zip whose bytes follow from the
-content): `manifest.json`, `bundle.id`, `cnn.onnx`, `gnn_<l>.onnx`, `action.onnx`,
-`golden.npz`.
+content): `manifest.json`, `bundle.id`, and the files of the policy's family.
 """
 
 import dataclasses
 import hashlib
 import io
 import json
-import re
 import tempfile
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
-from edge.core.aggregation import Geometry
-from edge.core.perception import MAP_CHANNELS, PerceptionParameters
+from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 BUNDLE_ID = "bundle.id"
-GOLDEN = "golden.npz"
-CNN = "cnn.onnx"
-ACTION = "action.onnx"
+# The family of a manifest that names none: its bundles are older than the key.
+LPAC = "lpac"
 # The oldest date that a zip entry can have, so that archives do not depend on the day.
 _ARCHIVE_DATE = (1980, 1, 1, 0, 0, 0)
+# The shipped one has 4 MB. Whoever reads a bundle may not know who made it.
+_MOST_BYTES = 2**25
+_MOST_MANIFEST_BYTES = 2**20
 
 
 class BundleError(ValueError):
     """The bundle cannot be used; the text says which part and why."""
-
-
-def gnn_graph(layer: int) -> str:
-    """File name of GNN layer `layer` = 1..L."""
-    return f"gnn_{layer}.onnx"
-
-
-@dataclass(frozen=True, slots=True)
-class Images:
-    """What the CNN takes and gives."""
-
-    channels: tuple[str, ...]
-    size: int
-    features: int
-    activation: Literal["leaky_relu_0.01"] = "leaky_relu_0.01"
-    padding: Literal["none"] = "none"
-
-    def __post_init__(self) -> None:
-        if self.channels not in MAP_CHANNELS.values():
-            allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
-            raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
-        if self.size < 1 or self.features < 1:
-            raise ValueError(f"size = {self.size}, features = {self.features}: must be positive")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,59 +49,38 @@ class Training:
     idf_norm: float = 1.0
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
             if not 0 < value < float("inf"):
-                raise ValueError(f"{field.name} = {value}: must be positive and finite")
-
-
-@dataclass(frozen=True, slots=True)
-class Provenance:
-    """Where the bundle came from; hashes are sha256."""
-
-    checkpoint: str
-    checkpoint_sha256: str
-    parameters: str
-    parameters_sha256: str
-    exporter: str
-    torch: str
+                raise ValueError(f"{each.name} = {value}: must be positive and finite")
 
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """The bundle's description. `images` and `perception` are None in one without perception."""
+    """The bundle's description.
+
+    `perception` is None in one that no robot can fly. `provenance` says where the bundle came from,
+    in names and hashes that its maker chose. `parameters` are the keys that only the family
+    understands, as JSON has them.
+    """
 
     schema: int
     name: str
-    opset: int
-    geometry: Geometry
-    images: Images | None
     perception: PerceptionParameters | None
     training: Training
-    provenance: Provenance
+    provenance: dict[str, str]
     files: dict[str, str]
+    family: str = LPAC
+    parameters: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.schema != SCHEMA_VERSION:
             raise ValueError(f"schema = {self.schema}: this version reads {SCHEMA_VERSION}")
-        if (self.images is None) != (self.perception is None):
-            raise ValueError("images and perception: both or neither")
-        if self.images and self.geometry.feature_sizes[0] != self.images.features + 2:
-            raise ValueError(
-                f"geometry.feature_sizes[0] = {self.geometry.feature_sizes[0]}: must be "
-                f"images.features + 2 = {self.images.features + 2}"
-            )
-        expected = {*self.graphs, GOLDEN}
-        if set(self.files) != expected:
-            raise ValueError(
-                f"files = {', '.join(sorted(self.files))}: must be {', '.join(sorted(expected))}"
-            )
+        for key in self.parameters.keys() & _KEYS:
+            raise ValueError(f"parameters: {key} is a key of every manifest")
 
-    @property
-    def graphs(self) -> tuple[str, ...]:
-        """The graphs' file names, in the order of computation."""
-        layers = (gnn_graph(layer) for layer in range(1, self.geometry.layers + 1))
-        return (*((CNN,) if self.images else ()), *layers, ACTION)
+
+_KEYS = {each.name for each in dataclasses.fields(Manifest)} - {"parameters"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,20 +93,39 @@ class Bundle:
 
 
 def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
-    """Seal `files` (graphs and golden vectors): their hashes are written into the manifest."""
+    """Seal a policy's `files`: their hashes are written into the manifest."""
     hashes = {name: _sha256(files[name]) for name in sorted(files)}
-    manifest = dataclasses.replace(manifest, files=hashes)
-    text = json.dumps(dataclasses.asdict(manifest), indent=2, sort_keys=True) + "\n"
+    mapping = dataclasses.asdict(dataclasses.replace(manifest, files=hashes))
+    mapping |= mapping.pop("parameters")
+    if manifest.family == LPAC:
+        del mapping["family"]
+    text = json.dumps(mapping, indent=2, sort_keys=True) + "\n"
     bundle_id = _sha256(text.encode())
     sealed = {**files, MANIFEST: text.encode(), BUNDLE_ID: f"{bundle_id}\n".encode()}
-    return Bundle(bundle_id, manifest, sealed)
+    return Bundle(bundle_id, _manifest(text.encode(), manifest.name), sealed)
+
+
+def _manifest(text: bytes, where: str) -> Manifest:
+    """Raises BundleError, one line with `where`."""
+    if len(text) > _MOST_MANIFEST_BYTES:
+        raise BundleError(f"{where} has {len(text)} bytes: more than {_MOST_MANIFEST_BYTES}")
+    try:
+        mapping = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise BundleError(f"{where} is not JSON: {error}") from None
+    try:
+        if isinstance(mapping, dict):
+            parameters = {key: mapping.pop(key) for key in mapping.keys() - _KEYS}
+            mapping["parameters"] = parameters
+        return from_mapping(Manifest, mapping, where)
+    except ConfigError as error:
+        raise BundleError(str(error)) from None
 
 
 def load_bundle(path: Path) -> Bundle:
     """Read a bundle's directory or archive; raises BundleError that names what is wrong.
 
-    Checked here: the schema, every hash, missing and unknown files. Whether the graphs compute
-    what torch computed is `verify`'s matter.
+    Checked here: the schema, every hash, missing and unknown files. The rest is the family's.
     """
     files = _read(path)
     for name in (MANIFEST, BUNDLE_ID):
@@ -161,12 +134,7 @@ def load_bundle(path: Path) -> Bundle:
     bundle_id = _sha256(files[MANIFEST])
     if files[BUNDLE_ID] != f"{bundle_id}\n".encode():
         raise BundleError(f"{path}: {MANIFEST} does not have the hash that {BUNDLE_ID} states")
-    try:
-        manifest = from_mapping(Manifest, json.loads(files[MANIFEST]), f"{path}: {MANIFEST}")
-    except ConfigError as error:
-        raise BundleError(str(error)) from None
-    except ValueError as error:
-        raise BundleError(f"{path}: {MANIFEST} is not JSON: {error}") from None
+    manifest = _manifest(files[MANIFEST], f"{path}: {MANIFEST}")
     for name in sorted(manifest.files.keys() - files.keys()):
         raise BundleError(f"{path}: {name} is missing")
     for name in sorted(files.keys() - manifest.files.keys() - {MANIFEST, BUNDLE_ID}):
@@ -213,15 +181,14 @@ def _write(bundle: Bundle, path: Path) -> None:
 
 def _holds_a_bundle(path: Path) -> bool:
     """Whether there is nothing but a bundle's files, or nothing at all, at `path`."""
-    if path.is_dir():
-        names = {entry.name for entry in path.iterdir()}
-    else:
-        try:
-            names = set(zipfile.ZipFile(path).namelist())
-        except zipfile.BadZipFile:
-            return False
-    belongs = re.compile(r"manifest\.json|bundle\.id|golden\.npz|(cnn|gnn_\d+|action)\.onnx")
-    return not names or (BUNDLE_ID in names and all(map(belongs.fullmatch, names)))
+    try:
+        files = _read(path)
+        belongs = {MANIFEST, BUNDLE_ID, *_manifest(files[MANIFEST], str(path)).files}
+    except BundleError:
+        return False
+    except KeyError:
+        return path.is_dir() and not any(path.iterdir())
+    return BUNDLE_ID in files and files.keys() <= belongs
 
 
 def _sha256(content: bytes) -> str:
@@ -244,16 +211,19 @@ def _read(path: Path) -> dict[str, bytes]:
         if path.is_dir():
             if not (path / MANIFEST).is_file():
                 return {}  # perhaps a large folder of something else
-            return {
-                entry.name: entry.read_bytes() if entry.is_file() else b""
-                for entry in path.iterdir()
-            }
+            entries = list(path.iterdir())
+            _bound(path, sum(entry.stat().st_size for entry in entries if entry.is_file()))
+            return {entry.name: entry.read_bytes() if entry.is_file() else b"" for entry in entries}
+        _bound(path, path.stat().st_size)
         content = path.read_bytes()
     except OSError as error:
         raise BundleError(f"{path}: {error.strerror}") from None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            _bound(path, sum(info.file_size for info in archive.infolist()))
             files = {name: archive.read(name) for name in archive.namelist()}
+    except BundleError:
+        raise
     except Exception as error:  # zipfile raises many kinds on damaged input
         raise BundleError(
             f"{path}: is neither a bundle directory nor its archive: {error}"
@@ -261,3 +231,10 @@ def _read(path: Path) -> dict[str, bytes]:
     if _archive(files) != content:
         raise BundleError(f"{path}: the archive's bytes are not those that its content gives")
     return files
+
+
+def _bound(path: Path, size: int) -> None:
+    if size > _MOST_BYTES:
+        raise BundleError(
+            f"{path}: has {size / 1e6:.0f} MB; a bundle at most {_MOST_BYTES / 1e6:.0f}"
+        )

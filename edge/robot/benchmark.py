@@ -12,8 +12,7 @@ from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import encode
-from edge.policy.bundle import Bundle
-from edge.policy.lpac.graphs import Policy
+from edge.policy.family import Policy
 from edge.robot.config import Rates
 from edge.robot.pac import Pac, PacParameters
 
@@ -56,18 +55,18 @@ class Benchmark:
     steps: tuple[StepTimes, ...]
 
 
-def benchmark(bundle: Bundle, neighbours: int, seconds: float) -> Benchmark:
+def benchmark(policy: Policy, neighbours: int, seconds: float) -> Benchmark:
     """Let a robot perceive and infer, one tick after another, for about `seconds`.
 
     All `neighbours` are in range, and each has sent a message before each tick. What they send and
-    what the robot sees is random, of the sizes that it has in flight. Raises BundleError if the
-    bundle has no perception, ValueError for a number that cannot be.
+    what the robot sees is random, of the sizes that it has in flight. Raises BundleError if no
+    robot can fly the policy, ValueError for a number that cannot be.
     """
     if not 0 <= neighbours <= _MOST_NEIGHBOURS:
         raise ValueError(f"neighbours = {neighbours}: must be from 0 to {_MOST_NEIGHBOURS}")
     if not 0.0 < seconds < math.inf:
         raise ValueError(f"seconds = {seconds:g}: must be positive and finite")
-    flight = _Flight(bundle, neighbours)
+    flight = _Flight(policy, neighbours)
     for _ in range(_WARM_UP_TICKS):
         flight.tick()
     ticks_s: list[tuple[float, float]] = []
@@ -88,8 +87,8 @@ def benchmark(bundle: Bundle, neighbours: int, seconds: float) -> Benchmark:
 class _Flight:
     """One robot that circles over a random world, neighbours around it; mission and model agree."""
 
-    def __init__(self, bundle: Bundle, neighbours: int) -> None:
-        self._policy = Policy(bundle)
+    def __init__(self, policy: Policy, neighbours: int) -> None:
+        self._policy = policy
         self._rng = np.random.default_rng(0)
         self._ticks = 0
         self._pac = Pac(
@@ -100,14 +99,14 @@ class _Flight:
             odometry=self,
             parameters=PacParameters(scale=ModelScale(1.0, 1.0), max_speed_m_s=1.0),
         )
-        perception = bundle.manifest.perception
+        perception = policy.manifest.perception
         assert perception is not None  # or Pac would have said so
         self._perception = perception
         self._view = self._rng.random((perception.sensor_size,) * 2, np.float32)
         angles_rad = self._rng.uniform(0.0, math.tau, neighbours)
         distances = self._rng.uniform(0.1, 0.9, neighbours) * perception.communication_range
         self._offsets = distances[:, None] * np.stack([np.cos(angles_rad), np.sin(angles_rad)], 1)
-        size = bundle.manifest.geometry.message_size
+        size = policy.message_size
         self._payloads = self._rng.random((neighbours, size), np.float32)
 
     def view(self, position: F64) -> F32:

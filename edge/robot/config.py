@@ -20,6 +20,7 @@ from edge.flight.energy import EnergyParameters
 from edge.flight.failsafe import required
 from edge.flight.margins import ErrorBudget, Margin
 from edge.flight.preflight import PreflightLimits
+from edge.flight.reach import Reach
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightParameters, RemoteControlLost, Robot
 from edge.robot.pac import PacParameters, PayloadType
@@ -57,14 +58,29 @@ def require_url(key: str, url: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class SensorConfig:
+    """What looks at the ground: a `type` of `edge.drivers.registry`, and what that takes."""
+
+    type: str = "world"
+    options: dict[str, object] = field(default_factory=dict, hash=False)
+
+
+@dataclass(frozen=True, slots=True)
 class AutopilotConfig:
-    """Where PX4's datagrams come in (`url`, e.g. udpin://127.0.0.1:14551), and which one it is."""
+    """The vehicle: a `type` of `edge.drivers.registry`, and what that takes.
+
+    `url` is where PX4's datagrams come in, e.g. udpin://127.0.0.1:14551; `system_id` which one it
+    is.
+    """
 
     url: str
     system_id: int
+    type: str = "px4"
+    options: dict[str, object] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        require_url("url", self.url)
+        if self.type == "px4":
+            require_url("url", self.url)
         require_system_id(self.system_id)
 
     @property
@@ -78,14 +94,19 @@ class LinkConfig:
     """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting.
 
     A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
+    `type` is one of `edge.drivers.registry`; `options` is what another type takes besides.
     """
 
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     scouting: bool = False
+    type: str = "zenoh"
+    options: dict[str, object] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        if self.type != "zenoh":
+            return
         if not (self.listen or self.connect or self.scouting):
             raise ValueError("listen, connect and scouting: one of them must be set")
         if self.mode == "client" and not (self.connect or self.scouting):
@@ -176,8 +197,10 @@ class RobotConfig:
     fence: Fence
     limits: MotionLimits
     failsafe: FailsafeConfig
+    sensor: SensorConfig = field(default_factory=SensorConfig)
     energy: EnergyParameters = field(default_factory=EnergyParameters)
     errors: ErrorBudget = field(default_factory=ErrorBudget)
+    reach: Reach = field(default_factory=Reach)
     rates: Rates = field(default_factory=Rates)
     preflight: PreflightLimits = field(default_factory=PreflightLimits)
     position: PositionLimits = field(default_factory=PositionLimits)
@@ -209,6 +232,7 @@ class RobotConfig:
             self.limits,
             None if self.failsafe.rc == "none" else self.failsafe.rc_lost,
             self.errors,
+            self.reach,
         )
 
     @property

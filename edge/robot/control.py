@@ -5,8 +5,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import NamedTuple
 
-import structlog
-
+from edge.core import log
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
@@ -24,13 +23,18 @@ from edge.flight.state import (
 from edge.flight.step import step
 from edge.messages.beacon import HeardBeacon
 from edge.messages.codes import CheckCode, FailedCheck, Reason
-from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, GroundState
+from edge.messages.mission import (
+    AIRBORNE,
+    ON_GROUND,
+    STEERED,
+    FlightState,
+    GroundState,
+    Origin,
+)
 from edge.robot.inbox import Inbox
 from edge.robot.navigation import Navigation
 from edge.robot.pac import Pac
 from edge.robot.readiness import Assignment, Checks
-
-_log = structlog.get_logger(__name__)
 
 # Beacons come at the policy's rate, or four times a second without it.
 _MAX_BEACON_AGE_S = 1.5
@@ -106,7 +110,7 @@ class FlightControl:
             if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
                 self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
-            self._take_up(ground, vehicle.armed)
+            self._take_up(ground, vehicle)
         self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
         neighbours = self._neighbours(now_s)
@@ -147,7 +151,7 @@ class FlightControl:
         sent = None if local is None else self._vehicle.send(local)
         if decision.flight.state is not before.state:
             flight = decision.flight
-            _log.info(
+            log.info(
                 "flight state", state=flight.state, was=before.state, reason=flight.reason.text
             )
         self._record(inputs, setpoint, sent, decision.actions)
@@ -187,13 +191,13 @@ class FlightControl:
         obeys = vehicle.mode in (Mode.OFFBOARD, Mode.HOLD) and not failsafe_acts(vehicle)
         return on_stop if self.flight.state in STEERED and obeys else None
 
-    def _take_up(self, ground: GroundState, armed: bool | None) -> None:
+    def _take_up(self, ground: GroundState, vehicle: VehicleState) -> None:
         """Take what the ground sets for a flight, on the ground only.
 
         A program that has not flown its vehicle, such as one that was started in flight, takes it
-        at any time: it steers nothing by it.
+        at any time: it steers nothing by it. What is out of its reach it never takes.
         """
-        now = self.assignment
+        now, armed = self.assignment, vehicle.armed
         origin = now.origin if ground.origin is None else ground.origin
         world_id = now.world_id if ground.world_id is None else ground.world_id
         self.wanted_world_id = None
@@ -213,11 +217,21 @@ class FlightControl:
             )
             return
         robot, sensor = now.robot, None
+        moves = self._configured.told(ground) != (robot.fence, robot.place)
+        changes = moves or origin != now.origin
+        place_m = self._place_in(origin, vehicle) if changes else None
+        if changes and place_m is None and armed is not False:
+            # It may be in the air, where no preflight asks again what is out of its reach.
+            return
         not_taken: list[FailedCheck] = []
-        try:
-            robot = self._configured.assigned(ground)
-        except ValueError as error:
-            not_taken.append(FailedCheck(CheckCode.FENCE_OR_PLACE_UNFIT, str(error)))
+        if origin != now.origin:
+            beyond = self._configured.reach.origin_beyond(place_m)
+            if beyond is not None:
+                not_taken.append(beyond)
+                origin = now.origin
+        if moves:
+            robot, why = self._assigned(ground, self._place_in(origin, vehicle))
+            not_taken += why
         if world_id != now.world_id:
             arrived = self.world if self.world and self.world.world_id == world_id else None
             if arrived is None:
@@ -234,6 +248,21 @@ class FlightControl:
             Assignment(origin, robot, now.world_id if sensor is None else world_id), sensor
         )
 
+    def _assigned(
+        self, ground: GroundState, place_m: tuple[float, float] | None
+    ) -> tuple[Robot, tuple[FailedCheck, ...]]:
+        """The robot with the ground's fence and place; or as it is, and why."""
+        now = self.assignment.robot
+        try:
+            assigned = self._configured.assigned(ground)
+        except ValueError as error:
+            return now, (FailedCheck(CheckCode.FENCE_OR_PLACE_UNFIT, str(error)),)
+        beyond = self._configured.reach.fence_beyond(assigned.fence, place_m)
+        return (assigned, ()) if beyond is None else (now, (beyond,))
+
+    def _place_in(self, origin: Origin | None, vehicle: VehicleState) -> tuple[float, float] | None:
+        return None if origin is None else self._navigation.place_in(origin.frame(), vehicle)
+
     def _assign(self, assignment: Assignment, sensor: Sensor | None) -> None:
         """`sensor` is over the world, None if that stays."""
         before = self.assignment
@@ -248,7 +277,7 @@ class FlightControl:
         if sensor is not None:
             self._pac.sensor = sensor
             self._pac.forget()
-        _log.info(
+        log.info(
             "taken up from the ground",
             origin=origin and asdict(origin),
             fence=asdict(robot.fence),

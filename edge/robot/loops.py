@@ -11,13 +11,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-import structlog
-
+from edge.core import log
 from edge.messages.mission import LoopStatus
 
 _LATENESSES_KEPT_S = 60.0
-
-log = structlog.get_logger()
 
 
 class Loop:
@@ -34,9 +31,11 @@ class Loop:
         self._latenesses_s: deque[float] = deque(maxlen=math.ceil(_LATENESSES_KEPT_S / period_s))
         self._succeeded_s: float | None = None
 
-    def start(self) -> None:
-        """Begin; the first tick is now."""
+    def start(self) -> int:
+        """Begin; the first tick is now. Returns the thread's number in the system."""
         self._thread.start()
+        assert self._thread.native_id is not None
+        return self._thread.native_id
 
     def stop(self, timeout_s: float) -> bool:
         """No further tick; whether the thread has ended, within `timeout_s`."""
@@ -79,11 +78,11 @@ class Loop:
         try:
             self._step()
             self._succeeded_s = time.monotonic()
-        except Exception:
+        except Exception as error:
             self._failures += 1
             # The first of a row says all; a log that fills the disk helps nobody.
             if self._failures & (self._failures - 1) == 0:
-                log.exception("loop step failed", loop=self.name, failures=self._failures)
+                log.error("loop step failed", error, loop=self.name, failures=self._failures)
 
 
 def _percentile(ascending: Sequence[float], share: float) -> float:

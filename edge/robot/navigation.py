@@ -89,6 +89,15 @@ class Navigation:
             _vector(transform.velocity_to_mission(np.array(velocity_m_s))),
         )
 
+    def place_in(self, frame: MissionFrame, vehicle: VehicleState) -> tuple[float, float] | None:
+        """Where the robot is in that frame, (x, y), m; None when lost or too old."""
+        origin, position_m = vehicle.origin, vehicle.position_local_m
+        if origin is None or position_m is None or not self._is_known(vehicle):
+            return None
+        transform = frame.relative_to(*origin)
+        x_m, y_m, _ = _vector(transform.local_to_mission(np.array(position_m)))
+        return x_m, y_m
+
     def global_deg(self, vehicle: VehicleState) -> tuple[float, float] | None:
         """Latitude and longitude, also without a mission frame; None when lost or too old."""
         origin, position_m = vehicle.origin, vehicle.position_local_m

@@ -8,9 +8,8 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
-from edge.core.ports import Clock, Recorder, Sensor, Vehicle, VehicleSetup, Watchdog
+from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
 from edge.core.vehicle import Action
 from edge.flight.state import flown_s
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
@@ -19,9 +18,7 @@ from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import FlightState, LoopStatus, RobotStatus, explored_to_bytes, world_id
 from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Link, Topic
-from edge.policy.bundle import load_bundle
-from edge.policy.lpac.graphs import Policy
-from edge.policy.verify import verify
+from edge.policy.family import VerifiedPolicy
 from edge.robot.config import RobotConfig
 from edge.robot.control import FlightControl, GroundWorld
 from edge.robot.inbox import Inbox
@@ -30,6 +27,8 @@ from edge.robot.pac import Pac
 from edge.robot.readiness import Readiness
 
 _EXPLORED_PERIOD_S = 1.0
+# Of an armed vehicle nobody asks whether it may take off; its checks are only shown.
+_ARMED_CHECKS_PERIOD_S = 0.95
 # A status without news; what is new goes at once. A little less, since ticks are never early.
 _STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
 # After as many of the policy's periods without a message, a beacon goes alone.
@@ -37,45 +36,16 @@ _SILENT_TICKS = 1.5
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 
-class RobotError(ValueError):
-    """The robot's program cannot start; the text says why and what to do."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class LoadedPolicy:
-    """A policy that was checked on this CPU; `problem` is why it does not pass, None if it does."""
-
-    policy: Policy
-    bundle_id: str
-    problem: str | None
-
-
-def load_policy(path: Path) -> LoadedPolicy:
-    """Load and verify a bundle. Raises ValueError or OSError that says what is wrong."""
-    bundle = load_bundle(path)
-    if bundle.manifest.perception is None:
-        raise RobotError(f"{path}: the bundle has no perception: it cannot fly")
-    failed = [check.name for check in verify(bundle) if not check.passed]
-    problem = None
-    if failed:
-        problem = f"{', '.join(failed)} of the bundle do not compute torch's golden outputs here"
-    return LoadedPolicy(Policy(bundle), bundle.id, problem)
-
-
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Ports:
-    """The outside world of one robot.
-
-    `sensor_over` makes a sensor over a world file's text; the second argument is what the text is
-    called in the ValueError that it raises for one that cannot be used.
-    """
+    """The outside world of one robot."""
 
     clock: Clock
     vehicle: Vehicle
     vehicle_setup: VehicleSetup
     watchdog: Watchdog
     recorder: Recorder
-    sensor_over: Callable[[str, str], Sensor]
+    sensor_over: SensorOver
 
 
 class RobotNode:
@@ -89,7 +59,7 @@ class RobotNode:
         self,
         config: RobotConfig,
         ports: Ports,
-        policy: LoadedPolicy,
+        policy: VerifiedPolicy,
         world: str,
         *,
         boot_nonce: int,
@@ -99,7 +69,7 @@ class RobotNode:
         clock = ports.clock
         self._config = config
         self._ports = ports
-        self._policy = policy
+        self._bundle_id = policy.policy.bundle_id.hex()
         self._boot_nonce = boot_nonce
         self._boot_epoch = boot_epoch
         self._started_s = clock.monotonic_s()
@@ -132,7 +102,7 @@ class RobotNode:
             config,
             ports.vehicle,
             ports.vehicle_setup,
-            bundle_id=policy.bundle_id,
+            bundle_id=self._bundle_id,
             bundle_problem=policy.problem,
         )
         self._statuses = 0
@@ -149,13 +119,22 @@ class RobotNode:
     @property
     def subscriptions(self) -> Mapping[Topic, Callable[[str, bytes], None]]:
         """What it hears: topic -> callback with the key and the data, from any thread."""
-        clock, inbox = self._ports.clock, self._inbox
         return {
             MESSAGE: self._receive_message,
-            STATE: lambda _, data: inbox.put_ground(data, clock.monotonic_s(), clock.unix_s()),
-            ORDER: lambda _, data: inbox.put_order(data),
-            WORLD: lambda _, data: inbox.put_world(data),
+            STATE: self._receive_state,
+            ORDER: self._receive_order,
+            WORLD: self._receive_world,
         }
+
+    def _receive_state(self, _: str, data: bytes) -> None:
+        clock = self._ports.clock
+        self._inbox.put_ground(data, clock.monotonic_s(), clock.unix_s())
+
+    def _receive_order(self, _: str, data: bytes) -> None:
+        self._inbox.put_order(data)
+
+    def _receive_world(self, _: str, data: bytes) -> None:
+        self._inbox.put_world(data)
 
     def _receive_message(self, key: str, data: bytes) -> None:
         """A robot's: to inbox and mailbox, and what came to the log."""
@@ -205,11 +184,7 @@ class RobotNode:
             self._ports.recorder.record(
                 "perception",
                 self._ports.clock.unix_s(),
-                {
-                    "images": tick.images.copy(),
-                    "position_feature": tick.position_feature,
-                    "features": tick.features,
-                },
+                {**tick.inputs, "features": tick.features},
             )
 
     def policy_step(self) -> None:
@@ -244,20 +219,27 @@ class RobotNode:
             slot_height_m=parameters.slot_height_m,
             landing_point_m=(x_m, y_m),
             frame_id=self._pac.frame_id,
-            bundle_tag=tag(self._policy.bundle_id),
+            bundle_tag=tag(self._bundle_id),
             world_tag=tag(assignment.world_id),
         )
         self._publish(MESSAGE, encode_beacon(beacon) + of_policy)
 
     def preflight_step(self) -> None:
-        """Prepare and check the vehicle, a few times a second; it may wait for the vehicle."""
+        """Prepare and check the vehicle, a few times a second; it may wait for the vehicle.
+
+        One that is armed is neither prepared nor about to take off: it is checked less often.
+        """
         control = self._control
         self._look_for_world()
         assignment = control.assignment
-        self.readiness.prepare(self._ports.clock.monotonic_s(), assignment)
+        is_due = self._checks_are_due(self._ports.clock.monotonic_s())
+        if is_due:
+            self.readiness.prepare(self._ports.clock.monotonic_s(), assignment)
         now_s = self._ports.clock.monotonic_s()
         peers = self._inbox.peers(now_s)
         control.peers = peers
+        if not is_due:
+            return
         control.checks = self.readiness.checks(
             now_s,
             self._ports.clock.unix_s(),
@@ -271,6 +253,13 @@ class RobotNode:
             ground_age_s=self._inbox.ground_age_s(now_s),
             ground_clock_offset_s=self._inbox.ground_clock_offset_s,
         )
+
+    def _checks_are_due(self, now_s: float) -> bool:
+        checks = self._control.checks
+        if not self._ports.vehicle.state().armed or checks is None:
+            return True
+        changed = checks.assignment is not self._control.assignment
+        return changed or now_s - checks.at_s >= _ARMED_CHECKS_PERIOD_S
 
     def _look_for_world(self) -> None:
         """Make a sensor of the world that the ground wants, once that has come."""
@@ -342,7 +331,7 @@ class RobotNode:
             obeyed_sequence=control.obeyed_sequence,
             operator=control.operator,
             orders=flight.answers,
-            bundle_id=self._policy.bundle_id,
+            bundle_id=self._bundle_id,
             world_id=world,
             trial=flight.trial,
             origin=origin,

@@ -8,22 +8,21 @@ simulated time; both run this code.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from edge.core import F32, F64, Bools
-from edge.core.aggregation import AggregatedMessage, HopBuffer
+from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
-from edge.core.perception import Perception, clamp_to_world, neighbours_in_range
+from edge.core.perception import RobotMemory, clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource, Sensor
 from edge.core.wire import MAX_ROBOT_ID, Rejection, decode, encode
 from edge.flight.safety import limit_speed
 from edge.policy.bundle import BundleError
-from edge.policy.lpac.graphs import Policy
+from edge.policy.family import Observation, Perceived, Policy
 
 Position = tuple[float, float, float]  # in the mission frame, m
 PayloadType = Literal["float16", "float32"]
@@ -61,23 +60,10 @@ class _Timed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PerceptionTick:
-    """What `Pac.perceive` did.
-
-    `images` (1, channels, size, size) is valid until the next call; `position_feature` (2,);
-    `features` (F_0,) are the images' and then the position's.
-    """
-
-    images: F32
-    position_feature: F32
-    features: F32
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PolicyTick:
     """What `Pac.infer` did.
 
-    From `features` (F_0,) and the `payloads` of `senders`, for a node of `degree` neighbours, came
+    From `features` and the `payloads` of `senders`, for a node of `degree` neighbours, came
     `velocity` (2,), in model units, and `message`, the bytes for the neighbours.
     """
 
@@ -106,11 +92,11 @@ class Pac:
         odometry: OdometrySource,
         parameters: PacParameters,
     ) -> None:
-        """Raises BundleError if the policy has no perception, ValueError for an impossible id."""
+        """Raises BundleError if no robot can fly the policy, ValueError for an impossible id."""
         if not 0 <= robot_id <= MAX_ROBOT_ID:
             raise ValueError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
         manifest = policy.manifest
-        if manifest.images is None or manifest.perception is None:
+        if manifest.perception is None:
             raise BundleError(
                 f"bundle {manifest.name!r} has no perception: it cannot drive a robot"
             )
@@ -119,15 +105,12 @@ class Pac:
         self._policy = policy
         self._odometry = odometry
         self._parameters = parameters
-        self._world_size = manifest.perception.world_size
-        self._sensor_size = manifest.perception.sensor_size
-        self._communication_range = manifest.perception.communication_range
-        self._new_perception = partial(
-            Perception, manifest.perception, len(manifest.images.channels), manifest.images.size
-        )
-        self._perception = self._new_perception()
+        self._perception = manifest.perception
+        self._memory = RobotMemory(manifest.perception)
+        self._agent = policy.agent()
+        # Set by whoever wants it, done by the thread that the memory, or the agent, belongs to.
         self._forget_map = False
-        self._hops = HopBuffer(manifest.geometry)
+        self._reset_agent = False
         self._sequence = 0
         self._features: _Timed | None = None
         self._action: _Timed | None = None
@@ -143,6 +126,7 @@ class Pac:
         The last action is left to the next tick of the policy, so that the robot need not stop.
         """
         self._forget_map = True
+        self._reset_agent = True
         self._features = None
         self.mailbox.clear()
 
@@ -153,21 +137,21 @@ class Pac:
             bundle_id=self._policy.bundle_id,
             frame_id=self.frame_id,
             own_robot_id=self._robot_id,
-            message_size=self._policy.manifest.geometry.message_size,
+            message_size=self._policy.message_size,
         )
         if isinstance(message, Rejection):
             self.mailbox.reject(message)
             return message
         return self.mailbox.receive(message, now_s, unix_now_s)
 
-    def perceive(self, now_s: float) -> PerceptionTick | None:
-        """Sensor view -> robot map -> images -> features x_i (32 of the CNN, 2 of the position).
+    def perceive(self, now_s: float) -> Perceived | None:
+        """Sensor view -> robot map -> features, as the policy makes them.
 
         None when there is nothing to perceive: no position, or no valid view.
         """
         if self._forget_map:
             self._forget_map = False
-            self._perception = self._new_perception()
+            self._memory = RobotMemory(self._perception)
         odometry = self._finite_odometry()
         if odometry is None:
             return None
@@ -175,18 +159,24 @@ class Pac:
         view = self.sensor.view(own)
         if view is None or not self._is_valid(view):
             return None
-        self._perception.observe(own, view)
+        self._memory.observe(own, view)
         heard = self._to_model([n.position_m for n in self.mailbox.neighbours(now_s)])
-        neighbours = heard[neighbours_in_range(own, heard, self._communication_range)]
-        images = self._perception.images(own, neighbours)
-        position = position_feature(own, self._world_size)
-        features = np.concatenate([self._policy.image_features(images), position])
-        self._features = _Timed(features, now_s)
-        return PerceptionTick(images, position, features)
+        # Outside the world the policy is told the nearest point of it, where training kept the
+        # robots: it never sees an input that it could not have been trained on.
+        position = clamp_to_world(own, self._perception.world_size)
+        perceived = self._agent.observe(
+            Observation(
+                position,
+                self._memory.local_map(position),
+                heard[neighbours_in_range(own, heard, self._perception.communication_range)],
+            )
+        )
+        self._features = _Timed(perceived.features, now_s)
+        return perceived
 
     def explored(self) -> Bools:
         """What it has seen, as `mission.explored_to_bytes` takes it; valid until it goes on."""
-        return self._perception.explored
+        return self._memory.explored
 
     def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
@@ -205,10 +195,11 @@ class Pac:
         degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
         heeded = [message for message, is_near in zip(messages, near, strict=True) if is_near]
         payloads = tuple(message.payload for message in heeded)
-        self._hops.diffuse(payloads, degree)
-        velocity = self._policy.velocity(features.value, self._hops)
-        payload = self._hops.message(degree)
-        if not (np.isfinite(velocity).all() and np.isfinite(payload).all()):
+        if self._reset_agent:
+            self._reset_agent = False
+            self._agent.reset()
+        velocity, payload = self._agent.step(features.value, payloads, degree)
+        if not (_is_finite(velocity, 2) and _is_finite(payload, self._policy.message_size)):
             return None
         self._action = _Timed(velocity, now_s)
         self._sequence += 1
@@ -258,11 +249,13 @@ class Pac:
 
     def _is_valid(self, view: F32) -> bool:
         """Whether it may go into the map: one cell that is not finite would stay in it."""
-        return view.shape == (self._sensor_size,) * 2 and bool(np.isfinite(view).all())
+        return view.shape == (self._perception.sensor_size,) * 2 and bool(np.isfinite(view).all())
 
     def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
         """(n,): which of the positions are within communication range of `own`, in model units."""
-        return neighbours_in_range(own, self._to_model(positions_m), self._communication_range)
+        return neighbours_in_range(
+            own, self._to_model(positions_m), self._perception.communication_range
+        )
 
     def _to_model(self, positions_m: Sequence[Position]) -> F64:
         """Horizontal positions (n, 2) in model units."""
@@ -273,7 +266,6 @@ class Pac:
         return now_s - timed.time_s > self._parameters.max_input_age_s
 
 
-def position_feature(position: F64, world_size: int) -> F32:
-    """(p + W/2) / W, with p taken into the world: in [0.5, 1.5], as policies were trained."""
-    inside = clamp_to_world(position, world_size)
-    return ((inside + world_size / 2.0) / world_size).astype(np.float32)
+def _is_finite(values: F32, size: int) -> bool:
+    """Whether it is (size,), all of it finite."""
+    return values.shape == (size,) and bool(np.isfinite(values).all())

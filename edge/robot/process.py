@@ -7,44 +7,40 @@ the control loop lives, and does nothing that could hang.
 """
 
 import ctypes
-import dataclasses
 import gc
-import json
-import logging
+import math
 import secrets
 import sys
 import threading
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack
-from functools import partial
-from importlib.metadata import version
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-import structlog
-
-from edge.core.ports import Sensor, Vehicle
+from edge.core import log
+from edge.core.ports import OpenVehicle, SensorOver, Vehicle, VehicleSetting, Watchdog
 from edge.core.px4_version import in_words
 from edge.core.vehicle import Action, Setpoint
-from edge.core.world import MOST_FEATURES, parse_world, rasterize
 from edge.drivers.clock import SystemClock
-from edge.drivers.flight_log import FlightLog, FlightMetadata
-from edge.drivers.logs import configure_logging
+from edge.drivers.flight_log import FlightLog
+from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
-from edge.drivers.px4.autopilot import MavsdkAutopilot
-from edge.drivers.px4.watchdog import Watchdog
+from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
-from edge.drivers.world_sensor import WorldSensor
-from edge.drivers.zenoh_link import ZenohLink
 from edge.messages.codes import FailedCheck
-from edge.policy.bundle import Manifest
+from edge.messages.mission import LoopStatus
+from edge.messages.topics import Link, LinkSetting
+from edge.policy.family import VerifiedPolicy
 from edge.robot.config import RobotConfig
+from edge.robot.log import open_log
 from edge.robot.loops import Loop
-from edge.robot.node import LoadedPolicy, Ports, RobotNode, load_policy
+from edge.robot.node import Ports, RobotNode
 
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
+# Of how the loops keep time, which is told of a whole minute.
+_LOOPS_PERIOD_S = 1.0
 # A control loop without a tick for longer hangs: the vehicle was told to hold before that.
 _CONTROL_FRESH_S = 1.0
 # On leaving: for the autopilot's answer, and for a loop that hangs.
@@ -52,28 +48,22 @@ _ANSWER_S = 1.2
 _JOIN_S = 0.3
 # The interpreter lets another thread run this often: a tick must not wait 5 ms for each other one.
 _SWITCH_INTERVAL_S = 0.001
+# glibc gives each thread that allocates an arena of its own, and none of them ever shrinks.
+_M_ARENA_MAX = -8
+# What is larger goes back to the system when it is freed; left alone, glibc keeps ever more.
+_M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 2**19
 
-_log = structlog.get_logger(__name__)
 
-
-def _load(config: RobotConfig) -> tuple[LoadedPolicy, str]:
-    """Policy and world, checked before any hardware. Raises ValueError or OSError."""
-    policy = load_policy(Path(config.policy.bundle))
+def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, SensorOver, str]:
+    """Policy, sensor and world, before anything that moves. Raises ValueError or OSError."""
+    policy = load_verified_policy(Path(config.policy.bundle))
+    sensor = config.sensor
+    sensor_over = parts.enter_context(
+        open_sensor(sensor.type, sensor.options, policy.policy.manifest)
+    )
     world = Path(config.policy.world).read_text("utf-8-sig")
-    _sensor_over(policy.policy.manifest, world, config.policy.world)
-    return policy, world
-
-
-def _sensor_over(manifest: Manifest, text: str, source: str) -> Sensor:
-    """A sensor over a world file's text. Raises ValueError, one line with `source`."""
-    perception, training = manifest.perception, manifest.training
-    assert perception is not None  # Without it no robot is loaded.
-    features = parse_world(text, source)
-    if len(features) > MOST_FEATURES:
-        raise ValueError(f"{source}: has {len(features)} features, at most {MOST_FEATURES} may be")
-    truncation, norm = training.idf_truncation, training.idf_norm
-    importance = rasterize(features, perception.world_size, truncation, norm)
-    return WorldSensor(importance, perception.sensor_size)
+    sensor_over(world, config.policy.world)  # or say what is wrong with it now
+    return policy, sensor_over, world
 
 
 def run(config: RobotConfig, stop: threading.Event) -> None:
@@ -81,33 +71,28 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
 
     Raises ValueError or OSError, in one line, for what keeps the program from starting.
     """
-    # 1. Policy and world, before anything that moves.
-    policy, world = _load(config)
-    if stop.is_set():
-        return
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
-    boot_nonce = secrets.randbits(48)
+    libc = ctypes.CDLL(None)
+    libc.mallopt(_M_ARENA_MAX, 1)
+    libc.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
     with ExitStack() as parts:
+        # 1. Policy, sensor and world, before anything that moves.
+        policy, sensor_over, world = _load(config, parts)
+        if stop.is_set():
+            return
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
+        bundle_id, boot_nonce = policy.policy.bundle_id.hex(), secrets.randbits(48)
         service_manager = ServiceManager()
         parts.callback(service_manager.close)
-        # 2. One program per robot, and per vehicle, on this machine.
-        _take_alone(config, parts)
+        # 2. One program per robot on this machine.
+        parts.enter_context(_robot_lock(config))
         # 3. The flight log, so that it holds all that follows.
-        recorder = _open_log(config, policy.bundle_id, boot_nonce)
+        recorder = open_log(config, bundle_id, boot_nonce)
         parts.callback(recorder.close)
-        configure_logging(recorder)
+        log_to(recorder)
         # 4. The vehicle, and who holds it when this program hangs.
-        vehicle = parts.enter_context(
-            MavsdkAutopilot(config.autopilot.url, system_id=config.autopilot.system_id)
-        )
-        watchdog = parts.enter_context(
-            Watchdog(
-                config.autopilot.port,
-                config.autopilot.system_id,
-                config.flight.command_timeout_s,
-                config.flight.hover_land_s,
-            )
-        )
+        vehicle, setup, new_watchdog = parts.enter_context(_open_vehicle(config))
+        flight = config.flight
+        watchdog = parts.enter_context(new_watchdog(flight.command_timeout_s, flight.hover_land_s))
         # 5. The robot itself.
         clock = SystemClock()
         node = RobotNode(
@@ -115,10 +100,10 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             Ports(
                 clock=clock,
                 vehicle=vehicle,
-                vehicle_setup=vehicle,
+                vehicle_setup=setup,
                 watchdog=watchdog,
                 recorder=recorder,
-                sensor_over=partial(_sensor_over, policy.policy.manifest),
+                sensor_over=sensor_over,
             ),
             policy,
             world,
@@ -126,47 +111,37 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             boot_epoch=int(clock.unix_s() * 1e3),
         )
         # 6. The radio that feeds it, and takes what it says.
-        link = parts.enter_context(_open_link(config, node, config.robot_id))
+        link = node.link = parts.enter_context(_open_link(config, node, config.robot_id))
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
         program = _Program(config, node, vehicle, watchdog, recorder, link)
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
-        ctypes.CDLL(None).malloc_trim(0)  # What verification took goes back to the system.
+        libc.malloc_trim(0)  # What verification took goes back to the system.
         program.start()
         parts.callback(program.leave)
         parts.callback(service_manager.tell, STOPPING)
-        _log.info("robot runs", robot=config.robot_id, bundle=policy.bundle_id[:12])
+        log.info("robot runs", robot=config.robot_id, bundle=bundle_id[:12])
         # 8. Until somebody stops the program.
         while not stop.wait(_PERIOD_S):  # A signal that another thread took is seen only here.
             service_manager.tell(*program.news())
 
 
-def _open_log(config: RobotConfig, bundle_id: str, boot_nonce: int) -> FlightLog:
-    metadata = FlightMetadata(
-        robot_id=config.robot_id,
-        boot_nonce=boot_nonce,
-        bundle_id=bundle_id,
-        bundle_path=config.policy.bundle,
-        configuration=json.dumps(dataclasses.asdict(config)),
-        version=version("lpac-edge"),
-    )
-    max_total_bytes = int(config.log.max_total_mb * 1e6)
-    return FlightLog(Path(config.log.folder), metadata, max_total_bytes=max_total_bytes)
+def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
+    autopilot = config.autopilot
+    setting = VehicleSetting(autopilot.url, autopilot.system_id, autopilot.options)
+    return open_vehicle(autopilot.type, setting)
 
 
-def _open_link(config: RobotConfig, node: RobotNode, robot_id: int | None) -> ZenohLink:
+def _open_link(
+    config: RobotConfig, node: RobotNode, robot_id: int | None
+) -> AbstractContextManager[Link]:
     """The radio, as that robot, or with None as somebody who only listens."""
-    link = ZenohLink(
-        fleet=config.fleet,
-        robot_id=robot_id,
-        mode=config.link.mode,
-        listen=config.link.listen,
-        connect=config.link.connect,
-        scouting=config.link.scouting,
-        subscriptions=node.subscriptions,
-    )
-    node.link = link
-    return link
+    link = config.link
+    setting = LinkSetting(
+        config.fleet, robot_id, link.mode, link.listen, link.connect, link.scouting, link.options,
+        node.subscriptions,
+    )  # fmt: skip
+    return open_link(link.type, setting)
 
 
 class _Program:
@@ -176,10 +151,10 @@ class _Program:
         self,
         config: RobotConfig,
         node: RobotNode,
-        vehicle: MavsdkAutopilot,
+        vehicle: Vehicle,
         watchdog: Watchdog,
         recorder: FlightLog,
-        link: ZenohLink,
+        link: Link,
     ) -> None:
         self._config = config
         self._node = node
@@ -199,11 +174,15 @@ class _Program:
             Loop("log", _PERIOD_S, recorder.flush),
         )
         self._status_text: str | None = None
+        self._loop_statuses: dict[str, LoopStatus] = {}
+        self._loops_due_s = -math.inf
 
     def start(self) -> None:
         """Start the loops; from now on the robot may send."""
         for loop in (*self._loops, *self._chores):
-            loop.start()
+            thread = loop.start()
+            with suppress(OSError):  # for whoever looks with `top -H`, and for the bench
+                Path(f"/proc/self/task/{thread}/comm").write_text(loop.name)
 
     def news(self) -> list[str]:
         """What systemd is to know now. Waits for nothing."""
@@ -222,14 +201,14 @@ class _Program:
         self._stop(control)
         action = self._node.leave(Action(self._config.on_stop))
         if action is not None:
-            _log.warning("program ends in flight", vehicle=action)
+            log.warning("program ends in flight", vehicle=action)
             self._command(action)
         for loop in (*others, *self._chores):
             self._stop(loop)
 
     def _stop(self, loop: Loop) -> None:
         if not loop.stop(_JOIN_S):
-            _log.error("loop hangs", loop=loop.name)
+            log.error("loop hangs", loop=loop.name)
 
     def _command(self, action: Action) -> None:
         asked_s = time.monotonic()
@@ -241,23 +220,26 @@ class _Program:
             if result and result.action is action and result.at_s >= asked_s:
                 return
             time.sleep(0.02)
-        _log.error("the autopilot did not answer", action=action)
+        log.error("the autopilot did not answer", action=action)
 
     def _status_step(self) -> None:
-        status = self._node.status_step({loop.name: loop.status() for loop in self._loops})
+        now_s = time.monotonic()
+        if now_s >= self._loops_due_s:
+            self._loops_due_s = now_s + _LOOPS_PERIOD_S
+            self._loop_statuses = {loop.name: loop.status() for loop in self._loops}
+        status = self._node.status_step(self._loop_statuses)
         self._status_text = status_text(
             status,
-            monotonic_s=time.monotonic(),
+            monotonic_s=now_s,
             autopilot=self._vehicle.state().connected,
             ages_s={loop.name: loop.age_s() for loop in self._loops},
             peers=self._link.peers(),
         )
 
 
-def _take_alone(config: RobotConfig, parts: ExitStack) -> None:
-    """Hold robot and vehicle for this process: another on this machine must not fly them too."""
-    parts.enter_context(ProcessLock(f"robot {config.robot_id} of fleet {config.fleet}"))
-    parts.enter_context(ProcessLock(f"the autopilot's port {config.autopilot.port}"))
+def _robot_lock(config: RobotConfig) -> ProcessLock:
+    """Another program on this machine must not be this robot too."""
+    return ProcessLock(f"robot {config.robot_id} of fleet {config.fleet}")
 
 
 class CheckReport(NamedTuple):
@@ -305,23 +287,21 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
 
     Raises ValueError or OSError, in one line, for what keeps the checks from running.
     """
-    policy, world = _load(config)
     with ExitStack() as parts:
-        _take_alone(config, parts)
-        structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-        vehicle = parts.enter_context(
-            MavsdkAutopilot(config.autopilot.url, system_id=config.autopilot.system_id)
-        )
+        policy, sensor_over, world = _load(config, parts)
+        parts.enter_context(_robot_lock(config))
+        log.listen(log.show_errors)
+        vehicle, setup, _ = parts.enter_context(_open_vehicle(config))
         looking = _OnlyLooking(vehicle)
         node = RobotNode(
             config,
             Ports(
                 clock=SystemClock(),
                 vehicle=looking,
-                vehicle_setup=vehicle,
+                vehicle_setup=setup,
                 watchdog=looking,
                 recorder=looking,
-                sensor_over=partial(_sensor_over, policy.policy.manifest),
+                sensor_over=sensor_over,
             ),
             policy,
             world,
@@ -329,7 +309,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             boot_epoch=0,
         )
         # Not as the robot itself: its program is not running.
-        parts.enter_context(_open_link(config, node, None))
+        node.link = parts.enter_context(_open_link(config, node, None))
         # Of its own, since the checks wait for the vehicle; it looks as often as a flight does.
         control = Loop("control", 1.0 / config.rates.control_hz, node.control_step)
         control.start()

@@ -8,8 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import structlog
-
+from edge.core import log
 from edge.core.fence import Fence
 from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement
@@ -25,8 +24,6 @@ from edge.robot.config import RobotConfig
 # Parameters may be changed by others meanwhile.
 _READ_AGAIN_S = 5.0
 _TRY_AGAIN_S = 3.0
-
-_log = structlog.get_logger(__name__)
 
 
 class Assignment(NamedTuple):
@@ -67,6 +64,8 @@ class Readiness:
         self._bundle_id = bundle_id
         self._bundle_problem = bundle_problem
         self._requirements: tuple[Requirement, ...] = ()
+        # What they were made for; all else that they follow from is configured.
+        self._ceiling_m: float | None = None
         self._parameter_problems: tuple[str, ...] | None = None
         self._parameters_due_s = self._fence_due_s = -math.inf
         self._uploaded: tuple[Origin, Fence] | None = None
@@ -80,9 +79,10 @@ class Readiness:
         """
         origin, fence = assignment.origin, assignment.robot.fence
         failsafe, flight = self._config.failsafe, self._config.flight
-        requirements = required(failsafe.rc, fence.ceiling_m, flight.command_timeout_s)
-        if requirements != self._requirements:
-            self._requirements, self._parameter_problems = requirements, None
+        if fence.ceiling_m != self._ceiling_m:
+            self._ceiling_m = fence.ceiling_m
+            self._requirements = required(failsafe.rc, fence.ceiling_m, flight.command_timeout_s)
+            self._parameter_problems = None
             self._parameters_due_s = -math.inf
         vehicle = self._vehicle.state()
         if not vehicle.connected:
@@ -129,6 +129,7 @@ class Readiness:
             vehicle=self._vehicle.state(),
             failsafe_problems=self._parameter_problems,
             fence=robot.fence,
+            reach=robot.reach,
             fence_uploaded=origin is not None and self._uploaded == (origin, robot.fence),
             origin=origin,
             position=position,
@@ -156,7 +157,7 @@ class Readiness:
             if self._config.failsafe.parameters == "set" and self._set_wrong(values):
                 values = self._setup.read_parameters(PARAMETERS)
         except OSError as error:
-            _log.warning("PX4 parameters not read or set", error=str(error))
+            log.warning("PX4 parameters not read or set", error=str(error))
             self._parameter_problems = None
             return False
         self._parameter_problems = check_parameters(self._requirements, values)
@@ -178,7 +179,7 @@ class Readiness:
             self._setup.set_parameter(requirement.name, value)
             change = f"{requirement.name} from {values[requirement.name]:g} to {value:g}"
             self.changes = (*self.changes, change)
-            _log.warning("PX4 parameter set", change=change, why=requirement.why)
+            log.warning("PX4 parameter set", change=change, why=requirement.why)
         return bool(wrong)
 
     def _upload_fence(self, origin: Origin, fence: Fence) -> None:
@@ -189,6 +190,6 @@ class Readiness:
         try:
             self._setup.upload_fence([frame.to_global_deg(*vertex) for vertex in grown_m])
         except OSError as error:
-            _log.warning("fence upload failed", error=str(error))
+            log.warning("fence upload failed", error=str(error))
             return
         self._uploaded = origin, fence

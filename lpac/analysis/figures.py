@@ -81,6 +81,8 @@ class Pictures:
         self._folder.mkdir(parents=True, exist_ok=True)
         with mpl.rc_context(_STYLE):
             figure.savefig(self._folder / f"{name}.pdf")
+            # It is laid out now: that takes as long again as drawing.
+            figure.set_layout_engine("none")
             png = io.BytesIO()
             figure.savefig(png, format="png")
         self.drawn[name] = png.getvalue()

@@ -206,8 +206,9 @@ class _LogReader:
             )
         else:
             refusal = message["answer"]["refusal"]
+            kind, operator, trial = (str(message[key]) for key in ("kind", "operator", "trial"))
             order = Ordered(
-                time_s, program[0], message["kind"], message["operator"], message["trial"],
+                time_s, program[0], kind, operator, trial,
                 refusal and _known(Refusal, refusal, "refusal"),
             )  # fmt: skip
             self._orders.append((program, order))
@@ -218,15 +219,15 @@ class _LogReader:
         elif topic == "event":
             self._events.add(_known(GroundEvent, message, "event"))
         else:
-            program = (message["robot_id"], message["boot_nonce"])
-            name = message["name"]
+            program = (int(message["robot_id"]), int(message["boot_nonce"]))
+            name = str(message["name"])
             heard_s = _time_s(message, "heard_at_unix_s") - _time_s(message, "uptime_s")
             self._take_status(program, message)
             self._logs.names[program[0]] = name
             self._heard[program].append(heard_s)
 
     def _take_status(self, program: Program, status: Mapping[str, Any]) -> None:
-        sequence = status["sequence"]
+        sequence = int(status["sequence"])
         if program in self._statuses and sequence in self._statuses[program]:
             return
         own_start_s = _time_s(status, "unix_time_s") - _time_s(status, "uptime_s")
@@ -234,6 +235,9 @@ class _LogReader:
         self._own_starts_s[program].append(own_start_s)
 
     def _said(self, status: Mapping[str, Any]) -> LoggedStatus:
+        for key in ("trial", "bundle_id", "world_id"):
+            if not isinstance(status[key], str):
+                raise TypeError(f"{key} = {status[key]!r}: must be text")
         position_m = status["position_m"]
         if position_m is not None:
             x_m, y_m, z_m = map(float, position_m)
@@ -248,10 +252,10 @@ class _LogReader:
         landing_x_m, landing_y_m = map(float, status["landing_point_m"])
         return LoggedStatus(
             time_s=_time_s(status, "uptime_s"),
-            boot_nonce=status["boot_nonce"],
+            boot_nonce=int(status["boot_nonce"]),
             state=FlightState(status["state"]),
             trial=status["trial"],
-            armed=status["armed"],
+            armed=bool(status["armed"]),
             position_m=position_m,
             alarms=tuple(_known(Reason, alarm, "alarm") for alarm in status["alarms"]),
             loops={

@@ -20,39 +20,49 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 @app.command()
 def info(path: BundlePath, as_json: AsJson = False) -> None:
     """Print what the bundle holds: geometry, perception, training, origin."""
-    from edge.policy.bundle import MANIFEST, load_bundle
+    from edge.policy.bundle import LPAC, MANIFEST, load_bundle
+    from edge.policy.lpac.manifest import LpacManifest
 
     bundle = load_bundle(path)
-    manifest, geometry = bundle.manifest, bundle.manifest.geometry
+    manifest = bundle.manifest
     if as_json:
         typer.echo(json.dumps({"id": bundle.id, **json.loads(bundle.files[MANIFEST])}, indent=2))
         return
-    images, perception, training = manifest.images, manifest.perception, manifest.training
-    sizes = " -> ".join(map(str, geometry.feature_sizes))
-    rows = [
-        ("name", manifest.name),
-        ("id", bundle.id),
-        ("network", f"L = {geometry.layers} layers ({sizes}), K = {geometry.hops} hops"),
-        (
-            "message",
-            f"{geometry.message_size} values: {4 * geometry.message_size:,} B in float32, "
-            f"{2 * geometry.message_size:,} B in float16",
-        ),
-    ]
-    if images and perception:
+    perception, training = manifest.perception, manifest.training
+    rows = [("name", manifest.name), ("id", bundle.id), ("family", manifest.family)]
+    if manifest.family == LPAC:
+        lpac = LpacManifest.of(manifest)
+        geometry, images = lpac.geometry, lpac.images
+        sizes = " -> ".join(map(str, geometry.feature_sizes))
         rows += [
-            ("images", f"{', '.join(images.channels)}: {images.size} x {images.size}"),
+            ("network", f"L = {geometry.layers} layers ({sizes}), K = {geometry.hops} hops"),
+            (
+                "message",
+                f"{geometry.message_size} values: {4 * geometry.message_size:,} B in float32, "
+                f"{2 * geometry.message_size:,} B in float16",
+            ),
+        ]
+        if images:
+            rows.append(("images", f"{', '.join(images.channels)}: {images.size} x {images.size}"))
+    else:
+        rows += [(key, json.dumps(value)) for key, value in sorted(manifest.parameters.items())]
+    if perception:
+        rows.append(
             (
                 "perception",
                 f"world {perception.world_size}, local map {perception.local_map_size}, "
                 f"sensor {perception.sensor_size}, range {perception.communication_range:g}",
-            ),
-        ]
+            )
+        )
     else:
         rows.append(("perception", "none: graph neural network and action only"))
     rows += [
-        ("training", f"{training.max_speed:g} units/s, time step {training.time_step:g} s"),
-        ("exported", f"from {manifest.provenance.checkpoint} ({manifest.provenance.exporter})"),
+        ("trained for", f"{training.max_speed:g} units/s, time step {training.time_step:g} s"),
+        *(
+            (key, value)
+            for key, value in sorted(manifest.provenance.items())
+            if "sha256" not in key
+        ),
         *((name, f"{len(bundle.files[name]):,} B") for name in manifest.files),
     ]
     for label, value in rows:
@@ -62,13 +72,13 @@ def info(path: BundlePath, as_json: AsJson = False) -> None:
 @app.command()
 def verify(path: BundlePath, as_json: AsJson = False) -> None:
     """Check every hash, then run every graph and a swarm against torch's golden outputs."""
+    from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
-    from edge.policy.verify import TOLERANCE
-    from edge.policy.verify import verify as run_checks
+    from edge.policy.family import TOLERANCE
 
     bundle = load_bundle(path)
     checks = []
-    for check in run_checks(bundle):
+    for check in load_policy(bundle).verify():
         checks.append(check)
         if not as_json:
             verdict = "ok" if check.passed else "FAILED"
@@ -95,12 +105,13 @@ def benchmark(
     as_json: AsJson = False,
 ) -> None:
     """Time the steps of a robot on this machine; fails if one takes over half of its period."""
+    from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
     from edge.robot.benchmark import MOST_OF_PERIOD
     from edge.robot.benchmark import benchmark as measure
 
     bundle = load_bundle(path)
-    result = measure(bundle, neighbours, seconds)
+    result = measure(load_policy(bundle), neighbours, seconds)
     if as_json:
         steps = {
             step.step: {**dataclasses.asdict(step), "share": step.share} for step in result.steps

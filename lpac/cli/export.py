@@ -29,13 +29,14 @@ def export(
 ) -> None:
     """Export a trained torch checkpoint as a bundle that runs without torch."""
     from edge.policy.bundle import write_bundle
+    from edge.policy.lpac.manifest import LpacManifest
     from export.exporter import export_bundle
 
     bundle = export_bundle(checkpoint, params, name)
     write_bundle(bundle, output)
 
-    manifest, geometry = bundle.manifest, bundle.manifest.geometry
-    images = manifest.images
+    manifest, lpac = bundle.manifest, LpacManifest.of(bundle.manifest)
+    geometry, images = lpac.geometry, lpac.images
     perception = (
         f"{images.size} x {images.size} images of {', '.join(images.channels)}"
         if images

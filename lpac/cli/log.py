@@ -34,11 +34,14 @@ def trials(
         times: dict[str, tuple[float, float]] = {}
         try:
             for _, time_s, status in read(path, "status"):
-                first_s, last_s = times.get(status["trial"], (time_s, time_s))
+                trial = str(status.get("trial", ""))
+                first_s, last_s = times.get(trial, (time_s, time_s))
                 # The clock may be set meanwhile.
-                times[status["trial"]] = (min(first_s, time_s), max(last_s, time_s))
-        except FlightLogError:
-            continue  # The power went before the first byte of it was on the disk.
+                times[trial] = (min(first_s, time_s), max(last_s, time_s))
+        except FlightLogError as error:
+            # Perhaps the power went before the first byte of it was on the disk.
+            typer.echo(f"lpac: {error}: left out", err=True)
+            continue
         found[str(path.relative_to(folder))] = times
     if as_json:
         typer.echo(json.dumps(found, indent=2))

@@ -15,7 +15,7 @@ def live_map(
     fleet: Fleet = DEFAULT_FLEET,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8300,
     host: Annotated[
-        str, typer.Option(help="Where to serve; beyond this machine a token is asked for.")
+        str, typer.Option(help="Where to serve; beyond this machine it asks for a token.")
     ] = "127.0.0.1",
     operate: Annotated[
         bool, typer.Option("--operate", help="Also command the fleet from the page.")
@@ -27,7 +27,7 @@ def live_map(
 ) -> None:
     """Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.
 
-    It only observes, unless --operate.
+    It only observes, unless --operate, and then asks for a token, which the address has.
     """
     import asyncio
     import re
@@ -45,7 +45,7 @@ def live_map(
         # asyncio would serve IPv6 alone, of which a field's network has no address to open.
         host = "0.0.0.0"
     local = is_loopback(host)
-    if token is None and not local:
+    if token is None and (operate or not local):
         token = secrets.token_urlsafe(16)
 
     def ready(addresses: list[str]) -> None:

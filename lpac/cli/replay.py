@@ -28,8 +28,8 @@ def replay(
 
     from edge.drivers.flight_log import read, read_metadata
     from edge.policy.bundle import BundleError, load_bundle
-    from edge.policy.lpac.graphs import Policy
-    from edge.policy.replay import replay as run_again
+    from edge.policy.lpac.policy import LpacPolicy
+    from edge.policy.lpac.replay import replay as run_again
 
     paths = list(_segments(logs))
     metadata = {path: read_metadata(path) for path in paths}
@@ -47,7 +47,7 @@ def replay(
                 f"and {bundle_path} is {policy_bundle.id[:12]}"
             )
     comparisons = run_again(
-        Policy(policy_bundle), chain.from_iterable(read(path) for path in paths)
+        LpacPolicy(policy_bundle), chain.from_iterable(read(path) for path in paths)
     )
     _, velocity, _ = comparisons
     if not velocity.ticks:

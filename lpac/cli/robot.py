@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import signal
-import sys
 import threading
 from enum import StrEnum
 from pathlib import Path
@@ -41,8 +40,6 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
     # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
-    # structlog would load it to draw tracebacks: 5 MB that no robot has a use for.
-    sys.modules["rich"] = None  # type: ignore[assignment]
     from edge.robot.config import load_config
     from edge.robot.process import run as run_robot
 
@@ -110,20 +107,17 @@ def setup(
 
     It must be the only vehicle there, and disarmed. No configuration is needed.
     """
-    import logging
-
-    import structlog
-
-    from edge.drivers.process_lock import ProcessLock
+    from edge.core import log
     from edge.drivers.px4.autopilot import MavsdkAutopilot
+    from edge.drivers.px4.driver import vehicle_lock
     from edge.flight.failsafe import required
     from edge.robot.config import AutopilotConfig
     from edge.robot.setup import set_up
 
     requirements = required(rc.value, ceiling, command_timeout)
     port = AutopilotConfig(url, system_id).port
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
-    with ProcessLock(f"the autopilot's port {port}"), MavsdkAutopilot(url) as autopilot:
+    log.listen(log.show_errors)
+    with vehicle_lock(port), MavsdkAutopilot(url) as autopilot:
         report = set_up(autopilot, autopilot, requirements, system_id, wait)
     if as_json:
         typer.echo(json.dumps(report._asdict(), indent=2))

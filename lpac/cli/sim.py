@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from lpac.sim.experiment import Scenario, SimulatedFlight
     from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.layout import FleetScenario
+    from lpac.sim.fleet.listener import Statuses
     from lpac.sim.fleet.processes import Fleet
-    from lpac.sim.operator import Statuses
 
 app = new_app()
 
@@ -50,7 +50,7 @@ class Scale(StrEnum):
     MODEL = "model"
 
 
-class Vehicle(StrEnum):
+class VehicleKind(StrEnum):
     """What the robots fly."""
 
     POINT = "point"
@@ -64,13 +64,13 @@ def sim(
     *,
     context: typer.Context,
     vehicle: Annotated[
-        Vehicle,
+        VehicleKind,
         typer.Option(
             help="point: points in simulated time; simulated: whole robots with simulated PX4s on "
             "one simulated clock; mavlink: the same as one process per robot in real time; px4: "
             "with real PX4s."
         ),
-    ] = Vehicle.POINT,
+    ] = VehicleKind.POINT,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
     controller: Annotated[Controller, typer.Option(help="Who flies.")] = Controller.LPAC,
     robots: Annotated[
@@ -103,6 +103,16 @@ def sim(
         bool,
         typer.Option(help="mavlink: positions, heights, compasses and batteries err, gusts blow."),
     ] = True,
+    sensor: Annotated[
+        str, typer.Option(help="Not point: the type of the robots' sensor.", metavar="TYPE")
+    ] = "world",
+    recorded: Annotated[
+        Path | None,
+        typer.Option(
+            help="simulated: an earlier flight's --out, whose policies' steps are taken again: the "
+            "same flight on any type of CPU."
+        ),
+    ] = None,
     px4: Annotated[
         Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
     ] = None,
@@ -124,13 +134,13 @@ def sim(
 
     _require_options_of(context, vehicle)
     count = _robot_count(robots)
-    if count is None and vehicle in (Vehicle.POINT, Vehicle.SIMULATED):
+    if count is None and vehicle in (VehicleKind.POINT, VehicleKind.SIMULATED):
         raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
     world_features = parse_world(_text(world), str(world)) if world else None
-    if vehicle is not Vehicle.POINT:
+    if vehicle is not VehicleKind.POINT:
         from lpac.sim.fleet.layout import FleetScenario
 
-        flown: Literal["mavlink", "px4"] = "px4" if vehicle is Vehicle.PX4 else "mavlink"
+        flown: Literal["mavlink", "px4"] = "px4" if vehicle is VehicleKind.PX4 else "mavlink"
         if flown == "px4" and px4 is None:
             raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
         fleet_scenario = FleetScenario(
@@ -140,10 +150,11 @@ def sim(
             features=world_features,
             random_feature_count=features,
             errors=errors,
+            sensor=sensor,
         )
 
-        if vehicle is Vehicle.SIMULATED:
-            _fly_on_clock(fleet_scenario, bundle, as_json, out)
+        if vehicle is VehicleKind.SIMULATED:
+            _fly_on_clock(fleet_scenario, bundle, as_json, out, recorded)
             return
 
         def prepared() -> int | None:
@@ -193,18 +204,20 @@ def sim(
 
 
 _ONLY_FOR = {
-    "controller": (Vehicle.POINT,),
-    "scale": (Vehicle.POINT,),
-    "loss": (Vehicle.POINT,),
-    "delay": (Vehicle.POINT,),
-    "max_message_age": (Vehicle.POINT,),
-    "errors": (Vehicle.SIMULATED, Vehicle.MAVLINK),
-    "px4": (Vehicle.PX4,),
-    "script": (Vehicle.MAVLINK, Vehicle.PX4),
+    "controller": (VehicleKind.POINT,),
+    "scale": (VehicleKind.POINT,),
+    "loss": (VehicleKind.POINT,),
+    "delay": (VehicleKind.POINT,),
+    "max_message_age": (VehicleKind.POINT,),
+    "errors": (VehicleKind.SIMULATED, VehicleKind.MAVLINK),
+    "sensor": (VehicleKind.SIMULATED, VehicleKind.MAVLINK, VehicleKind.PX4),
+    "recorded": (VehicleKind.SIMULATED,),
+    "px4": (VehicleKind.PX4,),
+    "script": (VehicleKind.MAVLINK, VehicleKind.PX4),
 }
 
 
-def _require_options_of(context: typer.Context, vehicle: Vehicle) -> None:
+def _require_options_of(context: typer.Context, vehicle: VehicleKind) -> None:
     """An option that would do nothing is a mistake."""
     for name, vehicles in _ONLY_FOR.items():
         source = context.get_parameter_source(name)
@@ -272,22 +285,27 @@ def _launch(
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
         fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
         fleet.carried = prepared()
-        flight = fly(fleet, say, lambda step: show(step, fleet.operator.statuses()))
+        flight = fly(fleet, say, lambda step: show(step, fleet.heard.statuses()))
     _show_fleet_flight(flight, as_json, out)
 
 
-def _fly_on_clock(scenario: "FleetScenario", bundle: Path, as_json: bool, out: Path | None) -> None:
+def _fly_on_clock(
+    scenario: "FleetScenario",
+    bundle: Path,
+    as_json: bool,
+    out: Path | None,
+    recorded: Path | None,
+) -> None:
     """Fly whole robots on one simulated clock; exit code 1 unless it ended as it should."""
-    import logging
-
-    import structlog
-
+    from edge.core import log
     from lpac.sim.fleet.clocked import fly_simulated
 
     # What ten robots say to their own logs is nothing for a person.
-    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+    log.listen(log.show_errors)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (_, say):
-        flight = fly_simulated(scenario, out or Path(nowhere), bundle, say)
+        flight = fly_simulated(
+            scenario, out or Path(nowhere), bundle, say, logs=out is not None, recorded=recorded
+        )
     _show_fleet_flight(flight, as_json, out)
 
 
@@ -327,10 +345,10 @@ def _serve(
             fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say)
             fleet.carried = prepared()
             with fleet:
-                while not fleet.operator.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
+                while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
                     fleet.require_running()
                     fleet.vehicles.require_running()
-                    show("programs start", fleet.operator.statuses())
+                    show("programs start", fleet.heard.statuses())
                 fleet.begin()
                 typer.echo(
                     f"{len(fleet.robots)} robots run until Ctrl-C; in a second terminal:\n\n"
@@ -368,7 +386,7 @@ def _watch_over(
         for robot in [robot for robot in running if not robot.running]:
             running.remove(robot)
             say(f"the program of {robot.name} has ended, {robot.ending()}")
-        show(f"fleet {fleet.name}", fleet.operator.statuses())
+        show(f"fleet {fleet.name}", fleet.heard.statuses())
         fleet.forget()
         time.sleep(0.2)
     raise SimulatedFleetError("the programs of all robots have ended")

@@ -41,6 +41,8 @@ from lpac.ground.station.subscriber import addressed
 
 _S = FlightState
 
+# Where checks are still to come, or to settle.
+_BEFORE_READY = (_S.INIT, _S.IDLE, _S.PREFLIGHT)
 _START_AGAIN_S = 3.0
 # So long a start may take: nothing else of the script may be due meanwhile.
 _START_TAKES_S = 7.0
@@ -384,7 +386,7 @@ class ScriptRun:
         report = yield SafetyCommand("hold", self._script.robots)
         told = "the fleet is told to hold"
         if not report.done:
-            told += f", but {_failures(report)}"
+            told += f", but {failures(report)}"
         return f"{told}: next `lpac mission land`, `lpac mission return`, or `lpac mission resume`"
 
     # Steps
@@ -462,8 +464,15 @@ class ScriptRun:
         ):
             # The last trial's end, which keeps robots from flying again.
             yield from self._require(Resume(self._script.robots))
-        yield from self._require(Enable(True, self._script.robots))
         began_s = self._ground.now_s
+        report = yield Enable(True, self._script.robots)
+        snapshot = yield from fresh_snapshot(self._ground)
+        statuses = self._statuses(snapshot)
+        late = {r.robot for r in report.results if not r.done}
+        if report.problem or not all(
+            n in statuses and statuses[n].state in _BEFORE_READY for n in late
+        ):
+            raise ScriptError(failures(report))
 
         def ready(snapshot: FleetSnapshot) -> bool:
             missing = self._not_ready(snapshot)
@@ -473,7 +482,8 @@ class ScriptRun:
                     self._say_once(what, text)
             return not missing
 
-        if not (yield Until(ready, step.at_most_s)):
+        left_s = began_s + step.at_most_s - self._ground.now_s
+        if not (yield Until(ready, max(0.0, left_s))):
             missing = self._not_ready(self._ground.snapshot)
             raise ScriptError(
                 f"not ready after {step.at_most_s:g} s: {'; '.join(missing.values())}"
@@ -508,7 +518,7 @@ class ScriptRun:
         report = yield request
         if not report.done:
             # Held, those that land already would stay in the air.
-            raise ScriptError(_failures(report), hold=False)
+            raise ScriptError(failures(report), hold=False)
 
     # The mission
 
@@ -552,7 +562,7 @@ class ScriptRun:
         self._last_start_s[name] = self._ground.now_s
         report = yield Start((name,))
         if not report.done:
-            text = f"{name} is not started again: {_failures(report)}"
+            text = f"{name} is not started again: {failures(report)}"
             codes = (report.problem and report.problem.code, *map(_codes, report.results))
             self._say_once((name, "not started", codes), text)
 
@@ -605,7 +615,7 @@ class ScriptRun:
             # On the ground a safety command may be left from the last landing.
             if not all(map(is_down, self._statuses(snapshot).values())):
                 self._look_for_others(snapshot)
-            raise ScriptError(_failures(report))
+            raise ScriptError(failures(report))
 
     def _say_once(self, what: Hashable, text: str) -> None:
         """Say a text unless the same was said in other words, such as other numbers."""
@@ -653,14 +663,14 @@ def take_site(
 
 def _require(report: CommandReport) -> None:
     if not report.done:
-        raise ScriptError(_failures(report))
+        raise ScriptError(failures(report))
 
 
 def _codes(result: RobotResult) -> tuple[str | None, ...]:
     return result.code, result.refusal
 
 
-def _failures(report: CommandReport) -> str:
+def failures(report: CommandReport) -> str:
     if report.problem is not None:
         return report.problem.text
     return "; ".join(f"{r.robot}: {r.text}" for r in report.results if not r.done)

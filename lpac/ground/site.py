@@ -33,7 +33,7 @@ FAR_M = 500.0
 MAX_PAD_DISTANCE_M = 3.0
 CLEARLY_FURTHER_M = 1.0
 # `off` leaves a fence of this side around the mission's origin.
-WIDE_FENCE_M = 500.0
+WIDE_FENCE_M = 200.0
 
 _USED = "used"
 

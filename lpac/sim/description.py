@@ -1,31 +1,34 @@
 """What the fleet.toml of a simulated fleet says of all its robots: the field, and how they fly."""
 
+import math
+from dataclasses import asdict
 from typing import Any
 
 from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget
+from edge.flight.reach import Reach
 from lpac.sim.experiment import FIELD_SCALE
 
 ERRORS = ErrorBudget()
+REACH = Reach()
 _BASE_HEIGHT_M = 5.0
-_SLOT_SPACING_M = ERRORS.slot_spacing.least_m
 # Robots stop half a metre outside the field, with the fence 1.5 m further out.
 _FENCE_BEYOND_FIELD_M = 2.0
 _FENCE_BUFFER_M = 1.5
 
 
-def fence_around(field_m: float, robots: int) -> Fence:
+def fence_around(field_m: float, robots: int, errors: ErrorBudget = ERRORS) -> Fence:
     """Around a field that is a square of that side, and above the heights of so many robots."""
     low_m, high_m = -_FENCE_BEYOND_FIELD_M, field_m + _FENCE_BEYOND_FIELD_M
     return Fence(
         vertices_m=((low_m, low_m), (high_m, low_m), (high_m, high_m), (low_m, high_m)),
         buffer_m=_FENCE_BUFFER_M,
         floor_m=_BASE_HEIGHT_M / 2.0,
-        ceiling_m=_BASE_HEIGHT_M + robots * _SLOT_SPACING_M + 2.0,
+        ceiling_m=_BASE_HEIGHT_M + robots * errors.slot_spacing.least_m + 2.0,
     )
 
 
-def robot_table(fence: Fence, max_speed_m_s: float) -> dict[str, Any]:
+def robot_table(fence: Fence, max_speed_m_s: float, errors: ErrorBudget = ERRORS) -> dict[str, Any]:
     """[robot] of fleet.toml: what all robots' robot.toml have alike."""
     return {
         "on_stop": "land",
@@ -33,12 +36,20 @@ def robot_table(fence: Fence, max_speed_m_s: float) -> dict[str, Any]:
             "env_scale": FIELD_SCALE.env_scale,
             "velocity_scale": FIELD_SCALE.velocity_scale,
         },
-        "flight": {"base_height_m": _BASE_HEIGHT_M, "slot_spacing_m": _SLOT_SPACING_M},
+        "flight": {
+            "base_height_m": _BASE_HEIGHT_M,
+            "slot_spacing_m": errors.slot_spacing.least_m,
+        },
         "fence": {
             "vertices_m": [list(vertex) for vertex in fence.vertices_m],
             "buffer_m": fence.buffer_m,
             "floor_m": fence.floor_m,
             "ceiling_m": fence.ceiling_m,
+        },
+        # Fields may be larger than that, and fleets fly higher.
+        "reach": {
+            "distance_m": max(REACH.distance_m, math.ceil(math.dist(*fence.vertices_m[::2]))),
+            "ceiling_m": max(REACH.ceiling_m, fence.ceiling_m),
         },
         "limits": {
             "max_speed_m_s": max_speed_m_s,
@@ -47,4 +58,5 @@ def robot_table(fence: Fence, max_speed_m_s: float) -> dict[str, Any]:
             "lag_s": 1.3,
         },
         "failsafe": {"rc": "none", "parameters": "set"},
+        "errors": asdict(errors),
     }

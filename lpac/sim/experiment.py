@@ -13,8 +13,8 @@ from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
 from edge.core.wire import MAX_ROBOT_ID
 from edge.core.world import Feature, random_features, rasterize
+from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle, BundleError
-from edge.policy.lpac.graphs import Policy
 from edge.robot.pac import PacParameters
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
 from lpac.sim.medium import Medium
@@ -150,7 +150,7 @@ def fly(
     swarm: Swarm | BaselineSwarm
     if scenario.controller == "lpac":
         swarm = Swarm(
-            policy=Policy(bundle),
+            policy=load_policy(bundle),
             importance=importance,
             positions_m=starts_m,
             parameters=PacParameters(

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from edge.messages.topics import Topic
 from lpac.sim.schedule import Schedule
 
 Subscriptions = Mapping[Topic, Callable[[str, bytes], None]]
+# The first ground; further ones are -2, -3, ...
 GROUND = -1
 
 
@@ -20,9 +22,10 @@ class Air:
 
     From one sender to one receiver a message is lost with probability `loss`, arrives twice with
     `duplication`, and travels `delay_s` on average, anything from half to one and a half of it, so
-    that later ones overtake it. Robots further apart than `range_m` do not hear each other; the
-    ground hears everybody. Who is in different groups of `partition` (robot ids, `GROUND` for the
-    ground) hears nothing of each other; who is in none hears everybody.
+    that later ones overtake it. Robots further apart than `range_m` do not hear each other; a
+    ground hears everybody. Who is in different groups of `partition` (robot ids, and grounds')
+    hears nothing of each other; who is in none hears everybody. Nobody hears the `silent`, and the
+    `deaf` hear nobody.
 
     Raises ValueError that names an impossible value.
     """
@@ -32,6 +35,8 @@ class Air:
     delay_s: float = 0.01
     range_m: float = math.inf
     partition: tuple[frozenset[int], ...] = ()
+    silent: frozenset[int] = frozenset()
+    deaf: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
         for name in ("loss", "duplication"):
@@ -42,10 +47,12 @@ class Air:
         if not self.range_m > 0.0:
             raise ValueError(f"range_m = {self.range_m}: must be above 0")
 
-    def parts(self, one: int, other: int) -> bool:
-        """Whether a partition keeps these two apart."""
-        of_one = [group for group in self.partition if one in group]
-        of_other = [group for group in self.partition if other in group]
+    def keeps_apart(self, sender: int, receiver: int) -> bool:
+        """Whether nothing of the one reaches the other, whatever their distance."""
+        if sender in self.silent or receiver in self.deaf:
+            return True
+        of_one = [group for group in self.partition if sender in group]
+        of_other = [group for group in self.partition if receiver in group]
         return bool(of_one and of_other and of_one != of_other)
 
 
@@ -65,57 +72,82 @@ class Radio:
         self.lost = 0
         self._schedule = schedule
         self._positions_m = positions_m
-        self._rng = rng
-        self._stations: dict[int, Subscriptions] = {}
+        self.rng = rng
+        self._links: list[RadioLink] = []
 
     def link(self, station: int, subscriptions: Subscriptions) -> "RadioLink":
-        """A robot's link, by its id, or the ground's, `GROUND`; one there was before is gone."""
-        self._stations[station] = subscriptions
-        return RadioLink(self, station)
+        """A program's link, as robot `station`, or as a ground, which is below 0."""
+        link = RadioLink(self, station, subscriptions)
+        self._links.append(link)
+        return link
 
-    def stations(self) -> frozenset[int]:
-        """Who is there."""
-        return frozenset(self._stations)
+    def leave(self, link: "RadioLink") -> None:
+        """That one is gone."""
+        self._links.remove(link)
 
-    def send(self, sender: int, topic: Topic, data: bytes) -> None:
+    def others(self, link: "RadioLink") -> frozenset[int]:
+        """What all other links say that they are."""
+        return frozenset(other.station for other in self._links if other is not link)
+
+    def send(self, sender: "RadioLink", topic: Topic, data: bytes) -> None:
         """To everybody else who listens to the topic."""
-        key = f"ground/{topic.name}" if topic.sender == "ground" else f"robot/{sender}/{topic.name}"
+        own = sender.station
+        key = f"ground/{topic.name}" if topic.sender == "ground" else f"robot/{own}/{topic.name}"
         self.sent_bytes += len(data)
-        for receiver, subscriptions in self._stations.items():
-            callback = subscriptions.get(topic)
-            if callback is None or receiver == sender or len(data) > topic.limit_bytes:
+        for receiver in self._links:
+            if receiver is sender or not receiver.listens(topic) or len(data) > topic.limit_bytes:
                 continue
             # All are drawn for each receiver: one chance alone does not change those after it.
-            lost, twice, *travels = self._rng.random(4).tolist()
-            if self._apart(sender, receiver):
+            lost, twice, *travels = self.rng.random(4).tolist()
+            if self._apart(own, receiver.station):
                 continue
             if lost < self.air.loss:
                 self.lost += 1
                 continue
             for travel in travels[: 2 if twice < self.air.duplication else 1]:
                 at_s = self._schedule.monotonic_s() + self.air.delay_s * (0.5 + travel)
-                self._schedule.at(at_s, lambda hear=callback: hear(key, data))  # type: ignore[misc]
+                self._schedule.at(at_s, partial(receiver.hear, topic, key, data))
 
     def _apart(self, sender: int, receiver: int) -> bool:
-        if self.air.parts(sender, receiver):
+        if self.air.keeps_apart(sender, receiver):
             return True
-        if GROUND in (sender, receiver) or self.air.range_m == math.inf:
+        if min(sender, receiver) < 0 or self.air.range_m == math.inf:
             return False
         offset_m = self._positions_m()[sender] - self._positions_m()[receiver]
         return math.hypot(*offset_m) > self.air.range_m
 
 
 class RadioLink:
-    """One station's link: a `Link`."""
+    """One program's link: a `Link`."""
 
-    def __init__(self, radio: Radio, station: int) -> None:
+    def __init__(self, radio: Radio, station: int, subscriptions: Subscriptions) -> None:
+        self.station = station
         self._radio = radio
-        self._station = station
+        self._subscriptions: Subscriptions = dict(subscriptions)
 
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send to whoever listens; it may be lost."""
-        self._radio.send(self._station, topic, data)
+        self._radio.send(self, topic, data)
+
+    def peers(self) -> int:
+        """How many other stations there are, in range or not."""
+        return len(self._radio.others(self))
 
     def is_claimed(self, robot_id: int) -> bool:
-        """Whether another station says that it is that robot: none does."""
-        return robot_id != self._station and robot_id in self._radio.stations()
+        """Whether another program says that it is that robot."""
+        return robot_id in self._radio.others(self)
+
+    def listens(self, topic: Topic) -> bool:
+        """Whether it wants to hear that."""
+        return topic in self._subscriptions
+
+    def hear(self, topic: Topic, key: str, data: bytes) -> None:
+        """Something has come, unless the program ended while it was on its way."""
+        callback = self._subscriptions.get(topic)
+        if callback is not None:
+            callback(key, data)
+
+    def close(self) -> None:
+        """The program has ended."""
+        self._subscriptions = {}
+        self._radio.leave(self)

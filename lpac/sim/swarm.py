@@ -11,7 +11,7 @@ import numpy as np
 from edge.core import F32, F64
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import BundleError
-from edge.policy.lpac.graphs import Policy
+from edge.policy.family import Policy
 from edge.robot.pac import Pac, PacParameters
 from lpac.sim.medium import Medium
 from lpac.sim.vehicles import PointVehicles, VehicleOdometry

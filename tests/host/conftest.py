@@ -1,5 +1,6 @@
 """The robot's image, which hosts are made of."""
 
+import fcntl
 import functools
 import os
 import platform
@@ -26,8 +27,13 @@ def build_image() -> BuildImage:
 
     @functools.cache
     def build(architecture: str) -> Path:
-        subprocess.run([ROOT / "deploy" / "docker" / "image.sh", architecture], check=True)
-        return ROOT / "out" / "image" / architecture / "root"
+        folder = ROOT / "out" / "image"
+        folder.mkdir(parents=True, exist_ok=True)
+        # Test runs beside each other want the same image.
+        with (folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            subprocess.run([ROOT / "deploy" / "docker" / "image.sh", architecture], check=True)
+        return folder / architecture / "root"
 
     return build
 

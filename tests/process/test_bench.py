@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
-from bench import command, footprint
+from bench import command, footprint, loops, simulated
 from tests.unit.test_bench import check_frame, kept
 
 pytestmark = pytest.mark.alone
@@ -24,3 +24,18 @@ def test_command(tmp_path: Path) -> None:
     check_frame(result, "command", targets=1)
     figures = result["figures"]
     assert 0.0 < figures["python -c pass"]["median"] < figures["lpac --help"]["median"]
+
+
+def test_loops(tmp_path: Path) -> None:
+    result = kept(loops.measure(robots=1, mission_s=6.0, beside_busy=False), tmp_path)
+    check_frame(result, "loops", targets=4)
+    (taken,) = result["figures"]["taken"]
+    assert set(loops.LOOPS) | {"preflight", "status", "log", "rx"} <= taken["cpu_percent"].keys()
+    assert taken["threads"] > 8 and 10.0 < taken["private_mb"] < taken["resident_mb"]
+
+
+def test_simulated(tmp_path: Path) -> None:
+    result = kept(simulated.measure(robots=1, mission_s=1.0, runs=1), tmp_path)
+    check_frame(result, "simulated", targets=1)
+    (flight,) = result["figures"]["1"]
+    assert flight["simulated_s"] > 10.0 and flight["cpu_s"] > 0.0

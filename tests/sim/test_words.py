@@ -27,19 +27,21 @@ from lpac.ground.station.protocol import (
     RobotResult,
     SafetyCommand,
     SetFence,
+    SetOrigin,
     SetPlaces,
     SetWorld,
     Start,
     Takeoff,
 )
 from lpac.ground.station.station import Station
+from lpac.sim.fleet.layout import ORIGIN
 from tests.conftest import ROOT
-from tests.pretend import FENCE
-from tests.sim.ground.test_station import OTHER_WORLD, Field, a_field
+from tests.sim.ground.field import Field, a_field
+from tests.sim.ground.test_station import OTHER_WORLD
 from tests.unit.fleet.test_doctor import well
 from tests.unit.flight.test_flight import World
 from tests.unit.flight.test_preflight import INPUTS, LIMITS, POSITIONS, READY, VEHICLE, VEHICLES
-from tests.unit.ground.snapshots import robot, setup, snapshot, status
+from tests.unit.ground.snapshots import FENCE, robot, setup, snapshot, status
 
 
 @pytest.fixture
@@ -163,32 +165,37 @@ def test_the_ground_alarms_the_same(wordless: Wordless) -> None:
 
 def commanded() -> list[object]:
     """A day on the ground, in codes: what came of each command, and what was told."""
-    field = a_field()
+    field = a_field(2)
+    # Whatever words the robots had before, they have said it anew.
+    field.run(1.0)
+    began = len(field.events)
     requests: tuple[Request, ...] = (
         Takeoff(), Start(), Enable(), SetFence(None), Takeoff(interval_s=0.0),
         SetWorld(OTHER_WORLD, "w"), SetPlaces({}), Start(), Start(), SafetyCommand("hold"),
         Start(), Resume(), NextTrial(), RobotCommand("pilot", ("r1",)),
-        RobotCommand("rejoin", ("r1",)), RobotCommand("kill", ("r2",)), Resume(),
+        RobotCommand("rejoin", ("r1",)), RobotCommand("kill", ("r1",)), Resume(),
         SafetyCommand("return", wait=True), SafetyCommand("land", wait=True), NextTrial(),
         SetWorld(OTHER_WORLD, "w"), SetFence(OTHER_FENCE),
     )  # fmt: skip
     told: list[object] = []
     ask(field, told, Takeoff())
-    field.make_ready()
-    field.robots[0].refuses = "the battery is low"
-    field.run(1.0)
+    ask(field, told, SetOrigin(ORIGIN))
+    ask(field, told, Enable())
+    charge = field.robots[0].vehicle.battery_remaining
+    field.robots[0].tire()
+    field.run(6.0)
     for request in requests:
         ask(field, told, request)
-        field.robots[0].refuses = ""
+        field.robots[0].vehicle.battery_remaining = charge
     unusable = FailedCheck(CheckCode.WORLD_UNUSABLE, "the ground's world cannot be used")
     station = field.stations["alice"]
-    last = field.robots[0].status(field.now_s)
+    last = field.robots[0].said
     for i, not_taken in enumerate(((), (unusable,))):
         lacking = replace(last, world_id="old", not_taken=not_taken, sequence=last.sequence + 1 + i)
         station.hear_status(lacking)
         told.append(station.published_world())
     assert told[-2:] == [OTHER_WORLD, None]
-    events = [(e.kind, e.robot, e.operator, e.trial, e.state) for e in field.events]
+    events = [(e.kind, e.robot, e.operator, e.trial, e.state) for e in field.events[began:]]
     return [*told, *events, [robot.state for robot in field.robots]]
 
 

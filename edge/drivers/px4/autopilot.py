@@ -9,13 +9,11 @@ import json
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from functools import cache
 from threading import Condition, Lock, Thread
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
-import structlog
 from mavsdk.component_type import ComponentType
 from mavsdk.connection_result import ConnectionResult
 from mavsdk.exceptions import MavsdkError
@@ -26,10 +24,9 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 from mavsdk.plugins.param import Param
 from mavsdk.system import System
 
+from edge.core import log
 from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
 from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
-
-_log = structlog.get_logger(__name__)
 
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
 
@@ -187,12 +184,11 @@ class MavsdkAutopilot:
         """See `Autopilot.state`. `other_system_ids` has the own one if two vehicles share it."""
         now_s = time.monotonic()
         link = self._link
-        state = self._telemetry.state(now_s)
         others = self._others
         if link is not None and self._telemetry.has_twin(now_s):
             others = (*others, link.system_id)
-        return replace(
-            state,
+        return self._telemetry.state(
+            now_s,
             system_id=None if link is None else link.system_id,
             other_system_ids=others,
             result=self._result,
@@ -340,7 +336,7 @@ class MavsdkAutopilot:
         """Count a failure, and log the first of its kind: there may be many a second."""
         self._failures[what] += 1
         if self._failures[what] == 1:
-            _log.warning("autopilot link", failure=what, detail=detail)
+            log.warning("autopilot link", failure=what, detail=detail)
 
     # MAVSDK's thread
 
@@ -403,7 +399,7 @@ class MavsdkAutopilot:
 
     def _finish(self, action: Action, refusal: str) -> None:
         self._result = ActionResult(action, not refusal, refusal, time.monotonic())
-        _log.info("command", action=action.value, accepted=not refusal, refusal=refusal)
+        log.info("command", action=action.value, accepted=not refusal, refusal=refusal)
 
     def _carry_out(self, action: Action, asked_at_s: float) -> None:
         refusal = "internal error"
@@ -509,7 +505,7 @@ class MavsdkAutopilot:
         direct.subscribe_message("COMMAND_ACK", self._hears("COMMAND_ACK", self._on_command_ack))
         direct.subscribe_message("PARAM_VALUE", self._hears("PARAM_VALUE", self._on_param_value))
         self._link = _Link(system, system_id, direct)
-        _log.info("autopilot found", system_id=system_id)
+        log.info("autopilot found", system_id=system_id)
 
     def _ask_for_streams(self) -> None:
         for message_id, rate_hz in RATES_HZ.items():
@@ -527,7 +523,6 @@ def _take_over_log() -> None:
 
 def _log_mavsdk(level: LogLevel, text: str, _file: str | None, _line: int) -> bool:
     """Into our log, and not to the terminal."""
-    _log.debug("mavsdk", level=level.name, text=text)
     return True
 
 

@@ -18,8 +18,8 @@ from edge.drivers.px4.raw_mavlink import Heartbeat, heartbeat, land_command
 _COMPONENT = 197  # as the watchdog
 # PX4 sends heartbeats at 1 Hz.
 _FRESH_S = 2.5
-# Whoever else has the socket takes some of them; after so many it is another flight.
-_GAP_S = 10.0
+# A program whose control loop alone hangs takes two of three; after so long it is another flight.
+_GAP_S = 30.0
 _AGAIN_S = 1.0
 _LOOK_S = 0.2
 _HOVER_LAND_S = 60.0  # where the configuration says nothing: its own default

@@ -81,6 +81,8 @@ class Px4Telemetry:
     def __init__(self) -> None:
         self._lock = Lock()
         self._state = VehicleState()
+        # What was made last: of which state, with which other fields.
+        self._told: tuple[VehicleState, dict[str, Any], VehicleState] | None = None
         self._clock = _VehicleClock()
         self._twin = _TwinWatch()
         self._sys_status_at_s = -math.inf
@@ -119,27 +121,27 @@ class Px4Telemetry:
         with self._lock:
             self._handlers[name](fields, now_s)
 
-    def state(self, now_s: float) -> VehicleState:
-        """All fields but those of the link: system ids and command results are not known here."""
+    def state(self, now_s: float, **of_link: Any) -> VehicleState:
+        """The newest of everything; `of_link` are the fields that are not known here.
+
+        Those are the system ids and what came of commands. As long as nothing changes, it is the
+        same object.
+        """
         with self._lock:
             state = self._state
+            fields = of_link | {"connected": now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S}
+            armable = state.armable
             if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
-                state = replace(
-                    state, armable=None, battery=None, voltage_v=None, remote_control=None
-                )
-            problems: tuple[AutopilotReason, ...] = ()
-            warnings: tuple[AutopilotReason, ...] = ()
+                armable = None
+                fields |= dict.fromkeys(("armable", "battery", "voltage_v", "remote_control"))
             if state.armed:
                 told = self._events.told(self._told_since_s(now_s))
-                warnings = without_repetition((*told, *self._events.wrong(state.mode)))
-            elif not state.armable:
-                problems = self._why_not_armed(now_s - _TOLD_FOR_S)
-            return replace(
-                state,
-                connected=now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S,
-                problems=problems,
-                warnings=warnings,
-            )
+                fields["warnings"] = without_repetition((*told, *self._events.wrong(state.mode)))
+            elif not armable:
+                fields["problems"] = self._why_not_armed(now_s - _TOLD_FOR_S)
+            if self._told is None or self._told[0] is not state or self._told[1] != fields:
+                self._told = state, fields, replace(state, **fields)
+            return self._told[2]
 
     def needs_origin(self) -> bool:
         """Whether the position jumped, and an origin that is as new has not come yet."""

@@ -41,7 +41,7 @@ class WatchdogError(OSError):
     """The watchdog cannot be started; the text says why."""
 
 
-class Watchdog:
+class WatchdogProcess:
     """Starts and feeds the watchdog, as a context. `feed` belongs to the control thread.
 
     The vehicle holds `timeout_s` after the last `feed(flying=True)` that none followed, and lands
@@ -57,7 +57,7 @@ class Watchdog:
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe = -1
 
-    def __enter__(self) -> "Watchdog":
+    def __enter__(self) -> "WatchdogProcess":
         """Raises WatchdogError if this process does not have the port open."""
         udp = _socket_on(self._port)
         reader, self._pipe = os.pipe()

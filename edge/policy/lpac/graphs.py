@@ -6,21 +6,24 @@ import numpy as np
 
 from edge.core import F32
 from edge.core.aggregation import HopBuffer
-from edge.policy.bundle import ACTION, CNN, Bundle, BundleError, Manifest, gnn_graph
+from edge.policy.bundle import Bundle, BundleError
+from edge.policy.lpac.manifest import ACTION, CNN, LpacManifest, gnn_graph
 
 # onnxruntime writes a telemetry database into the home directory unless told so before its import.
 os.environ["ORT_DISABLE_TELEMETRY"] = "1"
 import onnxruntime as ort
 
 
-class Policy:
+class Graphs:
     """Runs a bundle's graphs. Has no state of its own: several threads may call it at once."""
 
     def __init__(self, bundle: Bundle) -> None:
         """Load the graphs of `bundle`; raises BundleError for a graph that does not fit it."""
-        self.manifest: Manifest = bundle.manifest
+        self.manifest = bundle.manifest
         self.bundle_id = bytes.fromhex(bundle.id)
-        geometry, images = bundle.manifest.geometry, bundle.manifest.images
+        self.lpac = LpacManifest.of(bundle.manifest)
+        self.geometry, images = self.lpac.geometry, self.lpac.images
+        geometry = self.geometry
         sizes, hops = geometry.feature_sizes, geometry.hops
         self._cnn = None
         if images:
@@ -78,6 +81,8 @@ class _Graph:
         # One robot shares its board with the autopilot: no thread pool, nothing that spins.
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
+        # It would keep what the largest batch ever took, that of the verification: 4.5 MB for ever.
+        options.enable_cpu_mem_arena = False
         try:
             self._session = ort.InferenceSession(
                 bundle.files[name], options, providers=["CPUExecutionProvider"]
@@ -86,6 +91,8 @@ class _Graph:
             raise BundleError(
                 f"{name}: is not a graph that onnxruntime can load: {error}"
             ) from None
+        # It keeps the file, to load it once more on another device: four megabytes of a policy.
+        self._session._model_bytes = None
         found = {
             kind: {value.name: tuple(value.shape[1:]) for value in values}
             for kind, values in (

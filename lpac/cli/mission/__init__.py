@@ -132,7 +132,7 @@ def fence_on(fleet: Fleet = DEFAULT_FLEET, robots: WaitFor = None, as_json: AsJs
 def fence_off(
     yes: Yes = False, fleet: Fleet = DEFAULT_FLEET, robots: WaitFor = None, as_json: AsJson = False
 ) -> None:
-    """A square of 500 m around the origin only: nothing keeps the robots near. Asks first."""
+    """A square of 200 m around the origin only: nothing keeps the robots near. Asks first."""
     from lpac.ground.site import WIDE_FENCE_M, wide_fence
     from lpac.ground.station.protocol import SetFence
 

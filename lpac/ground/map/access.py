@@ -2,7 +2,8 @@
 
 Any page that the operator's browser shows can send requests to this machine. So what comes must
 name this very server (a name of somebody else's that leads here, DNS rebinding, does not), and must
-come from its own page. On the network, a token is asked for besides.
+come from its own page. Where the page commands, and on the network, a token is asked for besides:
+other users and programs of this machine are not the operator.
 """
 
 import fcntl

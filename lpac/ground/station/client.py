@@ -43,14 +43,18 @@ def socket_path(fleet: str) -> Path:
 
 
 def command(
-    fleet: str, request: Request, on_progress: Callable[[CommandProgress], None] = lambda _: None
+    fleet: str,
+    request: Request,
+    on_progress: Callable[[CommandProgress], None] = lambda _: None,
+    meanwhile: Callable[[], None] = lambda: None,
 ) -> CommandReport:
-    """Have a command done, and wait for what came of it.
+    """Have a command done, and wait for what came of it; `meanwhile` is called once a second.
 
     Whoever leaves before, as by Ctrl-C, abandons what is not ordered yet. Raises GroundError.
     """
     with _connected(fleet, to_line(request)) as answers:
         for told in answers:
+            meanwhile()
             if isinstance(told, CommandReport):
                 return told
             if isinstance(told, CommandProgress) and told.text:

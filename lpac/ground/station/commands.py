@@ -38,7 +38,7 @@ _GATHER_S = 3.0
 # Until a robot has obeyed; then, until what it was told shows.
 _OBEY_S = 10.0
 _TAKE_UP_S = 3.0
-_OBEY_S = 1.5
+_ACT_S = 1.5
 # A world is long, and computed with.
 _WORLD_S = 30.0
 # From idle, or after a landing, until all checks have been run.
@@ -372,7 +372,7 @@ class CommandTask:
         else:
             sequence = station.safety_action(request.action, self._those)
         if not request.wait:
-            yield from self._take_up(sequence, _obeying_words(request.action), _OBEY_S)
+            yield from self._take_up(sequence, _obeying_words(request.action), _ACT_S)
             return
         yield from self._obeyed(sequence)
         known: dict[str, tuple[FlightState, Reason]] = {}
@@ -596,7 +596,8 @@ class CommandTask:
                 if status.state is _S.MISSION and status.trial == trial:
                     self._settle(name, f"flies the mission, trial {trial}")
                 elif now_s > until_s or status.state not in (_S.HOLD, _S.TAKEOFF):
-                    if name in refusals:
+                    # Who has left hold since then is where it is for another reason.
+                    if name in refusals and status.state is _S.HOLD:
                         self._refuse(name, refusals[name])
                     else:
                         rule = "" if status.state is _S.HOLD else "start is from hold: "

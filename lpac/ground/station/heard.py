@@ -11,8 +11,8 @@ from typing import NamedTuple
 from edge.messages.mission import FlightState, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 
-# Two statuses of one program are at most so far apart, unless it has ended.
-_STATUS_GAP_S = 0.6
+# Two statuses of one program, of which one is lost, are at most so far apart, unless it has ended.
+_STATUS_GAP_S = 1.2
 _RATE_WINDOW_S = 3.0
 
 # Of a robot's name and a text, when it comes, falls silent, or starts again.

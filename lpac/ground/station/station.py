@@ -44,8 +44,9 @@ _OVERTAKEN_S = 1.0
 # Who restarts knows of its robots only when it has heard them for a while.
 _GATHER_S = 3.0
 # Robots that heard this station's name a moment ago have heard another one of that name, unless it
-# was an observer's hold: that ends before this time.
-_SPOKE_S = 0.6
+# was an observer's hold: that ends before this time. They hear a state five times a second, and say
+# so twice a second; one of either may be lost.
+_SPOKE_S = 1.2
 _NAME_TAKEN_S = 3.0
 _LATELY_S = 10.0
 # A robot refuses an order that expires later than the lifetime, or not after one that it obeyed.
@@ -86,12 +87,14 @@ class Station:
         self._now_s, self._unix_now_s = now_s, unix_now_s
         self._setup = setup
         self._worlds = {setup.world_id: setup.world}
+        # What somebody sent last that nobody was known to fly over: a state may come behind it.
+        self._stray_world = ""
         # By robot id: what each said last.
         self._worlds_of_robots: dict[int, str] = {}
         self._robots = HeardRobots(
             setup.robots,
-            lambda robot, text: self.tell("presence", robot, text),
-            lambda robot, state, text: self.tell("state", robot, text, state=state),
+            self._tell_presence,
+            self._tell_state,
         )
         self._began_s = now_s
         self._heard_s = now_s  # when the commander was
@@ -178,7 +181,7 @@ class Station:
         setup, world = self._setup, self.world_id
         if world != setup.world_id:
             # A wrong text would be shown as if it were the robots'.
-            setup = replace(setup, world=self._worlds.get(world, ""), world_id=world)
+            setup = replace(setup, world=self._text_of(world), world_id=world)
         places = {} if self.state is None else self.state.places
         if not places:
             return setup
@@ -242,6 +245,12 @@ class Station:
         event = GroundEvent(self._unix_now_s, kind, robot, text, operator, trial, state)
         self._events.append(event)
         self._new_events.append(event)
+
+    def _tell_presence(self, robot: str, text: str) -> None:
+        self.tell("presence", robot, text)
+
+    def _tell_state(self, robot: str, state: FlightState, text: str) -> None:
+        self.tell("state", robot, text, state=state)
 
     @property
     def last_events(self) -> tuple[GroundEvent, ...]:
@@ -597,13 +606,21 @@ class Station:
         return self.change(world_id=world_id(text))
 
     def hear_world(self, text: str) -> None:
-        """Another station sends it to the robots; what nobody flies over is not kept."""
+        """Another station sends it to the robots; what nobody flies over is soon forgotten."""
         if world_id(text) in (self.world_id, *self._worlds_of_robots.values()):
             self.remember_world(text)
+        else:
+            self._stray_world = text
 
     def remember_world(self, text: str) -> None:
         """It may be the one that the robots have."""
         self._worlds[world_id(text)] = text
+
+    def _text_of(self, world: str) -> str:
+        """The text of a world, "" if it is not known."""
+        if self._stray_world and world_id(self._stray_world) == world:
+            self.remember_world(self._stray_world)
+        return self._worlds.get(world, "")
 
     # Orders
 
@@ -659,8 +676,8 @@ class Station:
     def published_world(self) -> str | None:
         """The world's text, while a robot on the ground lacks it, and may have use for it."""
         wanted = self.state.world_id if self.commands and self.state else None
-        text = None if wanted is None else self._worlds.get(wanted)
-        if text is None:
+        text = "" if wanted is None else self._text_of(wanted)
+        if not text:
             return None
         lacking = any(
             s.world_id != wanted

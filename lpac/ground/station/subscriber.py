@@ -83,8 +83,11 @@ class GroundSubscriber:
         """The wall clock."""
         return time.time()
 
-    def carry_out(self, procedure: Procedure[T]) -> T:
-        """Go through a procedure; what it comes to. Raises what it raises, and GroundError."""
+    def carry_out(self, procedure: Procedure[T], meanwhile: Callable[[], None] = lambda: None) -> T:
+        """Go through a procedure; what it comes to. Raises what it raises, and GroundError.
+
+        `meanwhile` is called once a second or more often; what it raises ends the procedure.
+        """
         answer: CommandReport | bool | None = None
         while True:
             try:
@@ -95,9 +98,16 @@ class GroundSubscriber:
             except NothingComesError:
                 raise no_answer(self.fleet) from None
             if isinstance(wanted, Until):
-                answer = self.wait_for(wanted.condition, wanted.at_most_s)
+                answer = self._wait_until(wanted, meanwhile)
             else:
-                answer = command(self.fleet, wanted)
+                answer = command(self.fleet, wanted, meanwhile=meanwhile)
+
+    def _wait_until(self, wanted: Until, meanwhile: Callable[[], None]) -> bool:
+        def holds(snapshot: FleetSnapshot) -> bool:
+            meanwhile()
+            return wanted.condition(snapshot)
+
+        return self.wait_for(holds, wanted.at_most_s)
 
     def _run(self) -> None:
         try:

@@ -1,90 +1,48 @@
 """One flight of a fleet on the simulated clock, by a script of the real ground."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from edge.messages.mission import RobotStatus
 from lpac.ground.procedure import NothingComesError
-from lpac.ground.script import (
-    LandStep,
-    MissionStep,
-    OriginStep,
-    PreflightStep,
-    ReturnStep,
-    Script,
-    ScriptError,
-    ScriptListener,
-    ScriptRun,
-    TakeoffStep,
-)
-from lpac.ground.site import Sites
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.fleet.flight import FleetFlight, RobotRecord, flight_of
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.listener import Heard, Say
+from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.fleet.vehicles import TrueTrack
-from lpac.sim.operator import Heard, Say
-
-_PREFLIGHT_S = 60.0
 
 
 def fly_simulated(
-    scenario: FleetScenario, folder: Path, bundle: Path, say: Say = lambda _: None
+    scenario: FleetScenario,
+    folder: Path,
+    bundle: Path,
+    say: Say = lambda _: None,
+    *,
+    logs: bool = False,
+    recorded: Path | None = None,
 ) -> FleetFlight:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
-    A script that fails lands the robots where they are. Raises what `SimulatedFleet` does.
+    With `logs` the robots write theirs in `folder`; `recorded` is the folder of such a flight,
+    whose policies' steps are taken again. Raises what `SimulatedFleet` does, and RecordingError.
     """
-    fleet = SimulatedFleet(scenario, folder, bundle)
-    ground, listener = fleet.ground, _Listener(fleet, say)
-    script = Script(
-        path=folder / "fleet.toml",
-        trial="flight",
-        trials=1,
-        robots=(),
-        before=(OriginStep(ORIGIN.latitude_deg, ORIGIN.longitude_deg, ORIGIN.heading_deg),),
-        steps=(
-            PreflightStep(_PREFLIGHT_S), TakeoffStep(), MissionStep(scenario.duration_s),
-            ReturnStep(),
-        ),
-    )  # fmt: skip
+    earlier = set(folder.rglob("*.mcap"))
+    fleet = SimulatedFleet(scenario, folder, bundle, logs=logs, recorded=recorded)
+    ground = fleet.ground
+    flight = ScriptedFlight(
+        ground, folder / "fleet.toml", scenario.duration_s, on_step=say, say=say
+    )
     notes = _Notes(fleet)
-    sites = Sites(folder / "fleet.toml")
-    problem = None
     try:
-        ground.carry_out(ScriptRun(script, sites, ground, listener).fly())
-    except (ScriptError, NothingComesError) as error:
+        problem = ground.carry_out(flight.fly())
+    except NothingComesError as error:
         problem = str(error)
-        listener.step("land", None)
-        down = Script(script.path, "", 1, (), (), (LandStep(),))
-        try:
-            ground.carry_out(ScriptRun(down, sites, ground, listener).fly())
-        except (ScriptError, NothingComesError) as also:
-            problem = f"{problem}; {also}"
-    return notes.flight(listener.began_s | {"end": ground.now_s}, problem)
-
-
-class _Listener(ScriptListener):
-    """Notes when each step of the script began."""
-
-    def __init__(self, fleet: SimulatedFleet, say: Say) -> None:
-        self.began_s: dict[str, float] = {}
-        self._fleet = fleet
-        self._say = say
-
-    def step(self, name: str, at_most_s: float | None) -> None:
-        """A step begins."""
-        self.began_s.setdefault(name, self._fleet.ground.now_s)
-        self._say(name)
-
-    def line(self, text: str) -> None:
-        """Something is worth a line."""
-        self._say(text)
-
-    def may(self, question: str) -> bool:
-        """There is one trial."""
-        return True
+    fleet.close()
+    return notes.flight(flight, problem, sorted(set(folder.rglob("*.mcap")) - earlier))
 
 
 class _Notes:
@@ -104,19 +62,34 @@ class _Notes:
             if not history or history[-1].status.sequence != robot.status.sequence:
                 history.append(Heard(self._fleet.ground.now_s - robot.age_s, robot.status))
 
-    def flight(self, began_s: dict[str, float], problem: str | None) -> FleetFlight:
+    def flight(
+        self, flown: ScriptedFlight, problem: str | None, logs: Sequence[Path]
+    ) -> FleetFlight:
         self._look()
+        began_s = flown.began_s | {"end": self._fleet.ground.now_s}
         last_s = began_s.get("return", began_s["end"])
         return flight_of(
             self._fleet.layout,
             "simulated",
             [
-                RobotRecord(tuple(history), track, _last(history, last_s))
-                for history, track in zip(self._heard, self._tracks(), strict=True)
+                RobotRecord(
+                    tuple(history),
+                    track,
+                    _last(history, last_s),
+                    logs=tuple(
+                        str(path.relative_to(self._fleet.folder))
+                        for path in logs
+                        if path.is_relative_to(robot.config.log.folder)
+                    ),
+                )
+                for history, track, robot in zip(
+                    self._heard, self._tracks(), self._fleet.robots, strict=True
+                )
             ],
             0.0,
             began_s,
             problem=problem,
+            commands=tuple(flown.commands),
         )
 
     def _tracks(self) -> list[TrueTrack]:

@@ -16,11 +16,15 @@ from edge.core.fence import Fence
 from edge.core.world import rasterize
 from edge.messages.codes import Reason
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState, RobotStatus
+from lpac.ground.station.client import GroundError
+from lpac.ground.station.commands import in_words
 from lpac.sim.experiment import FIELD_SCALE
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario, Layout
+from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.listener import Heard, Say
 from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
+from lpac.sim.fleet.scripted import CommandOutcome, ScriptedFlight
 from lpac.sim.fleet.vehicles import TrueTrack, VehicleError
-from lpac.sim.operator import Heard, OperatorScript, OperatorScriptError, Say
 
 COST_PERIOD_S = 1.0
 SEPARATION_PERIOD_S = 0.04
@@ -52,11 +56,15 @@ class RobotFlight:
     changes: tuple[StateChange, ...]
     truth: TrueTrack
     last: RobotStatus | None
-    restarts: int
     mission_share: float
     cpu_share: float
     peak_memory_mb: float
     logs: tuple[str, ...]
+
+    @property
+    def restarts(self) -> int:
+        """How often it came back into its mission."""
+        return max(0, sum(c.state is FlightState.MISSION for c in self.changes) - 1)
 
     def state_at(self, time_s: float) -> FlightState | None:
         """The state at a time, None before the first."""
@@ -80,7 +88,8 @@ class FleetFlight:
     step began; the last entry, `end`, when all was over. `cost_time_s` (C,) is in the mission;
     `cost` and `true_cost` (C,) are the coverage cost J of the robots in the air, for where they
     take themselves to be and for where they really are, NaN where that is not known.
-    `launcher` is the process of the operator and the simulated vehicles: share of a core, and MB.
+    `commands` are those that the ground was given. `launcher` is what the processes of the ground
+    and of the simulated vehicles took: share of a core, and MB.
     """
 
     scenario: FleetScenario
@@ -94,7 +103,7 @@ class FleetFlight:
     robots: tuple[RobotFlight, ...]
     began_s: Mapping[str, float]
     problem: str | None
-    refusals: tuple[str, ...]
+    commands: tuple[CommandOutcome, ...]
     cost_time_s: F64
     cost: F64
     true_cost: F64
@@ -151,7 +160,14 @@ class FleetFlight:
             "errors": self.scenario.errors,
             "problem": self.problem,
             "all_landed": self.all_landed,
-            "refusals": list(self.refusals),
+            "commands": [
+                {
+                    "command": in_words(request),
+                    "problem": report.problem and report.problem.code,
+                    "results": {result.robot: result.code for result in report.results},
+                }
+                for request, report in self.commands
+            ],
             "steps_s": {name: round(at_s, 2) for name, at_s in self.began_s.items()},
             "cost": _cost_summary(self.cost),
             "true_cost": _cost_summary(self.true_cost),
@@ -184,45 +200,54 @@ class FleetFlight:
 def fly(
     fleet: Fleet, say: Say = lambda _: None, watch: Callable[[str], None] = lambda _: None
 ) -> FleetFlight:
-    """Run a fleet and fly the script; `watch` gets the step's name, some times a second.
+    """Run a fleet and its ground, and fly the script; `watch` gets the step's name now and then.
 
     Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
-    FleetError if a robot's program ends before all are heard; OSError, LinkError or VehicleError
-    if something cannot start.
+    FleetError if a robot's program ends before all are heard; OSError, LinkError, GroundError or
+    VehicleError if something cannot start.
     """
-    scenario, operator = fleet.layout.scenario, fleet.operator
-    script = OperatorScript(
-        operator, robots=range(scenario.robots), origin=ORIGIN, mission_s=scenario.duration_s,
-        trial=f"seed {scenario.seed}", say=fleet.say_unless_behind,
-    )  # fmt: skip
     moments: dict[str, _Moment] = {}
-
-    def look(step: str) -> None:
-        if step == "assemble":
-            fleet.require_running()
-        if step not in moments:
-            if step == "preflight":
-                fleet.begin()
-            say("landing all robots where they are" if step == "land" else step)
-            moments[step] = _Moment.of(fleet)
-        if step != "land":
-            fleet.vehicles.require_running()
-        if step not in ("assemble", "land"):
-            fleet.require_keeping_up()
-        watch(step)
-
+    step = "assemble"
     problem, overloaded = None, False
-    with fleet:
+    with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
+
+        def begin(name: str) -> None:
+            nonlocal step
+            if name == "preflight":
+                fleet.begin()
+            say("landing all robots where they are" if name == "land" else name)
+            moments.setdefault(name, _Moment.of(fleet, ground))
+            step = name
+
+        def look() -> None:
+            if step == "assemble":
+                fleet.require_running()
+            if step != "land":
+                fleet.vehicles.require_running()
+            if step not in ("assemble", "land"):
+                fleet.require_keeping_up()
+            watch(step)
+
+        flight = ScriptedFlight(
+            ground.told, fleet.fleet_toml, fleet.layout.scenario.duration_s,
+            on_step=begin, say=fleet.say_unless_behind,
+        )  # fmt: skip
         try:
-            script.fly(look)
-        except (OperatorScriptError, OverloadError, VehicleError) as error:
+            try:
+                problem = ground.told.carry_out(flight.fly(), look)
+            except GroundError:
+                raise
+            except BaseException:
+                ground.told.carry_out(flight.land(), lambda: watch(step))
+                raise
+        except (OverloadError, VehicleError, GroundError) as error:
             problem, overloaded = str(error), isinstance(error, OverloadError)
         except KeyboardInterrupt:
             problem = "stopped by Ctrl-C"
-        moments["end"] = _Moment.of(fleet)
+        moments["end"] = _Moment.of(fleet, ground)
         lateness = fleet.lateness()
     # The vehicles' own logs are whole once they have ended.
-    return _record(fleet, script, moments, problem, lateness, overloaded)
+    return _record(fleet, flight, moments, problem, lateness, overloaded)
 
 
 class _Moment(NamedTuple):
@@ -234,29 +259,32 @@ class _Moment(NamedTuple):
     launcher: Usage
 
     @classmethod
-    def of(cls, fleet: Fleet) -> "_Moment":
+    def of(cls, fleet: Fleet, ground: GroundProgram) -> "_Moment":
+        programs = [process_usage(os.getpid())]
+        if ground.running:
+            programs.append(process_usage(ground.pid))
         return cls(
             time.monotonic(),
             {
                 robot: heard[-1].status
                 for robot in range(fleet.layout.scenario.robots)
-                if (heard := fleet.operator.history(robot))
+                if (heard := fleet.heard.history(robot))
             },
             tuple(robot.usage() for robot in fleet.robots),
-            process_usage(os.getpid()),
+            Usage(*map(sum, zip(*programs, strict=True))),
         )
 
 
 def _record(
     fleet: Fleet,
-    script: OperatorScript,
+    flight: ScriptedFlight,
     moments: Mapping[str, _Moment],
     problem: str | None,
     lateness: Backlog,
     overloaded: bool,
 ) -> FleetFlight:
     start_s = moments["assemble"].time_s if "assemble" in moments else moments["end"].time_s
-    began_s = {name: at_s - start_s for name, at_s in script.began_s.items()}
+    began_s = {name: at_s - start_s for name, at_s in flight.began_s.items()}
     began_s["end"] = moments["end"].time_s - start_s
     # The mission's own figures; of the whole flight where there was none.
     first = moments.get("mission", next(iter(moments.values())))
@@ -267,10 +295,9 @@ def _record(
         "px4" if fleet.simulated is None else "mavlink",
         [
             RobotRecord(
-                history=fleet.operator.history(robot),
+                history=fleet.heard.history(robot),
                 track=tracks[robot],
                 last=last.statuses.get(robot),
-                restarts=script.restarts[robot],
                 cpu_share=_share(first, last, first.usages[robot], last.usages[robot]),
                 peak_memory_mb=moments["end"].usages[robot].peak_memory_mb,
                 logs=tuple(str(p.relative_to(fleet.folder)) for p in fleet.robots[robot].logs()),
@@ -280,7 +307,7 @@ def _record(
         start_s,
         began_s,
         problem=problem,
-        refusals=tuple(fleet.operator.refusals),
+        commands=tuple(flight.commands),
         launcher=(
             _share(first, last, first.launcher, last.launcher),
             moments["end"].launcher.peak_memory_mb,
@@ -296,7 +323,6 @@ class RobotRecord(NamedTuple):
     history: tuple[Heard, ...]
     track: TrueTrack
     last: RobotStatus | None
-    restarts: int = 0
     cpu_share: float = 0.0
     peak_memory_mb: float = 0.0
     logs: tuple[str, ...] = ()
@@ -310,7 +336,7 @@ def flight_of(
     began_s: Mapping[str, float],
     *,
     problem: str | None,
-    refusals: tuple[str, ...] = (),
+    commands: tuple[CommandOutcome, ...] = (),
     launcher: tuple[float, float] = (0.0, 0.0),
     lateness: Backlog = _IN_TIME,
     overloaded: bool = False,
@@ -329,7 +355,6 @@ def flight_of(
             mission_s,
             truth=track,
             last=record.last,
-            restarts=record.restarts,
             cpu_share=record.cpu_share,
             peak_memory_mb=record.peak_memory_mb,
             logs=record.logs,
@@ -358,7 +383,7 @@ def flight_of(
         robots=robots,
         began_s=began_s,
         problem=problem,
-        refusals=refusals,
+        commands=commands,
         cost_time_s=cost_time_s - mission_s[0],
         cost=costs[:, 0],
         true_cost=costs[:, 1],
@@ -529,6 +554,7 @@ def summary_lines(flight: FleetFlight) -> list[str]:
     """The flight for people, a line each."""
     scenario, robots = flight.scenario, flight.robots
     restarts = sum(robot.restarts for robot in robots)
+    not_done = sum(not report.done for _, report in flight.commands)
     lines = [f"{scenario.robots} robots, seed {scenario.seed}: {_outcome(flight)}"]
     if flight.problem is not None:
         lines.append(f"PROBLEM: {flight.problem}")
@@ -559,8 +585,8 @@ def summary_lines(flight: FleetFlight) -> list[str]:
     )
     lines.append(
         f"in the mission {100.0 * min(r.mission_share for r in robots):.0f} to "
-        f"{100.0 * max(r.mission_share for r in robots):.0f} % of its time; restarts by the "
-        f"operator: {restarts}; orders refused: {len(flight.refusals)}"
+        f"{100.0 * max(r.mission_share for r in robots):.0f} % of its time; restarts: {restarts}; "
+        f"commands not done: {not_done}"
     )
     lines += _loop_lines(flight)
     if flight.vehicle == "simulated":
@@ -570,7 +596,7 @@ def summary_lines(flight: FleetFlight) -> list[str]:
     memory_mb = [robot.peak_memory_mb for robot in robots]
     lines.append(
         f"each robot: {min(cpu_shares):.1f} to {max(cpu_shares):.1f} % of a core, at most "
-        f"{max(memory_mb):.0f} MB; operator and vehicles: {100.0 * flight.launcher[0]:.0f} %; all: "
+        f"{max(memory_mb):.0f} MB; ground and vehicles: {100.0 * flight.launcher[0]:.0f} %; all: "
         f"{(sum(cpu_shares) / 100.0 + flight.launcher[0]):.2f} cores"
     )
     if max(flight.lateness) > 0.0:

@@ -10,24 +10,24 @@ import numpy as np
 from edge.core import F64
 from edge.core.frames import LocalTransform
 from edge.core.world import Feature, format_world, random_features
-from edge.flight.margins import places_apart
+from edge.flight.margins import ErrorBudget, places_apart
 from edge.messages.mission import Origin
 from edge.policy.bundle import BundleError, load_bundle
 from lpac.fleet.settings import Places
-from lpac.fleet.writer import write_fleet, write_robot
+from lpac.fleet.writer import assign, write_fleet, write_robot
 from lpac.sim.description import ERRORS, fence_around, robot_table
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.px4.errors import Errors
-from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.px4.vehicle import GPS_ACCURACY_M, Px4Vehicle
 from lpac.sim.px4.world import WorldOrigin
 
-MAX_ROBOTS = 20
+MAX_ROBOTS = 30
 
 # The field is the policy's world; its y axis does not point north, so that mistakes show.
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
-# Pads, which are landing points too.
+# Pads, which are landing points too, of robots without a budget of their own.
 APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
 # As far inside the field as there is room: what a robot takes its place to be walks.
 _PADS_INSIDE_FIELD_M = (2.0, 1.0, 0.0)
@@ -43,7 +43,10 @@ class FleetScenario:
     """A flight of a fleet; everything random in it but the timing follows from `seed`.
 
     The world is that of a `lpac.sim.experiment.Scenario` with the same seed. Without `errors` the
-    simulated vehicles' estimates are off by noise alone, and the air stands still.
+    simulated vehicles' estimates are off by noise alone, and the air stands still. `budget` is what
+    the robots take their errors for: how far apart they stand and fly. `sensor` is the `type` in
+    robot.toml's [sensor]. They stand at `pads_m`, (x, y) of the mission frame, or else where there
+    is room.
 
     Raises ValueError that names what is impossible.
     """
@@ -54,6 +57,9 @@ class FleetScenario:
     features: tuple[Feature, ...] | None = None
     random_feature_count: int = 10
     errors: bool = True
+    budget: ErrorBudget = ERRORS
+    sensor: str = "world"
+    pads_m: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS:
@@ -62,6 +68,8 @@ class FleetScenario:
             raise ValueError(f"seed = {self.seed}: must be at least 0")
         if not 0.0 < self.duration_s < math.inf:
             raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
+        if self.pads_m is not None and len(self.pads_m) != self.robots:
+            raise ValueError(f"pads_m has {len(self.pads_m)} places: must be one for each robot")
         if self.random_feature_count < 0:
             raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
 
@@ -90,7 +98,9 @@ class Layout:
         self.to_mission: LocalTransform = ORIGIN.frame().relative_to(
             WORLD.latitude_deg, WORLD.longitude_deg
         )
-        self.fence = fence_around(self.field_m, scenario.robots)
+        self.fence = fence_around(self.field_m, scenario.robots, scenario.budget)
+        position_m = scenario.budget.position_m
+        self.apart_m = places_apart(position_m, position_m).least_m
         self.features = scenario.features
         if self.features is None:
             self.features = random_features(
@@ -110,14 +120,28 @@ class Layout:
         north_m, east_m, _ = self.to_mission.mission_to_local(np.array([*place_m, 0.0])).tolist()
         return north_m, east_m
 
-    def write(self, folder: Path, fleet: str, robots: Mapping[str, Mapping[str, object]]) -> None:
+    def write(
+        self,
+        folder: Path,
+        fleet: str,
+        robots: Mapping[str, Mapping[str, object]],
+        *,
+        settings: Mapping[str, Mapping[str, object]] | None = None,
+        spares: int = 0,
+    ) -> None:
         """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
 
         `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
+        `settings` are further keys of robot.toml's tables, for all robots. The last `spares` lose
+        their slots in fleet.toml, once their robot.toml is written.
         """
         assert self.features is not None
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "world.env").write_text(format_world(self.features))
+        robot = robot_table(self.fence, self.max_speed_m_s, self.scenario.budget)
+        robot["sensor"] = {"type": self.scenario.sensor}
+        for table, keys in (settings or {}).items():
+            robot[table] = {**robot.get(table, {}), **keys}
         config = write_fleet(
             folder / "fleet.toml",
             "Made by `lpac sim`: the robots are programs of this machine, without image or SSH.",
@@ -126,7 +150,7 @@ class Layout:
                 "image": "none",
                 "bundle": str(self.bundle_path),
                 "world": "world.env",
-                "robot": robot_table(self.fence, self.max_speed_m_s),
+                "robot": robot,
                 # No computer has such a host name, so that nobody deploys to this machine.
                 "robots": {
                     name: {
@@ -151,6 +175,8 @@ class Layout:
         places = Places(str(self.bundle_path), "../../world.env", "logs", "127.0.0.1")
         for robot_id, name in enumerate(robots):
             write_robot(folder / "robots" / str(robot_id) / "robot.toml", config, name, places)
+        for slot in range(len(robots) - spares, len(robots)):
+            assign(folder / "fleet.toml", slot, None)
 
     def _pad_seen_m(self, robot: int) -> list[float]:
         """Where a robot takes its pad to be: mission frame, m."""
@@ -175,25 +201,29 @@ class Layout:
             )  # fmt: skip
             if not self.scenario.errors:
                 vehicle.gps_bias_m = np.zeros(3)
+                # Half of the position error at worst, as a receiver with corrections tells.
+                vehicle.gps_told_m = min(GPS_ACCURACY_M[0], self.scenario.budget.gps_m / 2.0)
             vehicles.append(vehicle)
         return pads_m, pads_m + biases_m, tuple(vehicles)
 
     def _draw_pads(self, biases_m: F64) -> F64:
         """Pads (N, 2) apart from each other, both in truth and as the robots see them."""
+        if self.scenario.pads_m is not None:
+            return np.array(self.scenario.pads_m)
         rng = np.random.default_rng([self.scenario.seed, 1])
         robots, field_m = len(biases_m), self.field_m
         for inside_m in _PADS_INSIDE_FIELD_M:
-            pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, rng)
+            pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, self.apart_m, rng)
             if pads_m is not None:
                 return pads_m
         fit = next(
             fewer
             for fewer in range(robots - 1, 0, -1)
-            if _pads_apart(biases_m[:fewer], 0.0, field_m, rng) is not None
+            if _pads_apart(biases_m[:fewer], 0.0, field_m, self.apart_m, rng) is not None
         )
         raise ValueError(
-            f"robots = {robots}: {fit} fit on {field_m:g} x {field_m:g} m, with pads {APART_M:g} m "
-            "apart, which is twice the position error"
+            f"robots = {robots}: {fit} fit on {field_m:g} x {field_m:g} m, with pads "
+            f"{self.apart_m:g} m apart, which is twice the position error"
         )
 
     def _horizontal(self, vector_m: F64) -> F64:
@@ -202,8 +232,10 @@ class Layout:
         return turned
 
 
-def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Generator) -> F64 | None:
-    """Places (N, 2) within a square, `APART_M` from each other, and so with the biases added.
+def _pads_apart(
+    biases_m: F64, low_m: float, high_m: float, apart_m: float, rng: np.random.Generator
+) -> F64 | None:
+    """Places (N, 2) within a square, `apart_m` from each other, and so with the biases added.
 
     Drawn in the cells of a grid, then pushed apart; None if they find no room.
     """
@@ -211,7 +243,8 @@ def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Gener
     side = math.ceil(math.sqrt(robots))
     lowest_m, highest_m = np.maximum(low_m, low_m - biases_m), np.minimum(high_m, high_m - biases_m)
     truth_and_seen_m = np.stack([np.zeros_like(biases_m), biases_m])
-    wanted_m = APART_M * (1.0 + _PAD_SLACK)
+    wanted_m = apart_m * (1.0 + _PAD_SLACK)
+    itself = np.arange(robots)
     for _ in range(_PAD_DRAWS):
         cells = np.stack(np.divmod(rng.permutation(side * side)[:robots], side), axis=1)
         jittered = cells + rng.uniform(0.0, 1.0, (robots, 2))
@@ -220,9 +253,10 @@ def _pads_apart(biases_m: F64, low_m: float, high_m: float, rng: np.random.Gener
             places_m = np.clip(places_m, lowest_m, highest_m)
             all_m = truth_and_seen_m + places_m
             offsets_m = all_m[:, :, None] - all_m[:, None]
-            distances_m = np.linalg.norm(offsets_m, axis=3)
-            distances_m[:, range(robots), range(robots)] = math.inf
-            if distances_m.min() >= APART_M * (1.0 + _PAD_SLACK / 2.0):
+            # Several times as fast as a norm along an axis of two.
+            distances_m = np.sqrt(offsets_m[..., 0] ** 2 + offsets_m[..., 1] ** 2)
+            distances_m[:, itself, itself] = math.inf
+            if distances_m.min() >= apart_m * (1.0 + _PAD_SLACK / 2.0):
                 return places_m
             shares = np.maximum(wanted_m - distances_m, 0.0) / np.maximum(distances_m, 1e-9)
             # Less than half of what is missing for either of two: crowds come to rest so.

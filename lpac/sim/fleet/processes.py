@@ -1,4 +1,4 @@
-"""A whole fleet on this machine: vehicles, one `lpac robot run` process each, and an operator."""
+"""A whole fleet on this machine: vehicles, one `lpac robot run` process each, and who listens."""
 
 import math
 import os
@@ -16,8 +16,8 @@ import numpy as np
 from edge.core import F64
 from edge.robot.config import Rates
 from lpac.sim.fleet.layout import WORLD, FleetScenario, Layout
+from lpac.sim.fleet.listener import FleetListener, Say
 from lpac.sim.fleet.vehicles import SimulatedVehicles, Vehicles
-from lpac.sim.operator import Operator, Say
 from lpac.sim.ports import free_ports
 from lpac.sim.programs import python_program
 from lpac.sim.sitl.build import Px4Build
@@ -154,10 +154,10 @@ def process_usage(pid: int) -> Usage:
 
 
 class Fleet:
-    """Vehicles, robots and an operator: a context, in which all of them run.
+    """Vehicles and robots: a context, in which all of them run. Nobody commands them.
 
-    `layout` is what it is, `robots[i]` is robot i's process, `operator` speaks to all. `simulated`
-    are the vehicles themselves, for whoever wants to do something to them; None where they are real
+    `layout` is what it is, `robots[i]` is robot i's process, `heard` what they say. `simulated` are
+    the vehicles themselves, for whoever wants to do something to them; None where they are real
     PX4. `endpoints` are the robots' zenoh addresses, `name` the fleet's. `carried` is how many
     robots this machine was found to carry; who finds it out says so. `fleet_toml` describes the
     fleet to `lpac ground`, as if its robots were in the field.
@@ -198,7 +198,7 @@ class Fleet:
         )
         self.carried: int | None = None
         self._say = say
-        self.operator = Operator(
+        self.heard = FleetListener(
             fleet=self.name, connect=self.endpoints, say=self.say_unless_behind
         )
         self._late_before = Backlog(0.0, 0.0)
@@ -223,7 +223,7 @@ class Fleet:
         """Start everything. Raises OSError or LinkError if a port is taken."""
         with ExitStack() as stack:
             stack.enter_context(self.vehicles)
-            stack.enter_context(self.operator)
+            stack.enter_context(self.heard)
             stack.callback(self._stop_robots)
             for robot in self.robots:
                 robot.start()
@@ -266,7 +266,7 @@ class Fleet:
         control_s = 1.0 / Rates().control_hz
         left_out_s = [
             control_s * status.loops["control"].overruns
-            for status in self.operator.statuses().values()
+            for status in self.heard.statuses().values()
             if "control" in status.loops
         ]
         return Backlog(self.vehicles.lost_s(), float(np.median(left_out_s or [0.0])))
@@ -287,7 +287,7 @@ class Fleet:
 
     def forget(self) -> None:
         """Keep nothing of the past, which only grows, and which a flight's figures alone need."""
-        self.operator.forget()
+        self.heard.forget()
         self.vehicles.forget()
 
     def true_positions_m(self) -> F64:

@@ -1,23 +1,22 @@
-"""A whole fleet on one simulated clock: the robots' real nodes, simulated vehicles, a real ground.
+"""A whole fleet on one simulated clock: the robots' real nodes, simulated vehicles, real grounds.
 
 Everything follows from the scenario's seed, however loaded the machine is. The policy's numbers are
-onnxruntime's, which differ in the last bits from one type of CPU to another.
+onnxruntime's, which differ in the last bits from one type of CPU to another: `fleet.recorded` takes
+them from an earlier flight.
 """
 
-from collections.abc import Callable, Mapping
-from functools import partial
+import copy
+import copyreg
+import itertools
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from threading import Lock
+from typing import Any, Self, TypeVar
 
-import numpy as np
-
-from edge.core import F64
-from edge.core.world import parse_world, rasterize
-from edge.drivers.world_sensor import WorldSensor
 from edge.messages.mission import GroundState
-from edge.policy.bundle import Manifest
-from edge.robot.config import load_config
-from edge.robot.node import Ports, RobotNode, load_policy
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.procedure import NothingComesError, Procedure, Until
 from lpac.ground.station.config import load_ground
@@ -28,14 +27,12 @@ from lpac.ground.station.protocol import (
     Request,
     ServerMessage,
 )
-from lpac.sim.fleet.layout import FleetScenario, Layout
-from lpac.sim.px4.direct import DirectVehicle
-from lpac.sim.radio import GROUND, Radio
+from lpac.ground.station.station import NameTakenError
+from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.robots import VEHICLE_STEP_S, Settings, SimulatedRobot, SimulatedRobots
+from lpac.sim.radio import GROUND, Radio, RadioLink, Subscriptions
 from lpac.sim.schedule import Schedule
 
-# Of a vehicle's physics; and of preflight and status.
-_VEHICLE_STEP_S = 0.02
-_CHORE_S = 0.25
 # Long after any date that a robot takes for a wrong clock.
 _EPOCH_S = 1_800_000_000.0
 _FIRST_PORT = 7447
@@ -44,93 +41,117 @@ _PATIENCE_S = 60.0
 T = TypeVar("T")
 
 
-class SimulatedFleet:
-    """Robots, vehicles, radio and ground, prepared; `ground` lets their time pass.
+class SimulatedFleet(SimulatedRobots):
+    """Robots, vehicles, radio and a first ground, all of them running; a ground lets time pass.
 
-    `robots[i]` is robot i's node, `vehicles[i]` its vehicle, for whoever wants to do something to
-    it; `radio.air` is what becomes of messages.
+    `radio.air` is what becomes of messages. `grounds` are all that ever joined, by their names.
     """
 
-    def __init__(self, scenario: FleetScenario, folder: Path, bundle: Path) -> None:
-        """`folder` gets fleet.toml, the world and each robot's robot.toml, which are then read.
+    def __init__(
+        self,
+        scenario: FleetScenario,
+        folder: Path,
+        bundle: Path,
+        *,
+        operator: str = "operator",
+        absent: int = 0,
+        settings: Settings | None = None,
+        spares: int = 0,
+        vehicle_step_s: float = VEHICLE_STEP_S,
+        logs: bool = False,
+        recorded: Path | None = None,
+    ) -> None:
+        """The programs of the last `absent` robots are not started yet.
 
-        Raises what `Layout` does.
+        See `SimulatedRobots` for the others. Raises what `Layout` does.
         """
-        self.layout = layout = Layout(scenario, bundle)
-        self.schedule = schedule = Schedule(_EPOCH_S)
-        layout.write(
+        super().__init__(
+            scenario,
             folder,
-            "simulated",
-            {
-                f"r{robot}": {
-                    "zenoh_port": _FIRST_PORT + robot,
-                    "system_id": robot + 1,
-                    "mavlink_url": f"udpin://127.0.0.1:{14551 + robot}",
-                }
-                for robot in range(scenario.robots)
-            },
+            bundle,
+            fleet="simulated",
+            ports=range(_FIRST_PORT, _FIRST_PORT + scenario.robots),
+            epoch_s=_EPOCH_S,
+            settings=settings,
+            spares=spares,
+            vehicle_step_s=vehicle_step_s,
+            logs=logs,
+            recorded=recorded,
         )
-        rng = np.random.default_rng([scenario.seed, 2])
-        self.radio = Radio(schedule, self.true_positions_m, rng)
-        self.vehicles = tuple(
-            DirectVehicle(vehicle, robot + 1, schedule)
-            for robot, vehicle in enumerate(layout.vehicles)
-        )
-        policy, world = load_policy(bundle), (folder / "world.env").read_text()
-        robots = []
-        for robot, vehicle in enumerate(self.vehicles):
-            config = load_config(folder / "robots" / str(robot) / "robot.toml")
-            node = RobotNode(
-                config,
-                Ports(
-                    clock=schedule,
-                    vehicle=vehicle,
-                    vehicle_setup=vehicle,
-                    watchdog=_Watchdog(),
-                    recorder=_NoLog(),
-                    sensor_over=partial(_sensor_over, layout.bundle.manifest),
-                ),
-                policy,
-                world,
-                boot_nonce=robot + 1,
-                boot_epoch=int(_EPOCH_S * 1e3),
-            )
-            node.link = self.radio.link(robot, node.subscriptions)
-            robots.append(node)
-            schedule.every(_VEHICLE_STEP_S, partial(vehicle.step, _VEHICLE_STEP_S), _VEHICLE_STEP_S)
-            rates = config.rates
-            steps: tuple[tuple[float, Callable[[], object]], ...] = (
-                (1.0 / rates.control_hz, node.control_step),
-                (1.0 / rates.perception_hz, node.perception_step),
-                (1.0 / rates.policy_hz, node.policy_step),
-                (_CHORE_S, node.preflight_step),
-                (_CHORE_S, partial(node.status_step, {})),
-            )
-            for period_s, step in steps:
-                # Nobody starts ten programs at one time.
-                schedule.every(period_s, step, period_s * rng.random())
-        self.robots = tuple(robots)
-        setup = load_ground(folder / "fleet.toml", "operator").setup
-        self.ground = SimulatedGround(setup, schedule, self.radio)
+        self.radio = Radio(self.schedule, self.true_positions_m, self._rng)
+        for robot in self.robots[: scenario.robots - absent]:
+            robot.start()
+        self._setup = load_ground(self.fleet_toml, operator).setup
+        self.grounds: dict[str, SimulatedGround] = {}
+        self.ground = self.join(operator)
 
-    def true_positions_m(self) -> F64:
-        """Where the vehicles really are: the mission frame, (N, 3), m."""
-        to_mission = self.layout.to_mission
-        return np.array(
-            [to_mission.local_to_mission(each.vehicle.position_m) for each in self.vehicles]
-        )
+    def join(self, operator: str, *, remembers: bool = True) -> "SimulatedGround":
+        """A ground of that name starts; one that runs is ended first, as by a loss of power.
+
+        `remembers`: it is on the computer of the one before, and finds what that left there.
+        """
+        former = self.grounds.get(operator)
+        if former is None:
+            station = GROUND - len(self.grounds)
+        else:
+            former.leave()
+            station = former.station_id
+        setup = replace(self._setup, operator=operator)
+        ground = SimulatedGround(setup, self.schedule, self.radio, station)
+        if former is not None and remembers:
+            ground.recall(former)
+        self.grounds[operator] = ground
+        return ground
+
+    def copy(self) -> Self:
+        """The same once more, as it is now: what then happens to the one is not the other's.
+
+        So a thousand flights can begin in the air. What is on the schedule must be methods, or
+        partials of them: a function of its own goes on with the first fleet. Raises TypeError while
+        a command runs, and for a fleet that logs.
+        """
+        shared = (self._policy, self._policy.policy, self.layout.bundle, self._sensors)
+        with _copyable():
+            return copy.deepcopy(self, {id(each): each for each in shared})
+
+    def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> RadioLink:
+        return self.radio.link(robot.config.robot_id, subscriptions)
 
 
 class SimulatedGround:
-    """The real ground on the simulated clock: a `Ground` for procedures, which it carries out."""
+    """The real ground on the simulated clock: a `Ground` for procedures, which it carries out.
 
-    def __init__(self, setup: FleetSetup, schedule: Schedule, radio: Radio) -> None:
+    `problem` is why it ended by itself, None while it runs; `station_id` is who it is on the radio.
+    """
+
+    def __init__(self, setup: FleetSetup, schedule: Schedule, radio: Radio, station: int) -> None:
         self.events: list[GroundEvent] = []
+        self.station_id = station
+        self.problem: NameTakenError | None = None
         self.node = GroundNode(setup, schedule, self)
         self._schedule = schedule
         self._snapshot = self.node.snapshot
-        self.node.link = radio.link(GROUND, self.node.subscriptions)
-        schedule.every(SNAPSHOT_PERIOD_S, self._tick)
+        # What outlives it, on its disk.
+        self._commanded: GroundState | None = None
+        self._world = ""
+        subscriptions = dict.fromkeys(self.node.subscriptions, self._receive)
+        self._link = self.node.link = radio.link(station, subscriptions)
+        self._ticks = schedule.every(SNAPSHOT_PERIOD_S, self._tick)
+
+    def leave(self) -> None:
+        """It ends, as by a loss of power."""
+        if self.node.link is not None:
+            self._ticks.stop()
+            self._link.close()
+            self.node.link = None
+
+    def recall(self, former: "SimulatedGround") -> None:
+        """Know what the one before left on its disk."""
+        self._commanded, self._world = former._commanded, former._world
+        if self._world:
+            self.node.station.remember_world(self._world)
+        if self._commanded is not None:
+            self.node.station.remember(self._commanded)
 
     @property
     def setup(self) -> FleetSetup:
@@ -174,19 +195,35 @@ class SimulatedGround:
         return task.report
 
     def told(self, message: ServerMessage) -> None:
-        """Keep the events."""
+        """Keep the events, and the last world on the disk."""
         if isinstance(message, GroundEvent):
             self.events.append(message)
+        if isinstance(message, FleetSetup) and message.world:
+            self._world = message.world
 
     def stepped(self) -> None:
         """Nobody waits: time passes only while somebody looks."""
 
     def commanded(self, state: GroundState) -> None:
-        """There is no disk to keep it on."""
+        """To the disk."""
+        self._commanded = state
+
+    def _receive(self, key: str, data: bytes) -> None:
+        try:
+            self.node.receive(key, data)
+        except NameTakenError as problem:
+            self._end(problem)
 
     def _tick(self) -> None:
-        self.node.tick()
+        try:
+            self.node.tick()
+        except NameTakenError as problem:
+            self._end(problem)
         self._snapshot = self.node.snapshot
+
+    def _end(self, problem: NameTakenError) -> None:
+        self.problem = problem
+        self.leave()
 
     def _wait(self, until: Until) -> bool:
         end_s = self.now_s + until.at_most_s
@@ -197,32 +234,28 @@ class SimulatedGround:
         return True
 
 
-class _Watchdog:
-    """Nothing hangs on a simulated clock."""
-
-    def feed(self, *, flying: bool) -> None:
-        """Has nothing to watch."""
-
-    def alive(self) -> bool:
-        """Always."""
-        return True
+def _copy_count(count: Any) -> tuple[Any, tuple[int]]:
+    """Nothing else tells where it is without taking from it."""
+    return itertools.count, (int(repr(count)[len("count(") : -1]),)
 
 
-class _NoLog:
-    """A recorder that keeps nothing."""
+# What a copy makes anew: locks that nobody holds, since one thread runs all, and such.
+_COPIES: dict[type, Any] = {
+    type(Lock()): lambda _: (Lock, ()),
+    struct.Struct: lambda each: (struct.Struct, (each.format,)),
+    itertools.count: _copy_count,
+}
 
-    recording = True
 
-    def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
-        """Not kept."""
-
-
-def _sensor_over(manifest: Manifest, text: str, source: str) -> WorldSensor:
-    """A sensor over a world file's text."""
-    perception, training = manifest.perception, manifest.training
-    assert perception is not None  # Without it there is no layout.
-    features = parse_world(text, source)
-    importance = rasterize(
-        features, perception.world_size, training.idf_truncation, training.idf_norm
-    )
-    return WorldSensor(importance, perception.sensor_size)
+@contextmanager
+def _copyable() -> Iterator[None]:
+    before = {kind: copyreg.dispatch_table.get(kind) for kind in _COPIES}
+    copyreg.dispatch_table.update(_COPIES)
+    try:
+        yield
+    finally:
+        for kind, reduce in before.items():
+            if reduce is None:
+                del copyreg.dispatch_table[kind]
+            else:
+                copyreg.dispatch_table[kind] = reduce

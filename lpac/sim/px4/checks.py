@@ -58,7 +58,7 @@ class Px4Event:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class ArmingProblem:
     """One check that fails; masks have a bit per `Px4Mode`.
 
     In the modes of `keeps_from_arming` the vehicle is not armed, and in those of
@@ -90,12 +90,12 @@ _NOT_FOR_TAKEOFF = 0x3C3020
 _ERROR, _INFO, _CRITICAL = Level.ERROR, Level.INFO, Level.CRITICAL
 
 
-def _mode_problem(number: int, component: Component, level: Level, modes: int) -> Problem:
-    return Problem(number, component, level, modes, modes, modes)
+def _mode_problem(number: int, component: Component, level: Level, modes: int) -> ArmingProblem:
+    return ArmingProblem(number, component, level, modes, modes, modes)
 
 
-def _no_data(number: int, component: Component, text: str) -> Problem:
-    return Problem(
+def _no_data(number: int, component: Component, text: str) -> ArmingProblem:
+    return ArmingProblem(
         number, component, _ERROR, _ALL, arguments=b"\0", text=f"Preflight Fail: {text}",
         is_health=True,
     )  # fmt: skip
@@ -111,15 +111,15 @@ NO_HOME = _mode_problem(79408, Component.SYSTEM, _INFO, _HOME)
 # With COM_RC_IN_MODE 4 (no manual control at all), and otherwise.
 MANUAL_CONTROL_DISABLED = _mode_problem(453929, Component.REMOTE_CONTROL, _ERROR, _BY_HAND)
 NO_MANUAL_CONTROL = replace(MANUAL_CONTROL_DISABLED, level=Level.WARNING, told_modes=0xFFFFFFFF)
-MODE_PREVENTS_ARMING = Problem(
+MODE_PREVENTS_ARMING = ArmingProblem(
     1871713, Component.SYSTEM, _INFO, _NOT_FOR_TAKEOFF, told_modes=_NOT_FOR_TAKEOFF
 )
-GPS_FIX_TOO_LOW = Problem(
+GPS_FIX_TOO_LOW = ArmingProblem(
     12369553, Component.GPS, Level.WARNING, told_modes=_LOCAL | _GLOBAL,
     text="Preflight: GPS fix too low", text_level=Level.WARNING,
 )  # fmt: skip
-FENCE_BREACHED = Problem(143019, Component.SYSTEM, _ERROR, _ALL)
-NO_GROUND_STATION = Problem(6801787, Component.COMMUNICATION_LINKS, _INFO)
+FENCE_BREACHED = ArmingProblem(143019, Component.SYSTEM, _ERROR, _ALL)
+NO_GROUND_STATION = ArmingProblem(6801787, Component.COMMUNICATION_LINKS, _INFO)
 GROUND_STATION_REQUIRED = replace(
     NO_GROUND_STATION,
     level=_ERROR,
@@ -127,12 +127,14 @@ GROUND_STATION_REQUIRED = replace(
     text="Preflight Fail: No connection to the GCS",
     text_level=Level.WARNING,
 )
-BATTERY_LOW = Problem(5049764, Component.BATTERY, _CRITICAL, text="Low battery\t")
-BATTERY_CRITICAL = Problem(2627595, Component.BATTERY, _CRITICAL, _ALL, text="Critical battery\t")
-BATTERY_EMERGENCY = Problem(
+BATTERY_LOW = ArmingProblem(5049764, Component.BATTERY, _CRITICAL, text="Low battery\t")
+BATTERY_CRITICAL = ArmingProblem(
+    2627595, Component.BATTERY, _CRITICAL, _ALL, text="Critical battery\t"
+)
+BATTERY_EMERGENCY = ArmingProblem(
     11344647, Component.BATTERY, Level.EMERGENCY, _ALL, text="Emergency battery level\t"
 )
-BATTERY_SILENT = Problem(
+BATTERY_SILENT = ArmingProblem(
     13344346, Component.BATTERY, _ERROR, _ALL, text="Preflight Fail: Battery unhealthy",
     is_health=True,
 )  # fmt: skip
@@ -146,7 +148,7 @@ _ARMING_SUMMARY, _HEALTH_SUMMARY = 11047904, 1914663
 class HealthReport:
     """All that is wrong at one time, and what is there at all."""
 
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[ArmingProblem, ...] = ()
     present: frozenset[Component] = frozenset()
 
     @property

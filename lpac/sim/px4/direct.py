@@ -1,7 +1,8 @@
 """A simulated vehicle behind the robot's ports, in process: no socket, on a simulated clock."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -17,7 +18,7 @@ from lpac.sim.px4.world import FencePolygon
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 # Which fields count; see MAVLink's POSITION_TARGET_TYPEMASK.
 _VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
-_AUTOPILOT = 1
+_AUTOPILOT, _COMPANION = 1, 191  # component ids
 _REQUEST_AGAIN_S = 1.0
 _COMMANDS: dict[Action, tuple[int, tuple[float, ...]]] = {
     Action.ARM: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,)),
@@ -31,8 +32,8 @@ _MODES = {Action.OFFBOARD: Px4Mode.OFFBOARD, Action.HOLD: Px4Mode.HOLD}
 class DirectVehicle:
     """A `Vehicle` and its `VehicleSetup`; `step` lets its time pass.
 
-    It says and hears MAVLink, message by message, as over a wire: what the robot knows of it is
-    what PX4 tells, at PX4's rates.
+    It says and hears MAVLink, message by message, as over a wire, and rounded as on one: what the
+    robot knows of it is what PX4 tells, at PX4's rates.
     """
 
     def __init__(self, vehicle: Px4Vehicle, system_id: int, clock: Clock) -> None:
@@ -41,8 +42,6 @@ class DirectVehicle:
         self._clock = clock
         self._link = Px4Link(vehicle, system_id=system_id)
         self._telemetry = Px4Telemetry()
-        self._packer: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=191)
-        self._parser: Any = mavlink.MAVLink(None)
         self._result: ActionResult | None = None
         self._asked: Action | None = None
         self._requested_at_s = -_REQUEST_AGAIN_S
@@ -57,13 +56,11 @@ class DirectVehicle:
         """Let the vehicle fly on, and hear what it says."""
         self.vehicle.step(dt_s)
         now_s = self._clock.monotonic_s()
-        for datagram in self._link.due():
-            for message in self._parser.parse_buffer(datagram) or ():
-                name = message.get_type()
-                if name == "COMMAND_ACK":
-                    self._hear_answer(message, now_s)
-                elif name in self._telemetry.messages:
-                    self._telemetry.hear(name, message.to_dict(), now_s)
+        for name, fields in self._said():
+            if name == "COMMAND_ACK":
+                self._hear_answer(fields, now_s)
+            elif name in self._telemetry.messages:
+                self._telemetry.hear(name, fields, now_s)
         if self._telemetry.needs_origin() or now_s - self._requested_at_s >= _REQUEST_AGAIN_S:
             self._requested_at_s = now_s
             self._request(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
@@ -73,8 +70,9 @@ class DirectVehicle:
 
     def state(self) -> VehicleState:
         """The newest of everything."""
-        state = self._telemetry.state(self._clock.monotonic_s())
-        return replace(state, system_id=self._system_id, result=self._result)
+        return self._telemetry.state(
+            self._clock.monotonic_s(), system_id=self._system_id, result=self._result
+        )
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
         """Send it once."""
@@ -114,13 +112,13 @@ class DirectVehicle:
 
     # What it sends
 
-    def _hear_answer(self, message: Any, now_s: float) -> None:
-        if self._asked is None or message.command in (
+    def _hear_answer(self, fields: Mapping[str, Any], now_s: float) -> None:
+        if self._asked is None or fields["command"] in (
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE,
         ):  # fmt: skip
             return
-        accepted = message.result == mavlink.MAV_RESULT_ACCEPTED
-        refusal = "" if accepted else f"result {message.result}"
+        accepted = fields["result"] == mavlink.MAV_RESULT_ACCEPTED
+        refusal = "" if accepted else f"result {fields['result']}"
         self._result = ActionResult(self._asked, accepted, refusal, now_s)
         self._asked = None
         # Sooner than the next that is due.
@@ -136,5 +134,35 @@ class DirectVehicle:
             mavlink.MAVLink_command_long_message(self._system_id, _AUTOPILOT, number, 0, *padded)
         )
 
+    # The wire
+
     def _send(self, message: Any) -> None:
-        self._link.receive(bytes(message.pack(self._packer)))
+        header = message.get_header()
+        header.srcSystem, header.srcComponent = self._system_id, _COMPANION
+        self._link.hear(_rounded(message))
+
+    def _said(self) -> Iterable[tuple[str, Mapping[str, Any]]]:
+        """Name and fields of each message that comes from the vehicle now."""
+        return [(message.get_type(), vars(_rounded(message))) for message in self._link.say()]
+
+
+def _rounded(message: Any) -> Any:
+    """The message itself, its real numbers being such as MAVLink has bits for."""
+    names, bits = _real_fields(message.__class__)
+    if names:
+        fields = vars(message)
+        values = bits.unpack(bits.pack(*(fields[name] for name in names)))
+        fields.update(zip(names, values, strict=True))
+    return message
+
+
+@cache
+def _real_fields(kind: Any) -> tuple[tuple[str, ...], struct.Struct]:
+    """Names of a message's 32-bit reals, but for those in arrays, and their packed form."""
+    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+    names = tuple(
+        name
+        for name, length in zip(kind.ordered_fieldnames, kind.lengths, strict=True)
+        if types[name] == "float" and length == 1
+    )
+    return names, struct.Struct(f"<{len(names)}f")

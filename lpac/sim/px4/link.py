@@ -1,4 +1,4 @@
-"""MAVLink 2 for one simulated vehicle: datagrams in, datagrams out; no socket and no clock.
+"""MAVLink 2 for one simulated vehicle, as messages or as datagrams; no socket and no clock.
 
 What is told, when and in which bits is PX4 v1.17's: tests/sim/sim/test_px4_recordings.py holds it
 to recordings of a real one, on its link to a companion computer. Parameters travel with their bytes
@@ -79,13 +79,19 @@ class _EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
 
     def __init__(self, event: Px4Event, sequence: int, boot_ms: int) -> None:
         super().__init__(self.id, self.msgname)
+        self.id = 1 << 24 | event.number
+        self.event_time_boot_ms = boot_ms
         self.sequence = sequence
-        level = event.level << 4 | event.level
-        head = struct.pack("<IIHBBB", 1 << 24 | event.number, boot_ms, sequence, 0, 0, level)
-        self._payload = head + event.arguments.ljust(40, b"\0")
+        self.destination_component = self.destination_system = 0
+        self.log_levels = event.level << 4 | event.level
+        self.arguments = event.arguments.ljust(40, b"\0")
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
-        return self._pack(mav, self.crc_extra, self._payload, force_mavlink1=force_mavlink1)
+        head = struct.pack(
+            "<IIHBBB", self.id, self.event_time_boot_ms, self.sequence,
+            self.destination_component, self.destination_system, self.log_levels,
+        )  # fmt: skip
+        return self._pack(mav, self.crc_extra, head + self.arguments, force_mavlink1=force_mavlink1)
 
 
 class _EventSequence(mavlink.MAVLink_message):  # type: ignore[misc]
@@ -97,14 +103,21 @@ class _EventSequence(mavlink.MAVLink_message):  # type: ignore[misc]
 
     def __init__(self, sequence: int) -> None:
         super().__init__(self.id, self.msgname)
-        self._payload = struct.pack("<HB", sequence, 0)
+        self.sequence = sequence
+        self.flags = 0
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
-        return self._pack(mav, self.crc_extra, self._payload, force_mavlink1=force_mavlink1)
+        payload = struct.pack("<HB", self.sequence, self.flags)
+        return self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1)
 
 
 class Px4Link:
-    """What one vehicle says and understands. Give it datagrams; take from it what is due."""
+    """What one vehicle says and understands, and when.
+
+    Over a wire: give it datagrams (`receive`), take from it those that are due (`due`). Within one
+    process the same goes as message objects (`hear`, `say`), which costs a tenth: their numbers
+    must be rounded as MAVLink would.
+    """
 
     def __init__(
         self, vehicle: Px4Vehicle, *, system_id: int, hardware_uid: int | None = None
@@ -116,7 +129,7 @@ class Px4Link:
         self._hardware_uid = system_id if hardware_uid is None else hardware_uid
         self._mavlink: Any = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)
         self._mavlink.robust_parsing = True
-        self._out: list[bytes] = []
+        self._out: list[Any] = []
         self._parameters_to_send: list[str] = []
         self._upload: list[Any] = []
         self._upload_count = 0
@@ -175,9 +188,9 @@ class Px4Link:
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_or_disarm,
             mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
             mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
-            mavlink.MAV_CMD_RUN_PREARM_CHECKS: lambda _: vehicle.run_prearm_checks(),
-            mavlink.MAV_CMD_NAV_LAND: lambda _: vehicle.set_mode(Px4Mode.LAND),
-            mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: vehicle.set_mode(Px4Mode.RETURN),
+            mavlink.MAV_CMD_RUN_PREARM_CHECKS: self._run_prearm_checks,
+            mavlink.MAV_CMD_NAV_LAND: self._land,
+            mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: self._return_to_launch,
             mavlink.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_message_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
@@ -187,13 +200,28 @@ class Px4Link:
     def receive(self, datagram: bytes) -> None:
         """Act on what a client sent; anything that is no MAVLink, or not for us, is ignored."""
         for message in self._mavlink.parse_buffer(datagram) or ():
-            handler = self._handlers.get(message.get_type())
-            target = getattr(message, "target_system", 0)
-            if handler is not None and target in (0, self.system_id):
-                handler(message)
+            self.hear(message)
+
+    def hear(self, message: Any) -> None:
+        """Act on one message of a client; one that is not for us is ignored."""
+        handler = self._handlers.get(message.get_type())
+        target = getattr(message, "target_system", 0)
+        if handler is not None and target in (0, self.system_id):
+            handler(message)
 
     def due(self) -> list[bytes]:
-        """The datagrams to send now: answers first, then the streams whose time has come."""
+        """The datagrams to send now: what there is to say, packed."""
+        datagrams = [b""]
+        for message in self.say():
+            packet = bytes(message.pack(self._mavlink))
+            self._mavlink.seq = (self._mavlink.seq + 1) % 256
+            if len(datagrams[-1]) + len(packet) > MAX_DATAGRAM_BYTES:
+                datagrams.append(b"")
+            datagrams[-1] += packet
+        return [datagram for datagram in datagrams if datagram]
+
+    def say(self) -> list[Any]:
+        """The messages to send now: answers first, then the streams whose time has come."""
         vehicle = self.vehicle
         for event in vehicle.take_events():
             self._event_sequence = (self._event_sequence + 1) % 0x10000
@@ -211,17 +239,11 @@ class Px4Link:
                 interval_s = self._intervals_s[message]
                 self._due_s[message] = max(due_s + interval_s, now_s)
                 self._send_now(message)
-        datagrams = [b""]
-        for packet in self._out:
-            if len(datagrams[-1]) + len(packet) > MAX_DATAGRAM_BYTES:
-                datagrams.append(b"")
-            datagrams[-1] += packet
-        self._out.clear()
-        return [datagram for datagram in datagrams if datagram]
+        messages, self._out = self._out, []
+        return messages
 
     def _send(self, message: Any) -> None:
-        self._out.append(bytes(message.pack(self._mavlink)))
-        self._mavlink.seq = (self._mavlink.seq + 1) % 256
+        self._out.append(message)
 
     def _send_now(self, message_id: int, build: Callable[[], Any] | None = None) -> bool:
         """Whether there was something to tell."""
@@ -564,6 +586,15 @@ class Px4Link:
     def _take_off(self, message: Any) -> MavResult:
         long = message.get_type() == "COMMAND_LONG"
         return self.vehicle.take_off(message.param7 if long else message.z)
+
+    def _run_prearm_checks(self, _: Any) -> MavResult:
+        return self.vehicle.run_prearm_checks()
+
+    def _land(self, _: Any) -> MavResult:
+        return self.vehicle.set_mode(Px4Mode.LAND)
+
+    def _return_to_launch(self, _: Any) -> MavResult:
+        return self.vehicle.set_mode(Px4Mode.RETURN)
 
     def _terminate(self, message: Any) -> MavResult:
         return self.vehicle.disarm(force=True) if message.param1 > 0.5 else MavResult.ACCEPTED

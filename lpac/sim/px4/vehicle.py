@@ -18,7 +18,14 @@ import numpy as np
 
 from edge.core import F64
 from lpac.sim.px4 import checks
-from lpac.sim.px4.checks import Component, HealthReport, HealthReporter, Level, Problem, Px4Event
+from lpac.sim.px4.checks import (
+    ArmingProblem,
+    Component,
+    HealthReport,
+    HealthReporter,
+    Level,
+    Px4Event,
+)
 from lpac.sim.px4.errors import GPS_VERTICAL, Errors, draw_bias_m
 from lpac.sim.px4.estimator import NOISE_M, Estimator
 from lpac.sim.px4.failsafe import Failsafe
@@ -592,7 +599,9 @@ class Px4Vehicle:
                 checks.GROUND_STATION_REQUIRED if required else checks.NO_GROUND_STATION,
             ),
         )
-        problems: tuple[Problem, ...] = tuple(p for is_so, p in found if is_so and p is not None)
+        problems: tuple[ArmingProblem, ...] = tuple(
+            p for is_so, p in found if is_so and p is not None
+        )
         return HealthReport(problems, frozenset(is_there))
 
     # Modes
@@ -850,15 +859,21 @@ class Px4Vehicle:
 
     def _follow(self, setpoint: Px4Setpoint) -> tuple[F64, float, float]:
         gains = (self.parameters["MPC_XY_P"],) * 2 + (self.parameters["MPC_Z_P"],)
-        error_m = setpoint.position_m - self.local_position_m
-        bare_velocity = np.isnan(error_m)
-        drift = (0.0, 0.0, self._vertical_drift_m_s)
-        command = np.nan_to_num(setpoint.velocity_m_s) + np.where(
-            bare_velocity, drift, gains * np.nan_to_num(error_m)
+        errors_m = (setpoint.position_m - self.local_position_m).tolist()
+        drifts_m_s = (0.0, 0.0, self._vertical_drift_m_s)
+        command = np.array(
+            [
+                (0.0 if math.isnan(velocity_m_s) else velocity_m_s)
+                + (drift_m_s if math.isnan(error_m) else gain * error_m)
+                for velocity_m_s, error_m, gain, drift_m_s in zip(
+                    setpoint.velocity_m_s.tolist(), errors_m, gains, drifts_m_s, strict=True
+                )
+            ]
         )
         command[:2] = _shorten(command[:2], self.parameters["MPC_XY_VEL_MAX"])
         airframe = self._airframe
-        lag_s = airframe.offboard_velocity_lag_s if bare_velocity[0] else airframe.lag_s
+        bare_velocity = math.isnan(errors_m[0])
+        lag_s = airframe.offboard_velocity_lag_s if bare_velocity else airframe.lag_s
         return command, setpoint.yaw_rad, lag_s
 
     def _hold(self) -> F64:

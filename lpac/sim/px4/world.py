@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cache, lru_cache
 
 from edge.core import F64
 
@@ -16,7 +17,7 @@ class WorldOrigin:
 
     def to_global(self, position_m: F64) -> tuple[float, float, float]:
         """Latitude and longitude, deg, and height above mean sea level, m, of a world position."""
-        north_m, east_m = self._m_per_deg()
+        north_m, east_m = _m_per_deg(self.latitude_deg)
         return (
             self.latitude_deg + float(position_m[0]) / north_m,
             self.longitude_deg + float(position_m[1]) / east_m,
@@ -25,20 +26,11 @@ class WorldOrigin:
 
     def to_world(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
         """North and east of a place, m."""
-        north_m, east_m = self._m_per_deg()
+        north_m, east_m = _m_per_deg(self.latitude_deg)
         return (
             (latitude_deg - self.latitude_deg) * north_m,
             (longitude_deg - self.longitude_deg) * east_m,
         )
-
-    def _m_per_deg(self) -> tuple[float, float]:
-        """Lengths of a degree on the WGS84 ellipsoid; good to 1 cm within 1 km."""
-        semi_major_m, eccentricity_2 = 6378137.0, 6.69437999014e-3
-        latitude = math.radians(self.latitude_deg)
-        w_2 = 1.0 - eccentricity_2 * math.sin(latitude) ** 2
-        meridian_m = semi_major_m * (1.0 - eccentricity_2) / w_2**1.5
-        normal_m = semi_major_m / math.sqrt(w_2) * math.cos(latitude)
-        return math.radians(meridian_m), math.radians(normal_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +42,29 @@ class FencePolygon:
 
     def contains(self, world: WorldOrigin, north_m: float, east_m: float) -> bool:
         """Whether a place of the world lies inside the polygon (even-odd rule)."""
-        corners_m = [world.to_world(*vertex_deg) for vertex_deg in self.vertices_deg]
         inside = False
-        for (n_1, e_1), (n_2, e_2) in zip(corners_m, corners_m[1:] + corners_m[:1], strict=True):
+        for (n_1, e_1), (n_2, e_2) in _edges_m(self, world):
             crosses = (e_1 > east_m) != (e_2 > east_m)
             if crosses and north_m < n_1 + (east_m - e_1) * (n_2 - n_1) / (e_2 - e_1):
                 inside = not inside
         return inside
+
+
+@cache
+def _m_per_deg(latitude_deg: float) -> tuple[float, float]:
+    """Lengths of a degree on the WGS84 ellipsoid; good to 1 cm within 1 km."""
+    semi_major_m, eccentricity_2 = 6378137.0, 6.69437999014e-3
+    latitude = math.radians(latitude_deg)
+    w_2 = 1.0 - eccentricity_2 * math.sin(latitude) ** 2
+    meridian_m = semi_major_m * (1.0 - eccentricity_2) / w_2**1.5
+    normal_m = semi_major_m / math.sqrt(w_2) * math.cos(latitude)
+    return math.radians(meridian_m), math.radians(normal_m)
+
+
+@lru_cache
+def _edges_m(
+    polygon: FencePolygon, world: WorldOrigin
+) -> tuple[tuple[tuple[float, float], tuple[float, float]], ...]:
+    """From corner to corner, each north and east."""
+    corners_m = [world.to_world(*vertex_deg) for vertex_deg in polygon.vertices_deg]
+    return tuple(zip(corners_m, corners_m[1:] + corners_m[:1], strict=True))

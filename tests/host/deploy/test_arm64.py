@@ -15,14 +15,15 @@ import pytest
 
 from edge.drivers.flight_log import read as read_log
 from edge.messages.mission import FlightState
-from edge.policy.lpac.graphs import Policy
-from edge.policy.replay import replay
+from edge.policy.lpac.policy import LpacPolicy
+from edge.policy.lpac.replay import replay
+from lpac.ground.station.protocol import SafetyCommand, Start
 from tests.conftest import ROOT, SHIPPED
 from tests.host.conftest import BuildImage
 from tests.host.deploy.entering import inside
 from tests.robot_rig import Changes, Rig, new_vehicle, program, rig
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
@@ -108,7 +109,7 @@ def test_it_computes_what_torch_computed(tree: Path, tmp_path: Path) -> None:
 
 
 def test_a_robot_flies_a_mission_with_it(
-    tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shipped_policy: Policy
+    tree: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shipped_policy: LpacPolicy
 ) -> None:
     """Its policy, zenoh and MAVSDK are ARM's; vehicle and operator are this machine's."""
     for name, value in ENVIRONMENT.items():
@@ -155,8 +156,8 @@ def fly(made: Rig) -> None:
             made.take_off()
         elif made.status.state is FlightState.HOLD:
             # It may have begun to land just now, and refuse.
-            made.refusal("start", "arm")
+            made.command(Start())
     assert all(loop.failures == 0 for loop in made.status.loops.values())
-    made.operator.safety_action("land")
+    made.do(SafetyCommand("land"))
     made.wait_for_state(FlightState.LANDED)
     assert not made.vehicle.armed

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 from tests.process.sim.fault_rig import FaultRig, speed_m_s
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 ROBOTS = 3
 OWN_NETWORK = ("unshare", "--map-root-user", "--net", "sh", "-c")
@@ -68,10 +69,12 @@ def _fly(folder: Path) -> None:
             "COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0, "MPC_LAND_SPEED": 1.5,
             "COM_DISARM_LAND": 0.5,
         }  # fmt: skip
-    with fleet:
-        rig = FaultRig(fleet, range(ROBOTS), fleet.simulated)
-        for step in ("assemble", "preflight", "takeoff", "start"):
-            rig.script(step)
+    with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
+        rig = FaultRig(fleet, ground, range(ROBOTS), fleet.simulated)
+        rig.assemble()
+        rig.make_ready()
+        rig.take_off()
+        rig.start()
         for robot in range(ROBOTS):
             rig.wait_moving(robot)
         began_s = {robot: rig.now_s(robot) for robot in range(ROBOTS)}

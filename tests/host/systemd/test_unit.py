@@ -18,11 +18,12 @@ from edge.messages.mission import FlightState
 from lpac.fleet.release import drop_ins
 from lpac.fleet.settings import FleetConfig, load_fleet
 from lpac.fleet.writer import robot_toml
+from lpac.ground.station.protocol import Enable, SafetyCommand, SetOrigin, Takeoff
+from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.hosts.base import NoHostsError
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
-from lpac.sim.operator import Operator, Statuses
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
 
@@ -169,14 +170,13 @@ def look_at_the_sandbox(host: SimulatedHost, pid: str) -> None:
 
 
 def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_hold(
-    host: SimulatedHost, config: FleetConfig
+    hosts: SimulatedHosts, host: SimulatedHost, config: FleetConfig
 ) -> None:
     with host.stepped:
         host.vehicle.parameters |= {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
     host.run("systemctl start lpac-robot")
-    endpoint = f"tcp/{host.address}:{config.robots[host.name].zenoh_port}"
-    with Operator(fleet=config.fleet, connect=(endpoint,), name="test") as operator:
-        take_off(operator)
+    with GroundProgram(hosts.fleet_toml, config.fleet) as ground:
+        take_off(ground)
         hung = shown(host, "MainPID")["MainPID"]
         host.run(f"kill -STOP {hung}")
         with host.stepped:
@@ -217,15 +217,17 @@ def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
     toml.write_text(text)
 
 
-def take_off(operator: Operator) -> None:
-    def is_up(heard: Statuses) -> bool:
-        """If not, it takes off when it is ready, also for another time if it was held up."""
-        if 1 in heard and heard[1].ready and not operator.ordered(1):
-            operator.order("takeoff", 1)
-        return 1 in heard and heard[1].state is FlightState.HOLD
-
-    operator.enable(ORIGIN)
-    assert operator.wait_for(is_up, 180.0), (operator.statuses(), operator.refusals)
+def take_off(ground: GroundProgram) -> None:
+    """When it is ready; also for another time if it was held up."""
+    for request in (SetOrigin(ORIGIN), Enable()):
+        assert ground.told.wait_for(lambda told: told.robots[0].fresh, 180.0)
+        assert ground.command(request).problem is None
+    until_s = time.monotonic() + 180.0
+    while not (report := ground.command(Takeoff())).done:
+        assert report.problem is None and time.monotonic() < until_s, report
+        status = ground.told.snapshot.robots[0].status
+        if status is not None and status.state is FlightState.HOLD:
+            ground.command(SafetyCommand("land", wait=True))
 
 
 def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_says(

@@ -11,14 +11,14 @@ import pytest
 
 from edge.drivers.flight_log import FlightLog, FlightMetadata
 from edge.policy.bundle import Bundle
-from edge.policy.lpac.graphs import Policy
+from edge.policy.lpac.policy import LpacPolicy
 from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
 from tests.unit.policy.test_replay import Messages, fly
 
 
 @pytest.fixture(scope="module")
-def flown(shipped_policy: Policy) -> Messages:
+def flown(shipped_policy: LpacPolicy) -> Messages:
     return fly(shipped_policy)
 
 

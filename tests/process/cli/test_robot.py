@@ -11,7 +11,6 @@ import pytest
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode
 from lpac.sim.px4.link import Px4Link
 from tests.robot_rig import (
-    ORIGIN,
     SYSTEM_ID,
     Changes,
     Rig,
@@ -53,7 +52,7 @@ def test_check_explains_unsafe_failsafes_and_refuses_them(tmp_path: Path) -> Non
     vehicle = new_vehicle(COM_OBL_RC_ACT=0, NAV_RCL_ACT=0)
     changes: Changes = {"failsafe": {"parameters": "refuse"}}
     with rig(tmp_path, vehicle, changes=changes) as made:
-        made.operator.enable(ORIGIN)
+        made.enable()
         before = dict(vehicle.parameters)
         # Only the parameters are wrong.
         failed, explanations = failures_in_the_end(
@@ -69,7 +68,7 @@ def test_check_explains_unsafe_failsafes_and_refuses_them(tmp_path: Path) -> Non
 def test_check_passes_a_good_vehicle_and_says_what_it_set(tmp_path: Path) -> None:
     vehicle = new_vehicle()
     with rig(tmp_path, vehicle) as made:
-        made.operator.enable(ORIGIN)
+        made.enable()
         result = lpac_robot("check", "--config", made.config_path, "--wait", 60)
         assert (result.returncode, result.stderr) == (0, "")
         lines = result.stdout.splitlines()
@@ -97,7 +96,7 @@ def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
     vehicles = new_vehicle(), new_vehicle()
     before = dict(vehicles[0].parameters)
     with rig(tmp_path, vehicles[0], Px4Link(vehicles[1], system_id=SYSTEM_ID + 1)) as made:
-        made.operator.enable(ORIGIN)
+        made.enable()
         expected = [
             CheckCode.OTHER_VEHICLES, CheckCode.FAILSAFE_NOT_READ, CheckCode.FENCE_NOT_UPLOADED,
         ]  # fmt: skip

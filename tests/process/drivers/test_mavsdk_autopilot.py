@@ -11,7 +11,6 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
-from structlog.testing import capture_logs
 
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
 from edge.drivers.px4.autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
@@ -21,6 +20,7 @@ from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 from tests.conftest import ROOT
+from tests.said import lines_said
 
 CLIMB = Velocity((0.0, 0.0, -2.0))
 STAY = Velocity((0.0, 0.0, 0.0))
@@ -324,7 +324,7 @@ def test_hold_land_and_disarm() -> None:
 def results_of(commands: list[Action], vehicle: Px4Vehicle) -> list[tuple[str, str]]:
     """What became of commands that were given while the vehicle did not answer."""
     first, *others = commands
-    with capture_logs() as logs, connected(vehicle) as (autopilot, server):
+    with lines_said() as lines, connected(vehicle) as (autopilot, server):
         wait(autopilot, lambda s: s.armable)
         with server.stepped:
             autopilot.command(first)
@@ -332,7 +332,8 @@ def results_of(commands: list[Action], vehicle: Px4Vehicle) -> list[tuple[str, s
             for action in others:
                 autopilot.command(action)
         wait(autopilot, lambda s: s.result and s.result.action is commands[-1])
-    return [(log["action"], log["refusal"]) for log in logs if log["event"] == "command"]
+    commands_said = [line.details for line in lines if line.event == "command"]
+    return [(str(said["action"]), str(said["refusal"])) for said in commands_said]
 
 
 @pytest.mark.parametrize("last", [Action.LAND, Action.HOLD])
@@ -362,11 +363,11 @@ def test_a_command_that_waits_is_not_queued_twice() -> None:
 def test_a_start_that_waited_too_long_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     vehicle = new_vehicle()
-    with capture_logs() as logs, connected(vehicle) as (autopilot, server), server.stepped:
+    with lines_said() as lines, connected(vehicle) as (autopilot, server), server.stepped:
         autopilot.command(Action.DISARM)
         autopilot.command(Action.ARM)
         wait(autopilot, lambda s: s.result and s.result.action is Action.ARM)
-    assert [log["refusal"] for log in logs if log["event"] == "command"] == [
+    assert [line.details["refusal"] for line in lines if line.event == "command"] == [
         "no answer",
         "asked for too long ago",
     ]
@@ -444,12 +445,12 @@ def test_an_impossible_url_is_named() -> None:
 
 
 PILOT_PROGRAM = """
-import ctypes, logging, sys, time
-import structlog
+import ctypes, sys, time
+from edge.core import log
 from edge.drivers.px4.autopilot import MavsdkAutopilot
 from edge.core.vehicle import Action, Mode, Velocity
 
-structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+log.listen(log.show_errors)
 
 def fly(velocity, until, action=None):
     while not until(autopilot.state()):

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from edge.drivers.px4 import left_alone
 from edge.drivers.px4.raw_mavlink import Heartbeat, heartbeat, hold_command, land_command
-from edge.drivers.px4.watchdog import Watchdog, WatchdogError
+from edge.drivers.px4.watchdog import WatchdogError, WatchdogProcess
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import Px4Mode
@@ -25,13 +25,13 @@ from lpac.sim.px4.vehicle import Px4Vehicle
 from tests.conftest import ROOT
 
 PROGRAM = """
-import ctypes, logging, sys, time
-import structlog
-from edge.drivers.px4.watchdog import Watchdog
+import ctypes, sys, time
+from edge.core import log
+from edge.drivers.px4.watchdog import WatchdogProcess
 from edge.drivers.px4.autopilot import MavsdkAutopilot
 from edge.core.vehicle import Action, Mode, Velocity
 
-structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
+log.listen(log.show_errors)
 port, system_id, way = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 
 def fly(velocity, until, action=None):
@@ -44,7 +44,7 @@ def fly(velocity, until, action=None):
 
 with (
     MavsdkAutopilot(f"udpin://127.0.0.1:{port}", system_id=system_id) as autopilot,
-    Watchdog(port, system_id, 0.5, float(sys.argv[4])) as watchdog,
+    WatchdogProcess(port, system_id, 0.5, float(sys.argv[4])) as watchdog,
 ):
     while not autopilot.state().armable:
         time.sleep(0.05)
@@ -77,6 +77,7 @@ def program(
             running.kill()
 
 
+@pytest.mark.alone
 def test_a_program_that_hangs_or_dies_leaves_nobody_flying_or_hovering() -> None:
     hangs = ("process", "interpreter", "loop")
     ways = (*hangs, "killed", "stopped, then killed", "continued", "taken", "taken and left")
@@ -150,7 +151,9 @@ def test_silence_after_flying_is_answered_once_with_hold(
     sockets: tuple[socket.socket, socket.socket],
 ) -> None:
     own, autopilot = sockets
-    with Watchdog(own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0) as watchdog:
+    with WatchdogProcess(
+        own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0
+    ) as watchdog:
         assert watchdog.alive()
         watchdog.feed(flying=True)
         frames = [autopilot.recv(300) for _ in range(3)]
@@ -172,7 +175,9 @@ def test_a_robot_that_does_not_fly_may_be_silent(
 ) -> None:
     own, autopilot = sockets
     autopilot.settimeout(1.0)
-    with Watchdog(own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0) as watchdog:
+    with WatchdogProcess(
+        own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0
+    ) as watchdog:
         assert watchdog._process is not None
         # It hears both together, however slow this machine is.
         watchdog._process.send_signal(signal.SIGSTOP)
@@ -187,7 +192,9 @@ def test_feeding_a_watchdog_that_was_killed_does_not_raise(
     sockets: tuple[socket.socket, socket.socket],
 ) -> None:
     own, _ = sockets
-    with Watchdog(own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0) as watchdog:
+    with WatchdogProcess(
+        own.getsockname()[1], system_id=7, timeout_s=0.3, hover_land_s=60.0
+    ) as watchdog:
         assert watchdog._process is not None
         watchdog._process.kill()
         watchdog._process.wait()
@@ -198,7 +205,7 @@ def test_feeding_a_watchdog_that_was_killed_does_not_raise(
 def test_a_port_that_is_not_open_is_named() -> None:
     with (
         pytest.raises(WatchdogError, match=r"^no UDP socket on port 9 to guard"),
-        Watchdog(9, system_id=7, timeout_s=0.5, hover_land_s=60.0),
+        WatchdogProcess(9, system_id=7, timeout_s=0.5, hover_land_s=60.0),
     ):
         pass
 

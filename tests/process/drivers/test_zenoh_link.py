@@ -428,6 +428,42 @@ def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:
         assert of_first.largest <= EXPLORED.limit_bytes
 
 
+def test_whoever_floods_the_radio_costs_little_and_makes_nobody_deaf() -> None:
+    """Anybody who speaks zenoh, without our programs."""
+    known, inbox = endpoint(), Inbox()
+    with (
+        ZenohLink(
+            fleet="test", robot_id=0, listen=[known], subscriptions={MESSAGE: inbox, STATE: inbox}
+        ) as robot,
+        ZenohLink(fleet="test", robot_id=1, listen=[endpoint()], connect=[known]) as neighbour,
+        zenoh.open(attacker(known)) as stranger,
+    ):
+        eventually(partial(has_peers, robot, 2))
+        began_s = time.monotonic()
+        for sent in range(5000):
+            stranger.put("lpac/test/robot/2/message", bytes(64))
+            stranger.put(f"lpac/test/robot/{sent + 3}/message", bytes(64))
+            stranger.put(f"lpac/test/robot/{'9' * 4300}/message", bytes(64))
+        stranger.put("lpac/test/ground/state", bytes(STATE.limit_bytes + 1))
+        stranger.put("lpac/test/robot/2/message", bytes(50 * 2**20))
+        eventually_hears(neighbour, MESSAGE, b"still there", "robot/1/message", inbox)
+        lasted_s = time.monotonic() - began_s
+        from_one = MESSAGE.most_hz * (2.0 + lasted_s)
+        assert inbox.count <= 1000 + from_one + lasted_s * 100
+        assert all(len(data) <= 64 for data in inbox.newest.values())
+        assert max(map(len, inbox.newest)) < 40
+        assert robot.failures() == 0
+        # What zenoh itself refuses ends the stranger's connection, and nobody else's.
+        eventually(partial(is_present, robot, {1}))
+
+
+def attacker(known: str) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("connect/endpoints", json.dumps([known]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return config
+
+
 def test_close_twice_then_publish() -> None:
     link = ZenohLink(fleet="test", robot_id=1)
     link.close()
@@ -450,14 +486,18 @@ with ZenohLink(fleet="test", robot_id=1, connect=["tcp/127.0.0.1:1"]):
 
 
 def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
-    """Robots 1 and 2 in one network namespace, 3 and 4 in another, and a link between them."""
+    """Two robots in one network namespace, seven in another, and a link between them.
+
+    Each process loses 14 connections at once, as many as a robot of a team of 15.
+    """
+    nearby, far_away = (1, 2), tuple(range(3, 10))
     settings: list[dict[str, object]] = [
         {
             "robot_id": robot_id,
             "listen": [f"tcp/10.0.0.{robot_id}:7447"],
             "connect": [f"tcp/10.0.0.{other}:7447" for other in range(1, robot_id)],
         }
-        for robot_id in (1, 2, 3, 4)
+        for robot_id in nearby + far_away
     ]
     isolated = ["unshare", "--user", "--map-root-user", "--net"]
     if not shutil.which("ip") or subprocess.run([*isolated, "true"], check=False).returncode:
@@ -475,7 +515,7 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
         Robots(*settings[2:], prefix=[*enter(near), "unshare", "--net"]) as far,
     ):
         ip(near, f"link add name radio type veth peer name radio netns {far.process.pid}")
-        for robots, addresses in ((near, (1, 2)), (far, (3, 4))):
+        for robots, addresses in ((near, nearby), (far, far_away)):
             for address in addresses:
                 ip(robots, f"addr add 10.0.0.{address}/24 dev radio")
             for device in ("lo", "radio"):
@@ -485,7 +525,7 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
 
         def silence(action: str) -> None:
             """`add` or `del` what swallows the packets from one side to the other."""
-            for robots, others in ((near, (3, 4)), (far, (1, 2))):
+            for robots, others in ((near, far_away), (far, nearby)):
                 for other in others:
                     ip(robots, f"route {action} blackhole 10.0.0.{other}")
 
@@ -508,19 +548,24 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
         def present() -> list[list[int]]:
             return [seen["present"] for seen in near.seen() + far.seen()]
 
-        all_pairs = list(permutations((1, 2, 3, 4), 2))
-        everybody = [[2, 3, 4], [1, 3, 4], [1, 2, 4], [1, 2, 3]]
+        def others(*teams: tuple[int, ...]) -> list[list[int]]:
+            """Whom each robot hears if only the robots of its own team hear each other."""
+            return [[other for other in team if other != robot] for team in teams for robot in team]
+
+        all_pairs = list(permutations(nearby + far_away, 2))
+        everybody, apart = others(nearby + far_away), others(nearby, far_away)
+        pairs_apart = [*permutations(nearby, 2), *permutations(far_away, 2)]
         for _ in range(2):
             eventually(heard_more(all_pairs))
             eventually(lambda: present() == everybody)
             silence("add")
-            eventually(lambda: present() == [[2], [1], [4], [3]])
+            eventually(lambda: present() == apart)
             # Sooner than the 10 s for which a lost connection may hold a thread.
-            eventually(heard_more([(1, 2), (2, 1), (3, 4), (4, 3)]), timeout_s=5.0)
+            eventually(heard_more(pairs_apart), timeout_s=5.0)
             silence("del")
         eventually(heard_more(all_pairs))
         silence("add")
-        eventually(lambda: present() == [[2], [1], [4], [3]])
+        eventually(lambda: present() == apart)
         for robots in (near, far):
             robots.process.communicate(timeout=8.0)
             assert robots.process.returncode == 0

@@ -23,7 +23,7 @@ from playwright.sync_api import Page, sync_playwright
 from tests.conftest import ROOT
 
 CHROMIUM = shutil.which("chromium")
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 # Software rendering, and nothing that a browser does by itself on the network.
 _ARGUMENTS = (
     "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-background-networking",

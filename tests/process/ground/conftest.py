@@ -29,7 +29,7 @@ from lpac.ground.station.protocol import (
 from tests.conftest import ROOT
 
 # Nothing here takes so long unless it is broken.
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 def all_heard(snapshot: FleetSnapshot) -> bool:

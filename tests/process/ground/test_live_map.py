@@ -4,20 +4,24 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 from urllib.parse import urlsplit
+from urllib.request import HTTPCookieProcessor, build_opener, urlopen
 
 import aiohttp
 import pytest
 
+from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import ON_GROUND
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.ground.map.access import Access, is_loopback, reached_at
 from lpac.ground.map.server import Outbox, serving
 from lpac.ground.station.client import command, listen
 from lpac.ground.station.protocol import SetOrigin, TakeCommand
-from tests.pretend import ORIGIN, PretendedFleet, pretended
+from tests.live import ORIGIN, FlownFleet
 from tests.process.ground.browser import PATIENCE_S, Opened, live_map, lpac, opened
 from tests.process.ground.conftest import wait_for_snapshot
 
@@ -32,10 +36,10 @@ def _own_sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PretendedFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FlownFleet]:
     """Thirty robots and their ground process; nobody has taken off."""
     with (
-        pretended(tmp_path_factory.mktemp("fleet"), 30) as robots,
+        FlownFleet(tmp_path_factory.mktemp("fleet"), 30) as robots,
         lpac("ground", "--fleet", str(robots.fleet_toml), "--name", "alice"),
     ):
         yield robots
@@ -85,7 +89,7 @@ def test_what_a_stranger_gets_from_the_server() -> None:
     asyncio.run(ask())
 
 
-def test_on_the_network_the_address_has_a_token(fleet: PretendedFleet) -> None:
+def test_on_the_network_the_address_has_a_token(fleet: FlownFleet) -> None:
     async def ask(address: str) -> None:
         async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
             bare = address.partition("?")[0]
@@ -156,7 +160,7 @@ def test_without_a_ground_it_says_so() -> None:
     ],
 )
 def test_a_map_that_only_observes_refuses_every_action(
-    fleet: PretendedFleet, wish: dict[str, Any]
+    fleet: FlownFleet, wish: dict[str, Any]
 ) -> None:
     async def ask() -> None:
         async with (
@@ -173,10 +177,10 @@ def test_a_map_that_only_observes_refuses_every_action(
             assert snapshot["safety_action"] == "none"
 
     asyncio.run(ask())
-    assert all(robot.state in ON_GROUND for robot in fleet.robots)
+    assert all(robot.state in ON_GROUND for robot in fleet.flown)
 
 
-def test_kill_is_no_action_of_the_map(fleet: PretendedFleet) -> None:
+def test_kill_is_no_action_of_the_map(fleet: FlownFleet) -> None:
     async def ask() -> None:
         async with (
             asking(fleet.name, operate=True) as (address, session),
@@ -190,7 +194,7 @@ def test_kill_is_no_action_of_the_map(fleet: PretendedFleet) -> None:
 
 
 def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
-    fleet: PretendedFleet,
+    fleet: FlownFleet,
 ) -> None:
     """Five times a second of the ground's own clock, as soon as this machine lets it."""
 
@@ -246,7 +250,7 @@ def test_a_page_that_takes_nothing_misses_snapshots() -> None:
 
 
 def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
-    async def ask(fleet: PretendedFleet) -> None:
+    async def ask(fleet: FlownFleet) -> None:
         async with (
             asking(fleet.name) as (address, session),
             session.ws_connect(address + "live") as stream,
@@ -258,8 +262,10 @@ def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
             snapshot = await until(stream, of_kind("snapshot"))
             assert "world_not_here" in [alarm["code"] for alarm in snapshot["alarms"]]
 
-    with pretended(tmp_path, 1) as fleet:
-        fleet.robots[0].world_id = "0123456789ab"
+    with FlownFleet(tmp_path, 1) as fleet:
+        with fleet.paused():
+            fleet.robots[0].world = "CircularBND 100 100 20 5\n"
+            fleet.robots[0].start()
         with lpac("ground", "--fleet", str(fleet.fleet_toml), "--name", "alice"):
             asyncio.run(ask(fleet))
 
@@ -268,11 +274,26 @@ def test_a_world_that_the_ground_does_not_have(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def few(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PretendedFleet]:
+def few(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FlownFleet]:
     """Three robots, of which one says things that a careless page would run."""
-    with pretended(tmp_path_factory.mktemp("few"), 3) as robots:
-        robots.robots[2].refuses = HOSTILE
+    with FlownFleet(tmp_path_factory.mktemp("few"), 3) as robots:
+        hostile = (FailedCheck(CheckCode.OTHER, HOSTILE),)
+        robots.says[2] = lambda said: replace(said, ready=False, failed_checks=hostile)
         yield robots
+
+
+def test_a_map_that_commands_asks_for_its_token_on_this_machine_too(few: FlownFleet) -> None:
+    for options, asks in (((), False), (("--operate",), True)):
+        with live_map(few.fleet_toml, *options) as address:
+            bare, _, token = address.partition("?token=")
+            assert bool(token) is asks
+            with build_opener(HTTPCookieProcessor()).open(address) as page:
+                assert page.status == 200
+            if asks:
+                with pytest.raises(HTTPError) as refused:
+                    urlopen(bare)
+                assert refused.value.code == 403
+                refused.value.close()
 
 
 def check_innocence(seen: Opened) -> None:
@@ -282,7 +303,7 @@ def check_innocence(seen: Opened) -> None:
     assert "owned" not in seen.page.title()
 
 
-def test_a_flight_by_clicks(few: PretendedFleet) -> None:
+def test_a_flight_by_clicks(few: FlownFleet) -> None:
     with (
         lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"),
         live_map(few.fleet_toml, "--operate") as address,
@@ -311,7 +332,7 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         page.wait_for_selector(f"#toasts >> text={HOSTILE}")
         seen.act("start")
         seen.wait_for_states({"r0": "mission", "r1": "mission"})
-        assert few.robots[0].trial == page.inner_text("#trial")
+        assert few.flown[0].said.trial == page.inner_text("#trial")
         # The cost, and its bound.
         page.wait_for_function("() => Number(document.querySelector('#bound').textContent) > 0")
         page.wait_for_function("() => Number(document.querySelector('#share').textContent) > 0")
@@ -340,7 +361,7 @@ def test_a_flight_by_clicks(few: PretendedFleet) -> None:
         check_innocence(seen)
 
 
-def test_the_command_is_taken_by_a_click(few: PretendedFleet, short_path: Path) -> None:
+def test_the_command_is_taken_by_a_click(few: FlownFleet, short_path: Path) -> None:
     ground = "ground", "--fleet", str(few.fleet_toml), "--name"
     with (
         lpac(*ground, "alice"),
@@ -361,7 +382,7 @@ def test_the_command_is_taken_by_a_click(few: PretendedFleet, short_path: Path) 
         check_innocence(seen)
 
 
-def test_a_page_that_observes(few: PretendedFleet) -> None:
+def test_a_page_that_observes(few: FlownFleet) -> None:
     """It has nothing to command with; and it comes back by itself when the ground does."""
     with live_map(few.fleet_toml) as address, ExitStack() as first:
         ground = "ground", "--fleet", str(few.fleet_toml), "--name", "alice"
@@ -388,13 +409,13 @@ def test_a_page_that_observes(few: PretendedFleet) -> None:
                 assert command(few.name, SetOrigin(ORIGIN)).done
                 page.keyboard.press("Escape")
                 page.wait_for_selector("#absolute >> text=/e/")
-                known = [robot.world_id for robot in few.robots]
-                for robot in few.robots:
-                    robot.world_id = "feedbeef0000"
+                said = dict(few.says)
+                for robot in range(3):
+                    few.says[robot] = lambda said: replace(said, world_id="feedbeef0000")
                 page.wait_for_selector("#importance >> text=no importance known")
                 costs = [page.inner_text(f"#{name}") for name in ("share", "bound", "absolute")]
                 assert costs == ["\N{EN DASH}"] * 3 and page.is_hidden("#ramp")
-                for robot, world_id in zip(few.robots, known, strict=True):
-                    robot.world_id = world_id
+                few.says.clear()
+                few.says |= said
                 page.wait_for_selector("#importance >> text=/^importance/")
             check_innocence(seen)

@@ -1,7 +1,6 @@
-"""`lpac ground` as a real process, over real zenoh, with pretended robots."""
+"""`lpac ground` as a real process, over real zenoh, with robots that fly in this process."""
 
 import asyncio
-import math
 import signal
 import socket
 from collections.abc import Iterator
@@ -30,7 +29,7 @@ from lpac.ground.station.protocol import (
     TakeCommand,
     Takeoff,
 )
-from tests.pretend import ORIGIN, PretendedFleet, pretended
+from tests.live import ORIGIN, FlownFleet
 from tests.process.ground.conftest import PATIENCE_S, GroundStation, NewStation, all_heard
 from tests.said import not_done, problem
 
@@ -38,9 +37,9 @@ _S = FlightState
 
 
 @pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[PretendedFleet]:
+def fleet(tmp_path: Path) -> Iterator[FlownFleet]:
     """Three robots r0, r1, r2, and r3, a spare."""
-    with pretended(tmp_path, 3, spares=1) as running:
+    with FlownFleet(tmp_path, 3, spares=1) as running:
         yield running
 
 
@@ -53,7 +52,7 @@ def obeying(snapshot: FleetSnapshot, operator: str) -> bool:
 
 
 def done(report: CommandReport) -> CommandReport:
-    assert report.done, report
+    assert report.done, report.problem or [r for r in report.results if not r.done]
     return report
 
 
@@ -69,13 +68,13 @@ def fly(station: GroundStation) -> None:
     done(station.command(Start()))
 
 
-def test_a_whole_flight(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_a_whole_flight(fleet: FlownFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     assert problem(station.command(Takeoff())) is ProblemCode.NO_ORIGIN
     make_ready(station)
     progress: list[CommandProgress] = []
     report = station.command(Takeoff(interval_s=0.1), progress.append)
-    assert done(report).results[0] == RobotResult("r0", ResultCode.DONE, "at its height, 4 m")
+    assert done(report).results[0] == RobotResult("r0", ResultCode.DONE, "at its height, 5 m")
     began = [p.robot for p in progress if p.text == "takes off"]
     assert began == ["r2", "r1", "r0"], "the highest first"
     done(station.command(Start()))
@@ -99,13 +98,14 @@ def test_a_whole_flight(fleet: PretendedFleet, new_station: NewStation) -> None:
 
 def test_who_joins_late_has_the_state(tmp_path: Path, new_station: NewStation) -> None:
     text = "CircularBND 100 100 20 5\n"
-    with pretended(tmp_path, 3, absent=[2]) as fleet:
+    with FlownFleet(tmp_path, 3, absent=1) as fleet:
         station = new_station(fleet.fleet_toml)
         station.wait_for(lambda p: all(robot.fresh for robot in p.robots[:2]))
         report = station.command(SetOrigin(ORIGIN))
         assert not_done(report) == {"r2": ResultCode.NOT_HEARD}
         assert not_done(station.command(SetWorld(text, "w.env"))) == {"r2": ResultCode.NOT_HEARD}
-        fleet.join(2)
+        with fleet.paused():
+            fleet.robots[2].start()
         station.wait_for(
             lambda p: all(
                 r.status and r.status.origin == ORIGIN and r.status.world_id == world_id(text)
@@ -115,20 +115,20 @@ def test_who_joins_late_has_the_state(tmp_path: Path, new_station: NewStation) -
 
 
 def test_a_station_that_was_killed_goes_on_where_it_was(
-    fleet: PretendedFleet, new_station: NewStation
+    fleet: FlownFleet, new_station: NewStation
 ) -> None:
     text = "CircularBND 100 100 20 5\n"
     station = new_station(fleet.fleet_toml)
     make_ready(station)
     # It climbs for as long as the test has a use for it.
-    fleet.robots[2].takeoff_s = math.inf
+    fleet.flown[2].climb_slowly()
     done(station.command(SetWorld(text, "w.env")))
     takeoff = station.begin(Takeoff(interval_s=60.0))
     takeoff.progress("r2")
     station.wait_for(lambda p: p.robots[2].status and p.robots[2].status.state is _S.TAKEOFF)
     station.kill()
     takeoff.leave()
-    fleet.robots[2].takeoff_s = 1.0
+    fleet.flown[2].hurry()
     station.start()
     snapshot = station.wait_for(lambda p: p.ground is not None)
     assert snapshot.ground is not None
@@ -155,7 +155,7 @@ def test_a_station_that_was_killed_goes_on_where_it_was(
     station.wait_for(lambda p: p.ground is not None)
 
 
-def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_two_stations(fleet: FlownFleet, new_station: NewStation) -> None:
     alice = new_station(fleet.fleet_toml)
     fly(alice)
     bob = new_station(fleet.fleet_toml, "bob")
@@ -185,7 +185,7 @@ def test_two_stations(fleet: PretendedFleet, new_station: NewStation) -> None:
 
 
 def test_another_station_knows_the_world_that_one_sends(
-    fleet: PretendedFleet, new_station: NewStation
+    fleet: FlownFleet, new_station: NewStation
 ) -> None:
     text = "CircularBND 100 100 20 5\n"
     alice = new_station(fleet.fleet_toml)
@@ -207,14 +207,14 @@ def test_another_station_knows_the_world_that_one_sends(
 
 
 def test_a_ground_that_hangs(
-    fleet: PretendedFleet, new_station: NewStation, monkeypatch: pytest.MonkeyPatch
+    fleet: FlownFleet, new_station: NewStation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     station = new_station(fleet.fleet_toml)
     make_ready(station)
     subscribed = station.subscribed()
     next(subscribed)
     # It is silent for longer than that, and yet a long command goes on.
-    fleet.robots[2].takeoff_s = math.inf
+    fleet.flown[2].climb_slowly()
     takeoff = station.begin(Takeoff(interval_s=60.0))
     assert [takeoff.progress("").text for _ in range(2)] == ["", ""]
     assert station.process is not None
@@ -231,13 +231,13 @@ def test_a_ground_that_hangs(
         asyncio.run(client.send(station.fleet, SafetyCommand("hold")))
     monkeypatch.undo()
     station.process.send_signal(signal.SIGCONT)
-    fleet.robots[2].takeoff_s = 1.0
+    fleet.flown[2].hurry()
     # What it was told meanwhile it does.
     station.wait_for(lambda p: p.ground and p.ground.safety_action == "hold")
     takeoff.leave()
 
 
-def test_robots_land_when_their_files_say(fleet: PretendedFleet) -> None:
+def test_robots_land_when_their_files_say(fleet: FlownFleet) -> None:
     text = fleet.fleet_toml.read_text()
     flight = "battery_critical = 0.2\nground_timeout_s = 4.0\nground_lost_land_s = 30.0\n"
     fleet.fleet_toml.write_text(text.replace("[robot.flight]\n", f"[robot.flight]\n{flight}"))
@@ -246,7 +246,7 @@ def test_robots_land_when_their_files_say(fleet: PretendedFleet) -> None:
     assert (setup.ground_timeout_s, setup.ground_lost_land_s) == (4.0, 30.0)
 
 
-def test_two_stations_of_one_name(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_two_stations_of_one_name(fleet: FlownFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     make_ready(station)
     second = station.twin()
@@ -259,7 +259,7 @@ def test_two_stations_of_one_name(fleet: PretendedFleet, new_station: NewStation
     assert station.wait_for(lambda p: obeying(p, "alice")).commander == "alice"
 
 
-def test_another_fleet_is_not_reached(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_another_fleet_is_not_reached(fleet: FlownFleet, new_station: NewStation) -> None:
     text = fleet.fleet_toml.read_text()
     other = fleet.fleet_toml.with_name("other.toml")
     other.write_text(text.replace(fleet.name, f"{fleet.name}x"))
@@ -267,25 +267,25 @@ def test_another_fleet_is_not_reached(fleet: PretendedFleet, new_station: NewSta
     report = station.command(SetOrigin(ORIGIN))
     assert not_done(report) == dict.fromkeys(("r0", "r1", "r2"), ResultCode.NOT_HEARD)
     assert not_done(station.command(RobotCommand("kill", ("r0",)))) == {"r0": ResultCode.NOT_HEARD}
-    assert all(robot.ground is None for robot in fleet.robots)
+    assert {robot.said.obeyed_sequence for robot in fleet.flown} == {-1}
 
 
-def test_mistakes(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_mistakes(fleet: FlownFleet, new_station: NewStation) -> None:
     with pytest.raises(client.GroundError, match="no ground station runs for fleet"):
         client.command(fleet.name, Start())
     station = new_station(fleet.fleet_toml)
     assert problem(station.command(Start(robots=("r7",)))) is ProblemCode.UNKNOWN_ROBOT
     assert problem(station.command(RobotCommand("kill", ()))) is ProblemCode.NO_ROBOT
     make_ready(station)
-    fleet.robots[1].refuses = "the battery is low: 20 %"
+    fleet.flown[1].tire()
+    station.wait_for(lambda p: p.robots[1].status and not p.robots[1].status.ready)
     report = station.command(Takeoff(interval_s=0.0))
-    # It may have been ready a moment ago.
-    assert not_done(report) in ({"r1": ResultCode.NOT_READY}, {"r1": ResultCode.REFUSED})
+    assert not_done(report) == {"r1": ResultCode.NOT_READY}
     # A spare does not fly by default, but has the state.
-    station.wait_for(lambda _: fleet.robots[3].state is _S.PREFLIGHT)
+    station.wait_for(lambda _: fleet.flown[3].state is _S.PREFLIGHT)
 
 
-def test_lines_that_are_no_commands(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_lines_that_are_no_commands(fleet: FlownFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     for line in (
         b"", b"\n", b"{}\n", b"[" * 100_000 + b"\n", b'{"takeoff": {"interval_s": "x"}}\n',
@@ -301,15 +301,15 @@ def test_lines_that_are_no_commands(fleet: PretendedFleet, new_station: NewStati
 
 
 def test_who_leaves_abandons_what_is_not_ordered(
-    fleet: PretendedFleet, new_station: NewStation
+    fleet: FlownFleet, new_station: NewStation
 ) -> None:
     station = new_station(fleet.fleet_toml)
     make_ready(station)
     takeoff = station.begin(Takeoff(interval_s=60.0))
     takeoff.progress("r2")
     takeoff.leave()
-    station.wait_for(lambda p: not p.running and fleet.robots[2].state is _S.HOLD)
-    assert [robot.state for robot in fleet.robots[:2]] == [_S.PREFLIGHT] * 2
+    station.wait_for(lambda p: not p.running and fleet.flown[2].state is _S.HOLD)
+    assert [robot.state for robot in fleet.flown[:2]] == [_S.PREFLIGHT] * 2
     # A hold ends a takeoff, too, and then land is just as quick.
     takeoff = station.begin(Takeoff(interval_s=60.0))
     takeoff.progress("r1")
@@ -318,15 +318,16 @@ def test_who_leaves_abandons_what_is_not_ordered(
     done(station.command(SafetyCommand("land", wait=True)))
 
 
-def test_two_programs_of_one_robot(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_two_programs_of_one_robot(fleet: FlownFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     make_ready(station)
     fleet.duplicate(1)
     station.wait_for(lambda p: p.robots[1].duplicate)
-    assert not_done(station.command(Takeoff(interval_s=0.0))) == {"r1": ResultCode.DUPLICATE_ID}
+    report = station.command(Takeoff(interval_s=0.0))
+    assert not_done(report)["r1"] is ResultCode.DUPLICATE_ID
 
 
-def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) -> None:
+def test_the_end_of_a_station(fleet: FlownFleet, new_station: NewStation) -> None:
     station = new_station(fleet.fleet_toml)
     assert station.end(signal.SIGINT) == 0
     station.start()
@@ -342,13 +343,13 @@ def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) ->
     # Its terminal is closed, which is no reason to leave robots in the air alone.
     station.process.send_signal(signal.SIGHUP)
     # They are in the air for as long as it has something to say.
-    for robot in fleet.robots:
-        robot.takeoff_s = math.inf
+    for robot in fleet.flown:
+        robot.sink_slowly()
     done(station.command(SafetyCommand("land")))
-    for robot in fleet.robots:
-        robot.takeoff_s = 1.0
+    for robot in fleet.flown:
+        robot.hurry()
     assert station.process.wait(PATIENCE_S) == 0
-    assert {robot.state for robot in fleet.robots[:3]} == {_S.LANDED}
+    assert {robot.state for robot in fleet.flown[:3]} == {_S.LANDED}
     station.start()
     assert station.end(signal.SIGTERM) == 0
     station.start()
@@ -363,8 +364,9 @@ def test_the_end_of_a_station(fleet: PretendedFleet, new_station: NewStation) ->
         list(subscribed)
 
 
+@pytest.mark.alone
 def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
-    with pretended(tmp_path, 30) as fleet:
+    with FlownFleet(tmp_path, 30) as fleet:
         station = new_station(fleet.fleet_toml)
         station.wait_for(lambda p: all(robot.fresh for robot in p.robots))
         # It never reads.

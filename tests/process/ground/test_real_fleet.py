@@ -43,7 +43,7 @@ from tests.conftest import ROOT, SHIPPED
 from tests.process.ground.browser import live_map, opened
 from tests.said import problem
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 _S = FlightState
 NAMES = ("r0", "r1")
@@ -65,7 +65,8 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
     that loses much a takeoff is ordered again late: so they may take off within five minutes, which
     asks for heights further apart.
     """
-    made = Fleet(FleetScenario(robots=len(NAMES)), tmp_path_factory.mktemp("fleet"), SHIPPED)
+    scenario = FleetScenario(robots=len(NAMES), budget=PATIENT)
+    made = Fleet(scenario, tmp_path_factory.mktemp("fleet"), SHIPPED)
     assert made.simulated is not None
     for vehicle in made.simulated.vehicles:
         vehicle.parameters |= {
@@ -76,19 +77,12 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         path = robot.folder / "robot.toml"
         text = path.read_text().replace('listen = ["tcp/127.0.0.1:', 'listen = ["tcp/0.0.0.0:')
         path.write_text(text.replace("[flight]\n", "[flight]\nground_lost_land_s = 30.0\n"))
-    for path in (made.fleet_toml, *(robot.folder / "robot.toml" for robot in made.robots)):
-        before = "slot_spacing_m = 4.5\n"
-        text = path.read_text()
-        assert text.count(before) == 1
-        errors = "robot.errors" if path == made.fleet_toml else "errors"
-        text = text.replace(before, f"slot_spacing_m = {PATIENT.slot_spacing.least_m}\n")
-        path.write_text(f"{text}\n[{errors}]\ntakeoffs_height_m = {PATIENT.takeoffs_height_m}\n")
     with made:
-        found_all = made.operator.wait_for(
+        found_all = made.heard.wait_for(
             lambda statuses: [s.state for s in statuses.values()] == [_S.IDLE] * len(NAMES),
             PATIENCE_S,
         )
-        assert found_all, made.operator.statuses()
+        assert found_all, made.heard.statuses()
         yield made
 
 
@@ -100,7 +94,7 @@ def statuses_of_all(fleet: Fleet) -> dict[int, RobotStatus]:
         heard.update(statuses)
         return len(statuses) == len(NAMES)
 
-    assert fleet.operator.wait_for(all_heard, PATIENCE_S)
+    assert fleet.heard.wait_for(all_heard, PATIENCE_S)
     return heard
 
 
@@ -257,25 +251,25 @@ def test_a_robot_that_starts_later_is_told_origin_fence_and_world(fleet: Fleet) 
         ground.do(SetWorld(world, "changed.env"))
 
         def told(robot: int) -> bool:
-            status = fleet.operator.statuses().get(robot)
+            status = fleet.heard.statuses().get(robot)
             return (
                 status is not None
                 and (status.origin, status.fence, status.world_id)
                 == (ORIGIN, fence, world_id(world))
             )  # fmt: skip
 
-        assert fleet.operator.wait_for(lambda _: told(0) and told(1), PATIENCE_S)
-        before = fleet.operator.history(1)[-1].status.boot_nonce
+        assert fleet.heard.wait_for(lambda _: told(0) and told(1), PATIENCE_S)
+        before = fleet.heard.history(1)[-1].status.boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
         fleet.robots[1].wait(PATIENCE_S)
         fleet.robots[1].start()
 
         def heard_again(_: object) -> bool:
-            return fleet.operator.history(1)[-1].status.boot_nonce != before
+            return fleet.heard.history(1)[-1].status.boot_nonce != before
 
-        assert fleet.operator.wait_for(heard_again, PATIENCE_S)
+        assert fleet.heard.wait_for(heard_again, PATIENCE_S)
         began_s = time.monotonic()
-        assert fleet.operator.wait_for(lambda _: told(1), PATIENCE_S), fleet.operator.statuses()
+        assert fleet.heard.wait_for(lambda _: told(1), PATIENCE_S), fleet.heard.statuses()
         print(f"a robot that starts knows all {time.monotonic() - began_s:.2f} s after its radio")
         ground.do(SetFence(None))
 
@@ -345,7 +339,7 @@ def test_a_ground_that_dies_while_robots_take_off(fleet: Fleet) -> None:
         ground.kill()
         asked.join()
         wait_for_states(fleet, 1, began_s, _S.TAKEOFF, _S.HOLD, _S.LAND, _S.LANDED)
-    waiting = {h.status.state for h in fleet.operator.history(0) if h.at_s >= began_s}
+    waiting = {h.status.state for h in fleet.heard.history(0) if h.at_s >= began_s}
     assert waiting <= {*ON_GROUND}
 
 
@@ -353,13 +347,13 @@ def wait_for_states(fleet: Fleet, robot: int, since_s: float, *states: FlightSta
     """Until a robot has been in all of these, one after another, whoever commands."""
 
     def said() -> list[FlightState]:
-        return [h.status.state for h in fleet.operator.history(robot) if h.at_s >= since_s]
+        return [h.status.state for h in fleet.heard.history(robot) if h.at_s >= since_s]
 
     def been(_: object) -> bool:
         later = iter(said())
         return all(state in later for state in states)
 
-    assert fleet.operator.wait_for(been, PATIENCE_S), said()[-1:]
+    assert fleet.heard.wait_for(been, PATIENCE_S), said()[-1:]
 
 
 def ask_until_it_dies(ground: Ground, request: Request) -> None:

@@ -1,7 +1,6 @@
 """`lpac record` beside a ground process, which may start again."""
 
 import itertools
-import math
 import os
 import signal
 import subprocess
@@ -26,7 +25,7 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from tests.conftest import ROOT
-from tests.pretend import ORIGIN, pretended
+from tests.live import ORIGIN, FlownFleet
 from tests.process.ground.conftest import PATIENCE_S, all_heard, wait_for_snapshot
 
 S = FlightState
@@ -84,7 +83,7 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(short_path))
     processes: list[subprocess.Popen[Any]] = []
-    with pretended(tmp_path, 2) as fleet:
+    with FlownFleet(tmp_path, 2) as fleet:
         recorder = Recorder(fleet.fleet_toml)
         try:
             recorder.wait_for("waiting for it")
@@ -104,14 +103,14 @@ def test_a_flight_is_recorded_also_when_the_ground_starts_again(
             recorder.wait_for("hears the ground station")
             wait_for_snapshot(fleet.name, lambda told: told.commander == "ann" and all_heard(told))
             # They sink for as long as the test has a use for it.
-            for robot in fleet.robots:
-                robot.takeoff_s = math.inf
+            for robot in fleet.flown:
+                robot.sink_slowly()
             assert command(fleet.name, SafetyCommand("land")).done
             wait_until_all_are_told(fleet.name, S.LAND)
             # Its terminal is closed: it goes on until all have landed.
             recorder.process.send_signal(signal.SIGHUP)
-            for robot in fleet.robots:
-                robot.takeoff_s = 1.0
+            for robot in fleet.flown:
+                robot.hurry()
             assert command(fleet.name, SafetyCommand("land", wait=True)).done
             assert recorder.end() == 0
         finally:
@@ -162,7 +161,7 @@ def assert_costs_are_of_the_last_statuses(entries: list[tuple[str, float, dict[s
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
-    with pretended(tmp_path, 1) as fleet:
+    with FlownFleet(tmp_path, 1) as fleet:
         recorder = Recorder(fleet.fleet_toml)
         with recorder.process:
             recorder.wait_for("waiting for it")
@@ -176,7 +175,7 @@ def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, below: str, why: str) -> None:
     file = tmp_path / "file"
     file.write_text("")
-    with pretended(tmp_path, 1) as fleet:
+    with FlownFleet(tmp_path, 1) as fleet:
         done = subprocess.run(
             [
                 sys.executable, "-m", "lpac.cli.main", "record", "--fleet", str(fleet.fleet_toml),

@@ -6,10 +6,11 @@ import pty
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 from tests.conftest import ROOT
-from tests.pretend import PretendedFleet
+from tests.live import ORIGIN, FlownFleet
 from tests.process.ground.conftest import PATIENCE_S, NewStation
 
 
@@ -17,10 +18,10 @@ def test_ctrl_c_at_the_question_between_trials(tmp_path: Path, new_station: NewS
     """A program that reads the lines of --json is told, too."""
     script = tmp_path / "script.toml"
     steps = "".join(f'[[steps]]\ndo = "{step}"\n' for step in ("preflight", "takeoff", "land"))
-    origin = "latitude_deg = 47.4\nlongitude_deg = 8.5\nheading_deg = 0.0\n"
+    origin = "".join(f"{key} = {value}\n" for key, value in asdict(ORIGIN).items())
     script.write_text(f'trials = 2\n[[before]]\ndo = "origin"\n{origin}{steps}')
     person, terminal = pty.openpty()
-    with PretendedFleet(tmp_path, 1) as fleet:
+    with FlownFleet(tmp_path, 1) as fleet:
         runtime = new_station(fleet.fleet_toml).runtime
         arguments = ("mission", "run", script, "--json", "--fleet", fleet.fleet_toml)
         with subprocess.Popen(

@@ -1,5 +1,6 @@
 """The robot's program as a process: `lpac robot run`, a simulated vehicle, and a ground."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -23,12 +24,30 @@ from edge.drivers.flight_log import read as read_log
 from edge.drivers.zenoh_link import ZenohLink
 from edge.flight.failsafe import PARAMETERS
 from edge.messages.codes import CheckCode, ReasonCode, RefusalCode, texts
-from edge.messages.mission import FlightState, OrderKind, Place, explored_from_bytes, world_id
+from edge.messages.mission import (
+    FlightState,
+    OrderKind,
+    Place,
+    RobotStatus,
+    explored_from_bytes,
+    world_id,
+)
 from edge.messages.topics import EXPLORED
 from edge.policy.bundle import Bundle, make_bundle, write_bundle
-from lpac.sim.operator import Operator
+from lpac.ground.station.protocol import (
+    NextTrial,
+    Resume,
+    RobotCommand,
+    SafetyCommand,
+    SetPlaces,
+    SetWorld,
+    Start,
+    TakeCommand,
+)
 from lpac.sim.px4.modes import Px4Mode
+from tests.raw_ground import RawGround
 from tests.robot_rig import (
+    NAME,
     ORIGIN,
     Changes,
     Program,
@@ -42,11 +61,11 @@ from tests.robot_rig import (
 from tests.said import codes, why
 from tests.unit.policy.test_bundle import scaled, with_files
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 PARAM_REQUEST_READ = 20  # MAVLink's message id
 # Nothing here takes so long unless it is broken.
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 # An exit code of 0 says that the program ended by itself: after 2.9 s its own timer would kill it.
 
 
@@ -64,11 +83,10 @@ def test_a_day_of_one_robot(tmp_path: Path) -> None:
                 f"{first.process.pid} on this machine: stop that first"
             )
             fly_a_mission(made, "a")
-            made.operator.safety_action("land")
+            made.do(SafetyCommand("land"))
             made.wait_for_state(FlightState.LANDED)
             assert not vehicle.armed
 
-            made.operator.safety_action("none")
             made.take_off()
             fly_a_mission(made, "b")
             assert first.end(signal.SIGTERM) == 0
@@ -79,10 +97,10 @@ def test_a_day_of_one_robot(tmp_path: Path) -> None:
             made.wait(lambda status: status.state is FlightState.PILOT and status.uptime_s > 3.0)
             assert vehicle.mode is Px4Mode.HOLD
             assert ReasonCode.ARMED_BEFORE in codes(made.status.alarms)
-            made.order("rejoin")
+            made.do(RobotCommand("rejoin", (NAME,)))
             made.wait_for_state(FlightState.HOLD)
             assert made.vehicle_is(lambda v: v.mode is Px4Mode.OFFBOARD)
-            made.operator.safety_action("land")
+            made.do(SafetyCommand("land"))
             made.wait_for_state(FlightState.LANDED)
             assert again.end(signal.SIGINT) == 0
     look_into_the_logs(tmp_path / "logs")
@@ -90,15 +108,15 @@ def test_a_day_of_one_robot(tmp_path: Path) -> None:
 
 
 def fly_a_mission(made: Rig, trial: str) -> None:
-    made.order("start", trial)
+    made.do(NextTrial(trial))
+    made.do(Start())
     made.wait(lambda status: status.trial == trial and status.state is FlightState.MISSION)
     assert made.vehicle_is(lambda v: horizontal_speed_m_s(v) > 0.3)
     assert all(loop.failures == 0 for loop in made.status.loops.values())
     assert made.status.message_counts["accepted"] == 0
-    made.operator.safety_action("hold")
+    made.do(SafetyCommand("hold"))
     made.wait_for_state(FlightState.HOLD)
-    made.operator.safety_action("none")
-    made.order("start", trial)
+    made.do(Resume())
     made.wait_for_state(FlightState.MISSION)
 
 
@@ -112,13 +130,19 @@ ONE_LOOK = 64
 def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_path: Path) -> None:
     vehicle = new_vehicle(GF_MAX_VER_DIST=25)
     explored = [0]
-    with rig(tmp_path, vehicle) as made, program(made), listening(made, explored):
-        made.operator.enable(ORIGIN)
+    with (
+        rig(tmp_path, vehicle) as made, program(made), listening(made, explored),
+        RawGround(made.config.fleet, made.config.link.listen, made.heard) as eve,
+    ):  # fmt: skip
+        made.enable()
         tells_where_it_stands(made)
-        obeys_only_who_commands(made)
-        refuses_what_does_not_fit(made)
+        obeys_only_who_commands(made, eve)
+        refuses_what_does_not_fit(made, eve)
 
-        made.operator.assign(fence=FENCE, places={3: PLACE}, world=WORLD)
+        # Of eve's state the fence is right.
+        made.do(TakeCommand())
+        made.do(SetPlaces({NAME: PLACE}))
+        made.do(SetWorld(WORLD, "w.env"))
         made.wait(lambda status: status.world_id == world_id(WORLD) and status.ready)
         assert made.status.fence == FENCE
         assert (made.status.slot_height_m, made.status.landing_point_m) == (9.5, (14.0, 12.0))
@@ -127,33 +151,39 @@ def test_what_the_ground_sets_is_taken_up_on_the_ground_and_kept_in_flight(tmp_p
         assert made.vehicle_is(lambda v: v.parameters["GF_MAX_VER_DIST"] == 0)
         made.take_off()
         assert made.vehicle_is(lambda v: abs(-v.position_m[2] - 9.5) < 1.0)
-        keeps_what_it_has_in_flight(made)
+        keeps_what_it_has_in_flight(made, eve)
+        made.do(TakeCommand())
 
-        made.order("start", "a")
+        made.do(NextTrial("a"))
+        made.do(Start())
         wait_until(lambda: explored[-1] > 1.3 * ONE_LOOK)
         assert refused(made, "disarm") is RefusalCode.IN_THE_AIR
-        made.order("pilot")
+        made.do(RobotCommand("pilot", (NAME,)))
         assert made.vehicle_is(lambda v: v.mode is Px4Mode.HOLD)
         pilot = FlightState.PILOT, ReasonCode.GIVEN_TO_PILOT
         made.wait(lambda status: (status.state, status.reason.code) == pilot)
-        made.order("rejoin")
+        made.do(RobotCommand("rejoin", (NAME,)))
         made.wait_for_state(FlightState.HOLD)
-        made.operator.safety_action("land")
+        made.do(SafetyCommand("land"))
         made.wait_for_state(FlightState.LANDED)
         assert explored[-1] > 1.3 * ONE_LOOK
-        made.order("reset", "b")
+        made.do(NextTrial("b"))
         made.wait(lambda status: status.trial == "")
         wait_until(lambda: explored[-1] <= 1.3 * ONE_LOOK)
 
         # Without a word of the ground's, the configured fence and place count again.
-        made.operator.assign()
-        made.wait(lambda status: (status.fence, status.slot_height_m) == (made.config.fence, 5.0))
+        configured = made.config.fence, 5.0
+        says(
+            made, eve, lambda status: (status.fence, status.slot_height_m) == configured,
+            fence=None, places={}, world_id=None,
+        )  # fmt: skip
+        made.do(TakeCommand())
         assert made.status.world_id == world_id(WORLD)
         assert refused(made, "disarm") is RefusalCode.NOT_ARMED
         with made.server.stepped:
             vehicle.arm(force=True)
         made.wait_for_state(FlightState.PILOT)
-        made.order("disarm")
+        made.do(RobotCommand("disarm", (NAME,)))
         assert made.vehicle_is(lambda v: not v.armed)
     told = [m["message"] for path in (tmp_path / "logs").glob("*.mcap")
             for _, _, m in read_log(path, "/log")]  # fmt: skip
@@ -178,22 +208,35 @@ def tells_where_it_stands(made: Rig) -> None:
     assert status.ground_age_s is not None and status.ground_age_s < 3.0
 
 
-def obeys_only_who_commands(made: Rig) -> None:
-    fleet, connect = made.config.fleet, made.config.link.listen
-    with Operator(fleet=fleet, connect=connect, name="eve") as eve:
-        assert eve.wait_for(lambda statuses: 3 in statuses, PATIENCE_S)
-        answer = eve.result(eve.order("takeoff", 3), PATIENCE_S)
-        assert answer is not None
-        assert why(answer) is RefusalCode.OTHER_COMMANDER
+def obeys_only_who_commands(made: Rig, eve: RawGround) -> None:
+    assert why(eve.order("takeoff", made.status, "eve")) is RefusalCode.OTHER_COMMANDER
 
 
-def refuses_what_does_not_fit(made: Rig) -> None:
+def says(
+    made: Rig,
+    eve: RawGround,
+    condition: Callable[[RobotStatus], bool],
+    world: str = "",
+    **changes: Any,
+) -> None:
+    """Somebody else takes the command, and wants something else, until it shows."""
+    told = made.ground.told.snapshot.ground
+    assert told is not None
+    sequence = max(told.sequence, made.status.obeyed_sequence) + 10
+    state = dataclasses.replace(told, sequence=sequence, operator="eve", **changes)
+    eve.state_until(state, lambda statuses: 3 in statuses and condition(statuses[3]), world)
+
+
+def refuses_what_does_not_fit(made: Rig, eve: RawGround) -> None:
     """It stays on the ground, as it was."""
     before = made.status
     outside = Place(slot=1, landing_point_m=(50.0, 12.0))
-    made.operator.assign(fence=FENCE, places={3: outside}, world="Nonsense 1 2")
     unfit = [CheckCode.FENCE_OR_PLACE_UNFIT, CheckCode.WORLD_UNUSABLE]
-    made.wait(lambda status: codes(status.not_taken) == unfit)
+    nonsense = "Nonsense 1 2"
+    says(
+        made, eve, lambda status: codes(status.not_taken) == unfit, nonsense,
+        fence=FENCE, places={"3": outside}, world_id=world_id(nonsense),
+    )  # fmt: skip
     # What is wrong with them is the fence's, and the world's, own text.
     told = texts(made.status.not_taken)
     assert "landing_point_m = [50.0, 12.0]" in told and "record 1 (Nonsense)" in told
@@ -201,20 +244,25 @@ def refuses_what_does_not_fit(made: Rig) -> None:
     assert (made.status.fence, made.status.world_id) == (before.fence, before.world_id)
 
 
-def refused(made: Rig, kind: OrderKind, trial: str = "") -> RefusalCode | None:
-    refusal = made.refusal(kind, trial)
+def refused(made: Rig, kind: OrderKind) -> RefusalCode | None:
+    refusal = made.refusal(kind)
     return None if refusal is None else refusal.code
 
 
-def keeps_what_it_has_in_flight(made: Rig) -> None:
+def keeps_what_it_has_in_flight(made: Rig, eve: RawGround) -> None:
+    """Whatever somebody wants who takes the command; a ground of ours would not."""
     # No world is any world.
     kept = [CheckCode.KEEPS_FENCE, CheckCode.KEEPS_PLACE]
-    made.operator.assign()
-    made.wait(lambda status: codes(status.not_taken) == kept)
+    says(
+        made, eve, lambda status: codes(status.not_taken) == kept,
+        fence=None, places={}, world_id=None,
+    )  # fmt: skip
     assert made.status.fence == FENCE
-    assert refused(made, "start", "a") is RefusalCode.NOT_TAKEN_UP
-    made.operator.assign(fence=FENCE, places={3: PLACE}, world=WORLD)
-    made.wait(lambda status: status.not_taken == ())
+    assert refused(made, "start") is RefusalCode.NOT_TAKEN_UP
+    says(
+        made, eve, lambda status: status.not_taken == (),
+        fence=FENCE, places={"3": PLACE}, world_id=world_id(WORLD),
+    )  # fmt: skip
 
 
 @contextmanager
@@ -296,7 +344,7 @@ def test_a_vehicle_that_does_not_answer_holds_up_neither_status_nor_end(tmp_path
 
         made.link.receive = deaf_while_it_is_read  # type: ignore[method-assign]
         with program(made) as running:
-            made.operator.enable(ORIGIN)
+            made.enable()
             wait_until(lambda: asked[PARAM_REQUEST_READ] > len(PARAMETERS) + 5)
             made.wait(lambda status: codes(status.failed_checks) == [CheckCode.CHECKS_RUNNING])
             assert running.end(signal.SIGTERM) == 0
@@ -418,7 +466,7 @@ def test_a_robot_with_an_altered_policy_says_so_and_does_not_arm(
     vehicle = new_vehicle()
     changes = {"policy": {"bundle": "altered"}}
     with rig(tmp_path, vehicle, changes=changes) as made, program(made):
-        made.operator.enable(ORIGIN)
+        made.enable()
         made.wait_for_state(FlightState.PREFLIGHT)
         # All else is well by then.
         problem = "action.onnx, swarm of the bundle do not compute"
@@ -438,7 +486,7 @@ def test_without_a_vehicle_and_a_log_it_runs_and_says_what_is_missing(tmp_path: 
     (tmp_path / "file").touch()
     changes: Changes = {"autopilot": {"system_id": 9}, "log": {"folder": "file"}}
     with rig(tmp_path, new_vehicle(), changes=changes) as made, program(made) as running:
-        made.operator.enable(ORIGIN)
+        made.enable()
         status = made.wait(
             lambda status: (
                 status.uptime_s > 3.0
@@ -464,7 +512,7 @@ def test_it_flies_on_when_nobody_reads_what_it_prints(tmp_path: Path) -> None:
 def test_two_programs_that_say_they_are_one_robot_see_each_other(tmp_path: Path) -> None:
     """Not on one machine, which refuses the second: here it calls its fleet's link by itself."""
     with rig(tmp_path, new_vehicle()) as made, program(made):
-        made.operator.enable(ORIGIN)
+        made.enable()
         made.wait(lambda status: status.ready)
         with ZenohLink(
             fleet=made.config.fleet, robot_id=3, listen=("tcp/127.0.0.1:0",),

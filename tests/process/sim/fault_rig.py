@@ -12,30 +12,53 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Literal
 from unittest.mock import patch
 
 import numpy as np
 
+import edge.drivers.world_sensor
 import edge.robot.node
 import edge.robot.process
 from edge.core import F32, F64
+from edge.core.vehicle import PILOTED
 from edge.drivers.world_sensor import WorldSensor
-from edge.messages.codes import ReasonCode, texts
-from edge.messages.mission import FlightState, OrderKind, OrderResult, RobotStatus
+from edge.messages.codes import ReasonCode, RefusalCode, texts
+from edge.messages.mission import (
+    ON_GROUND,
+    FlightState,
+    OrderKind,
+    RobotStatus,
+    is_too_low,
+)
 from edge.robot.pac import Pac, PolicyTick
 from lpac.cli.robot import run
+from lpac.ground.station.protocol import (
+    CommandReport,
+    Enable,
+    Request,
+    Resume,
+    RobotCommand,
+    RobotResult,
+    SafetyCommand,
+    SetOrigin,
+    Start,
+    Takeoff,
+)
+from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import ORIGIN
+from lpac.sim.fleet.listener import Heard, Statuses
 from lpac.sim.fleet.processes import Fleet, RobotProcess
 from lpac.sim.fleet.vehicles import SimulatedVehicles
-from lpac.sim.operator import Heard, OperatorScript, Statuses
 from lpac.sim.px4.errors import GREATEST_WIND_M_S
 from lpac.sim.px4.vehicle import Px4Vehicle, Truth
 from tests.conftest import ROOT
 from tests.process.sim.px4_rig import RealVehicle, RealVehicles
-from tests.robot_rig import HELD_UP
+from tests.raw_ground import RawGround
+from tests.robot_rig import HELD_UP, NOT_YET
+from tests.said import why
 
 _S = FlightState
 
@@ -94,10 +117,15 @@ class FaultRig:
     """
 
     def __init__(
-        self, fleet: Fleet, robots: Sequence[int], vehicles: SimulatedVehicles | RealVehicles
+        self,
+        fleet: Fleet,
+        ground: GroundProgram,
+        robots: Sequence[int],
+        vehicles: SimulatedVehicles | RealVehicles,
     ) -> None:
         self.fleet = fleet
-        self.operator = fleet.operator
+        self.ground = ground
+        self.listener = fleet.heard
         self.simulated = vehicles
         self.flying = set(robots)
         # PX4's own estimate wanders, and the vehicle after it: by up to 0.63 m/s in 13 minutes of
@@ -116,36 +144,125 @@ class FaultRig:
 
     # The operator's part
 
-    def script(self, name: str) -> None:
-        """Do one step of the script with the robots that fly."""
-        script = OperatorScript(
-            self.operator, robots=self.flying, origin=ORIGIN, mission_s=0.0, trial="faults"
-        )
-        step = next(step for step in script.steps if step.name == name)
-        script.began_s[name] = time.monotonic()
-        while not self.operator.wait_for(step.done, 0.2):
-            late = time.monotonic() - script.began_s[name] > 4.0 * step.at_most_s
-            assert not late, (name, self.told(), self.operator.refusals[-5:])
-            step.act()
+    def name(self, robot: int) -> str:
+        """What its operator calls it."""
+        return self.fleet.robots[robot].name
 
-    def order(self, kind: OrderKind, robot: int) -> OrderResult:
-        """Order something, and wait for the answer; again if it is one that holds for a moment."""
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of those that fly."""
+        return tuple(map(self.name, sorted(self.flying)))
+
+    def command(self, request: Request) -> CommandReport:
+        """Command something that is possible as such; not every robot may do it."""
+        report = self.ground.command(request)
+        assert report.problem is None, report
+        return report
+
+    def assemble(self) -> None:
+        """Wait until the ground hears all that are to fly."""
+        self._wait_for_all("assemble", lambda told: True, self.fleet.require_running, 240.0)
+        heard = self.ground.told.wait_for(
+            lambda told: all(r.fresh for r in told.robots if r.name in self.names), 60.0
+        )
+        assert heard, self.ground.told.snapshot
+
+    def make_ready(self) -> None:
+        """Origin, and their checks, until all are passed."""
+        self.command(SetOrigin(ORIGIN))
+        self._wait_for_all(
+            "make ready",
+            lambda told: told.state is _S.PREFLIGHT and told.ready,
+            lambda: self.command(Enable()),
+            240.0,
+        )
+
+    def take_off(self) -> None:
+        """All come to hold at their heights; who was held up on its way lands, and tries again."""
+
+        def order() -> None:
+            statuses = {self.name(r): s for r, s in self.listener.statuses().items()}
+            low = [n for n, s in statuses.items() if s.state is _S.HOLD and is_too_low(s)]
+            if low:
+                self.command(SafetyCommand("land", tuple(low), wait=True))
+            waiting = [n for n, s in statuses.items() if s.state in ON_GROUND and n in self.names]
+            if waiting:
+                self.command(Takeoff(tuple(waiting)))
+
+        self._wait_for_all(
+            "take off", lambda told: told.state is _S.HOLD and not is_too_low(told), order, 300.0
+        )
+
+    def start(self) -> None:
+        """All fly their mission; who left offboard without a pilot is taken back before."""
+
+        def order() -> None:
+            left = [
+                self.name(robot)
+                for robot, status in self.listener.statuses().items()
+                if robot in self.flying and status.state is _S.PILOT and status.mode not in PILOTED
+            ]
+            if left:
+                self.command(RobotCommand("rejoin", tuple(left)))
+            self.command(Start(self.names))
+
+        self._wait_for_all("start", lambda told: told.state is _S.MISSION, order, 80.0)
+
+    def _wait_for_all(
+        self,
+        name: str,
+        holds: Callable[[RobotStatus], bool],
+        order: Callable[[], object],
+        at_most_s: float,
+    ) -> None:
+        """Order it again and again until it holds of all that fly."""
+
+        def all_are(statuses: Statuses) -> bool:
+            return self.flying <= statuses.keys() and all(holds(statuses[r]) for r in self.flying)
+
+        until_s = time.monotonic() + at_most_s
+        while not self.listener.wait_for(all_are, 0.2):
+            assert time.monotonic() < until_s, (name, self.told(), self.ground.told.snapshot.ground)
+            order()
+
+    def order(self, kind: Literal["takeoff", "start", "rejoin", "kill"], robot: int) -> RobotResult:
+        """What comes of a command to one robot; given again if it fails for what lasts a moment."""
         until_s = time.monotonic() + 60.0
+        names = (self.name(robot),)
+        request: Request
+        if kind == "takeoff":
+            request = Takeoff(names)
+        elif kind == "start":
+            request = Start(names)
+        else:
+            request = RobotCommand(kind, names)
         while True:
-            result = self.operator.result(self.operator.order(kind, robot, "faults"), 60.0)
-            assert result is not None, self.told()
-            refused = result.refusal
-            if refused is None or refused.code not in HELD_UP or time.monotonic() > until_s:
+            (result,) = self.command(request).results
+            lasts = result.refusal not in HELD_UP and result.code not in NOT_YET
+            if lasts or time.monotonic() > until_s:
                 return result
+
+    def refusal(self, kind: OrderKind, robot: int) -> RefusalCode | None:
+        """Why the robot itself refuses what the ground would not order it now; None: it obeys."""
+        with RawGround(self.fleet.name, self.fleet.endpoints, self.listener) as raw:
+            return why(raw.order(kind, self.status(robot)))
+
+    def hold(self, robot: int) -> None:
+        """The ground wants it to hold."""
+        assert self.command(SafetyCommand("hold", (self.name(robot),))).done
+
+    def resume(self, robot: int) -> None:
+        """The ground does not want it any more."""
+        self.command(Resume((self.name(robot),)))
 
     def told(self) -> dict[int, tuple[str, str, str | None, str]]:
         """What the robots say of themselves, for whoever reads a failure."""
-        statuses = sorted(self.operator.statuses().items())
+        statuses = sorted(self.listener.statuses().items())
         return {r: (s.state, s.reason.text, s.mode, texts(s.failed_checks)) for r, s in statuses}
 
     def status(self, robot: int) -> RobotStatus:
         """Its newest status."""
-        return self.operator.history(robot)[-1].status
+        return self.listener.history(robot)[-1].status
 
     def wait_status(self, robot: int, holds: Callable[[RobotStatus], object]) -> RobotStatus:
         """Wait for a status of which something holds; returns that one."""
@@ -156,7 +273,7 @@ class FaultRig:
                 found.append(statuses[robot])
             return bool(found)
 
-        assert self.operator.wait_for(is_found, 60.0), self.told()
+        assert self.listener.wait_for(is_found, 60.0), self.told()
         return found[0]
 
     def wait_state(self, robot: int, state: FlightState) -> RobotStatus:
@@ -172,7 +289,7 @@ class FaultRig:
         return self._others_say(lambda status: str(robot) not in status.neighbour_ages_s)
 
     def _others_say(self, holds: Callable[[RobotStatus], bool]) -> bool:
-        return self.operator.wait_for(
+        return self.listener.wait_for(
             lambda statuses: (
                 self.flying <= statuses.keys() and all(holds(statuses[r]) for r in self.flying)
             ),
@@ -182,22 +299,22 @@ class FaultRig:
     @contextmanager
     def others_go_on(self, robot: int, *, lost: bool = False) -> Iterator[None]:
         """Meanwhile the others fly their mission; afterwards all do, but a robot that is `lost`."""
-        self.script("start")
+        self.start()
         began_s = time.monotonic()
         self.flying.remove(robot)
         others = tuple(self.flying)
         yield
-        self.script("start")
+        self.start()
         for other in others:
             for _, status in self.heard(other, began_s):
                 assert flies_on(status), (other, status.state, status.reason)
         if not lost:
             self.flying.add(robot)
-            self.script("start")
+            self.start()
 
     def heard(self, robot: int, since_s: float) -> list[Heard]:
         """What a robot said since then (`time.monotonic()`)."""
-        return [heard for heard in self.operator.history(robot) if heard.at_s >= since_s]
+        return [heard for heard in self.listener.history(robot) if heard.at_s >= since_s]
 
     # The vehicles' part
 
@@ -264,7 +381,7 @@ class FaultRig:
         while not self._vehicle_is(robot, lambda v: speed_m_s(v.velocity_m_s, 2) > 0.3, 5.0):
             assert time.monotonic() < until_s, self.told()
             # It may have come to hold by itself.
-            self.script("start")
+            self.start()
 
     def wait_landed(self, robot: int) -> None:
         """Wait until the vehicle stands on the ground, disarmed, and its robot says so."""
@@ -400,7 +517,8 @@ def _run(folder: Path) -> None:
 
     with (
         patch.object(edge.robot.node, "Pac", FailingPac),
-        patch.multiple(edge.robot.process, WorldSensor=FailingSensor, _take_alone=lambda *_: None),
+        patch.object(edge.drivers.world_sensor, "WorldSensor", FailingSensor),
+        patch.object(edge.robot.process, "_robot_lock", lambda _: nullcontext()),
     ):
         run(folder / "robot.toml")
 

@@ -27,19 +27,22 @@ from edge.messages.beacon import BEACON_BYTES
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Order, RobotStatus
+from edge.policy.lpac.policy import LpacPolicy
+from lpac.ground.station.protocol import Enable, ResultCode, SetOrigin
 from lpac.sim.description import ERRORS
+from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import ORIGIN, WORLD, FleetScenario
+from lpac.sim.fleet.listener import Statuses
 from lpac.sim.fleet.processes import Fleet
-from lpac.sim.operator import Statuses
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.sitl.build import Px4Build
 from tests.conftest import SHIPPED
 from tests.process.sim.fault_rig import FaultRig, FaultyRobot, flies_on, speed_m_s
 from tests.process.sim.px4_rig import RealVehicle, RealVehicles
-from tests.said import codes, why
+from tests.said import codes
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 KILLED, NO_GPS, EMPTY, LOW, MANY_FAULTS, FAULTY, STOPPED = range(7)
 # Another vehicle, whose program says that it is robot STOPPED.
@@ -66,10 +69,10 @@ def grounded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     fleet.robots = tuple(programs)
     change_config(fleet, TWIN, f"robot_id = {TWIN}", f"robot_id = {STOPPED}")
     change_config(fleet, STOPPED, 'rc = "none"', 'rc = "pilot"')
-    with fleet:
-        rig = FaultRig(fleet, range(TWIN), fleet.simulated)
+    with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
+        rig = FaultRig(fleet, ground, range(TWIN), fleet.simulated)
         rig.change(STOPPED, rc_connected=True)
-        rig.script("assemble")
+        rig.assemble()
         yield rig
 
 
@@ -80,8 +83,9 @@ def simulated_rig(request: pytest.FixtureRequest) -> FaultRig:
     twin = grounded.fleet.robots[TWIN]
     twin.send_signal(signal.SIGTERM)
     assert twin.wait(60.0) == 0
-    for step in ("preflight", "takeoff", "start"):
-        grounded.script(step)
+    grounded.make_ready()
+    grounded.take_off()
+    grounded.start()
     return grounded
 
 
@@ -118,9 +122,12 @@ class Px4Rigs:
         vehicles = RealVehicles(fleet.vehicles, WORLD)
         self._stack.enter_context(fleet)
         self._stack.enter_context(vehicles)
-        rig = FaultRig(fleet, range(PX4S), vehicles)
-        for step in ("assemble", "preflight", "takeoff", "start"):
-            rig.script(step)
+        ground = self._stack.enter_context(GroundProgram(fleet.fleet_toml, fleet.name))
+        rig = FaultRig(fleet, ground, range(PX4S), vehicles)
+        rig.assemble()
+        rig.make_ready()
+        rig.take_off()
+        rig.start()
         return rig
 
 
@@ -212,11 +219,12 @@ def comes_straight_down(
 
 @pytest.mark.simulated_only("takes a vehicle more, and PX4 has no part in it")
 def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> None:
-    operator = grounded.operator
-    operator.enable(ORIGIN)
+    listener = grounded.listener
+    grounded.command(SetOrigin(ORIGIN))
+    grounded.command(Enable())
 
     def two() -> tuple[RobotStatus, ...]:
-        told = {heard.status.boot_nonce: heard.status for heard in operator.history(STOPPED)}
+        told = {heard.status.boot_nonce: heard.status for heard in listener.history(STOPPED)}
         return tuple(told.values())
 
     def both_say_so(_: Statuses) -> bool:
@@ -228,13 +236,13 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
             for status in told
         )
 
-    assert operator.wait_for(both_say_so, 120.0), grounded.told()
+    assert listener.wait_for(both_say_so, 120.0), grounded.told()
     with rogue(grounded.fleet) as session:
 
         def both_refuse(_: Statuses) -> bool:
             told = two()
             for status in told:
-                # For each program of the two; the operator takes them for one.
+                # For each program of the two; the ground orders nothing then.
                 order = Order(
                     order_id=f"for {status.boot_nonce}",
                     robot_id=STOPPED,
@@ -254,7 +262,7 @@ def test_neither_of_two_programs_with_one_id_takes_off(grounded: FaultRig) -> No
                 for status in told
             )
 
-        assert operator.wait_for(both_refuse, 60.0), grounded.told()
+        assert listener.wait_for(both_refuse, 60.0), grounded.told()
     for robot in (STOPPED, TWIN):
         assert not any(entry.armed for entry in grounded.truth(robot, 0.0))
 
@@ -316,7 +324,7 @@ def test_the_policy_raises_and_the_sensor_sees_nothing(
         # It brakes, and flies back slowly to where it was told to stop.
         assert rig.max_speed_m_s(robot, began_s + within_s + 1.0) < rig.at_rest_m_s + 0.15
         assert rig.max_speed_m_s(robot, began_s + within_s + 3.0) < rig.at_rest_m_s
-        assert why(rig.order("start", robot)) is RefusalCode.POLICY_STALE
+        assert rig.order("start", robot).refusal is RefusalCode.POLICY_STALE
         program.mend()
 
 
@@ -331,7 +339,7 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
             bundle_id=bytes.fromhex(bundle.id),
             frame_id=None,
             own_robot_id=-1,
-            message_size=bundle.manifest.geometry.message_size,
+            message_size=LpacPolicy(bundle).message_size,
         )
         assert not isinstance(message, Rejection)
         wrong = {
@@ -353,8 +361,8 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
                 for kind in wrong
             )
 
-        assert rig.operator.wait_for(all_are_counted, 60.0), rig.told()
-        assert rig.operator.wait_for(
+        assert rig.listener.wait_for(all_are_counted, 60.0), rig.told()
+        assert rig.listener.wait_for(
             lambda statuses: (
                 before.keys() <= statuses.keys()
                 and all(
@@ -373,7 +381,7 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
     robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot):
         if state is _S.HOLD:
-            rig.operator.safety_action("hold", robot)
+            rig.hold(robot)
             rig.wait_state(robot, _S.HOLD)
             rig.wait_time(robot, rig.now_s(robot) + 2.5)
         north_m = 5.6
@@ -401,7 +409,8 @@ def test_the_estimators_origin_jumps(rig: FaultRig, state: FlightState) -> None:
         assert all(
             abs(entry.position_m[2] - began_m[2]) < 1.5 for entry in rig.truth(robot, began_s)
         )
-        rig.operator.safety_action("none", robot)
+        if state is _S.HOLD:
+            rig.resume(robot)
 
 
 def test_a_vehicle_leaves_offboard(rig: FaultRig) -> None:
@@ -414,8 +423,9 @@ def test_a_vehicle_leaves_offboard(rig: FaultRig) -> None:
         assert status.reason.code is ReasonCode.LEFT_OFFBOARD
         nothing_is_sent(rig, robot)
         assert rig.vehicle(robot).mode is Px4Mode.HOLD
-        assert why(rig.order("start", robot)) is RefusalCode.WRONG_STATE
-        assert rig.order("rejoin", robot).accepted
+        assert rig.order("start", robot).code is ResultCode.WRONG_STATE
+        assert rig.refusal("start", robot) is RefusalCode.WRONG_STATE
+        assert rig.order("rejoin", robot).done
         rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Px4Mode.OFFBOARD)
 
 
@@ -469,14 +479,14 @@ def test_a_pilot_takes_a_robot_out_of_the_area_and_brings_it_back(rig: FaultRig)
         assert rig.is_heard(robot)
         ticks = status.loops["perception"].ticks
         rig.wait_status(robot, lambda status: status.loops["perception"].ticks > ticks)
-        assert why(rig.order("rejoin", robot)) is RefusalCode.OUTSIDE_FENCE
+        assert rig.order("rejoin", robot).refusal is RefusalCode.OUTSIDE_FENCE
         rig.fly_by_hand(robot, place_m + np.array([0.0, 0.0, 3.0]))
-        assert why(rig.order("rejoin", robot)) is RefusalCode.NOT_AT_HEIGHT
+        assert rig.order("rejoin", robot).refusal is RefusalCode.NOT_AT_HEIGHT
         rig.fly_by_hand(robot, place_m)
         rig.wait_vehicle(robot, lambda v: math.hypot(*v.velocity_m_s) < rig.at_rest_m_s)
         assert rig.status(robot).state is _S.PILOT
         began_s = rig.now_s(robot)
-        assert rig.order("rejoin", robot).accepted
+        assert rig.order("rejoin", robot).done
         rig.wait_vehicle(robot, lambda vehicle: vehicle.mode is Px4Mode.OFFBOARD)
         # Nothing but the operator's order makes it fly on.
         rig.wait_time(robot, rig.now_s(robot) + 3.0)
@@ -545,7 +555,7 @@ def test_a_robot_is_killed_by_the_operator(rig: FaultRig) -> None:
     robot = rig.robot(MANY_FAULTS)
     with rig.others_go_on(robot, lost=True):
         began_s = rig.now_s(robot)
-        assert rig.order("kill", robot).accepted
+        assert rig.order("kill", robot).done
         status = rig.wait_state(robot, _S.FAULT)
         assert status.reason == status.alarms[0]
         assert status.reason.code is ReasonCode.KILLED
@@ -554,14 +564,15 @@ def test_a_robot_is_killed_by_the_operator(rig: FaultRig) -> None:
         assert disarmed.position_m[2] < -0.5 * status.slot_height_m
         # It stays so.
         rig.wait_time(robot, rig.now_s(robot) + 2.0)
-        assert why(rig.order("takeoff", robot)) is RefusalCode.WRONG_STATE
+        assert rig.order("takeoff", robot).code is ResultCode.WRONG_STATE
+        assert rig.refusal("takeoff", robot) is RefusalCode.WRONG_STATE
 
 
 def test_the_ground_disappears(rig: FaultRig) -> None:
-    rig.script("start")
+    rig.start()
     heard_s = time.monotonic()
     began_s = {robot: rig.now_s(robot) for robot in rig.flying}
-    rig.operator.silent = True
+    rig.ground.kill()
     lost = ReasonCode.GROUND_LOST
     for robot in rig.flying:
         rig.wait_status(robot, lambda s: s.state is _S.HOLD and lost in codes(s.alarms))

@@ -27,13 +27,11 @@ from lpac.fleet.settings import load_fleet
 from lpac.sim.description import ERRORS
 from lpac.sim.experiment import Scenario
 from lpac.sim.experiment import fly as fly_in_process
-from lpac.sim.fleet.layout import APART_M, FleetScenario
+from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.listener import FleetListener
 from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
-from lpac.sim.operator import Operator
 from tests.conftest import ROOT, SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
-
-pytestmark = pytest.mark.alone
 
 # Worlds in which the swarm's cost hangs little, by 10 % at most, on the clocks' phases, on the last
 # decimetres of the starts and on the vehicles' lag. In others luck decides.
@@ -58,7 +56,7 @@ class Flown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """Five robots over each of five worlds, and two until Ctrl-C; as many at once as cores."""
+    """Five robots over each of five worlds, and two until Ctrl-C; two flights at once."""
 
     folder = tmp_path_factory.mktemp("fleet")
 
@@ -78,7 +76,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             output, _ = process.communicate(timeout=180.0)
         return process.returncode, json.loads(output)
 
-    with ThreadPoolExecutor(min(len(SEEDS), os.cpu_count() or 1)) as at_once:
+    with ThreadPoolExecutor(2) as at_once:
         flights = at_once.map(fly, SEEDS)
         stopped = at_once.submit(fly_until_ctrl_c)
         return Flown(dict(zip(SEEDS, flights, strict=True)), stopped.result())
@@ -92,6 +90,7 @@ def flights(flown: Flown) -> Flights:
     return flown.flights
 
 
+@pytest.mark.real_time
 def test_all_robots_take_off_cover_and_land(flights: Flights) -> None:
     for flight, _ in flights.values():
         assert flight["problem"] is None and flight["all_landed"], flight
@@ -105,17 +104,20 @@ def test_all_robots_take_off_cover_and_land(flights: Flights) -> None:
             assert robot["messages"]["accepted"] > 0
 
 
+@pytest.mark.real_time
 def test_robots_never_touch_in_truth(flights: Flights) -> None:
     assert (
         min(flight["separation"]["distance_m"] for flight, _ in flights.values()) > ERRORS.drone_m
     )
 
 
+@pytest.mark.real_time
 def test_the_fence_is_never_crossed_by_the_estimate(flights: Flights) -> None:
     for flight, _ in flights.values():
         assert not flight["fence"]["crossed"] and flight["fence"]["margin_m"] > 0.0
 
 
+@pytest.mark.real_time
 def test_a_fleet_covers_as_well_as_the_swarm_in_simulated_time(
     flights: Flights, shipped_bundle: Bundle
 ) -> None:
@@ -134,6 +136,7 @@ def test_a_fleet_covers_as_well_as_the_swarm_in_simulated_time(
     assert np.median(flown) == pytest.approx(np.median(simulated), rel=0.1), (flown, simulated)
 
 
+@pytest.mark.real_time
 def test_what_a_flight_leaves_behind(flights: Flights) -> None:
     for flight, out in flights.values():
         assert json.loads((out / "flight.json").read_text()) == flight
@@ -148,60 +151,21 @@ def test_what_a_flight_leaves_behind(flights: Flights) -> None:
             assert all(loop["failures"] == 0 for loop in robot["loops"].values())
 
 
-@pytest.mark.parametrize("seed", range(20))
-@pytest.mark.parametrize("robots", [1, 10, 16])
-def test_where_a_fleet_stands(tmp_path: Path, seed: int, robots: int) -> None:
-    fleet = Fleet(FleetScenario(robots=robots, seed=seed), tmp_path, SHIPPED)
-    assert fleet.simulated is not None
-    for places_m in (fleet.layout.pads_m, fleet.layout.landing_points_m):
-        assert (
-            min(fleet.layout.fence.distance_m(x, y) for x, y in places_m)
-            > fleet.layout.fence.buffer_m
-        )
-        away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
-        assert away_m[~np.eye(robots, dtype=bool)].min(initial=np.inf) >= APART_M
-    np.testing.assert_allclose(fleet.true_positions_m()[:, :2], fleet.layout.pads_m, atol=1e-9)
-    errors_m = np.linalg.norm(fleet.layout.landing_points_m - fleet.layout.pads_m, axis=1)
-    assert np.all((errors_m >= 1.0) & (errors_m <= 5.0))
-
-
-def test_more_robots_than_fit_are_refused_with_how_many_do(tmp_path: Path) -> None:
-    with pytest.raises(
-        ValueError, match=r"robots = 20: (\d+) fit on 32 x 32 m, with pads 8 m apart"
-    ) as refused:
-        Fleet(FleetScenario(robots=20), tmp_path, SHIPPED)
-    (fit,) = re.findall(r": (\d+) fit", str(refused.value))
-    assert Fleet(FleetScenario(robots=int(fit)), tmp_path, SHIPPED).layout.pads_m.shape == (
-        int(fit),
-        2,
-    )
-    # Twenty that know where they are stand on the same field.
-    Fleet(FleetScenario(robots=20, errors=False), tmp_path, SHIPPED)
-
-
-def test_a_seed_has_the_world_of_the_swarm_in_simulated_time(
-    tmp_path: Path, shipped_bundle: Bundle
-) -> None:
-    fleet = Fleet(FleetScenario(robots=1, seed=11), tmp_path, SHIPPED)
-    swarm = fly_in_process(Scenario(robots=1, seed=11, duration_s=0.1), shipped_bundle)
-    assert fleet.layout.features == swarm.features
-    assert parse_world((tmp_path / "world.env").read_text()) == swarm.features
-
-
+@pytest.mark.real_time
 def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lpac.sim.fleet.processes.STOP_WITHIN_S", 60.0)
     with Fleet(FleetScenario(robots=2), tmp_path, SHIPPED) as fleet:
-        assert fleet.operator.wait_for(lambda statuses: len(statuses) == 2, 60.0)
-        before = fleet.operator.statuses()[1].boot_nonce
+        assert fleet.heard.wait_for(lambda statuses: len(statuses) == 2, 60.0)
+        before = fleet.heard.statuses()[1].boot_nonce
         fleet.robots[1].send_signal(signal.SIGKILL)
         assert fleet.robots[1].wait(60.0) == -signal.SIGKILL
-        assert fleet.operator.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
+        assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
         with pytest.raises(SimulatedFleetError, match="the program of robot 1 has ended"):
             fleet.require_running()
         fleet.robots[1].start()
-        assert fleet.operator.wait_for(
+        assert fleet.heard.wait_for(
             lambda statuses: 1 in statuses and statuses[1].boot_nonce != before, 60.0
         )
         # A stopped process is woken up to end.
@@ -237,12 +201,14 @@ def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
     raise AssertionError(f"{pattern!r} is not among {lines}")
 
 
+@pytest.mark.real_time
 def test_ctrl_c_lands_all(flown: Flown) -> None:
     code, flight = flown.stopped
     assert code == 1
     assert flight["problem"] == "stopped by Ctrl-C" and flight["all_landed"]
 
 
+@pytest.mark.real_time
 def test_without_the_script_it_waits_for_a_ground(tmp_path: Path) -> None:
     """What it says to type next is right; it outlives a robot's program, and ends by Ctrl-C."""
     out = tmp_path / "a fleet"
@@ -253,17 +219,17 @@ def test_without_the_script_it_waits_for_a_ground(tmp_path: Path) -> None:
         assert setting == f"LPAC_FLEET={out / 'fleet.toml'}"
         config = load_fleet(out / "fleet.toml")
         endpoints = [f"tcp/{r.address}:{r.zenoh_port}" for r in config.robots.values()]
-        with Operator(fleet=config.fleet, connect=endpoints) as operator:
-            assert operator.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
+        with FleetListener(fleet=config.fleet, connect=endpoints) as heard:
+            assert heard.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
             # It only listens: nobody commands.
-            assert {operator.history(robot)[-1].status.operator for robot in (0, 1)} == {""}
+            assert {heard.history(robot)[-1].status.operator for robot in (0, 1)} == {""}
             assert len(list((out / "robots" / "1" / "logs").glob("*.mcap"))) == 1
             os.kill(pid_of(str(out / "robots" / "1" / "robot.toml")), signal.SIGKILL)
             read_until(process.stderr, r"the program of r1 has ended, by SIGKILL$")
-            assert operator.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
+            assert heard.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
             process.send_signal(signal.SIGINT)
             assert process.wait(60.0) == 0
-            assert operator.wait_for(lambda statuses: not statuses, 60.0)
+            assert heard.wait_for(lambda statuses: not statuses, 60.0)
 
 
 def pid_of(arguments: str) -> int:
@@ -306,8 +272,8 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["-n", "0"], "robots = 0: must be from 1 to 20"),
-        (["-n", "21"], "robots = 21: must be from 1 to 20"),
+        (["-n", "0"], "robots = 0: must be from 1 to 30"),
+        (["-n", "31"], "robots = 31: must be from 1 to 30"),
         (["--duration", "0"], "duration = 0.0: must be positive and finite"),
         (["--loss", "0.1"], "--loss does nothing with --vehicle mavlink"),
         (["--controller", "lpac"], "--controller does nothing with --vehicle mavlink"),

@@ -29,7 +29,7 @@ from tests.conftest import ROOT
 from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.test_fleet import launched, pid_of, read_until
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.real_time
 
 STAND_IN = f"""#!{sys.executable}
 import argparse, os, signal, socket, sys, threading, time

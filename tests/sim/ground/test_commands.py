@@ -19,22 +19,23 @@ from lpac.ground.station.protocol import (
     SetOrigin,
     SetPlaces,
     SetWorld,
+    Start,
     TakeCommand,
     Takeoff,
 )
-from tests.pretend import ORIGIN
+from lpac.sim.fleet.layout import ORIGIN
 from tests.said import not_done, problem
-from tests.sim.ground.test_station import OTHER_WORLD, WORLD, Field, a_field, pad_m
+from tests.sim.ground.field import Field, Stage, a_field
+from tests.sim.ground.test_station import OTHER_WORLD
 
 _S = FlightState
 TAKEOFF = Takeoff(interval_s=0.0)
 
 
-def two_stations() -> Field:
-    """Alice commands robots that are ready, bob observes."""
-    field = a_field()
+def two_stations(n: int = 2, stage: Stage = "ready") -> Field:
+    """Alice commands the robots, bob observes."""
+    field = a_field(n, stage)
     field.join("bob")
-    field.make_ready()
     field.run(1.0)
     return field
 
@@ -58,7 +59,7 @@ def test_a_hold_on_the_ground_is_not_withdrawn_by_takeoff(by: str) -> None:
 
 
 def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> None:
-    field = two_stations()
+    field = two_stations(3)
     field.done(SafetyCommand("hold", robots=("r1",)), "bob")
     field.run(1.0)
     assert not_done(field.do(TAKEOFF)) == {"r1": ResultCode.UNDER_SAFETY_ACTION}
@@ -73,25 +74,26 @@ def test_a_hold_of_one_robot_is_not_withdrawn_with_the_landing_of_others() -> No
 
 
 def test_who_is_not_heard_may_be_in_the_air() -> None:
-    field = a_field()
-    field.take_off()
+    field = a_field(2, "hovering")
     field.done(SafetyCommand("land", wait=True))
     field.robots[1].silent = True
     field.run(12.0)
     assert problem(field.do(TAKEOFF)) is ProblemCode.UNDER_SAFETY_ACTION
     # Who is heard may be asked for by name; the other is to land, still.
-    field.done(Takeoff(interval_s=0.0, robots=("r0", "r2")))
+    field.done(Takeoff(interval_s=0.0, robots=("r0",)))
     state = field.stations["alice"].state
     assert state is not None
     assert state.safety_action_for(1) == "land"
 
 
 def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
-    field = Field(2, spares=1)
-    field.join("alice")
+    field = a_field(2, spares=1)
     field.robots[2].silent = True
+    field.join("alice")
     field.run(1.0)
-    field.take_off()
+    field.done(SetOrigin(ORIGIN))
+    field.done(Enable())
+    field.done(TAKEOFF)
     field.done(SafetyCommand("land", wait=True))
     field.done(TAKEOFF)
     state = field.stations["alice"].state
@@ -103,8 +105,7 @@ def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
 
 
 def test_a_reset_robot_has_not_begun_the_trial() -> None:
-    field = a_field()
-    field.make_ready()
+    field = a_field(2, "ready")
     field.done(NextTrial("second"))
     field.done(TAKEOFF)
     field.done(SafetyCommand("hold"))
@@ -124,12 +125,11 @@ def test_a_reset_robot_has_not_begun_the_trial() -> None:
         SetOrigin(replace(ORIGIN, heading_deg=90.0), robots=("r0",)),
         SetFence(None, robots=("r0",)),
         SetWorld(OTHER_WORLD, "w", robots=("r0",)),
-        SetPlaces({"r0": Place(1, pad_m(1))}),
+        SetPlaces({"r0": Place(1, (3.0, 3.0))}),
     ],
 )
 def test_who_is_not_addressed_keeps_what_it_has(request_: Request) -> None:
-    field = a_field(2)
-    field.make_ready()
+    field = a_field(2, "ready")
     field.done(Takeoff(robots=("r1",)))
     before = field.stations["alice"].state
     text = "r1 is armed: land and disarm first"
@@ -138,8 +138,7 @@ def test_who_is_not_addressed_keeps_what_it_has(request_: Request) -> None:
 
 
 def test_a_killed_robot_is_not_in_the_others_way() -> None:
-    field = a_field()
-    field.take_off()
+    field = a_field(3, "hovering")
     field.done(RobotCommand("kill", ("r0",)))
     field.done(SafetyCommand("land", robots=("r1", "r2"), wait=True))
     field.done(SetWorld(OTHER_WORLD, "w", robots=("r1", "r2")))
@@ -147,14 +146,15 @@ def test_a_killed_robot_is_not_in_the_others_way() -> None:
 
 def test_the_fleets_world_is_made_known_at_any_time() -> None:
     field = two_stations()
+    configured = field.stations["alice"].setup.world
     field.done(SetWorld(OTHER_WORLD, "w"))
     field.leave("bob")
     field.done(TAKEOFF)
     bob = field.join("bob")
-    field.run(1.0)
+    field.run(1.5)
     assert not bob.setup.world
     before = field.stations["alice"].state
-    assert problem(field.do(SetWorld(WORLD, "w"), "bob")) is ProblemCode.OTHER_COMMANDS
+    assert problem(field.do(SetWorld(configured, "w"), "bob")) is ProblemCode.OTHER_COMMANDS
     field.done(SetWorld(OTHER_WORLD, "w"), "bob")
     assert bob.setup.world == OTHER_WORLD
     assert field.stations["alice"].state == before
@@ -170,30 +170,39 @@ def test_who_takes_over_has_gathered_its_robots_first() -> None:
     field.done(TakeCommand(), "carol")
 
 
-def test_who_took_over_is_not_robbed_of_the_command() -> None:
-    for request in (NextTrial(), RobotCommand("disarm", ("r0",)), SafetyCommand("hold"), Enable()):
-        field = two_stations()
-        # It obeys somebody who is gone, and hears nobody: alice waits for it.
-        robot = field.robots[0]
-        assert robot.ground is not None
-        robot.deaf, robot.ground = True, replace(robot.ground, operator="carol")
-        field.run(0.5)
-        waiting = field.begin(request)
-        field.run(1.0)
-        assert waiting.report is None
-        taken = field.begin(TakeCommand(), "bob")
-        field.run(1.0)
-        assert waiting.report is not None
-        assert not_done(waiting.report)["r0"] is ResultCode.ABANDONED
-        robot.deaf = False
-        field.until(lambda taken=taken: taken.report)
-        field.run(15.0)
-        assert [station.commands for station in field.stations.values()] == [False, True]
+@pytest.mark.parametrize(
+    "request_", [NextTrial(), RobotCommand("disarm", ("r0",)), SafetyCommand("hold"), Enable()]
+)
+def test_who_took_over_is_not_robbed_of_the_command(request_: Request) -> None:
+    field = two_stations()
+    # It obeys somebody who is gone, and hears nobody: alice waits for it.
+    field.join("carol")
+    field.cut(("alice", "bob", "r1"), ("carol", "r0"))
+    field.run(4.0)
+    field.do(TakeCommand(), "carol")
+    robot = field.robots[0]
+    assert [each.said.operator for each in field.robots] == ["carol", "alice"]
+    field.leave("carol")
+    robot.deaf = True
+    field.run(1.2)
+    field.mend()
+    field.run(1.0)
+    assert field.stations["alice"].commands
+    waiting = field.begin(request_)
+    field.run(1.0)
+    assert waiting.report is None
+    taken = field.begin(TakeCommand(), "bob")
+    field.run(1.0)
+    assert waiting.report is not None
+    assert not_done(waiting.report)["r0"] is ResultCode.ABANDONED
+    robot.deaf = False
+    field.until(lambda: taken.report)
+    field.run(6.0)
+    assert [station.commands for station in field.stations.values()] == [False, True]
 
 
 def test_kill_goes_on_whoever_takes_over() -> None:
-    field = two_stations()
-    field.done(TAKEOFF)
+    field = two_stations(stage="hovering")
     field.robots[0].deaf = True
     kill = field.begin(RobotCommand("kill", ("r0",)))
     field.run(1.0)
@@ -218,17 +227,26 @@ def test_anothers_hold_ends_only_what_sets_in_motion() -> None:
     assert again.report.done
 
 
+def test_who_hears_the_ground_after_seconds_obeys_it_still() -> None:
+    field = two_stations(stage="flying")
+    field.robots[0].silent = field.robots[0].deaf = True
+    field.run(0.5)
+    hold = field.begin(SafetyCommand("hold"))
+    field.run(2.5)
+    assert hold.report is None
+    field.robots[0].silent = field.robots[0].deaf = False
+    field.until(lambda: hold.report, 5.0)
+    assert hold.report is not None
+    assert hold.report.done
+
+
 # A client that leaves
 
 
 def half_resumed() -> Field:
     """Robots that return are asked to resume, and hold by now."""
-    field = a_field()
-    field.join("bob")
-    field.fly()
-    for robot in field.robots:
-        robot.position_m = (30.0, 30.0, robot.slot_height_m)
-    field.run(0.5)
+    field = two_stations(stage="flying")
+    field.until(lambda: min(robot.away_m for robot in field.robots) > 2.0)
     field.done(SafetyCommand("return"))
     return field
 
@@ -249,7 +267,7 @@ def test_who_is_told_to_hold_goes_nowhere_if_resume_is_abandoned(by: str) -> Non
     field.done(SafetyCommand("hold"), by)
     field.run(1.0)
     assert resume.report is not None
-    assert set(not_done(resume.report)) == {"r0", "r1", "r2"}
+    assert set(not_done(resume.report)) == {"r0", "r1"}
     field.run(5.0)
     assert field.states() == {_S.HOLD}
 
@@ -258,10 +276,14 @@ def test_who_is_told_to_hold_goes_nowhere_if_resume_is_abandoned(by: str) -> Non
 
 
 def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
-    field = a_field()
-    field.take_off()
+    field = a_field(2, "hovering")
     field.done(RobotCommand("pilot", ("r1",)))
-    field.robots[1].state = _S.HOLD
+    # It is taken back, and does not come to say so before all are to land.
+    field.robots[1].program.loops["status"].hang(1.5)
+    field.begin(RobotCommand("rejoin", ("r1",)))
+    field.run(1.0)
+    heard = field.stations["alice"].status("r1")
+    assert heard is not None and heard.state is _S.PILOT
     field.done(SafetyCommand("land", wait=True))
     assert field.states() == {_S.LANDED}
 
@@ -269,8 +291,24 @@ def test_who_was_with_its_pilot_until_now_lands_with_the_others() -> None:
 # Who cannot do it is said so at once, and does not count as done
 
 
+def test_a_refusal_is_not_the_reason_of_who_left_hold_since() -> None:
+    field = a_field(1, "hovering")
+    field.robots[0].program.loops["policy"].hang(60.0)
+    field.run(3.0)
+    start = field.begin(Start())
+    field.until(lambda: field.robots[0].said.orders)
+    field.run(1.0)
+    assert start.report is None  # It is asked again for a while.
+    field.robots[0].vehicle.pilot()
+    field.until(lambda: start.report)
+    assert start.report is not None
+    (result,) = start.report.results
+    assert (result.code, result.refusal) == (ResultCode.WRONG_STATE, None)
+    assert "pilot" in result.text
+
+
 def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
-    field = two_stations()
+    field = two_stations(3)
     field.done(RobotCommand("kill", ("r1",)))
     report = field.do(Enable())
     assert not_done(report) == {"r1": ResultCode.WRONG_STATE}
@@ -287,7 +325,7 @@ def test_who_is_killed_fails_and_does_not_hold_up_the_others() -> None:
 
 def test_who_is_not_ready_is_not_done_with_enable() -> None:
     field = a_field()
-    field.robots[2].refuses = "GPS: 4 satellites"
+    field.robots[2].tire()
     field.done(SetOrigin(ORIGIN))
     assert not_done(field.do(Enable())) == {"r2": ResultCode.NOT_READY}
 
@@ -301,8 +339,7 @@ def test_who_is_not_enabled_is_not_waited_for() -> None:
 
 
 def test_two_holds_at_once_are_both_done() -> None:
-    field = a_field()
-    field.fly()
+    field = a_field(2, "flying")
     field.robots[1].silent = True
     first = field.begin(SafetyCommand("hold"))
     field.run(1.0)
@@ -313,8 +350,7 @@ def test_two_holds_at_once_are_both_done() -> None:
 
 
 def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
-    field = a_field()
-    field.fly()
+    field = a_field(3, "flying")
     field.done(SafetyCommand("hold", robots=("r0",)))
     text = "r1, r2 fly the mission: hold or land first"
     told = field.do(NextTrial(robots=("r0",))).problem
@@ -322,8 +358,7 @@ def test_the_next_trial_begins_only_when_nobody_flies_this_one() -> None:
 
 
 def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    field = a_field()
-    field.fly()
+    field = a_field(2, "flying")
     hold = field.begin(SafetyCommand("hold", wait=True))
     monkeypatch.setattr(hold, "_steps", (1 / 0 for _ in range(1)))
     with pytest.raises(ZeroDivisionError):

@@ -39,7 +39,7 @@ from edge.messages.mission import (
     Origin,
     Place,
 )
-from edge.policy.lpac.graphs import Policy
+from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.config import load_config
 from edge.robot.control import FlightControl, GroundWorld
 from edge.robot.inbox import Inbox
@@ -141,12 +141,13 @@ class Flown:
     def __init__(
         self,
         folder: Path,
-        policy: Policy,
+        policy: LpacPolicy,
         autopilot: type[DirectAutopilot] = DirectAutopilot,
+        vehicle: Px4Vehicle | None = None,
     ) -> None:
         path = write_config(folder, url="udpin://127.0.0.1:1", endpoint="tcp/127.0.0.1:1")
         config = load_config(path)
-        self.vehicle = new_vehicle(COM_OBL_RC_ACT=4)
+        self.vehicle = new_vehicle(COM_OBL_RC_ACT=4) if vehicle is None else vehicle
         self.autopilot = autopilot(self.vehicle)
         self.records: list[tuple[str, Mapping[str, Any]]] = []
         self.navigation = Navigation(self.autopilot, lambda: self.now_s, config.position)
@@ -166,7 +167,7 @@ class Flown:
             recorder=self,
             energy=config.energy,
             unix_clock_s=lambda: self.now_s,
-            started_s=0.0,
+            started_s=self.now_s,
         )
         self.ground = GroundState(sequence=1, operator="test", origin=ORIGIN, enabled=True)
         self.failed_checks: tuple[FailedCheck, ...] = ()
@@ -197,7 +198,7 @@ class Flown:
         self.inbox.put_ground(encode(self.ground), self.now_s, self.now_s)
         self.look()
         perceived = self.pac.perceive(self.now_s)
-        self.images = None if perceived is None else perceived.images.copy()
+        self.images = None if perceived is None else perceived.inputs["images"]
         self.pac.infer(self.now_s, self.now_s)
         self.sent = self.control.tick(self.now_s)
         for _ in range(5):
@@ -278,7 +279,7 @@ def vector(values: Any) -> Vector:
 
 
 @pytest.fixture
-def flown(tmp_path: Path, shipped_policy: Policy) -> Flown:
+def flown(tmp_path: Path, shipped_policy: LpacPolicy) -> Flown:
     return Flown(tmp_path, shipped_policy)
 
 
@@ -331,7 +332,7 @@ def test_what_the_watchdog_did_in_a_tick_that_took_long_is_not_taken_for_a_pilot
 @pytest.mark.parametrize("state", [FlightState.HOLD, FlightState.MISSION, FlightState.RETURN])
 @pytest.mark.parametrize("jump_m", [(0.0, 0.0, 6.0), (0.0, 0.0, -10.0), (5.0, 0.0, -1.3)])
 def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
-    tmp_path: Path, shipped_policy: Policy, state: FlightState, jump_m: Vector
+    tmp_path: Path, shipped_policy: LpacPolicy, state: FlightState, jump_m: Vector
 ) -> None:
     """North, east, down: without a new origin. The vehicle itself has not moved."""
     flown = Flown(tmp_path, shipped_policy, ListeningAutopilot)
@@ -353,8 +354,9 @@ def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
     assert abs(flown.odometry()[2] - 5.0) < 0.8
     doubted = [r["height_m"] for t, r in flown.records[-30:] if t == "control"]
     assert max(doubted) - min(doubted) < 1.0
-    flown.say(safety_action="land")
-    flown.until(FlightState.LANDED)
+    if state is FlightState.HOLD:
+        flown.say(safety_action="land")
+        flown.until(FlightState.LANDED)
 
 
 def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
@@ -394,7 +396,9 @@ def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
 def test_a_program_that_starts_in_flight_takes_the_origin_it_hears(flown: Flown) -> None:
     flown.vehicle.arm(force=True)
     flown.until(FlightState.PILOT)
-    flown.tick()
+    # It needs to know where it is first.
+    for _ in range(100):
+        flown.tick()
     assert flown.control.assignment.origin == ORIGIN
     assert not flown.sent
     assert flown.autopilot.commands == []
@@ -448,6 +452,44 @@ def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(fl
     flown.say(fence=FENCE, places={"3": PLACE})
     flown.tick()
     assert flies_by(flown) == (FENCE, PLACE, "configured")
+
+
+FAR = 300.0
+FAR_FENCE = Fence(((0.0, 0.0), (FAR, 0.0), (FAR, FAR), (0.0, FAR)), 1.5, 2.0, 28.0)
+FAR_ORIGIN = Origin(ORIGIN.latitude_deg + 0.003, ORIGIN.longitude_deg, 0.0)  # to the north
+
+
+def test_what_is_out_of_its_reach_is_not_taken_up(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    before, origin = flies_by(flown), flown.control.assignment.origin
+    high = dataclasses.replace(FENCE, ceiling_m=1e9)
+    for said, code in (
+        ({"origin": FAR_ORIGIN}, CheckCode.ORIGIN_OUT_OF_REACH),
+        ({"fence": FAR_FENCE}, CheckCode.FENCE_OUT_OF_REACH),
+        ({"fence": high, "places": {"3": PLACE}}, CheckCode.FENCE_OR_PLACE_UNFIT),
+    ):
+        flown.say(**{"origin": ORIGIN, "fence": None, "places": {}, **said})
+        assert why(flown.order("takeoff")) is RefusalCode.NOT_READY
+        assert codes(flown.control.not_taken) == [code]
+        assert (flies_by(flown), flown.control.assignment.origin) == (before, origin)
+    flown.say(origin=ORIGIN, fence=FENCE, places={"3": PLACE})
+    flown.tick()
+    assert flies_by(flown) == (FENCE, PLACE, "configured") and not flown.control.not_taken
+
+
+def test_a_program_that_starts_in_flight_takes_up_nothing_out_of_its_reach(
+    tmp_path: Path, shipped_policy: LpacPolicy
+) -> None:
+    flown = Flown(tmp_path, shipped_policy)
+    flown.take_off()
+    again = Flown(tmp_path, shipped_policy, vehicle=flown.vehicle)
+    again.say(origin=ORIGIN, fence=FAR_FENCE)
+    for _ in range(50):
+        again.tick()
+        assert again.control.assignment.robot.fence != FAR_FENCE
+    assert again.state is FlightState.PILOT
+    assert codes(again.control.not_taken) == [CheckCode.FENCE_OUT_OF_REACH]
+    assert again.control.assignment.origin == ORIGIN
 
 
 def test_a_world_is_waited_for_and_then_seen_instead_of_the_old_one(flown: Flown) -> None:

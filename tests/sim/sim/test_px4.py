@@ -106,7 +106,7 @@ def test_arming_is_denied_until_health_is_good(seed: int) -> None:
     ],
 )
 def test_arming_is_denied_with_a_reason(
-    spoil: Callable[[Any], object], problem: checks.Problem
+    spoil: Callable[[Any], object], problem: checks.ArmingProblem
 ) -> None:
     vehicle = Px4Vehicle(seed=0, ready_after_s=0.0)
     run(vehicle, 0.1)

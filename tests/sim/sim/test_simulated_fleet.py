@@ -1,13 +1,24 @@
 """A fleet of real robot nodes under a real ground, on one simulated clock."""
 
 import dataclasses
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
 from edge.core import F64
+from edge.drivers.flight_log import read
+from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
+from edge.policy.lpac.policy import LpacPolicy
+from edge.policy.lpac.replay import replay
+from edge.robot.readiness import Checks
+from lpac.analysis.snapshot import RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script
 from lpac.ground.site import Sites
@@ -15,9 +26,13 @@ from lpac.ground.station.protocol import Enable, SafetyCommand, SetOrigin, Start
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight, normalized
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.recorded import RecordingError
+from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
+from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.radio import GROUND
 from tests.conftest import SHIPPED
+from tests.flown import PRECISE
 
 ROBOTS = 3
 DRONE_M = 0.5
@@ -25,6 +40,17 @@ DRONE_M = 0.5
 
 def a_fleet(folder: Path, seed: int = 3, robots: int = ROBOTS) -> SimulatedFleet:
     return SimulatedFleet(FleetScenario(robots=robots, seed=seed), folder, SHIPPED)
+
+
+def low_flight(robots: int, seed: int, duration_s: float) -> FleetScenario:
+    """Robots that know where they are fly low, and are soon up and down."""
+    return FleetScenario(
+        robots=robots, seed=seed, duration_s=duration_s, errors=False, budget=PRECISE
+    )
+
+
+def a_low_fleet(folder: Path) -> SimulatedFleet:
+    return SimulatedFleet(low_flight(2, 3, 60.0), folder, SHIPPED)
 
 
 def to_mission(ground: SimulatedGround) -> Procedure[None]:
@@ -38,6 +64,19 @@ def to_mission(ground: SimulatedGround) -> Procedure[None]:
             assert ready, ground.snapshot
         report = yield request
         assert report.done, (request, report)
+
+
+@cache
+def _in_mission() -> SimulatedFleet:
+    with tempfile.TemporaryDirectory() as folder:
+        fleet = a_fleet(Path(folder), robots=2)
+    fleet.ground.carry_out(to_mission(fleet.ground))
+    return fleet
+
+
+def in_mission() -> SimulatedFleet:
+    """Two robots that fly their mission."""
+    return _in_mission().copy()
 
 
 def states(fleet: SimulatedFleet) -> set[FlightState]:
@@ -79,23 +118,74 @@ def test_a_fleet_flies_its_mission_and_lands_on_its_pads(tmp_path: Path) -> None
     assert min(apart_m) > DRONE_M
 
 
-def test_a_flight_is_the_same_each_time(tmp_path: Path) -> None:
-    def flown(folder: Path, seed: int) -> tuple[bytes, list[str]]:
-        fleet = a_fleet(folder, seed, robots=2)
-        fleet.ground.carry_out(to_mission(fleet.ground))
-        fleet.ground.carry_out(_pass(3.0))
-        return fleet.true_positions_m().tobytes(), [each.text for each in fleet.ground.events]
+def test_a_copy_flies_on_as_the_first_does_and_apart_from_it() -> None:
+    fleet = in_mission()
+    copies = [fleet.copy() for _ in range(3)]
+    copies[0].vehicles[0].vehicle.wind_m_s = np.array([3.0, 0.0, 0.0])
+    copies[1].radio.air = dataclasses.replace(copies[1].radio.air, silent=frozenset({0, 1}))
+    flown = []
+    for each in (*copies, fleet):
+        each.ground.carry_out(_pass(4.0))
+        assert each.ground.command(SafetyCommand("hold")).done is (each is not copies[1])
+        flown.append((each.true_positions_m().tobytes(), [e.text for e in each.ground.events]))
+    assert flown[2] == flown[3]
+    assert flown[0] != flown[3] != flown[1]
 
-    first = flown(tmp_path / "first", 3)
-    assert flown(tmp_path / "again", 3) == first
-    assert flown(tmp_path / "other", 4) != first
 
-
-def test_robots_that_lose_the_ground_hold_and_land(tmp_path: Path) -> None:
-    fleet = a_fleet(tmp_path)
+def test_whose_loop_hangs_is_held_and_whose_program_ends_lands() -> None:
+    fleet = in_mission()
     ground = fleet.ground
+    fleet.robots[0].loops["control"].hang(3.0)
+    fleet.robots[1].stop()
+    ground.carry_out(_pass(2.0))
+    assert [each.vehicle.mode for each in fleet.vehicles] == [Px4Mode.HOLD] * 2
+    ground.carry_out(_pass(3.0))
+    said = fleet.robots[0].status
+    assert said is not None
+    assert (said.state, said.reason.code) == (FlightState.HOLD, ReasonCode.CONTROL_SILENT)
+    ground.carry_out(_pass(90.0))
+    assert all(each.vehicle.landed and not each.vehicle.armed for each in fleet.vehicles)
+
+
+def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
+    scenario = FleetScenario(robots=2, seed=3)
+    fleet = SimulatedFleet(scenario, tmp_path, SHIPPED, absent=1)
+    ground = fleet.ground
+    assert not ground.carry_out(_until_all(lambda robot: robot.fresh, 10.0))
+    fleet.robots[1].start()
     ground.carry_out(to_mission(ground))
-    robots = frozenset(range(ROBOTS))
+    # As by a loss of power, in flight: whoever comes back only looks.
+    fleet.robots[0].start()
+    ground.carry_out(_pass(5.0))
+    told = [e.text for e in ground.events if e.kind == "presence" and e.robot == "r0"]
+    assert told[-1] == "its program has started again"
+    assert fleet.robots[0].status is not None
+    assert fleet.robots[0].status.state is FlightState.PILOT
+    # A ground of the same computer knows what the one before said.
+    assert ground.command(SafetyCommand("hold", robots=("r1",))).done
+    again = fleet.join("operator")
+    assert ground.node.link is None and not again.node.station.commands
+    assert again.carry_out(_until_all(lambda robot: robot.fresh, 10.0))
+    again.carry_out(_pass(3.0))
+    assert again.node.station.commands and again.node.station.state is not None
+    assert again.node.station.state.robot_safety_actions == {"1": "hold"}
+    # Another one of another name observes; one of the same name, on another computer, ends.
+    other = fleet.join("other")
+    twin = SimulatedGround(again.setup, fleet.schedule, fleet.radio, -9)
+    again.carry_out(_pass(5.0))
+    assert (other.node.station.commands, other.node.station.commander) == (False, "operator")
+    assert again.problem is None and "--name" in str(twin.problem)
+
+
+def _until_all(condition: Callable[[RobotSnapshot], bool], at_most_s: float) -> Procedure[bool]:
+    came: bool = yield Until(lambda told: all(map(condition, told.robots)), at_most_s)
+    return came
+
+
+def test_robots_that_lose_the_ground_hold_and_land() -> None:
+    fleet = in_mission()
+    ground = fleet.ground
+    robots = frozenset(range(len(fleet.robots)))
     cut = (frozenset({GROUND}), robots)
     fleet.radio.air = dataclasses.replace(fleet.radio.air, partition=cut)
     ground.carry_out(_pass(5.0))
@@ -113,7 +203,7 @@ def test_robots_that_lose_the_ground_hold_and_land(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 def test_a_script_is_flown_on_the_simulated_clock(tmp_path: Path, loss: float) -> None:
-    fleet = a_fleet(tmp_path)
+    fleet = a_low_fleet(tmp_path)
     fleet.radio.air = dataclasses.replace(fleet.radio.air, loss=loss)
     path = tmp_path / "script.toml"
     path.write_text(
@@ -157,6 +247,10 @@ def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
         return fly_simulated(scenario, tmp_path / name, SHIPPED)
 
     flight, again = flown("first"), flown("again")
+    for robot, same in zip(flight.robots, again.robots, strict=True):
+        np.testing.assert_array_equal(robot.truth.position_m, same.truth.position_m)
+    other = a_fleet(tmp_path / "other", seed=6).true_positions_m()
+    assert (other != a_fleet(tmp_path / "same", seed=5).true_positions_m()).any()
     assert flight.all_landed and flight.problem is None
     assert [change.state for change in flight.robots[0].changes][-4:] == [
         FlightState.MISSION, FlightState.RETURN, FlightState.LAND, FlightState.LANDED,
@@ -165,4 +259,163 @@ def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
     assert flight.true_fence_margin_m() > 0.0
     assert flight.separation is not None and flight.separation.distance_m > DRONE_M
     assert flight.summary() == again.summary()
+    assert [each["command"] for each in flight.summary()["commands"]] == [
+        "origin", "again", "enable", "takeoff", "start", "return",
+    ]  # fmt: skip
+    for each in flight.summary()["commands"]:
+        assert each["problem"] is None
+        assert each["results"] == dict.fromkeys(("r0", "r1", "r2"), "done")
     assert normalized(flight.cost)[-1] < 1.0
+
+
+def test_who_flies_is_checked_once_a_second_and_who_has_landed_more_often(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fleet = a_fleet(tmp_path, robots=1)
+    ground, node = fleet.ground, fleet.robots[0].node
+    assert node is not None
+    readiness = node.readiness
+    checked_at_s: list[float] = []
+    check = readiness.checks
+
+    def counted(now_s: float, *arguments: Any, **facts: Any) -> Checks:
+        checked_at_s.append(now_s)
+        return check(now_s, *arguments, **facts)
+
+    monkeypatch.setattr(readiness, "checks", counted)
+    ground.carry_out(to_mission(ground))
+    checked_at_s.clear()
+    ground.carry_out(_pass(10.0))
+    assert 9 <= len(checked_at_s) <= 11
+    assert ground.command(SafetyCommand("land", wait=True)).done
+    checked_at_s.clear()
+    ground.carry_out(_pass(10.0))
+    assert 39 <= len(checked_at_s) <= 41
+
+
+def test_a_takeoff_that_fails_brings_all_down_and_is_tried_again(tmp_path: Path) -> None:
+    fleet = a_low_fleet(tmp_path)
+    [_, low] = [each.vehicle for each in fleet.vehicles]
+    lost = False
+
+    def lose_gps_once() -> None:
+        nonlocal lost
+        climbing = low.armed and low.position_m[2] < -1.0
+        if climbing and not lost:
+            lost = low.gps_lost = True
+        elif low.landed and not low.armed:
+            low.gps_lost = False
+
+    fleet.schedule.every(0.1, lose_gps_once)
+    said: list[str] = []
+    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 2.0, say=said.append)
+    assert fleet.ground.carry_out(flight.fly()) is None
+    assert lost and any(text.startswith("all take off again: ") for text in said)
+    takeoffs = [done.report.done for done in flight.commands if isinstance(done.request, Takeoff)]
+    assert takeoffs == [False, True]
+    assert all(each.vehicle.landed and not each.vehicle.armed for each in fleet.vehicles)
+
+
+def test_a_flight_that_cannot_go_on_says_why_and_all_land(tmp_path: Path) -> None:
+    fleet = a_low_fleet(tmp_path)
+    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 10.0)
+
+    def leave_offboard() -> None:
+        if "mission" in flight.began_s:
+            fleet.vehicles[0].vehicle.set_mode(Px4Mode.HOLD)
+
+    fleet.schedule.every(0.1, leave_offboard)
+    problem = fleet.ground.carry_out(flight.fly())
+    # Nobody flies that one any more but its pilot.
+    assert problem is not None and "r0: pilot" in problem
+    assert [each.vehicle.landed for each in fleet.vehicles] == [False, True]
+
+
+def test_a_vehicle_that_leaves_offboard_once_is_taken_back_and_flies_on(tmp_path: Path) -> None:
+    fleet = a_low_fleet(tmp_path)
+    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 10.0)
+    seen: list[FlightState] = []
+
+    def leave_offboard_once() -> None:
+        status = fleet.ground.snapshot.robots[0].status
+        if "mission" in flight.began_s and FlightState.PILOT not in seen:
+            fleet.vehicles[0].vehicle.set_mode(Px4Mode.HOLD)
+        if status is not None and seen[-1:] != [status.state]:
+            seen.append(status.state)
+
+    fleet.schedule.every(0.1, leave_offboard_once)
+    assert fleet.ground.carry_out(flight.fly()) is None
+    mission = [FlightState.MISSION, FlightState.PILOT, FlightState.HOLD, FlightState.MISSION]
+    began = seen.index(FlightState.MISSION)
+    assert seen[began : began + 4] == mission and seen[began + 4] is FlightState.RETURN
+
+
+def test_nobody_takes_off_who_is_not_ready(tmp_path: Path) -> None:
+    fleet = a_low_fleet(tmp_path)
+    fleet.vehicles[1].vehicle.battery_remaining = 0.1
+    flight = ScriptedFlight(fleet.ground, tmp_path / "fleet.toml", 10.0)
+    problem = fleet.ground.carry_out(flight.fly())
+    assert problem is not None and problem.startswith("preflight (steps[0]): not ready after 60 s")
+    assert "takeoff" not in flight.began_s and "land" not in flight.began_s
+    assert not any(entry.armed for each in fleet.vehicles for entry in each.vehicle.truth)
+
+
+LOGGED = low_flight(2, 1, 3.0)
+
+
+class Logged(NamedTuple):
+    """A flight whose robots wrote logs, and the folder that they are in."""
+
+    flight: FleetFlight
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory: pytest.TempPathFactory) -> Logged:
+    folder = tmp_path_factory.mktemp("logged")
+    return Logged(fly_simulated(LOGGED, folder, SHIPPED, logs=True), folder)
+
+
+def test_what_the_robots_logged_is_what_they_computed(
+    shipped_policy: LpacPolicy, logged: Logged
+) -> None:
+    """Flight logs as the robots' programs write them."""
+    for robot, record in enumerate(logged.flight.robots):
+        (log,) = record.logs
+        assert log == f"robots/{robot}/logs/robot-{robot}-0001.mcap"
+        messages = list(read(logged.folder / log))
+        states = {message["state"] for topic, _, message in messages if topic == "status"}
+        assert {FlightState.MISSION, FlightState.LANDED} <= states
+        for compared in replay(shipped_policy, messages):
+            assert compared.ticks > 0 and compared.differing == 0
+
+
+def test_recorded_steps_of_the_policy_are_the_same_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: Logged
+) -> None:
+    """As on a CPU whose onnxruntime rounds otherwise."""
+    velocity = LpacPolicy.velocity
+    monkeypatch.setattr(LpacPolicy, "velocity", lambda *inputs: velocity(*inputs) * 1.01)
+    other = fly_simulated(LOGGED, tmp_path / "other", SHIPPED)
+    again = fly_simulated(LOGGED, tmp_path / "again", SHIPPED, recorded=logged.folder)
+    for robot, first in zip(again.robots, logged.flight.robots, strict=True):
+        np.testing.assert_array_equal(robot.truth.position_m, first.truth.position_m)
+    assert not any(robot.logs for robot in (*other.robots, *again.robots))
+    assert again.summary()["cost_curve"] == logged.flight.summary()["cost_curve"]
+    assert other.summary()["cost_curve"] != logged.flight.summary()["cost_curve"]
+
+
+def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -> None:
+    def recorded(scenario: FleetScenario, folder: Path) -> None:
+        fly_simulated(scenario, tmp_path / "flown", SHIPPED, recorded=folder)
+
+    with pytest.raises(RecordingError, match="has no flight log of robot 2"):
+        recorded(low_flight(3, 1, 3.0), logged.folder)
+    with pytest.raises(RecordingError, match=r"robot \d: its log has no step of the policy at"):
+        recorded(low_flight(2, 2, 3.0), logged.folder)
+    two = tmp_path / "two"
+    shutil.copytree(logged.folder, two)
+    again = fly_simulated(low_flight(1, 1, 2.0), two, SHIPPED, logs=True)
+    assert again.robots[0].logs == ("robots/0/logs/robot-0-0002.mcap",)
+    with pytest.raises(RecordingError, match="holds logs of more than one flight"):
+        recorded(low_flight(1, 1, 2.0), two)

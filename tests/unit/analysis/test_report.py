@@ -33,9 +33,9 @@ from lpac.analysis.trials import find_missions
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata
 from tests.conftest import SHIPPED
-from tests.pretend import FENCE
 from tests.said import reason, refusal
 from tests.unit.analysis.test_coverage import STATUS
+from tests.unit.ground.snapshots import FENCE
 
 S = FlightState
 NAN = math.nan
@@ -333,7 +333,7 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     (values,) = found.summary()["trials"]
     assert values["cost"]["initial"] is None and values["end_m"].keys() == {"0", "1", "2"}
     assert [f"world {id_of(WORLD)} is not here" in note for note in found.notes] == [True]
-    write(found, tmp_path / "out", (), lambda *_: None)
+    write(found, tmp_path / "out", (0.0,), lambda *_: None)
     assert (tmp_path / "out/t1/snapshots.png").exists()
     assert not (tmp_path / "out/t1/cost.png").exists()
     other = tmp_path / "other.txt"
@@ -370,7 +370,7 @@ def test_a_world_without_importance_has_no_normalised_cost(tmp_path: Path) -> No
     writer = Writer((FIRST, SECOND))
     writer.world = "CircularBND 100 100 20 0\n"
     writer.ground(tmp_path)
-    arguments = ["report", str(tmp_path), "--out", str(tmp_path / "out")]
+    arguments = ["report", str(tmp_path), "--out", str(tmp_path / "out"), "--times", "0"]
     result = CliRunner().invoke(app, arguments)
     assert "cost" not in result.stdout.splitlines()[0] and "nan" not in result.stdout
     assert "note: t1: the world holds no importance: no normalised cost" in result.stdout
@@ -423,7 +423,7 @@ def test_restarts_and_alarms_are_told(tmp_path: Path) -> None:
     (alarm,) = values["alarms"]
     assert (alarm["robot"], alarm["code"], alarm["text"]) == ("r1", "battery_low", "battery <low>")
     assert alarm["time_s"] == pytest.approx(5.0, abs=0.01)
-    page = write(found, tmp_path / "out", (), lambda *_: None)
+    page = write(found, tmp_path / "out", (0.0,), lambda *_: None)
     assert "battery <low>" in Page(page.read_text()).text
 
 
@@ -510,7 +510,7 @@ def test_odd_flights_have_a_report_too(
     writer.robots(tmp_path)
     (tmp_path / "world.env").write_text(WORLD)
     found = examined(tmp_path)
-    assert write(found, tmp_path / "out", (), lambda *_: None).exists()
+    assert write(found, tmp_path / "out", (0.0,), lambda *_: None).exists()
     (values,) = found.summary()["trials"]
     if change is nowhere:
         assert values["cost"]["initial"] is None and values["end_m"] == {}
@@ -567,7 +567,7 @@ def test_numbers_that_are_not_finite_are_not_known(tmp_path: Path) -> None:
     (values,) = found.summary()["trials"]
     assert found.notes == () and values["robots"] == ["0", "1", "2"]
     assert values["end_m"].keys() == {"0", "2"} and values["loops"]["control"]["p99_ms"] == 4.0
-    text = Page(write(found, tmp_path / "out", (), lambda *_: None).read_text()).text
+    text = Page(write(found, tmp_path / "out", (0.0,), lambda *_: None).read_text()).text
     assert "80 %" in text and "nan" not in text
 
 

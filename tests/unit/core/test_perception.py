@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 from edge.core import F32
 from edge.core.perception import (
     TILE_SIZE,
-    Perception,
     PerceptionParameters,
-    Resize,
     RobotMap,
-    neighbour_maps,
+    RobotMemory,
     neighbours_in_range,
     part_in_world,
     window_corner,
 )
+from edge.policy.lpac.images import PolicyImages, Resize, neighbour_maps
 
 PARAMETERS = PerceptionParameters(
     world_size=512, local_map_size=256, sensor_size=64, communication_range=256.0
@@ -67,22 +66,21 @@ def test_resize_is_torchs_antialiased_bilinear_one(size: int, new_size: int) -> 
 
 
 def images_at(position: tuple[float, float], neighbours: list[tuple[float, float]]) -> F32:
-    perception = Perception(PARAMETERS, channels=4, image_size=32)
-    images: F32 = perception.images(
-        np.array(position), np.array(neighbours, np.float64).reshape(-1, 2)
-    ).copy()[0]
+    own, memory = np.array(position), RobotMemory(PARAMETERS)
+    others = np.array(neighbours, np.float64).reshape(-1, 2)
+    images: F32 = PolicyImages(PARAMETERS, 4, 32).images(own, memory.local_map(own), others)[0]
     return images
 
 
 def test_images_keep_x_and_y_and_left_and_right_apart() -> None:
     position = np.array([200.0, 300.0])
-    perception = Perception(PARAMETERS, channels=4, image_size=32)
+    memory = RobotMemory(PARAMETERS)
     view = np.zeros((64, 64), np.float32)
     view[60, 8] = 1.0  # 28 to the right (+x) and 24 behind (-y)
-    perception.observe(position, view)
+    memory.observe(position, view)
     neighbour = np.array([300.0, 250.0])
-    importance, neighbours_x, neighbours_y, obstacles = perception.images(
-        position, neighbour[None]
+    importance, neighbours_x, neighbours_y, obstacles = PolicyImages(PARAMETERS, 4, 32).images(
+        position, memory.local_map(position), neighbour[None]
     )[0]
     # 128 + 28 and 128 - 24 cells into a local map of 256, eight of them to one of the image.
     assert np.unravel_index(importance.argmax(), importance.shape) == (19, 13)
@@ -101,17 +99,10 @@ def test_obstacles_are_on_the_side_of_the_border() -> None:
 
 
 def test_two_channels_leave_the_neighbours_out() -> None:
-    perception = Perception(PARAMETERS, channels=2, image_size=32)
-    images = perception.images(np.array([0.0, 256.0]), np.array([[10.0, 256.0]]))
+    own, unseen = np.array([0.0, 256.0]), np.zeros((256, 256), np.float32)
+    images = PolicyImages(PARAMETERS, 2, 32).images(own, unseen, np.array([[10.0, 256.0]]))
     assert images.shape == (1, 2, 32, 32)
     np.testing.assert_array_equal(images[0, 1], images_at((0.0, 256.0), [])[3])
-
-
-@given(st.tuples(*[st.floats(-2000.0, 2000.0)] * 2))
-@settings(deadline=None, max_examples=30)
-def test_outside_the_world_the_view_is_that_from_its_border(position: tuple[float, float]) -> None:
-    clipped = tuple(np.clip(position, 0.0, 512.0))
-    np.testing.assert_array_equal(images_at(position, []), images_at(clipped, []))
 
 
 @given(st.lists(st.tuples(*[st.floats(-255.9, 255.9)] * 2), max_size=12))
@@ -161,15 +152,15 @@ def test_impossible_parameters_are_named(change: dict[str, Any], text: str) -> N
 @pytest.mark.parametrize("world_size", [512, 300, 40])
 def test_a_coarse_cell_counts_as_seen_when_its_centre_was(world_size: int) -> None:
     parameters = dataclasses.replace(PARAMETERS, world_size=world_size)
-    perception = Perception(parameters, channels=4, image_size=32)
+    memory = RobotMemory(parameters)
     centres = (np.arange(64) + 0.5) * world_size / 64
     seen = np.zeros((64, 64), np.bool_)
-    assert not perception.explored.any()
+    assert not memory.explored.any()
     for x, y in ((0.0, 100.0), (70.3, 250.0), (world_size + 20.0, 10.0), (-500.0, 9e3)):
-        perception.observe(np.array([x, y]), np.ones((64, 64), np.float32))
+        memory.observe(np.array([x, y]), np.ones((64, 64), np.float32))
         corner_x, corner_y = window_corner(np.array([x, y]), 64)
         in_x = (centres >= corner_x) & (centres < corner_x + 64)
         in_y = (centres >= corner_y) & (centres < corner_y + 64)
         seen |= np.outer(in_x, in_y)
-        np.testing.assert_array_equal(perception.explored, seen)
+        np.testing.assert_array_equal(memory.explored, seen)
     assert seen.any()

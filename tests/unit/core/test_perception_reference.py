@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from edge.core import F32, F64
-from edge.core.perception import Perception, PerceptionParameters, neighbours_in_range
+from edge.core.perception import PerceptionParameters, RobotMemory, neighbours_in_range
 from edge.core.world import random_features
 from edge.drivers.world_sensor import WorldSensor
+from edge.policy.lpac.images import PolicyImages
 from tests.unit.core.reference import point_vector, reference_environment
 
 PARAMETERS = PerceptionParameters(
@@ -50,15 +51,15 @@ def test_images_are_the_librarys(seed: int) -> None:
     environment = reference_environment(features, walk[0])
     # The library's own raster: ours is compared with it elsewhere.
     sensor = WorldSensor(environment.GetWorldMap().astype(np.float32), PARAMETERS.sensor_size)
-    robots = [Perception(PARAMETERS, channels=4, image_size=32) for _ in range(ROBOTS)]
+    robots = [(RobotMemory(PARAMETERS), PolicyImages(PARAMETERS, 4, 32)) for _ in range(ROBOTS)]
     seen = 0.0
     for positions in walk:
         environment.SetGlobalRobotPositions(point_vector(positions))
-        for i, robot in enumerate(robots):
+        for i, (memory, policy_images) in enumerate(robots):
             own, others = positions[i], np.delete(positions, i, axis=0)
-            robot.observe(own, sensor.view(own))
+            memory.observe(own, sensor.view(own))
             near = neighbours_in_range(own, others, PARAMETERS.communication_range)
-            images = robot.images(own, others[near])[0]
+            images = policy_images.images(own, memory.local_map(own), others[near])[0]
             expected = reference_images(environment, i)
             np.testing.assert_allclose(images, expected, atol=1e-5)
             seen += float(expected[0].sum())

@@ -350,7 +350,7 @@ def test_what_comes_too_fast_is_dropped_and_counted(
     log.close()
     found = logged(tmp_path)
     assert len(found) == 100 and log.dropped == 3900
-    assert capsys.readouterr().out.count("dropped=3900") == 1
+    assert capsys.readouterr().err.count("dropped=3900") == 1
 
 
 def test_a_message_that_cannot_be_held_costs_only_itself(
@@ -371,7 +371,7 @@ def test_a_message_that_cannot_be_held_costs_only_itself(
             log.record(topic, time_s, message)
     assert [message["number"] for _, _, message in logged(tmp_path)] == [1, 2]
     assert log.dropped == 7
-    lines = capsys.readouterr().out.splitlines()
+    lines = capsys.readouterr().err.splitlines()
     assert len([line for line in lines if "cannot hold a message" in line]) == 3  # one per topic
 
 
@@ -384,7 +384,7 @@ def test_a_directory_that_cannot_be_written(
     log.record("policy", NOW, {})
     log.flush()
     log.close()
-    (line,) = capsys.readouterr().out.splitlines()
+    (line,) = capsys.readouterr().err.splitlines()
     assert "flight log stopped" in line and "Not a directory" in line
 
 

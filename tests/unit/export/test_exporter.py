@@ -10,7 +10,8 @@ from typer.testing import CliRunner, Result
 
 from edge.core.perception import PerceptionParameters
 from edge.policy.bundle import load_bundle
-from edge.policy.verify import verify
+from edge.policy.lpac.manifest import LpacManifest
+from edge.policy.lpac.policy import LpacPolicy
 from export.checkpoint import CheckpointError
 from export.exporter import export_bundle
 from lpac.cli.export import export
@@ -31,15 +32,15 @@ def run(*arguments: str | Path) -> Result:
 def test_shipped_policy_is_what_its_checkpoint_gives() -> None:
     shipped = load_bundle(POLICIES / NAME)
     bundle = export_bundle(POLICIES / f"{NAME}.pt", POLICIES / f"{NAME}.toml")
-    for name in bundle.manifest.graphs:
+    for name in LpacManifest.of(bundle.manifest).graphs:
         assert bundle.files[name] == shipped.files[name], name
     assert bundle.manifest.name == NAME
-    for field in ("geometry", "images", "perception", "training", "opset"):
+    for field in ("family", "parameters", "perception", "training"):
         assert getattr(bundle.manifest, field) == getattr(shipped.manifest, field)
     provenance = shipped.manifest.provenance
     for file, sha256 in (
-        (provenance.checkpoint, provenance.checkpoint_sha256),
-        (provenance.parameters, provenance.parameters_sha256),
+        (provenance["checkpoint"], provenance["checkpoint_sha256"]),
+        (provenance["parameters"], provenance["parameters_sha256"]),
     ):
         assert hashlib.sha256((POLICIES / file).read_bytes()).hexdigest() == sha256
 
@@ -63,11 +64,11 @@ def test_command_writes_a_bundle_that_verifies(tmp_path: Path) -> None:
         assert result.exit_code == 0, result.output
         bundle = load_bundle(output)
         assert bundle.manifest.name == "ours"
-        assert bundle.manifest.images
-        assert bundle.manifest.images.channels == ("importance", "obstacles")
-        assert (bundle.manifest.images.size, bundle.manifest.images.features) == (20, 8)
+        images = LpacManifest.of(bundle.manifest).images
+        assert images and images.channels == ("importance", "obstacles")
+        assert (images.size, images.features) == (20, 8)
         assert bundle.manifest.perception == PerceptionParameters(512, 256, 64, 256.0)
-        assert all(check.passed for check in verify(bundle))
+        assert all(check.passed for check in LpacPolicy(bundle).verify())
         assert bundle.id in result.output
         assert "L = 2, K = 1, features 10 -> 16 -> 16" in result.output
 
@@ -79,8 +80,9 @@ def test_authors_taps_give_a_bundle_without_perception(tmp_path: Path) -> None:
     assert "none: this checkpoint has no CNN" in result.output
     manifest = load_bundle(tmp_path / "bundle").manifest
     assert manifest.name == "authors_taps"
-    assert manifest.perception is None and manifest.images is None
-    assert manifest.geometry.layers == 5
+    assert manifest.perception is None
+    lpac = LpacManifest.of(manifest)
+    assert lpac.images is None and lpac.geometry.layers == 5
 
 
 def test_nothing_is_written_when_the_input_is_wrong(tmp_path: Path) -> None:

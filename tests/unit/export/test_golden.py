@@ -10,7 +10,7 @@ import pytest
 import torch
 from onnx import numpy_helper
 
-from edge.policy.bundle import CNN
+from edge.policy.lpac.manifest import CNN
 from export import network
 from export.checkpoint import Checkpoint, CheckpointError, read_checkpoint
 from export.golden import golden_vectors

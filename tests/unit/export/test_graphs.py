@@ -9,7 +9,7 @@ import onnx
 import pytest
 import torch
 
-from edge.policy.bundle import ACTION, CNN, gnn_graph
+from edge.policy.lpac.manifest import ACTION, CNN, gnn_graph
 from export import network
 from export.checkpoint import Checkpoint, read_checkpoint
 from export.golden import golden_vectors

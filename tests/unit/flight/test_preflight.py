@@ -17,6 +17,7 @@ from edge.flight.preflight import (
     PreflightLimits,
     failed_checks,
 )
+from edge.flight.reach import Reach
 from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode
 from edge.messages.mission import FlightState, Origin
@@ -71,6 +72,7 @@ READY = PreflightInputs(
     vehicle=VEHICLE,
     failsafe_problems=(),
     fence=Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 3.0, 25.0),
+    reach=Reach(),
     fence_uploaded=True,
     origin=ORIGIN,
     position=PositionJudgement(PositionQuality.GOOD, None),
@@ -157,6 +159,11 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         {"slot_height_m": 2.0},
         _C.HEIGHT_OUTSIDE,
         "slot height is 2 m, must be from the floor at 3 m to the ceiling",
+    ),
+    (
+        {"reach": Reach(distance_m=33.0)},
+        _C.FENCE_OUT_OF_REACH,
+        "fence reaches to 34 m from this robot, must be within its reach of 33 m: carry it nearer",
     ),
     ({"slot_height_m": 26.0}, _C.HEIGHT_OUTSIDE, "slot height is 26 m"),
     ({"duplicate_id": True}, _C.DUPLICATE_ID, "another program says that it is robot 1: stop it"),

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from edge.messages.mission import ON_GROUND, FlightState, GroundState
-from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
+from lpac.analysis.snapshot import FleetSnapshot
 from lpac.ground.map.access import Access, is_loopback
 from lpac.ground.map.view import Missions, detail_view
-from tests.pretend import FENCE, PretendedRobot
+from tests.unit.ground.snapshots import LOOP, robot, setup, status
 
 
 @pytest.mark.parametrize(
@@ -51,12 +51,9 @@ def test_beyond_this_machine_a_token_is_asked_for() -> None:
 
 
 def snapshot_of(state: FlightState, unix_time_s: float, trial: str = "t1") -> FleetSnapshot:
-    robot = PretendedRobot(1, 0, (2.0, 2.0), (2.0, 2.0), 1, "", "")
-    status = replace(
-        robot.status(0.0), state=state, trial=trial, armed=state not in ON_GROUND, boot_nonce=7
-    )
+    said = status(1, state=state, trial=trial, armed=state not in ON_GROUND)
     ground = GroundState(1, "alice", trial=trial)
-    return FleetSnapshot(unix_time_s, "alice", ground, (RobotSnapshot("r1", 1, status, 0.1),))
+    return FleetSnapshot(unix_time_s, "alice", ground, (robot(said),))
 
 
 def test_a_page_that_opens_late_has_the_whole_curve() -> None:
@@ -112,13 +109,8 @@ def test_a_mission_after_another_is_a_new_curve(
 
 
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:
-    (robot,) = snapshot_of(FlightState.HOLD, 0.0).robots
-    assert robot.status is not None
-    late = replace(robot.status.loops["control"], lateness_p99_ms=math.nan)
-    broken = replace(robot.status, loops={"control": late}, hdop=math.nan)
-    setup = FleetSetup(
-        "f", "alice", {"r1": 1}, (), FENCE, "", "", "", 512, 64, 128.0, 16.0, 2.0, 1.0
-    )
-    view = detail_view(setup, replace(robot, status=broken))
+    late = replace(LOOP, lateness_p99_ms=math.nan)
+    broken = status(1, loops={"control": late}, hdop=math.nan)
+    view = detail_view(setup(2), robot(broken))
     shown = json.loads(json.dumps(view, allow_nan=False))["status"]
     assert shown["loops"]["control"]["lateness_p99_ms"] is None and shown["hdop"] is None

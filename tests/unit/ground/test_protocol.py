@@ -52,7 +52,7 @@ from lpac.ground.station.protocol import (
     server_message_from_line,
     to_line,
 )
-from tests.pretend import FENCE, ORIGIN, PretendedRobot
+from tests.unit.ground.snapshots import FENCE, ORIGIN, robot, status
 
 REQUESTS: tuple[Request, ...] = (
     SetOrigin(ORIGIN), SetFence(FENCE, ("r1",)), SetFence(None),
@@ -64,17 +64,12 @@ REQUESTS: tuple[Request, ...] = (
 )  # fmt: skip
 
 
-def status_snapshot() -> RobotSnapshot:
-    robot = PretendedRobot(1, 1, (2.0, 2.0), (2.0, 2.0), 3, "bundle", "world")
-    return RobotSnapshot("r1", 1, robot.status(robot.now_s), 0.1, -0.01, {"2": 2.5})
-
-
 TOLD: tuple[ServerMessage, ...] = (
     FleetSetup("demo", "me@here", {"r1": 1}, (FleetSlot(Place(0, (1.0, 2.0)), (1.0, 1.0), "r1"),),
     FENCE,
           "Uniform 0 0\n", "abc", "bundle", 512, 64, 128.0, 16.0, 2.0, 1.0),
     FleetSnapshot(1e9, "me", GroundState(4, "me", ORIGIN, robot_safety_actions={"1": "hold"}),
-            (status_snapshot(), RobotSnapshot("r2", 2)), ("takeoff",), 0.4),
+            (robot(status(1)), RobotSnapshot("r2", 2)), ("takeoff",), 0.4),
     GroundEvent(1e9, "state", "r1", "hold: ground commands hold", "me", "t1", FlightState.HOLD),
     Explored("r1", base64.b64encode(bytes(512)).decode()),
     CommandProgress("r1", "takes off"),

@@ -206,7 +206,7 @@ def test_what_is_assigned_has_the_least_total_distance(
 
 def test_fence_that_is_off_keeps_the_heights_only() -> None:
     wide = wide_fence(FENCE)
-    assert wide.distance_m(0.0, 0.0) == 250.0
+    assert wide.distance_m(0.0, 0.0) == 100.0
     assert (wide.floor_m, wide.ceiling_m) == (2.0, 30.0)
 
 

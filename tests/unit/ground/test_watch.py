@@ -23,9 +23,8 @@ from lpac.ground.terminal.lines import Line, age, fit, number, some
 from lpac.ground.terminal.robot import detail, in_short
 from lpac.ground.terminal.table import Row, columns, heading, in_order, table_row
 from lpac.ground.terminal.text import all_of_it, few_alarms, header, outcome
-from tests.pretend import ORIGIN
 from tests.said import reason, reasons
-from tests.unit.ground.snapshots import robot, setup, snapshot, status
+from tests.unit.ground.snapshots import ORIGIN, robot, setup, snapshot, status
 
 _S = FlightState
 

@@ -14,7 +14,6 @@ from onnx import numpy_helper
 
 from edge.policy.bundle import (
     BUNDLE_ID,
-    GOLDEN,
     MANIFEST,
     Bundle,
     BundleError,
@@ -22,8 +21,8 @@ from edge.policy.bundle import (
     make_bundle,
     write_bundle,
 )
-from edge.policy.lpac.graphs import Policy
-from edge.policy.verify import verify
+from edge.policy.lpac.manifest import GOLDEN, LpacManifest
+from edge.policy.lpac.policy import LpacPolicy
 
 GRAPHS = ("cnn.onnx", "gnn_1.onnx", "gnn_2.onnx", "action.onnx")
 
@@ -52,7 +51,7 @@ def test_directory_and_archive_hold_the_same_bundle(shipped_bundle: Bundle, arch
 
 
 def test_the_shipped_bundle_computes_what_torch_computed(shipped_bundle: Bundle) -> None:
-    checks = list(verify(shipped_bundle))
+    checks = list(LpacPolicy(shipped_bundle).verify())
     assert [check.name for check in checks] == [*GRAPHS, "swarm"]
     assert all(check.passed for check in checks), checks
 
@@ -106,7 +105,7 @@ def weights(bundle: Bundle) -> list[tuple[str, str, slice]]:
         for weight in onnx.load_from_string(bundle.files[name]).graph.initializer:
             assert weight.data_type == onnx.TensorProto.FLOAT
             if weight.name == "taps":
-                taps = bundle.manifest.geometry.hops + 1
+                taps = LpacManifest.of(bundle.manifest).geometry.hops + 1
                 rows = weight.dims[0] // taps
                 found += [(name, "taps", slice(k * rows, (k + 1) * rows)) for k in range(taps)]
             else:
@@ -123,7 +122,7 @@ def test_a_weight_scaled_by_a_hundredth_with_mended_hashes_is_found_and_named(
         content = scaled(shipped_bundle.files[graph], tensor, part)
         files = with_files(shipped_bundle, **{graph: content})
         mended = make_bundle(shipped_bundle.manifest, files)
-        failed = [check.name for check in verify(mended) if not check.passed]
+        failed = [check.name for check in LpacPolicy(mended).verify() if not check.passed]
         assert graph in failed, (graph, tensor, part)
         assert set(failed) <= {graph, "swarm"}
 
@@ -134,19 +133,19 @@ def test_a_graph_that_does_not_fit_the_manifest_is_named(shipped_bundle: Bundle)
         shipped_bundle.manifest, with_files(shipped_bundle, **{"gnn_2.onnx": gnn_1})
     )
     with pytest.raises(BundleError, match=r"gnn_2\.onnx: its input is .*34.*256"):
-        Policy(swapped)
+        LpacPolicy(swapped)
     broken = make_bundle(
         shipped_bundle.manifest, with_files(shipped_bundle, **{"gnn_2.onnx": gnn_1[:1000]})
     )
     with pytest.raises(BundleError, match=r"gnn_2\.onnx: is not a graph"):
-        Policy(broken)
+        LpacPolicy(broken)
 
 
 @pytest.mark.parametrize("golden", [b"", b"PK\x03\x04 not a zip"])
 def test_unreadable_golden_vectors_are_named(shipped_bundle: Bundle, golden: bytes) -> None:
     bundle = make_bundle(shipped_bundle.manifest, with_files(shipped_bundle, **{GOLDEN: golden}))
     with pytest.raises(BundleError, match=r"golden\.npz"):
-        list(verify(bundle))
+        list(LpacPolicy(bundle).verify())
 
 
 def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
@@ -165,22 +164,31 @@ def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
     [
         ({"schema": 2}, "schema = 2: this version reads 1"),
         ({"schema": "1"}, "schema = '1': expected int"),
-        ({"colour": "red"}, "unknown key 'colour'; known are schema, name"),
+        ({"colour": "red"}, "unknown key 'colour'; known are opset, geometry, images"),
         ({"geometry": {"hops": 0, "feature_sizes": [34, 256]}}, "hops = 0: must be at least 1"),
         ({"geometry": {"hops": 3}}, "geometry: feature_sizes is missing"),
         ({"images": None}, "images and perception: both or neither"),
         ({"training": {"max_speed": -5.0, "time_step": 0.2}}, "max_speed = -5.0: must be positive"),
-        ({"files": {}}, "files = : must be action.onnx, cnn.onnx"),
+        ({"files": {}}, "action.onnx does not belong to the bundle"),
         ({"opset": 20.5}, "opset = 20.5: expected int"),
+        ({"family": "other"}, "is of the family 'other', not 'lpac'"),
     ],
 )
 def test_an_impossible_manifest_is_named(
     shipped_bundle: Bundle, tmp_path: Path, change: dict[str, object], text: str
 ) -> None:
     with pytest.raises(BundleError) as error:
-        load_bundle(resealed(shipped_bundle, tmp_path / "bundle", change))
+        LpacPolicy(load_bundle(resealed(shipped_bundle, tmp_path / "bundle", change)))
     assert text in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_bundle_that_lacks_a_graph_of_its_network_is_refused(shipped_bundle: Bundle) -> None:
+    files = with_files(shipped_bundle)
+    del files["gnn_2.onnx"]
+    bundle = make_bundle(shipped_bundle.manifest, files)
+    with pytest.raises(BundleError, match=r"files = .*: must be action\.onnx, cnn\.onnx, gnn_1\."):
+        LpacPolicy(bundle)
 
 
 def test_missing_and_foreign_files_are_named(shipped_bundle: Bundle, tmp_path: Path) -> None:
@@ -228,8 +236,10 @@ def test_a_bundle_without_perception_says_so(shipped_bundle: Bundle) -> None:
     files = with_files(shipped_bundle)
     del files["cnn.onnx"]
     manifest = dataclasses.replace(
-        shipped_bundle.manifest, images=None, perception=None, files=dict.fromkeys(files, "")
+        shipped_bundle.manifest,
+        perception=None,
+        parameters=shipped_bundle.manifest.parameters | {"images": None},
     )
-    policy = Policy(make_bundle(manifest, files))
+    policy = LpacPolicy(make_bundle(manifest, files))
     with pytest.raises(BundleError, match="has no perception"):
         policy.image_features(np.zeros((1, 4, 32, 32), np.float32))

@@ -11,8 +11,8 @@ from edge.core import F64
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.policy.bundle import Bundle, BundleError
-from edge.policy.lpac.graphs import Policy
-from edge.policy.replay import ReplayError, replay
+from edge.policy.lpac.policy import LpacPolicy
+from edge.policy.lpac.replay import ReplayError, replay
 from edge.robot.pac import Pac, PacParameters, PayloadType
 
 Messages = list[tuple[str, float, dict[str, Any]]]
@@ -32,7 +32,7 @@ class Surroundings:
         return Odometry((self._x_m, 15.0, 3.0), (0.5, 0.0, 0.0))
 
 
-def fly(policy: Policy, payload: PayloadType = "float16", ticks: int = 6) -> Messages:
+def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) -> Messages:
     """The first of three robots' ticks, as its loops record them."""
     parameters = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=1.0, payload=payload)
     robots = []
@@ -55,15 +55,21 @@ def fly(policy: Policy, payload: PayloadType = "float16", ticks: int = 6) -> Mes
             for robot, receiver in enumerate(robots):
                 if robot != sender:
                     assert receiver.receive(sent.message, now_s, now_s) is None
-        for topic, value in (("perception", seen_ticks[0]), ("policy", done[0])):
-            assert value is not None
-            messages.append((topic, 1.7e9 + now_s, dataclasses.asdict(value)))
+        perceived, step = seen_ticks[0], done[0]
+        assert perceived is not None and step is not None
+        for topic, message in (
+            ("perception", {**perceived.inputs, "features": perceived.features}),
+            ("policy", dataclasses.asdict(step)),
+        ):
+            messages.append((topic, 1.7e9 + now_s, message))
         messages.append(("status", 1.7e9 + now_s, {"state": "mission"}))
     return messages
 
 
 @pytest.mark.parametrize("payload", ["float16", "float32"])
-def test_the_same_machine_computes_the_same(shipped_policy: Policy, payload: PayloadType) -> None:
+def test_the_same_machine_computes_the_same(
+    shipped_policy: LpacPolicy, payload: PayloadType
+) -> None:
     flown = fly(shipped_policy, payload)
     assert [len(m["payloads"]) for topic, _, m in flown if topic == "policy"] == [0, 2, 2, 2, 2, 2]
     for comparison in replay(shipped_policy, flown):
@@ -71,7 +77,7 @@ def test_the_same_machine_computes_the_same(shipped_policy: Policy, payload: Pay
         assert comparison.largest_difference == 0.0
 
 
-def test_ticks_stand_for_themselves(shipped_policy: Policy) -> None:
+def test_ticks_stand_for_themselves(shipped_policy: LpacPolicy) -> None:
     """A log has gaps where the recorder dropped something."""
     flown = fly(shipped_policy)
     for comparison in replay(shipped_policy, flown[:0:-2]):
@@ -88,7 +94,7 @@ def test_ticks_stand_for_themselves(shipped_policy: Policy) -> None:
     ],
 )
 def test_what_was_altered_shows(
-    shipped_policy: Policy, topic: str, field: str, output: str
+    shipped_policy: LpacPolicy, topic: str, field: str, output: str
 ) -> None:
     flown = fly(shipped_policy)
     altered = [m for name, _, m in flown if name == topic][2][field]
@@ -101,7 +107,7 @@ def test_what_was_altered_shows(
         assert by_name[output].largest_difference > 0.0
 
 
-def test_an_altered_payload_shows_in_what_was_sent(shipped_policy: Policy) -> None:
+def test_an_altered_payload_shows_in_what_was_sent(shipped_policy: LpacPolicy) -> None:
     flown = fly(shipped_policy)
     policy_ticks = [m for topic, _, m in flown if topic == "policy"]
     first, *others = policy_ticks[3]["payloads"]
@@ -111,7 +117,7 @@ def test_an_altered_payload_shows_in_what_was_sent(shipped_policy: Policy) -> No
     assert message.largest_difference > 0.1
 
 
-def test_a_logged_nan_is_a_difference(shipped_policy: Policy) -> None:
+def test_a_logged_nan_is_a_difference(shipped_policy: LpacPolicy) -> None:
     flown = fly(shipped_policy)
     flown[1][2]["velocity"][0] = np.nan
     _, velocity, _ = replay(shipped_policy, flown)
@@ -131,7 +137,7 @@ def test_a_logged_nan_is_a_difference(shipped_policy: Policy) -> None:
     ],
 )
 def test_what_is_no_tick_of_this_policy_is_named(
-    shipped_policy: Policy, topic: str, alter: Callable[[dict[str, Any]], object], text: str
+    shipped_policy: LpacPolicy, topic: str, alter: Callable[[dict[str, Any]], object], text: str
 ) -> None:
     flown = fly(shipped_policy, ticks=2)
     flown = [(name, 1.7e9, m) for name, _, m in flown if name == topic][-1:]
@@ -141,11 +147,9 @@ def test_what_is_no_tick_of_this_policy_is_named(
 
 
 def test_a_bundle_without_perception_flew_nothing(shipped_bundle: Bundle) -> None:
-    blind = Policy(shipped_bundle)
+    blind = LpacPolicy(shipped_bundle)
     flown = fly(blind, ticks=1)
-    blind.manifest = dataclasses.replace(
-        blind.manifest, images=None, perception=None,
-        files={n: h for n, h in blind.manifest.files.items() if n != "cnn.onnx"},
-    )  # fmt: skip
+    blind.manifest = dataclasses.replace(blind.manifest, perception=None)
+    blind.lpac = dataclasses.replace(blind.lpac, images=None)
     with pytest.raises(BundleError, match="has no perception"):
         replay(blind, flown)

@@ -12,9 +12,10 @@ from edge.core.aggregation import Geometry
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.policy.bundle import Bundle
-from edge.policy.lpac.graphs import Policy
-from edge.policy.verify import swarm_velocities
-from edge.robot.pac import Pac, PacParameters, position_feature
+from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.policy import LpacPolicy, position_feature
+from edge.policy.lpac.verify import swarm_velocities
+from edge.robot.pac import Pac, PacParameters
 from tests.conftest import ROOT, SHIPPED
 
 torch = pytest.importorskip("torch", reason="torch is the oracle here")
@@ -100,8 +101,8 @@ def test_after_k_l_rounds_the_swarm_is_the_centralised_network(
     layers: int, hops: int, latent: int, tmp_path: Path
 ) -> None:
     state = random_state(layers=layers, hops=hops, latent=latent, image_size=IMAGE_SIZE)
-    policy = Policy(exported(state, tmp_path))
-    geometry = policy.manifest.geometry
+    policy = LpacPolicy(exported(state, tmp_path))
+    geometry = policy.geometry
     assert (geometry.layers, geometry.hops) == (layers, hops)
     for robots in ROBOTS:
         neighbours = geometric_graph(robots)
@@ -127,7 +128,7 @@ def test_after_k_l_rounds_the_swarm_is_the_reference_librarys_network(
 ) -> None:
     state = random_state(layers=layers, hops=hops, latent=latent, image_size=IMAGE_SIZE)
     model = reference_lpac(state, IMAGE_SIZE)
-    policy = Policy(exported(state, tmp_path))
+    policy = LpacPolicy(exported(state, tmp_path))
     for robots in ROBOTS:
         neighbours = geometric_graph(robots)
         random = np.random.default_rng(robots)
@@ -157,8 +158,8 @@ def test_the_authors_network_decentralised_is_their_network(tmp_path: Path) -> N
     def tensor(name: str) -> object:
         return torch.load(AUTHORS_TAPS / f"{name}.pt", "cpu", weights_only=True)
 
-    policy = Policy(export_bundle(AUTHORS_TAPS, PARAMETERS))
-    geometry = policy.manifest.geometry
+    policy = LpacPolicy(export_bundle(AUTHORS_TAPS, PARAMETERS))
+    geometry = policy.geometry
     names = {
         "gnn_mlp.lins.0.weight": "mlp_lin_0", "gnn_mlp.lins.0.bias": "mlp_bias_0",
         "gnn_mlp.lins.1.weight": "mlp_lin_1", "gnn_mlp.lins.1.bias": "mlp_bias_1",
@@ -186,7 +187,7 @@ def test_news_travels_one_hop_an_exchange_and_no_further_than_k_l(
     layers: int, hops: int, tmp_path: Path
 ) -> None:
     """On a tree, changing a feature of robot 0 is seen after n exchanges by all within n hops."""
-    policy = Policy(exported(random_state(layers=layers, hops=hops, latent=64), tmp_path))
+    policy = LpacPolicy(exported(random_state(layers=layers, hops=hops, latent=64), tmp_path))
     parents = np.array([0, 0, 0, 1, 1, 2, 3, 5, 6, 7, 8, 9, 10, 11, 12])
     robots = len(parents)
     neighbours = np.zeros((robots, robots), np.bool_)
@@ -195,7 +196,7 @@ def test_news_travels_one_hop_an_exchange_and_no_further_than_k_l(
         neighbours[robot, parents[robot]] = neighbours[parents[robot], robot] = True
         distance[robot] = distance[parents[robot]] + 1
     assert distance.max() > hops * layers
-    size = policy.manifest.geometry.feature_sizes[0]
+    size = policy.geometry.feature_sizes[0]
     features = np.random.default_rng(5).uniform(-1, 1, (robots, size)).astype(np.float32)
     changed = features.copy()
     changed[0, 3] += 1.0
@@ -224,7 +225,7 @@ class Still:
         return self._seen
 
 
-def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: Policy) -> None:
+def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: LpacPolicy) -> None:
     """Images, mailboxes and encoded messages of ten robots, against LPAC on the whole swarm."""
     random = np.random.default_rng(3)
     places_m = random.uniform(0, 32, (10, 2))
@@ -237,7 +238,7 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: P
         )
         for i in range(10)
     ]  # fmt: skip
-    geometry = shipped_policy.manifest.geometry
+    geometry = shipped_policy.geometry
     # One exchange more than K L: the first messages only tell the robots who their neighbours are.
     for tick in range(geometry.hops * geometry.layers + 2):
         now_s = 0.4 * tick
@@ -252,10 +253,16 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: P
 
     neighbours = np.hypot(*(places_m[:, None] - places_m[None]).T) < 16.0
     np.fill_diagonal(neighbours, False)
+    perception = shipped_policy.manifest.perception
+    assert perception
     images = np.concatenate(
-        [robot._perception.images(places_m[i] * 16.0, places_m[neighbours[i]] * 16.0)
-         for i, robot in enumerate(robots)]
-    )  # fmt: skip
+        [
+            PolicyImages(perception, 4, 32).images(
+                place, robot._memory.local_map(place), places_m[near] * 16.0
+            )
+            for robot, place, near in zip(robots, places_m * 16.0, neighbours, strict=True)
+        ]
+    )
     positions = np.array([position_feature(place * 16.0, 512) for place in places_m])
     state = torch.load(SHIPPED.with_suffix(".pt"), weights_only=True)
     truth = lpac_velocities(reference_lpac(state, 32), images, positions, neighbours)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from edge.policy.bundle import Bundle
+from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.benchmark import StepTimes, benchmark
 
 
@@ -12,8 +12,8 @@ def test_a_step_may_take_half_of_its_period() -> None:
 
 
 @pytest.mark.parametrize("neighbours", [0, 10])
-def test_every_step_is_called_equally_often(shipped_bundle: Bundle, neighbours: int) -> None:
-    result = benchmark(shipped_bundle, neighbours, 0.01)
+def test_every_step_is_called_equally_often(shipped_policy: LpacPolicy, neighbours: int) -> None:
+    result = benchmark(shipped_policy, neighbours, 0.01)
     assert [step.step for step in result.steps] == ["perceive", "infer"]
     assert len({step.calls for step in result.steps}) == 1
     assert result.steps[0].calls >= 20

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
@@ -12,8 +14,8 @@ from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import Rejection, decode, encode
 from edge.policy.bundle import Bundle, BundleError
-from edge.policy.lpac.graphs import Policy
-from edge.robot.pac import Pac, PacParameters, position_feature
+from edge.policy.lpac.policy import LpacPolicy
+from edge.robot.pac import Pac, PacParameters
 
 PARAMETERS = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=1.25)
 
@@ -34,7 +36,7 @@ class World:
 
 
 def make_robot(
-    policy: Policy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
+    policy: LpacPolicy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
 ) -> Pac:
     return Pac(
         robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, odometry=world,
@@ -42,11 +44,11 @@ def make_robot(
     )  # fmt: skip
 
 
-def fill(policy: Policy, value: float) -> F32:
-    return np.full(policy.manifest.geometry.message_size, value, np.float32)
+def fill(policy: LpacPolicy, value: float) -> F32:
+    return np.full(policy.geometry.message_size, value, np.float32)
 
 
-def message(policy: Policy, robot_id: int = 2, value: float = 0.1, **changes: object) -> bytes:
+def message(policy: LpacPolicy, robot_id: int = 2, value: float = 0.1, **changes: object) -> bytes:
     fields = {
         "robot_id": robot_id, "boot_epoch": 1, "sequence": 1, "sent_at_s": 0.0,
         "position_m": (18.0, 16.0, 3.0), "velocity_m_s": (0.0, 0.0, 0.0), "frame_id": 0,
@@ -55,7 +57,9 @@ def message(policy: Policy, robot_id: int = 2, value: float = 0.1, **changes: ob
     return encode(AggregatedMessage(**fields), policy.bundle_id, "float32")  # type: ignore[arg-type]
 
 
-def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(shipped_policy: Policy) -> None:
+def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(
+    shipped_policy: LpacPolicy,
+) -> None:
     slow = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=0.01)
     world = World()
     fast_robot = make_robot(shipped_policy, world)
@@ -70,7 +74,7 @@ def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(shipped_polic
     np.testing.assert_allclose(slowed / 0.01, fast / np.hypot(*fast))
 
 
-def test_nothing_moves_before_the_first_inference(shipped_policy: Policy) -> None:
+def test_nothing_moves_before_the_first_inference(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     assert robot.infer(0.0, 0.0) is None
     robot.perceive(0.0)
@@ -78,7 +82,9 @@ def test_nothing_moves_before_the_first_inference(shipped_policy: Policy) -> Non
 
 
 @pytest.mark.parametrize("missing", ["position", "seen"])
-def test_without_position_or_sensor_the_robot_stops(shipped_policy: Policy, missing: str) -> None:
+def test_without_position_or_sensor_the_robot_stops(
+    shipped_policy: LpacPolicy, missing: str
+) -> None:
     world = World()
     robot = make_robot(shipped_policy, world)
     robot.perceive(0.0)
@@ -93,7 +99,7 @@ def test_without_position_or_sensor_the_robot_stops(shipped_policy: Policy, miss
     assert robot.control(2.0) is None
 
 
-def test_a_position_that_is_not_a_number_is_none(shipped_policy: Policy) -> None:
+def test_a_position_that_is_not_a_number_is_none(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World(position=(16.0, float("nan"), 3.0)))
     robot.perceive(0.0)
     assert robot.infer(0.0, 0.0) is None
@@ -104,7 +110,7 @@ def test_a_position_that_is_not_a_number_is_none(shipped_policy: Policy) -> None
     [np.full((64, 64), np.nan, np.float32), np.zeros((32, 32), np.float32)],
     ids=["not finite", "wrong size"],
 )
-def test_a_bad_view_does_not_enter_the_map(shipped_policy: Policy, view: F32) -> None:
+def test_a_bad_view_does_not_enter_the_map(shipped_policy: LpacPolicy, view: F32) -> None:
     world = World(seen=view)
     robot = make_robot(shipped_policy, world)
     robot.perceive(0.0)
@@ -114,7 +120,9 @@ def test_a_bad_view_does_not_enter_the_map(shipped_policy: Policy, view: F32) ->
     assert robot.infer(0.2, 0.2) is not None
 
 
-def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(shipped_policy: Policy) -> None:
+def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
+    shipped_policy: LpacPolicy,
+) -> None:
     """The degree is that of the neighbour table, not the number of messages in this tick."""
     once = PacParameters(
         scale=ModelScale(16.0, 0.25), max_speed_m_s=1.25, max_message_age_s=0.0, payload="float32"
@@ -156,12 +164,14 @@ def test_impossible_settings_are_named(change: dict[str, object], text: str) -> 
 
 
 @pytest.mark.parametrize("robot_id", [-1, 2**16])
-def test_an_id_that_no_message_can_hold_is_refused(shipped_policy: Policy, robot_id: int) -> None:
+def test_an_id_that_no_message_can_hold_is_refused(
+    shipped_policy: LpacPolicy, robot_id: int
+) -> None:
     with pytest.raises(ValueError, match=f"robot_id = {robot_id}: must be from 0 to 65535"):
         make_robot(shipped_policy, World(), robot_id)
 
 
-def test_an_action_without_a_successor_grows_old(shipped_policy: Policy) -> None:
+def test_an_action_without_a_successor_grows_old(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.perceive(0.0)
     robot.infer(0.0, 0.0)
@@ -170,7 +180,7 @@ def test_an_action_without_a_successor_grows_old(shipped_policy: Policy) -> None
 
 
 def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
-    shipped_policy: Policy,
+    shipped_policy: LpacPolicy,
 ) -> None:
     velocities = []
     for heard in ([], [message(shipped_policy)], [message(shipped_policy, position_m=(40, 16, 3))]):
@@ -195,7 +205,7 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
     np.testing.assert_array_equal(velocity, alone)
 
 
-def test_what_a_robot_must_not_hear_is_counted(shipped_policy: Policy) -> None:
+def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     good = message(shipped_policy)
     other = encode(
@@ -220,7 +230,7 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: Policy) -> None:
     assert robot.mailbox.counts()["accepted"] == 1
 
 
-def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: Policy) -> None:
+def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.receive(message(shipped_policy, value=3e38), 0.0, 0.0)
     robot.receive(message(shipped_policy, robot_id=3, value=3e38), 0.0, 0.0)
@@ -236,22 +246,39 @@ def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: 
     [((0.0, 512.0), (0.5, 1.5)), ((256.0, 128.0), (1.0, 0.75)), ((-90.0, 600.0), (0.5, 1.5))],
 )
 def test_position_features_are_those_of_training(
-    position: tuple[float, float], feature: tuple[float, float]
+    shipped_policy: LpacPolicy, position: tuple[float, float], feature: tuple[float, float]
 ) -> None:
-    assert tuple(position_feature(np.array(position), 512)) == feature
+    """Outside the world, those of its nearest point."""
+    robot = make_robot(shipped_policy, World((position[0] / 16.0, position[1] / 16.0, 3.0)))
+    perceived = robot.perceive(0.0)
+    assert perceived and tuple(perceived.inputs["position_feature"]) == feature
+    assert tuple(perceived.features[-2:]) == feature
+
+
+@given(st.tuples(*[st.floats(-100.0, 100.0)] * 2))
+@settings(deadline=None, max_examples=30)
+def test_outside_the_world_the_view_is_that_from_its_border(
+    shipped_policy: LpacPolicy, position_m: tuple[float, float]
+) -> None:
+    """With nothing seen, so that only the place shows."""
+    inside_m = np.clip(position_m, 0.0, 32.0).tolist()
+    outside, border = (
+        make_robot(shipped_policy, World((x, y, 3.0), np.zeros((64, 64), np.float32))).perceive(0.0)
+        for x, y in (position_m, inside_m)
+    )
+    assert outside and border
+    np.testing.assert_array_equal(outside.inputs["images"], border.inputs["images"])
+    np.testing.assert_array_equal(outside.features, border.features)
 
 
 def test_a_bundle_without_perception_drives_no_robot(shipped_bundle: Bundle) -> None:
-    blind = Policy(shipped_bundle)
-    blind.manifest = dataclasses.replace(
-        blind.manifest, images=None, perception=None,
-        files={n: h for n, h in blind.manifest.files.items() if n != "cnn.onnx"},
-    )  # fmt: skip
+    blind = LpacPolicy(shipped_bundle)
+    blind.manifest = dataclasses.replace(blind.manifest, perception=None)
     with pytest.raises(BundleError, match="has no perception"):
         make_robot(blind, World())
 
 
-def test_a_new_mission_forgets_map_and_messages(shipped_policy: Policy) -> None:
+def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> None:
     flown, fresh = (make_robot(shipped_policy, World()) for _ in range(2))
     flown.receive(message(shipped_policy), 0.0, 0.0)
     flown.perceive(0.0)
@@ -264,10 +291,10 @@ def test_a_new_mission_forgets_map_and_messages(shipped_policy: Policy) -> None:
         robot.sensor = dark
     ticks = [robot.perceive(0.2) for robot in (flown, fresh)]
     assert ticks[0] and ticks[1]
-    np.testing.assert_array_equal(ticks[0].images, ticks[1].images)
+    np.testing.assert_array_equal(ticks[0].inputs["images"], ticks[1].inputs["images"])
 
 
-def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: Policy) -> None:
+def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.frame_id = 8
     assert robot.receive(message(shipped_policy), 0.0, 0.0) is Rejection.OTHER_FRAME

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from edge.core.aggregation import AggregatedMessage, HopBuffer
 from edge.core.wire import Rejection, decode, encode
 from edge.policy.bundle import BundleError
-from edge.policy.lpac.graphs import Policy
+from edge.policy.lpac.policy import LpacPolicy
 
 _Array = npt.NDArray[Any]
 
@@ -47,20 +47,20 @@ class Comparison:
 
 
 def replay(
-    policy: Policy, messages: Iterable[tuple[str, float, Mapping[str, Any]]]
+    policy: LpacPolicy, messages: Iterable[tuple[str, float, Mapping[str, Any]]]
 ) -> tuple[Comparison, Comparison, Comparison]:
     """Run every tick again from its logged inputs; compares features, velocity and message.
 
-    `messages` are (topic, Unix time in s, message), of which `perception` (the fields of a
-    `PerceptionTick`) and `policy` (of a `PolicyTick`) count. Every tick stands for itself, so that
-    gaps do no harm. Of the message it is the payload that is compared, as it was sent: in float16
-    if that was its type.
+    `messages` are (topic, Unix time in s, message), of which `perception` (features and inputs of a
+    `Perceived`) and `policy` (the fields of a `PolicyTick`) count. Every tick stands for itself, so
+    that gaps do no harm. Of the message it is the payload that is compared, as it was sent: in
+    float16 if that was its type.
 
     Raises ReplayError that names the tick if one is not of this policy, and BundleError if no robot
     can fly it.
     """
     features, velocity, payload = (Comparison(n) for n in ("features", "velocity", "message"))
-    hops = HopBuffer(policy.manifest.geometry)
+    hops = HopBuffer(policy.geometry)
     for topic, unix_time_s, message in messages:
         try:
             if topic == "perception":
@@ -73,28 +73,28 @@ def replay(
             raise
         except KeyError as error:
             raise ReplayError(f"{topic} at {unix_time_s:.3f} s: {error} is missing") from None
-        except ValueError as error:
+        except (AttributeError, OverflowError, TypeError, ValueError) as error:
             raise ReplayError(f"{topic} at {unix_time_s:.3f} s: {error}") from None
     return features, velocity, payload
 
 
-def _perceive(policy: Policy, message: Mapping[str, Any]) -> tuple[_Array, _Array]:
+def _perceive(policy: LpacPolicy, message: Mapping[str, Any]) -> tuple[_Array, _Array]:
     """The features that were logged, and those of now."""
-    inputs = policy.manifest.images
+    inputs = policy.lpac.images
     if inputs is None:
         raise BundleError(f"bundle {policy.manifest.name!r} has no perception: no robot flew it")
     shape = (1, len(inputs.channels), inputs.size, inputs.size)
     images = _checked("images", message["images"], shape)
     position_feature = _checked("position_feature", message["position_feature"], (2,))
-    logged = _checked("features", message["features"], policy.manifest.geometry.feature_sizes[:1])
+    logged = _checked("features", message["features"], policy.geometry.feature_sizes[:1])
     return logged, np.concatenate([policy.image_features(images), position_feature])
 
 
 def _infer(
-    policy: Policy, hops: HopBuffer, message: Mapping[str, Any]
+    policy: LpacPolicy, hops: HopBuffer, message: Mapping[str, Any]
 ) -> tuple[tuple[_Array, _Array], tuple[_Array, _Array]]:
     """The velocity that was logged, and that of now; the payload that was sent, and that of now."""
-    geometry = policy.manifest.geometry
+    geometry = policy.geometry
     features = _checked("features", message["features"], geometry.feature_sizes[:1])
     logged = _checked("velocity", message["velocity"], (2,))
     payloads = [_checked("payloads", p, (geometry.message_size,)) for p in message["payloads"]]
@@ -116,13 +116,13 @@ def _checked(name: str, value: object, shape: tuple[int, ...]) -> _Array:
     return value
 
 
-def _decoded(policy: Policy, data: bytes) -> AggregatedMessage:
+def _decoded(policy: LpacPolicy, data: bytes) -> AggregatedMessage:
     message = decode(
         data,
         bundle_id=policy.bundle_id,
         frame_id=None,
         own_robot_id=_NOBODY,
-        message_size=policy.manifest.geometry.message_size,
+        message_size=policy.geometry.message_size,
     )
     if isinstance(message, Rejection):
         raise ValueError(f"message: would be refused: {message}")

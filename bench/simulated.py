@@ -1,0 +1,77 @@
+"""Whole robots on one simulated clock: how much faster than real time they fly, on one core."""
+
+import gc
+import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from time import perf_counter, process_time
+
+from bench import BUNDLE
+from bench.report import Report, Table, Target, progress
+from edge.core import log
+from lpac.sim.fleet.clocked import fly_simulated
+from lpac.sim.fleet.layout import FleetScenario
+
+
+def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Report:
+    """Flights in processes of their own, one at a time: from the pads to the pads."""
+    with ProcessPoolExecutor(
+        max_workers=1, max_tasks_per_child=1, mp_context=get_context("spawn")
+    ) as processes:
+        flights = []
+        for run in range(runs):
+            progress(f"simulated: {robots} robots, flight {run + 1} of {runs}")
+            flights.append(processes.submit(_fly, robots, mission_s).result())
+    flights.sort(key=lambda flight: flight["real_time_factor"])
+    median = flights[runs // 2]
+    return Report(
+        "simulated",
+        {str(robots): flights},
+        [
+            Table(
+                "Whole robots, vehicles, radio and ground on one simulated clock, one core",
+                ("robots", "simulated, s", "x real time", "x by CPU", "CPU ms per robot and s"),
+                [
+                    (
+                        f"{robots}",
+                        f"{median['simulated_s']:.0f}",
+                        f"{median['real_time_factor']:.2f}",
+                        f"{median['simulated_s'] / median['cpu_s']:.2f}",
+                        f"{1e3 * median['cpu_s'] / robots / median['simulated_s']:.1f}",
+                    )
+                ],
+            )
+        ],
+        [
+            Target(
+                f"{robots} whole robots: times real time",
+                median["real_time_factor"],
+                5.0,
+                at_least=True,
+            )
+        ],
+        [
+            f"`lpac sim --vehicle simulated` from takeoff to landing with {mission_s:g} s of "
+            "mission, without loading the program. Of several flights, all equal, the median."
+        ],
+    )
+
+
+def _fly(robots: int, mission_s: float) -> dict[str, float]:
+    log.listen(log.show_errors)
+    gc.freeze()  # what is loaded stays
+    with tempfile.TemporaryDirectory() as folder:
+        wall_s, cpu_s = perf_counter(), process_time()
+        scenario = FleetScenario(robots=robots, seed=3, duration_s=mission_s)
+        flight = fly_simulated(scenario, Path(folder), BUNDLE)
+        wall_s, cpu_s = perf_counter() - wall_s, process_time() - cpu_s
+    if flight.problem is not None:
+        raise RuntimeError(f"the flight did not go as planned: {flight.problem}")
+    simulated_s = flight.began_s["end"]
+    return {
+        "simulated_s": simulated_s,
+        "wall_s": wall_s,
+        "cpu_s": cpu_s,
+        "real_time_factor": simulated_s / wall_s,
+    }

@@ -1,0 +1,103 @@
+"""The images that the policy takes, of what a robot has seen.
+
+LPAC paper (arXiv 2401.04855), section "Perception Module": four square images around the robot:
+importance, the neighbours' relative x and y, and obstacles (the outside of the world). All are
+indexed [x, y]; one cell of a map is one model unit; positions are in model units.
+"""
+
+import numpy as np
+
+from edge.core import F32, F64
+from edge.core.perception import (
+    PerceptionParameters,
+    clamp_to_world,
+    part_in_world,
+    window_corner,
+)
+
+# The images by number of channels, in the order in which CoverageControl stacks them.
+MAP_CHANNELS = {
+    2: ("importance", "obstacles"),
+    4: ("importance", "neighbours_x", "neighbours_y", "obstacles"),
+}
+
+
+class Resize:
+    """Bilinear, antialiased resize from `size` to `new_size` cells: A @ x @ A.T for an image x.
+
+    Each row of A (new_size, size) is a triangle as wide as two new cells, cut at the border and
+    summing to one; as torch and torchvision resize.
+    """
+
+    # Rows of A that are multiplied together, without the columns that are zero in all of them.
+    _BAND = 8
+
+    def __init__(self, size: int, new_size: int) -> None:
+        scale = size / new_size
+        centres = (np.arange(new_size) + 0.5) * scale
+        distances = np.abs(np.arange(size) + 0.5 - centres[:, None]) / max(scale, 1.0)
+        weights = np.clip(1.0 - distances, 0.0, None)
+        weights /= weights.sum(axis=1, keepdims=True)
+        self._cumulated = np.concatenate([np.zeros((1, new_size)), weights.T.cumsum(axis=0)])
+        matrix = weights.astype(np.float32)
+        self._transposed = np.ascontiguousarray(matrix.T)
+        self._bands = []
+        for start in range(0, new_size, self._BAND):
+            rows = slice(start, start + self._BAND)
+            used = np.flatnonzero(matrix[rows].any(axis=0))
+            columns = slice(used[0], used[-1] + 1)
+            self._bands.append((rows, columns, matrix[rows, columns].copy()))
+        self._half = np.empty((new_size, size), np.float32)
+
+    def image(self, image: F32, out: F32) -> None:
+        """Resize `image` (size, size) into `out` (new_size, new_size)."""
+        for rows, columns, band in self._bands:
+            np.matmul(band, image[columns], out=self._half[rows])
+        np.matmul(self._half, self._transposed, out=out)
+
+    def interval(self, part: slice) -> F64:
+        """Resize the line (size,) that is 1 in `part` and 0 elsewhere to (new_size,)."""
+        resized: F64 = self._cumulated[part.stop] - self._cumulated[part.start]
+        return resized
+
+
+def neighbour_maps(offsets: F64, communication_range: float, image_size: int) -> F32:
+    """The neighbours' relative x and relative y as two images, (2, image_size, image_size).
+
+    `offsets` (n, 2) are the neighbours' positions relative to the robot, in model units. An image
+    spans twice the range; values are in units of the range and add up within a cell.
+    """
+    scaled = offsets * (image_size / (2.0 * communication_range)) + (image_size / 2.0 - 0.5)
+    cells = np.clip(np.rint(scaled), 0, image_size - 1).astype(np.intp)
+    maps = np.zeros((2, image_size, image_size), np.float32)
+    for axis in range(2):
+        np.add.at(maps[axis], (cells[:, 0], cells[:, 1]), offsets[:, axis] / communication_range)
+    return maps
+
+
+class PolicyImages:
+    """Makes one robot's images. Not thread-safe: it belongs to the perception thread."""
+
+    def __init__(self, parameters: PerceptionParameters, channels: int, image_size: int) -> None:
+        self._parameters = parameters
+        self._resize = Resize(parameters.local_map_size, image_size)
+        self._images = np.empty((1, channels, image_size, image_size), np.float32)
+
+    def images(self, position: F64, local_map: F32, neighbours: F64) -> F32:
+        """The policy's images, (1, channels, image_size, image_size), valid until the next call.
+
+        `position` (2,) is in the world, `local_map` (local_map_size, local_map_size) around it, and
+        `neighbours` (n, 2) are the positions of the robots in range. Those outside the world are
+        taken to the nearest point of it, where training kept the robots.
+        """
+        parameters = self._parameters
+        self._resize.image(local_map, out=self._images[0, 0])
+        corner = window_corner(position, parameters.local_map_size)
+        _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)
+        self._images[0, -1] = 1.0 - np.outer(*map(self._resize.interval, inside))
+        if self._images.shape[1] == len(MAP_CHANNELS[4]):
+            others = clamp_to_world(neighbours, parameters.world_size)
+            self._images[0, 1:3] = neighbour_maps(
+                others - position, parameters.communication_range, self._images.shape[-1]
+            )
+        return self._images

@@ -1,0 +1,83 @@
+"""What the manifest of a bundle says that only this family understands."""
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+from edge.core.aggregation import Geometry
+from edge.core.schema import ConfigError, from_mapping
+from edge.policy.bundle import LPAC, BundleError, Manifest
+from edge.policy.lpac.images import MAP_CHANNELS
+
+GOLDEN = "golden.npz"
+CNN = "cnn.onnx"
+ACTION = "action.onnx"
+
+
+def gnn_graph(layer: int) -> str:
+    """File name of GNN layer `layer` = 1..L."""
+    return f"gnn_{layer}.onnx"
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """What the CNN takes and gives."""
+
+    channels: tuple[str, ...]
+    size: int
+    features: int
+    activation: Literal["leaky_relu_0.01"] = "leaky_relu_0.01"
+    padding: Literal["none"] = "none"
+
+    def __post_init__(self) -> None:
+        if self.channels not in MAP_CHANNELS.values():
+            allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
+            raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
+        if self.size < 1 or self.features < 1:
+            raise ValueError(f"size = {self.size}, features = {self.features}: must be positive")
+
+
+@dataclass(frozen=True, slots=True)
+class LpacManifest:
+    """The network. `images` is None in a bundle without perception."""
+
+    opset: int
+    geometry: Geometry
+    images: Images | None
+
+    def __post_init__(self) -> None:
+        if self.images and self.geometry.feature_sizes[0] != self.images.features + 2:
+            raise ValueError(
+                f"geometry.feature_sizes[0] = {self.geometry.feature_sizes[0]}: must be "
+                f"images.features + 2 = {self.images.features + 2}"
+            )
+
+    @classmethod
+    def of(cls, manifest: Manifest) -> "LpacManifest":
+        """The part of the manifest that is the family's. Raises BundleError if it is not right."""
+        where = f"bundle {manifest.name!r}"
+        if manifest.family != LPAC:
+            raise BundleError(f"{where}: is of the family {manifest.family!r}, not {LPAC!r}")
+        try:
+            lpac = from_mapping(cls, manifest.parameters, where)
+        except ConfigError as error:
+            raise BundleError(str(error)) from None
+        if (lpac.images is None) != (manifest.perception is None):
+            raise BundleError(f"{where}: images and perception: both or neither")
+        expected = {*lpac.graphs, GOLDEN}
+        if set(manifest.files) != expected:
+            raise BundleError(
+                f"{where}: files = {', '.join(sorted(manifest.files))}: must be "
+                f"{', '.join(sorted(expected))}"
+            )
+        return lpac
+
+    @property
+    def parameters(self) -> dict[str, object]:
+        """`Manifest.parameters` of it."""
+        return asdict(self)
+
+    @property
+    def graphs(self) -> tuple[str, ...]:
+        """The graphs' file names, in the order of computation."""
+        layers = (gnn_graph(layer) for layer in range(1, self.geometry.layers + 1))
+        return (*((CNN,) if self.images else ()), *layers, ACTION)

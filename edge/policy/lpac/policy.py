@@ -1,0 +1,71 @@
+"""A bundle of this family as a policy that robots fly."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from edge.core import F32, F64
+from edge.core.aggregation import HopBuffer
+from edge.policy.bundle import Bundle, BundleError
+from edge.policy.family import GoldenCheck, Observation, Perceived, PolicyStep
+from edge.policy.lpac.graphs import Graphs
+from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.manifest import GOLDEN
+from edge.policy.lpac.verify import verify
+
+
+class LpacPolicy(Graphs):
+    """See `edge.policy.family.Policy`."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        super().__init__(bundle)
+        self._golden = bundle.files[GOLDEN]
+
+    @property
+    def message_size(self) -> int:
+        """Number of floats in an aggregated message."""
+        return self.geometry.message_size
+
+    def agent(self) -> "LpacAgent":
+        """Raises BundleError if the bundle has no perception."""
+        return LpacAgent(self)
+
+    def verify(self) -> Iterator[GoldenCheck]:
+        """Graph by graph, then a whole swarm. Raises BundleError."""
+        return verify(self, self._golden)
+
+
+class LpacAgent:
+    """See `edge.policy.family.Agent`; paper, section "Decentralized Graph Neural Networks"."""
+
+    def __init__(self, policy: LpacPolicy) -> None:
+        manifest, images = policy.manifest, policy.lpac.images
+        if images is None or manifest.perception is None:
+            raise BundleError(
+                f"bundle {manifest.name!r} has no perception: it cannot drive a robot"
+            )
+        self._policy = policy
+        self._world_size = manifest.perception.world_size
+        self._images = PolicyImages(manifest.perception, len(images.channels), images.size)
+        self._hops = HopBuffer(policy.geometry)
+
+    def observe(self, observation: Observation) -> Perceived:
+        """x_i: the CNN's 32 features of the images, and the 2 of the position."""
+        images = self._images.images(*observation)
+        position = position_feature(observation.position, self._world_size)
+        features = np.concatenate([self._policy.image_features(images), position])
+        return Perceived(features, {"images": images.copy(), "position_feature": position})
+
+    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+        """The action of x_i and the neighbours' Y_j, and the robot's own Y_i."""
+        self._hops.diffuse(payloads, degree)
+        velocity = self._policy.velocity(features, self._hops)
+        return PolicyStep(velocity, self._hops.message(degree))
+
+    def reset(self) -> None:
+        """Each step writes all that it reads."""
+
+
+def position_feature(position: F64, world_size: int) -> F32:
+    """(p + W/2) / W, in [0.5, 1.5] for p in the world, as policies were trained."""
+    return ((position + world_size / 2.0) / world_size).astype(np.float32)

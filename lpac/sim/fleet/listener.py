@@ -1,0 +1,101 @@
+"""What the robots of a fleet say of themselves on the radio, for whoever only listens."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.codec import MessageError, decode
+from edge.messages.mission import RobotStatus
+from edge.messages.topics import STATUS
+from lpac.analysis.snapshot import FRESH_S
+
+_LOOK_AGAIN_S = 0.2
+
+Statuses = Mapping[int, RobotStatus]
+Say = Callable[[str], None]
+
+
+class Heard(NamedTuple):
+    """A status, and the `time.monotonic()` when it came."""
+
+    at_s: float
+    status: RobotStatus
+
+
+class FleetListener:
+    """Keeps every status of every robot, whoever commands them; a context. It says nothing.
+
+    Every method may be called from any thread.
+    """
+
+    def __init__(self, *, fleet: str, connect: Sequence[str], say: Say = lambda _: None) -> None:
+        """`connect` are the robots' endpoints; `say` is told what cannot be understood, from
+        another thread."""
+        self._fleet = fleet
+        self._connect = tuple(connect)
+        self._say = say
+        self._changed = threading.Condition()
+        self._heard: dict[int, list[Heard]] = {}
+        self._link: ZenohLink | None = None
+
+    def __enter__(self) -> Self:
+        """Raises LinkError."""
+        self._link = ZenohLink(
+            fleet=self._fleet,
+            listen=("tcp/127.0.0.1:0",),
+            connect=self._connect,
+            subscriptions={STATUS: lambda _, data: self._take(time.monotonic(), data)},
+        )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        assert self._link is not None
+        self._link.close()
+
+    def statuses(self) -> dict[int, RobotStatus]:
+        """The newest status of each robot that is heard, by robot id."""
+        earliest_s = time.monotonic() - FRESH_S
+        with self._changed:
+            newest = {robot: heard[-1] for robot, heard in self._heard.items()}
+        return {robot: heard.status for robot, heard in newest.items() if heard.at_s >= earliest_s}
+
+    def history(self, robot: int) -> tuple[Heard, ...]:
+        """Everything that a robot has said of itself, in order."""
+        with self._changed:
+            return tuple(self._heard.get(robot, ()))
+
+    def forget(self) -> None:
+        """Keep of each robot only what it said last."""
+        with self._changed:
+            for heard in self._heard.values():
+                del heard[:-1]
+
+    def wait_for(self, condition: Callable[[Statuses], bool], timeout_s: float) -> bool:
+        """Wait until `condition` holds of the statuses; False if that took too long."""
+        deadline_s = time.monotonic() + timeout_s
+        while not condition(self.statuses()):
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                return False
+            with self._changed:
+                # Who falls silent changes nothing here, so look again.
+                self._changed.wait(min(left_s, _LOOK_AGAIN_S))
+        return True
+
+    def _take(self, at_s: float, data: bytes) -> None:
+        try:
+            status = decode(RobotStatus, data)
+        except MessageError as error:
+            self._say(f"a status is malformed: {error}")
+            return
+        with self._changed:
+            self._heard.setdefault(status.robot_id, []).append(Heard(at_s, status))
+            self._changed.notify_all()

@@ -1,0 +1,302 @@
+"""Whole robots on one clock, in one process: their real nodes, and simulated vehicles.
+
+Who has them gives them their links, and lets their time pass: on a simulated clock
+(`fleet.simulated`), or as fast as real time (`fleet.live`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.ports import SensorOver
+from edge.core.vehicle import Action, Mode
+from edge.drivers.flight_log import FlightLog
+from edge.drivers.registry import load_verified_policy, open_sensor
+from edge.messages.mission import RobotStatus
+from edge.messages.topics import Link
+from edge.policy.family import VerifiedPolicy, verified
+from edge.robot.config import RobotConfig, load_config
+from edge.robot.log import open_log
+from edge.robot.node import Ports, RobotNode
+from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.recorded import RecordedPolicy, recorded_steps
+from lpac.sim.px4.direct import DirectVehicle
+from lpac.sim.radio import Subscriptions
+from lpac.sim.schedule import Recurrence, Schedule
+
+# Of a vehicle's physics, unless somebody is content with less.
+VEHICLE_STEP_S = 0.02
+# Of preflight and status.
+_CHORE_S = 0.25
+_WATCH_S = 0.1
+
+Settings = Mapping[str, Mapping[str, object]]
+
+
+class OpenLink(Link, Protocol):
+    """A link that ends with its program."""
+
+    def close(self) -> None:
+        """Leave."""
+        ...
+
+
+class SimulatedRobot:
+    """A vehicle, which is always there, and a robot's program, while that runs.
+
+    `status` is what the program said of itself last, whoever heard it; None before it did.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        vehicle: DirectVehicle,
+        policy: VerifiedPolicy,
+        sensor_over: SensorOver,
+        world: str,
+        schedule: Schedule,
+        rng: np.random.Generator,
+        open_link: Callable[["SimulatedRobot", Subscriptions], OpenLink],
+        next_boot: Callable[[], int],
+        vehicle_step_s: float,
+        logs: bool,
+    ) -> None:
+        """`world` is the text of its world file. `next_boot` numbers the starts of programs."""
+        self.config = config
+        self.vehicle = vehicle
+        self.world = world
+        self.node: RobotNode | None = None
+        self.status: RobotStatus | None = None
+        self.loops: dict[str, Recurrence] = {}
+        self._policy = policy
+        self._sensor_over = sensor_over
+        self._schedule = schedule
+        self._rng = rng
+        self._open_link = open_link
+        self._next_boot = next_boot
+        self._link: OpenLink | None = None
+        self._logs = logs
+        self._log: FlightLog | None = None
+        schedule.every(vehicle_step_s, partial(vehicle.step, vehicle_step_s), vehicle_step_s)
+
+    def start(self) -> None:
+        """Its program starts, or starts again."""
+        self.stop()
+        schedule, boot = self._schedule, self._next_boot()
+        if self._logs:
+            self._log = open_log(self.config, self._policy.policy.bundle_id.hex(), boot)
+        self.node = node = RobotNode(
+            self.config,
+            Ports(
+                clock=schedule,
+                vehicle=self.vehicle,
+                vehicle_setup=self.vehicle,
+                watchdog=SimulatedWatchdog(
+                    self.vehicle,
+                    schedule,
+                    self.config.flight.command_timeout_s,
+                    self.config.flight.hover_land_s,
+                ),
+                recorder=self._log or _NoLog(),
+                sensor_over=self._sensor_over,
+            ),
+            self._policy,
+            self.world,
+            boot_nonce=boot,
+            boot_epoch=int(schedule.unix_s() * 1e3) + boot,
+        )
+        self._link = node.link = self._open_link(self, node.subscriptions)
+        rates = self.config.rates
+        steps: tuple[tuple[str, float, Callable[[], object]], ...] = (
+            ("control", 1.0 / rates.control_hz, node.control_step),
+            ("perception", 1.0 / rates.perception_hz, node.perception_step),
+            ("policy", 1.0 / rates.policy_hz, node.policy_step),
+            ("preflight", _CHORE_S, node.preflight_step),
+            ("status", _CHORE_S, self._say_status),
+        )
+        self.loops = {
+            # Nobody starts ten programs at one time.
+            name: schedule.every(period_s, step, period_s * self._rng.random())
+            for name, period_s, step in steps
+        }
+        if self._log is not None:
+            self.loops["log"] = schedule.every(_CHORE_S, self._log.flush)
+
+    def stop(self) -> None:
+        """Its program ends, as by a loss of power."""
+        for loop in self.loops.values():
+            loop.stop()
+        if self._link is not None:
+            self._link.close()
+        if self._log is not None:
+            self._log.close()
+        self.loops, self._link, self._log, self.node = {}, None, None, None
+
+    def _say_status(self) -> None:
+        assert self.node is not None
+        self.status = self.node.status_step({})
+
+
+class SimulatedRobots:
+    """The robots of a scenario, on `schedule`; their programs are still to be started.
+
+    `robots[i]` is robot i; `all_programs` has second programs of them, too. `layout` says where
+    all of them stand.
+    """
+
+    def __init__(
+        self,
+        scenario: FleetScenario,
+        folder: Path,
+        bundle: Path,
+        *,
+        fleet: str,
+        ports: Sequence[int],
+        epoch_s: float,
+        settings: Settings | None = None,
+        spares: int = 0,
+        vehicle_step_s: float = VEHICLE_STEP_S,
+        logs: bool = False,
+        recorded: Path | None = None,
+    ) -> None:
+        """`folder` gets fleet.toml, the world and each robot's robot.toml, which are then read.
+
+        `ports` are the robots' zenoh ports; the wall clock begins at `epoch_s`. See `Layout.write`
+        for `settings` and `spares`. With `logs` the robots write theirs in `folder`. `recorded` is
+        such a folder of an earlier flight, whose policies' steps are then taken. Raises what
+        `Layout` does, and RecordingError.
+        """
+        self.layout = layout = Layout(scenario, bundle)
+        self.folder = folder
+        self.fleet_toml = folder / "fleet.toml"
+        self.schedule = Schedule(epoch_s)
+        self._boots = 0
+        self._vehicle_step_s = vehicle_step_s
+        self._logs = logs
+        self._recorded = recorded
+        self._policy = load_verified_policy(bundle)
+        self._sensors = ExitStack()
+        self._rng = np.random.default_rng([scenario.seed, 2])
+        layout.write(
+            folder,
+            fleet,
+            {
+                f"r{robot}": {
+                    "zenoh_port": port,
+                    "system_id": robot + 1,
+                    "mavlink_url": f"udpin://127.0.0.1:{14551 + robot}",
+                }
+                for robot, port in enumerate(ports)
+            },
+            settings=settings,
+            spares=spares,
+        )
+        self.vehicles = tuple(
+            DirectVehicle(vehicle, robot + 1, self.schedule)
+            for robot, vehicle in enumerate(layout.vehicles)
+        )
+        world = (folder / "world.env").read_text()
+        self.robots = tuple(
+            self._robot(load_config(folder / "robots" / str(i) / "robot.toml"), vehicle, world)
+            for i, vehicle in enumerate(self.vehicles)
+        )
+        self.all_programs = list(self.robots)
+
+    def second_program(self, robot_id: int, vehicle: DirectVehicle) -> SimulatedRobot:
+        """Another computer that says that it is this robot, with a vehicle of its own."""
+        first = self.robots[robot_id]
+        second = self._robot(first.config, vehicle, first.world)
+        self.all_programs.append(second)
+        return second
+
+    def true_positions_m(self) -> F64:
+        """Where the vehicles really are: the mission frame, (N, 3), m."""
+        to_mission = self.layout.to_mission
+        return np.array(
+            [to_mission.local_to_mission(each.vehicle.position_m) for each in self.vehicles]
+        )
+
+    def close(self) -> None:
+        """End the robots' programs, and close their sensors."""
+        for robot in self.robots:
+            robot.stop()
+        self._sensors.close()
+
+    def _robot(self, config: RobotConfig, vehicle: DirectVehicle, world: str) -> SimulatedRobot:
+        sensor = open_sensor(config.sensor.type, config.sensor.options, self.layout.bundle.manifest)
+        return SimulatedRobot(
+            config,
+            vehicle,
+            self._policy_of(config.robot_id),
+            self._sensors.enter_context(sensor),
+            world,
+            self.schedule,
+            self._rng,
+            self._open_link,
+            self._next_boot,
+            self._vehicle_step_s,
+            self._logs,
+        )
+
+    def _policy_of(self, robot_id: int) -> VerifiedPolicy:
+        if self._recorded is None:
+            return self._policy
+        policy = self._policy.policy
+        steps = recorded_steps(self._recorded, robot_id, policy)
+        return verified(RecordedPolicy(policy, steps, self.schedule.unix_s))
+
+    def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> OpenLink:
+        raise NotImplementedError
+
+    def _next_boot(self) -> int:
+        self._boots += 1
+        return self._boots
+
+
+class SimulatedWatchdog:
+    """As `edge.drivers.px4.watchdog`: it goes on when the program does not."""
+
+    def __init__(
+        self, vehicle: DirectVehicle, schedule: Schedule, timeout_s: float, hover_land_s: float
+    ) -> None:
+        self._vehicle = vehicle
+        self._schedule = schedule
+        self._timeout_s = timeout_s
+        self._hover_land_s = hover_land_s
+        self._flying = False
+        self._fed_s = schedule.monotonic_s()
+        self._held: Literal["no", "holds", "left"] = "no"
+        schedule.every(_WATCH_S, self._look, _WATCH_S)
+
+    def feed(self, *, flying: bool) -> None:
+        """The control loop lives."""
+        self._flying, self._fed_s, self._held = flying, self._schedule.monotonic_s(), "no"
+
+    def alive(self) -> bool:
+        """Always."""
+        return True
+
+    def _look(self) -> None:
+        """Hold what was flown and is not any more; land what still holds so, a while later."""
+        silent_s = self._schedule.monotonic_s() - self._fed_s
+        if self._flying and self._held == "no" and silent_s >= self._timeout_s:
+            self._held = "holds"
+            self._vehicle.command(Action.HOLD)
+        elif self._held == "holds" and silent_s >= self._hover_land_s:
+            self._held = "left"
+            if self._vehicle.state().mode is Mode.HOLD:
+                self._vehicle.command(Action.LAND)
+
+
+class _NoLog:
+    """A recorder that keeps nothing."""
+
+    recording = True
+
+    def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
+        """Not kept."""

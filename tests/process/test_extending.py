@@ -1,0 +1,108 @@
+"""docs/extending.md as it stands: the package that it shows is installed elsewhere, and flies."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+GUIDE = (ROOT / "docs" / "extending.md").read_text()
+# `name`: and, after an empty line, the file in a fence.
+FILES = dict(re.findall(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL))
+[COMMANDS] = re.findall(r"^```sh\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the package's source, and in `site` the package, installed."""
+    folder = tmp_path_factory.mktemp("extending")
+    for name, text in FILES.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    options = ["--no-deps", "--no-index", "--no-build-isolation"]
+    site = folder / "site"
+    subprocess.run([*pip, "install", *options, "--target", site, "."], check=True, cwd=folder)
+    return folder
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    paths = (str(folder / "site"), os.environ.get("PYTHONPATH", ""))
+    return subprocess.run(
+        [str(Path(sys.executable).with_name(arguments[0])), *arguments[1:]],
+        cwd=folder / "site",
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def bundle(installed: Path) -> None:
+    install, make, *_ = COMMANDS.splitlines()
+    assert install == "pip install ."
+    made = run(installed, *shlex.split(make))
+    assert (made.returncode, made.stderr) == (0, "")
+
+
+@pytest.mark.usefixtures("bundle")
+def test_the_bundle_says_what_it_is(installed: Path) -> None:
+    info, verify = "lpac bundle info lloyd", "lpac bundle verify lloyd"
+    assert info in COMMANDS
+    told = run(installed, *shlex.split(info))
+    assert (told.returncode, told.stderr) == (0, "")
+    for line in ("family       lloyd", "gain         0.5", "made by      lpac-lloyd 1.0"):
+        assert line in told.stdout.splitlines()
+    assert run(installed, *shlex.split(verify)).returncode == 0
+    times = run(installed, *shlex.split("lpac bundle benchmark lloyd --seconds 0.1 --json"))
+    assert set(json.loads(times.stdout)["steps"]) == {"perceive", "infer"}
+
+
+@pytest.mark.usefixtures("bundle")
+@pytest.mark.parametrize(
+    "vehicle", ["simulated", pytest.param("mavlink", marks=pytest.mark.real_time)]
+)
+def test_it_flies(installed: Path, vehicle: str) -> None:
+    [command] = [line for line in COMMANDS.splitlines() if f"--vehicle {vehicle}" in line]
+    flown = run(installed, *shlex.split(command), "--json")
+    assert flown.returncode == 0, flown.stderr
+    flight = json.loads(flown.stdout)
+    curve = flight["cost_curve"]["normalized_cost"]
+    assert max(curve) - min(curve) > 0.02, curve  # the policy took them somewhere
+    assert all(robot["messages"]["accepted"] > 0 for robot in flight["fleet"])
+
+
+@pytest.mark.usefixtures("bundle")
+def test_the_fog_hides_what_is_far(installed: Path) -> None:
+    """The same flight under the built-in sensor is another one."""
+    [command] = [line for line in COMMANDS.splitlines() if "--vehicle simulated" in line]
+    short = ["--duration", "5", "--json"]
+    flights = [
+        json.loads(run(installed, *shlex.split(text), *short).stdout)
+        for text in (command, command.replace("--sensor fog", ""))
+    ]
+    assert flights[0] != flights[1]
+
+
+@pytest.mark.usefixtures("bundle")
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (
+            "--bundle lloyd --sensor haze",
+            "sensor: type = 'haze': is not installed here (entry points 'lpac_edge.sensors'); "
+            "known are 'fog', 'world'",
+        ),
+    ],
+)
+def test_what_is_not_installed_is_named(installed: Path, arguments: str, text: str) -> None:
+    refused = run(installed, "lpac", "sim", "--vehicle", "simulated", *shlex.split(arguments))
+    assert refused.returncode == 1
+    assert text in refused.stderr and "Traceback" not in refused.stderr
