@@ -32,6 +32,14 @@ from tests.conftest import ROOT
 PATIENCE_S = 120.0
 
 
+@pytest.fixture(autouse=True)
+def from_a_terminal() -> Iterator[None]:
+    """Processes end when their terminal does, also if these tests have none to lose (nohup)."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 def all_heard(snapshot: FleetSnapshot) -> bool:
     return all(robot.fresh for robot in snapshot.robots)
 

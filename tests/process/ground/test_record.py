@@ -36,14 +36,11 @@ class Recorder:
     """`lpac record` as a process, and the lines that it prints."""
 
     def __init__(self, fleet_toml: Path) -> None:
-        # As from a terminal, also if these tests have none to lose.
-        before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
         self.process = subprocess.Popen(
             [sys.executable, "-m", "lpac.cli.main", "record", "--fleet", str(fleet_toml)],
             cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
-        signal.signal(signal.SIGHUP, before)
         assert self.process.stdout is not None
         self._output = self.process.stdout
 
