@@ -4,7 +4,9 @@ Hangs share nothing with it but the socket; it needs the standard library alone.
 vehicle meanwhile, by any other mode, keeps it.
 """
 
+import os
 import select
+import signal
 import socket
 import sys
 import time
@@ -18,8 +20,10 @@ from edge.drivers.px4.raw_mavlink import Heartbeat, heartbeat, land_command
 _COMPONENT = 197  # as the watchdog
 # PX4 sends heartbeats at 1 Hz.
 _FRESH_S = 2.5
-# A program whose control loop alone hangs takes two of three; after so long it is another flight.
+# After so long it is another flight.
 _GAP_S = 30.0
+# A program whose control loop alone hangs reads the same socket, and may take all that comes.
+_DEAF_S = 10.0
 _AGAIN_S = 1.0
 _LOOK_S = 0.2
 _HOVER_LAND_S = 60.0  # where the configuration says nothing: its own default
@@ -27,12 +31,17 @@ _DATAGRAM_BYTES = 2048
 
 
 def land_if_left(
-    udp: socket.socket, system_id: int, after_s: float, pipe: int | None = None
+    udp: socket.socket,
+    system_id: int,
+    after_s: float,
+    pipe: int | None = None,
+    program: int | None = None,
 ) -> bool:
     """Land the vehicle once it has hovered for `after_s`; True when there is nothing left to do.
 
     False as soon as `pipe` can be read. `udp` hears the vehicle: its datagrams are read here, and
-    nobody else gets them. Mode OFFBOARD is PX4's to end: without setpoints it lands by itself.
+    nobody else gets them, unless `program`, the process that hangs, takes them still: it is killed
+    if none comes. Mode OFFBOARD is PX4's to end: without setpoints it lands by itself.
     """
     heard_s = since_s = time.monotonic()
     asked_s, hovered, sequence = -_AGAIN_S, False, 0
@@ -55,6 +64,11 @@ def land_if_left(
                 hovered = True
             elif hovered or beat.mode != "offboard":
                 return _end(f"somebody has it: {beat.mode}")
+        if program is not None and now_s - heard_s > _DEAF_S:
+            say("the vehicle is not heard beside the program that hangs: kill the program")
+            with suppress(OSError):
+                os.kill(program, signal.SIGKILL)
+            program = None
         if now_s - heard_s > max(after_s, _GAP_S) + _FRESH_S:
             return _end("it is not heard")
         due = hovered and now_s - since_s >= after_s and now_s - heard_s < _FRESH_S

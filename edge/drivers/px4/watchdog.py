@@ -134,7 +134,7 @@ def _watch(
             if not select.select([pipe], [], [], _LEAVE_S)[0]:
                 # What is read there the robot's program misses: it would be old by then.
                 left_s = fed_s + hover_land_s - time.monotonic()
-                held = not land_if_left(udp, system_id, left_s, pipe)
+                held = not land_if_left(udp, system_id, left_s, pipe, os.getppid())
         elif pipe not in readable:
             continue
         fed = os.read(pipe, 4096)

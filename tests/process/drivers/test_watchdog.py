@@ -2,6 +2,7 @@
 program died lands at once."""
 
 import math
+import os
 import signal
 import socket
 import subprocess
@@ -285,3 +286,19 @@ def test_only_a_vehicle_that_hovers_and_that_nobody_took_is_landed(
         assert lands
         assert message.command == mavlink.MAV_CMD_NAV_LAND
         assert message.target_system == 7
+
+
+def test_a_program_that_hangs_and_takes_all_that_the_vehicle_says_is_killed(
+    sockets: tuple[socket.socket, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, _ = sockets
+    monkeypatch.setattr(left_alone, "_DEAF_S", 0.3)
+    reader, writer = os.pipe()
+    with (
+        os.fdopen(reader),
+        subprocess.Popen(["sleep", "600"], pass_fds=(writer,)) as program,
+    ):
+        os.close(writer)
+        # Its end shows at the pipe, which it alone has, before the vehicle is given up.
+        assert not left_alone.land_if_left(own, 7, 0.0, reader, program.pid)
+        assert program.wait() == -signal.SIGKILL
