@@ -469,6 +469,7 @@ def least_separation(tracks: list[TrueTrack]) -> TrueSeparation | None:
     first_s = max(track.time_s[0] for track in flown)
     last_s = min(track.time_s[-1] for track in flown)
     times_s = np.arange(first_s, last_s, SEPARATION_PERIOD_S)
+    times_s = times_s[times_s <= last_s]  # which rounding exceeds
     places_m = np.stack(
         [
             np.stack([np.interp(times_s, t.time_s, t.position_m[:, a]) for a in range(3)], axis=1)
