@@ -58,6 +58,7 @@ class Rejection(StrEnum):
     OTHER_BUNDLE = "other_bundle"
     OTHER_FRAME = "other_frame"
     OWN = "own"
+    OTHER_SENDER = "other_sender"
     PAYLOAD_LENGTH = "payload_length"
     NON_FINITE = "non_finite"
     OUTDATED = "outdated"

@@ -9,6 +9,11 @@ connected again when it alone is lost; scouting does it within some 8 s. So for 
 robot's `connect` name all robots with smaller ids, and the ground's all robots: the configured side
 tries again for ever. Never name each other: two sides that connect at once after a cut may end up
 connected and yet deaf to each other.
+
+With TLS both sides show a certificate of the fleet's authority, and what a peer says is taken by
+its certificate's common name: `robot-<id>` below its own key, `operator` below the ground's,
+`observer` there a state only. Names of hosts are not looked at, since robots have none. A router
+passes on what others say, so that behind one only the signatures of the messages tell who they are.
 """
 
 import atexit
@@ -28,15 +33,26 @@ from edge.core import log
 from edge.core.schema import no_options
 from edge.core.wire import MAX_ROBOT_ID
 from edge.messages.admission import Admission
-from edge.messages.topics import TOPICS, LinkSetting, ReceiveCallback, Sender, Topic
+from edge.messages.topics import (
+    GROUND_CARD,
+    STATE,
+    TOPICS,
+    LinkSetting,
+    ReceiveCallback,
+    Sender,
+    TlsFiles,
+    Topic,
+)
 
 # Of 64 kB each, for topics that go later: a world that does not fit in there at once is dropped.
 _PATIENT_BATCHES = 8
-_ENDPOINT = re.compile(r"tcp/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
+_ENDPOINT = re.compile(r"(tcp|tls)/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
 _TOKEN = re.compile(r"robot/(\d{1,5})/alive/(\w{1,32})")
 # Of all topics' limits the largest, and what zenoh says besides.
 _MOST_BYTES = max(topic.limit_bytes for topic in TOPICS) + 2**12
 _MOST_TOKENS = 1000
+# As many as PX4's system ids, of which every vehicle has one of its own.
+MAX_CERTIFIED_ID = 255
 _CLOSE_TIMEOUT_S = 1.0
 _CLOSE_AT_EXIT_S = 1.5
 
@@ -68,6 +84,7 @@ def zenoh_link(setting: LinkSetting) -> "ZenohLink":
         connect=setting.connect,
         scouting=setting.scouting,
         subscriptions=setting.subscriptions,
+        tls=setting.tls,
     )
 
 
@@ -88,12 +105,14 @@ class ZenohLink:
         connect: Sequence[str] = (),
         scouting: bool = False,
         subscriptions: Mapping[Topic, ReceiveCallback] | None = None,
+        tls: TlsFiles | None = None,
     ) -> None:
         """Open the session.
 
-        `listen` and `connect` are endpoints, `tcp/<host>:<port>`; without `listen` a peer takes a
-        free port. A peer opens even if nobody answers, and connects later; a client needs its
-        router. `scouting` finds others by multicast.
+        `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all of them
+        `tls/<host>:<port>`; without `listen` a peer takes a free port. A peer opens even if nobody
+        answers, and connects later; a client needs its router. `scouting` finds others by
+        multicast.
 
         `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
         and the data, from zenoh's threads, several at once; what this session publishes is not
@@ -102,7 +121,7 @@ class ZenohLink:
 
         Raises LinkError if a setting is wrong, a port is taken or a client finds no router.
         """
-        _check(fleet, robot_id, mode, listen, connect, scouting)
+        _check(fleet, robot_id, mode, listen, connect, scouting, tls)
         self._prefix = f"lpac/{fleet}/"
         self._own_prefix = self._prefix + ("ground/" if robot_id is None else f"robot/{robot_id}/")
         self._robot_id = robot_id
@@ -111,7 +130,7 @@ class ZenohLink:
         self._failures: Counter[str] = Counter()
         self._admission = Admission()
         self._session_id = _session_id(robot_id)
-        self._session = _open(self._config(mode, listen, connect, scouting))
+        self._session = _open(self._config(mode, listen, connect, scouting, tls))
         try:
             self._publishers = self._declare(subscriptions or {})
         except BaseException:
@@ -180,16 +199,22 @@ class ZenohLink:
             self._failed("close", error)
 
     def _config(
-        self, mode: str, listen: Sequence[str], connect: Sequence[str], scouting: bool
+        self,
+        mode: str,
+        listen: Sequence[str],
+        connect: Sequence[str],
+        scouting: bool,
+        tls: TlsFiles | None,
     ) -> zenoh.Config:
         # Of two robots that find each other by scouting or gossip, the one of the greater id
         # connects: the same side as the configured endpoints make it.
         once = {"autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
         retry = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
         if mode == "peer":
-            listen = listen or ("tcp/0.0.0.0:0",)
+            listen = listen or ("tcp/0.0.0.0:0" if tls is None else "tls/0.0.0.0:0",)
         config = zenoh.Config()
         for key, value in {
+            **({} if tls is None else self._tls(mode, tls)),
             "id": self._session_id,
             "mode": mode,
             "listen/endpoints": list(listen),
@@ -224,6 +249,24 @@ class ZenohLink:
         }.items():
             config.insert_json5(key, json.dumps(value))
         return config
+
+    def _tls(self, mode: str, tls: TlsFiles) -> dict[str, object]:
+        """Only members get in, and say only what is theirs."""
+        settings: dict[str, object] = {
+            "transport/link/protocols": ["tls"],
+            "transport/link/tls": {
+                "root_ca_certificate": tls.authority,
+                "enable_mtls": True,
+                "verify_name_on_connect": False,
+                "listen_private_key": tls.key,
+                "listen_certificate": tls.certificate,
+                "connect_private_key": tls.key,
+                "connect_certificate": tls.certificate,
+            },
+        }
+        if mode == "peer":
+            settings["access_control"] = _access_control(self._prefix)
+        return settings
 
     def _declare(
         self, subscriptions: Mapping[Topic, ReceiveCallback]
@@ -299,6 +342,44 @@ class ZenohLink:
             return frozenset(id_ for id_, session in self._tokens if session != self._session_id)
 
 
+def _access_control(prefix: str) -> dict[str, object]:
+    """Who says what below the prefix, by the common names of certificates; all hear all."""
+    may_say = {
+        "operator": [f"{prefix}ground/**"],
+        "observer": [f"{prefix}ground/{topic.name}" for topic in (STATE, GROUND_CARD)],
+        **{f"robot-{id_}": [f"{prefix}robot/{id_}/**"] for id_ in range(MAX_CERTIFIED_ID + 1)},
+    }
+    listening = ["declare_subscriber", "declare_liveliness_subscriber", "liveliness_query"]
+    saying = ["put", "liveliness_token", "reply"]
+    everything = {"permission": "allow", "key_exprs": [f"{prefix}**"]}
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [
+            {"id": "to all", "flows": ["egress"], "messages": listening + saying, **everything},
+            {"id": "listening", "flows": ["ingress"], "messages": listening, **everything},
+            *(
+                {
+                    "id": name,
+                    "permission": "allow",
+                    "flows": ["ingress"],
+                    "messages": saying,
+                    "key_exprs": keys,
+                }
+                for name, keys in may_say.items()
+            ),
+        ],
+        "subjects": [
+            {"id": "all"},
+            *({"id": name, "cert_common_names": [name]} for name in may_say),
+        ],
+        "policies": [
+            {"rules": ["to all", "listening"], "subjects": ["all"]},
+            *({"rules": [name], "subjects": [name]} for name in may_say),
+        ],
+    }
+
+
 def _check(
     fleet: str,
     robot_id: int | None,
@@ -306,6 +387,7 @@ def _check(
     listen: Sequence[str],
     connect: Sequence[str],
     scouting: bool,
+    tls: TlsFiles | None,
 ) -> None:
     if not re.fullmatch(r"[\w-]+", fleet):
         raise LinkError(f"fleet = {fleet!r}: must be letters, digits, '-' and '_'")
@@ -314,10 +396,13 @@ def _check(
     # zenoh itself would wait for ever for an endpoint that cannot be.
     for name, endpoints in (("listen", listen), ("connect", connect)):
         for endpoint in endpoints:
-            if not _ENDPOINT.fullmatch(endpoint):
-                raise LinkError(f"{name} = {endpoint!r}: must be 'tcp/<host>:<port>'")
+            scheme = "tcp" if tls is None else "tls"
+            if not (_ENDPOINT.fullmatch(endpoint) and endpoint.startswith(f"{scheme}/")):
+                raise LinkError(f"{name} = {endpoint!r}: must be '{scheme}/<host>:<port>'")
     if mode == "client" and not (connect or scouting):
         raise LinkError("mode = 'client' needs the router's endpoint in connect, or scouting")
+    if tls is not None and robot_id is not None and robot_id > MAX_CERTIFIED_ID:
+        raise LinkError(f"robot_id = {robot_id}: must be from 0 to {MAX_CERTIFIED_ID} with TLS")
 
 
 def _session_id(robot_id: int | None) -> str:

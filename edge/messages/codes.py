@@ -32,6 +32,7 @@ class CheckCode(_Code):
     CLOCK_OFF_GROUND = "clock_off_ground"
     GROUND_NOT_HEARD = "ground_not_heard"
     GROUND_SILENT = "ground_silent"
+    CARD_NOT_GOOD = "card_not_good"
     # The vehicle.
     AUTOPILOT_NOT_CONNECTED = "autopilot_not_connected"
     OTHER_AUTOPILOT = "other_autopilot"

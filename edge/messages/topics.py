@@ -45,8 +45,12 @@ EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
 STATE = Topic("state", "ground", "GroundState", 5.0, 50, 2**16, "now", "ground")
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
 WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 10, 400_000, "later", None)
+# Who is a member, and whose key is not good any more: signed by the fleet's authority.
+CARD = Topic("card", "robot", "Card", 0.5, 10, 2**11, "now", None)
+GROUND_CARD = Topic("card", "ground", "Card", 0.5, 50, 2**11, "now", None)
+REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 20, 2**15, "now", None)
 
-TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD)
+TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD, CARD, GROUND_CARD, REVOKED)
 
 
 class Link(Protocol):
@@ -66,10 +70,19 @@ class Link(Protocol):
 ReceiveCallback = Callable[[str, bytes], None]
 
 
+class TlsFiles(NamedTuple):
+    """A member's paths: the authority's certificate, its own, and its secret key, all PEM."""
+
+    authority: str
+    certificate: str
+    key: str
+
+
 class LinkSetting(NamedTuple):
     """What robot.toml says of the radio: see `edge.robot.config.LinkConfig`.
 
-    With `robot_id` None it only listens. `subscriptions` maps topics to callbacks.
+    With `robot_id` None it only listens. `subscriptions` maps topics to callbacks. With `tls` only
+    members of the fleet are let in; without, whoever reaches it.
     """
 
     fleet: str
@@ -80,6 +93,7 @@ class LinkSetting(NamedTuple):
     scouting: bool
     options: Mapping[str, object]
     subscriptions: Mapping[Topic, ReceiveCallback]
+    tls: TlsFiles | None
 
 
 class LinkDriver(Protocol):

@@ -94,6 +94,8 @@ class LinkConfig:
     """How robots find each other: zenoh endpoints such as tcp/192.168.8.10:7447, or scouting.
 
     A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
+    Members of a fleet ([identity]) meet by TLS: tls/192.168.8.10:7447. Without an identity whoever
+    reaches the radio can fly the robot.
     `type` is one of `edge.drivers.registry`; `options` is what another type takes besides.
     """
 
@@ -113,8 +115,17 @@ class LinkConfig:
             raise ValueError("mode = 'client': connect or scouting must be set")
         for name in ("listen", "connect"):
             for endpoint in getattr(self, name):
-                if re.fullmatch(r"tcp/\S+:\d{1,5}", endpoint) is None:
-                    raise ValueError(f"{name} = {endpoint!r}: must be tcp/ADDRESS:PORT")
+                if re.fullmatch(r"(tcp|tls)/\S+:\d{1,5}", endpoint) is None:
+                    raise ValueError(
+                        f"{name} = {endpoint!r}: must be tls/ADDRESS:PORT, or tcp/ADDRESS:PORT"
+                    )
+
+
+@dataclass(frozen=True, slots=True)
+class IdentityConfig:
+    """Where `lpac fleet enroll` put who this robot is; "": it is no member of a fleet."""
+
+    folder: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,6 +208,7 @@ class RobotConfig:
     fence: Fence
     limits: MotionLimits
     failsafe: FailsafeConfig
+    identity: IdentityConfig = field(default_factory=IdentityConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     energy: EnergyParameters = field(default_factory=EnergyParameters)
     errors: ErrorBudget = field(default_factory=ErrorBudget)
@@ -215,12 +227,23 @@ class RobotConfig:
                 f"flight: command_timeout_s = {self.flight.command_timeout_s}: must be at least "
                 f"two periods of rates: control_hz = {self.rates.control_hz}"
             )
+        self._check_schemes()
         # What only shows when the tables come together, before any of it is used.
         required(self.failsafe.rc, self.fence.ceiling_m, self.flight.command_timeout_s)
         self.robot(boot_nonce=0)
         beyond = self.errors.px4_fence(self.limits)
         if not beyond.holds(self.failsafe.fence_margin_m):
             raise ValueError(f"failsafe: fence_margin_m = {self.failsafe.fence_margin_m}: {beyond}")
+
+    def _check_schemes(self) -> None:
+        if self.link.type != "zenoh":
+            return
+        is_member = bool(self.identity.folder)
+        for name in ("listen", "connect"):
+            for endpoint in getattr(self.link, name):
+                if endpoint.startswith("tls/") != is_member:
+                    must = "tls, with [identity]" if is_member else "tcp, without [identity]"
+                    raise ValueError(f"link: {name} = {endpoint!r}: must be {must}")
 
     def robot(self, boot_nonce: int) -> Robot:
         """Who flies, in this start of its program."""
@@ -263,9 +286,11 @@ def load_config(path: Path) -> RobotConfig:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
     folder = path.resolve().parent
-    for table, key in (("policy", "bundle"), ("policy", "world"), ("log", "folder")):
+    for table, key in (
+        ("policy", "bundle"), ("policy", "world"), ("log", "folder"), ("identity", "folder"),
+    ):  # fmt: skip
         section = mapping.get(table)
-        if isinstance(section, dict) and isinstance(section.get(key), str):
+        if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
             section[key] = str(folder / section[key])
     mapping.setdefault("log", {})
     if isinstance(mapping["log"], dict):

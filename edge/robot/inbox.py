@@ -5,9 +5,12 @@ The link's threads only put bytes in; whoever takes something out decodes it.
 
 import math
 from collections import deque
+from dataclasses import replace
 from threading import Lock
 from typing import NamedTuple
 
+from edge.identity.card import Role
+from edge.identity.guard import Speaker
 from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
@@ -21,12 +24,24 @@ from edge.messages.mission import (
 _MOST_ORDERS = 64
 _MOST_STATES = 16
 _BEACON_LIFETIME_S = 3.0
+# A hold that somebody else than the commander asks for counts for as long as it is said; robots
+# hear a state five times a second. The commander's next states end it, so that nobody who asks for
+# one can get far ahead of the commander.
+_ASKED_HOLD_LASTS_S = 1.5
+_MOST_SEQUENCES_AHEAD = 1000
 
 
 class _Arrived(NamedTuple):
     data: bytes
+    speaker: Speaker
     at_s: float
     unix_s: float
+
+
+class _AskedHold(NamedTuple):
+    by: str
+    sequence: int
+    at_s: float
 
 
 class Inbox:
@@ -35,18 +50,20 @@ class Inbox:
     def __init__(self, robot_id: int, ground_timeout_s: float) -> None:
         """Of several grounds' states the one with the greatest (sequence, operator) counts.
 
-        A smaller one does once no other came for the timeout.
+        A smaller one does once no other came for the timeout. Of a state that another operator's
+        key signed, or an observer's, only a hold counts, while the commander asks for nothing.
         """
         self._robot_id = robot_id
         self._ground_timeout_s = ground_timeout_s
         self._lock = Lock()
         self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
-        self._orders: deque[bytes] = deque(maxlen=_MOST_ORDERS)
+        self._orders: deque[tuple[bytes, Speaker]] = deque(maxlen=_MOST_ORDERS)
         self._beacons: dict[int, HeardBeacon] = {}
         # When robots, by what they are called, said what is no beacon of this version.
         self._strangers: dict[str, float] = {}
         self._ground: GroundState | None = None
         self._ground_at_s = -math.inf
+        self._asked_hold: _AskedHold | None = None
         self._safety_form: SafetyAction = "none"
         self._safety_form_at_s = -math.inf
         # Why the newest state of a ground was not understood; "" if it was.
@@ -59,17 +76,17 @@ class Inbox:
         self.not_understood: tuple[str, ...] = ()
         self.malformed = 0
 
-    def put_ground(self, data: bytes, now_s: float, unix_now_s: float) -> None:
+    def put_ground(self, data: bytes, speaker: Speaker, now_s: float, unix_now_s: float) -> None:
         """A ground's state arrived."""
-        self._grounds.append(_Arrived(data, now_s, unix_now_s))
+        self._grounds.append(_Arrived(data, speaker, now_s, unix_now_s))
 
     def put_world(self, data: bytes) -> None:
         """A world file arrived."""
         self.world = data
 
-    def put_order(self, data: bytes) -> None:
+    def put_order(self, data: bytes, speaker: Speaker) -> None:
         """An order arrived."""
-        self._orders.append(data)
+        self._orders.append((data, speaker))
 
     def put_beacon(self, beacon: Beacon, now_s: float, unix_now_s: float) -> None:
         """Another robot's beacon arrived."""
@@ -98,12 +115,34 @@ class Inbox:
                 self.ground_refusal = str(error)
                 self._take_safety_form(arrived)
                 continue
-            if self._counts(state, arrived.at_s):
+            if not _is_own(state.operator, arrived.speaker):
+                if state.safety_action_for(self._robot_id) == "hold":
+                    self._asked_hold = _AskedHold(
+                        arrived.speaker.name, state.sequence, arrived.at_s
+                    )
+            elif self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
                 self._safety_form, self.ground_refusal = "none", ""
                 if state.unix_time_s is not None:
                     self.ground_clock_offset_s = state.unix_time_s - arrived.unix_s
-        return self._ground, now_s - self._ground_at_s
+        return self._with_asked_hold(now_s), now_s - self._ground_at_s
+
+    def _with_asked_hold(self, now_s: float) -> GroundState | None:
+        ground, asked = self._ground, self._asked_hold
+        if (
+            ground is None
+            or asked is None
+            or now_s - asked.at_s > _ASKED_HOLD_LASTS_S
+            or not 0 < asked.sequence - ground.sequence <= _MOST_SEQUENCES_AHEAD
+            or ground.safety_action_for(self._robot_id) != "none"
+        ):
+            return ground
+        return replace(
+            ground,
+            sequence=asked.sequence,
+            robot_safety_actions=ground.robot_safety_actions | {str(self._robot_id): "hold"},
+            safety_action_by=asked.by,
+        )
 
     def safety_form(self, now_s: float) -> SafetyAction:
         """What a ground asks whose states are not understood: hold, land, or none. Control thread.
@@ -122,6 +161,8 @@ class Inbox:
             return
         asked = form.robot_safety_actions.get(str(self._robot_id), form.safety_action)
         known: dict[str, SafetyAction] = {"hold": "hold", "land": "land"}
+        if not _is_own(form.operator, arrived.speaker):
+            del known["land"]
         self._safety_form = known.get(asked, "none")
         self._safety_form_at_s = arrived.at_s
 
@@ -138,8 +179,9 @@ class Inbox:
     def order(self) -> Order | None:
         """The next order for this robot, if one has come. Control thread."""
         while self._orders:
-            order = self._order(self._orders.popleft())
-            if order and order.robot_id == self._robot_id:
+            data, speaker = self._orders.popleft()
+            order = self._order(data)
+            if order and order.robot_id == self._robot_id and _is_own(order.operator, speaker):
                 return order
         return None
 
@@ -173,3 +215,8 @@ class Inbox:
             }
             self.not_understood = tuple(self._strangers)
             return tuple(self._beacons.values())
+
+
+def _is_own(operator: str, speaker: Speaker) -> bool:
+    """Whether who says it is the operator that it names, as far as that is known."""
+    return speaker.role is Role.OPERATOR and speaker.name in ("", operator)

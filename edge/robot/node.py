@@ -7,17 +7,28 @@ Nothing here has a clock, a thread or a socket of its own. On a drone, threads c
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
 from edge.core.vehicle import Action
 from edge.flight.state import flown_s
+from edge.identity.guard import Guard, Speaker
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
 from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import FlightState, LoopStatus, RobotStatus, explored_to_bytes, world_id
-from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Link, Topic
+from edge.messages.topics import (
+    EXPLORED,
+    MESSAGE,
+    ORDER,
+    STATE,
+    STATUS,
+    WORLD,
+    Link,
+    ReceiveCallback,
+    Topic,
+)
 from edge.policy.family import VerifiedPolicy
 from edge.robot.config import RobotConfig
 from edge.robot.control import FlightControl, GroundWorld
@@ -51,8 +62,9 @@ class Ports:
 class RobotNode:
     """One robot. Each `*_step` belongs to one thread; `receive`'s callbacks to any number.
 
-    `link` is what it says goes to; until there is one, nobody hears it. `boot_nonce` and
-    `boot_epoch` tell this start of its program from others; the epoch grows from start to start.
+    It speaks and hears by its guard, and until it has a link (`attach`), nobody hears it.
+    `boot_nonce` and `boot_epoch` tell this start of its program from others; the epoch grows from
+    start to start.
     """
 
     def __init__(
@@ -61,6 +73,7 @@ class RobotNode:
         ports: Ports,
         policy: VerifiedPolicy,
         world: str,
+        guard: Guard,
         *,
         boot_nonce: int,
         boot_epoch: int,
@@ -74,7 +87,8 @@ class RobotNode:
         self._boot_epoch = boot_epoch
         self._started_s = clock.monotonic_s()
         self._fed_s = -math.inf
-        self.link: Link | None = None
+        self._guard = guard
+        self._link: Link | None = None
         # What it knows: its place, its radio mail, its map and messages.
         self._navigation = Navigation(ports.vehicle, clock.monotonic_s, config.position)
         self._inbox = Inbox(config.robot_id, config.flight.ground_timeout_s)
@@ -117,26 +131,32 @@ class RobotNode:
     # What comes
 
     @property
-    def subscriptions(self) -> Mapping[Topic, Callable[[str, bytes], None]]:
+    def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
         """What it hears: topic -> callback with the key and the data, from any thread."""
-        return {
-            MESSAGE: self._receive_message,
-            STATE: self._receive_state,
-            ORDER: self._receive_order,
-            WORLD: self._receive_world,
-        }
+        return self._guard.subscriptions(
+            {
+                MESSAGE: self._receive_message,
+                STATE: self._receive_state,
+                ORDER: self._receive_order,
+                WORLD: self._receive_world,
+            }
+        )
 
-    def _receive_state(self, _: str, data: bytes) -> None:
+    def attach(self, link: Link) -> None:
+        """What it says goes there from now on."""
+        self._link = self._guard.over(link)
+
+    def _receive_state(self, _: str, data: bytes, speaker: Speaker) -> None:
         clock = self._ports.clock
-        self._inbox.put_ground(data, clock.monotonic_s(), clock.unix_s())
+        self._inbox.put_ground(data, speaker, clock.monotonic_s(), clock.unix_s())
 
-    def _receive_order(self, _: str, data: bytes) -> None:
-        self._inbox.put_order(data)
+    def _receive_order(self, _: str, data: bytes, speaker: Speaker) -> None:
+        self._inbox.put_order(data, speaker)
 
-    def _receive_world(self, _: str, data: bytes) -> None:
+    def _receive_world(self, _: str, data: bytes, __: Speaker) -> None:
         self._inbox.put_world(data)
 
-    def _receive_message(self, key: str, data: bytes) -> None:
+    def _receive_message(self, key: str, data: bytes, _: Speaker) -> None:
         """A robot's: to inbox and mailbox, and what came to the log."""
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
         sender = int(key.split("/")[1])
@@ -150,7 +170,7 @@ class RobotNode:
             self._inbox.put_beacon(beacon, now_s, unix_now_s)
         rejection = None
         if len(data) > BEACON_BYTES:
-            rejection = self._pac.receive(data[BEACON_BYTES:], now_s, unix_now_s)
+            rejection = self._pac.receive(data[BEACON_BYTES:], now_s, unix_now_s, sender=sender)
         self._ports.recorder.record(
             "received",
             unix_now_s,
@@ -250,9 +270,14 @@ class RobotNode:
             not_understood=self._inbox.not_understood,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
+            card_problem=self._guard.card_problem(self._ground_unix_s()),
             ground_age_s=self._inbox.ground_age_s(now_s),
             ground_clock_offset_s=self._inbox.ground_clock_offset_s,
         )
+
+    def _ground_unix_s(self) -> float:
+        """The ground's wall clock, or this robot's own where that is not known."""
+        return self._ports.clock.unix_s() + (self._inbox.ground_clock_offset_s or 0.0)
 
     def _checks_are_due(self, now_s: float) -> bool:
         checks = self._control.checks
@@ -401,11 +426,11 @@ class RobotNode:
         return self._control.leave(on_stop)
 
     def _publish(self, topic: Topic, data: bytes) -> None:
-        if self.link is not None:
-            self.link.publish(topic, data)
+        if self._link is not None:
+            self._link.publish(topic, data)
 
     def _is_duplicate(self) -> bool:
-        return self.link is not None and self.link.is_claimed(self._config.robot_id)
+        return self._link is not None and self._link.is_claimed(self._config.robot_id)
 
 
 def _news(status: RobotStatus) -> tuple[object, ...]:

@@ -130,8 +130,13 @@ class Pac:
         self._features = None
         self.mailbox.clear()
 
-    def receive(self, data: bytes, now_s: float, unix_now_s: float) -> Rejection | None:
-        """Put a neighbour's message into the mailbox; returns, and counts, why it was not."""
+    def receive(
+        self, data: bytes, now_s: float, unix_now_s: float, *, sender: int | None = None
+    ) -> Rejection | None:
+        """Put a neighbour's message into the mailbox; returns, and counts, why it was not.
+
+        `sender` is the robot that it came from, for whoever knows: no other's is taken then.
+        """
         message = decode(
             data,
             bundle_id=self._policy.bundle_id,
@@ -139,6 +144,8 @@ class Pac:
             own_robot_id=self._robot_id,
             message_size=self._policy.message_size,
         )
+        if not isinstance(message, Rejection) and sender not in (None, message.robot_id):
+            message = Rejection.OTHER_SENDER
         if isinstance(message, Rejection):
             self.mailbox.reject(message)
             return message

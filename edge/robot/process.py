@@ -13,7 +13,7 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -21,13 +21,16 @@ from typing import NamedTuple
 from edge.core import log
 from edge.core.ports import OpenVehicle, SensorOver, Vehicle, VehicleSetting, Watchdog
 from edge.core.px4_version import in_words
+from edge.core.schema import ConfigError
 from edge.core.vehicle import Action, Setpoint
 from edge.drivers.clock import SystemClock
 from edge.drivers.flight_log import FlightLog
+from edge.drivers.identity_folder import Identity, load_identity
 from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
 from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
+from edge.identity.guard import SignedGuard, Unguarded
 from edge.messages.codes import FailedCheck
 from edge.messages.mission import LoopStatus
 from edge.messages.topics import Link, LinkSetting
@@ -80,6 +83,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         if stop.is_set():
             return
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
+        clock = SystemClock()
         bundle_id, boot_nonce = policy.policy.bundle_id.hex(), secrets.randbits(48)
         service_manager = ServiceManager()
         parts.callback(service_manager.close)
@@ -94,7 +98,8 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         flight = config.flight
         watchdog = parts.enter_context(new_watchdog(flight.command_timeout_s, flight.hover_land_s))
         # 5. The robot itself.
-        clock = SystemClock()
+        identity = _identity(config, clock)
+        guard = _guard(identity, clock)
         node = RobotNode(
             config,
             Ports(
@@ -107,13 +112,16 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             ),
             policy,
             world,
+            guard,
             boot_nonce=boot_nonce,
             boot_epoch=int(clock.unix_s() * 1e3),
         )
         # 6. The radio that feeds it, and takes what it says.
-        link = node.link = parts.enter_context(_open_link(config, node, config.robot_id))
+        link = parts.enter_context(_open_link(config, node, config.robot_id, identity))
+        node.attach(link)
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
-        program = _Program(config, node, vehicle, watchdog, recorder, link)
+        keep_news = _keeper(identity, guard)
+        program = _Program(config, node, vehicle, watchdog, recorder, link, keep_news)
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
         libc.malloc_trim(0)  # What verification took goes back to the system.
@@ -132,20 +140,54 @@ def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
     return open_vehicle(autopilot.type, setting)
 
 
+def _identity(config: RobotConfig, clock: SystemClock) -> Identity | None:
+    """Who this robot is in its fleet; None if nobody says so. Raises ConfigError or OSError."""
+    folder = config.identity.folder
+    if not folder:
+        return None
+    identity = load_identity(Path(folder), fleet=config.fleet, unix_s=clock.unix_s())
+    if identity.card.robot_id != config.robot_id:
+        card = identity.card
+        raise ConfigError(f"{folder}: is {card.role} {card.name}'s, not robot {config.robot_id}'s")
+    return identity
+
+
+def _guard(identity: Identity | None, clock: SystemClock) -> SignedGuard | Unguarded:
+    return Unguarded() if identity is None else identity.guard(clock.monotonic_s)
+
+
+def _keeper(identity: Identity | None, guard: SignedGuard | Unguarded) -> Callable[[], None]:
+    """Writes the newest list of revoked keys, when there is a newer one: for the next start."""
+    if identity is None or isinstance(guard, Unguarded):
+        return lambda: None
+    kept = identity.revocations
+
+    def keep() -> None:
+        nonlocal kept
+        if guard.revocations != kept:
+            identity.keep(guard.revocations)
+            kept = guard.revocations
+
+    return keep
+
+
 def _open_link(
-    config: RobotConfig, node: RobotNode, robot_id: int | None
+    config: RobotConfig, node: RobotNode, robot_id: int | None, identity: Identity | None
 ) -> AbstractContextManager[Link]:
     """The radio, as that robot, or with None as somebody who only listens."""
     link = config.link
     setting = LinkSetting(
         config.fleet, robot_id, link.mode, link.listen, link.connect, link.scouting, link.options,
-        node.subscriptions,
+        node.subscriptions, None if identity is None else identity.tls,
     )  # fmt: skip
     return open_link(link.type, setting)
 
 
 class _Program:
-    """The threads of a running robot. The main thread calls its methods."""
+    """The threads of a running robot. The main thread calls its methods.
+
+    `keep_news` writes what is to be known of the fleet at the next start.
+    """
 
     def __init__(
         self,
@@ -155,12 +197,15 @@ class _Program:
         watchdog: Watchdog,
         recorder: FlightLog,
         link: Link,
+        keep_news: Callable[[], None],
     ) -> None:
         self._config = config
         self._node = node
         self._vehicle = vehicle
         self._watchdog = watchdog
         self._link = link
+        self._recorder = recorder
+        self._keep_news = keep_news
         rates = config.rates
         self._loops = (
             Loop("control", 1.0 / rates.control_hz, node.control_step),
@@ -171,7 +216,7 @@ class _Program:
         self._chores = (
             Loop("preflight", _PERIOD_S, node.preflight_step),
             Loop("status", _PERIOD_S, self._status_step),
-            Loop("log", _PERIOD_S, recorder.flush),
+            Loop("log", _PERIOD_S, self._write_step),
         )
         self._status_text: str | None = None
         self._loop_statuses: dict[str, LoopStatus] = {}
@@ -221,6 +266,10 @@ class _Program:
                 return
             time.sleep(0.02)
         log.error("the autopilot did not answer", action=action)
+
+    def _write_step(self) -> None:
+        self._recorder.flush()
+        self._keep_news()
 
     def _status_step(self) -> None:
         now_s = time.monotonic()
@@ -291,12 +340,14 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
         policy, sensor_over, world = _load(config, parts)
         parts.enter_context(_robot_lock(config))
         log.listen(log.show_errors)
+        clock = SystemClock()
+        identity = _identity(config, clock)
         vehicle, setup, _ = parts.enter_context(_open_vehicle(config))
         looking = _OnlyLooking(vehicle)
         node = RobotNode(
             config,
             Ports(
-                clock=SystemClock(),
+                clock=clock,
                 vehicle=looking,
                 vehicle_setup=setup,
                 watchdog=looking,
@@ -305,11 +356,12 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             ),
             policy,
             world,
+            _guard(identity, clock),
             boot_nonce=0,
             boot_epoch=0,
         )
         # Not as the robot itself: its program is not running.
-        node.link = parts.enter_context(_open_link(config, node, None))
+        node.attach(parts.enter_context(_open_link(config, node, None, identity)))
         # Of its own, since the checks wait for the vehicle; it looks as often as a flight does.
         control = Loop("control", 1.0 / config.rates.control_hz, node.control_step)
         control.start()

@@ -16,6 +16,7 @@ from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Robot
+from edge.identity.guard import CardProblem
 from edge.messages.beacon import HeardBeacon
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
@@ -111,6 +112,7 @@ class Readiness:
         not_understood: Sequence[str],
         duplicate: bool,
         watchdog_alive: bool,
+        card_problem: CardProblem | None,
         ground_age_s: float,
         ground_clock_offset_s: float | None,
     ) -> Checks:
@@ -148,6 +150,9 @@ class Readiness:
         if not watchdog_alive:
             text = "watchdog has ended: start this robot's program again"
             failed = (*failed, FailedCheck(CheckCode.WATCHDOG_ENDED, text))
+        if card_problem is not None:
+            text = f"its card in the fleet is {card_problem.value}: enroll this robot again"
+            failed = (*failed, FailedCheck(CheckCode.CARD_NOT_GOOD, text))
         return Checks(failed, now_s, assignment)
 
     def _read(self) -> bool:

@@ -30,7 +30,8 @@ _LONGEST_NAME = 64
 def ground(
     fleet: Fleet = DEFAULT_FLEET,
     name: Annotated[
-        str, typer.Option("--name", help="This station's name; by default user@host.")
+        str,
+        typer.Option("--name", help="This station's name; by default its card's, or user@host."),
     ] = "",
 ) -> None:
     """Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.
@@ -40,16 +41,15 @@ def ground(
     from lpac.ground.station.config import load_ground
     from lpac.ground.station.server import GroundProcess
 
-    operator = name or _user_at_host()
-    if not operator.isprintable() or len(operator) > _LONGEST_NAME:
+    if not name.isprintable() or len(name) > _LONGEST_NAME:
         raise ValueError(f"--name {name!r}: must be at most {_LONGEST_NAME} printable characters")
-    config = load_ground(fleet, operator)
+    config = load_ground(fleet, name or None, default_name=_user_at_host())
     # Nothing that a robot says can be a text that cannot be printed.
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     process = GroundProcess(config, _print_event)
     started = (
-        f"ground station {operator} of fleet {config.setup.fleet}, {len(config.setup.robots)} "
-        "robots: Ctrl-C ends it"
+        f"ground station {config.setup.operator} of fleet {config.setup.fleet}, "
+        f"{len(config.setup.robots)} robots: Ctrl-C ends it"
     )
     asyncio.run(_run(process, config.setup, lambda: typer.echo(started)))
 

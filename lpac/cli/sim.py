@@ -116,6 +116,13 @@ def sim(
     px4: Annotated[
         Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
     ] = None,
+    secure: Annotated[
+        bool,
+        typer.Option(
+            help="Not point: robots and ground are members of a fleet, with keys that are made for "
+            "it: what they say is signed, and nobody else is heard."
+        ),
+    ] = False,
     script: Annotated[
         bool,
         typer.Option(help="mavlink, px4: take off, cover and land; else wait for `lpac ground`."),
@@ -151,6 +158,7 @@ def sim(
             random_feature_count=features,
             errors=errors,
             sensor=sensor,
+            secure=secure,
         )
 
         if vehicle is VehicleKind.SIMULATED:

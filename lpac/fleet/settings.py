@@ -43,6 +43,7 @@ _ELSEWHERE = {
     "policy.bundle": "it is `bundle` at the top of the file",
     "policy.world": "it is `world` at the top of the file",
     "autopilot.system_id": "it is `system_id` in [robots.NAME]",
+    "identity": "it follows from `keys` at the top of the file",
     "link": "it follows from `address` and `zenoh_port` in [robots.NAME]",
     "flight.slot": "it is `height` in [[slots]]",
     "flight.landing_point_m": "it is `landing_point_m` in [[slots]]",
@@ -117,16 +118,20 @@ class RobotHost:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where a robot finds bundle and world and keeps its logs, and the address it listens on."""
+    """Where a robot finds bundle and world and who it is, keeps its logs, and the address it
+    listens on."""
 
     bundle: str
     world: str
+    identity: str
     logs: str
     listen: str
 
 
 # A release lies at /release in the sandbox of the robot's unit.
-IN_RELEASE = Places("bundle", "world.env", "/var/lib/lpac/logs", "0.0.0.0")
+IN_RELEASE = Places(
+    "bundle", "world.env", "/var/lib/lpac/identity", "/var/lib/lpac/logs", "0.0.0.0"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +139,8 @@ class FleetConfig:
     """All of fleet.toml, checked as a whole; `shared` is what all robots' robot.toml have.
 
     `directory` is the robots' folder of releases; `predecessors` are containers and units that must
-    not run beside ours.
+    not run beside ours. `keys` is the folder of this computer's own identity in the fleet; None if
+    nobody has one, and whoever reaches the radio can fly the fleet.
     """
 
     path: Path
@@ -148,6 +154,16 @@ class FleetConfig:
     robots: Mapping[str, RobotHost]
     slots: tuple[Slot, ...]
     shared: Mapping[str, Any]
+    keys: Path | None
+
+    def endpoint(self, robot: RobotHost) -> str:
+        """Where zenoh reaches the robot."""
+        return f"{self.scheme}/{robot.address}:{robot.zenoh_port}"
+
+    @property
+    def scheme(self) -> str:
+        """Of zenoh's endpoints."""
+        return "tcp" if self.keys is None else "tls"
 
     def slot_of(self, name: str) -> Slot | None:
         """The robot's slot; None for a spare."""
@@ -259,6 +275,7 @@ class _FleetTable:
     world: str
     directory: str = DEFAULT_DIRECTORY
     predecessors: tuple[str, ...] = ()
+    keys: str = ""
     ssh: SshConfig = field(default_factory=SshConfig)
     robot: dict = field(default_factory=dict)  # type: ignore[type-arg]
     robots: dict = field(default_factory=dict)  # type: ignore[type-arg]
@@ -333,6 +350,7 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
         },
         slots=table.slots,
         shared=table.robot,
+        keys=place(table.keys) if table.keys else None,
     )
     for mistake in itertools.chain(_shared_by_two(config), _sittings(config)):
         raise ConfigError(f"{path}: {mistake}")
@@ -451,14 +469,15 @@ def _robot_mapping(
         "policy": {"bundle": places.bundle, "world": places.world},
         "autopilot": {"url": robot.mavlink_url, "system_id": robot.system_id},
         "link": {
-            "listen": [f"tcp/{places.listen}:{robot.zenoh_port}"],
+            "listen": [f"{config.scheme}/{places.listen}:{robot.zenoh_port}"],
             "connect": [
-                f"tcp/{other.address}:{other.zenoh_port}"
+                config.endpoint(other)
                 for other in sorted(earlier, key=lambda other: other.robot_id)
             ],
         },
         "flight": {"slot": slot.height, "landing_point_m": list(slot.landing_point_m)},
         "log": {"folder": places.logs},
+        **({} if config.keys is None else {"identity": {"folder": places.identity}}),
     }
     return _merged(config.values_of(robot), own)
 

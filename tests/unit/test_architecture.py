@@ -11,19 +11,22 @@ from tests.conftest import ROOT
 OURS = ("edge", "export", "lpac")
 
 _EDGE = {
-    "edge.core", "edge.messages", "edge.flight", "edge.policy", "edge.robot", "edge.drivers",
-    "edge.drivers.registry",
+    "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.policy", "edge.robot",
+    "edge.drivers", "edge.drivers.registry",
 }  # fmt: skip
 # Part -> the parts of the project that it may import (besides itself).
 ALLOWED = {
     "edge.core": set(),
     "edge.messages": {"edge.core"},
+    "edge.identity": {"edge.core", "edge.messages"},
     "edge.flight": {"edge.core", "edge.messages"},
     "edge.policy": {"edge.core", "edge.messages"},
-    "edge.drivers": {"edge.core", "edge.messages"},
+    "edge.drivers": {"edge.core", "edge.messages", "edge.identity"},
     # Finds drivers and policy families by their names, those of other packages too.
     "edge.drivers.registry": {"edge.core", "edge.messages", "edge.policy"},
-    "edge.robot": {"edge.core", "edge.messages", "edge.flight", "edge.policy"},
+    "edge.robot": {
+        "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.policy",
+    },
     "edge.robot.process": {*_EDGE, "edge.robot.log"},
     "edge.robot.log": {"edge.core", "edge.robot", "edge.drivers"},
     "export": {"edge.core", "edge.policy"},
@@ -33,10 +36,13 @@ ALLOWED = {
     # What describes a fleet; the ground reads it, and the simulator describes its fleets with it.
     "lpac.fleet.settings": _EDGE,
     "lpac.fleet.writer": {*_EDGE, "lpac.fleet.settings"},
-    "lpac.fleet": {*_EDGE, "lpac.shipped", "lpac.fleet.settings", "lpac.fleet.writer"},
+    "lpac.fleet.authority": _EDGE,
+    "lpac.fleet": {
+        *_EDGE, "lpac.shipped", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
+    },
     "lpac.sim": {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
-        "lpac.fleet.writer",
+        "lpac.fleet.writer", "lpac.fleet.authority",
     },
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
@@ -58,13 +64,16 @@ ONLY_IN = {
     "textual": {"lpac/ground/terminal/"},
     "aiohttp": {"lpac/ground/map/"},
     "tomlkit": {"lpac/fleet/writer.py"},
+    "nacl": {"edge/identity/signature.py"},
+    "cryptography": {"lpac/fleet/authority.py"},
 }
 # No clock, thread, file or socket: all of it is called by somebody who has them. What several
 # threads call has a lock; a bundle and a configuration are read from their paths.
-PURE = ("edge.core", "edge.messages", "edge.flight", "edge.robot")
+PURE = ("edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.robot")
 BUT = {
     "edge/core/mailbox.py": {"threading"},
     "edge/robot/inbox.py": {"threading"},
+    "edge/identity/guard.py": {"threading"},
     "edge/robot/node.py": {"pathlib"},
     "edge/robot/config.py": {"pathlib"},
     # Wait for a vehicle, and measure; neither is part of a robot that flies.

@@ -1,26 +1,39 @@
 """What `lpac ground` needs to know of its fleet."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from edge.core.schema import ConfigError
 from edge.core.world import parse_world
+from edge.drivers.identity_folder import Identity, load_identity
+from edge.identity.card import Role
 from edge.messages.mission import Place, world_id
 from edge.policy.bundle import load_bundle
 from lpac.analysis.snapshot import FleetSetup, FleetSlot
-from lpac.fleet.settings import load_fleet
+from lpac.fleet.settings import FleetConfig, load_fleet
 
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
-    """`setup` is what its clients are told; `connect` are all robots' endpoints, for zenoh."""
+    """`setup` is what its clients are told; `connect` are all robots' endpoints, for zenoh.
+
+    `identity` is this station's in its fleet, None where nobody has one.
+    """
 
     setup: FleetSetup
     connect: tuple[str, ...]
+    identity: Identity | None = None
 
 
-def load_ground(path: Path, operator: str) -> GroundConfig:
-    """What the ground station needs to know of the fleet. Raises ValueError or OSError."""
+def load_ground(path: Path, operator: str | None, *, default_name: str = "") -> GroundConfig:
+    """What the ground station needs to know of the fleet. Raises ValueError or OSError.
+
+    In a fleet with keys its name is that of its card, and `operator` None or just that.
+    """
     config = load_fleet(path)
+    identity = _identity(config, operator)
+    name = operator or default_name if identity is None else identity.card.name
     seated = next((slot.robot for slot in config.slots if slot.robot), None)
     if seated is None:
         raise ValueError(f"{path}: slots: no robot sits in one")
@@ -34,7 +47,7 @@ def load_ground(path: Path, operator: str) -> GroundConfig:
     return GroundConfig(
         setup=FleetSetup(
             fleet=config.fleet,
-            operator=operator,
+            operator=name,
             robots={name: host.robot_id for name, host in config.robots.items()},
             slots=tuple(
                 FleetSlot(Place(slot.height, slot.landing_point_m), slot.pad_m, slot.robot or "")
@@ -57,5 +70,20 @@ def load_ground(path: Path, operator: str) -> GroundConfig:
             ground_timeout_s=robot.flight.ground_timeout_s,
             ground_lost_land_s=robot.flight.ground_lost_land_s,
         ),
-        connect=tuple(f"tcp/{host.address}:{host.zenoh_port}" for host in config.robots.values()),
+        connect=tuple(map(config.endpoint, config.robots.values())),
+        identity=identity,
     )
+
+
+def _identity(config: FleetConfig, operator: str | None) -> Identity | None:
+    if config.keys is None:
+        return None
+    identity = load_identity(config.keys, fleet=config.fleet, unix_s=time.time())
+    card = identity.card
+    if card.role is Role.ROBOT:
+        raise ConfigError(f"{config.keys}: is robot {card.name}'s, not a ground station's")
+    if operator not in (None, card.name):
+        raise ConfigError(
+            f"--name {operator!r}: this station's card says {card.name!r}: leave --name out"
+        )
+    return identity

@@ -5,15 +5,25 @@
 
 import base64
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
 from edge.core.perception import EXPLORED_CELLS
 from edge.core.ports import Clock
+from edge.identity.guard import Guard, Speaker
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import GroundState, RobotStatus
-from edge.messages.topics import EXPLORED, ORDER, STATE, STATUS, WORLD, Link, Topic
+from edge.messages.topics import (
+    EXPLORED,
+    ORDER,
+    STATE,
+    STATUS,
+    WORLD,
+    Link,
+    ReceiveCallback,
+    Topic,
+)
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot
 from lpac.ground.station.commands import Commands, CommandTask
 from lpac.ground.station.protocol import Request, ServerMessage
@@ -36,16 +46,19 @@ class GroundListener(Protocol):
 
 
 class GroundNode:
-    """One ground, which one thread calls. `link` is what it says goes to, None as long as none is.
+    """One ground, which one thread calls, and which speaks and hears by its guard.
 
     What raises in it is told as an event: robots that fly need it more than they need what it could
     not do. Only NameTakenError is raised.
     """
 
-    def __init__(self, setup: FleetSetup, clock: Clock, listener: GroundListener) -> None:
+    def __init__(
+        self, setup: FleetSetup, clock: Clock, listener: GroundListener, guard: Guard
+    ) -> None:
         self.station = Station(setup, clock.monotonic_s(), clock.unix_s())
         self.commands = Commands(self.station)
-        self.link: Link | None = None
+        self._guard = guard
+        self._link: Link | None = None
         self._clock = clock
         self._listener = listener
         self._names = {f"robot/{robot}": name for name, robot in setup.robots.items()}
@@ -57,9 +70,21 @@ class GroundNode:
         self._complained: set[str] = set()
 
     @property
-    def subscriptions(self) -> Mapping[Topic, Callable[[str, bytes], None]]:
-        """What it hears: topic -> callback with the key and the data, in the node's thread."""
-        return dict.fromkeys((STATUS, EXPLORED, STATE, WORLD), self.receive)
+    def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
+        """What it hears: topic -> callback with the key and the data, in the node's thread.
+
+        It raises NameTakenError.
+        """
+        topics = (STATUS, EXPLORED, STATE, WORLD)
+        return self._guard.subscriptions(dict.fromkeys(topics, self._hear))
+
+    def attach(self, link: Link) -> None:
+        """What it says goes there from now on."""
+        self._link = self._guard.over(link)
+
+    def detach(self) -> None:
+        """What it says goes nowhere from now on."""
+        self._link = None
 
     @property
     def explored(self) -> tuple[Explored, ...]:
@@ -71,11 +96,10 @@ class GroundNode:
         """The fleet now."""
         return self.station.snapshot(self.commands.texts)
 
-    def receive(self, key: str, data: bytes) -> None:
-        """Something came. Raises NameTakenError."""
+    def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
         self._set_time()
         try:
-            self._receive(key, data)
+            self._receive(key, data, speaker)
         except NameTakenError:
             raise
         except Exception as error:
@@ -116,7 +140,7 @@ class GroundNode:
     def _set_time(self) -> None:
         self.station.set_time(self._clock.monotonic_s(), self._clock.unix_s())
 
-    def _receive(self, key: str, data: bytes) -> None:
+    def _receive(self, key: str, data: bytes, speaker: Speaker) -> None:
         source, _, topic = key.rpartition("/")
         name = self._names.get(source)
         if topic == EXPLORED.name:
@@ -127,11 +151,14 @@ class GroundNode:
             return
         try:
             if topic == STATE.name:
-                self.station.hear_state(decode(GroundState, data))
+                self.station.hear_state(decode(GroundState, data), speaker)
             elif topic == WORLD.name:
                 self.station.hear_world(data.decode(errors="replace"))
             else:
-                self.station.hear_status(decode(RobotStatus, data))
+                status = decode(RobotStatus, data)
+                if source != f"robot/{status.robot_id}":
+                    raise MessageError(f"it says that it is robot {status.robot_id}")
+                self.station.hear_status(status)
         except MessageError as error:
             # Another version of the program, say.
             self._complain(key, name or "", f"{topic} is not understood: {error}")
@@ -162,16 +189,16 @@ class GroundNode:
             self._listener.commanded(station.state)
         state, orders = station.published_state(), station.published_orders()
         self._published = (None if state is None else state.sequence, len(orders))
-        if self.link is None:
+        if self._link is None:
             return
         if state is not None:
-            self.link.publish(STATE, encode(state))
+            self._link.publish(STATE, encode(state))
         for order in orders:
-            self.link.publish(ORDER, encode(order))
+            self._link.publish(ORDER, encode(order))
         world, now_s = station.published_world(), self._clock.monotonic_s()
         if world is not None and now_s - self._world_at_s >= _WORLD_PERIOD_S:
             self._world_at_s = now_s
-            self.link.publish(WORLD, world.encode())
+            self._link.publish(WORLD, world.encode())
 
     def survive(self, what: str, error: Exception) -> None:
         """Tell of a defect, and go on."""

@@ -9,12 +9,15 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from edge.drivers.clock import SystemClock
 from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.guard import Unguarded
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import GroundState
+from edge.messages.topics import ReceiveCallback
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.ground.station.client import MAX_LINE, GroundError, socket_path
 from lpac.ground.station.commands import DEFECT
@@ -60,7 +63,9 @@ class GroundProcess:
     def __init__(self, config: GroundConfig, tell: Callable[[GroundEvent], None]) -> None:
         self._config = config
         self._tell = tell
-        self._node = GroundNode(config.setup, SystemClock(), self)
+        clock, identity = SystemClock(), config.identity
+        guard = Unguarded() if identity is None else identity.guard(clock.monotonic_s)
+        self._node = GroundNode(config.setup, clock, self, guard)
         self._clients: set[_Client] = set()
         self._world = config.setup.world
         self._socket_path = socket_path(config.setup.fleet)
@@ -75,21 +80,25 @@ class GroundProcess:
 
         Raises GroundError, LinkError or NameTakenError, in one line.
         """
-        fleet = self._config.setup.fleet
+        fleet, identity = self._config.setup.fleet, self._config.identity
         loop = asyncio.get_running_loop()
         self._failed = loop.create_future()
         self._recall()
 
-        def received(key: str, data: bytes) -> None:
+        def received(hear: ReceiveCallback, key: str, data: bytes) -> None:
             with suppress(RuntimeError):  # The loop has ended.
-                loop.call_soon_threadsafe(self._receive, key, data)
+                loop.call_soon_threadsafe(self._receive, hear, key, data)
 
         _refuse_second(self._socket_path, fleet)
         with ZenohLink(
             fleet=fleet,
             connect=self._config.connect,
-            subscriptions=dict.fromkeys(self._node.subscriptions, received),
-        ) as self._node.link:
+            subscriptions={
+                topic: partial(received, hear) for topic, hear in self._node.subscriptions.items()
+            },
+            tls=None if identity is None else identity.tls,
+        ) as link:
+            self._node.attach(link)
             server = await asyncio.start_unix_server(self._serve, self._socket_path, limit=MAX_LINE)
             self._socket_path.chmod(0o600)
             on_listening()
@@ -112,10 +121,10 @@ class GroundProcess:
         statuses = map(station.lately, self._config.setup.robots)
         return station.commands and not all(map(is_down, filter(None, statuses)))
 
-    def _receive(self, key: str, data: bytes) -> None:
+    def _receive(self, hear: ReceiveCallback, key: str, data: bytes) -> None:
         assert self._failed is not None
         try:
-            self._node.receive(key, data)
+            hear(key, data)
         except NameTakenError as error:
             if not self._failed.done():
                 self._failed.set_exception(error)

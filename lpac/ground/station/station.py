@@ -15,6 +15,8 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
+from edge.identity.card import Role
+from edge.identity.guard import Speaker
 from edge.messages.codes import CheckCode, Refusal, RefusalCode
 from edge.messages.mission import (
     ON_GROUND,
@@ -55,6 +57,8 @@ _LATER_S = 1e-3
 _EVENTS_KEPT = 200
 _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
+# Who asks for a hold gets the commander's sequence up by no more at a time.
+_MOST_SEQUENCES_AHEAD = 1000
 
 _S = FlightState
 T = TypeVar("T")
@@ -327,8 +331,16 @@ class Station:
             if order.kind != "kill":
                 self._refuse(order.order_id, RefusalCode.INTERRUPTED, self.interruption)
 
-    def hear_state(self, state: GroundState) -> None:
-        """Another station's state came. Raises NameTakenError if it has this one's name."""
+    def hear_state(self, state: GroundState, speaker: Speaker) -> None:
+        """Another station's state came. Raises NameTakenError if it has this one's name.
+
+        Of one that is signed by another key than the operator's that it names only a hold counts.
+        """
+        if speaker.name not in ("", state.operator):
+            self._hear_asked_hold(state, speaker.name)
+            return
+        if speaker.role is not Role.OPERATOR:
+            return
         if state.operator == self.operator:
             self._hear_own_name(state)
             return
@@ -363,8 +375,20 @@ class Station:
         if not by_observer:
             raise self._name_taken()
         after = replace(_with_hold_of(own, state), sequence=state.sequence + 1)
-        self._tell_changes(own, after, state.safety_action_by)
-        self.interruption = f"{state.safety_action_by} commands hold"
+        self._take_asked_hold(own, after, state.safety_action_by)
+
+    def _hear_asked_hold(self, asked: GroundState, by: str) -> None:
+        own = self.state
+        if not self.commands or own is None or asked.operator != self.operator:
+            return
+        if not own.sequence < asked.sequence <= own.sequence + _MOST_SEQUENCES_AHEAD:
+            return
+        held = _with_hold_of(own, replace(asked, safety_action_by=by))
+        self._take_asked_hold(own, replace(held, sequence=asked.sequence + 1), by)
+
+    def _take_asked_hold(self, before: GroundState, after: GroundState, by: str) -> None:
+        self._tell_changes(before, after, by)
+        self.interruption = f"{by} commands hold"
         self.state = after
 
     def _name_taken(self) -> NameTakenError:

@@ -45,8 +45,9 @@ class FleetScenario:
     The world is that of a `lpac.sim.experiment.Scenario` with the same seed. Without `errors` the
     simulated vehicles' estimates are off by noise alone, and the air stands still. `budget` is what
     the robots take their errors for: how far apart they stand and fly. `sensor` is the `type` in
-    robot.toml's [sensor]. They stand at `pads_m`, (x, y) of the mission frame, or else where there
-    is room.
+    robot.toml's [sensor]. With `secure` robots and ground are members of a fleet, with keys that
+    are made for it. They stand at `pads_m`, (x, y) of the mission frame, or else where there is
+    room.
 
     Raises ValueError that names what is impossible.
     """
@@ -59,6 +60,7 @@ class FleetScenario:
     errors: bool = True
     budget: ErrorBudget = ERRORS
     sensor: str = "world"
+    secure: bool = False
     pads_m: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
@@ -128,25 +130,28 @@ class Layout:
         *,
         settings: Mapping[str, Mapping[str, object]] | None = None,
         spares: int = 0,
+        keys: bool = False,
     ) -> None:
         """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
 
         `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
         `settings` are further keys of robot.toml's tables, for all robots. The last `spares` lose
-        their slots in fleet.toml, once their robot.toml is written.
+        their slots in fleet.toml, once their robot.toml is written. `keys`: a secure fleet has them
+        in `folder`, where `write_keys` puts them.
         """
         assert self.features is not None
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "world.env").write_text(format_world(self.features))
         robot = robot_table(self.fence, self.max_speed_m_s, self.scenario.budget)
         robot["sensor"] = {"type": self.scenario.sensor}
-        for table, keys in (settings or {}).items():
-            robot[table] = {**robot.get(table, {}), **keys}
+        for table, values in (settings or {}).items():
+            robot[table] = {**robot.get(table, {}), **values}
         config = write_fleet(
             folder / "fleet.toml",
             "Made by `lpac sim`: the robots are programs of this machine, without image or SSH.",
             {
                 "fleet": fleet,
+                **({"keys": "keys"} if self.scenario.secure and keys else {}),
                 "image": "none",
                 "bundle": str(self.bundle_path),
                 "world": "world.env",
@@ -172,7 +177,7 @@ class Layout:
                 ],
             },
         )
-        places = Places(str(self.bundle_path), "../../world.env", "logs", "127.0.0.1")
+        places = Places(str(self.bundle_path), "../../world.env", "identity", "logs", "127.0.0.1")
         for robot_id, name in enumerate(robots):
             write_robot(folder / "robots" / str(robot_id) / "robot.toml", config, name, places)
         for slot in range(len(robots) - spares, len(robots)):

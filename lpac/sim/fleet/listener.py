@@ -3,10 +3,13 @@
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple, Self
 
+from edge.drivers.identity_folder import load_identity
 from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.guard import Guard, Speaker, Unguarded
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import STATUS
@@ -31,10 +34,18 @@ class FleetListener:
     Every method may be called from any thread.
     """
 
-    def __init__(self, *, fleet: str, connect: Sequence[str], say: Say = lambda _: None) -> None:
-        """`connect` are the robots' endpoints; `say` is told what cannot be understood, from
-        another thread."""
+    def __init__(
+        self,
+        *,
+        fleet: str,
+        connect: Sequence[str],
+        identity: Path | None = None,
+        say: Say = lambda _: None,
+    ) -> None:
+        """`connect` are the robots' endpoints; `identity` is the folder of its own, where they have
+        one; `say` is told what cannot be understood, from another thread."""
         self._fleet = fleet
+        self._identity = identity
         self._connect = tuple(connect)
         self._say = say
         self._changed = threading.Condition()
@@ -43,11 +54,17 @@ class FleetListener:
 
     def __enter__(self) -> Self:
         """Raises LinkError."""
+        guard: Guard = Unguarded()
+        tls, scheme = None, "tcp"
+        if self._identity is not None:
+            identity = load_identity(self._identity, fleet=self._fleet, unix_s=time.time())
+            guard, tls, scheme = identity.guard(time.monotonic), identity.tls, "tls"
         self._link = ZenohLink(
             fleet=self._fleet,
-            listen=("tcp/127.0.0.1:0",),
+            listen=(f"{scheme}/127.0.0.1:0",),
             connect=self._connect,
-            subscriptions={STATUS: lambda _, data: self._take(time.monotonic(), data)},
+            subscriptions=guard.subscriptions({STATUS: self._hear}),
+            tls=tls,
         )
         return self
 
@@ -90,7 +107,8 @@ class FleetListener:
                 self._changed.wait(min(left_s, _LOOK_AGAIN_S))
         return True
 
-    def _take(self, at_s: float, data: bytes) -> None:
+    def _hear(self, _: str, data: bytes, __: Speaker) -> None:
+        at_s = time.monotonic()
         try:
             status = decode(RobotStatus, data)
         except MessageError as error:

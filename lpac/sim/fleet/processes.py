@@ -15,6 +15,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.robot.config import Rates
+from lpac.sim.fleet.keys import write_keys
 from lpac.sim.fleet.layout import WORLD, FleetScenario, Layout
 from lpac.sim.fleet.listener import FleetListener, Say
 from lpac.sim.fleet.vehicles import SimulatedVehicles, Vehicles
@@ -190,7 +191,8 @@ class Fleet:
             starts_m = [self.layout.to_world_m(pad_m) for pad_m in self.layout.pads_m]
             self.vehicles = Px4Build(px4_build, starts_m, WORLD, self.folder / "px4")
         ports = free_ports(scenario.robots)
-        self.endpoints = tuple(f"tcp/127.0.0.1:{port}" for port in ports)
+        scheme = "tls" if scenario.secure else "tcp"
+        self.endpoints = tuple(f"{scheme}/127.0.0.1:{port}" for port in ports)
         self.name = f"sim-{ports[0]}"
         self.robots = tuple(
             RobotProcess(robot, self.folder / "robots" / str(robot))
@@ -198,8 +200,12 @@ class Fleet:
         )
         self.carried: int | None = None
         self._say = say
+        keys = write_keys(self.folder, self.name, scenario.robots) if scenario.secure else None
         self.heard = FleetListener(
-            fleet=self.name, connect=self.endpoints, say=self.say_unless_behind
+            fleet=self.name,
+            connect=self.endpoints,
+            identity=keys,
+            say=self.say_unless_behind,
         )
         self._late_before = Backlog(0.0, 0.0)
         self._latenesses = deque([(-math.inf, self._late_before)])
@@ -217,6 +223,7 @@ class Fleet:
                     self.robots, ports, self.vehicles.autopilots, strict=True
                 )
             },
+            keys=True,
         )
 
     def __enter__(self) -> Self:

@@ -17,6 +17,7 @@ from edge.core.ports import SensorOver
 from edge.core.vehicle import Action, Mode
 from edge.drivers.flight_log import FlightLog
 from edge.drivers.registry import load_verified_policy, open_sensor
+from edge.identity.guard import Guard, Unguarded
 from edge.messages.mission import RobotStatus
 from edge.messages.topics import Link
 from edge.policy.family import VerifiedPolicy, verified
@@ -62,6 +63,7 @@ class SimulatedRobot:
         schedule: Schedule,
         rng: np.random.Generator,
         open_link: Callable[["SimulatedRobot", Subscriptions], OpenLink],
+        new_guard: Callable[["SimulatedRobot", int], Guard],
         next_boot: Callable[[], int],
         vehicle_step_s: float,
         logs: bool,
@@ -78,6 +80,7 @@ class SimulatedRobot:
         self._schedule = schedule
         self._rng = rng
         self._open_link = open_link
+        self._new_guard = new_guard
         self._next_boot = next_boot
         self._link: OpenLink | None = None
         self._logs = logs
@@ -107,10 +110,12 @@ class SimulatedRobot:
             ),
             self._policy,
             self.world,
+            self._new_guard(self, boot),
             boot_nonce=boot,
             boot_epoch=int(schedule.unix_s() * 1e3) + boot,
         )
-        self._link = node.link = self._open_link(self, node.subscriptions)
+        self._link = self._open_link(self, node.subscriptions)
+        node.attach(self._link)
         rates = self.config.rates
         steps: tuple[tuple[str, float, Callable[[], object]], ...] = (
             ("control", 1.0 / rates.control_hz, node.control_step),
@@ -238,6 +243,7 @@ class SimulatedRobots:
             self.schedule,
             self._rng,
             self._open_link,
+            self._new_guard,
             self._next_boot,
             self._vehicle_step_s,
             self._logs,
@@ -252,6 +258,10 @@ class SimulatedRobots:
 
     def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> OpenLink:
         raise NotImplementedError
+
+    def _new_guard(self, robot: SimulatedRobot, start: int) -> Guard:
+        """What that start of its program speaks and hears through."""
+        return Unguarded()
 
     def _next_boot(self) -> int:
         self._boots += 1

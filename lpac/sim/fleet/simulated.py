@@ -12,11 +12,15 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, Self, TypeVar
 
+from edge.identity.card import Role
+from edge.identity.guard import Guard, Unguarded
 from edge.messages.mission import GroundState
+from edge.messages.topics import ReceiveCallback
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.procedure import NothingComesError, Procedure, Until
 from lpac.ground.station.config import load_ground
@@ -29,6 +33,7 @@ from lpac.ground.station.protocol import (
 )
 from lpac.ground.station.station import NameTakenError
 from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.robots import VEHICLE_STEP_S, Settings, SimulatedRobot, SimulatedRobots
 from lpac.sim.radio import GROUND, Radio, RadioLink, Subscriptions
 from lpac.sim.schedule import Schedule
@@ -65,6 +70,7 @@ class SimulatedFleet(SimulatedRobots):
 
         See `SimulatedRobots` for the others. Raises what `Layout` does.
         """
+        self.members = SimulatedMembers("simulated") if scenario.secure else None
         super().__init__(
             scenario,
             folder,
@@ -97,7 +103,8 @@ class SimulatedFleet(SimulatedRobots):
             former.leave()
             station = former.station_id
         setup = replace(self._setup, operator=operator)
-        ground = SimulatedGround(setup, self.schedule, self.radio, station)
+        guard = self._guard(Role.OPERATOR, operator, None, self._next_boot())
+        ground = SimulatedGround(setup, self.schedule, self.radio, station, guard)
         if former is not None and remembers:
             ground.recall(former)
         self.grounds[operator] = ground
@@ -117,33 +124,50 @@ class SimulatedFleet(SimulatedRobots):
     def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> RadioLink:
         return self.radio.link(robot.config.robot_id, subscriptions)
 
+    def _new_guard(self, robot: SimulatedRobot, start: int) -> Guard:
+        robot_id = robot.config.robot_id
+        return self._guard(Role.ROBOT, f"r{robot_id}", robot_id, start)
+
+    def _guard(self, role: Role, name: str, robot_id: int | None, start: int) -> Guard:
+        if self.members is None:
+            return Unguarded()
+        return self.members.guard(role, name, robot_id, start, self.schedule.monotonic_s)
+
 
 class SimulatedGround:
     """The real ground on the simulated clock: a `Ground` for procedures, which it carries out.
 
-    `problem` is why it ended by itself, None while it runs; `station_id` is who it is on the radio.
+    `runs` until it ends; `problem` is why it ended by itself, None if it did not; `station_id` is
+    who it is on the radio.
     """
 
-    def __init__(self, setup: FleetSetup, schedule: Schedule, radio: Radio, station: int) -> None:
+    def __init__(
+        self, setup: FleetSetup, schedule: Schedule, radio: Radio, station: int, guard: Guard
+    ) -> None:
         self.events: list[GroundEvent] = []
         self.station_id = station
         self.problem: NameTakenError | None = None
-        self.node = GroundNode(setup, schedule, self)
+        self.runs = True
+        self.node = GroundNode(setup, schedule, self, guard)
         self._schedule = schedule
         self._snapshot = self.node.snapshot
         # What outlives it, on its disk.
         self._commanded: GroundState | None = None
         self._world = ""
-        subscriptions = dict.fromkeys(self.node.subscriptions, self._receive)
-        self._link = self.node.link = radio.link(station, subscriptions)
+        self._link = radio.link(
+            station,
+            {t: partial(self._receive, hear) for t, hear in self.node.subscriptions.items()},
+        )
+        self.node.attach(self._link)
         self._ticks = schedule.every(SNAPSHOT_PERIOD_S, self._tick)
 
     def leave(self) -> None:
         """It ends, as by a loss of power."""
-        if self.node.link is not None:
+        if self.runs:
+            self.runs = False
             self._ticks.stop()
             self._link.close()
-            self.node.link = None
+            self.node.detach()
 
     def recall(self, former: "SimulatedGround") -> None:
         """Know what the one before left on its disk."""
@@ -208,9 +232,9 @@ class SimulatedGround:
         """To the disk."""
         self._commanded = state
 
-    def _receive(self, key: str, data: bytes) -> None:
+    def _receive(self, hear: ReceiveCallback, key: str, data: bytes) -> None:
         try:
-            self.node.receive(key, data)
+            hear(key, data)
         except NameTakenError as problem:
             self._end(problem)
 

@@ -88,7 +88,7 @@ class Field:
     def stations(self) -> Mapping[str, Station]:
         """Of the grounds that run."""
         grounds = self.fleet.grounds
-        return {n: g.node.station for n, g in grounds.items() if g.node.link is not None}
+        return {n: g.node.station for n, g in grounds.items() if g.runs}
 
     @property
     def commands(self) -> Mapping[str, Commands]:
@@ -186,11 +186,13 @@ class Field:
 
 
 @cache
-def _flown(n: int, spares: int, stage: Stage) -> Field:
+def _flown(n: int, spares: int, stage: Stage, secure: bool) -> Field:
     """The fleet that others are copies of."""
     if stage == "standing":
         with tempfile.TemporaryDirectory() as folder:
-            scenario = FleetScenario(robots=n + spares, seed=3, errors=False, budget=PRECISE)
+            scenario = FleetScenario(
+                robots=n + spares, seed=3, errors=False, budget=PRECISE, secure=secure
+            )
             fleet = SimulatedFleet(
                 scenario, Path(folder), SHIPPED,
                 operator="alice", settings=_SETTINGS, spares=spares, vehicle_step_s=0.1,
@@ -204,7 +206,7 @@ def _flown(n: int, spares: int, stage: Stage) -> Field:
     before: dict[Stage, Stage] = {
         "ready": "standing", "hovering": "ready", "flying": "hovering",
     }  # fmt: skip
-    field = a_field(n, before[stage], spares=spares)
+    field = a_field(n, before[stage], spares=spares, secure=secure)
     requests: dict[Stage, tuple[Request, ...]] = {
         "ready": (SetOrigin(ORIGIN), Enable()),
         "hovering": (Takeoff(interval_s=0.0),),
@@ -225,9 +227,14 @@ def _come_so_far(field: Field) -> Field:
     return field
 
 
-def a_field(n: int = 3, stage: Stage = "standing", *, spares: int = 0, seed: int = 0) -> Field:
-    """N robots that alice commands, and spares that fly nowhere; `seed` is the radio's luck."""
-    field = Field(_flown(n, spares, stage).fleet.copy())
+def a_field(
+    n: int = 3, stage: Stage = "standing", *, spares: int = 0, seed: int = 0, secure: bool = False
+) -> Field:
+    """N robots that alice commands, and spares that fly nowhere; `seed` is the radio's luck.
+
+    With `secure` all of them sign what they say.
+    """
+    field = Field(_flown(n, spares, stage, secure).fleet.copy())
     if seed:
         field.fleet.radio.rng = np.random.default_rng(seed)
     return field

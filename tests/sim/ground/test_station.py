@@ -11,6 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edge.identity.card import Role
+from edge.identity.guard import Speaker, Unguarded
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
 from lpac.ground.station.protocol import (
@@ -36,6 +38,8 @@ from lpac.sim.fleet.simulated import SimulatedGround
 from tests.said import not_done, problem
 from tests.sim.ground.field import Field, a_field
 from tests.unit.ground.snapshots import on_ground, setup
+
+ANYBODY = Speaker(Role.OPERATOR, "")
 
 _S = FlightState
 OTHER_WORLD = "CircularBND 100 100 20 5\n"
@@ -803,18 +807,20 @@ def test_a_name_is_one_stations() -> None:
     state = alice.published_state()
     assert state is not None
     with pytest.raises(NameTakenError, match="--name"):
-        twin.hear_state(state)
+        twin.hear_state(state, ANYBODY)
     # A state of its own former life that says less is no other's.
-    alice.hear_state(replace(state, sequence=state.sequence - 1))
+    alice.hear_state(replace(state, sequence=state.sequence - 1), ANYBODY)
     with pytest.raises(NameTakenError):
-        alice.hear_state(replace(state, sequence=state.sequence + 1))
+        alice.hear_state(replace(state, sequence=state.sequence + 1), ANYBODY)
 
 
 @pytest.mark.parametrize("robots", [1, 3])
 def test_a_second_station_of_a_name_ends_and_not_the_first(robots: int) -> None:
     field = a_field(robots, "flying")
     fleet = field.fleet
-    twin = SimulatedGround(field.stations["alice"].setup, fleet.schedule, fleet.radio, -7)
+    twin = SimulatedGround(
+        field.stations["alice"].setup, fleet.schedule, fleet.radio, -7, Unguarded()
+    )
     # Each hears the robots, and not the other.
     field.air = replace(field.air, partition=(frozenset({-1}), frozenset({-7})))
     field.until(lambda: twin.problem, 10.0)

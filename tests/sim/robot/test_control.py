@@ -27,6 +27,8 @@ from edge.core.vehicle import (
 from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
+from edge.identity.card import Role
+from edge.identity.guard import Speaker
 from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode
@@ -52,6 +54,8 @@ from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
 from tests.robot_rig import ORIGIN, new_vehicle, write_config
 from tests.said import checks, codes, why
 from tests.unit.flight.test_preflight import NEIGHBOUR
+
+ANYBODY = Speaker(Role.OPERATOR, "")
 
 FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 28.0)
 PLACE = Place(slot=1, landing_point_m=(14.0, 12.0))
@@ -195,7 +199,7 @@ class Flown:
 
     def tick(self) -> None:
         """One tenth of a second of everything."""
-        self.inbox.put_ground(encode(self.ground), self.now_s, self.now_s)
+        self.inbox.put_ground(encode(self.ground), ANYBODY, self.now_s, self.now_s)
         self.look()
         perceived = self.pac.perceive(self.now_s)
         self.images = None if perceived is None else perceived.inputs["images"]
@@ -221,7 +225,7 @@ class Flown:
             order_id=str(self._orders), robot_id=3, boot_nonce=11, kind=kind,
             expires_at_uptime_s=self.now_s + 9.0, operator="test", trial=trial,
         )  # fmt: skip
-        self.inbox.put_order(encode(order))
+        self.inbox.put_order(encode(order), ANYBODY)
         self.tick()
         return self.control.flight.answers[-1]
 

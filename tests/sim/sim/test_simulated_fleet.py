@@ -13,6 +13,7 @@ import pytest
 
 from edge.core import F64
 from edge.drivers.flight_log import read
+from edge.identity.guard import Unguarded
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from edge.policy.lpac.policy import LpacPolicy
@@ -164,14 +165,14 @@ def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     # A ground of the same computer knows what the one before said.
     assert ground.command(SafetyCommand("hold", robots=("r1",))).done
     again = fleet.join("operator")
-    assert ground.node.link is None and not again.node.station.commands
+    assert not ground.runs and not again.node.station.commands
     assert again.carry_out(_until_all(lambda robot: robot.fresh, 10.0))
     again.carry_out(_pass(3.0))
     assert again.node.station.commands and again.node.station.state is not None
     assert again.node.station.state.robot_safety_actions == {"1": "hold"}
     # Another one of another name observes; one of the same name, on another computer, ends.
     other = fleet.join("other")
-    twin = SimulatedGround(again.setup, fleet.schedule, fleet.radio, -9)
+    twin = SimulatedGround(again.setup, fleet.schedule, fleet.radio, -9, Unguarded())
     again.carry_out(_pass(5.0))
     assert (other.node.station.commands, other.node.station.commander) == (False, "operator")
     assert again.problem is None and "--name" in str(twin.problem)

@@ -18,7 +18,7 @@ from edge.policy.bundle import Bundle, make_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from tests.conftest import SHIPPED
 
-LINK = LinkSetting("demo", None, "peer", (), (), True, {}, {})
+LINK = LinkSetting("demo", None, "peer", (), (), True, {}, {}, None)
 VEHICLE = VehicleSetting("udpin://127.0.0.1:14999", 1, {})
 
 

@@ -494,7 +494,7 @@ def test_a_file_that_would_be_wrong_is_not_written(tmp_path: Path) -> None:
 
 def test_a_robot_may_have_its_files_elsewhere(tmp_path: Path) -> None:
     config = load_fleet(EXAMPLE)
-    places = Places("/policy", "field.env", "kept", "127.0.0.1")
+    places = Places("/policy", "field.env", "who", "kept", "127.0.0.1")
     write_robot(tmp_path / "r2" / "robot.toml", config, "r2", places)
     robot = load_config(tmp_path / "r2" / "robot.toml")
     assert (robot.policy.bundle, robot.policy.world, robot.log.folder) == (

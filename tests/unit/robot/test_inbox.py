@@ -8,10 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.identity.card import Role
+from edge.identity.guard import Speaker
 from edge.messages.codec import encode
 from edge.messages.mission import GroundState, Order, Origin
 from edge.robot.inbox import Inbox
 from tests.unit.flight.test_preflight import NEIGHBOUR
+
+ANYBODY = Speaker(Role.OPERATOR, "")
 
 STATE = GroundState(sequence=5, operator="anna", origin=Origin(40.0, -75.0, 30.0), enabled=True)
 ORDER = Order("a", 3, 77, "takeoff", 12.0, "anna")
@@ -29,28 +33,28 @@ def test_nothing_heard_is_infinitely_old() -> None:
 
 def test_the_ground_state_ages_until_the_next_comes() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     assert inbox.ground(1.5) == (STATE, 0.5)
     assert inbox.ground(3.0) == (STATE, 2.0)
-    inbox.put_ground(encode(STATE), 3.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 3.0, 1e9)
     assert inbox.ground(3.0) == (STATE, 0.0)
 
 
 def test_an_older_state_that_arrives_late_does_not_count() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     assert inbox.ground(1.0)[0] == STATE
     older = dataclasses.replace(STATE, sequence=4, safety_action="land")
-    inbox.put_ground(encode(older), 1.5, 1e9)
+    inbox.put_ground(encode(older), ANYBODY, 1.5, 1e9)
     assert inbox.ground(1.5) == (STATE, 0.5)
 
 
 def test_a_ground_that_starts_anew_is_heard_once_the_old_one_is_lost() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     inbox.ground(1.0)
     anew = GroundState(sequence=0, operator="ben")
-    inbox.put_ground(encode(anew), 5.0, 1e9)
+    inbox.put_ground(encode(anew), ANYBODY, 5.0, 1e9)
     assert inbox.ground(5.0) == (anew, 0.0)
 
 
@@ -59,7 +63,7 @@ def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_count
 
     def hear(now_s: float, *states: GroundState) -> tuple[GroundState | None, float]:
         for state in states:
-            inbox.put_ground(encode(state), now_s, 1e9)
+            inbox.put_ground(encode(state), ANYBODY, now_s, 1e9)
         return inbox.ground(now_s)
 
     ben, cleo = (dataclasses.replace(STATE, operator=name) for name in ("ben", "cleo"))
@@ -80,7 +84,7 @@ def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_count
 def test_orders_for_others_are_passed_over() -> None:
     inbox = make_inbox()
     for robot_id in (1, 3, 2):
-        inbox.put_order(encode(dataclasses.replace(ORDER, robot_id=robot_id)))
+        inbox.put_order(encode(dataclasses.replace(ORDER, robot_id=robot_id)), ANYBODY)
     assert inbox.order() == ORDER
     assert inbox.order() is None
 
@@ -88,10 +92,10 @@ def test_orders_for_others_are_passed_over() -> None:
 @given(st.binary() | st.text().map(str.encode) | st.just(b"[" * 100_000) | st.just(b"{}"))
 def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     assert inbox.ground(1.0)[0] == STATE
-    inbox.put_ground(data, 2.0, 1e9)
-    inbox.put_order(data)
+    inbox.put_ground(data, ANYBODY, 2.0, 1e9)
+    inbox.put_order(data, ANYBODY)
     assert inbox.ground(2.0) == (STATE, 1.0)
     assert inbox.order() is None
     assert inbox.peers(2.0) == ()
@@ -106,38 +110,40 @@ def newer(message: GroundState | Order, **changes: object) -> bytes:
 
 def test_a_state_that_is_not_understood_holds_and_lands_and_ages_the_last_one() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     for now_s, action, form in ((1.5, "none", "none"), (2.0, "hold", "hold"),
                                 (3.0, "return", "none"), (4.5, "land", "land")):  # fmt: skip
-        inbox.put_ground(newer(STATE, sequence=6, safety_action=action), now_s, 1e9)
+        inbox.put_ground(newer(STATE, sequence=6, safety_action=action), ANYBODY, now_s, 1e9)
         # The last one that was understood stays, and ground lost counts on.
         assert inbox.ground(now_s) == (STATE, now_s - 1.0)
         assert inbox.safety_form(now_s) == form
         assert "new: this program is too old to know" in inbox.ground_refusal
     assert inbox.safety_form(7.6) == "none"
-    inbox.put_ground(newer(STATE, robot_safety_actions={"3": "hold", "4": "land"}), 8.0, 1e9)
+    inbox.put_ground(
+        newer(STATE, robot_safety_actions={"3": "hold", "4": "land"}), ANYBODY, 8.0, 1e9
+    )
     inbox.ground(8.0)
     assert inbox.safety_form(8.0) == "hold"
     again = dataclasses.replace(STATE, sequence=7)
-    inbox.put_ground(encode(again), 8.5, 1e9)
+    inbox.put_ground(encode(again), ANYBODY, 8.5, 1e9)
     assert inbox.ground(8.5) == (again, 0.0)
     assert (inbox.safety_form(8.5), inbox.ground_refusal) == ("none", "")
 
 
 def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     inbox.ground(1.0)
-    inbox.put_ground(newer(STATE, sequence=4, safety_action="land"), 1.5, 1e9)
+    inbox.put_ground(newer(STATE, sequence=4, safety_action="land"), ANYBODY, 1.5, 1e9)
     inbox.ground(1.5)
     assert inbox.safety_form(1.5) == "none"
 
 
 def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
     inbox = make_inbox()
-    inbox.put_order(newer(ORDER))
+    inbox.put_order(newer(ORDER), ANYBODY)
     assert inbox.order() is None
-    inbox.put_order(newer(ORDER, kind="kill"))
+    inbox.put_order(newer(ORDER, kind="kill"), ANYBODY)
     kill = inbox.order()
     assert kill is not None and (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)
 
@@ -164,3 +170,55 @@ def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
     for now_s, names in ((2.0, ["robot 4"]), (4.5, [])):
         assert inbox.peers(now_s) == ()
         assert list(inbox.not_understood) == names
+
+
+def test_of_who_does_not_command_only_a_hold_counts() -> None:
+    ann, bob = Speaker(Role.OPERATOR, "ann"), Speaker(Role.OPERATOR, "bob")
+    guest = Speaker(Role.OBSERVER, "guest")
+    inbox = Inbox(3, 3.0)
+    state = dataclasses.replace(STATE, operator="ann", safety_action="none")
+    after = state.sequence + 1
+
+    def obeyed(**changes: object) -> tuple[str, int]:
+        """Asked by another than the commander, just before 1.0 s."""
+        inbox.put_ground(encode(state), ann, 0.9, 1e9)
+        asked = dataclasses.replace(state, **{"sequence": after, **changes})  # type: ignore[arg-type]
+        inbox.put_ground(encode(asked), speaker, 0.95, 1e9)
+        ground, age_s = inbox.ground(1.0)
+        assert ground is not None and ground.operator == "ann" and age_s == pytest.approx(0.1)
+        return ground.safety_action_for(3), ground.sequence
+
+    for speaker in (bob, guest):
+        inbox = Inbox(3, 3.0)
+        assert obeyed(safety_action="land") == ("none", state.sequence)
+        assert obeyed(enabled=False, robot_safety_actions={"4": "hold"}) == ("none", state.sequence)
+        # Nobody gets far ahead of the commander.
+        assert obeyed(safety_action="hold", sequence=after + 10**6) == ("none", state.sequence)
+        assert obeyed(safety_action="hold") == ("hold", after)
+        ground, _ = inbox.ground(2.4)
+        assert ground is not None and ground.safety_action_by == speaker.name
+        # It ends with whoever says it, and with what the commander says next.
+        assert inbox.ground(2.5)[0] == state
+        assert obeyed(robot_safety_actions={"3": "hold"}) == ("hold", after)
+        landing = dataclasses.replace(state, sequence=after, safety_action="land")
+        inbox.put_ground(encode(landing), ann, 1.1, 1e9)
+        assert inbox.ground(1.1)[0] == landing
+    # Nor does one that can only be understood in part.
+    inbox = Inbox(3, 3.0)
+    for action, known in (("land", "none"), ("hold", "hold")):
+        data = newer(state, sequence=after, safety_action=action)
+        inbox.put_ground(data, guest, 1.0, 1e9)
+        inbox.ground(1.0)
+        assert inbox.safety_form(1.0) == known
+
+
+def test_an_order_is_its_operators_own() -> None:
+    inbox = Inbox(3, 3.0)
+    order = dataclasses.replace(ORDER, robot_id=3, operator="ann")
+    for kind in ("takeoff", "kill"):
+        data = encode(dataclasses.replace(order, kind=kind))
+        inbox.put_order(data, Speaker(Role.OPERATOR, "bob"))
+        inbox.put_order(data, Speaker(Role.OBSERVER, "ann"))
+        assert inbox.order() is None
+        inbox.put_order(data, Speaker(Role.OPERATOR, "ann"))
+        assert inbox.order() == dataclasses.replace(order, kind=kind)

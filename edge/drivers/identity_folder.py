@@ -1,0 +1,144 @@
+"""A member's identity on its disk: what `lpac fleet` put there, and a secret key that never leaves.
+
+| file | what |
+| --- | --- |
+| `identity.json` | fleet, authority (its public key) and card, both in hexadecimal digits |
+| `key.pem` | the secret key, PKCS #8; for nobody else to read |
+| `certificate.pem`, `authority.pem` | for TLS: of the same key, and of the authority |
+| `revoked` | the newest list of revoked keys that was heard |
+| `start` | the number of this start of the program, greater than those before |
+"""
+
+import base64
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from edge.core.schema import ConfigError
+from edge.identity.card import Card, CardError
+from edge.identity.guard import Membership, SignedGuard
+from edge.identity.signature import SEED_BYTES, Signer
+from edge.messages.topics import TlsFiles
+
+# The DER of an Ed25519 secret key (RFC 8410) is this, and then its seed.
+_PKCS8_HEAD = bytes.fromhex("302e020100300506032b657004220420")
+_MOST_BYTES = 2**16
+_REVOKED, _START = "revoked", "start"
+AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM = "authority.pem", "certificate.pem", "key.pem"
+IDENTITY_JSON = "identity.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """One start of a member's program."""
+
+    folder: Path
+    membership: Membership
+    card: Card
+    tls: TlsFiles
+    revocations: bytes
+
+    def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
+        """What the program speaks and hears through; `clock_s` is its monotonic clock."""
+        return SignedGuard(self.membership, clock_s, self.revocations)
+
+    def keep(self, revocations: bytes) -> None:
+        """Write the newest list of revoked keys. Raises OSError."""
+        _write(self.folder / _REVOKED, revocations)
+
+
+def load_identity(folder: Path, *, fleet: str, unix_s: float) -> Identity:
+    """The identity in the folder, for a new start of the program.
+
+    Starts are numbered by the wall clock, ms, or by one more than the last where that is behind:
+    a computer whose clock was lost is heard all the same.
+
+    Raises ConfigError, in one line, for what cannot be used; OSError.
+    """
+    try:
+        written = _Written.read(folder / IDENTITY_JSON)
+        signer = Signer(_seed(folder / KEY_PEM))
+        start = max(_last_start(folder / _START) + 1, int(unix_s * 1e3))
+        membership = Membership(written.authority_key, signer, written.card_data, start)
+        card = membership.card
+        revoked = folder / _REVOKED
+        revocations = _bytes_of(revoked) if revoked.exists() else b""
+        # Before anything counts on it.
+        SignedGuard(membership, lambda: 0.0, revocations)
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"{folder}: {Path(error.filename).name} is missing: enroll it first (lpac fleet enroll "
+            "for a robot, lpac fleet operator for a ground station)"
+        ) from None
+    except (CardError, ValueError) as error:
+        raise ConfigError(f"{folder}: {error}") from None
+    if card.fleet != fleet or written.fleet != fleet:
+        raise ConfigError(f"{folder}: is of fleet {card.fleet!r}, not of {fleet!r}")
+    _write(folder / _START, f"{start}\n".encode())
+    paths = (str(folder / name) for name in (AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM))
+    return Identity(folder, membership, card, TlsFiles(*paths), revocations)
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    fleet: str
+    authority: str
+    card: str
+
+    @classmethod
+    def read(cls, path: Path) -> "_Written":
+        try:
+            return msgspec.json.decode(_bytes_of(path), type=cls)
+        except msgspec.MsgspecError as error:
+            raise ValueError(f"{path.name}: {error}") from None
+
+    @property
+    def authority_key(self) -> bytes:
+        return bytes.fromhex(self.authority)
+
+    @property
+    def card_data(self) -> bytes:
+        return bytes.fromhex(self.card)
+
+
+def identity_json(fleet: str, authority: bytes, card_data: bytes) -> bytes:
+    """The file of that name."""
+    return msgspec.json.encode(_Written(fleet, authority.hex(), card_data.hex()))
+
+
+def _seed(path: Path) -> bytes:
+    if path.stat().st_mode & 0o077:
+        raise ValueError(f"{path.name} is readable for others: chmod 600 {path}")
+    match = re.search(
+        r"-----BEGIN PRIVATE KEY-----([A-Za-z0-9+/=\s]+)-----END PRIVATE KEY-----",
+        _bytes_of(path).decode("ascii", "replace"),
+    )
+    der = base64.b64decode(match[1]) if match else b""
+    if len(der) != len(_PKCS8_HEAD) + SEED_BYTES or not der.startswith(_PKCS8_HEAD):
+        raise ValueError(f"{path.name}: is no Ed25519 key (PKCS #8, PEM)")
+    return der[len(_PKCS8_HEAD) :]
+
+
+def _last_start(path: Path) -> int:
+    try:
+        return min(max(int(_bytes_of(path)), 0), 2**47)
+    except (FileNotFoundError, ValueError):  # The first one, or its disk was full.
+        return 0
+
+
+def _bytes_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_MOST_BYTES)
+
+
+def _write(path: Path, data: bytes) -> None:
+    new = path.with_name(f"{path.name}-new")
+    with new.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)

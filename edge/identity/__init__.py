@@ -1,0 +1,1 @@
+"""Who speaks on the radio: cards, signed envelopes, and what is not a member's is not heard."""

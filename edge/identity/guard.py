@@ -1,0 +1,328 @@
+"""Between a node and its link: what goes out is signed, what comes in is a member's or nobody's.
+
+Who a message is from is decided here, before anything of it is decoded and whatever brought it.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
+from threading import Lock
+from typing import NamedTuple, Protocol
+
+from edge.core import log
+from edge.identity.card import Card, CardError, Revocations, Role, verified
+from edge.identity.envelope import Address, Envelope, read_envelope, seal
+from edge.identity.signature import Signer
+from edge.messages.topics import (
+    CARD,
+    GROUND_CARD,
+    REVOKED,
+    STATE,
+    Link,
+    ReceiveCallback,
+    Topic,
+)
+
+_MOST_CARDS = 1000
+# How often a card is shown anyway, and at most when somebody new is heard.
+_SHOWN_EVERY_S = 1.0 / CARD.rate_hz
+_SHOWN_AT_MOST_EVERY_S = 0.25
+
+
+class Speaker(NamedTuple):
+    """Who said a message: `name` is its card's, "" where messages are not signed."""
+
+    role: Role
+    name: str
+
+
+# Of the key below `lpac/<fleet>/`, the payload and who said it; from any thread.
+Hear = Callable[[str, bytes, Speaker], None]
+
+
+class RefusedMessage(StrEnum):
+    """Why a message is nobody's."""
+
+    NO_ENVELOPE = "no_envelope"
+    UNKNOWN_KEY = "unknown_key"
+    REVOKED = "revoked"
+    NOT_ALLOWED = "not_allowed"
+    FORGED = "forged"
+    REPLAYED = "replayed"
+
+
+class CardProblem(StrEnum):
+    """Why others do not listen to this member, or it must not take off."""
+
+    REVOKED = "revoked"
+    REPLACED = "replaced"
+    EXPIRED = "expired"
+
+
+class Guard(Protocol):
+    """What a node speaks and hears through."""
+
+    def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
+        """What the link is to be opened with, so that the node hears those topics."""
+
+    def over(self, link: Link) -> Link:
+        """What the node says goes there, and so to the link."""
+
+    def card_problem(self, unix_s: float) -> CardProblem | None:
+        """What is wrong with this member's own card at that time; None: nothing."""
+
+
+class Unguarded:
+    """Messages go as they are, and are taken for those of the keys that they come on.
+
+    For a radio that nobody else can reach.
+    """
+
+    def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
+        """See `Guard`."""
+        return {topic: partial(_hear_by_key, callback) for topic, callback in hear.items()}
+
+    def over(self, link: Link) -> Link:
+        """See `Guard`."""
+        return link
+
+    def card_problem(self, unix_s: float) -> CardProblem | None:
+        """See `Guard`."""
+
+
+def _hear_by_key(hear: Hear, key: str, data: bytes) -> None:
+    hear(key, data, Speaker(Role.ROBOT if key.startswith("robot/") else Role.OPERATOR, ""))
+
+
+@dataclass(frozen=True, slots=True)
+class Membership:
+    """One program's place in its fleet.
+
+    `authority` is the public key of the fleet's authority, `card_data` the card as it signed it,
+    `start` what tells this start of the program from all before, which were smaller.
+    """
+
+    authority: bytes
+    signer: Signer
+    card_data: bytes
+    start: int
+
+    @property
+    def card(self) -> Card:
+        """Who it is. Raises CardError if the card is another key's, or not this authority's."""
+        card = verified(Card, self.card_data, self.authority)
+        if card.public_key != self.signer.public_key:
+            raise CardError(f"the card of {card.name} is for another key than the one beside it")
+        return card
+
+
+class SignedGuard:
+    """The guard of a member. From any thread.
+
+    Nobody needs a list of members: each shows its card, which the authority has signed, now and
+    then and when somebody new is heard. `revocations` is the newest signed list that is known.
+    """
+
+    def __init__(
+        self, membership: Membership, clock_s: Callable[[], float], revocations: bytes = b""
+    ) -> None:
+        """Raises CardError for a card or a list that is not this fleet's."""
+        self.card = membership.card
+        self._membership = membership
+        self._clock_s = clock_s
+        self._lock = Lock()
+        self._members: dict[tuple[Role, str], Card] = {self.card.member: self.card}
+        self._cards: dict[bytes, Card] = {self.card.fingerprint: self.card}
+        self._revocations = Revocations(0)
+        self._revoked: frozenset[bytes] = frozenset()
+        self.revocations = b""
+        self._heard: dict[tuple[bytes, str], tuple[int, int]] = {}
+        self._refused: Counter[RefusedMessage] = Counter()
+        self._sequence = 0
+        self._shown_at_s = -math.inf
+        self._show_soon = False
+        if revocations:
+            self._hear_revocations(verified(Revocations, revocations, self._authority), revocations)
+
+    @property
+    def _authority(self) -> bytes:
+        return self._membership.authority
+
+    def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
+        """See `Guard`."""
+        return {
+            **{topic: partial(self._receive, topic, callback) for topic, callback in hear.items()},
+            CARD: self._receive_card,
+            GROUND_CARD: self._receive_card,
+            REVOKED: self._receive_revocations,
+        }
+
+    def over(self, link: Link) -> Link:
+        """See `Guard`."""
+        return _SigningLink(self, link)
+
+    def card_problem(self, unix_s: float) -> CardProblem | None:
+        """See `Guard`."""
+        if self.card.fingerprint in self._revoked:
+            return CardProblem.REVOKED
+        if self._members[self.card.member] is not self.card:
+            return CardProblem.REPLACED
+        return CardProblem.EXPIRED if unix_s > self.card.expires_unix_s else None
+
+    def refused(self) -> dict[str, int]:
+        """How many messages were nobody's, by why."""
+        with self._lock:
+            return {reason.value: count for reason, count in self._refused.items()}
+
+    # What goes out
+
+    def seal(self, topic: Topic, payload: bytes) -> bytes:
+        """The payload in this member's envelope."""
+        with self._lock:
+            self._sequence += 1
+            sequence = self._sequence
+        return seal(
+            payload,
+            signer=self._membership.signer,
+            address=Address(self._authority, self._own_key(topic)),
+            start=self._membership.start,
+            sequence=sequence,
+        )
+
+    def _own_key(self, topic: Topic) -> str:
+        if self.card.role is Role.ROBOT:
+            return f"robot/{self.card.robot_id}/{topic.name}"
+        return f"ground/{topic.name}"
+
+    def to_show(self) -> tuple[tuple[Topic, bytes], ...]:
+        """What goes out besides, now: the own card, and from an operator the revocations."""
+        now_s = self._clock_s()
+        with self._lock:
+            wait_s = _SHOWN_AT_MOST_EVERY_S if self._show_soon else _SHOWN_EVERY_S
+            if now_s - self._shown_at_s < wait_s:
+                return ()
+            self._shown_at_s, self._show_soon = now_s, False
+        card = CARD if self.card.role is Role.ROBOT else GROUND_CARD
+        shown = [(card, self._membership.card_data)]
+        if self.card.role is Role.OPERATOR and self.revocations:
+            shown.append((REVOKED, self.revocations))
+        return tuple(shown)
+
+    # What comes in
+
+    def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> None:
+        found = self._opened(topic, key, data)
+        if isinstance(found, RefusedMessage):
+            self._refuse(found, key)
+        else:
+            hear(key, found[0], found[1])
+
+    def _opened(
+        self, topic: Topic, key: str, data: bytes
+    ) -> tuple[bytes, Speaker] | RefusedMessage:
+        envelope = read_envelope(data)
+        if envelope is None:
+            return RefusedMessage.NO_ENVELOPE
+        card = self._cards.get(envelope.fingerprint)
+        if envelope.fingerprint in self._revoked:
+            return RefusedMessage.REVOKED
+        if card is None:
+            self._show_soon = True  # It may know as little of this one.
+            return RefusedMessage.UNKNOWN_KEY
+        if not _may_say(card, topic, key):
+            return RefusedMessage.NOT_ALLOWED
+        if not envelope.is_from(card.public_key, Address(self._authority, key)):
+            return RefusedMessage.FORGED
+        if not self._is_news(key, envelope):
+            return RefusedMessage.REPLAYED
+        return envelope.payload, Speaker(card.role, card.name)
+
+    def _is_news(self, key: str, envelope: Envelope) -> bool:
+        said = envelope.start, envelope.sequence
+        with self._lock:
+            if said <= self._heard.get((envelope.fingerprint, key), (-1, -1)):
+                return False
+            self._heard[envelope.fingerprint, key] = said
+        return True
+
+    def _receive_card(self, key: str, data: bytes) -> None:
+        try:
+            card = verified(Card, data, self._authority)
+        except CardError:
+            self._refuse(RefusedMessage.FORGED, key)
+            return
+        topic = CARD if card.role is Role.ROBOT else GROUND_CARD
+        if not _is_of(card, topic, key):
+            self._refuse(RefusedMessage.NOT_ALLOWED, key)
+            return
+        with self._lock:
+            known = self._members.get(card.member)
+            if known is not None and known.serial >= card.serial:
+                return
+            if known is None and len(self._members) >= _MOST_CARDS:
+                return
+            if known is not None:
+                del self._cards[known.fingerprint]
+            self._members[card.member] = self._cards[card.fingerprint] = card
+            self._show_soon = True
+
+    def _receive_revocations(self, key: str, data: bytes) -> None:
+        if data == self.revocations:
+            return
+        try:
+            revocations = verified(Revocations, data, self._authority)
+        except CardError:
+            self._refuse(RefusedMessage.FORGED, key)
+            return
+        self._hear_revocations(revocations, data)
+
+    def _hear_revocations(self, revocations: Revocations, data: bytes) -> None:
+        with self._lock:
+            if revocations.count > self._revocations.count:
+                self._revocations, self.revocations = revocations, data
+                self._revoked = frozenset(map(bytes.fromhex, revocations.fingerprints))
+
+    def _refuse(self, reason: RefusedMessage, key: str) -> None:
+        with self._lock:
+            self._refused[reason] += 1
+            first = self._refused[reason] == 1
+        # Of whoever comes the card is not known at first.
+        if first and reason is not RefusedMessage.UNKNOWN_KEY:
+            log.warning("a message is not listened to", why=reason.value, key=key)
+
+
+class _SigningLink:
+    """A link on which everything is signed."""
+
+    def __init__(self, guard: SignedGuard, link: Link) -> None:
+        self._guard = guard
+        self._link = link
+
+    def publish(self, topic: Topic, data: bytes) -> None:
+        """Send to whoever listens; it may be lost."""
+        for other, shown in self._guard.to_show():
+            self._link.publish(other, shown)
+        self._link.publish(topic, self._guard.seal(topic, data))
+
+    def is_claimed(self, robot_id: int) -> bool:
+        """Whether another program than this one says that it is that robot."""
+        return self._link.is_claimed(robot_id)
+
+    def peers(self) -> int:
+        """How many others it reaches now."""
+        return self._link.peers()
+
+
+def _is_of(card: Card, topic: Topic, key: str) -> bool:
+    """Whether that is the member's own key."""
+    if card.role is Role.ROBOT:
+        return key == f"robot/{card.robot_id}/{topic.name}"
+    return key == f"ground/{topic.name}"
+
+
+def _may_say(card: Card, topic: Topic, key: str) -> bool:
+    """An observer says a state, of which others take only hold."""
+    return _is_of(card, topic, key) and (card.role is not Role.OBSERVER or topic is STATE)

@@ -1,0 +1,208 @@
+"""Who may not fly the fleet does not: real programs and real radio, judged by the vehicles' truth.
+
+Three robots and their ground fly with keys of their own; whoever attacks has what an outsider has,
+or another fleet's keys, or those of a stolen robot.
+"""
+
+import json
+import secrets
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from edge.drivers.identity_folder import load_identity
+from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.card import Role
+from edge.identity.guard import SignedGuard
+from edge.messages.codec import encode
+from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
+from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
+from lpac.fleet.authority import create_authority, new_member
+from lpac.ground.station.protocol import SafetyCommand
+from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.processes import Fleet
+from tests.conftest import SHIPPED
+from tests.process.sim.fault_rig import FaultRig, flies_on
+
+pytestmark = pytest.mark.real_time
+
+STOLEN = 2
+_S = FlightState
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
+    """A fleet with keys, in its mission."""
+    scenario = FleetScenario(robots=3, secure=True)
+    fleet = Fleet(scenario, tmp_path_factory.mktemp("secure"), SHIPPED)
+    with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
+        rig = FaultRig(fleet, ground, range(3), fleet.vehicles)  # type: ignore[arg-type]
+        rig.assemble()
+        rig.make_ready()
+        rig.take_off()
+        rig.start()
+        yield rig
+
+
+@contextmanager
+def session(fleet: Fleet, tls: Mapping[str, object] | None) -> Iterator[zenoh.Session]:
+    """A session on the robots' radio that keeps to no rule."""
+    scheme = "tcp" if tls is None else "tls"
+    config = zenoh.Config()
+    for key, value in {
+        "scouting/multicast/enabled": False,
+        "listen/endpoints": [f"{scheme}/127.0.0.1:0"],
+        "connect/endpoints": [e.replace("tls/", f"{scheme}/") for e in fleet.endpoints],
+        **({} if tls is None else {"transport/link/tls": tls}),
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as opened:
+        yield opened
+
+
+def certified(files: TlsFiles) -> dict[str, object]:
+    return {
+        "root_ca_certificate": files.authority, "enable_mtls": True,
+        "verify_name_on_connect": False,
+        "listen_private_key": files.key, "listen_certificate": files.certificate,
+        "connect_private_key": files.key, "connect_certificate": files.certificate,
+    }  # fmt: skip
+
+
+def attack(rig: FaultRig, session: zenoh.Session, seal: Callable[[Topic, bytes], bytes]) -> None:
+    """In the operator's name, and a robot's: states that land all, kills, and false statuses."""
+    prefix = f"lpac/{rig.fleet.name}/"
+    state = rig.ground.told.snapshot.ground
+    assert state is not None
+    lands = GroundState(
+        **{
+            **{name: getattr(state, name) for name in GroundState.__dataclass_fields__},
+            "sequence": state.sequence + 100,
+            "safety_action": "land",
+        }
+    )
+    for robot in range(3):
+        status = rig.status(robot)
+        kill = Order(
+            order_id=secrets.token_hex(6),
+            robot_id=robot,
+            boot_nonce=status.boot_nonce,
+            kind="kill",
+            expires_at_uptime_s=status.uptime_s + 5.0,
+            operator=status.operator,
+        )
+        for data in (encode(kill), seal(ORDER, encode(kill))):
+            session.put(f"{prefix}ground/order", data)
+        for data in (encode(status), seal(STATUS, encode(status))):
+            session.put(f"{prefix}robot/{robot}/status", data)
+    for data in (encode(lands), seal(STATE, encode(lands))):
+        session.put(f"{prefix}ground/state", data)
+
+
+def nothing_comes_of(rig: FaultRig, once: Callable[[], None]) -> None:
+    """It is done twenty times while the robots fly, and all of them go on with their mission."""
+    rig.start()
+    sequence = rig.status(0).obeyed_sequence
+    for _ in range(20):
+        once()
+        # Long enough for something to come of it.
+        rig.wait_status(0, partial(_is_later, rig.status(0).sequence))
+    for robot in range(3):
+        vehicle, status = rig.simulated_vehicle(robot), rig.status(robot)
+        assert vehicle.armed and not vehicle.landed
+        assert flies_on(status), (robot, status.state, status.reason)
+        assert (status.operator, status.obeyed_sequence) == ("sim", sequence)
+    snapshot = rig.ground.told.snapshot
+    assert rig.ground.running and snapshot.commander == "sim"
+    assert all(robot.fresh and not robot.duplicate for robot in snapshot.robots)
+
+
+def _is_later(sequence: int, status: RobotStatus) -> bool:
+    return status.sequence > sequence
+
+
+def as_it_is(_: Topic, data: bytes) -> bytes:
+    return data
+
+
+def test_without_a_key_nobody_gets_in(rig: FaultRig) -> None:
+    keys = rig.fleet.folder / "keys"
+    one_sided = {
+        "root_ca_certificate": str(keys / "authority.pem"), "enable_mtls": False,
+        "verify_name_on_connect": False,
+        "listen_private_key": str(keys / "key.pem"),
+        "listen_certificate": str(keys / "certificate.pem"),
+    }  # fmt: skip
+    with session(rig.fleet, None) as plain, session(rig.fleet, one_sided) as nameless:
+
+        def once() -> None:
+            for opened in (plain, nameless):
+                attack(rig, opened, as_it_is)
+
+        nothing_comes_of(rig, once)
+        assert not plain.info.peers_zid() and not nameless.info.peers_zid()
+
+
+def test_another_fleet_of_the_same_name_does_not_meet_this_one(
+    rig: FaultRig, tmp_path: Path
+) -> None:
+    authority = create_authority(tmp_path / "keys", rig.fleet.name)
+    new_member(authority, tmp_path / "keys", Role.OPERATOR, "sim")
+    other = load_identity(tmp_path / "keys", fleet=rig.fleet.name, unix_s=2e9)
+    heard = threading.Event()
+    with (
+        ZenohLink(
+            fleet=rig.fleet.name,
+            connect=rig.fleet.endpoints,
+            tls=other.tls,
+            subscriptions={STATUS: lambda *_: heard.set()},
+        ) as link,
+        session(rig.fleet, certified(other.tls)) as opened,
+    ):
+        guard = SignedGuard(other.membership, lambda: 0.0)
+        nothing_comes_of(rig, lambda: attack(rig, opened, guard.seal))
+        assert link.peers() == 0 and not opened.info.peers_zid()
+    assert not heard.is_set()
+
+
+def test_a_stolen_robots_key_commands_nobody(rig: FaultRig, tmp_path: Path) -> None:
+    """Nor do the operator's own messages, said again by whoever has heard them."""
+    folder = rig.fleet.robots[STOLEN].folder / "identity"
+    stolen = load_identity(folder, fleet=rig.fleet.name, unix_s=1.0)
+    # It does not speak as itself here: then the others would take it for that robot's next start.
+    guard = SignedGuard(stolen.membership, lambda: 0.0)
+    recorded: dict[str, bytes] = {}
+    prefix = f"lpac/{rig.fleet.name}/"
+    with session(rig.fleet, certified(stolen.tls)) as opened:
+        for topic in TOPICS:
+            opened.declare_subscriber(
+                prefix + topic.pattern,
+                lambda sample: recorded.update({str(sample.key_expr): sample.payload.to_bytes()}),
+            )
+
+        def seal(topic: Topic, data: bytes) -> bytes:
+            return data if topic is STATUS else guard.seal(topic, data)
+
+        def once() -> None:
+            attack(rig, opened, seal)
+            for key, data in dict(recorded).items():
+                if not key.startswith(f"{prefix}robot/{STOLEN}/"):
+                    opened.put(key, data)
+
+        nothing_comes_of(rig, once)
+        # It was in, and heard what members hear.
+        assert len(opened.info.peers_zid()) >= 3
+        assert f"{prefix}ground/state" in recorded
+
+
+def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
+    assert rig.command(SafetyCommand("hold")).done
+    assert {rig.status(robot).state for robot in range(3)} == {_S.HOLD}
+    assert rig.command(SafetyCommand("land", wait=True)).done
+    assert all(rig.simulated_vehicle(robot).landed for robot in range(3))

@@ -1,0 +1,265 @@
+"""Only members of the fleet are heard, each only as itself."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.identity.card import Card, CardError, Revocations, Role, signed
+from edge.identity.envelope import OVERHEAD_BYTES
+from edge.identity.guard import CardProblem, Membership, SignedGuard, Speaker, Unguarded
+from edge.identity.signature import Signer
+from edge.messages.topics import (
+    CARD,
+    GROUND_CARD,
+    MESSAGE,
+    ORDER,
+    REVOKED,
+    STATE,
+    STATUS,
+    ReceiveCallback,
+    Topic,
+)
+
+AUTHORITY = Signer(b"a" * 32)
+OTHER_FLEET = Signer(b"b" * 32)
+
+
+def membership(
+    role: Role,
+    name: str,
+    robot_id: int | None = None,
+    *,
+    authority: Signer = AUTHORITY,
+    start: int = 1,
+    serial: int = 1,
+    key: str = "",
+) -> Membership:
+    signer = Signer((key or f"{role} {name}").encode().ljust(32, b"."))
+    card = Card("demo", role, name, signer.public_key, serial, 2e9, robot_id)
+    return Membership(authority.public_key, signer, signed(card, authority), start)
+
+
+class Member:
+    """A guard, what it hears, and what it sends: by topic, as it goes over the air."""
+
+    def __init__(self, member: Membership, revocations: bytes = b"") -> None:
+        self.now_s = 0.0
+        self.guard = SignedGuard(member, lambda: self.now_s, revocations)
+        self.heard: list[tuple[str, bytes, Speaker]] = []
+        topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
+            dict.fromkeys((MESSAGE, STATUS, STATE, ORDER), lambda *said: self.heard.append(said))
+        )
+        self._topics = topics
+        self.sent: list[tuple[Topic, bytes]] = []
+        self._link = self.guard.over(self)
+
+    def publish(self, topic: Topic, data: bytes) -> None:
+        self.sent.append((topic, data))
+
+    def is_claimed(self, robot_id: int) -> bool:
+        return robot_id == 7
+
+    def peers(self) -> int:
+        return 3
+
+    def say(self, topic: Topic, data: bytes) -> list[tuple[Topic, bytes]]:
+        """What goes out for it."""
+        self.sent = []
+        self._link.publish(topic, data)
+        return self.sent
+
+    def key(self, topic: Topic) -> str:
+        card = self.guard.card
+        sender = "ground" if card.robot_id is None else f"robot/{card.robot_id}"
+        return f"{sender}/{topic.name}"
+
+    def hear(self, other: "Member", sent: list[tuple[Topic, bytes]], key: str = "") -> None:
+        for topic, data in sent:
+            self._topics[topic](key or other.key(topic), data)
+
+    def takes(self, topic: Topic, key: str, data: bytes) -> bool:
+        before = len(self.heard)
+        self._topics[topic](key, data)
+        return len(self.heard) > before
+
+
+def robot(robot_id: int, **changes: object) -> Member:
+    return Member(membership(Role.ROBOT, f"r{robot_id}", robot_id, **changes))  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def one() -> Member:
+    return robot(1)
+
+
+@pytest.fixture
+def two(one: Member) -> Member:
+    """Known to `one`, which heard its card."""
+    member = robot(2)
+    one.hear(member, member.say(MESSAGE, b"first"))
+    return member
+
+
+def test_a_member_shows_its_card_and_is_heard_as_itself(one: Member) -> None:
+    two = robot(2)
+    (topic, card), (_, message) = sent = two.say(MESSAGE, b"hello")
+    assert topic is CARD and len(message) == len(b"hello") + OVERHEAD_BYTES
+    # Unknown as long as its card was not heard; then at once.
+    assert not one.takes(MESSAGE, "robot/2/message", message)
+    one.hear(two, sent)
+    assert one.heard == [("robot/2/message", b"hello", Speaker(Role.ROBOT, "r2"))]
+    assert one.guard.refused() == {"unknown_key": 1}
+    # Who hears somebody new shows its own card soon.
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
+    one.now_s = 0.1
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
+    one.now_s = 2.1
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
+    # The same card again is no news.
+    assert not one.takes(CARD, "robot/2/card", card)
+
+
+@given(at=st.integers(0, 10_000), bit=st.integers(0, 7), payload=st.binary(max_size=300))
+def test_no_changed_message_is_heard(at: int, bit: int, payload: bytes) -> None:
+    one, two = robot(1), robot(2)
+    one.hear(two, two.say(MESSAGE, b"first"))
+    ((_, data),) = two.say(MESSAGE, payload)
+    changed = bytearray(data)
+    changed[at % len(data)] ^= 1 << bit
+    assert not one.takes(MESSAGE, "robot/2/message", bytes(changed))
+    assert one.takes(MESSAGE, "robot/2/message", data)
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_are_a_message_or_a_card(data: bytes) -> None:
+    one = robot(1)
+    for topic, key in ((MESSAGE, "robot/2/message"), (CARD, "robot/2/card")):
+        assert not one.takes(topic, key, data)
+    one._topics[REVOKED]("ground/revoked", data)
+    assert one.guard.revocations == b""
+
+
+def test_a_message_counts_once_and_for_its_own_place_only(one: Member, two: Member) -> None:
+    ((_, data),) = two.say(MESSAGE, b"second")
+    assert not one.takes(MESSAGE, "robot/3/message", data)
+    assert not one.takes(STATUS, "robot/2/status", data)
+    assert not one.takes(STATE, "ground/state", data)
+    assert one.takes(MESSAGE, "robot/2/message", data)
+    assert not one.takes(MESSAGE, "robot/2/message", data)
+    ((_, third),) = two.say(MESSAGE, b"third")
+    ((_, fourth),) = two.say(MESSAGE, b"fourth")
+    assert one.takes(MESSAGE, "robot/2/message", fourth)
+    assert not one.takes(MESSAGE, "robot/2/message", third)
+    # Its program starts again; what the former one said is over, whatever its sequence.
+    again = robot(2, start=2)
+    assert one.takes(MESSAGE, "robot/2/message", again.say(MESSAGE, b"anew")[-1][1])
+    ((_, former),) = two.say(MESSAGE, b"fifth")
+    assert not one.takes(MESSAGE, "robot/2/message", former)
+    assert one.guard.refused()["replayed"] == 3
+
+
+def test_a_robots_key_is_no_operators_and_no_other_robots(one: Member, two: Member) -> None:
+    data = two.guard.seal(STATE, b"land")
+    for topic, key in (
+        (STATE, "ground/state"),
+        (ORDER, "ground/order"),
+        (STATUS, "robot/1/status"),
+    ):
+        assert not one.takes(topic, key, data)
+    # A card for one is none for another.
+    three = membership(Role.ROBOT, "r3", 3)
+    one._topics[CARD]("robot/2/card", three.card_data)
+    assert one.guard.refused()["not_allowed"] == 4
+
+
+def test_an_observer_says_a_state_and_nothing_else(one: Member) -> None:
+    observer = Member(membership(Role.OBSERVER, "guest"))
+    operator = Member(membership(Role.OPERATOR, "ann"))
+    for member, heard in ((observer, [True, False]), (operator, [True, True])):
+        sent = member.say(STATE, b"state")
+        assert [topic for topic, _ in sent] == [GROUND_CARD, STATE]
+        one.hear(member, sent[:1])
+        said = [sent[1], member.say(ORDER, b"order")[-1]]
+        assert [one.takes(t, member.key(t), data) for t, data in said] == heard
+    assert [speaker for *_, speaker in one.heard] == [
+        Speaker(Role.OBSERVER, "guest"), Speaker(Role.OPERATOR, "ann"),
+        Speaker(Role.OPERATOR, "ann"),
+    ]  # fmt: skip
+
+
+def test_another_fleet_is_not_heard_even_of_the_same_name_and_key(one: Member) -> None:
+    stranger = robot(2, authority=OTHER_FLEET)
+    one.hear(stranger, stranger.say(MESSAGE, b"hello"))
+    assert not one.heard and one.guard.refused() == {"forged": 1, "unknown_key": 1}
+    # A key that both fleets have signs for one of them.
+    ours = robot(2)
+    one.hear(ours, ours.say(MESSAGE, b"")[:1])
+    assert not one.takes(MESSAGE, "robot/2/message", stranger.guard.seal(MESSAGE, b"hello"))
+
+
+def test_who_was_replaced_is_not_heard_any_more(one: Member, two: Member) -> None:
+    swapped = robot(2, serial=2, key="another computer")
+    one.hear(swapped, swapped.say(MESSAGE, b"I am two"))
+    assert one.heard[-1][1] == b"I am two"
+    assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"so am I"))
+    # The former card does not come back, and its holder knows why nobody listens.
+    two.now_s = 9.0
+    one.hear(two, two.say(MESSAGE, b"hello?"))
+    assert one.heard[-1][1] == b"I am two"
+    assert two.guard.card_problem(1.9e9) is None
+    assert two.guard.card_problem(2.1e9) is CardProblem.EXPIRED
+    swapped.now_s = 9.0
+    two.hear(swapped, swapped.say(MESSAGE, b"")[:1])
+    assert two.guard.card_problem(1.9e9) is CardProblem.REPLACED
+
+
+def test_a_revoked_key_is_not_heard_and_a_list_only_grows(one: Member, two: Member) -> None:
+    lists = [
+        signed(Revocations(count, tuple(fingerprints)), AUTHORITY)
+        for count, fingerprints in ((1, []), (2, [two.guard.card.fingerprint.hex()]), (3, []))
+    ]
+    forged = signed(Revocations(9, ()), OTHER_FLEET)
+    assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"1"))
+    for data in (lists[0], lists[1], forged, lists[0]):
+        one._topics[REVOKED]("ground/revoked", data)
+    assert one.guard.revocations == lists[1]
+    assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
+    # It is known from the disk, too, and to who was revoked.
+    revoked = Member(membership(Role.ROBOT, "r2", 2), lists[1])
+    assert revoked.guard.card_problem(1.9e9) is CardProblem.REVOKED
+    # An operator carries it on, an observer does not.
+    operator = Member(membership(Role.OPERATOR, "ann"), lists[1])
+    assert (REVOKED, lists[1]) in operator.say(STATE, b"")
+    observer = Member(membership(Role.OBSERVER, "guest"), lists[1])
+    assert REVOKED not in dict(observer.say(STATE, b""))
+    one._topics[REVOKED]("ground/revoked", lists[2])
+    assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
+
+
+def test_a_card_must_be_the_keys_beside_it() -> None:
+    member = membership(Role.ROBOT, "r1", 1)
+    with pytest.raises(CardError, match="for another key"):
+        SignedGuard(replace(member, signer=Signer(b"x" * 32)), lambda: 0.0)
+    with pytest.raises(CardError, match="has not signed it"):
+        SignedGuard(replace(member, authority=OTHER_FLEET.public_key), lambda: 0.0)
+    with pytest.raises(ValueError, match="a robot has one, and nobody else"):
+        Card("demo", Role.ROBOT, "r1", b"k" * 32, 1, 2e9)
+
+
+def test_without_a_guard_a_message_is_its_keys() -> None:
+    heard: list[tuple[str, bytes, Speaker]] = []
+    topics = Unguarded().subscriptions(
+        dict.fromkeys((MESSAGE, STATE), lambda *said: heard.append(said))
+    )
+    topics[MESSAGE]("robot/3/message", b"m")
+    topics[STATE]("ground/state", b"s")
+    assert [speaker for *_, speaker in heard] == [
+        Speaker(Role.ROBOT, ""), Speaker(Role.OPERATOR, ""),
+    ]  # fmt: skip
+
+
+def test_the_link_itself_is_asked_for_the_rest(one: Member) -> None:
+    assert one._link.is_claimed(7) and not one._link.is_claimed(1) and one._link.peers() == 3
