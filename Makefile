@@ -5,7 +5,7 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup check test lint hooks bench export image lock deploy start stop \
+.PHONY: help demo fly setup check test redteam lint hooks bench export image lock deploy start stop \
 	status fleet-demo screenshots clean
 .DEFAULT_GOAL := help
 
@@ -31,6 +31,10 @@ test: lint ## style, types, and every test; as root with real robot hosts too: h
 	some --numprocesses 2 $(BY_FILE) -m real_time; \
 	some -m alone; \
 	exit $$failed
+
+redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"
+	.venv/bin/pytest -v --tries 1000 tests/sim/ground/test_attacks.py tests/process/sim/test_attacks.py \
+		tests/process/cli/test_enemy_files.py tests/unit/identity tests/unit/messages
 
 lint: .venv/test ## style, and strict types of the product and its tests
 	.venv/bin/ruff check .

@@ -1,7 +1,8 @@
 """Robots in flight on this machine: how late their loops are, and what their programs take.
 
-Ten robots, and one beside busy processes. The processes are those of a fleet: each robot's with its
-radio, autopilot and flight log; its watchdog, a process of its own, is not counted.
+Ten robots, without keys and with them, and one beside busy processes. The processes are those of a
+fleet: each robot's with its radio, autopilot and flight log; its watchdog, a process of its own, is
+not counted.
 """
 
 import math
@@ -12,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from operator import attrgetter
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -56,7 +58,12 @@ def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = Tr
     """A flight of so many robots; and with `beside_busy` one of a single robot."""
     progress(f"loops: {robots} robots fly, about two minutes")
     crowd = _fly(robots, mission_s)
-    flights = {f"{robots} robots": crowd.statuses}
+    progress(f"loops: {robots} robots with keys fly, about two minutes")
+    with_keys = _fly(robots, mission_s, secure=True)
+    flights = {
+        f"{robots} robots": crowd.statuses,
+        f"{robots} robots with keys": with_keys.statuses,
+    }
     if beside_busy:
         progress("loops: one robot flies beside busy processes, about two minutes")
         with _busy():
@@ -69,10 +76,20 @@ def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = Tr
             figures.setdefault(name, {})[loop] = _summary(of_all)
             rows.append((name, loop, *_cells(of_all)))
     figures["taken"] = [each._asdict() for each in crowd.taken]
+    figures["taken_with_keys"] = [each._asdict() for each in with_keys.taken]
+    cpu, private = (
+        {
+            name: median(what(each) for each in flight.taken)
+            for name, flight in (("plain", crowd), ("with keys", with_keys))
+        }
+        for what in (attrgetter("all_cpu_percent"), attrgetter("private_mb"))
+    )
     medians = {
-        "processor, % of a core": (median(each.all_cpu_percent for each in crowd.taken), 4.0),
+        "processor, % of a core": (cpu["plain"], 4.0),
         "threads": (median(each.threads for each in crowd.taken), 40.0),
-        "private memory, MB": (median(each.private_mb for each in crowd.taken), 45.0),
+        "private memory, MB": (private["plain"], 45.0),
+        "processor, % of a core, that keys cost": (cpu["with keys"] - cpu["plain"], 1.0),
+        "private memory, MB, that keys cost": (private["with keys"] - private["plain"], 8.0),
     }
     return Report(
         "loops",
@@ -87,6 +104,11 @@ def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = Tr
                 f"What each of {robots} robots' programs takes in flight: the median, the most",
                 ("", "median", "most"),
                 _taken_rows(crowd.taken),
+            ),
+            Table(
+                "The same with keys: messages signed, and TLS",
+                ("", "median", "most"),
+                _taken_rows(with_keys.taken),
             ),
         ],
         [
@@ -108,7 +130,7 @@ def measure(robots: int = 10, mission_s: float = 60.0, *, beside_busy: bool = Tr
     )
 
 
-def _fly(robots: int, mission_s: float) -> _Flight:
+def _fly(robots: int, mission_s: float, *, secure: bool = False) -> _Flight:
     looks: list[tuple[float, list[Usage]]] = []
     began_s = looked_s = -math.inf
 
@@ -123,7 +145,7 @@ def _fly(robots: int, mission_s: float) -> _Flight:
             looks.append((now_s, [usage(robot.pid) for robot in fleet.robots]))
 
     with tempfile.TemporaryDirectory() as folder:
-        scenario = FleetScenario(robots=robots, seed=7, duration_s=mission_s)
+        scenario = FleetScenario(robots=robots, seed=7, duration_s=mission_s, secure=secure)
         fleet = Fleet(scenario, Path(folder), BUNDLE)
         flight = fly(fleet, watch=watch)
     if flight.problem is not None:

@@ -55,6 +55,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption(
         "--px4", type=Path, metavar="DIR", help="PX4's build folder, as `make px4_sitl` fills it"
     )
+    group.addoption(
+        "--tries", type=int, default=60, help="attacks before each hold and kill of an operator"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -58,6 +58,8 @@ LEFT_OUT = (
         "google", "flatbuffers", "protobuf-*", "flatbuffers-*", "rich", "rich-*", "pygments",
         "pygments-*", "markdown_it", "markdown_it_py-*", "mdurl", "mdurl-*", "lz4",
         "lz4-*", "zstandard/_cffi*",
+        # Of what PyNaCl brings only _cffi_backend is loaded.
+        "cffi", "pycparser",
     )),
 )  # fmt: skip
 # Mount points of the unit's sandbox and of a container, and the release itself.

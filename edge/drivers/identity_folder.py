@@ -19,7 +19,7 @@ from pathlib import Path
 import msgspec
 
 from edge.core.schema import ConfigError
-from edge.identity.card import Card, CardError
+from edge.identity.card import Card, CardError, verified
 from edge.identity.guard import Membership, SignedGuard
 from edge.identity.signature import SEED_BYTES, Signer
 from edge.messages.topics import TlsFiles
@@ -46,9 +46,17 @@ class Identity:
         """What the program speaks and hears through; `clock_s` is its monotonic clock."""
         return SignedGuard(self.membership, clock_s, self.revocations)
 
-    def keep(self, revocations: bytes) -> None:
-        """Write the newest list of revoked keys. Raises OSError."""
-        _write(self.folder / _REVOKED, revocations)
+    def exchange_revocations(self, guard: SignedGuard) -> None:
+        """Tell the guard of a newer list on the disk, and the disk of a newer one that it heard.
+
+        Raises OSError.
+        """
+        kept = _revocations_in(self.folder)
+        if kept == guard.revocations:
+            return
+        guard.hear_revocations(kept)
+        if guard.revocations != kept:
+            _write(self.folder / _REVOKED, guard.revocations)
 
 
 def load_identity(folder: Path, *, fleet: str, unix_s: float) -> Identity:
@@ -59,28 +67,51 @@ def load_identity(folder: Path, *, fleet: str, unix_s: float) -> Identity:
 
     Raises ConfigError, in one line, for what cannot be used; OSError.
     """
+    start = max(_last_start(folder / _START) + 1, int(unix_s * 1e3))
+    identity = _load(folder, fleet, start)
+    _write(folder / _START, f"{start}\n".encode())
+    return identity
+
+
+def listening_identity(folder: Path, *, fleet: str) -> Identity:
+    """The same for a program that says nothing: it is no new start, and nothing is written.
+
+    Raises as above.
+    """
+    return _load(folder, fleet, 0)
+
+
+def _load(folder: Path, fleet: str, start: int) -> Identity:
     try:
         written = _Written.read(folder / IDENTITY_JSON)
         signer = Signer(_seed(folder / KEY_PEM))
-        start = max(_last_start(folder / _START) + 1, int(unix_s * 1e3))
         membership = Membership(written.authority_key, signer, written.card_data, start)
         card = membership.card
-        revoked = folder / _REVOKED
-        revocations = _bytes_of(revoked) if revoked.exists() else b""
+        revocations = _revocations_in(folder)
         # Before anything counts on it.
         SignedGuard(membership, lambda: 0.0, revocations)
     except FileNotFoundError as error:
         raise ConfigError(
-            f"{folder}: {Path(error.filename).name} is missing: enroll it first (lpac fleet enroll "
-            "for a robot, lpac fleet operator for a ground station)"
+            f"{folder}: {Path(error.filename).name} is missing: enroll it first (`lpac fleet "
+            "enroll` for a robot, `lpac fleet operator` for a ground station)"
         ) from None
     except (CardError, ValueError) as error:
         raise ConfigError(f"{folder}: {error}") from None
     if card.fleet != fleet or written.fleet != fleet:
         raise ConfigError(f"{folder}: is of fleet {card.fleet!r}, not of {fleet!r}")
-    _write(folder / _START, f"{start}\n".encode())
     paths = (str(folder / name) for name in (AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM))
     return Identity(folder, membership, card, TlsFiles(*paths), revocations)
+
+
+def load_card(folder: Path, authority: bytes) -> Card:
+    """The card alone, as the authority of that public key signed it.
+
+    Raises ConfigError for what is none; OSError.
+    """
+    try:
+        return verified(Card, _Written.read(folder / IDENTITY_JSON).card_data, authority)
+    except (CardError, ValueError) as error:
+        raise ConfigError(f"{folder}: {error}") from None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +152,13 @@ def _seed(path: Path) -> bytes:
     if len(der) != len(_PKCS8_HEAD) + SEED_BYTES or not der.startswith(_PKCS8_HEAD):
         raise ValueError(f"{path.name}: is no Ed25519 key (PKCS #8, PEM)")
     return der[len(_PKCS8_HEAD) :]
+
+
+def _revocations_in(folder: Path) -> bytes:
+    try:
+        return _bytes_of(folder / _REVOKED)
+    except FileNotFoundError:
+        return b""
 
 
 def _last_start(path: Path) -> int:

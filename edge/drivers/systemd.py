@@ -48,11 +48,13 @@ def status_text(
     autopilot: bool,
     ages_s: Mapping[str, float | None],
     peers: int,
+    insecure: bool,
 ) -> str:
     """`STATUS=` and one JSON object: ASCII, below 3,000 characters, since systemd takes 4 kB.
 
     `monotonic_s` tells readers how old it is. `autopilot`: its telemetry is fresh. `ages_s`: since
     each loop's last tick that succeeded. `peers`: zenoh sessions connected to this one.
+    `insecure`: whoever is on the network can fly it.
     """
     text = {
         "monotonic_s": round(monotonic_s, 3),
@@ -74,6 +76,7 @@ def status_text(
             for name, loop in status.loops.items()
         },
         "peers": peers,
+        "insecure": insecure,
         # It is opened before the loops start, and closed after they ended.
         "link": True,
         "bundle_id": status.bundle_id,

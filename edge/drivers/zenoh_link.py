@@ -42,6 +42,7 @@ from edge.messages.topics import (
     Sender,
     TlsFiles,
     Topic,
+    is_loopback,
 )
 
 # Of 64 kB each, for topics that go later: a world that does not fit in there at once is dropped.
@@ -211,7 +212,9 @@ class ZenohLink:
         once = {"autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
         retry = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
         if mode == "peer":
-            listen = listen or ("tcp/0.0.0.0:0" if tls is None else "tls/0.0.0.0:0",)
+            # Who calls nobody elsewhere need not be called from there.
+            host = "127.0.0.1" if connect and all(map(is_loopback, connect)) else "0.0.0.0"
+            listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
         config = zenoh.Config()
         for key, value in {
             **({} if tls is None else self._tls(mode, tls)),

@@ -65,14 +65,24 @@ class CardProblem(StrEnum):
 class Guard(Protocol):
     """What a node speaks and hears through."""
 
+    @property
+    def role(self) -> Role | None:
+        """What it speaks as; None where nobody's word is signed."""
+
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
         """What the link is to be opened with, so that the node hears those topics."""
 
     def over(self, link: Link) -> Link:
         """What the node says goes there, and so to the link."""
 
+    def introduce(self) -> None:
+        """Show others who this is, if it is time; for a node that may have nothing to say."""
+
     def card_problem(self, unix_s: float) -> CardProblem | None:
         """What is wrong with this member's own card at that time; None: nothing."""
+
+    def revoked_robots(self) -> frozenset[int]:
+        """Robots that are listened to no more, and may still fly."""
 
 
 class Unguarded:
@@ -80,6 +90,10 @@ class Unguarded:
 
     For a radio that nobody else can reach.
     """
+
+    @property
+    def role(self) -> None:
+        """See `Guard`."""
 
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
         """See `Guard`."""
@@ -89,8 +103,15 @@ class Unguarded:
         """See `Guard`."""
         return link
 
+    def introduce(self) -> None:
+        """See `Guard`."""
+
     def card_problem(self, unix_s: float) -> CardProblem | None:
         """See `Guard`."""
+
+    def revoked_robots(self) -> frozenset[int]:
+        """See `Guard`."""
+        return frozenset()
 
 
 def _hear_by_key(hear: Hear, key: str, data: bytes) -> None:
@@ -144,8 +165,14 @@ class SignedGuard:
         self._sequence = 0
         self._shown_at_s = -math.inf
         self._show_soon = False
-        if revocations:
-            self._hear_revocations(verified(Revocations, revocations, self._authority), revocations)
+        self._link: Link | None = None
+        if revocations and not self.hear_revocations(revocations):
+            raise CardError("Revocations: this fleet's authority has not signed it")
+
+    @property
+    def role(self) -> Role:
+        """See `Guard`."""
+        return self.card.role
 
     @property
     def _authority(self) -> bytes:
@@ -162,7 +189,14 @@ class SignedGuard:
 
     def over(self, link: Link) -> Link:
         """See `Guard`."""
+        self._link = link
         return _SigningLink(self, link)
+
+    def introduce(self) -> None:
+        """See `Guard`."""
+        if self._link is not None:
+            for topic, shown in self._to_show():
+                self._link.publish(topic, shown)
 
     def card_problem(self, unix_s: float) -> CardProblem | None:
         """See `Guard`."""
@@ -171,6 +205,12 @@ class SignedGuard:
         if self._members[self.card.member] is not self.card:
             return CardProblem.REPLACED
         return CardProblem.EXPIRED if unix_s > self.card.expires_unix_s else None
+
+    def revoked_robots(self) -> frozenset[int]:
+        """See `Guard`."""
+        with self._lock:
+            revoked = [c for c in self._members.values() if c.fingerprint in self._revoked]
+        return frozenset(card.robot_id for card in revoked if card.robot_id is not None)
 
     def refused(self) -> dict[str, int]:
         """How many messages were nobody's, by why."""
@@ -197,8 +237,8 @@ class SignedGuard:
             return f"robot/{self.card.robot_id}/{topic.name}"
         return f"ground/{topic.name}"
 
-    def to_show(self) -> tuple[tuple[Topic, bytes], ...]:
-        """What goes out besides, now: the own card, and from an operator the revocations."""
+    def _to_show(self) -> tuple[tuple[Topic, bytes], ...]:
+        """The own card, and from an operator the revocations, if it is time."""
         now_s = self._clock_s()
         with self._lock:
             wait_s = _SHOWN_AT_MOST_EVERY_S if self._show_soon else _SHOWN_EVERY_S
@@ -270,20 +310,20 @@ class SignedGuard:
             self._show_soon = True
 
     def _receive_revocations(self, key: str, data: bytes) -> None:
-        if data == self.revocations:
-            return
+        if data != self.revocations and not self.hear_revocations(data):
+            self._refuse(RefusedMessage.FORGED, key)
+
+    def hear_revocations(self, data: bytes) -> bool:
+        """Take a signed list if it is a newer one; whether the authority has signed it at all."""
         try:
             revocations = verified(Revocations, data, self._authority)
         except CardError:
-            self._refuse(RefusedMessage.FORGED, key)
-            return
-        self._hear_revocations(revocations, data)
-
-    def _hear_revocations(self, revocations: Revocations, data: bytes) -> None:
+            return False
         with self._lock:
             if revocations.count > self._revocations.count:
                 self._revocations, self.revocations = revocations, data
                 self._revoked = frozenset(map(bytes.fromhex, revocations.fingerprints))
+        return True
 
     def _refuse(self, reason: RefusedMessage, key: str) -> None:
         with self._lock:
@@ -303,8 +343,7 @@ class _SigningLink:
 
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send to whoever listens; it may be lost."""
-        for other, shown in self._guard.to_show():
-            self._link.publish(other, shown)
+        self._guard.introduce()
         self._link.publish(topic, self._guard.seal(topic, data))
 
     def is_claimed(self, robot_id: int) -> bool:
@@ -325,4 +364,4 @@ def _is_of(card: Card, topic: Topic, key: str) -> bool:
 
 def _may_say(card: Card, topic: Topic, key: str) -> bool:
     """An observer says a state, of which others take only hold."""
-    return _is_of(card, topic, key) and (card.role is not Role.OBSERVER or topic is STATE)
+    return _is_of(card, topic, key) and (card.role is not Role.OBSERVER or topic == STATE)

@@ -23,6 +23,7 @@ from edge.flight.preflight import PreflightLimits
 from edge.flight.reach import Reach
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightParameters, RemoteControlLost, Robot
+from edge.messages.topics import is_loopback
 from edge.robot.pac import PacParameters, PayloadType
 
 # What fleet.toml has too. Each raises ValueError, one line that says what is allowed.
@@ -95,7 +96,7 @@ class LinkConfig:
 
     A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
     Members of a fleet ([identity]) meet by TLS: tls/192.168.8.10:7447. Without an identity whoever
-    reaches the radio can fly the robot.
+    reaches the radio can fly the robot: beyond this machine that must be said, by `insecure`.
     `type` is one of `edge.drivers.registry`; `options` is what another type takes besides.
     """
 
@@ -103,6 +104,7 @@ class LinkConfig:
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     scouting: bool = False
+    insecure: bool = False
     type: str = "zenoh"
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
@@ -119,6 +121,13 @@ class LinkConfig:
                     raise ValueError(
                         f"{name} = {endpoint!r}: must be tls/ADDRESS:PORT, or tcp/ADDRESS:PORT"
                     )
+
+    @property
+    def leaves_machine(self) -> bool:
+        """Whether somebody on another computer may be heard."""
+        if self.type != "zenoh" or self.scouting or not self.listen:
+            return True
+        return not all(map(is_loopback, (*self.listen, *self.connect)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,6 +231,13 @@ class RobotConfig:
     def __post_init__(self) -> None:
         require_name("fleet = ", self.fleet)
         require_robot_id(self.robot_id)
+        if self.identity.folder and self.link.insecure:
+            raise ValueError("link.insecure = true: not with [identity] folder")
+        if self.link.leaves_machine and not (self.identity.folder or self.link.insecure):
+            raise ValueError(
+                "[identity] folder is missing: whoever is on the network could fly this robot: "
+                "enroll it (`lpac fleet enroll`), or say link.insecure = true"
+            )
         if self.flight.command_timeout_s * self.rates.control_hz < 2.0:
             raise ValueError(
                 f"flight: command_timeout_s = {self.flight.command_timeout_s}: must be at least "

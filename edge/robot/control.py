@@ -40,6 +40,8 @@ from edge.robot.readiness import Assignment, Checks
 _MAX_BEACON_AGE_S = 1.5
 # Checks that are older say nothing about now.
 _MAX_CHECKS_AGE_S = 5.0
+# Longer than any drone stays in the air.
+_REVOKED_STAYS_S = 1800.0
 _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
 
 
@@ -54,10 +56,10 @@ class GroundWorld(NamedTuple):
 class FlightControl:
     """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
 
-    Another thread sets `checks`, `peers` (the other robots' beacons), and `world` for
-    the `wanted_world_id`, whole. `obeyed_sequence` and `operator` are the last ground state's.
-    `assignment` is what is flown by, `not_taken` what of the ground's state it is not. `energy` is
-    how long the battery lasts, and the way home takes.
+    Another thread sets `checks`, `peers` (the other robots' beacons), `revoked` (robots that nobody
+    listens to any more), and `world` for the `wanted_world_id`, whole. `obeyed_sequence` and
+    `operator` are the last ground state's. `assignment` is what is flown by, `not_taken` what of
+    the ground's state it is not. `energy` is how long the battery lasts, and the way home takes.
     """
 
     def __init__(
@@ -92,6 +94,9 @@ class FlightControl:
         self.alarms: tuple[Reason, ...] = ()
         self.checks: Checks | None = None
         self.peers: tuple[HeardBeacon, ...] = ()
+        self.revoked: frozenset[int] = frozenset()
+        # By robot id: the last that was heard of it in this frame, and when that was so.
+        self._last_places: dict[int, tuple[Neighbour, float]] = {}
         self.assignment = Assignment(None, robot, world_id)
         self.not_taken: tuple[FailedCheck, ...] = ()
         self.wanted_world_id: str | None = None
@@ -130,7 +135,7 @@ class FlightControl:
             safety_form=self._inbox.safety_form(now_s),
             failed_checks=self.failed_checks(now_s),
             not_taken=self.not_taken,
-            order=self._inbox.order(),
+            order=self._inbox.order(now_s),
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
         )
@@ -273,6 +278,7 @@ class FlightControl:
         if origin is not None and origin != before.origin:
             frame = origin.frame()
             self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
+            self._last_places.clear()
             self._pac.forget()
         if sensor is not None:
             self._pac.sensor = sensor
@@ -302,7 +308,19 @@ class FlightControl:
                 told.append(
                     Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
                 )
-        return (*heard, *told)
+        return self._with_revoked((*heard, *told), now_s)
+
+    def _with_revoked(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
+        """Besides, who is not listened to any more, where it was: it may still hover there."""
+        for neighbour in heard:
+            self._last_places[neighbour.robot_id] = neighbour, now_s - neighbour.age_s
+        silent = self.revoked.intersection(self._last_places) - {n.robot_id for n in heard}
+        stay = []
+        for robot_id in sorted(silent):
+            last, at_s = self._last_places[robot_id]
+            if now_s - at_s <= _REVOKED_STAYS_S:
+                stay.append(Neighbour(robot_id, last.position_m, (0.0, 0.0, 0.0), 0.0))
+        return (*heard, *stay)
 
     def _closest(
         self, odometry: Odometry | None, neighbours: tuple[Neighbour, ...]

@@ -38,6 +38,12 @@ class _Arrived(NamedTuple):
     unix_s: float
 
 
+class _ArrivedOrder(NamedTuple):
+    data: bytes
+    speaker: Speaker
+    at_s: float
+
+
 class _AskedHold(NamedTuple):
     by: str
     sequence: int
@@ -57,7 +63,7 @@ class Inbox:
         self._ground_timeout_s = ground_timeout_s
         self._lock = Lock()
         self._grounds: deque[_Arrived] = deque(maxlen=_MOST_STATES)
-        self._orders: deque[tuple[bytes, Speaker]] = deque(maxlen=_MOST_ORDERS)
+        self._orders: deque[_ArrivedOrder] = deque(maxlen=_MOST_ORDERS)
         self._beacons: dict[int, HeardBeacon] = {}
         # When robots, by what they are called, said what is no beacon of this version.
         self._strangers: dict[str, float] = {}
@@ -84,9 +90,9 @@ class Inbox:
         """A world file arrived."""
         self.world = data
 
-    def put_order(self, data: bytes, speaker: Speaker) -> None:
+    def put_order(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """An order arrived."""
-        self._orders.append((data, speaker))
+        self._orders.append(_ArrivedOrder(data, speaker, now_s))
 
     def put_beacon(self, beacon: Beacon, now_s: float, unix_now_s: float) -> None:
         """Another robot's beacon arrived."""
@@ -176,10 +182,13 @@ class Inbox:
         """The age of the ground's newest state, s; infinite if none came. From any thread."""
         return now_s - self._ground_at_s
 
-    def order(self) -> Order | None:
-        """The next order for this robot, if one has come. Control thread."""
-        while self._orders:
-            data, speaker = self._orders.popleft()
+    def order(self, now_s: float) -> Order | None:
+        """The next order for this robot, if one has come by then. Control thread.
+
+        What came since was made by a later uptime than the tick's, and would seem valid too long.
+        """
+        while self._orders and self._orders[0].at_s <= now_s:
+            data, speaker, _ = self._orders.popleft()
             order = self._order(data)
             if order and order.robot_id == self._robot_id and _is_own(order.operator, speaker):
                 return order

@@ -151,7 +151,7 @@ class RobotNode:
         self._inbox.put_ground(data, speaker, clock.monotonic_s(), clock.unix_s())
 
     def _receive_order(self, _: str, data: bytes, speaker: Speaker) -> None:
-        self._inbox.put_order(data, speaker)
+        self._inbox.put_order(data, speaker, self._ports.clock.monotonic_s())
 
     def _receive_world(self, _: str, data: bytes, __: Speaker) -> None:
         self._inbox.put_world(data)
@@ -258,6 +258,7 @@ class RobotNode:
         now_s = self._ports.clock.monotonic_s()
         peers = self._inbox.peers(now_s)
         control.peers = peers
+        control.revoked = self._guard.revoked_robots()
         if not is_due:
             return
         control.checks = self.readiness.checks(

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,12 +26,12 @@ from edge.core.schema import ConfigError
 from edge.core.vehicle import Action, Setpoint
 from edge.drivers.clock import SystemClock
 from edge.drivers.flight_log import FlightLog
-from edge.drivers.identity_folder import Identity, load_identity
+from edge.drivers.identity_folder import Identity, listening_identity, load_identity
 from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
 from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
-from edge.identity.guard import SignedGuard, Unguarded
+from edge.identity.guard import Unguarded
 from edge.messages.codes import FailedCheck
 from edge.messages.mission import LoopStatus
 from edge.messages.topics import Link, LinkSetting
@@ -98,8 +99,11 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         flight = config.flight
         watchdog = parts.enter_context(new_watchdog(flight.command_timeout_s, flight.hover_land_s))
         # 5. The robot itself.
-        identity = _identity(config, clock)
-        guard = _guard(identity, clock)
+        identity = _identity(
+            config,
+            lambda folder: load_identity(folder, fleet=config.fleet, unix_s=clock.unix_s()),
+        )
+        signed = None if identity is None else identity.guard(clock.monotonic_s)
         node = RobotNode(
             config,
             Ports(
@@ -112,7 +116,7 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             ),
             policy,
             world,
-            guard,
+            signed or Unguarded(),
             boot_nonce=boot_nonce,
             boot_epoch=int(clock.unix_s() * 1e3),
         )
@@ -120,7 +124,9 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         link = parts.enter_context(_open_link(config, node, config.robot_id, identity))
         node.attach(link)
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
-        keep_news = _keeper(identity, guard)
+        keep_news = None
+        if identity is not None and signed is not None:
+            keep_news = partial(identity.exchange_revocations, signed)
         program = _Program(config, node, vehicle, watchdog, recorder, link, keep_news)
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
@@ -128,6 +134,8 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
         program.start()
         parts.callback(program.leave)
         parts.callback(service_manager.tell, STOPPING)
+        if config.link.insecure:
+            log.warning("insecure: whoever is on the network can fly this robot")
         log.info("robot runs", robot=config.robot_id, bundle=bundle_id[:12])
         # 8. Until somebody stops the program.
         while not stop.wait(_PERIOD_S):  # A signal that another thread took is seen only here.
@@ -140,35 +148,17 @@ def _open_vehicle(config: RobotConfig) -> AbstractContextManager[OpenVehicle]:
     return open_vehicle(autopilot.type, setting)
 
 
-def _identity(config: RobotConfig, clock: SystemClock) -> Identity | None:
+def _identity(config: RobotConfig, load: Callable[[Path], Identity]) -> Identity | None:
     """Who this robot is in its fleet; None if nobody says so. Raises ConfigError or OSError."""
-    folder = config.identity.folder
-    if not folder:
+    if not config.identity.folder:
         return None
-    identity = load_identity(Path(folder), fleet=config.fleet, unix_s=clock.unix_s())
-    if identity.card.robot_id != config.robot_id:
-        card = identity.card
-        raise ConfigError(f"{folder}: is {card.role} {card.name}'s, not robot {config.robot_id}'s")
+    identity = load(Path(config.identity.folder))
+    card = identity.card
+    if card.robot_id != config.robot_id:
+        raise ConfigError(
+            f"{identity.folder}: is {card.role} {card.name}'s, not robot {config.robot_id}'s"
+        )
     return identity
-
-
-def _guard(identity: Identity | None, clock: SystemClock) -> SignedGuard | Unguarded:
-    return Unguarded() if identity is None else identity.guard(clock.monotonic_s)
-
-
-def _keeper(identity: Identity | None, guard: SignedGuard | Unguarded) -> Callable[[], None]:
-    """Writes the newest list of revoked keys, when there is a newer one: for the next start."""
-    if identity is None or isinstance(guard, Unguarded):
-        return lambda: None
-    kept = identity.revocations
-
-    def keep() -> None:
-        nonlocal kept
-        if guard.revocations != kept:
-            identity.keep(guard.revocations)
-            kept = guard.revocations
-
-    return keep
 
 
 def _open_link(
@@ -197,7 +187,7 @@ class _Program:
         watchdog: Watchdog,
         recorder: FlightLog,
         link: Link,
-        keep_news: Callable[[], None],
+        keep_news: Callable[[], None] | None,
     ) -> None:
         self._config = config
         self._node = node
@@ -269,7 +259,8 @@ class _Program:
 
     def _write_step(self) -> None:
         self._recorder.flush()
-        self._keep_news()
+        if self._keep_news is not None:
+            self._keep_news()
 
     def _status_step(self) -> None:
         now_s = time.monotonic()
@@ -283,6 +274,7 @@ class _Program:
             autopilot=self._vehicle.state().connected,
             ages_s={loop.name: loop.age_s() for loop in self._loops},
             peers=self._link.peers(),
+            insecure=self._config.link.insecure,
         )
 
 
@@ -341,7 +333,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
         parts.enter_context(_robot_lock(config))
         log.listen(log.show_errors)
         clock = SystemClock()
-        identity = _identity(config, clock)
+        identity = _identity(config, lambda folder: listening_identity(folder, fleet=config.fleet))
         vehicle, setup, _ = parts.enter_context(_open_vehicle(config))
         looking = _OnlyLooking(vehicle)
         node = RobotNode(
@@ -356,7 +348,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             ),
             policy,
             world,
-            _guard(identity, clock),
+            Unguarded() if identity is None else identity.guard(clock.monotonic_s),
             boot_nonce=0,
             boot_epoch=0,
         )

@@ -31,7 +31,7 @@ class FleetSetup:
     it. `fence` is the configured one. A slot's height is `base_height_m` + its number x
     `slot_spacing_m`; how far places must be apart follows from `errors`. Robots land at once with a
     battery of `battery_critical`, hold when they have heard no ground for `ground_timeout_s`, and
-    land `ground_lost_land_s` later.
+    land `ground_lost_land_s` later. `insecure`: whoever is on the network can fly the fleet.
     """
 
     fleet: str
@@ -54,6 +54,7 @@ class FleetSetup:
     battery_critical: float = 0.15
     ground_timeout_s: float = 3.0
     ground_lost_land_s: float = 10.0
+    insecure: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,8 @@ class FleetSnapshot:
 
     `commander` is who commands, "" if nobody does yet; `ground` is the state that robots are told,
     by whoever commands. `running` are the commands that run now, in words. `commander_age_s` is how
-    long ago the commander was heard, 0 if that is this station.
+    long ago the commander was heard, 0 if that is this station; `shares_name` whether another
+    station speaks in this one's name.
     """
 
     unix_time_s: float
@@ -94,6 +96,7 @@ class FleetSnapshot:
     robots: tuple[RobotSnapshot, ...]
     running: tuple[str, ...] = ()
     commander_age_s: float = 0.0
+    shares_name: bool = False
 
 
 EventKind = Literal["command", "result", "refusal", "state", "commander", "presence"]

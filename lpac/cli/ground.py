@@ -2,9 +2,7 @@
 
 import asyncio
 import contextlib
-import getpass
 import signal
-import socket
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_FLEET, Fleet
+from lpac.cli.options import DEFAULT_FLEET, Fleet, user_at_host
 
 if TYPE_CHECKING:
     from lpac.analysis.snapshot import FleetSetup, GroundEvent
@@ -43,7 +41,7 @@ def ground(
 
     if not name.isprintable() or len(name) > _LONGEST_NAME:
         raise ValueError(f"--name {name!r}: must be at most {_LONGEST_NAME} printable characters")
-    config = load_ground(fleet, name or None, default_name=_user_at_host())
+    config = load_ground(fleet, name or None, default_name=user_at_host)
     # Nothing that a robot says can be a text that cannot be printed.
     sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     process = GroundProcess(config, _print_event)
@@ -52,13 +50,6 @@ def ground(
         f"{len(config.setup.robots)} robots: Ctrl-C ends it"
     )
     asyncio.run(_run(process, config.setup, lambda: typer.echo(started)))
-
-
-def _user_at_host() -> str:
-    try:
-        return f"{getpass.getuser()}@{socket.gethostname()}"
-    except (KeyError, OSError):
-        raise ValueError("this user has no name: give the station one with --name") from None
 
 
 async def _run(

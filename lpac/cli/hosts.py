@@ -46,10 +46,9 @@ def hosts(
         ) as running:
             _give_to_user(out)
             fleet = f"--fleet {running.fleet_toml}"
-            names = " ".join(host.name for host in running)
             typer.echo(f"fleet {running.fleet}; Ctrl-C ends all; in another terminal:")
             for line in (
-                f"for robot in {names}; do lpac fleet enroll $robot {fleet}; done",
+                f"lpac fleet enroll {fleet}",
                 f"lpac fleet deploy {fleet}",
                 f"lpac fleet status {fleet}",
                 f"lpac fleet stop {fleet}",

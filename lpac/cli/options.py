@@ -1,5 +1,7 @@
 """Options that several commands have, and what they mean."""
 
+import getpass
+import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,3 +29,11 @@ def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["Rob
 
     config = load_fleet(path)
     return config, select(config, robots)
+
+
+def user_at_host() -> str:
+    """What this operator is called if nothing says otherwise. Raises ValueError."""
+    try:
+        return f"{getpass.getuser()}@{socket.gethostname()}"
+    except (KeyError, OSError):
+        raise ValueError("this user has no name: give the station one with --name") from None

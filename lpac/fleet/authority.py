@@ -24,12 +24,14 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
 )
 from cryptography.x509.oid import NameOID
 
+from edge.core.schema import ConfigError
 from edge.drivers.identity_folder import (
     AUTHORITY_PEM,
     CERTIFICATE_PEM,
     IDENTITY_JSON,
     KEY_PEM,
     identity_json,
+    load_card,
 )
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID
 from edge.identity.card import MOST_REVOKED, Card, Revocations, Role, signed
@@ -81,7 +83,7 @@ class Issued(NamedTuple):
 
 
 class Authority:
-    """The authority in a folder. `open_authority` makes one."""
+    """The authority in a folder. `create_authority` makes one."""
 
     def __init__(self, folder: Path, fleet: str) -> None:
         """Raises AuthorityError if there is none, or it is another fleet's."""
@@ -132,34 +134,57 @@ class Authority:
             ledger.members.append(member)
             if revoked:
                 self._write_revoked(ledger)
-        card = Card(
-            self.fleet, role, name, public_key, member.serial, member.expires_unix_s, robot_id
-        )
-        common_name = role.value if robot_id is None else f"robot-{robot_id}"
-        files = {
-            IDENTITY_JSON: identity_json(self.fleet, self.public_key, signed(card, self._signer)),
-            CERTIFICATE_PEM: _certificate(
-                common_name, self.fleet, Ed25519PublicKey.from_public_bytes(public_key), self._key
-            ),
+        return Issued(member, self.files(member))
+
+    def files(self, member: Member) -> dict[str, bytes]:
+        """What the member has of the authority: the files of its folder by name, none secret."""
+        common_name = member.role.value
+        if member.robot_id is not None:
+            common_name = f"robot-{member.robot_id}"
+        key = Ed25519PublicKey.from_public_bytes(member.public_key)
+        return {
+            IDENTITY_JSON: self.identity_json(member),
+            CERTIFICATE_PEM: _certificate(common_name, self.fleet, key, self._key),
             AUTHORITY_PEM: _certificate(
                 "authority", self.fleet, self._key.public_key(), self._key, is_authority=True
             ),
             _REVOKED: self.revocations,
         }
-        return Issued(member, files)
+
+    def identity_json(self, member: Member) -> bytes:
+        """The member's file of that name, with its card."""
+        card = Card(
+            self.fleet, member.role, member.name, member.public_key, member.serial,
+            member.expires_unix_s, member.robot_id,
+        )  # fmt: skip
+        return identity_json(self.fleet, self.public_key, signed(card, self._signer))
 
     @property
     def revocations(self) -> bytes:
         """The signed list of revoked keys."""
         return (self.folder / _REVOKED).read_bytes()
 
+    def own_name(self) -> str | None:
+        """Of the operator in this very folder; None if there is nobody's identity."""
+        try:
+            card = load_card(self.folder, self.public_key)
+        except (OSError, ConfigError):
+            return None
+        return card.name
+
+    def named(self, name: str) -> list[Member]:
+        """The members of that name, revoked ones too. Raises AuthorityError if there are none."""
+        members = self.members()
+        known = [m for m in members if m.name == name]
+        if not known:
+            names = ", ".join(sorted({m.name for m in members})) or "nobody"
+            raise AuthorityError(f"{name}: is no member of fleet {self.fleet}; known: {names}")
+        return known
+
     def revoke(self, name: str) -> list[Member]:
         """Revoke all keys of the member of that name; those that were. Raises AuthorityError."""
+        known = self.named(name)
         with self._changed() as ledger:
-            known = [m for m in ledger.members if m.name == name]
-            if not known:
-                names = ", ".join(sorted({m.name for m in ledger.members})) or "nobody"
-                raise AuthorityError(f"{name}: is no member of fleet {self.fleet}; known: {names}")
             ledger.members = [
                 replace(m, revoked=True) if m.name == name else m for m in ledger.members
             ]
@@ -171,7 +196,7 @@ class Authority:
         if len(fingerprints) > MOST_REVOKED:
             raise AuthorityError(
                 f"{len(fingerprints)} keys are revoked, and a list holds {MOST_REVOKED}: make a "
-                "new authority (lpac fleet rotate --authority)"
+                "new authority"
             )
         ledger.revocations += 1
         data = signed(Revocations(ledger.revocations, fingerprints), self._signer)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from edge.core.schema import ConfigError
+from lpac.fleet.cards import CardGiven, give_card
 from lpac.fleet.deploy import deploy
 from lpac.fleet.hold import lock
 from lpac.fleet.release import load_common, make_release
@@ -62,6 +63,7 @@ async def enroll(
     address: str | None,
     robot_id: int | None,
     rename: bool,
+    operator: Callable[[], str],
     on_step: OnStep,
     say: Say,
 ) -> None:
@@ -72,7 +74,9 @@ async def enroll(
     `robot_id` has the number in its name.
 
     `on_step` hears of every step, `say` what is being done. `rename` lets a robot that is enrolled
-    as another one become this one. Raises ConfigError or FleetError at the first step that fails.
+    as another one become this one. The first robot makes the fleet's authority, with `operator` as
+    this computer's name. Raises ConfigError, AuthorityError or FleetError at the first step that
+    fails.
     """
     config = load_fleet(path)
     robot = _robot(config, name, host, user, port, address, robot_id)
@@ -96,6 +100,7 @@ async def enroll(
         identity = await session.call("set_identity", **wanted, rename=rename)
         was = (f"it was {identity['former']}",) if identity["former"] else ()
         on_step(EnrolStep("robot id", *_done(identity["changed"], was)))
+        on_step(_card_step(config, await give_card(session, config, robot, operator)))
         on_step(_vision_hub_step(
             await session.call("set_vision_hub", mavlink_port=robot.mavlink_port)
         ))  # fmt: skip
@@ -272,6 +277,20 @@ async def _release(config: FleetConfig, robot: RobotHost, say: Say) -> EnrolStep
 
         await deploy(config, robot, release, report)
     return EnrolStep("release", "done", ("as a spare's: nothing was started",))
+
+
+def _card_step(config: FleetConfig, given: CardGiven) -> EnrolStep:
+    if given.outcome is None:
+        why = "insecure = true: whoever is on the network can fly it" if config.insecure else ""
+        return EnrolStep("card", "skipped", (why,) if why else ())
+    notes: tuple[str, ...] = ()
+    if given.new_authority is not None:
+        notes = (
+            f"made the fleet's keys: {given.new_authority}",
+            "keep a copy of that folder where nobody else can read it: whoever has it can fly the "
+            "fleet, and without it no robot joins",
+        )
+    return EnrolStep("card", given.outcome, notes)
 
 
 def _vision_hub_step(result: Mapping[str, Any]) -> EnrolStep:

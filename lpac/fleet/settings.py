@@ -11,12 +11,13 @@ import math
 import re
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.margins import Margin, places_apart
+from edge.messages.topics import is_loopback
 from edge.robot.config import (
     AutopilotConfig,
     RobotConfig,
@@ -27,6 +28,8 @@ from edge.robot.config import (
 )
 
 DEFAULT_DIRECTORY = "/opt/lpac"
+# Where fleets' keys are if the file does not say: not beside it, where repositories are.
+_KEYS = "~/.local/share/lpac/keys"
 _MAX_CPU = 1023
 
 # These stand on the command lines of ssh, and in files of systemd.
@@ -140,7 +143,8 @@ class FleetConfig:
 
     `directory` is the robots' folder of releases; `predecessors` are containers and units that must
     not run beside ours. `keys` is the folder of this computer's own identity in the fleet; None if
-    nobody has one, and whoever reaches the radio can fly the fleet.
+    nobody has one: all of it is on this computer, or it is `insecure`, and whoever reaches the
+    radio can fly it.
     """
 
     path: Path
@@ -155,6 +159,7 @@ class FleetConfig:
     slots: tuple[Slot, ...]
     shared: Mapping[str, Any]
     keys: Path | None
+    insecure: bool
 
     def endpoint(self, robot: RobotHost) -> str:
         """Where zenoh reaches the robot."""
@@ -276,6 +281,7 @@ class _FleetTable:
     directory: str = DEFAULT_DIRECTORY
     predecessors: tuple[str, ...] = ()
     keys: str = ""
+    insecure: bool = False
     ssh: SshConfig = field(default_factory=SshConfig)
     robot: dict = field(default_factory=dict)  # type: ignore[type-arg]
     robots: dict = field(default_factory=dict)  # type: ignore[type-arg]
@@ -283,6 +289,8 @@ class _FleetTable:
 
     def __post_init__(self) -> None:
         require_name("fleet = ", self.fleet)
+        if self.insecure and self.keys:
+            raise ValueError("insecure = true: not with keys: leave one of them out")
         for name in ("image", "bundle", "world"):
             if not getattr(self, name):
                 raise ValueError(f"{name} = '': must be a path")
@@ -350,12 +358,23 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
         },
         slots=table.slots,
         shared=table.robot,
-        keys=place(table.keys) if table.keys else None,
+        keys=None,
+        insecure=table.insecure,
     )
+    needs_keys = not table.insecure and not _is_all_here(config)
+    if table.keys or needs_keys:
+        config = replace(config, keys=place(table.keys or f"{_KEYS}/{table.fleet}"))
     for mistake in itertools.chain(_shared_by_two(config), _sittings(config)):
         raise ConfigError(f"{path}: {mistake}")
     _check_flights(config)
     return config
+
+
+def _is_all_here(config: FleetConfig) -> bool:
+    """Whether it is a fleet that this computer simulates."""
+    return bool(config.robots) and all(
+        map(is_loopback, map(config.endpoint, config.robots.values()))
+    )
 
 
 def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
@@ -463,17 +482,20 @@ def _robot_mapping(
 ) -> dict[str, Any]:
     """The robot's robot.toml, in that slot."""
     earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
+    # A fleet that is all on this computer needs no keys, and nobody else reaches it.
+    listen = places.listen if config.keys or config.insecure else "127.0.0.1"
     own = {
         "fleet": config.fleet,
         "robot_id": robot.robot_id,
         "policy": {"bundle": places.bundle, "world": places.world},
         "autopilot": {"url": robot.mavlink_url, "system_id": robot.system_id},
         "link": {
-            "listen": [f"{config.scheme}/{places.listen}:{robot.zenoh_port}"],
+            "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
             "connect": [
                 config.endpoint(other)
                 for other in sorted(earlier, key=lambda other: other.robot_id)
             ],
+            **({"insecure": True} if config.insecure else {}),
         },
         "flight": {"slot": slot.height, "landing_point_m": list(slot.landing_point_m)},
         "log": {"folder": places.logs},

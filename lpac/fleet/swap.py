@@ -1,12 +1,14 @@
 """A spare takes a failed robot's slot: its pad, height and landing point."""
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from edge.core.schema import ConfigError
+from lpac.fleet.cards import give_card
 from lpac.fleet.deploy import Deployed, deploy
-from lpac.fleet.hold import Report, check_identity, visit
+from lpac.fleet.hold import Report, check_identity, hold
 from lpac.fleet.release import load_common, make_release
 from lpac.fleet.session import RemoteError, UnreachableError, connect
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet, select
@@ -28,20 +30,24 @@ class Swapped(NamedTuple):
     callers: tuple[str, ...]
 
 
-async def swap(path: Path, failed: str, spare: str, report: Report) -> Swapped:
+async def swap(
+    path: Path, failed: str, spare: str, report: Report, operator: Callable[[], str]
+) -> Swapped:
     """Let `spare` fly instead of `failed`; a repeat finishes what was interrupted.
 
-    The spare is looked at before anything is changed, and the failed robot is stopped before the
-    spare gets its place. Raises ConfigError, or FleetError if the failed robot is armed or the
-    spare cannot have the release; ValueError or OSError if there is no release.
+    The spare is looked at, and has a good card, before anything is changed, and the failed robot is
+    stopped before the spare gets its place; `operator` is as for `enroll`. Raises ConfigError, or
+    FleetError if the failed robot is armed or the spare cannot have the release; ValueError or
+    OSError if there is no release.
     """
     config = load_fleet(path)
     index = _slot(config, failed, spare)
     changed = config.slots[index].robot == failed
     common = load_common(config)
     report(f"look at {spare}", None)
-    async with visit(config, config.robots[spare]):
-        pass
+    async with hold(config, config.robots[spare], report) as held:
+        report(f"card of {spare}", None)
+        await give_card(held.session, config, config.robots[spare], operator)
     report(f"stop {failed}", None)
     silent = await _stop(config, config.robots[failed])
     report(path.name, None)

@@ -49,6 +49,8 @@ class AlarmCode(StrEnum):
     NOBODY_COMMANDS = "nobody_commands"
     COMMANDER_SILENT = "commander_silent"
     HELD_BY_OTHERS = "held_by_others"
+    NAME_SHARED = "name_shared"
+    INSECURE = "insecure"
     WORLD_NOT_HERE = "world_not_here"
     NOT_HEARD_YET = "not_heard_yet"
     # One robot.
@@ -189,6 +191,12 @@ def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
     if fleet.snapshot.commander and silent:
         text = f"{fleet.snapshot.commander} commands, but is not heard: hold takes over"
         yield ("critical" if flying else "warning"), AlarmCode.COMMANDER_SILENT, text
+    if fleet.setup.insecure:
+        text = "insecure: whoever is on the network can fly this fleet"
+        yield "warning", AlarmCode.INSECURE, text
+    if fleet.snapshot.shares_name:
+        text = f"another ground station speaks as {fleet.setup.operator}: two may command by turns"
+        yield "critical", AlarmCode.NAME_SHARED, text
     if ground is not None and ground.safety_action_by not in ("", ground.operator):
         held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
         text = f"{ground.safety_action_by} asks {len(held)} robots to hold"

@@ -28,9 +28,10 @@ def test_command(tmp_path: Path) -> None:
 
 def test_loops(tmp_path: Path) -> None:
     result = kept(loops.measure(robots=1, mission_s=6.0, beside_busy=False), tmp_path)
-    check_frame(result, "loops", targets=4)
+    check_frame(result, "loops", targets=6)
     (taken,) = result["figures"]["taken"]
     assert set(loops.LOOPS) | {"preflight", "status", "log", "rx"} <= taken["cpu_percent"].keys()
+    assert len(result["figures"]["taken_with_keys"]) == 1
     assert taken["threads"] > 8 and 10.0 < taken["private_mb"] < taken["resident_mb"]
 
 

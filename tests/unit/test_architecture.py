@@ -47,6 +47,7 @@ ALLOWED = {
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
         "lpac.ground", "lpac.sim", "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer",
+        "lpac.fleet.authority",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.

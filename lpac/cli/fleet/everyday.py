@@ -78,7 +78,7 @@ def deploy(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson 
         print_json(config, outcomes, lambda v: {**v.deployed._asdict(), "duration_s": v.duration_s})
     else:
         numbers = ("MB sent", "perceive ms", "infer ms", "s")
-        _print_outcomes(outcomes, ("release", *numbers, "result"), _deployed_cells, numbers)
+        print_outcomes(outcomes, ("release", *numbers, "result"), _deployed_cells, numbers)
     require_all(outcomes, "deployed on")
 
 
@@ -108,7 +108,7 @@ def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJso
     if as_json:
         print_json(config, outcomes, lambda release: {"release": release})
     else:
-        _print_outcomes(
+        print_outcomes(
             outcomes, ("release", "result"), lambda release: (release, styled("rolled back", GOOD))
         )
     require_all(outcomes, "rolled back on")
@@ -191,7 +191,7 @@ def land(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = 
     if as_json:
         print_json(config, outcomes, dict)
     else:
-        _print_outcomes(
+        print_outcomes(
             outcomes,
             ("result",),
             lambda v: (styled("it lands" if v["armed"] else "it has landed", GOOD),),
@@ -223,7 +223,7 @@ def _print_controlled(
     if as_json:
         print_json(config, outcomes, _Controlled._asdict)
     else:
-        _print_outcomes(
+        print_outcomes(
             outcomes,
             ("release", "flight", "result"),
             lambda v: ((v.release or "")[:SHORT], flight(v.service), program(v.service)),
@@ -375,7 +375,7 @@ def _labels(robots: Sequence["RobotHost"]) -> dict[str, str]:
     }
 
 
-def _print_outcomes(
+def print_outcomes(
     outcomes: Sequence["Outcome[T]"],
     headings: Sequence[str],
     cells: Callable[[T], Sequence["str | Text"]],

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.fleet.progress import print_json, print_problems, require_all, run_for_each
-from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
 from lpac.cli.printing import GOOD, print_table, styled
 
 if TYPE_CHECKING:
@@ -22,7 +22,10 @@ _STEP_WIDTH = 14
 
 
 def enroll(
-    name: Annotated[str, typer.Argument(help="The robot's name in the fleet, such as r11.")],
+    name: Annotated[
+        str | None,
+        typer.Argument(help="The robot's name in the fleet, such as r11; else all of the file."),
+    ] = None,
     host: Annotated[
         str | None,
         typer.Argument(
@@ -48,9 +51,52 @@ def enroll(
 ) -> None:
     """Make a computer with a vehicle a robot of the fleet; may be repeated at any time.
 
-    Key, place in the fleet's file as a spare, id, voxl-vision-hub, whoever commanded the vehicle
-    before, the release, and PX4's parameters. ssh asks for the password, if it is needed.
+    Key, place in the fleet's file as a spare, id, card, voxl-vision-hub, whoever commanded the
+    vehicle before, the release, and PX4's parameters. ssh asks for the password, if it is needed.
     """
+    from lpac.fleet.settings import load_fleet
+
+    options = {"host": host, "--user": user, "--port": port, "--address": address,
+               "--robot-id": robot_id}  # fmt: skip
+    given = [option for option, value in options.items() if value is not None]
+    if name is None and given:
+        raise ValueError(f"{given[0]} is one robot's: give its name too")
+    names = list(load_fleet(fleet).robots) if name is None else [name]
+    if not names:
+        raise ValueError(f"{fleet}: has no robots yet: give a name and an address")
+    left = {}
+    for each in names:
+        if len(names) > 1:
+            typer.echo(f"{each}:")
+        left[each] = _enroll(
+            fleet, each, host, user=user, port=port, address=address, robot_id=robot_id, rename=yes
+        )
+    problems = [
+        f"{each} is not ready: left to do: {', '.join(steps)}"
+        for each, steps in left.items()
+        if steps
+    ]
+    if problems:
+        raise ValueError("; ".join(problems))
+    are = "is" if len(names) == 1 else "are"
+    typer.echo(
+        f"{', '.join(names)} {are} enrolled; `lpac fleet doctor --robots {','.join(names)}` looks "
+        "at the rest"
+    )
+
+
+def _enroll(
+    fleet: Path,
+    name: str,
+    host: str | None,
+    *,
+    user: str | None,
+    port: int | None,
+    address: str | None,
+    robot_id: int | None,
+    rename: bool,
+) -> list[str]:
+    """Print each step; those that are left to do."""
     from lpac.fleet.enroll import EnrolStep
     from lpac.fleet.enroll import enroll as enroll_robot
 
@@ -67,12 +113,10 @@ def enroll(
     asyncio.run(
         enroll_robot(
             fleet, name, host, user=user, port=port, address=address, robot_id=robot_id,
-            rename=yes, on_step=on_step, say=_say,
+            rename=rename, operator=user_at_host, on_step=on_step, say=_say,
         )
     )  # fmt: skip
-    if left:
-        raise ValueError(f"{name} is not ready: left to do: {', '.join(left)}")
-    typer.echo(f"{name} is enrolled; `lpac fleet doctor --robots {name}` looks at the rest")
+    return left
 
 
 def swap(
@@ -90,7 +134,7 @@ def swap(
     def report(step: str, share: float | None) -> None:
         _say(step if share is None else f"{step} {100.0 * share:.0f} %")
 
-    swapped = asyncio.run(swap_robots(fleet, failed, spare, report))
+    swapped = asyncio.run(swap_robots(fleet, failed, spare, report, user_at_host))
     _say("")
     slot = load_fleet(fleet).slots[swapped.slot]
     deployed = swapped.deployed

@@ -1,5 +1,7 @@
 """What is done once to a computer that becomes a robot of a fleet; each step may be repeated."""
 
+import base64
+import binascii
 import json
 import os
 import shutil
@@ -10,6 +12,9 @@ from lpac.fleet.on_robot import probes, releases, service
 from lpac.fleet.on_robot.calls import Refused, call, must, reason, say, write_whole
 
 _IDENTITY = "/etc/lpac/robot.json"
+# As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac.
+_MEMBERSHIP = "/var/lib/private/lpac/identity"
+_KEY, _NEXT_KEY, _CARD = "key.pem", "next-key.pem", "identity.json"
 # Bridges PX4 to DDS: through it a predecessor's program commands the vehicle.
 _DDS_AGENT = "voxl-microdds-agent"
 # What else of ModalAI's may send setpoints.
@@ -37,6 +42,63 @@ def set_identity(fleet: str, robot: str, robot_id: int, rename: bool) -> Dict[st
     os.makedirs(os.path.dirname(_IDENTITY), mode=0o755, exist_ok=True)
     write_whole(_IDENTITY, (json.dumps(wanted) + "\n").encode())
     return {"changed": True, "former": former}
+
+
+@call
+def identity_key(fresh: bool) -> Dict[str, Any]:
+    """The public key of this robot, whose secret key is made here and never leaves.
+
+    With `fresh` it is another one than before, which counts once `set_card` brings its card.
+    Returns the `public_key` in hexadecimal digits, and the text of the `card` that is there.
+    """
+    _make_identity()
+    key = os.path.join(_MEMBERSHIP, _NEXT_KEY if fresh else _KEY)
+    if fresh or not os.path.exists(key):
+        part = key + ".part"
+        must(["openssl", "genpkey", "-algorithm", "ed25519", "-out", part])
+        os.chmod(part, 0o600)
+        os.replace(part, key)
+        _own_identity()
+    pem = must(["openssl", "pkey", "-in", key, "-pubout"])
+    der = base64.b64decode("".join(pem.strip().split("\n")[1:-1]))
+    card = None
+    if os.path.exists(os.path.join(_MEMBERSHIP, _CARD)):
+        with open(os.path.join(_MEMBERSHIP, _CARD)) as file:
+            card = file.read()
+    # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
+    return {"public_key": binascii.hexlify(der[-32:]).decode(), "card": card}
+
+
+@call
+def set_card(files: Dict[str, str], fresh: bool, mavlink_port: int) -> Dict[str, Any]:
+    """Write what the fleet's authority gave for the key, `fresh` or not; by name, in base64.
+
+    The robot's program reads it when it starts.
+    """
+    releases.require_lock()
+    service.refuse_in_flight(mavlink_port, "a new card")
+    _make_identity()
+    if fresh:
+        os.replace(os.path.join(_MEMBERSHIP, _NEXT_KEY), os.path.join(_MEMBERSHIP, _KEY))
+    for name, text in sorted(files.items()):
+        if os.path.basename(name) != name:
+            raise Refused("%r is no file's name" % name)
+        write_whole(os.path.join(_MEMBERSHIP, name), base64.b64decode(text))
+    _own_identity()
+    return {}
+
+
+def _make_identity() -> None:
+    # As systemd makes it for a DynamicUser=.
+    os.makedirs("/var/lib/private", mode=0o700, exist_ok=True)
+    os.makedirs(_MEMBERSHIP, mode=0o700, exist_ok=True)
+
+
+def _own_identity() -> None:
+    """For the program's user, who owns the folder around, or will when it starts first."""
+    owner = os.stat(os.path.dirname(_MEMBERSHIP))
+    for path in [_MEMBERSHIP, *(os.path.join(_MEMBERSHIP, n) for n in os.listdir(_MEMBERSHIP))]:
+        os.chown(path, owner.st_uid, owner.st_gid)
 
 
 @call

@@ -22,6 +22,7 @@ VISION_HUB = "/etc/modalai/voxl-vision-hub.conf"
 _CHECKS_WAIT_S = 8.0
 # Failed checks that mean that it has not looked yet.
 _NOT_SETTLED = ("checks_running", "failsafe_not_read")
+_PRIVATE = "/var/lib/private"
 # `lpac robot check` waits so long for the vehicle; the ground will be missing to its end.
 _CHECK_S = 10.0
 
@@ -118,6 +119,8 @@ def vehicle_check(directory: str) -> Dict[str, Any]:
         os.path.realpath(os.path.join(directory, "current")),
         ["/usr/bin/lpac", "robot", "check", "--config", "/release/robot.toml", "--json", "--wait",
          "%g" % _CHECK_S],
+        # Who it is in its fleet, which is for the program's user alone.
+        state=_PRIVATE if os.path.isdir(os.path.join(_PRIVATE, "lpac/identity")) else "",
     )  # fmt: skip
     try:
         report = json.loads(done.stdout)

@@ -154,6 +154,9 @@ class CommandTask:
     def _refuse_observer(self) -> None:
         station = self._station
         commander = station.commander
+        if not station.may_command and not _is_hold(self.request):
+            text = f"{station.operator} is an observer of this fleet: it may ask for hold alone"
+            raise _ProblemError(ProblemCode.MAY_NOT, text)
         own = station.commands or commander in ("", station.operator)
         if own or _is_everybodys(self.request):
             return
@@ -795,10 +798,14 @@ def _supersedes(request: Request) -> bool:
     return isinstance(request, SafetyCommand | Resume) or _is_kill(request)
 
 
+def _is_hold(request: Request) -> bool:
+    return isinstance(request, SafetyCommand) and request.action == "hold"
+
+
 def _is_everybodys(request: Request) -> bool:
-    """Whether it needs no command of the fleet."""
-    is_hold = isinstance(request, SafetyCommand) and request.action == "hold"
-    return isinstance(request, TakeCommand) or is_hold or _is_kill(request)
+    """Whether it needs no command of the fleet, or takes it on the way."""
+    is_land = isinstance(request, SafetyCommand) and request.action == "land"
+    return isinstance(request, TakeCommand) or is_land or _is_hold(request) or _is_kill(request)
 
 
 def in_words(request: Request) -> str:

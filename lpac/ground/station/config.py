@@ -1,6 +1,7 @@
 """What `lpac ground` needs to know of its fleet."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,14 +27,16 @@ class GroundConfig:
     identity: Identity | None = None
 
 
-def load_ground(path: Path, operator: str | None, *, default_name: str = "") -> GroundConfig:
+def load_ground(
+    path: Path, operator: str | None, *, default_name: Callable[[], str] = lambda: ""
+) -> GroundConfig:
     """What the ground station needs to know of the fleet. Raises ValueError or OSError.
 
     In a fleet with keys its name is that of its card, and `operator` None or just that.
     """
     config = load_fleet(path)
     identity = _identity(config, operator)
-    name = operator or default_name if identity is None else identity.card.name
+    name = operator or default_name() if identity is None else identity.card.name
     seated = next((slot.robot for slot in config.slots if slot.robot), None)
     if seated is None:
         raise ValueError(f"{path}: slots: no robot sits in one")
@@ -69,6 +72,7 @@ def load_ground(path: Path, operator: str | None, *, default_name: str = "") -> 
             battery_critical=robot.flight.battery_critical,
             ground_timeout_s=robot.flight.ground_timeout_s,
             ground_lost_land_s=robot.flight.ground_lost_land_s,
+            insecure=config.insecure,
         ),
         connect=tuple(map(config.endpoint, config.robots.values())),
         identity=identity,

@@ -11,6 +11,7 @@ from typing import Protocol
 
 from edge.core.perception import EXPLORED_CELLS
 from edge.core.ports import Clock
+from edge.identity.card import Role
 from edge.identity.guard import Guard, Speaker
 from edge.messages.codec import MessageError, decode, encode
 from edge.messages.mission import GroundState, RobotStatus
@@ -27,7 +28,7 @@ from edge.messages.topics import (
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot
 from lpac.ground.station.commands import Commands, CommandTask
 from lpac.ground.station.protocol import Request, ServerMessage
-from lpac.ground.station.station import NameTakenError, Station
+from lpac.ground.station.station import Station
 
 _WORLD_PERIOD_S = 0.5
 
@@ -49,13 +50,14 @@ class GroundNode:
     """One ground, which one thread calls, and which speaks and hears by its guard.
 
     What raises in it is told as an event: robots that fly need it more than they need what it could
-    not do. Only NameTakenError is raised.
+    not do.
     """
 
     def __init__(
         self, setup: FleetSetup, clock: Clock, listener: GroundListener, guard: Guard
     ) -> None:
-        self.station = Station(setup, clock.monotonic_s(), clock.unix_s())
+        may_command = guard.role is not Role.OBSERVER
+        self.station = Station(setup, clock.monotonic_s(), clock.unix_s(), may_command=may_command)
         self.commands = Commands(self.station)
         self._guard = guard
         self._link: Link | None = None
@@ -71,10 +73,7 @@ class GroundNode:
 
     @property
     def subscriptions(self) -> Mapping[Topic, ReceiveCallback]:
-        """What it hears: topic -> callback with the key and the data, in the node's thread.
-
-        It raises NameTakenError.
-        """
+        """What it hears: topic -> callback with the key and the data, in the node's thread."""
         topics = (STATUS, EXPLORED, STATE, WORLD)
         return self._guard.subscriptions(dict.fromkeys(topics, self._hear))
 
@@ -100,19 +99,15 @@ class GroundNode:
         self._set_time()
         try:
             self._receive(key, data, speaker)
-        except NameTakenError:
-            raise
         except Exception as error:
             self.survive(key, error)
 
     def tick(self) -> None:
-        """Time has passed; some five times a second. Raises NameTakenError."""
+        """Time has passed; some five times a second."""
         self._set_time()
         try:
             self.station.tick()
             self._step()
-        except NameTakenError:
-            raise
         except Exception as error:
             self.survive("tick", error)
         try:
@@ -191,6 +186,7 @@ class GroundNode:
         self._published = (None if state is None else state.sequence, len(orders))
         if self._link is None:
             return
+        self._guard.introduce()
         if state is not None:
             self._link.publish(STATE, encode(state))
         for order in orders:

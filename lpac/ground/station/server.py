@@ -34,7 +34,7 @@ from lpac.ground.station.protocol import (
     request_from_line,
     to_line,
 )
-from lpac.ground.station.station import NameTakenError, is_down
+from lpac.ground.station.station import is_down
 
 # A client takes it from this that its ground does not hang.
 _WORD_PERIOD_S = 1.0
@@ -64,8 +64,12 @@ class GroundProcess:
         self._config = config
         self._tell = tell
         clock, identity = SystemClock(), config.identity
-        guard = Unguarded() if identity is None else identity.guard(clock.monotonic_s)
-        self._node = GroundNode(config.setup, clock, self, guard)
+        guard = None if identity is None else identity.guard(clock.monotonic_s)
+        self._exchange = (
+            None if identity is None or guard is None
+            else partial(identity.exchange_revocations, guard)
+        )  # fmt: skip
+        self._node = GroundNode(config.setup, clock, self, guard or Unguarded())
         self._clients: set[_Client] = set()
         self._world = config.setup.world
         self._socket_path = socket_path(config.setup.fleet)
@@ -73,21 +77,19 @@ class GroundProcess:
         self._world_path = self._socket_path.with_suffix(".world")
         self._state_path = self._socket_path.with_suffix(".state")
         self._stepped = asyncio.Event()
-        self._failed: asyncio.Future[None] | None = None
 
     async def run(self, on_listening: Callable[[], None]) -> None:
         """Until it is cancelled; `on_listening` is called once clients can connect.
 
-        Raises GroundError, LinkError or NameTakenError, in one line.
+        Raises GroundError or LinkError, in one line.
         """
         fleet, identity = self._config.setup.fleet, self._config.identity
         loop = asyncio.get_running_loop()
-        self._failed = loop.create_future()
         self._recall()
 
         def received(hear: ReceiveCallback, key: str, data: bytes) -> None:
             with suppress(RuntimeError):  # The loop has ended.
-                loop.call_soon_threadsafe(self._receive, hear, key, data)
+                loop.call_soon_threadsafe(hear, key, data)
 
         _refuse_second(self._socket_path, fleet)
         with ZenohLink(
@@ -104,10 +106,7 @@ class GroundProcess:
             on_listening()
             ticking = asyncio.create_task(self._tick_on())
             try:
-                await asyncio.wait((ticking, self._failed), return_when=asyncio.FIRST_COMPLETED)
-                for ended in (ticking, self._failed):
-                    if ended.done():
-                        ended.result()
+                await ticking
             finally:
                 ticking.cancel()
                 server.close()
@@ -121,17 +120,12 @@ class GroundProcess:
         statuses = map(station.lately, self._config.setup.robots)
         return station.commands and not all(map(is_down, filter(None, statuses)))
 
-    def _receive(self, hear: ReceiveCallback, key: str, data: bytes) -> None:
-        assert self._failed is not None
-        try:
-            hear(key, data)
-        except NameTakenError as error:
-            if not self._failed.done():
-                self._failed.set_exception(error)
-
     async def _tick_on(self) -> None:
         next_s = time.monotonic()
         while True:
+            if self._exchange is not None:
+                with suppress(OSError):  # Only the next one misses it.
+                    self._exchange()
             self._node.tick()
             try:
                 if self._clients:

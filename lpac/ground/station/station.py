@@ -6,10 +6,13 @@ thread at a time.
 Of several stations one commands: its name is the `operator` of the state that the robots obey, and
 it alone changes that state. The others observe. Only hold is everybody's: an observer publishes
 the commander's own state with hold in it and the next sequence, until the commander says so itself.
+
+What robots say of whom they obey counts if most of them say so: one alone may be cut off, or lie.
 """
 
 import math
 import re
+import statistics
 from collections import Counter, deque
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -59,13 +62,11 @@ _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
 # Who asks for a hold gets the commander's sequence up by no more at a time.
 _MOST_SEQUENCES_AHEAD = 1000
+# Beyond what most robots obey, none has heard a station.
+_MOST_OBEYED_AHEAD = 10**6
 
 _S = FlightState
 T = TypeVar("T")
-
-
-class NameTakenError(ValueError):
-    """Another station has this one's name; the text says what to do."""
 
 
 def is_down(status: RobotStatus) -> bool:
@@ -78,10 +79,14 @@ def is_down(status: RobotStatus) -> bool:
 class Station:
     """One ground station. `state` is what the fleet is told, by whoever commands it.
 
-    It is None as long as nobody was heard to say anything.
+    It is None as long as nobody was heard to say anything. One that may not command asks for holds
+    alone: robots take nothing else of it.
     """
 
-    def __init__(self, setup: FleetSetup, now_s: float, unix_now_s: float) -> None:
+    def __init__(
+        self, setup: FleetSetup, now_s: float, unix_now_s: float, *, may_command: bool = True
+    ) -> None:
+        self.may_command = may_command
         self.state: GroundState | None = None
         self.commands = False
         # What became of orders, by their id.
@@ -104,6 +109,7 @@ class Station:
         self._heard_s = now_s  # when the commander was
         self._obeyed_since_s: float | None = None
         self._decided = False
+        self._name_shared_at_s = -math.inf
         self._ahead_since_s: dict[int, float] = {}
         # The hold that this station asks for while another commands, and of whom; None: of all.
         self._asked: GroundState | None = None
@@ -148,9 +154,11 @@ class Station:
         """Who commands, or did last; "" if nobody does yet."""
         if self.state is not None:
             return self.state.operator
-        statuses = self.statuses().values()
-        newest = max(statuses, key=lambda status: status.obeyed_sequence, default=None)
-        return "" if newest is None else newest.operator
+        named: dict[str, list[int]] = {}
+        for status in self.statuses().values():
+            if status.operator:
+                named.setdefault(status.operator, []).append(status.obeyed_sequence)
+        return max(named, key=lambda o: (len(named[o]), max(named[o])), default="")
 
     @property
     def commander_age_s(self) -> float:
@@ -172,6 +180,11 @@ class Station:
             if status.operator == commander and status.ground_age_s is not None
         ]
         return min(told_s if told_s and self.state is None else [own_s, *told_s])
+
+    @property
+    def shares_name(self) -> bool:
+        """Whether another station spoke in this one's name lately."""
+        return self._now_s - self._name_shared_at_s <= _LATELY_S
 
     @property
     def world_id(self) -> str:
@@ -232,6 +245,7 @@ class Station:
             robots=self._robots.snapshots(self._now_s),
             running=running,
             commander_age_s=self.commander_age_s,
+            shares_name=self.shares_name,
         )
 
     # Events
@@ -311,16 +325,27 @@ class Station:
             self._ahead_since_s.pop(status.robot_id, None)
             return
         # An observer's hold, or another commander, mostly comes here too.
-        since_s = self._ahead_since_s.setdefault(status.robot_id, self._now_s)
-        if self._now_s - since_s <= _OVERTAKEN_S:
+        self._ahead_since_s.setdefault(status.robot_id, self._now_s)
+        ahead = self._ahead_of(state)
+        if 2 * len(ahead) <= len(self.statuses()):
             return
-        if own:
-            self.state = replace(state, sequence=status.obeyed_sequence + 1)
+        operator = _commonest(told.operator for told in ahead)
+        if operator in (None, self.operator):
+            self.state = replace(state, sequence=self._greatest_obeyed() + 1)
             return
-        self._step_down(status.operator)
-        self._tell_commander(status.operator)
+        self._step_down(operator)
+        self._tell_commander(operator)
         # What the other one wants is not known.
         self.state, self._decided = None, True
+
+    def _ahead_of(self, state: GroundState) -> list[RobotStatus]:
+        """Who has obeyed something beyond that state for a while."""
+        return [
+            status
+            for robot, status in self.statuses().items()
+            if self._now_s - self._ahead_since_s.get(robot, self._now_s) > _OVERTAKEN_S
+            and (status.obeyed_sequence, status.operator) > _rank(state)
+        ]
 
     def _step_down(self, operator: str) -> None:
         """Another station commands from now on."""
@@ -332,7 +357,7 @@ class Station:
                 self._refuse(order.order_id, RefusalCode.INTERRUPTED, self.interruption)
 
     def hear_state(self, state: GroundState, speaker: Speaker) -> None:
-        """Another station's state came. Raises NameTakenError if it has this one's name.
+        """Another station's state came.
 
         Of one that is signed by another key than the operator's that it names only a hold counts.
         """
@@ -342,15 +367,16 @@ class Station:
         if speaker.role is not Role.OPERATOR:
             return
         if state.operator == self.operator:
-            self._hear_own_name(state)
-            return
+            if self._is_of_its_own(state):
+                return
+            self._tell_shared_name()
         before = self.state
         silent = not self.commands and self.commander_age_s > COMMANDER_SILENT_S
         if before is not None and _rank(state) < _rank(before) and not silent:
             return
+        if self.commands:
+            self._step_down(state.operator)
         if before is None or before.operator != state.operator:
-            if self.commands:
-                self._step_down(state.operator)
             self._tell_commander(state.operator)
         elif before.sequence != state.sequence:
             by = state.safety_action_by if _is_safer(before, state) else ""
@@ -361,21 +387,19 @@ class Station:
             held = _holds(state, self._asked_of)
             self._asked = None if held else replace(asked, sequence=state.sequence + 1)
 
-    def _hear_own_name(self, state: GroundState) -> None:
-        """It is an observer's hold, or somebody else has this name."""
+    def _is_of_its_own(self, state: GroundState) -> bool:
+        """Whether no other station of this name said it.
+
+        It may be an observer's hold, which is asked for in the commander's name and taken up here,
+        or a state of this station's former life.
+        """
         own = self.state
-        by_observer = state.safety_action_by not in ("", self.operator)
-        if not self.commands or own is None:
-            # An observer that goes on with the state of this station's former life soon ends.
-            if not by_observer:
-                raise self._name_taken()
-            return
-        if state.sequence < own.sequence or (state.sequence == own.sequence and not by_observer):
-            return
-        if not by_observer:
-            raise self._name_taken()
-        after = replace(_with_hold_of(own, state), sequence=state.sequence + 1)
-        self._take_asked_hold(own, after, state.safety_action_by)
+        if state.safety_action_by in ("", self.operator):
+            return self.commands and own is not None and state.sequence <= own.sequence
+        if self.commands and own is not None and state.sequence >= own.sequence:
+            after = replace(_with_hold_of(own, state), sequence=state.sequence + 1)
+            self._take_asked_hold(own, after, state.safety_action_by)
+        return True
 
     def _hear_asked_hold(self, asked: GroundState, by: str) -> None:
         own = self.state
@@ -391,11 +415,11 @@ class Station:
         self.interruption = f"{by} commands hold"
         self.state = after
 
-    def _name_taken(self) -> NameTakenError:
-        return NameTakenError(
-            f"another ground station commands this fleet as {self.operator}: give this one "
-            "another name with --name"
-        )
+    def _tell_shared_name(self) -> None:
+        if not self.shares_name:
+            text = "another ground station has this one's name: give one another with --name"
+            self.tell("commander", "", text, self.operator)
+        self._name_shared_at_s = self._now_s
 
     def _tell_commander(self, operator: str) -> None:
         self.tell("commander", "", f"{operator} commands the fleet", operator)
@@ -422,12 +446,8 @@ class Station:
             self._bring_home()
 
     def _listen(self) -> None:
-        """Find out who commands robots that obey somebody; take those that were left alone.
-
-        Raises NameTakenError if that is somebody else of this name.
-        """
-        obeyed = {s.operator for s in self.statuses().values() if s.operator}
-        if self.state is not None or self._decided or not obeyed:
+        """Find out who commands robots that obey somebody; take those that were left alone."""
+        if self.state is not None or self._decided or not self.commander:
             self._obeyed_since_s = None
             return
         if self._obeyed_since_s is None:
@@ -437,24 +457,26 @@ class Station:
             return
         if self._own_name_age_s() < _SPOKE_S:
             if listened_s > _NAME_TAKEN_S:
-                raise self._name_taken()
+                self._tell_shared_name()
+                self._decided = True
             return
         self._decided = True
+        if not self.may_command:
+            return
         # The robots' ages tell of a commander that this station does not hear, but they do.
-        if obeyed == {self.operator} or self.commander_age_s > _ROBOTS_HEAR_NOBODY_S:
+        if self.commander == self.operator or self.commander_age_s > _ROBOTS_HEAR_NOBODY_S:
             self.take_command()
 
     def _own_name_age_s(self) -> float:
-        """How long ago a robot heard a station of this name; infinite if none does, s."""
+        """How long ago most robots had heard a station of this name; infinite if not, s."""
         lasts = (self._robots.last(robot, self._now_s) for robot in self.statuses())
-        return min(
-            (
-                status.ground_age_s + age_s
-                for status, age_s in filter(None, lasts)
-                if status.operator == self.operator and status.ground_age_s is not None
-            ),
-            default=math.inf,
-        )
+        ages_s = [
+            status.ground_age_s + age_s
+            if status.operator == self.operator and status.ground_age_s is not None
+            else math.inf
+            for status, age_s in filter(None, lasts)
+        ]
+        return statistics.median_high(ages_s) if ages_s else math.inf
 
     # Who commands
 
@@ -476,7 +498,15 @@ class Station:
         self._tell_commander(self.operator)
 
     def _greatest_obeyed(self) -> int:
-        return max((s.obeyed_sequence for s in self.statuses().values()), default=0)
+        """As far as that can be: no robot alone makes it so great that no state goes beyond."""
+        return min(
+            max((s.obeyed_sequence for s in self.statuses().values()), default=0),
+            self._obeyed_by_most() + _MOST_OBEYED_AHEAD,
+        )
+
+    def _obeyed_by_most(self) -> int:
+        obeyed = [s.obeyed_sequence for s in self.statuses().values()]
+        return max(statistics.median_low(obeyed), 0) if obeyed else 0
 
     def _known_state(self) -> GroundState:
         """What the fleet is told, by whoever was heard, or as it is remembered or seen."""
@@ -568,10 +598,14 @@ class Station:
     def hold(self, robots: Collection[int] | None = None) -> int:
         """Hold, whoever commands; the sequence that says so."""
         lost = self.commander_age_s > COMMANDER_SILENT_S
-        if self.commands or not self.commander or lost:
+        if self.may_command and (self.commands or not self.commander or lost):
             return self._hold_as_commander(robots)
         state = self._asked or self._known_state()
-        sequence = max(state.sequence, self._greatest_obeyed()) + 1
+        # Robots take a hold that is not the commander's if it is little ahead of its states.
+        sequence = min(
+            max(state.sequence, self._greatest_obeyed()) + 1,
+            max(state.sequence, self._obeyed_by_most()) + _MOST_SEQUENCES_AHEAD - 1,
+        )
         asked_of: frozenset[int] | None = frozenset() if self._asked is None else self._asked_of
         self._asked_of = None if robots is None or asked_of is None else asked_of | set(robots)
         self._asked = replace(_held(state, self._asked_of, self.operator), sequence=sequence)
@@ -582,13 +616,14 @@ class Station:
         assert self.state is not None
         # Robots may obey somebody who took over without being heard here.
         others = (s for s in self.statuses().values() if s.operator != self.operator)
-        beyond = max((s.obeyed_sequence for s in others), default=0) + 1
+        beyond = max((s.obeyed_sequence for s in others), default=0)
+        beyond = min(beyond, self._greatest_obeyed()) + 1
         self.state = replace(self.state, sequence=max(self.state.sequence, beyond))
         return self.state.sequence
 
     def _end_asking(self, asked: GroundState) -> None:
         """The commander takes the hold up, or is gone, or is out of reach of this station."""
-        if self.commander_age_s > COMMANDER_SILENT_S:
+        if self.may_command and self.commander_age_s > COMMANDER_SILENT_S:
             self.take_command()
             self.change(
                 safety_action=asked.safety_action,

@@ -12,7 +12,6 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, Self, TypeVar
@@ -20,7 +19,6 @@ from typing import Any, Self, TypeVar
 from edge.identity.card import Role
 from edge.identity.guard import Guard, Unguarded
 from edge.messages.mission import GroundState
-from edge.messages.topics import ReceiveCallback
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.procedure import NothingComesError, Procedure, Until
 from lpac.ground.station.config import load_ground
@@ -31,7 +29,6 @@ from lpac.ground.station.protocol import (
     Request,
     ServerMessage,
 )
-from lpac.ground.station.station import NameTakenError
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.robots import VEHICLE_STEP_S, Settings, SimulatedRobot, SimulatedRobots
@@ -91,7 +88,9 @@ class SimulatedFleet(SimulatedRobots):
         self.grounds: dict[str, SimulatedGround] = {}
         self.ground = self.join(operator)
 
-    def join(self, operator: str, *, remembers: bool = True) -> "SimulatedGround":
+    def join(
+        self, operator: str, role: Role = Role.OPERATOR, *, remembers: bool = True
+    ) -> "SimulatedGround":
         """A ground of that name starts; one that runs is ended first, as by a loss of power.
 
         `remembers`: it is on the computer of the one before, and finds what that left there.
@@ -103,7 +102,7 @@ class SimulatedFleet(SimulatedRobots):
             former.leave()
             station = former.station_id
         setup = replace(self._setup, operator=operator)
-        guard = self._guard(Role.OPERATOR, operator, None, self._next_boot())
+        guard = self._guard(role, operator, None, self._next_boot())
         ground = SimulatedGround(setup, self.schedule, self.radio, station, guard)
         if former is not None and remembers:
             ground.recall(former)
@@ -137,8 +136,7 @@ class SimulatedFleet(SimulatedRobots):
 class SimulatedGround:
     """The real ground on the simulated clock: a `Ground` for procedures, which it carries out.
 
-    `runs` until it ends; `problem` is why it ended by itself, None if it did not; `station_id` is
-    who it is on the radio.
+    `runs` until it leaves; `station_id` is who it is on the radio.
     """
 
     def __init__(
@@ -146,7 +144,6 @@ class SimulatedGround:
     ) -> None:
         self.events: list[GroundEvent] = []
         self.station_id = station
-        self.problem: NameTakenError | None = None
         self.runs = True
         self.node = GroundNode(setup, schedule, self, guard)
         self._schedule = schedule
@@ -156,7 +153,7 @@ class SimulatedGround:
         self._world = ""
         self._link = radio.link(
             station,
-            {t: partial(self._receive, hear) for t, hear in self.node.subscriptions.items()},
+            self.node.subscriptions,
         )
         self.node.attach(self._link)
         self._ticks = schedule.every(SNAPSHOT_PERIOD_S, self._tick)
@@ -232,22 +229,9 @@ class SimulatedGround:
         """To the disk."""
         self._commanded = state
 
-    def _receive(self, hear: ReceiveCallback, key: str, data: bytes) -> None:
-        try:
-            hear(key, data)
-        except NameTakenError as problem:
-            self._end(problem)
-
     def _tick(self) -> None:
-        try:
-            self.node.tick()
-        except NameTakenError as problem:
-            self._end(problem)
+        self.node.tick()
         self._snapshot = self.node.snapshot
-
-    def _end(self, problem: NameTakenError) -> None:
-        self.problem = problem
-        self.leave()
 
     def _wait(self, until: Until) -> bool:
         end_s = self.now_s + until.at_most_s

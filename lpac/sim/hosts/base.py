@@ -20,7 +20,7 @@ MIRRORS = {
 }
 PACKAGES = (
     "systemd", "systemd-sysv", "dbus", "openssh-server", "rsync", "iproute2", "iputils-ping",
-    "procps", "python3",
+    "procps", "python3", "openssl",
 )  # fmt: skip
 
 # Program -> the Debian package that has it.
@@ -123,9 +123,11 @@ def _make(suite: str, tree: Path) -> None:
         making = Path(name)
         keys = [f"--keyring={_ubuntu_keys(making)}"] if suite == SUITE else []
         root = making / "root"
+        # Updates too, as a VOXL2 has them: the first openssl of bionic knows no Ed25519.
+        suites = (suite, f"{suite}-updates")
         _run(
             "mmdebstrap", "--quiet", "--variant=minbase", f"--include={','.join(PACKAGES)}", *keys,
-            suite, str(root), MIRRORS[suite],
+            suite, str(root), *(f"deb {MIRRORS[suite]} {each} main" for each in suites),
         )  # fmt: skip
         for path, text in _FILES.items():
             (root / path).parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ clock is this machine's (it cannot be set), its kernel too, and memory limits ar
 """
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -72,6 +73,8 @@ class SimulatedHosts(Sequence[SimulatedHost]):
     def __enter__(self) -> Self:
         """Boot all. Raises NoHostsError as above, OSError if a host does not come up."""
         self.folder.mkdir(parents=True, exist_ok=True)
+        # Those of hosts that are gone.
+        shutil.rmtree(self.folder / "keys", ignore_errors=True)
         base = base_tree(self._say)
         with ExitStack() as stack:
             stack.callback(self._ended)
@@ -146,6 +149,7 @@ class SimulatedHosts(Sequence[SimulatedHost]):
             "image": str(self._image),
             "bundle": str(self._bundle),
             "world": "world.env",
+            "keys": "keys",
             "ssh": {"config": "ssh_config"},
             "robot": robot | {"autopilot": {"url": f"udpin://127.0.0.1:{MAVLINK_PORT}"}},
             "robots": {

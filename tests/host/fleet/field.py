@@ -1,5 +1,6 @@
 """What the tests of the fleet share: the `lpac fleet` command, and what is done to robots."""
 
+import asyncio
 import json
 import os
 import subprocess
@@ -8,6 +9,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from lpac.fleet.cards import give_card
+from lpac.fleet.hold import hold
+from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
+from lpac.sim.fleet.keys import OPERATOR
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
@@ -55,9 +60,16 @@ def unwatched(_: str, __: float | None) -> None:
 
 
 def name_robot(hosts: SimulatedHosts, host: SimulatedHost) -> None:
-    """Give the host its identity, as `enroll` does."""
+    """Give the host its identity and its card, as `enroll` does."""
     identity = {"fleet": hosts.fleet, "robot": host.name, "robot_id": host.robot_id}
     host.run(f"mkdir -p /etc/lpac; echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
+    config = load_fleet(hosts.fleet_toml)
+    asyncio.run(_give_card(config, config.robots[host.name]))
+
+
+async def _give_card(config: FleetConfig, robot: RobotHost) -> None:
+    async with hold(config, robot) as held:
+        await give_card(held.session, config, robot, lambda: OPERATOR)
 
 
 @contextmanager

@@ -104,7 +104,7 @@ def test_wrong_keys_are_refused(hosts: SimulatedHosts, tmp_path: Path) -> None:
 def test_is_like_the_robots_computer(hosts: SimulatedHosts) -> None:
     if not base_tree(lambda _: None).name.startswith(SUITE):
         pytest.skip("Ubuntu's archive was not there: the hosts run Debian")
-    assert hosts[0].run("python3 --version") == "Python 3.6.5\n"
+    assert hosts[0].run("python3 --version") == "Python 3.6.9\n"
     assert "systemd 237" in hosts[0].run("systemctl --version")
     assert "OpenSSH_7.6" in ssh(hosts, "r1", "ssh -V")[1]
     assert "version 3.1.2" in hosts[0].run("rsync --version")

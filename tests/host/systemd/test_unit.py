@@ -26,6 +26,7 @@ from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
+from tests.host.fleet.field import name_robot
 
 UNIT = ROOT / "systemd" / "lpac-robot.service"
 LAND_UNIT = ROOT / "systemd" / "lpac-land.service"
@@ -53,6 +54,7 @@ def hosts(amd64_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         (release / "robot.toml").write_text(robot_toml(config, host.name))
         (release.parents[1] / "current").symlink_to("releases/a")
         (release.parents[1] / "sandbox").mkdir()
+        name_robot(running, host)
         for unit in UNITS:
             shutil.copy(unit, host.root / "etc/systemd/system")
         host.run("systemctl daemon-reload")

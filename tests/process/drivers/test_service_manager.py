@@ -81,6 +81,7 @@ def test_a_status_is_one_line_of_ascii_however_long_its_texts_are() -> None:
         autopilot=True,
         ages_s={"control": 1 / 3, "perception": None, "policy": 1e6 / 3},
         peers=10,
+        insecure=True,
     )
     assert text.isascii() and text.isprintable() and len(text) < 3000
     assert text.startswith("STATUS={")

@@ -102,12 +102,10 @@ class GroundStation:
     def socket_path(self) -> Path:
         return self.runtime / f"lpac-ground-{self.fleet}.sock"
 
-    def twin(self, runtime: Path | None = None) -> subprocess.CompletedProcess[str]:
-        """Another one of the same name, until it ends; by default as on another laptop."""
-        elsewhere = self.runtime / "twin"
-        elsewhere.mkdir(exist_ok=True)
+    def twin(self) -> subprocess.CompletedProcess[str]:
+        """Another one of the same user, until it ends."""
         return subprocess.run(
-            self._command, env=_environment(runtime or elsewhere),
+            self._command, env=_environment(self.runtime),
             capture_output=True, text=True, timeout=PATIENCE_S, check=False,
         )  # fmt: skip
 
@@ -198,7 +196,7 @@ class Pending:
 class NewStation(Protocol):
     """Starts a station: whoever has another name has another socket, as on another laptop."""
 
-    def __call__(self, fleet_toml: Path, name: str = ...) -> GroundStation: ...
+    def __call__(self, fleet_toml: Path, name: str = ..., laptop: str = ...) -> GroundStation: ...
 
 
 @pytest.fixture
@@ -207,10 +205,10 @@ def new_station(tmp_path: Path) -> Iterator[NewStation]:
     # A socket's path must be short.
     with tempfile.TemporaryDirectory(prefix="lpac-") as folder, ExitStack() as stack:
 
-        def start(fleet_toml: Path, name: str = "alice") -> GroundStation:
-            runtime = Path(folder, name)
+        def start(fleet_toml: Path, name: str = "alice", laptop: str = "") -> GroundStation:
+            runtime = Path(folder, laptop or name)
             runtime.mkdir(exist_ok=True)
-            station = GroundStation(fleet_toml, runtime, name, tmp_path / f"{name}.log")
+            station = GroundStation(fleet_toml, runtime, name, tmp_path / f"{runtime.name}.log")
             stack.callback(station.kill)
             station.start()
             return station

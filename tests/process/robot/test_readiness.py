@@ -13,6 +13,7 @@ import pytest
 from edge.core.fence import Fence
 from edge.core.position import PositionJudgement
 from edge.drivers.px4.autopilot import MavsdkAutopilot
+from edge.identity.guard import CardProblem
 from edge.messages.codes import CheckCode
 from edge.messages.mission import GroundState, Origin
 from edge.robot.config import load_config
@@ -56,6 +57,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "not_understood": (),
         "duplicate": False,
         "watchdog_alive": True,
+        "card_problem": None,
         "ground_age_s": 0.1,
         "ground_clock_offset_s": 0.0,
     }
@@ -173,6 +175,7 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
     [
         ({"watchdog_alive": False}, CheckCode.WATCHDOG_ENDED),
         ({"duplicate": True}, CheckCode.DUPLICATE_ID),
+        ({"card_problem": CardProblem.REVOKED}, CheckCode.CARD_NOT_GOOD),
         ({"ground_age_s": float("inf")}, CheckCode.GROUND_NOT_HEARD),
         ({"ground_age_s": 9.0}, CheckCode.GROUND_SILENT),
         ({"ground_clock_offset_s": 5.0}, CheckCode.CLOCK_OFF_GROUND),

@@ -111,7 +111,11 @@ def fly_a_mission(made: Rig, trial: str) -> None:
     made.do(NextTrial(trial))
     made.do(Start())
     made.wait(lambda status: status.trial == trial and status.state is FlightState.MISSION)
-    assert made.vehicle_is(lambda v: horizontal_speed_m_s(v) > 0.3)
+    until_s = time.monotonic() + 120.0
+    while not made.vehicle_is(lambda v: horizontal_speed_m_s(v) > 0.3, 5.0):
+        assert time.monotonic() < until_s, made.status
+        # A machine that held it up lets it hold by itself.
+        made.do(Start())
     assert all(loop.failures == 0 for loop in made.status.loops.values())
     assert made.status.message_counts["accepted"] == 0
     made.do(SafetyCommand("hold"))

@@ -39,6 +39,7 @@ from lpac.ground.station.protocol import (
     CommandReport,
     Enable,
     Request,
+    ResultCode,
     Resume,
     RobotCommand,
     RobotResult,
@@ -157,6 +158,16 @@ class FaultRig:
         """Command something that is possible as such; not every robot may do it."""
         report = self.ground.command(request)
         assert report.problem is None, report
+        return report
+
+    def done(self, request: Request) -> CommandReport:
+        """Command it until it is done of all, but for what lasts a moment."""
+        until_s = time.monotonic() + 60.0
+        while not (report := self.command(request)).done:
+            for result in report.results:
+                for_a_moment = result.refusal in HELD_UP or result.code in NOT_YET
+                assert result.code is ResultCode.DONE or for_a_moment, report
+            assert time.monotonic() < until_s, report
         return report
 
     def assemble(self) -> None:

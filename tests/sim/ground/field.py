@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from edge.identity.card import Role
 from edge.messages.mission import FlightState
 from lpac.analysis.snapshot import GroundEvent
 from lpac.ground.station.commands import Commands, CommandTask
@@ -120,9 +121,9 @@ class Field:
         grounds = self.fleet.grounds
         return grounds[name].station_id if name in grounds else int(name.removeprefix("r"))
 
-    def join(self, name: str) -> Station:
+    def join(self, name: str, role: Role = Role.OPERATOR) -> Station:
         """Start a ground, or start it again: as on another computer, it remembers nothing."""
-        return self.fleet.join(name, remembers=False).node.station
+        return self.fleet.join(name, role, remembers=False).node.station
 
     def restart(self, name: str, away_s: float = 0.5) -> Station:
         """As on the same laptop, where the last process' memory is."""

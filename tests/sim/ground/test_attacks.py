@@ -1,16 +1,19 @@
 """What a fleet with keys makes of whoever is on its radio without one, or with a robot's."""
 
+import random
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from edge.identity.card import Role
 from edge.messages.codec import encode
-from edge.messages.mission import FlightState, Order, RobotStatus
-from edge.messages.topics import ORDER, REVOKED, STATE, STATUS, Topic
-from lpac.ground.station.protocol import SafetyCommand
+from edge.messages.mission import FlightState, Order, RobotStatus, SafetyAction
+from edge.messages.topics import ORDER, REVOKED, STATE, STATUS, TOPICS, Topic
+from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
+from lpac.sim.fleet.members import SimulatedMembers
 from tests.flown import FlownRobot
 from tests.sim.ground.field import Field, a_field
 
@@ -89,3 +92,123 @@ def test_who_is_revoked_is_heard_no_more() -> None:
     field.run(3.0)
     assert status_of(field.robots[0]).neighbour_ages_s.keys() == set()
     assert status_of(field.robots[1]).neighbour_ages_s.keys() == {"0"}
+
+
+@pytest.mark.parametrize("name", ["alice", "mallory"])
+@pytest.mark.parametrize("sequences_ahead", [5, 10**5, 2**48])
+def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
+    name: str, sequences_ahead: int
+) -> None:
+    field = a_field(3, "flying", secure=True)
+    members, alice = field.fleet.members, field.stations["alice"]
+    assert members is not None and alice.state is not None
+    liar = field.robots[2]
+    link = field.fleet.radio.link(liar.robot_id, {})
+    seal = members.guard(Role.ROBOT, "r2", 2, 10**9, lambda: 0.0).seal
+    sequence = min(alice.state.sequence + sequences_ahead, 2**48)
+    for i in range(40):
+        status = status_of(liar)
+        told = replace(
+            status, sequence=10**6 + i, operator=name, obeyed_sequence=sequence, ground_age_s=0.0,
+            boot_nonce=status.boot_nonce + 1,
+        )  # fmt: skip
+        link.publish(STATUS, seal(STATUS, encode(told)))
+        field.run(0.1)
+    honest = field.robots[:2]
+    assert alice.commands and alice.state.sequence < 2**47
+    assert {robot.state for robot in honest} == {_S.MISSION}
+    # Nor from a ground that starts just now, and knows nothing; nor a hold that others ask for.
+    bob = field.join("bob")
+    field.run(1.0)
+    field.begin(SafetyCommand("hold"), "bob")
+    field.until(lambda: {robot.state for robot in honest} == {_S.HOLD}, 3.0)
+    assert bob.commander == "alice" and alice.commands
+    # What sets robots in motion waits for those who do not obey, for a while.
+    field.begin(Resume())
+    field.until(lambda: {robot.state for robot in honest} == {_S.MISSION}, 10.0)
+    field.begin(SafetyCommand("land"), "bob")
+    field.until(lambda: {robot.state for robot in honest} == {_S.LAND}, 3.0)
+
+
+class Enemy:
+    """Whoever has heard this fleet's messages, has robot 1's key, and another fleet's."""
+
+    def __init__(self, field: Field, rng: random.Random) -> None:
+        members = field.fleet.members
+        assert members is not None
+        others = SimulatedMembers("other")
+        self._rng = rng
+        self._field = field
+        self._seals: list[Seal] = [
+            as_it_is,
+            members.guard(Role.ROBOT, "r1", 1, 10**9, lambda: 0.0).seal,
+            members.guard(Role.OBSERVER, "eve", None, 10**9, lambda: 0.0).seal,
+            others.guard(Role.OPERATOR, "alice", None, 10**9, lambda: 0.0).seal,
+        ]
+        self.recorded: list[tuple[Topic, bytes]] = []
+        for station in (-60, 7):
+            field.fleet.radio.link(station, {t: partial(self._record, t) for t in TOPICS})
+        field.run(0.7)
+
+    def _record(self, topic: Topic, _: str, data: bytes) -> None:
+        self.recorded.append((topic, data))
+
+    def says(self) -> None:
+        """One message, as whoever it likes to be."""
+        topic, data = self._made_up()
+        station = ENEMY if topic.sender == "ground" else self._rng.choice((0, 1, 9))
+        link = self._field.fleet.radio.link(station, {})
+        link.publish(topic, data)
+        link.close()
+
+    def _made_up(self) -> tuple[Topic, bytes]:
+        rng, seal = self._rng, self._rng.choice(self._seals)
+        kind = rng.randrange(6)
+        if kind == 0:  # Said again.
+            return rng.choice(self.recorded)
+        if kind == 1:  # Said again, and changed.
+            topic, data = rng.choice(self.recorded)
+            changed = bytearray(data)
+            for _ in range(rng.randrange(1, 9)):
+                changed[rng.randrange(len(changed))] = rng.randrange(256)
+            return topic, bytes(changed[: rng.choice((len(changed), rng.randrange(len(changed))))])
+        topic = rng.choice(TOPICS)
+        if kind == 2:
+            return topic, seal(topic, rng.randbytes(rng.randrange(topic.limit_bytes)))
+        if kind == 3:
+            return topic, seal(topic, rng.choice((b"[" * 4000, b"", b'{"sequence":' + b"9" * 4300)))
+        if kind == 4:
+            state = self._field.stations["alice"].published_state()
+            assert state is not None
+            sequence = rng.choice((state.sequence, state.sequence + 1, 2**48))
+            actions: tuple[SafetyAction, ...] = ("none", "hold", "return", "land")
+            said = replace(
+                state, sequence=sequence, operator=rng.choice(("alice", "zoe")),
+                safety_action=rng.choice(actions), enabled=rng.random() < 0.5,
+            )  # fmt: skip
+            return STATE, seal(STATE, encode(said))
+        status = replace(
+            status_of(self._field.robots[rng.randrange(2)]),
+            sequence=rng.choice((1, 10**6, 2**48)), boot_nonce=rng.randrange(2**48),
+            operator=rng.choice(("", "alice", "zoe")), obeyed_sequence=rng.choice((-1, 2**48)),
+            uptime_s=rng.choice((0.0, 1e9)), state=rng.choice(tuple(_S)),
+        )  # fmt: skip
+        return STATUS, seal(STATUS, encode(status))
+
+
+def test_hold_and_kill_act_whatever_single_message_came_before(
+    request: pytest.FixtureRequest,
+) -> None:
+    for seed in range(request.config.getoption("--tries")):
+        hold_and_kill_act(a_field(2, "flying", secure=True, seed=seed), random.Random(seed))
+
+
+def hold_and_kill_act(field: Field, rng: random.Random) -> None:
+    enemy, first = Enemy(field, rng), field.robots[0]
+    enemy.says()
+    field.run(0.3)
+    field.begin(SafetyCommand("hold"))
+    field.until(lambda: first.state is _S.HOLD, 1.0)
+    enemy.says()
+    field.begin(RobotCommand("kill", ("r0",)))
+    field.until(lambda: not first.vehicle.armed, 1.0)

@@ -15,6 +15,7 @@ from edge.identity.card import Role
 from edge.identity.guard import Speaker, Unguarded
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode, RefusalCode
 from edge.messages.mission import ORDER_LIFETIME_S, FlightState, Place, world_id
+from lpac.ground.alarms import AlarmCode, alarms
 from lpac.ground.station.protocol import (
     Enable,
     NextTrial,
@@ -32,7 +33,7 @@ from lpac.ground.station.protocol import (
     TakeCommand,
     Takeoff,
 )
-from lpac.ground.station.station import NameTakenError, Station, next_trial
+from lpac.ground.station.station import Station, next_trial
 from lpac.sim.fleet.layout import ORIGIN
 from lpac.sim.fleet.simulated import SimulatedGround
 from tests.said import not_done, problem
@@ -731,13 +732,12 @@ def test_stations_that_do_not_hear_each_other() -> None:
     field.done(SafetyCommand("hold"))
 
 
-def test_an_observer_holds_and_nothing_else() -> None:
+def test_who_does_not_command_holds_and_nothing_else() -> None:
     field = a_field(3, "flying")
     bob = field.join("bob")
     field.run(2.0)
     assert (bob.commands, bob.commander) == (False, "alice")
-    for request in (SafetyCommand("land"), SafetyCommand("return"), Start(), Resume(), Takeoff(),
-    Enable(on=False),
+    for request in (SafetyCommand("return"), Start(), Resume(), Takeoff(), Enable(on=False),
                     SetOrigin(ORIGIN), NextTrial(), RobotCommand("disarm", ("r0",))):  # fmt: skip
         assert problem(field.do(request, "bob")) is ProblemCode.OTHER_COMMANDS
     field.done(SafetyCommand("hold", robots=("r1",)), "bob")
@@ -754,6 +754,26 @@ def test_an_observer_holds_and_nothing_else() -> None:
     assert field.states() == {_S.MISSION}
     field.done(RobotCommand("kill", ("r0",)), "bob")
     assert field.robots[0].state is _S.FAULT
+    # Whoever lands robots commands from then on.
+    field.done(SafetyCommand("land", robots=("r1",)), "bob")
+    assert field.each_state() == [_S.FAULT, _S.LAND, _S.MISSION]
+    assert (alice.commands, alice.commander) == (False, "bob")
+
+
+def test_an_observer_may_ask_for_hold_alone() -> None:
+    field = a_field(2, "flying", secure=True)
+    eve = field.join("eve", Role.OBSERVER)
+    field.run(2.0)
+    for request in (SafetyCommand("land"), TakeCommand(), Start(), Resume(),
+                    RobotCommand("kill", ("r0",))):  # fmt: skip
+        assert problem(field.do(request, "eve")) is ProblemCode.MAY_NOT
+    field.done(SafetyCommand("hold"), "eve")
+    assert field.states() == {_S.HOLD} and field.stations["alice"].commands
+    field.done(Resume())
+    # When nobody commands any more, robots do by themselves what is safe.
+    field.leave("alice")
+    field.until(lambda: field.states() == {_S.LANDED}, 120.0)
+    assert not eve.commands and eve.commander == "alice"
 
 
 def test_an_observers_hold_ends_a_takeoff() -> None:
@@ -800,22 +820,29 @@ def test_a_hold_when_the_commander_is_gone_commands() -> None:
     assert field.states() == {_S.MISSION}
 
 
-def test_a_name_is_one_stations() -> None:
+def test_two_stations_of_a_name_are_an_alarm_and_end_nobody() -> None:
     field = a_field(1, "ready")
     alice = field.stations["alice"]
     twin = Station(alice.setup, field.now_s, 1e9)
     state = alice.published_state()
     assert state is not None
-    with pytest.raises(NameTakenError, match="--name"):
-        twin.hear_state(state, ANYBODY)
+    twin.hear_state(state, ANYBODY)
+    assert twin.shares_name and not twin.commands
     # A state of its own former life that says less is no other's.
     alice.hear_state(replace(state, sequence=state.sequence - 1), ANYBODY)
-    with pytest.raises(NameTakenError):
-        alice.hear_state(replace(state, sequence=state.sequence + 1), ANYBODY)
+    assert alice.commands and not alice.shares_name
+    alice.hear_state(replace(state, sequence=state.sequence + 1), ANYBODY)
+    assert alice.shares_name and not alice.commands
+    (alarm, *_) = alarms(alice.setup, alice.snapshot())
+    assert (alarm.severity, alarm.code) == ("critical", AlarmCode.NAME_SHARED)
+    # Its operator decides.
+    alice.take_command()
+    assert alice.commands and alice.state is not None
+    assert alice.state.sequence == state.sequence + 2
 
 
 @pytest.mark.parametrize("robots", [1, 3])
-def test_a_second_station_of_a_name_ends_and_not_the_first(robots: int) -> None:
+def test_a_second_station_of_a_name_leaves_the_fleet_to_the_first(robots: int) -> None:
     field = a_field(robots, "flying")
     fleet = field.fleet
     twin = SimulatedGround(
@@ -823,8 +850,7 @@ def test_a_second_station_of_a_name_ends_and_not_the_first(robots: int) -> None:
     )
     # Each hears the robots, and not the other.
     field.air = replace(field.air, partition=(frozenset({-1}), frozenset({-7})))
-    field.until(lambda: twin.problem, 10.0)
-    assert "--name" in str(twin.problem)
+    field.until(lambda: twin.node.station.shares_name, 10.0)
     assert not twin.node.station.commands
     assert twin.node.station.published_state() is None
     field.run(5.0)

@@ -225,7 +225,7 @@ class Flown:
             order_id=str(self._orders), robot_id=3, boot_nonce=11, kind=kind,
             expires_at_uptime_s=self.now_s + 9.0, operator="test", trial=trial,
         )  # fmt: skip
-        self.inbox.put_order(encode(order), ANYBODY)
+        self.inbox.put_order(encode(order), ANYBODY, self.now_s)
         self.tick()
         return self.control.flight.answers[-1]
 
@@ -591,6 +591,21 @@ def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: F
     assert why(flown.order("start", "a")) is RefusalCode.TOO_CLOSE
     # What it said two seconds ago tells nothing, nor does a place in another frame.
     flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)), age_s=2.0)
+    assert flown.order("start", "a").accepted
+
+
+def test_a_revoked_robot_is_kept_away_from_where_it_was_last(flown: Flown) -> None:
+    flown.take_off()
+    x_m, y_m, height_m = flown.odometry()
+    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))
+    flown.tick()
+    flown.control.revoked = frozenset({5, 6})
+    flown.peers()
+    for _ in range(100):
+        flown.tick()
+    assert why(flown.order("start", "a")) is RefusalCode.TOO_CLOSE
+    # It has a new card, and is silent.
+    flown.control.revoked = frozenset()
     assert flown.order("start", "a").accepted
 
 

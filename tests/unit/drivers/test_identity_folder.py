@@ -28,9 +28,16 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
     assert load_identity(folder, fleet="demo", unix_s=5.0).membership.start == 2_000_000_000_001
     assert load_identity(folder, fleet="demo", unix_s=3e9).membership.start == 3_000_000_000_000
     # What was heard in flight is known the next time.
+    guard = identity.guard(lambda: 0.0)
     authority.revoke("r3")
-    identity.keep(authority.revocations)
+    assert guard.hear_revocations(authority.revocations)
+    identity.exchange_revocations(guard)
     assert load_identity(folder, fleet="demo", unix_s=3e9).revocations == authority.revocations
+    # And what comes onto the disk meanwhile, in flight.
+    authority.revoke("r3")
+    (folder / "revoked").write_bytes(authority.revocations)
+    identity.exchange_revocations(guard)
+    assert guard.revocations == authority.revocations
 
 
 def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> None:

@@ -147,9 +147,9 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert first.autopilot.url == "udpin://10.0.0.1:9"
     assert (config.robots["r1"].mavlink_port, config.robots["r3"].mavlink_port) == (9, 14551)
     assert third.autopilot.url == "udpin://127.0.0.1:14551"
-    assert (first.link.listen, first.link.connect) == (("tcp/0.0.0.0:7",), ())
-    assert third.link.listen == ("tcp/0.0.0.0:7447",)
-    assert third.link.connect == ("tcp/10.0.0.1:7", "tcp/192.168.8.12:7447")
+    assert (first.link.listen, first.link.connect) == (("tls/0.0.0.0:7",), ())
+    assert third.link.listen == ("tls/0.0.0.0:7447",)
+    assert third.link.connect == ("tls/10.0.0.1:7", "tls/192.168.8.12:7447")
     assert (third.flight.slot, third.flight.landing_point_m) == (2, (20.0, 4.0))
     assert third.policy.bundle == str(tmp_path / "bundle")
     assert third.policy.world == str(tmp_path / "world.env")
@@ -500,7 +500,7 @@ def test_a_robot_may_have_its_files_elsewhere(tmp_path: Path) -> None:
     assert (robot.policy.bundle, robot.policy.world, robot.log.folder) == (
         "/policy", str(tmp_path / "r2" / "field.env"), str(tmp_path / "r2" / "kept"),
     )  # fmt: skip
-    assert robot.link.listen == ("tcp/127.0.0.1:7447",)
+    assert robot.link.listen == ("tls/127.0.0.1:7447",)
     assert robot.link.connect == config.robot_config("r2").link.connect
 
 

@@ -227,6 +227,7 @@ def test_a_revoked_key_is_not_heard_and_a_list_only_grows(one: Member, two: Memb
         one._topics[REVOKED]("ground/revoked", data)
     assert one.guard.revocations == lists[1]
     assert not one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"2"))
+    assert one.guard.revoked_robots() == {2}
     # It is known from the disk, too, and to who was revoked.
     revoked = Member(membership(Role.ROBOT, "r2", 2), lists[1])
     assert revoked.guard.card_problem(1.9e9) is CardProblem.REVOKED
@@ -237,6 +238,7 @@ def test_a_revoked_key_is_not_heard_and_a_list_only_grows(one: Member, two: Memb
     assert REVOKED not in dict(observer.say(STATE, b""))
     one._topics[REVOKED]("ground/revoked", lists[2])
     assert one.takes(MESSAGE, "robot/2/message", two.guard.seal(MESSAGE, b"3"))
+    assert one.guard.revoked_robots() == Unguarded().revoked_robots() == set()
 
 
 def test_a_card_must_be_the_keys_beside_it() -> None:

@@ -27,7 +27,7 @@ def make_inbox() -> Inbox:
 
 def test_nothing_heard_is_infinitely_old() -> None:
     assert make_inbox().ground(10.0) == (None, math.inf)
-    assert make_inbox().order() is None
+    assert make_inbox().order(0.0) is None
     assert make_inbox().peers(10.0) == ()
 
 
@@ -84,9 +84,16 @@ def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_count
 def test_orders_for_others_are_passed_over() -> None:
     inbox = make_inbox()
     for robot_id in (1, 3, 2):
-        inbox.put_order(encode(dataclasses.replace(ORDER, robot_id=robot_id)), ANYBODY)
-    assert inbox.order() == ORDER
-    assert inbox.order() is None
+        inbox.put_order(encode(dataclasses.replace(ORDER, robot_id=robot_id)), ANYBODY, 0.0)
+    assert inbox.order(0.0) == ORDER
+    assert inbox.order(0.0) is None
+
+
+def test_an_order_that_came_after_the_ticks_time_waits_for_the_next() -> None:
+    inbox = make_inbox()
+    inbox.put_order(encode(ORDER), ANYBODY, 5.0)
+    assert inbox.order(4.9) is None
+    assert inbox.order(5.0) == ORDER
 
 
 @given(st.binary() | st.text().map(str.encode) | st.just(b"[" * 100_000) | st.just(b"{}"))
@@ -95,9 +102,9 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
     assert inbox.ground(1.0)[0] == STATE
     inbox.put_ground(data, ANYBODY, 2.0, 1e9)
-    inbox.put_order(data, ANYBODY)
+    inbox.put_order(data, ANYBODY, 0.0)
     assert inbox.ground(2.0) == (STATE, 1.0)
-    assert inbox.order() is None
+    assert inbox.order(0.0) is None
     assert inbox.peers(2.0) == ()
     assert inbox.malformed == 2
 
@@ -141,10 +148,10 @@ def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
 
 def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
     inbox = make_inbox()
-    inbox.put_order(newer(ORDER), ANYBODY)
-    assert inbox.order() is None
-    inbox.put_order(newer(ORDER, kind="kill"), ANYBODY)
-    kill = inbox.order()
+    inbox.put_order(newer(ORDER), ANYBODY, 0.0)
+    assert inbox.order(0.0) is None
+    inbox.put_order(newer(ORDER, kind="kill"), ANYBODY, 0.0)
+    kill = inbox.order(0.0)
     assert kill is not None and (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)
 
 
@@ -217,8 +224,8 @@ def test_an_order_is_its_operators_own() -> None:
     order = dataclasses.replace(ORDER, robot_id=3, operator="ann")
     for kind in ("takeoff", "kill"):
         data = encode(dataclasses.replace(order, kind=kind))
-        inbox.put_order(data, Speaker(Role.OPERATOR, "bob"))
-        inbox.put_order(data, Speaker(Role.OBSERVER, "ann"))
-        assert inbox.order() is None
-        inbox.put_order(data, Speaker(Role.OPERATOR, "ann"))
-        assert inbox.order() == dataclasses.replace(order, kind=kind)
+        inbox.put_order(data, Speaker(Role.OPERATOR, "bob"), 0.0)
+        inbox.put_order(data, Speaker(Role.OBSERVER, "ann"), 0.0)
+        assert inbox.order(0.0) is None
+        inbox.put_order(data, Speaker(Role.OPERATOR, "ann"), 0.0)
+        assert inbox.order(0.0) == dataclasses.replace(order, kind=kind)

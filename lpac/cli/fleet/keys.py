@@ -1,0 +1,171 @@
+"""`lpac fleet init`, `operator`, `members`, `revoke` and `rotate`: who belongs to the fleet."""
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lpac.cli.fleet.everyday import print_outcomes
+from lpac.cli.fleet.progress import require_all, run_for_each
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet, user_at_host
+from lpac.cli.printing import BAD, GOOD, print_table, styled
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from lpac.fleet.authority import Member
+    from lpac.fleet.hold import Report
+    from lpac.fleet.settings import FleetConfig, RobotHost
+
+
+def init(
+    fleet: Fleet = DEFAULT_FLEET,
+    name: Annotated[
+        str, typer.Option("--name", help="What you are called in the fleet; else user@host.")
+    ] = "",
+) -> None:
+    """Make the fleet's keys on this computer; the first `enroll` does it too."""
+    from lpac.fleet.cards import init as make_authority
+    from lpac.fleet.settings import load_fleet
+
+    authority = make_authority(load_fleet(fleet), name or user_at_host())
+    typer.echo(f"made the fleet's keys: {authority.folder}")
+    typer.echo(
+        "keep a copy of that folder where nobody else can read it: whoever has it can fly the "
+        "fleet, and without it no robot joins"
+    )
+
+
+def operator(
+    name: Annotated[str, typer.Argument(help="What that ground station is called.")],
+    out: Annotated[Path, typer.Option(help="The new folder that its laptop gets.")],
+    fleet: Fleet = DEFAULT_FLEET,
+    observer: Annotated[
+        bool, typer.Option("--observer", help="It may ask the fleet to hold, and nothing else.")
+    ] = False,
+) -> None:
+    """Make another laptop a ground station of the fleet: the folder OUT, for it alone."""
+    from edge.identity.card import Role
+    from lpac.fleet.authority import new_member
+    from lpac.fleet.cards import open_authority
+    from lpac.fleet.settings import load_fleet
+
+    if out.exists():
+        raise ValueError(f"{out}: is there already: give a new folder")
+    role = Role.OBSERVER if observer else Role.OPERATOR
+    config = load_fleet(fleet)
+    new_member(open_authority(config), out, role, name)
+    typer.echo(f"{out}: {name} is an {role} of fleet {config.fleet}")
+    typer.echo(
+        f"move the folder to that laptop, by a way that nobody else can read, and name it there "
+        f'in {fleet.name}: keys = "FOLDER"'
+    )
+
+
+def members(fleet: Fleet = DEFAULT_FLEET, as_json: AsJson = False) -> None:
+    """Who has a card of the fleet, until when, and whose was revoked."""
+    from lpac.fleet.cards import open_authority
+    from lpac.fleet.settings import load_fleet
+
+    known = open_authority(load_fleet(fleet)).members()
+    if as_json:
+        typer.echo(json.dumps([_facts(member) for member in known]))
+        return
+    rows: list[list[str | Text]] = [
+        [
+            member.name, member.role.value, "" if member.robot_id is None else str(member.robot_id),
+            time.strftime("%Y-%m-%d", time.gmtime(member.expires_unix_s)),
+            styled("revoked", BAD) if member.revoked else styled("good", GOOD),
+        ]
+        for member in known
+    ]  # fmt: skip
+    print_table(("name", "role", "robot id", "good until", "card"), rows, ("robot id",))
+
+
+def _facts(member: "Member") -> dict[str, object]:
+    return {
+        "name": member.name,
+        "role": member.role.value,
+        "robot_id": member.robot_id,
+        "fingerprint": member.fingerprint,
+        "expires_unix_s": member.expires_unix_s,
+        "revoked": member.revoked,
+    }
+
+
+def revoke(
+    name: Annotated[str, typer.Argument(help="A robot or a ground station of the fleet.")],
+    fleet: Fleet = DEFAULT_FLEET,
+    in_flight: Annotated[
+        bool, typer.Option("--in-flight", help="Also a robot in the air, or who commands.")
+    ] = False,
+) -> None:
+    """Let nobody listen to NAME any more: its drone or laptop was lost.
+
+    This laptop's `lpac ground` tells the robots, at once and for as long as it runs. Robots keep
+    away from where they heard a revoked one last.
+    """
+    from lpac.fleet.cards import open_authority
+    from lpac.fleet.settings import load_fleet
+
+    config = load_fleet(fleet)
+    authority = open_authority(config)
+    authority.named(name)
+    why = _why_not_now(config, name)
+    if why and not in_flight:
+        raise ValueError(f"{why}: add --in-flight if that is what you want")
+    count = len(authority.revoke(name))
+    typer.echo(f"{name} is revoked ({count} {'card' if count == 1 else 'cards'})")
+    typer.echo(
+        "robots know it 2 s after they hear this laptop's `lpac ground`: let it run while they "
+        "are on; one that never hears it goes on listening"
+    )
+
+
+def _why_not_now(config: "FleetConfig", name: str) -> str:
+    """What speaks against it as far as this laptop's ground knows; "" if nothing does."""
+    from lpac.analysis.snapshot import FleetSnapshot
+    from lpac.ground.station.client import GroundError, subscribe
+    from lpac.ground.station.station import is_down
+
+    try:
+        with subscribe(config.fleet) as told:
+            snapshot = next(t for t in told if isinstance(t, FleetSnapshot))
+    except GroundError:
+        return f"no `lpac ground` runs here, so nobody knows what {name} does now"
+    if snapshot.commander == name:
+        return f"{name} commands the fleet"
+    for robot in snapshot.robots:
+        if robot.name == name and robot.status is not None and not is_down(robot.status):
+            return f"{name} was heard in the air last"
+    return ""
+
+
+def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
+    """Renew everybody's keys: robots on the ground get new ones, and this computer.
+
+    The old keys are revoked. A robot in flight refuses, and keeps its own.
+    """
+    from edge.identity.card import Role
+    from lpac.fleet.authority import new_member
+    from lpac.fleet.cards import open_authority, renew_card
+
+    config, chosen = open_fleet(fleet, robots)
+    authority = open_authority(config)
+
+    async def one(robot: "RobotHost", report: "Report") -> None:
+        report("new key", None)
+        await renew_card(config, robot, report)
+
+    outcomes = run_for_each(chosen, one)
+    print_outcomes(outcomes, ("result",), lambda _: (styled("new key", GOOD),))
+    own = authority.own_name()
+    if own is not None and robots is None:
+        new_member(authority, authority.folder, Role.OPERATOR, own)
+        typer.echo(f"{own} has a new key: start `lpac ground` again")
+    others = {m.name for m in authority.members() if m.robot_id is None and not m.revoked} - {own}
+    for name in sorted(others):
+        typer.echo(f"{name} keeps its key: `lpac fleet operator {name}` makes a new one")
+    require_all(outcomes, "renewed on")
