@@ -5,6 +5,7 @@ import numpy as np
 from bench import BUNDLE
 from bench.first_tick import ENV_SCALE, NEIGHBOURS_M, POSITION_M, run
 from edge.core.aggregation import AggregatedMessage
+from edge.core.fleet_time import FleetTime
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import encode
@@ -35,16 +36,24 @@ def main() -> None:
         odometry=_Standing(),
         parameters=PacParameters(scale=ModelScale(ENV_SCALE, 0.25), max_speed_m_s=1.25),
     )
+    robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     payload = np.zeros(policy.message_size, np.float32)
     for number, position_m in enumerate(NEIGHBOURS_M, 1):
         message = AggregatedMessage(
-            number, 1, 1, 0.0, position_m, velocity_m_s=(0.0, 0.0, 0.0), frame_id=0, payload=payload
+            number,
+            1,
+            1,
+            FleetTime(1, 0.0, 0.0),
+            position_m,
+            velocity_m_s=(0.0, 0.0, 0.0),
+            frame_id=0,
+            payload=payload,
         )
-        robot.receive(encode(message, policy.bundle_id, "float16"), now_s=0.0, unix_now_s=0.0)
+        robot.receive(encode(message, policy.bundle_id, "float16"), now_s=0.0)
 
     def tick() -> None:
         robot.perceive(now_s=0.0)
-        assert robot.infer(now_s=0.0, unix_now_s=0.0)
+        assert robot.infer(now_s=0.0)
 
     run(tick)
 

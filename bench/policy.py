@@ -146,7 +146,7 @@ class EdgeRobot:
             "own message": lambda: self._hops.message(NEIGHBOURS),
             "encode": lambda: encode(own, policy.bundle_id, "float16"),
             "whole step: Pac.perceive": lambda: moment.robot.perceive(moment.now_s),
-            "whole step: Pac.infer": lambda: moment.robot.infer(moment.now_s, moment.now_s),
+            "whole step: Pac.infer": lambda: moment.robot.infer(moment.now_s),
         }
 
     def _observation(self) -> Observation:

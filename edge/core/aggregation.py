@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge.core import F32
+from edge.core.fleet_time import FleetTime
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +50,14 @@ class AggregatedMessage:
     `payload` is (message_size,), float32 or float16: (y_j)_kl in the order [l][k][feature],
     already multiplied by 1/sqrt(d_j), d_j being the sender's number of neighbours.
     `position_m` and `velocity_m_s` are in the mission frame that `frame_id` stands for
-    (`MissionFrame.frame_id`); `sent_at_s` is the sender's Unix time.
+    (`MissionFrame.frame_id`); `sent` is when, None as long as the sender does not know the time.
     `boot_epoch` grows with every start of the sender, `sequence` with every message of one start.
     """
 
     robot_id: int
     boot_epoch: int
     sequence: int
-    sent_at_s: float
+    sent: FleetTime | None
     position_m: tuple[float, float, float]
     velocity_m_s: tuple[float, float, float]
     frame_id: int

@@ -15,9 +15,6 @@ from edge.core.wire import Rejection
 
 # After a cut, TCP delivers data that is up to 2 s old; nothing is in transit longer than this.
 _LONGEST_TRANSIT_S = 5.0
-# Clocks that are synchronised over the network are off by far less than this, one that is wrong
-# after power-up by far more.
-_CLOCK_TOLERANCE_S = 0.5
 
 
 class Neighbour(NamedTuple):
@@ -38,16 +35,13 @@ class _LastHeard(NamedTuple):
     boot_epoch: int
     sequence: int
     at_s: float
-    # Of this start: the clocks' difference and the link's delay.
-    shortest_transit_s: float
 
 
 class Mailbox:
     """One robot's receive buffer. Every method may be called from any thread.
 
-    `now_s` is a monotonic clock, `unix_now_s` the wall clock, both the robot's own, s. A message's
-    age counts from its sending where the two robots' clocks agree, which the quickest message since
-    the sender's start tells. Where they do not agree, that one counts as not delayed at all.
+    `now_s` is the robot's own monotonic clock, s. How old a message was when it came is for the
+    caller to say: its greatest possible age. One of which that is not known is not kept.
 
     `swap` and `neighbours` leave out what is not younger than `max_message_age_s`, and take nothing
     away. With 0 age plays no part, and the paper's rule holds: `swap` hands each message out once,
@@ -78,29 +72,19 @@ class Mailbox:
         )
 
     def receive(
-        self, message: AggregatedMessage, now_s: float, unix_now_s: float
+        self, message: AggregatedMessage, now_s: float, age_s: float | None
     ) -> Rejection | None:
-        """Keep `message` if it is its sender's newest, else say why not: OWN, OUTDATED or STALE.
+        """Keep `message`, which is at most so old, if it is its sender's newest.
 
-        Nobody may change the message or its payload afterwards.
+        Else say why not: OWN, OUTDATED, AGE_UNKNOWN or STALE. Nobody may change the message or its
+        payload afterwards.
         """
-        sender = message.robot_id
-        transit_s = unix_now_s - message.sent_at_s
         with self._lock:
-            heard = self._heard.get(sender)
-            shortest_s = transit_s
-            # After a silence the sender's clock may have been set: nothing is known of it any more.
-            if heard and heard.boot_epoch == message.boot_epoch and not self._silent(heard, now_s):
-                shortest_s = min(transit_s, heard.shortest_transit_s)
-            clocks_agree = abs(shortest_s) <= _CLOCK_TOLERANCE_S
-            delay_s = transit_s if clocks_agree else transit_s - shortest_s
-            born_s = now_s - max(delay_s, 0.0)
-            rejection = self._rejection(message, born_s, now_s)
+            rejection = self._rejection(message, now_s, age_s)
             if rejection is None:
-                self._heard[sender] = _LastHeard(
-                    message.boot_epoch, message.sequence, now_s, shortest_s
-                )
-                self._received[sender] = _Received(message, born_s)
+                sender = message.robot_id
+                self._heard[sender] = _LastHeard(message.boot_epoch, message.sequence, now_s)
+                self._received[sender] = _Received(message, now_s - (age_s or 0.0))
                 self._accepted[sender] += 1
             self._counts[rejection or "accepted"] += 1
         return rejection
@@ -157,7 +141,7 @@ class Mailbox:
         return self._max_message_age_s == 0.0 or now_s - born_s < self._max_message_age_s
 
     def _rejection(
-        self, message: AggregatedMessage, born_s: float, now_s: float
+        self, message: AggregatedMessage, now_s: float, age_s: float | None
     ) -> Rejection | None:
         if message.robot_id == self._robot_id:
             return Rejection.OWN
@@ -168,6 +152,8 @@ class Mailbox:
             and (message.boot_epoch == heard.boot_epoch or not self._silent(heard, now_s))
         ):
             return Rejection.OUTDATED
-        if not self._is_fresh(born_s, now_s):
-            return Rejection.STALE
-        return None
+        if self._max_message_age_s == 0.0:
+            return None
+        if age_s is None:
+            return Rejection.AGE_UNKNOWN
+        return None if age_s < self._max_message_age_s else Rejection.STALE

@@ -1,23 +1,25 @@
 """AggregatedMessage <-> the bytes that travel between robots.
 
-Little-endian, a header of 96 bytes and then the payload:
+Little-endian, a header of 104 bytes and then the payload:
 
 | offset | type | field | unit |
 | --- | --- | --- | --- |
 | 0 | 8 bytes | magic, `LPAC-MSG` | |
-| 8 | uint8 | version of this layout, 2 | |
+| 8 | uint8 | version of this layout, 3 | |
 | 9 | uint8 | payload type: 1 float32, 2 float16 | |
 | 10 | uint16 | robot id | |
 | 12 | uint32 | sequence | |
 | 16 | 16 bytes | first half of the bundle id (SHA-256 of the manifest) | |
 | 32 | uint64 | boot epoch | |
-| 40 | float64 | send time | Unix s |
+| 40 | float64 | send time by the ground's clock | s |
 | 48 | 3 x float64 | position x, y, z in the mission frame | m |
 | 72 | 3 x float32 | velocity x, y, z in the mission frame | m/s |
 | 84 | uint32 | the mission frame's `frame_id` | |
 | 88 | uint32 | payload length | floats |
-| 92 | uint32 | CRC-32 (zlib) of all other bytes, payload included | |
-| 96 | float32 or float16 | payload | |
+| 92 | uint32 | which ground's clock, 0 if none is known | |
+| 96 | float32 | how wrong the send time may be | s |
+| 100 | uint32 | CRC-32 (zlib) of all other bytes, payload included | |
+| 104 | float32 or float16 | payload | |
 
 Magic and version stay where they are in every version.
 """
@@ -32,17 +34,22 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core.aggregation import AggregatedMessage
+from edge.core.fleet_time import FleetTime
 
 _MAGIC = b"LPAC-MSG"
-_VERSION = 2
+_VERSION = 3
 _VERSION_AT = len(_MAGIC)
-_FIELDS = struct.Struct("<8sBBHI16sQ4d3f2I")
+_FIELDS = struct.Struct("<8sBBHI16sQ4d3f3If")
 _CHECKSUM = struct.Struct("<I")
 # A multiple of 8, so that the payload is aligned wherever the message is.
 _HEADER_SIZE = _FIELDS.size + _CHECKSUM.size
 _BUNDLE_ID_SIZE = 16
+# Far outside of what a fleet needs: boot epochs are ms of a wall clock, this is the year 2248.
+_MOST_EPOCH = 2**43
+_MOST_M, _MOST_M_S, _MOST_S = 1e6, 1e4, 1e9
 
 MAX_ROBOT_ID = 2**16 - 1
+_NO_TIME = FleetTime(0, 0.0, 0.0)
 _PAYLOAD_TYPES: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 2: np.dtype("<f2")}
 
 
@@ -61,6 +68,8 @@ class Rejection(StrEnum):
     OTHER_SENDER = "other_sender"
     PAYLOAD_LENGTH = "payload_length"
     NON_FINITE = "non_finite"
+    IMPOSSIBLE = "impossible"
+    AGE_UNKNOWN = "age_unknown"
     OUTDATED = "outdated"
     STALE = "stale"
 
@@ -82,6 +91,7 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTyp
     saturated = np.clip(message.payload, -limit, limit)
     payload = np.where(np.isfinite(message.payload), saturated, message.payload)
     data = payload.astype(_PAYLOAD_TYPES[payload_type]).tobytes()
+    base, time_s, uncertainty_s = message.sent or _NO_TIME
     fields = _FIELDS.pack(
         _MAGIC,
         _VERSION,
@@ -90,11 +100,13 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTyp
         message.sequence,
         bundle_id[:_BUNDLE_ID_SIZE],
         message.boot_epoch,
-        message.sent_at_s,
+        time_s,
         *message.position_m,
         *message.velocity_m_s,
         message.frame_id,
         message.payload.size,
+        base,
+        uncertainty_s,
     )
     return b"".join((fields, _CHECKSUM.pack(zlib.crc32(data, zlib.crc32(fields))), data))
 
@@ -131,13 +143,17 @@ def decode(
         sequence,
         sender_bundle_id,
         boot_epoch,
-        sent_at_s,
+        time_s,
         x_m,
         y_m,
         z_m,
-        *velocity_m_s,
+        vx_m_s,
+        vy_m_s,
+        vz_m_s,
         sender_frame_id,
         payload_length,
+        base,
+        uncertainty_s,
     ) = _FIELDS.unpack_from(view)
     # First whether these are the bytes that were sent; only then does what they say mean anything.
     dtype = _PAYLOAD_TYPES.get(payload_type)
@@ -158,16 +174,26 @@ def decode(
     if frame_id is not None and sender_frame_id != frame_id:
         return Rejection.OTHER_FRAME
     payload = np.frombuffer(view, dtype, offset=_HEADER_SIZE)
-    header = (sent_at_s, x_m, y_m, z_m, *velocity_m_s)
+    position_m, velocity_m_s = (x_m, y_m, z_m), (vx_m_s, vy_m_s, vz_m_s)
+    header = (time_s, uncertainty_s, *position_m, *velocity_m_s)
     if not (all(map(math.isfinite, header)) and np.isfinite(payload).all()):
         return Rejection.NON_FINITE
+    possible = (
+        boot_epoch < _MOST_EPOCH
+        and all(abs(c) <= _MOST_M for c in position_m)
+        and all(abs(c) <= _MOST_M_S for c in velocity_m_s)
+        and abs(time_s) <= _MOST_S
+        and 0.0 <= uncertainty_s <= _MOST_S
+    )
+    if not possible:
+        return Rejection.IMPOSSIBLE
     return AggregatedMessage(
         robot_id,
         boot_epoch,
         sequence,
-        sent_at_s,
-        (x_m, y_m, z_m),
-        (velocity_m_s[0], velocity_m_s[1], velocity_m_s[2]),
+        FleetTime(base, time_s, uncertainty_s) if base else None,
+        position_m,
+        velocity_m_s,
         sender_frame_id,
         payload,
     )

@@ -15,8 +15,6 @@ from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 
-# 2026-01-01 UTC. A computer that lost its clock with its battery starts years before.
-_EARLIEST_UNIX_S = 1_767_225_600.0
 _FIX_3D = 3
 
 
@@ -32,7 +30,7 @@ class PreflightLimits:
     max_hdop: float = 2.0
     max_position_age_s: float = 0.5
     max_ground_age_s: float = 3.0
-    max_clock_difference_s: float = 1.0
+    max_time_uncertainty_s: float = 0.2
 
     def __post_init__(self) -> None:
         if not 0.0 < self.min_battery <= 1.0:
@@ -43,7 +41,7 @@ class PreflightLimits:
             "max_hdop",
             "max_position_age_s",
             "max_ground_age_s",
-            "max_clock_difference_s",
+            "max_time_uncertainty_s",
         ):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
@@ -60,12 +58,11 @@ class PreflightInputs:
     point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
     `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
     robots that were heard lately, `not_understood` those who said what cannot be read.
-    `ground_age_s` is how long ago the ground was heard, None if never; `ground_clock_offset_s` is
-    its wall clock minus this one, None if it is not known.
+    `ground_age_s` is how long ago the ground was heard, None if never; the fleet's time is known to
+    `time_uncertainty_s`, None if it is not.
     """
 
     now_s: float
-    unix_now_s: float
     robot_id: int
     duplicate_id: bool
     bundle_problem: str | None
@@ -88,7 +85,7 @@ class PreflightInputs:
     not_understood: Sequence[str]
     rc: RemoteControl
     ground_age_s: float | None
-    ground_clock_offset_s: float | None
+    time_uncertainty_s: float | None
 
 
 def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[FailedCheck, ...]:
@@ -107,10 +104,6 @@ def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
             CheckCode.BUNDLE_NOT_VERIFIED,
             f"bundle is not verified ({inputs.bundle_problem}): deploy it again",
         )
-    if not inputs.unix_now_s >= _EARLIEST_UNIX_S:
-        yield FailedCheck(
-            CheckCode.CLOCK_NOT_SET, "clock is before 2026: set the time of this robot"
-        )
     age_s = inputs.ground_age_s
     if age_s is None:
         yield FailedCheck(
@@ -121,12 +114,11 @@ def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
         yield FailedCheck(
             CheckCode.GROUND_SILENT, f"ground was last heard {age_s:.1f} s ago: check the radio"
         )
-    offset_s = inputs.ground_clock_offset_s
-    if offset_s is not None and not abs(offset_s) <= limits.max_clock_difference_s:
-        yield FailedCheck(
-            CheckCode.CLOCK_OFF_GROUND,
-            f"clock differs from the ground's by {offset_s:.1f} s: set the time of this robot",
-        )
+    error_s = inputs.time_uncertainty_s
+    if age_s is not None and not (error_s is not None and error_s <= limits.max_time_uncertainty_s):
+        known = "not known yet" if error_s is None else f"known to {error_s:.1f} s only"
+        text = f"the ground's time is {known}: wait, or check the radio"
+        yield FailedCheck(CheckCode.TIME_NOT_KNOWN, text, True)
 
 
 def _vehicle(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
@@ -330,7 +322,7 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
             CheckCode.NOT_UNDERSTOOD,
             f"{robot} runs another version of this program: deploy one to all",
         )
-    for beacon, _, heard_at_unix_s in others:
+    for beacon, _ in others:
         other = f"robot {beacon.robot_id}"
         if beacon.system_id is not None and beacon.system_id == inputs.system_id:
             yield FailedCheck(
@@ -352,12 +344,6 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
                 f"{other} has another mission origin: set it again on the ground",
             )
         yield from _apart(inputs, beacon, other)
-        offset_s = beacon.sent_at_s - heard_at_unix_s
-        if not abs(offset_s) <= limits.max_clock_difference_s:
-            yield FailedCheck(
-                CheckCode.CLOCK_OFF_ROBOT,
-                f"{other}'s clock differs by {offset_s:.1f} s: set the time of both",
-            )
     if not inputs.vehicle.armed:
         yield from _too_late(inputs.errors, [heard.beacon for heard in others])
 

@@ -75,11 +75,10 @@ class Beacon:
 
 
 class HeardBeacon(NamedTuple):
-    """Another robot's, and when it came: this robot's monotonic and wall clock, s."""
+    """Another robot's, and when it came by this robot's monotonic clock, s."""
 
     beacon: Beacon
     heard_at_s: float
-    heard_at_unix_s: float
 
 
 def tag(name: str) -> int:

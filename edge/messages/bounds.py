@@ -19,6 +19,8 @@ MOST_LETTERS = 1000
 RobotId = Annotated[int, Meta(ge=0, le=MAX_ROBOT_ID)]
 # JSON's keys are texts.
 RobotKey = Annotated[str, Meta(pattern=r"^[0-9]{1,5}$")]
+# Of 32 bits; 0 is none.
+TimeBase = Annotated[int, Meta(ge=0, lt=2**32)]
 Nonce = Annotated[int, Meta(ge=0, lt=2**48)]
 Sequence = Annotated[int, Meta(ge=-1, le=2**48)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]

@@ -28,8 +28,7 @@ class CheckCode(_Code):
     # The program, its clock and its ground.
     BUNDLE_NOT_VERIFIED = "bundle_not_verified"
     WATCHDOG_ENDED = "watchdog_ended"
-    CLOCK_NOT_SET = "clock_not_set"
-    CLOCK_OFF_GROUND = "clock_off_ground"
+    TIME_NOT_KNOWN = "time_not_known"
     GROUND_NOT_HEARD = "ground_not_heard"
     GROUND_SILENT = "ground_silent"
     CARD_NOT_GOOD = "card_not_good"
@@ -74,7 +73,6 @@ class CheckCode(_Code):
     OTHER_ORIGIN = "other_origin"
     HEIGHTS_TOO_NEAR = "heights_too_near"
     LANDINGS_TOO_NEAR = "landings_too_near"
-    CLOCK_OFF_ROBOT = "clock_off_robot"
     TAKEOFFS_TOO_FAR_APART = "takeoffs_too_far_apart"
     # What of the ground's state it does not take up: in flight, or because it cannot.
     KEEPS_ORIGIN = "keeps_origin"

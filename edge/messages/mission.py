@@ -42,6 +42,7 @@ from edge.messages.bounds import (
     Sequence,
     Share,
     SystemId,
+    TimeBase,
     UnixSeconds,
     bounds_of,
 )
@@ -129,6 +130,15 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
+class Echo:
+    """A robot's newest status, as its ground heard it `held_s` before it says so."""
+
+    boot_nonce: Nonce
+    uptime_s: Seconds
+    held_s: Seconds
+
+
+@dataclass(frozen=True, slots=True)
 class GroundState:
     """What the ground wants for as long as it says so; `sequence` grows with every change.
 
@@ -139,8 +149,10 @@ class GroundState:
     robot. Withdrawing it sets nothing in motion. `origin`, `fence` (None: the robot's
     configured one), `places` (by robot id; who is not in it keeps its configured one) and
     `world_id` (None: whatever the robot has) are taken up on the ground only. `trial` is the
-    mission's name. `unix_time_s` is the ground's clock when it said so. `waiting` are those that
-    hold in a return only until their way down is free: nobody asked them to.
+    mission's name. `unix_time_s` is the ground's wall clock when it said so, `time_s` the fleet's
+    time, which is the clock of the ground `time_base`; `echoes` are for robots (by id) to find out
+    how long messages travel. `waiting` are those that hold in a return only until their way down is
+    free: nobody asked them to.
     """
 
     sequence: Sequence
@@ -159,6 +171,9 @@ class GroundState:
     trial: Name = ""
     unix_time_s: UnixSeconds | None = None
     waiting: Annotated[tuple[RobotId, ...], _OfRobots] = ()
+    time_base: TimeBase = 0
+    time_s: Seconds | None = None
+    echoes: Annotated[dict[RobotKey, Echo], _OfRobots] = field(default_factory=dict)
     version: Version = VERSION
     must_understand: MustUnderstand = ()
 

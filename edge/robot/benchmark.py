@@ -128,13 +128,14 @@ class _Flight:
         began_s = perf_counter()
         perceived = self._pac.perceive(now_s)
         between_s = perf_counter()
-        inferred = self._pac.infer(now_s, now_s)
+        inferred = self._pac.infer(now_s)
         ended_s = perf_counter()
         assert perceived is not None and inferred is not None
         assert len(inferred.senders) == len(self._offsets)
         return between_s - began_s, ended_s - between_s
 
     def _receive(self, now_s: float) -> None:
+        self._pac.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
         x, y, height = self.odometry().position_m
         for number, (offset, payload) in enumerate(
             zip(self._offsets.tolist(), self._payloads, strict=True), 1
@@ -143,13 +144,13 @@ class _Flight:
                 robot_id=number,
                 boot_epoch=1,
                 sequence=self._ticks,
-                sent_at_s=now_s,
+                sent=self._pac.clock.at(now_s),
                 position_m=(x + offset[0], y + offset[1], height),
                 velocity_m_s=(0.0, 0.0, 0.0),
                 frame_id=0,
                 payload=payload,
             )
-            self._pac.receive(encode(message, self._policy.bundle_id, "float16"), now_s, now_s)
+            self._pac.receive(encode(message, self._policy.bundle_id, "float16"), now_s)
 
 
 def _percentiles_ms(times_s: F64) -> tuple[float, float, float]:

@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 from typing import NamedTuple
 
 from edge.core import log
+from edge.core.fleet_time import FleetTime
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
@@ -87,6 +88,8 @@ class FlightControl:
         self._guidance = Guidance()
         self._last_tick_s: float | None = None
         self._has_flown = False
+        self._time_heard_at_s = -math.inf
+        self._ground_said: FleetTime | None = None
         self._energy_parameters = energy
         self._consumption = Consumption(energy)
         self.energy: Energy | None = None
@@ -115,6 +118,8 @@ class FlightControl:
             if (ground.operator, ground.sequence) != (self.operator, self.obeyed_sequence):
                 self._recorder.record("ground", self._unix_clock_s(), asdict(ground))
             self.obeyed_sequence, self.operator = ground.sequence, ground.operator
+            self._hear_time(ground, now_s - ground_age_s)
+            ground_age_s = self.ground_age_s(now_s)
             self._take_up(ground, vehicle)
         self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
@@ -161,6 +166,33 @@ class FlightControl:
             )
         self._record(inputs, setpoint, sent, decision.actions)
         return sent is not None and not failsafe_acts(vehicle)
+
+    def _hear_time(self, ground: GroundState, at_s: float) -> None:
+        if at_s == self._time_heard_at_s or ground.time_s is None:
+            return
+        self._time_heard_at_s = at_s
+        before = self._ground_said
+        # What was overtaken on its way is not its newest word.
+        if before is None or before.base != ground.time_base or before.time_s < ground.time_s:
+            self._ground_said = FleetTime(ground.time_base, ground.time_s, 0.0)
+        echo = ground.echoes.get(str(self.assignment.robot.robot_id))
+        if echo is not None and echo.boot_nonce == self.assignment.robot.boot_nonce:
+            self._pac.clock.hear(
+                ground.time_base,
+                ground.time_s,
+                echoed_at_s=self._started_s + echo.uptime_s,
+                held_s=echo.held_s,
+                now_s=at_s,
+            )
+
+    def ground_age_s(self, now_s: float) -> float:
+        """How old the ground's newest word is, s; infinite if none came. From any thread.
+
+        One that was held up on its way is as old as it is at least.
+        """
+        heard_s, said = self._inbox.ground_age_s(now_s), self._ground_said
+        age = None if said is None else self._pac.clock.age_s(said, now_s)
+        return heard_s if age is None else max(heard_s, age.least_s)
 
     def look_back(self, silent_since_s: float, now_s: float) -> None:
         """Nothing was sent between these times, as the watchdog counts it.
@@ -299,7 +331,7 @@ class FlightControl:
         heard = self._pac.mailbox.neighbours(now_s)
         known = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
         told = []
-        for beacon, heard_at_s, _ in self.peers:
+        for beacon, heard_at_s in self.peers:
             age_s = now_s - heard_at_s
             comparable = beacon.frame_id == self._pac.frame_id and age_s <= _MAX_BEACON_AGE_S
             if beacon.robot_id in known or not comparable:

@@ -35,7 +35,6 @@ class _Arrived(NamedTuple):
     data: bytes
     speaker: Speaker
     at_s: float
-    unix_s: float
 
 
 class _ArrivedOrder(NamedTuple):
@@ -74,17 +73,15 @@ class Inbox:
         self._safety_form_at_s = -math.inf
         # Why the newest state of a ground was not understood; "" if it was.
         self.ground_refusal = ""
-        # The ground's wall clock minus this one, None while it is not known.
-        self.ground_clock_offset_s: float | None = None
         # The text of the newest world file that the ground sent.
         self.world: bytes | None = None
         # Who said lately what could not be read, as `peers` found it.
         self.not_understood: tuple[str, ...] = ()
         self.malformed = 0
 
-    def put_ground(self, data: bytes, speaker: Speaker, now_s: float, unix_now_s: float) -> None:
+    def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """A ground's state arrived."""
-        self._grounds.append(_Arrived(data, speaker, now_s, unix_now_s))
+        self._grounds.append(_Arrived(data, speaker, now_s))
 
     def put_world(self, data: bytes) -> None:
         """A world file arrived."""
@@ -94,7 +91,7 @@ class Inbox:
         """An order arrived."""
         self._orders.append(_ArrivedOrder(data, speaker, now_s))
 
-    def put_beacon(self, beacon: Beacon, now_s: float, unix_now_s: float) -> None:
+    def put_beacon(self, beacon: Beacon, now_s: float) -> None:
         """Another robot's beacon arrived."""
         with self._lock:
             known = self._beacons.get(beacon.robot_id)
@@ -102,7 +99,7 @@ class Inbox:
                 beacon.boot_epoch, beacon.sequence
             ) <= (known.beacon.boot_epoch, known.beacon.sequence)  # fmt: skip
             if not late:
-                self._beacons[beacon.robot_id] = HeardBeacon(beacon, now_s, unix_now_s)
+                self._beacons[beacon.robot_id] = HeardBeacon(beacon, now_s)
 
     def put_stranger(self, name: str, now_s: float) -> None:
         """A robot's message arrived that could not be read."""
@@ -129,8 +126,6 @@ class Inbox:
             elif self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
                 self._safety_form, self.ground_refusal = "none", ""
-                if state.unix_time_s is not None:
-                    self.ground_clock_offset_s = state.unix_time_s - arrived.unix_s
         return self._with_asked_hold(now_s), now_s - self._ground_at_s
 
     def _with_asked_hold(self, now_s: float) -> GroundState | None:
@@ -181,6 +176,13 @@ class Inbox:
     def ground_age_s(self, now_s: float) -> float:
         """The age of the ground's newest state, s; infinite if none came. From any thread."""
         return now_s - self._ground_at_s
+
+    def ground_unix_s(self, now_s: float) -> float | None:
+        """The ground's wall clock, None if it is not known. From any thread."""
+        ground, at_s = self._ground, self._ground_at_s
+        if ground is None or ground.unix_time_s is None:
+            return None
+        return ground.unix_time_s + now_s - at_s
 
     def order(self, now_s: float) -> Order | None:
         """The next order for this robot, if one has come by then. Control thread.

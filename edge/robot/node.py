@@ -147,8 +147,7 @@ class RobotNode:
         self._link = self._guard.over(link)
 
     def _receive_state(self, _: str, data: bytes, speaker: Speaker) -> None:
-        clock = self._ports.clock
-        self._inbox.put_ground(data, speaker, clock.monotonic_s(), clock.unix_s())
+        self._inbox.put_ground(data, speaker, self._ports.clock.monotonic_s())
 
     def _receive_order(self, _: str, data: bytes, speaker: Speaker) -> None:
         self._inbox.put_order(data, speaker, self._ports.clock.monotonic_s())
@@ -167,10 +166,10 @@ class RobotNode:
         if beacon is None or beacon.robot_id != sender:
             self._inbox.put_stranger(f"robot {sender}", now_s)
         else:
-            self._inbox.put_beacon(beacon, now_s, unix_now_s)
+            self._inbox.put_beacon(beacon, now_s)
         rejection = None
         if len(data) > BEACON_BYTES:
-            rejection = self._pac.receive(data[BEACON_BYTES:], now_s, unix_now_s, sender=sender)
+            rejection = self._pac.receive(data[BEACON_BYTES:], now_s, sender=sender)
         self._ports.recorder.record(
             "received",
             unix_now_s,
@@ -209,7 +208,7 @@ class RobotNode:
 
     def policy_step(self) -> None:
         """Hear the neighbours, decide where to fly, tell the neighbours; the policy's rate."""
-        tick = self._pac.infer(self._ports.clock.monotonic_s(), self._ports.clock.unix_s())
+        tick = self._pac.infer(self._ports.clock.monotonic_s())
         if tick is None:
             return
         self._publish_message(tick.message)
@@ -261,9 +260,11 @@ class RobotNode:
         control.revoked = self._guard.revoked_robots()
         if not is_due:
             return
+        # A robot's own wall clock may be wrong: there is no internet on a field.
+        unix_now_s = self._inbox.ground_unix_s(now_s) or self._ports.clock.unix_s()
+        time = self._pac.clock.at(now_s)
         control.checks = self.readiness.checks(
             now_s,
-            self._ports.clock.unix_s(),
             assignment=assignment,
             position=self._navigation.position,
             odometry=self._navigation.odometry(),
@@ -271,14 +272,10 @@ class RobotNode:
             not_understood=self._inbox.not_understood,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
-            card_problem=self._guard.card_problem(self._ground_unix_s()),
-            ground_age_s=self._inbox.ground_age_s(now_s),
-            ground_clock_offset_s=self._inbox.ground_clock_offset_s,
+            card_problem=self._guard.card_problem(unix_now_s),
+            ground_age_s=control.ground_age_s(now_s),
+            time_uncertainty_s=None if time is None else time.uncertainty_s,
         )
-
-    def _ground_unix_s(self) -> float:
-        """The ground's wall clock, or this robot's own where that is not known."""
-        return self._ports.clock.unix_s() + (self._inbox.ground_clock_offset_s or 0.0)
 
     def _checks_are_due(self, now_s: float) -> bool:
         checks = self._control.checks
@@ -341,7 +338,7 @@ class RobotNode:
         ready = flight.state is FlightState.PREFLIGHT and failed_checks == ()
         neighbours = self._pac.mailbox.neighbours(now_s)
         policy_velocity_m_s = self._pac.control(now_s)
-        ground_age_s = self._inbox.ground_age_s(now_s)
+        ground_age_s = control.ground_age_s(now_s)
         energy = control.energy
         return RobotStatus(
             robot_id=robot.robot_id,

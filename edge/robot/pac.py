@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
+from edge.core.fleet_time import FleetClock
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
 from edge.core.perception import RobotMemory, clamp_to_world, neighbours_in_range
@@ -114,6 +115,7 @@ class Pac:
         self._sequence = 0
         self._features: _Timed | None = None
         self._action: _Timed | None = None
+        self.clock = FleetClock()
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
         # Replaced whole when the ground sets another origin or another world, which it does while
         # nobody flies.
@@ -130,9 +132,7 @@ class Pac:
         self._features = None
         self.mailbox.clear()
 
-    def receive(
-        self, data: bytes, now_s: float, unix_now_s: float, *, sender: int | None = None
-    ) -> Rejection | None:
+    def receive(self, data: bytes, now_s: float, *, sender: int | None = None) -> Rejection | None:
         """Put a neighbour's message into the mailbox; returns, and counts, why it was not.
 
         `sender` is the robot that it came from, for whoever knows: no other's is taken then.
@@ -149,7 +149,8 @@ class Pac:
         if isinstance(message, Rejection):
             self.mailbox.reject(message)
             return message
-        return self.mailbox.receive(message, now_s, unix_now_s)
+        age = None if message.sent is None else self.clock.age_s(message.sent, now_s)
+        return self.mailbox.receive(message, now_s, None if age is None else age.most_s)
 
     def perceive(self, now_s: float) -> Perceived | None:
         """Sensor view -> robot map -> features, as the policy makes them.
@@ -185,7 +186,7 @@ class Pac:
         """What it has seen, as `mission.explored_to_bytes` takes it; valid until it goes on."""
         return self._memory.explored
 
-    def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
+    def infer(self, now_s: float) -> PolicyTick | None:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
 
         None when there is nothing to send: no fresh features, no position, or a result that is
@@ -214,7 +215,7 @@ class Pac:
             robot_id=self._robot_id,
             boot_epoch=self._boot_epoch,
             sequence=self._sequence,
-            sent_at_s=unix_now_s,
+            sent=self.clock.at(now_s),
             position_m=odometry.position_m,
             velocity_m_s=odometry.velocity_m_s,
             frame_id=self.frame_id,

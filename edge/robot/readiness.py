@@ -103,7 +103,6 @@ class Readiness:
     def checks(
         self,
         now_s: float,
-        unix_now_s: float,
         *,
         assignment: Assignment,
         position: PositionJudgement,
@@ -114,14 +113,13 @@ class Readiness:
         watchdog_alive: bool,
         card_problem: CardProblem | None,
         ground_age_s: float,
-        ground_clock_offset_s: float | None,
+        time_uncertainty_s: float | None,
     ) -> Checks:
         """All checks, now. `ground_age_s` is infinite if the ground was never heard."""
         config = self._config
         origin, robot, world_id = assignment
         inputs = PreflightInputs(
             now_s=now_s,
-            unix_now_s=unix_now_s,
             robot_id=config.robot_id,
             duplicate_id=duplicate,
             bundle_problem=self._bundle_problem,
@@ -144,7 +142,7 @@ class Readiness:
             not_understood=not_understood,
             rc=config.failsafe.rc,
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
-            ground_clock_offset_s=ground_clock_offset_s,
+            time_uncertainty_s=time_uncertainty_s,
         )
         failed = failed_checks(inputs, config.preflight)
         if not watchdog_alive:

@@ -55,9 +55,7 @@ _SAID_ELSEWHERE = (
     *_NO_AUTOPILOT,
     CheckCode.FAILSAFE_NOT_READ,
     CheckCode.FAILSAFE_WRONG,
-    CheckCode.CLOCK_NOT_SET,
-    CheckCode.CLOCK_OFF_GROUND,
-    CheckCode.CLOCK_OFF_ROBOT,
+    CheckCode.TIME_NOT_KNOWN,
 )
 
 

@@ -36,6 +36,8 @@ FEATURE_AGE_S = 1.0
 LATE_MS = 50.0
 # Half of the rate at which robots send.
 _MESSAGE_RATE_HZ = 1.25
+# Of a robot's wall clock, by which it writes its logs.
+_CLOCK_WITHIN_S = 1.0
 _ID = 8
 _NAMES = 4
 
@@ -362,7 +364,7 @@ def _loops(fleet: _Fleet, seen: _Seen) -> _Found:
 
 def _clock(fleet: _Fleet, seen: _Seen) -> _Found:
     offset_s = seen.robot.clock_offset_s
-    if offset_s is None or abs(offset_s) <= LIMITS.max_clock_difference_s:
+    if offset_s is None or abs(offset_s) <= _CLOCK_WITHIN_S:
         return None
     return "warning", f"its clock is {abs(offset_s):.0f} s {'ahead' if offset_s > 0 else 'behind'}"
 

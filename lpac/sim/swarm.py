@@ -126,12 +126,18 @@ class Swarm:
 
     def _infer(self, robot: int) -> None:
         now_s = self._vehicles.now_s
-        tick = self.robots[robot].infer(now_s, unix_now_s=now_s)
+        self._tell_time(robot)
+        tick = self.robots[robot].infer(now_s)
         if tick is None:
             return
         for receiver, travel_s in self._medium.broadcast(robot, self._vehicles.positions_m()):
             self._schedule(now_s + travel_s, partial(self._deliver, receiver, tick.message))
 
     def _deliver(self, receiver: int, message: bytes) -> None:
+        self._tell_time(receiver)
+        self.robots[receiver].receive(message, self._vehicles.now_s)
+
+    def _tell_time(self, robot: int) -> None:
+        """All have one clock."""
         now_s = self._vehicles.now_s
-        self.robots[receiver].receive(message, now_s, unix_now_s=now_s)
+        self.robots[robot].clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)

@@ -13,6 +13,7 @@ What robots say of whom they obey counts if most of them say so: one alone may b
 import math
 import re
 import statistics
+import zlib
 from collections import Counter, deque
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -24,6 +25,7 @@ from edge.messages.codes import CheckCode, Refusal, RefusalCode
 from edge.messages.mission import (
     ON_GROUND,
     ORDER_LIFETIME_S,
+    Echo,
     FlightState,
     GroundState,
     Order,
@@ -58,6 +60,8 @@ _LATELY_S = 10.0
 _EXPIRY_MARGIN_S = 0.5
 _LATER_S = 1e-3
 _EVENTS_KEPT = 200
+# Each status is echoed once or twice.
+_ECHOED_S = 0.3
 _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
 # Who asks for a hold gets the commander's sequence up by no more at a time.
@@ -120,6 +124,7 @@ class Station:
         # Kills of second programs of one robot: nobody waits for their answers.
         self._more_kills: list[tuple[Order, float]] = []
         self._orders_prefix = f"{setup.operator}-{int(unix_now_s * 1e3)}"
+        self._time_base = zlib.crc32(self._orders_prefix.encode()) or 1
         self._arrived: set[int] = set()
         self._remembered: GroundState | None = None
         self._events: deque[GroundEvent] = deque(maxlen=_EVENTS_KEPT)
@@ -725,8 +730,28 @@ class Station:
 
     def published_state(self) -> GroundState | None:
         """None: nothing is."""
-        state = self.state if self.commands else self._asked
-        return None if state is None else replace(state, unix_time_s=self._unix_now_s)
+        if not self.commands or self.state is None:
+            # The commander's time is not this station's to tell.
+            asked = self._asked
+            return None if asked is None else replace(asked, time_s=None, echoes={})
+        return replace(
+            self.state,
+            unix_time_s=self._unix_now_s,
+            time_base=self._time_base,
+            time_s=self._now_s,
+            echoes=self._echoes(),
+        )
+
+    def _echoes(self) -> dict[str, Echo]:
+        echoes = {}
+        for robot in self._robots.names:
+            last = self._robots.last(robot, self._now_s)
+            if last is not None and last[1] <= _ECHOED_S:
+                status, held_s = last
+                echoes[str(robot)] = Echo(
+                    status.boot_nonce, round(status.uptime_s, 4), round(held_s, 4)
+                )
+        return echoes
 
     def published_orders(self) -> tuple[Order, ...]:
         """Those that are not answered."""

@@ -59,9 +59,9 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "watchdog_alive": True,
         "card_problem": None,
         "ground_age_s": 0.1,
-        "ground_clock_offset_s": 0.0,
+        "time_uncertainty_s": 0.01,
     }
-    return asked.checks(now_s, time.time(), **known | facts)
+    return asked.checks(now_s, **known | facts)
 
 
 def about_parameters(checks: Checks) -> list[str]:
@@ -178,7 +178,7 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
         ({"card_problem": CardProblem.REVOKED}, CheckCode.CARD_NOT_GOOD),
         ({"ground_age_s": float("inf")}, CheckCode.GROUND_NOT_HEARD),
         ({"ground_age_s": 9.0}, CheckCode.GROUND_SILENT),
-        ({"ground_clock_offset_s": 5.0}, CheckCode.CLOCK_OFF_GROUND),
+        ({"time_uncertainty_s": None}, CheckCode.TIME_NOT_KNOWN),
     ],
 )
 def test_what_the_program_knows_itself(

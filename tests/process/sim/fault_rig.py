@@ -516,10 +516,10 @@ def speed_m_s(velocity_m_s: Sequence[float] | F64, axes: int) -> float:
 
 def _run(folder: Path) -> None:
     class FailingPac(Pac):
-        def infer(self, now_s: float, unix_now_s: float) -> PolicyTick | None:
+        def infer(self, now_s: float) -> PolicyTick | None:
             if (folder / "fail-policy").exists():
                 raise RuntimeError("the policy was made to fail")
-            return super().infer(now_s, unix_now_s)
+            return super().infer(now_s)
 
     class FailingSensor(WorldSensor):
         def view(self, position: F64) -> F32:

@@ -199,11 +199,11 @@ class Flown:
 
     def tick(self) -> None:
         """One tenth of a second of everything."""
-        self.inbox.put_ground(encode(self.ground), ANYBODY, self.now_s, self.now_s)
+        self.inbox.put_ground(encode(self.ground), ANYBODY, self.now_s)
         self.look()
         perceived = self.pac.perceive(self.now_s)
         self.images = None if perceived is None else perceived.inputs["images"]
-        self.pac.infer(self.now_s, self.now_s)
+        self.pac.infer(self.now_s)
         self.sent = self.control.tick(self.now_s)
         for _ in range(5):
             self.vehicle.step(0.02)
@@ -259,7 +259,7 @@ class Flown:
     def peers(self, *beacons: Beacon, age_s: float = 0.1) -> None:
         """What other robots said of themselves."""
         at_s = self.now_s - age_s
-        self.control.peers = tuple(HeardBeacon(beacon, at_s, at_s) for beacon in beacons)
+        self.control.peers = tuple(HeardBeacon(beacon, at_s) for beacon in beacons)
 
     def odometry(self) -> Vector:
         odometry = self.navigation.odometry()

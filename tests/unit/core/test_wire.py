@@ -14,11 +14,12 @@ from hypothesis.extra import numpy as hnp
 
 from edge.core import F32
 from edge.core.aggregation import AggregatedMessage
+from edge.core.fleet_time import FleetTime
 from edge.core.wire import Rejection, decode, encode
 
 BUNDLE_ID = hashlib.sha256(b"manifest").digest()
 OTHER_BUNDLE_ID = hashlib.sha256(b"another manifest").digest()
-HEADER_SIZE = 96
+HEADER_SIZE = 104
 FRAME_ID = 0x0A0B0C0D
 OWN_ID = 9
 FLOAT16_MAX = 65504.0
@@ -26,28 +27,28 @@ TYPES = pytest.mark.parametrize("payload_dtype", [np.float32, np.float16])
 
 MESSAGE = AggregatedMessage(
     robot_id=3,
-    boot_epoch=0x0102030405060708,
+    boot_epoch=0x010203040506,
     sequence=258,
-    sent_at_s=1.5,
+    sent=FleetTime(0x04030201, 1.5, 0.25),
     position_m=(1.0, -2.0, 0.5),
     velocity_m_s=(0.25, -1.5, 0.125),
     frame_id=FRAME_ID,
     payload=np.array([0.0, 1.0, -2.5, 100.0, 0.125], np.float32),
 )
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
-finite32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
-
 
 def messages(payload: st.SearchStrategy[F32]) -> st.SearchStrategy[AggregatedMessage]:
     return st.builds(
         AggregatedMessage,
         robot_id=st.integers(0, 2**16 - 1).filter(lambda robot_id: robot_id != OWN_ID),
-        boot_epoch=st.integers(0, 2**64 - 1),
+        boot_epoch=st.integers(0, 2**43 - 1),
         sequence=st.integers(0, 2**32 - 1),
-        sent_at_s=finite,
-        position_m=st.tuples(finite, finite, finite),
-        velocity_m_s=st.tuples(finite32, finite32, finite32),
+        sent=st.none()
+        | st.builds(
+            FleetTime, st.integers(1, 2**32 - 1), st.floats(-1e9, 1e9), st.floats(0, 1e9, width=32)
+        ),
+        position_m=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
+        velocity_m_s=st.tuples(*[st.floats(-1e4, 1e4, width=32)] * 3),
         frame_id=st.just(FRAME_ID),
         payload=payload,
     )
@@ -84,8 +85,8 @@ def accepted(data: bytes | memoryview, message_size: int) -> AggregatedMessage:
 
 def seal(data: bytes) -> bytes:
     """The same message with the checksum that its content asks for."""
-    checksum = zlib.crc32(data[HEADER_SIZE:], zlib.crc32(data[:92]))
-    return data[:92] + struct.pack("<I", checksum) + data[HEADER_SIZE:]
+    checksum = zlib.crc32(data[HEADER_SIZE:], zlib.crc32(data[: HEADER_SIZE - 4]))
+    return data[: HEADER_SIZE - 4] + struct.pack("<I", checksum) + data[HEADER_SIZE:]
 
 
 def without_payload(message: AggregatedMessage) -> tuple[object, ...]:
@@ -138,17 +139,22 @@ def test_arbitrary_floats_in_a_sealed_message_arrive_or_are_not_finite(
 ) -> None:
     good = encode(MESSAGE, BUNDLE_ID, np.float32)
     data = seal(good[:40] + header_floats + good[84:HEADER_SIZE] + payload)
-    floats = struct.unpack("<4d3f", header_floats) + struct.unpack("<5f", payload)
-    if all(map(math.isfinite, floats)):
+    header = struct.unpack("<4d3f", header_floats)
+    floats = header + struct.unpack("<5f", payload)
+    limits = (1e9, *[1e6] * 3, *[1e4] * 3)
+    if not all(map(math.isfinite, floats)):
+        assert receive(data) is Rejection.NON_FINITE
+    elif any(abs(value) > limit for value, limit in zip(header, limits, strict=True)):
+        assert receive(data) is Rejection.IMPOSSIBLE
+    else:
         message = accepted(data, 5)
+        assert message.sent is not None
         assert (
-            message.sent_at_s,
+            message.sent.time_s,
             *message.position_m,
             *message.velocity_m_s,
             *message.payload.tolist(),
         ) == floats
-    else:
-        assert receive(data) is Rejection.NON_FINITE
 
 
 @TYPES
@@ -173,12 +179,12 @@ def test_every_truncation_and_extension_is_named(payload_dtype: type) -> None:
 def test_the_layout_is_a_contract() -> None:
     head = (
         "4c5041432d4d5347"  # LPAC-MSG
-        "02"  # version
+        "03"  # version
         "{payload_type}"
         "0300"  # robot id 3
         "02010000"  # sequence 258
         "05b3abf2579a5eb66403cd78be557fd8"  # the first 16 bytes of BUNDLE_ID
-        "0807060504030201"  # boot epoch
+        "0605040302010000"  # boot epoch
         "000000000000f83f"  # sent at 1.5
         "000000000000f03f"  # x 1
         "00000000000000c0"  # y -2
@@ -188,12 +194,14 @@ def test_the_layout_is_a_contract() -> None:
         "0000003e"  # z 0.125
         "0d0c0b0a"  # frame id
         "05000000"  # payload length
+        "01020304"  # which ground's clock
+        "0000803e"  # to 0.25
     )
     # CRC-32, and then 0, 1, -2.5, 100, 0.125.
     float32 = (
-        head.format(payload_type="01") + "a6270351" + "000000000000803f000020c00000c8420000003e"
+        head.format(payload_type="01") + "8b4e9941" + "000000000000803f000020c00000c8420000003e"
     )
-    float16 = head.format(payload_type="02") + "1b3a0aab" + "0000003c00c140560030"
+    float16 = head.format(payload_type="02") + "4fb75a3f" + "0000003c00c140560030"
     assert encode(MESSAGE, BUNDLE_ID, np.float32).hex() == float32
     assert encode(MESSAGE, BUNDLE_ID, np.float16).hex() == float16
     assert accepted(bytes.fromhex(float32), 5).sequence == 258
@@ -217,7 +225,7 @@ def test_the_reason_is_the_most_telling_one() -> None:
     reasons = {
         Rejection.MAGIC: b"lpac" + good[4:],
         # Another version may have any length and any checksum.
-        Rejection.VERSION: good[:8] + b"\1" + good[9:70],
+        Rejection.VERSION: good[:8] + b"\2" + good[9:70],
         Rejection.PAYLOAD_TYPE: good[:9] + b"\3" + good[10:],
         Rejection.CHECKSUM: good[:-1] + b"\x7f",
         # Another bundle's payload may have any length; its robots' ids are not ours.
@@ -247,7 +255,8 @@ def test_what_is_not_finite_is_refused(payload_dtype: type, value: float) -> Non
     payload[-1] = value
     for message in (
         dataclasses.replace(MESSAGE, payload=payload),
-        dataclasses.replace(MESSAGE, sent_at_s=value),
+        dataclasses.replace(MESSAGE, sent=FleetTime(1, value, 0.0)),
+        dataclasses.replace(MESSAGE, sent=FleetTime(1, 0.0, value)),
         dataclasses.replace(MESSAGE, position_m=(value, 0.0, 0.0)),
         dataclasses.replace(MESSAGE, position_m=(0.0, value, 0.0)),
         dataclasses.replace(MESSAGE, position_m=(0.0, 0.0, value)),

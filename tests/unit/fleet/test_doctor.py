@@ -226,7 +226,7 @@ def container(**about: object) -> list[dict[str, object]]:
         (says(failed(_C.CHECKS_RUNNING, settles=True)), "failsafe", "warning", "not read"),
         (says(failed(_C.CHECKS_RUNNING, settles=True)), "preflight", "warning", "x"),
         (says(failed(_C.AUTOPILOT_NOT_CONNECTED)), "failsafe", "warning", "not read"),
-        (says(failed(_C.CLOCK_OFF_ROBOT)), "preflight", "ok", "nothing but the ground"),
+        (says(failed(_C.TIME_NOT_KNOWN)), "preflight", "ok", "nothing but the ground"),
         (says(failed(_C.GPS_NO_FIX, settles=True)), "preflight", "warning", "x"),
         (says(failed(_C.BATTERY_LOW, "40 %")), "preflight", "FAILED", "40 %"),
         (says(failed(_C.NOT_ARMABLE)), "preflight", "FAILED", "x"),

@@ -62,7 +62,6 @@ NEIGHBOUR = Beacon(
 )
 READY = PreflightInputs(
     now_s=100.0,
-    unix_now_s=UNIX_S,
     robot_id=1,
     duplicate_id=False,
     bundle_problem=None,
@@ -81,11 +80,11 @@ READY = PreflightInputs(
     landing_point_m=(8.0, 8.0),
     min_separation_m=2.0,
     errors=ErrorBudget(),
-    neighbours=(HeardBeacon(NEIGHBOUR, 99.8, UNIX_S + 0.2),),
+    neighbours=(HeardBeacon(NEIGHBOUR, 99.8),),
     not_understood=(),
     rc="none",
     ground_age_s=0.4,
-    ground_clock_offset_s=None,
+    time_uncertainty_s=0.05,
 )
 
 # What is wrong with the inputs, and the one line that says so.
@@ -95,18 +94,10 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         _C.BUNDLE_NOT_VERIFIED,
         "bundle is not verified (cnn differs): deploy it again",
     ),
-    (
-        {"unix_now_s": 1_500_000_000.0},
-        _C.CLOCK_NOT_SET,
-        "clock is before 2026: set the time of this robot",
-    ),
     ({"ground_age_s": None}, _C.GROUND_NOT_HEARD, "ground was not heard: start"),
     ({"ground_age_s": 3.1}, _C.GROUND_SILENT, "ground was last heard 3.1 s ago: check the radio"),
-    (
-        {"ground_clock_offset_s": -7.0},
-        _C.CLOCK_OFF_GROUND,
-        "clock differs from the ground's by -7.0 s: set the time",
-    ),
+    ({"time_uncertainty_s": None}, _C.TIME_NOT_KNOWN, "the ground's time is not known yet: wait"),
+    ({"time_uncertainty_s": 0.3}, _C.TIME_NOT_KNOWN, "the ground's time is known to 0.3 s only"),
     (
         {"system_id": 9},
         _C.SYSTEM_ID_WRONG,
@@ -185,11 +176,6 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         {"min_separation_m": 5.0},
         _C.HEIGHTS_TOO_NEAR,
         "robot 2 flies 4.5 m above or below, must be 5 m (min_separ",
-    ),
-    (
-        {"neighbours": (HeardBeacon(NEIGHBOUR, 99.8, UNIX_S - 30.0),)},
-        _C.CLOCK_OFF_ROBOT,
-        "robot 2's clock differs by 30.0 s: set the time of both",
     ),
 ]
 # In the place of a position that is missing or old.
@@ -286,7 +272,7 @@ def test_what_settles_under_open_sky_is_marked() -> None:
     assert settling == {
         _C.FAILSAFE_NOT_READ, _C.FENCE_NOT_UPLOADED, _C.POSITION_NOT_KNOWN, _C.POSITION_NOT_GOOD,
         _C.ESTIMATOR_ORIGIN_NOT_KNOWN, _C.HEADING_NOT_KNOWN, _C.GPS_NO_FIX,
-        _C.GPS_FEW_SATELLITES, _C.GPS_IMPRECISE,
+        _C.GPS_FEW_SATELLITES, _C.GPS_IMPRECISE, _C.TIME_NOT_KNOWN,
     }  # fmt: skip
 
 
@@ -311,7 +297,7 @@ def test_what_a_lost_autopilot_said_before_counts_for_nothing() -> None:
 
 
 def test_a_neighbour_without_an_origin_has_not_ours() -> None:
-    neighbour = HeardBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8, UNIX_S)
+    neighbour = HeardBeacon(dataclasses.replace(NEIGHBOUR, frame_id=0), 99.8)
     (failed,) = failed_checks(dataclasses.replace(READY, neighbours=(neighbour,)), LIMITS)
     assert failed.code is _C.OTHER_ORIGIN
 
@@ -323,7 +309,7 @@ def in_the_air(*flown_s: float | None) -> tuple[HeardBeacon, ...]:
             dataclasses.replace(
                 NEIGHBOUR, robot_id=2 + i, system_id=2 + i, state=FlightState.HOLD, armed=True,
                 flown_s=each_s, slot_height_m=9.5 + 4.5 * i, landing_point_m=(16.0 + 8.0 * i, 8.0),
-            ), 99.8, UNIX_S,
+            ), 99.8,
         )
         for i, each_s in enumerate(flown_s)
     )  # fmt: skip
@@ -363,7 +349,7 @@ def lines(
     neighbour = dataclasses.replace(
         NEIGHBOUR, landing_point_m=(landing_x_m, 8.0), gps_accuracy_m=its_accuracy_m
     )
-    heard = HeardBeacon(neighbour, 99.8, UNIX_S)
+    heard = HeardBeacon(neighbour, 99.8)
     vehicle = dataclasses.replace(VEHICLE, gps=own)
     inputs = dataclasses.replace(READY, vehicle=vehicle, neighbours=(heard,), errors=errors)
     failed = failed_checks(inputs, LIMITS)
@@ -413,7 +399,7 @@ def test_receivers_with_corrections_stand_nearer_as_long_as_they_report_it() -> 
         ({"max_hdop": math.inf}, "max_hdop = inf: must be finite and above 0"),
         ({"max_position_age_s": 0.0}, "max_position_age_s = 0.0"),
         ({"max_ground_age_s": math.nan}, "max_ground_age_s = nan"),
-        ({"max_clock_difference_s": -1.0}, "max_clock_difference_s = -1.0"),
+        ({"max_time_uncertainty_s": -1.0}, "max_time_uncertainty_s = -1.0"),
     ],
 )
 def test_limits_that_make_no_sense_are_refused_by_name(

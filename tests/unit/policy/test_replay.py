@@ -45,16 +45,17 @@ def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) ->
             )
         )  # fmt: skip
         robots[-1].frame_id = 0x89ABCDEF
+        robots[-1].clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     messages: Messages = []
     for tick in range(ticks):
         now_s = 0.4 * tick
         seen_ticks = [robot.perceive(now_s) for robot in robots]
-        done = [robot.infer(now_s, now_s) for robot in robots]
+        done = [robot.infer(now_s) for robot in robots]
         for sender, sent in enumerate(done):
             assert sent is not None
             for robot, receiver in enumerate(robots):
                 if robot != sender:
-                    assert receiver.receive(sent.message, now_s, now_s) is None
+                    assert receiver.receive(sent.message, now_s) is None
         perceived, step = seen_ticks[0], done[0]
         assert perceived is not None and step is not None
         for topic, message in (

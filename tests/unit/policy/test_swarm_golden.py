@@ -238,17 +238,19 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: L
         )
         for i in range(10)
     ]  # fmt: skip
+    for robot in robots:
+        robot.clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
     geometry = shipped_policy.geometry
     # One exchange more than K L: the first messages only tell the robots who their neighbours are.
     for tick in range(geometry.hops * geometry.layers + 2):
         now_s = 0.4 * tick
         for robot in robots:
             robot.perceive(now_s)
-        ticks = [robot.infer(now_s, now_s) for robot in robots]
+        ticks = [robot.infer(now_s) for robot in robots]
         for i, robot in enumerate(robots):
             for j, sent in enumerate(ticks):
                 if i != j:
-                    assert sent and robot.receive(sent.message, now_s, now_s) is None
+                    assert sent and robot.receive(sent.message, now_s) is None
     velocities = np.array([robot.control(now_s) for robot in robots], np.float32)
 
     neighbours = np.hypot(*(places_m[:, None] - places_m[None]).T) < 16.0

@@ -33,28 +33,28 @@ def test_nothing_heard_is_infinitely_old() -> None:
 
 def test_the_ground_state_ages_until_the_next_comes() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     assert inbox.ground(1.5) == (STATE, 0.5)
     assert inbox.ground(3.0) == (STATE, 2.0)
-    inbox.put_ground(encode(STATE), ANYBODY, 3.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 3.0)
     assert inbox.ground(3.0) == (STATE, 0.0)
 
 
 def test_an_older_state_that_arrives_late_does_not_count() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     assert inbox.ground(1.0)[0] == STATE
     older = dataclasses.replace(STATE, sequence=4, safety_action="land")
-    inbox.put_ground(encode(older), ANYBODY, 1.5, 1e9)
+    inbox.put_ground(encode(older), ANYBODY, 1.5)
     assert inbox.ground(1.5) == (STATE, 0.5)
 
 
 def test_a_ground_that_starts_anew_is_heard_once_the_old_one_is_lost() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     inbox.ground(1.0)
     anew = GroundState(sequence=0, operator="ben")
-    inbox.put_ground(encode(anew), ANYBODY, 5.0, 1e9)
+    inbox.put_ground(encode(anew), ANYBODY, 5.0)
     assert inbox.ground(5.0) == (anew, 0.0)
 
 
@@ -63,7 +63,7 @@ def test_of_two_grounds_the_greater_sequence_and_then_the_greater_operator_count
 
     def hear(now_s: float, *states: GroundState) -> tuple[GroundState | None, float]:
         for state in states:
-            inbox.put_ground(encode(state), ANYBODY, now_s, 1e9)
+            inbox.put_ground(encode(state), ANYBODY, now_s)
         return inbox.ground(now_s)
 
     ben, cleo = (dataclasses.replace(STATE, operator=name) for name in ("ben", "cleo"))
@@ -99,9 +99,9 @@ def test_an_order_that_came_after_the_ticks_time_waits_for_the_next() -> None:
 @given(st.binary() | st.text().map(str.encode) | st.just(b"[" * 100_000) | st.just(b"{}"))
 def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     assert inbox.ground(1.0)[0] == STATE
-    inbox.put_ground(data, ANYBODY, 2.0, 1e9)
+    inbox.put_ground(data, ANYBODY, 2.0)
     inbox.put_order(data, ANYBODY, 0.0)
     assert inbox.ground(2.0) == (STATE, 1.0)
     assert inbox.order(0.0) is None
@@ -117,31 +117,29 @@ def newer(message: GroundState | Order, **changes: object) -> bytes:
 
 def test_a_state_that_is_not_understood_holds_and_lands_and_ages_the_last_one() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     for now_s, action, form in ((1.5, "none", "none"), (2.0, "hold", "hold"),
                                 (3.0, "return", "none"), (4.5, "land", "land")):  # fmt: skip
-        inbox.put_ground(newer(STATE, sequence=6, safety_action=action), ANYBODY, now_s, 1e9)
+        inbox.put_ground(newer(STATE, sequence=6, safety_action=action), ANYBODY, now_s)
         # The last one that was understood stays, and ground lost counts on.
         assert inbox.ground(now_s) == (STATE, now_s - 1.0)
         assert inbox.safety_form(now_s) == form
         assert "new: this program is too old to know" in inbox.ground_refusal
     assert inbox.safety_form(7.6) == "none"
-    inbox.put_ground(
-        newer(STATE, robot_safety_actions={"3": "hold", "4": "land"}), ANYBODY, 8.0, 1e9
-    )
+    inbox.put_ground(newer(STATE, robot_safety_actions={"3": "hold", "4": "land"}), ANYBODY, 8.0)
     inbox.ground(8.0)
     assert inbox.safety_form(8.0) == "hold"
     again = dataclasses.replace(STATE, sequence=7)
-    inbox.put_ground(encode(again), ANYBODY, 8.5, 1e9)
+    inbox.put_ground(encode(again), ANYBODY, 8.5)
     assert inbox.ground(8.5) == (again, 0.0)
     assert (inbox.safety_form(8.5), inbox.ground_refusal) == ("none", "")
 
 
 def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
     inbox = make_inbox()
-    inbox.put_ground(encode(STATE), ANYBODY, 1.0, 1e9)
+    inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     inbox.ground(1.0)
-    inbox.put_ground(newer(STATE, sequence=4, safety_action="land"), ANYBODY, 1.5, 1e9)
+    inbox.put_ground(newer(STATE, sequence=4, safety_action="land"), ANYBODY, 1.5)
     inbox.ground(1.5)
     assert inbox.safety_form(1.5) == "none"
 
@@ -157,17 +155,17 @@ def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
 
 def test_peers_are_who_was_heard_lately_and_the_newest_counts() -> None:
     inbox = make_inbox()
-    inbox.put_beacon(NEIGHBOUR, 1.0, 1e9)
+    inbox.put_beacon(NEIGHBOUR, 1.0)
     late = dataclasses.replace(NEIGHBOUR, sequence=8, slot_height_m=50.0)
-    inbox.put_beacon(late, 1.1, 1e9)
+    inbox.put_beacon(late, 1.1)
     assert [peer.beacon for peer in inbox.peers(1.2)] == [NEIGHBOUR]
     restarted = dataclasses.replace(NEIGHBOUR, boot_epoch=6, sequence=1)
-    inbox.put_beacon(restarted, 1.3, 1e9)
-    inbox.put_beacon(dataclasses.replace(NEIGHBOUR, robot_id=1), 2.0, 1e9)
+    inbox.put_beacon(restarted, 1.3)
+    inbox.put_beacon(dataclasses.replace(NEIGHBOUR, robot_id=1), 2.0)
     assert [peer.beacon.robot_id for peer in inbox.peers(2.5)] == [1, 2]
     assert [peer.heard_at_s for peer in inbox.peers(4.5)] == [2.0]
     # Its clock was set back while it was away.
-    inbox.put_beacon(NEIGHBOUR, 5.0, 1e9)
+    inbox.put_beacon(NEIGHBOUR, 5.0)
     assert [peer.beacon for peer in inbox.peers(5.1)] == [NEIGHBOUR]
 
 
@@ -188,9 +186,9 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
 
     def obeyed(**changes: object) -> tuple[str, int]:
         """Asked by another than the commander, just before 1.0 s."""
-        inbox.put_ground(encode(state), ann, 0.9, 1e9)
+        inbox.put_ground(encode(state), ann, 0.9)
         asked = dataclasses.replace(state, **{"sequence": after, **changes})  # type: ignore[arg-type]
-        inbox.put_ground(encode(asked), speaker, 0.95, 1e9)
+        inbox.put_ground(encode(asked), speaker, 0.95)
         ground, age_s = inbox.ground(1.0)
         assert ground is not None and ground.operator == "ann" and age_s == pytest.approx(0.1)
         return ground.safety_action_for(3), ground.sequence
@@ -208,13 +206,13 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
         assert inbox.ground(2.5)[0] == state
         assert obeyed(robot_safety_actions={"3": "hold"}) == ("hold", after)
         landing = dataclasses.replace(state, sequence=after, safety_action="land")
-        inbox.put_ground(encode(landing), ann, 1.1, 1e9)
+        inbox.put_ground(encode(landing), ann, 1.1)
         assert inbox.ground(1.1)[0] == landing
     # Nor does one that can only be understood in part.
     inbox = Inbox(3, 3.0)
     for action, known in (("land", "none"), ("hold", "hold")):
         data = newer(state, sequence=after, safety_action=action)
-        inbox.put_ground(data, guest, 1.0, 1e9)
+        inbox.put_ground(data, guest, 1.0)
         inbox.ground(1.0)
         assert inbox.safety_form(1.0) == known
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
+from edge.core.fleet_time import FleetTime
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import Rejection, decode, encode
@@ -18,6 +19,7 @@ from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.pac import Pac, PacParameters
 
 PARAMETERS = PacParameters(scale=ModelScale(16.0, 0.25), max_speed_m_s=1.25)
+GROUND = 7
 
 
 @dataclass
@@ -38,10 +40,12 @@ class World:
 def make_robot(
     policy: LpacPolicy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
 ) -> Pac:
-    return Pac(
+    robot = Pac(
         robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, odometry=world,
         parameters=parameters,
     )  # fmt: skip
+    robot.clock.hear(GROUND, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    return robot
 
 
 def fill(policy: LpacPolicy, value: float) -> F32:
@@ -50,7 +54,7 @@ def fill(policy: LpacPolicy, value: float) -> F32:
 
 def message(policy: LpacPolicy, robot_id: int = 2, value: float = 0.1, **changes: object) -> bytes:
     fields = {
-        "robot_id": robot_id, "boot_epoch": 1, "sequence": 1, "sent_at_s": 0.0,
+        "robot_id": robot_id, "boot_epoch": 1, "sequence": 1, "sent": FleetTime(GROUND, 0.0, 0.0),
         "position_m": (18.0, 16.0, 3.0), "velocity_m_s": (0.0, 0.0, 0.0), "frame_id": 0,
         "payload": fill(policy, value), **changes,
     }  # fmt: skip
@@ -66,7 +70,7 @@ def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(
     slow_robot = make_robot(shipped_policy, world, parameters=slow)
     for robot in (fast_robot, slow_robot):
         robot.perceive(0.0)
-        assert robot.infer(0.0, 0.0) is not None
+        assert robot.infer(0.0) is not None
     fast, slowed = fast_robot.control(0.1), slow_robot.control(0.1)
     assert fast is not None and slowed is not None
     assert 0.01 < np.hypot(*fast) <= 1.25
@@ -76,7 +80,7 @@ def test_a_robot_perceives_infers_and_moves_within_the_speed_limit(
 
 def test_nothing_moves_before_the_first_inference(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
-    assert robot.infer(0.0, 0.0) is None
+    assert robot.infer(0.0) is None
     robot.perceive(0.0)
     assert robot.control(0.0) is None
 
@@ -88,12 +92,12 @@ def test_without_position_or_sensor_the_robot_stops(
     world = World()
     robot = make_robot(shipped_policy, world)
     robot.perceive(0.0)
-    robot.infer(0.0, 0.0)
+    robot.infer(0.0)
     setattr(world, missing, None)
     for tick in range(1, 10):
         now_s = tick * 0.4
         robot.perceive(now_s)
-        sent = robot.infer(now_s, now_s)
+        sent = robot.infer(now_s)
         assert (sent is not None) == (missing == "seen" and now_s <= 1.0)
     assert robot.control(1.0 if missing == "position" else 1.8) is not None
     assert robot.control(2.0) is None
@@ -102,7 +106,7 @@ def test_without_position_or_sensor_the_robot_stops(
 def test_a_position_that_is_not_a_number_is_none(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World(position=(16.0, float("nan"), 3.0)))
     robot.perceive(0.0)
-    assert robot.infer(0.0, 0.0) is None
+    assert robot.infer(0.0) is None
 
 
 @pytest.mark.parametrize(
@@ -114,10 +118,10 @@ def test_a_bad_view_does_not_enter_the_map(shipped_policy: LpacPolicy, view: F32
     world = World(seen=view)
     robot = make_robot(shipped_policy, world)
     robot.perceive(0.0)
-    assert robot.infer(0.0, 0.0) is None
+    assert robot.infer(0.0) is None
     world.seen = np.zeros((64, 64), np.float32)
     robot.perceive(0.2)
-    assert robot.infer(0.2, 0.2) is not None
+    assert robot.infer(0.2) is not None
 
 
 def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
@@ -132,9 +136,9 @@ def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
     for tick, heard in enumerate(((2, 3), (2,), ())):
         now_s = 0.4 * tick
         for robot_id in heard:
-            robot.receive(message(shipped_policy, robot_id, sequence=tick + 1), now_s, now_s)
+            robot.receive(message(shipped_policy, robot_id, sequence=tick + 1), now_s)
         robot.perceive(now_s)
-        sent = robot.infer(now_s, now_s)
+        sent = robot.infer(now_s)
         assert sent is not None
         own.append(
             decode(
@@ -174,7 +178,7 @@ def test_an_id_that_no_message_can_hold_is_refused(
 def test_an_action_without_a_successor_grows_old(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.perceive(0.0)
-    robot.infer(0.0, 0.0)
+    robot.infer(0.0)
     assert robot.control(1.0) is not None
     assert robot.control(1.001) is None
 
@@ -186,9 +190,9 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
     for heard in ([], [message(shipped_policy)], [message(shipped_policy, position_m=(40, 16, 3))]):
         robot = make_robot(shipped_policy, World())
         for data in heard:
-            assert robot.receive(data, 0.0, 0.0) is None
+            assert robot.receive(data, 0.0) is None
         robot.perceive(0.0)
-        robot.infer(0.0, 0.0)
+        robot.infer(0.0)
         velocity = robot.control(0.0)
         assert velocity is not None
         velocities.append(velocity)
@@ -197,9 +201,9 @@ def test_a_neighbour_changes_what_the_robot_does_and_is_forgotten_when_silent(
     np.testing.assert_array_equal(alone, beside_far)  # 24 m is beyond the range of 16 m
 
     robot = make_robot(shipped_policy, World())
-    robot.receive(message(shipped_policy), 0.0, 0.0)
+    robot.receive(message(shipped_policy), 0.0)
     robot.perceive(0.8)
-    robot.infer(0.8, 0.8)
+    robot.infer(0.8)
     velocity = robot.control(0.8)
     assert velocity is not None
     np.testing.assert_array_equal(velocity, alone)
@@ -210,7 +214,7 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> No
     good = message(shipped_policy)
     other = encode(
         AggregatedMessage(
-            3, 1, 1, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)
+            3, 1, 1, None, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0, fill(shipped_policy, 0.0)
         ),
         bytes(32),
         "float32",
@@ -221,23 +225,25 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> No
         Rejection.TRUNCATED: good[:-1],
         Rejection.CHECKSUM: good[:-1] + bytes([good[-1] ^ 1]),
         Rejection.NON_FINITE: message(shipped_policy, value=float("nan")),
-        Rejection.STALE: message(shipped_policy, sequence=2, sent_at_s=-1.0),
+        Rejection.STALE: message(shipped_policy, sequence=2, sent=FleetTime(GROUND, -1.0, 0.0)),
+        Rejection.AGE_UNKNOWN: message(shipped_policy, sequence=2, sent=None),
+        Rejection.IMPOSSIBLE: message(shipped_policy, boot_epoch=2**63),
     }
-    assert robot.receive(good, 0.0, 0.0) is None
+    assert robot.receive(good, 0.0) is None
     for reason, data in cases.items():
-        assert robot.receive(data, 0.0, 0.0) is reason
+        assert robot.receive(data, 0.0) is reason
         assert robot.mailbox.counts()[reason] == 1
     assert robot.mailbox.counts()["accepted"] == 1
 
 
 def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
-    robot.receive(message(shipped_policy, value=3e38), 0.0, 0.0)
-    robot.receive(message(shipped_policy, robot_id=3, value=3e38), 0.0, 0.0)
-    robot.receive(message(shipped_policy, robot_id=4, position_m=(1e300, -1e300, 0.0)), 0.0, 0.0)
+    robot.receive(message(shipped_policy, value=3e38), 0.0)
+    robot.receive(message(shipped_policy, robot_id=3, value=3e38), 0.0)
+    robot.receive(message(shipped_policy, robot_id=4, position_m=(1e300, -1e300, 0.0)), 0.0)
     robot.perceive(0.0)
     with np.errstate(over="ignore", invalid="ignore"):
-        assert robot.infer(0.0, 0.0) is None
+        assert robot.infer(0.0) is None
     assert robot.control(0.0) is None
 
 
@@ -280,12 +286,12 @@ def test_a_bundle_without_perception_drives_no_robot(shipped_bundle: Bundle) -> 
 
 def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> None:
     flown, fresh = (make_robot(shipped_policy, World()) for _ in range(2))
-    flown.receive(message(shipped_policy), 0.0, 0.0)
+    flown.receive(message(shipped_policy), 0.0)
     flown.perceive(0.0)
-    assert flown.infer(0.0, 0.0) is not None
+    assert flown.infer(0.0) is not None
     flown.forget()
     assert flown.mailbox.neighbours(0.0) == ()
-    assert flown.infer(0.1, 0.1) is None  # no features yet
+    assert flown.infer(0.1) is None  # no features yet
     dark = World(seen=np.zeros((64, 64), np.float32))
     for robot in (flown, fresh):
         robot.sensor = dark
@@ -297,5 +303,5 @@ def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> N
 def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: LpacPolicy) -> None:
     robot = make_robot(shipped_policy, World())
     robot.frame_id = 8
-    assert robot.receive(message(shipped_policy), 0.0, 0.0) is Rejection.OTHER_FRAME
-    assert robot.receive(message(shipped_policy, frame_id=8), 0.0, 0.0) is None
+    assert robot.receive(message(shipped_policy), 0.0) is Rejection.OTHER_FRAME
+    assert robot.receive(message(shipped_policy, frame_id=8), 0.0) is None
