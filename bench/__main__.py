@@ -18,6 +18,7 @@ BENCHES = (
     "scaling",
     "simulated",
     "closed_loop",
+    "payloads",
     "loops",
     "release",
     "position",

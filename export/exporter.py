@@ -27,7 +27,7 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     each.
     """
     network = read_checkpoint(checkpoint)
-    perception, training = read_parameters(parameters)
+    trained = read_parameters(parameters)
     files = {GOLDEN: golden_vectors(network), **build_graphs(network)}
     images = None
     if network.cnn:
@@ -39,8 +39,9 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     manifest = Manifest(
         schema=SCHEMA_VERSION,
         name=name or checkpoint.stem,
-        perception=perception if images else None,
-        training=training,
+        perception=trained.perception if images else None,
+        training=trained.training,
+        payload_limit=trained.messages.payload_limit,
         # Hashes are sha256.
         provenance={
             "checkpoint": checkpoint.name,

@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from edge.core.perception import PerceptionParameters
@@ -11,14 +11,22 @@ from edge.policy.bundle import Training
 
 
 @dataclass(frozen=True, slots=True)
-class _Parameters:
-    """Our file: these two tables."""
+class _Messages:
+    """What robots take of each other: see `Manifest.payload_limit`."""
+
+    payload_limit: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyParameters:
+    """Our file: these tables."""
 
     perception: PerceptionParameters
     training: Training
+    messages: _Messages = field(default_factory=_Messages)
 
 
-def read_parameters(path: Path) -> tuple[PerceptionParameters, Training]:
+def read_parameters(path: Path) -> PolicyParameters:
     """Read our parameter file, or a coverage_control_params.toml: that has [Environment.Maps].
 
     Raises ConfigError that names the file and the line or key.
@@ -34,8 +42,7 @@ def read_parameters(path: Path) -> tuple[PerceptionParameters, Training]:
     environment = document.get("Environment")
     if isinstance(environment, Mapping) and "Maps" in environment:
         document = _from_coverage_control(_TableReader(document, path))
-    parameters = from_mapping(_Parameters, document, str(path))
-    return parameters.perception, parameters.training
+    return from_mapping(PolicyParameters, document, str(path))
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,6 +69,7 @@ class Rejection(StrEnum):
     PAYLOAD_LENGTH = "payload_length"
     NON_FINITE = "non_finite"
     IMPOSSIBLE = "impossible"
+    PAYLOAD_RANGE = "payload_range"
     AGE_UNKNOWN = "age_unknown"
     OUTDATED = "outdated"
     STALE = "stale"
@@ -118,13 +119,15 @@ def decode(
     frame_id: int | None,
     own_robot_id: int,
     message_size: int,
+    payload_limit: float | None = None,
 ) -> AggregatedMessage | Rejection:
     """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
 
     `bundle_id` is the 32 bytes of the own manifest's SHA-256, `frame_id` that of the own mission
     frame (None takes messages of any), `message_size` the number of floats that the own network
-    takes. The payload is a read-only view of `data`, float32 or float16, not a copy: `data` must
-    not change afterwards.
+    takes, `payload_limit` the largest that one of them can be (None: any that is finite). The
+    payload is a read-only view of `data`, float32 or float16, not a copy: `data` must not change
+    afterwards.
     """
     view = memoryview(data).toreadonly()
     # Nothing behind the version can be read in a layout that is not this one.
@@ -173,27 +176,36 @@ def decode(
         return Rejection.PAYLOAD_LENGTH
     if frame_id is not None and sender_frame_id != frame_id:
         return Rejection.OTHER_FRAME
-    payload = np.frombuffer(view, dtype, offset=_HEADER_SIZE)
-    position_m, velocity_m_s = (x_m, y_m, z_m), (vx_m_s, vy_m_s, vz_m_s)
-    header = (time_s, uncertainty_s, *position_m, *velocity_m_s)
-    if not (all(map(math.isfinite, header)) and np.isfinite(payload).all()):
+    message = AggregatedMessage(
+        robot_id,
+        boot_epoch,
+        sequence,
+        FleetTime(base, time_s, uncertainty_s) if base else None,
+        (x_m, y_m, z_m),
+        (vx_m_s, vy_m_s, vz_m_s),
+        sender_frame_id,
+        np.frombuffer(view, dtype, offset=_HEADER_SIZE),
+    )
+    return _out_of_range(message, (time_s, uncertainty_s), payload_limit) or message
+
+
+def _out_of_range(
+    message: AggregatedMessage, times_s: tuple[float, float], payload_limit: float | None
+) -> Rejection | None:
+    """Which number in it no honest robot says."""
+    (time_s, uncertainty_s), payload = times_s, message.payload
+    numbers = (*times_s, *message.position_m, *message.velocity_m_s)
+    if not (all(map(math.isfinite, numbers)) and np.isfinite(payload).all()):
         return Rejection.NON_FINITE
     possible = (
-        boot_epoch < _MOST_EPOCH
-        and all(abs(c) <= _MOST_M for c in position_m)
-        and all(abs(c) <= _MOST_M_S for c in velocity_m_s)
+        message.boot_epoch < _MOST_EPOCH
+        and all(abs(c) <= _MOST_M for c in message.position_m)
+        and all(abs(c) <= _MOST_M_S for c in message.velocity_m_s)
         and abs(time_s) <= _MOST_S
         and 0.0 <= uncertainty_s <= _MOST_S
     )
     if not possible:
         return Rejection.IMPOSSIBLE
-    return AggregatedMessage(
-        robot_id,
-        boot_epoch,
-        sequence,
-        FleetTime(base, time_s, uncertainty_s) if base else None,
-        position_m,
-        velocity_m_s,
-        sender_frame_id,
-        payload,
-    )
+    if payload_limit is not None and payload.size and np.abs(payload).max() > payload_limit:
+        return Rejection.PAYLOAD_RANGE
+    return None

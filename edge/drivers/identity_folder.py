@@ -114,6 +114,18 @@ def load_card(folder: Path, authority: bytes) -> Card:
         raise ConfigError(f"{folder}: {error}") from None
 
 
+def card_in(text: str, keys: Path) -> Card:
+    """The card in the text of an `identity.json`, of the same fleet as the one in `keys`.
+
+    Raises ConfigError for what is none; OSError.
+    """
+    own = _Written.read(keys / IDENTITY_JSON)
+    try:
+        return verified(Card, _Written.parse(text.encode()).card_data, own.authority_key)
+    except (CardError, ValueError) as error:
+        raise ConfigError(f"its card: {error}") from None
+
+
 @dataclass(frozen=True, slots=True)
 class _Written:
     fleet: str
@@ -123,9 +135,13 @@ class _Written:
     @classmethod
     def read(cls, path: Path) -> "_Written":
         try:
-            return msgspec.json.decode(_bytes_of(path), type=cls)
+            return cls.parse(_bytes_of(path))
         except msgspec.MsgspecError as error:
             raise ValueError(f"{path.name}: {error}") from None
+
+    @classmethod
+    def parse(cls, data: bytes) -> "_Written":
+        return msgspec.json.decode(data, type=cls)
 
     @property
     def authority_key(self) -> bytes:

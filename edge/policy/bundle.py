@@ -8,6 +8,7 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -61,7 +62,8 @@ class Manifest:
 
     `perception` is None in one that no robot can fly. `provenance` says where the bundle came from,
     in names and hashes that its maker chose. `parameters` are the keys that only the family
-    understands, as JSON has them.
+    understands, as JSON has them. Robots take no payload with a number beyond `payload_limit`;
+    None: any that is finite.
     """
 
     schema: int
@@ -71,9 +73,12 @@ class Manifest:
     provenance: dict[str, str]
     files: dict[str, str]
     family: str = LPAC
+    payload_limit: float | None = None
     parameters: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.payload_limit is not None and not 0.0 < self.payload_limit < math.inf:
+            raise ValueError(f"payload_limit = {self.payload_limit}: must be finite and above 0")
         if self.schema != SCHEMA_VERSION:
             raise ValueError(f"schema = {self.schema}: this version reads {SCHEMA_VERSION}")
         for key in self.parameters.keys() & _KEYS:
@@ -99,6 +104,8 @@ def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
     mapping |= mapping.pop("parameters")
     if manifest.family == LPAC:
         del mapping["family"]
+    if manifest.payload_limit is None:
+        del mapping["payload_limit"]
     text = json.dumps(mapping, indent=2, sort_keys=True) + "\n"
     bundle_id = _sha256(text.encode())
     sealed = {**files, MANIFEST: text.encode(), BUNDLE_ID: f"{bundle_id}\n".encode()}

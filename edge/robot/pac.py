@@ -143,6 +143,7 @@ class Pac:
             frame_id=self.frame_id,
             own_robot_id=self._robot_id,
             message_size=self._policy.message_size,
+            payload_limit=self._policy.manifest.payload_limit,
         )
         if not isinstance(message, Rejection) and sender not in (None, message.robot_id):
             message = Rejection.OTHER_SENDER

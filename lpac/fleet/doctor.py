@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+from edge.core.schema import ConfigError
+from edge.drivers.identity_folder import card_in
 from edge.messages.codes import CheckCode, FailedCheck, texts
 from lpac.fleet.hold import Report, lock, wrong_identity
 from lpac.fleet.operations import Outcome
@@ -218,6 +220,7 @@ def judge(
     found = fleet[robot.name]
     facts = found.facts
     yield _identity(config, robot, facts)
+    yield _card(config, robot, facts["card"])
     yield _release(config, robot, {name: other.facts for name, other in fleet.items()})
     yield _program(config, robot, fleet)
     yield _system(facts)
@@ -230,6 +233,7 @@ def judge(
     yield _mavlink(robot, facts)
     yield _px4(robot, facts)
     yield _vision_hub(config, robot, facts["vision_hub"])
+    yield _doors(robot, facts)
     yield _commanders(config, robot, facts)
     yield _containers(config, robot, facts["containers"])
     yield from _vehicle(robot, facts, found.vehicle)
@@ -267,6 +271,57 @@ def _identity(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorChec
     if wrong is not None:
         return DoctorCheck("enrolled", "FAILED", *wrong)
     return DoctorCheck("enrolled", "ok", f"robot id {robot.robot_id} of fleet {config.fleet}")
+
+
+def _card(config: FleetConfig, robot: RobotHost, card: str | None) -> DoctorCheck:
+    name = "card"
+    if config.keys is None:
+        found = "insecure: whoever is on the network can fly it"
+        return DoctorCheck(name, "warning", found, f"take insecure out of {config.path.name}")
+    if card is None:
+        return DoctorCheck(name, "FAILED", "it has no card of the fleet", _enroll(robot))
+    try:
+        own = card_in(card, config.keys)
+    except (OSError, ConfigError) as error:
+        return DoctorCheck(name, "FAILED", str(error), _enroll(robot))
+    if own.robot_id != robot.robot_id:
+        return DoctorCheck(name, "FAILED", f"its card is {own.name}'s", _enroll(robot))
+    until = time.strftime("%Y-%m-%d", time.gmtime(own.expires_unix_s))
+    return DoctorCheck(name, "ok", f"a member of fleet {own.fleet} until {until}")
+
+
+def _doors(robot: RobotHost, facts: Facts) -> DoctorCheck:
+    """Ways to the vehicle past the fleet's keys."""
+    name = "doors"
+    users = facts["factory_passwords"]
+    if users:
+        found = f"{', '.join(users)}: no password, or the one that every VOXL comes with"
+        return DoctorCheck(name, "FAILED", found, on(robot, *(f"passwd {user}" for user in users)))
+    expected = {("tcp", robot.port or 22), ("tcp", robot.zenoh_port)}
+    others = [
+        each for each in facts["open_ports"] if (each["protocol"], each["port"]) not in expected
+    ]
+    mavlink = [each for each in others if _may_be_mavlink(each)]
+    if mavlink:
+        found = f"others on the network may reach PX4's MAVLink: {_ports(mavlink)}"
+        rules = [
+            f"iptables -I INPUT ! -i lo -p udp --dport {each['port']} -j DROP" for each in mavlink
+        ]
+        return DoctorCheck(name, "warning", found, on(robot, *rules) + " (at every boot)")
+    if others:
+        found = f"other programs listen to the network: {_ports(others)}"
+        return DoctorCheck(name, "warning", found, "stop what the fleet does not need")
+    return DoctorCheck(name, "ok", "ssh and the radio alone listen to the network")
+
+
+def _may_be_mavlink(port: Facts) -> bool:
+    """By its number, as PX4 and ground stations have them, or by who has it."""
+    its = port["program"].startswith(("px4", "voxl-mavlink", "voxl-vision", "mavlink"))
+    return bool(port["protocol"] == "udp" and (its or 14_540 <= port["port"] <= 14_599))
+
+
+def _ports(ports: Sequence[Facts]) -> str:
+    return ", ".join(f"{each['protocol']} {each['port']} ({each['program']})" for each in ports)
 
 
 def _release(config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:

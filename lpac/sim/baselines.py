@@ -113,6 +113,9 @@ def make_baseline(
 class BaselineSwarm:
     """A baseline's robots: all decide at every sample, and fly there until the next."""
 
+    # They say nothing.
+    largest_payload = 0.0
+
     def __init__(
         self,
         baseline: Baseline,

@@ -75,7 +75,8 @@ class SimulatedFlight:
     """What a simulated flight was like; times in s, positions in m of the mission frame.
 
     `time_s` (T,) and `positions_m` (T, N, 2) sample the flight; `cost_time_s` (C,) and `cost` (C,)
-    are the coverage cost J at fewer of these times, from the start to the end.
+    are the coverage cost J at fewer of these times, from the start to the end. `messages` counts
+    what became of them; `largest_payload` is the largest number in one, by its absolute value.
     """
 
     scenario: Scenario
@@ -88,6 +89,7 @@ class SimulatedFlight:
     cost_time_s: F64
     cost: F64
     messages: dict[str, int]
+    largest_payload: float
 
     @property
     def normalized_cost(self) -> F64:
@@ -194,6 +196,7 @@ def fly(
         cost_time_s=np.array(list(costs)),
         cost=np.array(list(costs.values())),
         messages=swarm.message_counts(),
+        largest_payload=swarm.largest_payload,
     )
 
 

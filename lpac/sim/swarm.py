@@ -63,6 +63,7 @@ class Swarm:
             )
             for robot in range(len(positions_m))
         )
+        self.largest_payload = 0.0
         self._medium = medium
         self._rng = rng
         # Events (time, order, what to do); the order makes equal times deterministic.
@@ -130,6 +131,8 @@ class Swarm:
         tick = self.robots[robot].infer(now_s)
         if tick is None:
             return
+        for payload in tick.payloads:
+            self.largest_payload = max(self.largest_payload, float(np.abs(payload).max()))
         for receiver, travel_s in self._medium.broadcast(robot, self._vehicles.positions_m()):
             self._schedule(now_s + travel_s, partial(self._deliver, receiver, tick.message))
 

@@ -12,7 +12,7 @@ from edge.messages import codes
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import OrderKind, Origin
 from lpac.fleet.doctor import judge
-from lpac.fleet.settings import load_fleet
+from lpac.fleet.settings import parse_fleet
 from lpac.ground.alarms import alarms
 from lpac.ground.station import commands
 from lpac.ground.station.protocol import (
@@ -124,7 +124,8 @@ def failed() -> list[FailedCheck]:
 
 def diagnosed(checks: list[FailedCheck]) -> list[tuple[str, str, str]]:
     """What doctor makes of a robot whose program says that."""
-    config = load_fleet(ROOT / "docs" / "fleet.toml")
+    path = ROOT / "docs" / "fleet.toml"
+    config = parse_fleet(path, path.read_text().replace("# insecure = false", "insecure = true"))
     fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
     told = [dataclasses.asdict(check) for check in checks]
     fleet["r1"].facts["service"]["status"]["failed_checks"] = told

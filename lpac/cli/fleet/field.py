@@ -168,6 +168,8 @@ def up(
         _print_findings(diagnoses)
         _print_free_ground(config)
         _print_decisions(decisions, batteries)
+        if config.insecure:
+            typer.secho("insecure: whoever is on the network can fly this fleet", fg="yellow")
         typer.echo(
             f"trials: how many of {trial:g} s each pack lasts for; --trial SECONDS for others"
         )

@@ -17,6 +17,8 @@ from lpac.fleet.on_robot import releases, service
 from lpac.fleet.on_robot.calls import Refused, call, reason, run, say
 
 VISION_HUB = "/etc/modalai/voxl-vision-hub.conf"
+# root's, as ModalAI's documentation has it.
+_FACTORY_PASSWORD = "oelinux123"
 
 # How long the program may take, after its start, until its first checks are done.
 _CHECKS_WAIT_S = 8.0
@@ -40,10 +42,8 @@ def clock() -> Dict[str, Any]:
 def set_clock(offset_s: float, mavlink_port: int) -> Dict[str, Any]:
     """Take `offset_s` off the wall clock at once, and set the battery-backed clock if there is one.
 
-    Refused while the vehicle is armed. On the ground the program may run meanwhile: its loops,
-    deadlines and timeouts count monotonic time. Only a message's time in transit comes from wall
-    clocks: after a jump forward a robot takes all messages for late and drops them, for 5 s; then
-    each sender counts as heard anew. The flight log's times jump as the clock does.
+    Refused while the vehicle is armed. On the ground the program may run meanwhile: it counts
+    monotonic time. Only the flight log's times jump as the clock does.
     """
     service.refuse_in_flight(mavlink_port, "setting the clock")
     try:
@@ -88,8 +88,50 @@ def facts(directory: str, mavlink_port: int, names: List[str]) -> Dict[str, Any]
         vision_hub=_vision_hub(),
         units=units(known_units(names)),
         containers=known_containers(),
+        card=_card(),
+        open_ports=open_ports(_output(["ss", "-H", "-t", "-u", "-l", "-n", "-p"])),
+        factory_passwords=_factory_passwords(),
     )
     return found
+
+
+def _card() -> Optional[str]:
+    """The file with who this robot is in its fleet; None if it has no card."""
+    return _read(os.path.join(_PRIVATE, "lpac/identity/identity.json")) or None
+
+
+def open_ports(text: str) -> List[Dict[str, Any]]:
+    """The ports that other computers reach, of `ss -tulnp`: protocol, number and program."""
+    found = {}  # type: Dict[Any, str]
+    for line in text.split("\n"):
+        match = re.match(r"(udp|tcp)\s+\S+\s+\d+\s+\d+\s+(\S+):(\d+)\s", line)
+        if match is None or re.match(r"127\.|\[::1\]|\[?::ffff:127\.", match.group(2)):
+            continue
+        program = _group(r'users:\(\("([^"]+)"', line) or "?"
+        found[match.group(1), int(match.group(3))] = program
+    return [
+        {"protocol": protocol, "port": port, "program": program}
+        for (protocol, port), program in sorted(found.items())
+    ]
+
+
+def _factory_passwords() -> List[str]:
+    """Who may log in with no password, or with the one that every VOXL comes with."""
+    found = []
+    for line in _read("/etc/shadow").split("\n"):
+        user, _, rest = line.partition(":")
+        stored = rest.partition(":")[0]
+        if user and (not stored or _is_password(_FACTORY_PASSWORD, stored)):
+            found.append(user)
+    return found
+
+
+def _is_password(password: str, stored: str) -> bool:
+    match = re.match(r"\$([156])\$([^$]+)\$", stored)
+    if match is None or not shutil.which("openssl"):
+        return False
+    method, salt = match.groups()
+    return _output(["openssl", "passwd", "-" + method, "-salt", salt, password]).strip() == stored
 
 
 def _settled(state: Dict[str, Any]) -> Dict[str, Any]:

@@ -230,6 +230,16 @@ def test_up_starts_what_was_switched_off_and_says_go(
     assert host.run("systemctl is-active lpac-robot || true") == "inactive\n"
 
 
+def test_the_password_that_every_voxl_comes_with_is_found(enrolled: SimulatedHosts) -> None:
+    host = enrolled[1]
+    host.run("echo root:oelinux123 | chpasswd")
+    try:
+        doors = run_doctor(enrolled, host.name)[host.name]["doors"]
+    finally:
+        host.run("usermod --password '*' root")
+    assert doors.verdict == "FAILED" and doors.fix.endswith("'passwd root'")
+
+
 def test_no_clock_is_set_under_an_armed_vehicle(enrolled: SimulatedHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
     with armed(enrolled[1]):

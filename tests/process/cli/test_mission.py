@@ -322,7 +322,7 @@ def test_observer_may_hold_and_must_ask_for_the_rest(
     field.do("mission", "start")
     with ground(short_path / "run", field.fleet, "bob") as environment:
         monkeypatch.setenv("XDG_RUNTIME_DIR", environment["XDG_RUNTIME_DIR"])
-        assert "alice" in field.refused("mission", "land")
+        assert "alice" in field.refused("mission", "return")
         field.do("mission", "hold")
         assert states(field) == [_S.HOLD] * 3
         field.do("mission", "command")

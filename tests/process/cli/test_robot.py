@@ -113,7 +113,10 @@ def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
         ({"policy": {"world": "nothing.env"}}, "nothing.env"),
         ({"policy": {"world": "broken.env"}}, "broken.env: record 1 (CircularBND)"),
         ({"flight": {"slot": 99}}, "slot = 99 flies at 450.5 m"),
-        ({"link": {"listen": ["tcp/192.0.2.1:1"]}}, "this machine has no such address"),
+        (
+            {"link": {"listen": ["tcp/192.0.2.1:1"], "insecure": True}},
+            "this machine has no such address",
+        ),
         ({"link": {"listen": ["TAKEN"]}}, "another program has this port"),
     ],
 )
@@ -133,7 +136,7 @@ def test_what_keeps_it_from_starting_is_one_line(
         free.close()
         if "link" in changes:
             listen = [e.replace("TAKEN", endpoint) for e in changes["link"]["listen"]]
-            changes = {"link": {"listen": listen}}
+            changes = {"link": {**changes["link"], "listen": listen}}
         path = write_config(tmp_path, url=url, endpoint=endpoint, changes=changes)
         result = lpac_robot("run", "--config", path)
     assert result.returncode == 1

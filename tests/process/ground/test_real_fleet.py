@@ -46,6 +46,8 @@ from tests.said import problem
 pytestmark = pytest.mark.real_time
 
 _S = FlightState
+# For other computers too.
+OPEN = 'insecure = true\nlisten = ["tcp/0.0.0.0:'
 NAMES = ("r0", "r1")
 PATIENCE_S = 90.0
 PATIENT = ErrorBudget(takeoffs_height_m=3.0)
@@ -75,7 +77,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fleet]:
         }  # fmt: skip
     for robot in made.robots:
         path = robot.folder / "robot.toml"
-        text = path.read_text().replace('listen = ["tcp/127.0.0.1:', 'listen = ["tcp/0.0.0.0:')
+        text = path.read_text().replace('listen = ["tcp/127.0.0.1:', OPEN)
         path.write_text(text.replace("[flight]\n", "[flight]\nground_lost_land_s = 30.0\n"))
     with made:
         found_all = made.heard.wait_for(
@@ -304,7 +306,8 @@ def test_a_lossy_link_and_then_a_new_ground_in_flight(fleet: Fleet, tmp_path: Pa
     with lossy_network() as (enter, address):
         far_toml = fleet.folder / "far.toml"
         text = fleet.fleet_toml.read_text()
-        far_toml.write_text(text.replace('address = "127.0.0.1"', f'address = "{address}"'))
+        text = text.replace('address = "127.0.0.1"', f'address = "{address}"')
+        far_toml.write_text(f"insecure = true\n{text}")
         with run_ground(fleet, far_toml, enter) as ground:
             for request in (
                 SetOrigin(ORIGIN), Resume(), Enable(), Takeoff(interval_s=0.5), Start(),

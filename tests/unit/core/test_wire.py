@@ -5,6 +5,7 @@ import hashlib
 import math
 import struct
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +68,7 @@ def receive(
     message_size: int = MESSAGE.payload.size,
     bundle_id: bytes = BUNDLE_ID,
     own_robot_id: int = OWN_ID,
+    payload_limit: float | None = None,
 ) -> AggregatedMessage | Rejection:
     return decode(
         data,
@@ -74,6 +76,7 @@ def receive(
         frame_id=FRAME_ID,
         own_robot_id=own_robot_id,
         message_size=message_size,
+        payload_limit=payload_limit,
     )
 
 
@@ -263,6 +266,29 @@ def test_what_is_not_finite_is_refused(payload_dtype: type, value: float) -> Non
         dataclasses.replace(MESSAGE, velocity_m_s=(0.0, value, 0.0)),
     ):
         assert receive(encode(message, BUNDLE_ID, payload_dtype)) is Rejection.NON_FINITE
+
+
+@TYPES
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"boot_epoch": 2**43},
+        {"boot_epoch": 2**63},
+        {"position_m": (0.0, -1.1e6, 0.0)},
+        {"velocity_m_s": (0.0, 0.0, 1.1e4)},
+        {"sent": FleetTime(1, 1.1e9, 0.0)},
+        {"sent": FleetTime(1, 0.0, -1.0)},
+    ],
+)
+def test_what_cannot_be_is_refused(payload_dtype: type, changes: dict[str, Any]) -> None:
+    message = dataclasses.replace(MESSAGE, **changes)
+    assert receive(encode(message, BUNDLE_ID, payload_dtype)) is Rejection.IMPOSSIBLE
+
+
+def test_a_payload_beyond_the_bundles_limit_is_refused() -> None:
+    data = encode(MESSAGE, BUNDLE_ID, np.float32)
+    assert isinstance(receive(data, payload_limit=100.0), AggregatedMessage)
+    assert receive(data, payload_limit=99.9) is Rejection.PAYLOAD_RANGE
 
 
 def test_a_wrong_payload_type_is_named() -> None:

@@ -47,19 +47,25 @@ time_step = 0.1
 
 def read(text: str, folder: Path) -> tuple[PerceptionParameters, Training]:
     (folder / "parameters.toml").write_text(text)
-    return read_parameters(folder / "parameters.toml")
+    read = read_parameters(folder / "parameters.toml")
+    return read.perception, read.training
 
 
 def test_the_shipped_file() -> None:
-    perception, training = read_parameters(OURS)
+    read = read_parameters(OURS)
+    perception, training = read.perception, read.training
     assert perception == PerceptionParameters(512, 256, 64, 256.0)
     assert training == Training(max_speed=5.0, time_step=0.2)
 
 
 @pytest.mark.skipif(not THEIRS.is_dir(), reason="CoverageControl's files are not in this checkout")
 def test_coverage_control_file_says_the_same_as_ours() -> None:
-    assert read_parameters(THEIRS / "coverage_control_params_512.toml") == read_parameters(OURS)
-    perception, _ = read_parameters(THEIRS / "coverage_control_params_1024.toml")
+    theirs, ours = (
+        read_parameters(THEIRS / "coverage_control_params_512.toml"),
+        read_parameters(OURS),
+    )
+    assert (theirs.perception, theirs.training) == (ours.perception, ours.training)
+    perception = read_parameters(THEIRS / "coverage_control_params_1024.toml").perception
     assert perception.world_size == 1024
 
 

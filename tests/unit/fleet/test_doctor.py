@@ -11,7 +11,9 @@ import pytest
 
 from edge.core.vehicle import Gps
 from edge.flight.margins import ErrorBudget
+from edge.identity.card import Role
 from edge.messages.codes import CheckCode, FailedCheck
+from lpac.fleet.cards import init, open_authority
 from lpac.fleet.doctor import (
     ClockOffset,
     Diagnosis,
@@ -24,7 +26,7 @@ from lpac.fleet.doctor import (
 )
 from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
 from lpac.fleet.operations import Outcome
-from lpac.fleet.settings import FleetConfig, SshConfig, load_fleet
+from lpac.fleet.settings import FleetConfig, RobotHost, SshConfig, load_fleet
 from lpac.fleet.up import decide, packs
 from lpac.fleet.writer import robot_toml
 from tests.conftest import ROOT
@@ -41,8 +43,20 @@ def config(tmp_path: Path) -> FleetConfig:
     """The example's three robots and a spare."""
     text = (ROOT / "docs" / "fleet.toml").read_text()
     path = tmp_path / "fleet.toml"
-    path.write_text(text.replace("# predecessors = []", 'predecessors = ["old_ros"]'))
-    return load_fleet(path)
+    text = text.replace("# predecessors = []", 'predecessors = ["old_ros"]')
+    path.write_text(text.replace('# keys = ""', 'keys = "keys"'))
+    config = load_fleet(path)
+    init(config, "ann")
+    return config
+
+
+def card_of(config: FleetConfig, robot: RobotHost) -> str | None:
+    if config.keys is None:
+        return None
+    issued = open_authority(config).issue(
+        Role.ROBOT, robot.name, robot.name.encode().ljust(32), robot.robot_id
+    )
+    return issued.files["identity.json"].decode()
 
 
 def failed(code: CheckCode, text: str = "x", *, settles: bool = False) -> dict[str, Any]:
@@ -91,7 +105,9 @@ def well(config: FleetConfig, name: str) -> Examination:
             "voxl-px4": {**runs}, "voxl-mavlink-server": {**runs}, "voxl-vision-hub": {**runs},
             "voxl-microdds-agent": {**idle}, "old_ros": {**idle},
         },
-        "containers": [],
+        "containers": [], "card": card_of(config, robot), "factory_passwords": [],
+        "open_ports": [{"protocol": "tcp", "port": 22, "program": "sshd"},
+                       {"protocol": "tcp", "port": 7447, "program": "python3"}],
     }  # fmt: skip
     pings = {other: PING for other in ("r1", "r2", "r3") if other != name}
     return Examination(facts, ClockOffset(0.001, 0.01), "its program says so itself", pings)
@@ -208,6 +224,18 @@ def container(**about: object) -> list[dict[str, object]]:
             "commanders", "FAILED", "voxl-microdds-agent runs",
         ),
         (put("units.old_ros.enabled", True), "commanders", "FAILED", "starts at the next boot"),
+        (put("card", None), "card", "FAILED", "no card"),
+        (put("card", "{"), "card", "FAILED", "its card: "),
+        (put("card", '{"fleet":"x","authority":"00","card":"00"}'), "card", "FAILED", "not signed"),
+        (put("factory_passwords", ["root"]), "doors", "FAILED", "root: no password, or the one"),
+        (
+            put("open_ports", [{"protocol": "udp", "port": 14556, "program": "voxl-mavlink-s"}]),
+            "doors", "warning", "may reach PX4's MAVLink: udp 14556 (voxl-mavlink-s)",
+        ),
+        (
+            put("open_ports", [{"protocol": "tcp", "port": 80, "program": "voxl-portal"}]),
+            "doors", "warning", "listen to the network: tcp 80 (voxl-portal)",
+        ),
         (put("containers", None), "containers", "warning", "does not answer"),
         (put("containers", container()), "containers", "ok", "1 run"),
         (put("containers", container(host_network=True)), "containers", "FAILED", "box (host"),

@@ -218,3 +218,23 @@ def test_a_program_is_waited_for_until_it_has_looked(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(service, "service", lambda: next(states))
     monkeypatch.setattr("time.sleep", lambda _: None)
     assert probes._settled(said(told[0])) == said(CheckCode.GPS_NO_FIX)
+
+
+def test_ports_that_others_reach() -> None:
+    text = (
+        'udp UNCONN 0 0 0.0.0.0:14556 0.0.0.0:* users:(("voxl-mavlink-s",pid=7,fd=3))\n'
+        'udp UNCONN 0 0 127.0.0.1:14551 0.0.0.0:* users:(("python3",pid=8,fd=3))\n'
+        'tcp LISTEN 0 128 [::]:22 [::]:* users:(("sshd",pid=9,fd=4))\n'
+        "tcp LISTEN 0 128 [::1]:631 [::]:*\n"
+        "tcp LISTEN 0 128 *:80 *:*\n"
+    )
+    assert probes.open_ports(text) == [
+        {"protocol": "tcp", "port": 22, "program": "sshd"},
+        {"protocol": "tcp", "port": 80, "program": "?"},
+        {"protocol": "udp", "port": 14556, "program": "voxl-mavlink-s"},
+    ]
+
+
+@given(ANYTHING)
+def test_whatever_ss_prints_names_no_port_or_some(text: str) -> None:
+    assert isinstance(probes.open_ports(text), list)

@@ -236,11 +236,16 @@ def test_what_a_robot_must_not_hear_is_counted(shipped_policy: LpacPolicy) -> No
     assert robot.mailbox.counts()["accepted"] == 1
 
 
-def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_policy: LpacPolicy) -> None:
-    robot = make_robot(shipped_policy, World())
-    robot.receive(message(shipped_policy, value=3e38), 0.0)
-    robot.receive(message(shipped_policy, robot_id=3, value=3e38), 0.0)
-    robot.receive(message(shipped_policy, robot_id=4, position_m=(1e300, -1e300, 0.0)), 0.0)
+def test_absurd_neighbours_stop_the_robot_instead_of_driving_it(shipped_bundle: Bundle) -> None:
+    """Of a policy whose payloads have no limit: the shipped one's robots do not listen to them."""
+    shipped = LpacPolicy(shipped_bundle)
+    robot = make_robot(shipped, World())
+    absurd = message(shipped, value=3e38)
+    assert robot.receive(absurd, 0.0) is Rejection.PAYLOAD_RANGE
+    without = dataclasses.replace(shipped_bundle.manifest, payload_limit=None)
+    robot = make_robot(LpacPolicy(dataclasses.replace(shipped_bundle, manifest=without)), World())
+    assert robot.receive(absurd, 0.0) is None
+    assert robot.receive(message(shipped, robot_id=3, value=3e38), 0.0) is None
     robot.perceive(0.0)
     with np.errstate(over="ignore", invalid="ignore"):
         assert robot.infer(0.0) is None
