@@ -23,7 +23,6 @@ _KEPT = 3
 _VERIFY_S = 150.0
 # The robot's, whatever folder its releases are in; it can be taken when no disk can be written.
 _LOCK = "/run/lpac-fleet.lock"
-_HEALTHY_S = 40.0
 
 _lock = []  # type: List[int]
 
@@ -235,7 +234,7 @@ def _activate(directory: str, release: str) -> Optional[str]:
         if not _starts(directory, release):
             service.halt()
             return None
-        return service.run_now(_HEALTHY_S)
+        return service.run_now()
     except (Refused, OSError) as error:
         return str(error)
 

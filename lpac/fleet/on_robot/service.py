@@ -18,7 +18,8 @@ UNIT_PATH = "/etc/systemd/system/"
 
 # The program says how it is four times a second.
 _STATUS_FRESH_S = 2.0
-# For so long it must be well without a restart.
+# By then it must be well, and for so long without a restart.
+_HEALTHY_S = 40.0
 _STEADY_S = 2.0
 # PX4 sends heartbeats at 1 Hz.
 _HEARTBEAT_WAIT_S = 2.5
@@ -123,7 +124,7 @@ def start(directory: str) -> Dict[str, Any]:
     must(["systemctl", "enable", UNIT])
     # A program that cannot start shows in its health, with the reason.
     run(["systemctl", "start", UNIT], timeout_s=90.0)
-    problem = unhealthy(20.0)
+    problem = unhealthy()
     if problem is not None:
         raise Refused("it does not run well: %s" % problem)
     return service()
@@ -158,13 +159,13 @@ def last_words() -> Dict[str, Any]:
     return {"text": _reason()}
 
 
-def unhealthy(within_s: float) -> Optional[str]:
-    """Why the program does not run well, None once it has done so for a few seconds.
+def unhealthy() -> Optional[str]:
+    """Why the program does not run well 40 s from now, None once it has for a few seconds.
 
     Well means: systemd has it active without a restart, all its loops tick without new failures,
     and it has joined the radio link. Vehicle, GPS and battery are preflight's matter.
     """
-    until_s = time.monotonic() + within_s
+    until_s = time.monotonic() + _HEALTHY_S
     first = None  # type: Optional[Dict[str, Any]]
     first_s = 0.0
     restarts = service()["restarts"]
@@ -235,7 +236,7 @@ def install_unit(directory: str, release: str) -> None:
         must(["systemctl", "daemon-reload"])
 
 
-def run_now(within_s: float) -> Optional[str]:
+def run_now() -> Optional[str]:
     """Restart the unit, also at every boot; why the program does not run well then."""
     say("restart")
     run(["systemctl", "reset-failed", UNIT])
@@ -246,7 +247,7 @@ def run_now(within_s: float) -> Optional[str]:
     if former and service()["invocation"] == former:
         return "it was not restarted: see `systemctl status lpac-robot` on the robot"
     say("health")
-    return unhealthy(within_s)
+    return unhealthy()
 
 
 def halt() -> None:

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from lpac.fleet.cards import open_authority
+from lpac.fleet.settings import load_fleet
 from lpac.sim.hosts.hosts import SimulatedHosts
 from lpac.sim.hosts.rack import children
 from lpac.sim.px4.modes import Px4Mode
@@ -72,6 +74,20 @@ def test_status_tells_of_release_program_vehicle_and_clock(operator: Operator) -
     assert r1[6:8] == ["idle", "no"] or r1[6:8] == ["init", "no"]
     assert r4[:4] == ["r4", "spare", robots["r4"]["current"][:8], "stopped"]
     assert notes.split()[0] == "all"
+
+
+def test_rotate_gives_a_robot_a_new_key_and_the_others_hear_it(operator: Operator) -> None:
+    first = operator.hosts[0]
+    key = "sha256sum /var/lib/private/lpac/identity/key.pem"
+    before = first.run(key)
+    done = operator("rotate", "--robots", "r1")
+    assert done.returncode == 0, done.stderr
+    assert first.run(key) != before
+    # The others keep their keys, and let it in with its new one.
+    for host in operator.hosts[:3]:
+        await_said(host, '"peers":2')
+    known = open_authority(load_fleet(operator.fleet_toml)).members()
+    assert [member.name for member in known if member.revoked] == ["r1"]
 
 
 def test_a_program_that_cannot_start_and_a_host_that_is_another(operator: Operator) -> None:

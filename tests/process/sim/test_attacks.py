@@ -22,8 +22,8 @@ from edge.identity.guard import SignedGuard
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
 from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
-from lpac.fleet.authority import create_authority, new_member
-from lpac.ground.station.protocol import SafetyCommand
+from lpac.fleet.authority import Authority, create_authority, new_member
+from lpac.ground.station.protocol import Resume, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
@@ -206,5 +206,18 @@ def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
     rig.start()
     rig.done(SafetyCommand("hold"))
     assert {rig.status(robot).state for robot in ROBOTS} == {_S.HOLD}
-    rig.done(SafetyCommand("land", wait=True))
-    assert all(rig.simulated_vehicle(robot).landed for robot in ROBOTS)
+
+
+def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FaultRig) -> None:
+    rig.command(Resume())
+    rig.start()
+    # As `lpac fleet revoke` does it: the ground that runs tells the robots.
+    Authority(rig.fleet.folder / "keys", rig.fleet.name).revoke(f"r{STOLEN}")
+    rig.wait_status(0, lambda status: not status.neighbour_ages_s)
+    assert flies_on(rig.status(0))
+    assert rig.ground.told.wait_for(
+        lambda told: {robot.name for robot in told.robots if robot.fresh} == {"r0"}, 60.0
+    )
+    rig.command(SafetyCommand("land"))
+    for robot in ROBOTS:
+        rig.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed)
