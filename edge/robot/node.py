@@ -120,6 +120,8 @@ class RobotNode:
             bundle_problem=policy.problem,
         )
         self._statuses = 0
+        # What it said last of itself: there before anybody can have heard it.
+        self.status: RobotStatus | None = None
         # What the ground was told last, and when.
         self._told: tuple[object, ...] = ()
         self._told_at_s = -math.inf
@@ -305,7 +307,7 @@ class RobotNode:
         `loops` are the loops that call the steps, by their names.
         """
         now_s, unix_now_s = self._ports.clock.monotonic_s(), self._ports.clock.unix_s()
-        status = self._status(now_s, unix_now_s, loops)
+        self.status = status = self._status(now_s, unix_now_s, loops)
         news = _news(status)
         if news != self._told or now_s - self._told_at_s >= _STATUS_PERIOD_S:
             self._told, self._told_at_s = news, now_s

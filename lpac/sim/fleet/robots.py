@@ -73,7 +73,7 @@ class SimulatedRobot:
         self.vehicle = vehicle
         self.world = world
         self.node: RobotNode | None = None
-        self.status: RobotStatus | None = None
+        self._said: RobotStatus | None = None
         self.loops: dict[str, Recurrence] = {}
         self._policy = policy
         self._sensor_over = sensor_over
@@ -86,6 +86,11 @@ class SimulatedRobot:
         self._logs = logs
         self._log: FlightLog | None = None
         schedule.every(vehicle_step_s, partial(vehicle.step, vehicle_step_s), vehicle_step_s)
+
+    @property
+    def status(self) -> RobotStatus | None:
+        """What it said last, also before its program ended; None: nothing yet."""
+        return (self.node and self.node.status) or self._said
 
     def start(self) -> None:
         """Its program starts, or starts again."""
@@ -122,7 +127,7 @@ class SimulatedRobot:
             ("perception", 1.0 / rates.perception_hz, node.perception_step),
             ("policy", 1.0 / rates.policy_hz, node.policy_step),
             ("preflight", _CHORE_S, node.preflight_step),
-            ("status", _CHORE_S, self._say_status),
+            ("status", _CHORE_S, partial(node.status_step, {})),
         )
         self.loops = {
             # Nobody starts ten programs at one time.
@@ -134,6 +139,7 @@ class SimulatedRobot:
 
     def stop(self) -> None:
         """Its program ends, as by a loss of power."""
+        self._said = self.status
         for loop in self.loops.values():
             loop.stop()
         if self._link is not None:
@@ -141,10 +147,6 @@ class SimulatedRobot:
         if self._log is not None:
             self._log.close()
         self.loops, self._link, self._log, self.node = {}, None, None, None
-
-    def _say_status(self) -> None:
-        assert self.node is not None
-        self.status = self.node.status_step({})
 
 
 class SimulatedRobots:
