@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+from lpac.fleet.cards import open_authority
 from lpac.fleet.hold import Held, Report, hold
 from lpac.fleet.release import Release
 from lpac.fleet.session import FleetError, RemoteError, rsync
@@ -27,7 +28,9 @@ async def deploy(
     """Bring `release` to the robot and run it there, or leave what runs untouched.
 
     Raises FleetError that says what went wrong; the robot then has what it had before.
+    AuthorityError: the fleet has keys, and its authority is not on this computer.
     """
+    authority = None if config.keys is None else open_authority(config)
     async with hold(config, robot, report) as held:
         before, session = held.found, held.session
         if before["machine"] != release.image.machine:
@@ -40,6 +43,10 @@ async def deploy(
         if before["current"] == release.id and before["pending"] is None and runs:
             return Deployed(release.id, held.recovered or "unchanged", 0, None, None)
         sent_bytes = await _bring(config, robot, release, held, report)
+        signature = authority and authority.sign_release(release.manifest_sha256)
+        await session.call(
+            "sign", directory=config.directory, release=release.id, signature=signature
+        )
         proof = await session.call("prove", directory=config.directory, release=release.id)
         report("switch", None)
         after = await session.call(

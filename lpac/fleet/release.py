@@ -44,12 +44,20 @@ class Image:
 
 
 class Release(NamedTuple):
-    """One robot's release: the image beside it, all else in `folder`, ready to travel."""
+    """One robot's release: the image beside it, all else in `folder`, ready to travel.
 
-    id: str
+    `manifest_sha256` is its content's name in full, in hexadecimal.
+    """
+
+    manifest_sha256: str
     image: Image
     folder: Path
     size_bytes: int
+
+    @property
+    def id(self) -> str:
+        """Its name."""
+        return self.manifest_sha256[:16]
 
 
 class Common(NamedTuple):
@@ -126,7 +134,7 @@ def make_release(config: FleetConfig, robot: RobotHost, common: Common, folder: 
     (folder / "manifest.json").write_bytes(manifest)
     (folder / "manifest.json").chmod(0o644)
     size_bytes = common.image.size_bytes + len(manifest) + sum(map(len, files.values()))
-    return Release(hashlib.sha256(manifest).hexdigest()[:16], common.image, folder, size_bytes)
+    return Release(hashlib.sha256(manifest).hexdigest(), common.image, folder, size_bytes)
 
 
 def drop_ins(config: FleetConfig, robot: RobotHost) -> dict[str, str]:

@@ -30,7 +30,9 @@ _PACKAGES = (
     "lpac.fleet",
     "lpac.fleet.on_robot",
 )
-_MODULES = ("calls", "service", "releases", "probes", "enrolment", "collection", "landing")
+_MODULES = (
+    "calls", "service", "signatures", "releases", "probes", "enrolment", "collection", "landing",
+)  # fmt: skip
 # Reads the modules' sources, makes them modules, and serves. The login shell sees but this.
 _BOOTSTRAP = """
 import json, os, sys, types

@@ -8,13 +8,14 @@ import shutil
 import time
 from typing import Any, Dict, List, Optional
 
-from lpac.fleet.on_robot import probes, releases, service
+from lpac.fleet.on_robot import probes, releases, service, signatures
 from lpac.fleet.on_robot.calls import Refused, call, must, reason, say, write_whole
 
 _IDENTITY = "/etc/lpac/robot.json"
 # As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac.
 _MEMBERSHIP = "/var/lib/private/lpac/identity"
 _KEY, _NEXT_KEY, _CARD = "key.pem", "next-key.pem", "identity.json"
+_AUTHORITY = "authority.pem"
 # Bridges PX4 to DDS: through it a predecessor's program commands the vehicle.
 _DDS_AGENT = "voxl-microdds-agent"
 # What else of ModalAI's may send setpoints.
@@ -49,7 +50,8 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
     """The public key of this robot, whose secret key is made here and never leaves.
 
     With `fresh` it is another one than before, which counts once `set_card` brings its card.
-    Returns the `public_key` in hexadecimal digits, and the text of the `card` that is there.
+    Returns the `public_key` in hexadecimal digits, and the text of the `card` that is there, None
+    unless the robot knows by whom releases are signed, too.
     """
     _make_identity()
     key = os.path.join(_MEMBERSHIP, _NEXT_KEY if fresh else _KEY)
@@ -62,7 +64,8 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
     pem = must(["openssl", "pkey", "-in", key, "-pubout"])
     der = base64.b64decode("".join(pem.strip().split("\n")[1:-1]))
     card = None
-    if os.path.exists(os.path.join(_MEMBERSHIP, _CARD)):
+    paths = (os.path.join(_MEMBERSHIP, _CARD), signatures.AUTHORITY)
+    if all(map(os.path.exists, paths)):
         with open(os.path.join(_MEMBERSHIP, _CARD)) as file:
             card = file.read()
     # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
@@ -85,6 +88,7 @@ def set_card(files: Dict[str, str], fresh: bool, mavlink_port: int) -> Dict[str,
             raise Refused("%r is no file's name" % name)
         write_whole(os.path.join(_MEMBERSHIP, name), base64.b64decode(text))
     _own_identity()
+    signatures.trust_authority(base64.b64decode(files[_AUTHORITY]))
     return {}
 
 

@@ -15,7 +15,7 @@ import stat
 import time
 from typing import Any, Dict, List, Optional, Set
 
-from lpac.fleet.on_robot import service
+from lpac.fleet.on_robot import service, signatures
 from lpac.fleet.on_robot.calls import Refused, call, reason, run, say, write_whole
 
 _MARGIN_BYTES = 100000000
@@ -23,6 +23,9 @@ _KEPT = 3
 _VERIFY_S = 150.0
 # The robot's, whatever folder its releases are in; it can be taken when no disk can be written.
 _LOCK = "/run/lpac-fleet.lock"
+
+# Of a release's files: what its manifest cannot have.
+_UNLISTED = ("manifest.json", signatures.SIGNATURE)
 
 _lock = []  # type: List[int]
 
@@ -160,6 +163,17 @@ def accept(directory: str, release: str) -> Dict[str, Any]:
 
 
 @call
+def sign(directory: str, release: str, signature: Optional[str]) -> Dict[str, Any]:
+    """Keep the authority's signature of a release that is here; a robot without one needs none.
+
+    Raises Refused if the robot must not run it: it is not the authority's, or an older one.
+    """
+    require_lock()
+    signatures.sign(os.path.join(directory, "releases", release), signature)
+    return {}
+
+
+@call
 def prove(directory: str, release: str) -> Dict[str, Any]:
     """Run the release's own verification of its policy, and its benchmark, on this CPU.
 
@@ -167,6 +181,7 @@ def prove(directory: str, release: str) -> Dict[str, Any]:
     """
     require_lock()
     path = os.path.join(directory, "releases", release)
+    signatures.require_signed(path, forward=True)
     reports = {}
     for command, options in (("verify", []), ("benchmark", ["--seconds", "1"])):
         say(command)
@@ -186,6 +201,7 @@ def switch(directory: str, release: str, mavlink_port: int) -> Dict[str, Any]:
     if the vehicle is armed, or if the new release did not run well, with the reason.
     """
     require_lock()
+    signatures.require_signed(os.path.join(directory, "releases", release), forward=True)
     _prune(directory, {release})
     service.refuse_in_flight(mavlink_port, "switching")
     former, last_good = linked(directory, "current"), linked(directory, "last-good")
@@ -206,6 +222,7 @@ def rollback(directory: str, mavlink_port: int) -> Dict[str, Any]:
     current, last_good = linked(directory, "current"), linked(directory, "last-good")
     if last_good in (None, current) or not _starts(directory, str(last_good)):
         raise Refused("there is no earlier release to go back to")
+    signatures.require_signed(os.path.join(directory, "releases", str(last_good)), forward=False)
     _change(directory, str(last_good), last_good, mavlink_port)
     return overview(directory)
 
@@ -314,7 +331,7 @@ def _check(folder: str, release: str) -> None:
         for name in folders + files:
             path = os.path.join(parent, name)
             relative = os.path.relpath(path, folder)
-            if relative == "manifest.json" or (os.path.isdir(path) and not os.path.islink(path)):
+            if relative in _UNLISTED or (os.path.isdir(path) and not os.path.islink(path)):
                 continue
             found.add(relative)
             if wanted.get(relative) != _entry(path):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lpac.fleet.deploy import Deployed, deploy, rollback
-from lpac.fleet.hold import Report
+from lpac.fleet.hold import Report, hold
 from lpac.fleet.release import Common, Release, load_common, make_release
 from lpac.fleet.session import connect
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
@@ -57,6 +57,19 @@ class Laptop:
         """The same with another world file: a release that differs in one file, and versions."""
         world = self.common.world + b"CircularBND 100 100 20 %.9f\n" % time.monotonic()
         return self.common._replace(world=world)
+
+    def switch(self, index: int, release: Release) -> None:
+        """What a session may ask for that keeps to no order of steps."""
+        robot, directory = self.robot(index), self.config.directory
+
+        async def one() -> None:
+            async with hold(self.config, robot) as held:
+                await held.session.call(
+                    "switch", directory=directory, release=release.id,
+                    mavlink_port=robot.mavlink_port,
+                )  # fmt: skip
+
+        asyncio.run(one())
 
     def roll_back(self, index: int) -> str:
         return asyncio.run(rollback(self.config, self.robot(index), unwatched))

@@ -7,14 +7,17 @@ import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import onnx
 import pytest
 from onnx import numpy_helper
 
 from edge.policy.bundle import BUNDLE_ID, MANIFEST, make_bundle
+from lpac.fleet.authority import Authority, create_authority
 from lpac.fleet.deploy import deploy
-from lpac.fleet.release import make_release
+from lpac.fleet.hold import hold
+from lpac.fleet.release import Release, make_release
 from lpac.fleet.session import FleetError, RemoteError, UnreachableError, connect
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
@@ -65,6 +68,45 @@ def test_a_changed_file_travels_alone_and_rollback_brings_the_former_back(laptop
     assert laptop.overview(0)["current"] == former
     with pytest.raises(RemoteError, match="no earlier release"):
         laptop.roll_back(0)
+
+
+def test_only_what_the_authority_signed_runs_and_nothing_older(
+    laptop: Laptop, tmp_path: Path
+) -> None:
+    assert laptop.config.keys is not None
+    authority = Authority(laptop.config.keys, laptop.config.fleet)
+    stranger = create_authority(tmp_path / "keys", laptop.config.fleet)
+    robot = next(m for m in authority.members() if m.name == laptop.hosts[0].name)
+    former = laptop.release(0, laptop.changed())
+    laptop.deploy(0, former)
+    recorded = laptop.hosts[0].run(f"cat /opt/lpac/releases/{former.id}/signature.pem")
+    release = laptop.release(0, laptop.changed())
+    laptop.deploy(0, release)
+    digest = release.manifest_sha256
+
+    def refused(release: Release, signature: str | None) -> str:
+        async def sign() -> None:
+            async with hold(laptop.config, laptop.robot(0)) as held:
+                at = {"directory": laptop.config.directory, "release": release.id}
+                await held.session.call("sign", **at, signature=signature)
+
+        with pytest.raises(RemoteError) as why:
+            asyncio.run(sign())
+        return str(why.value)
+
+    certificate = authority.files(robot)["certificate.pem"].decode()
+    assert "is not signed" in refused(release, None)
+    assert "not the fleet's authority's" in refused(release, "no certificate")
+    assert "not the fleet's authority's" in refused(release, stranger.sign_release(digest))
+    assert "a certificate for something else" in refused(release, certificate)
+    assert "another release's" in refused(release, authority.sign_release("0" * 64))
+    assert "older than one" in refused(former, recorded)
+    with pytest.raises(RemoteError, match="older than one"):
+        laptop.switch(0, former)
+    # Rollback alone goes backwards; and who deploys the same again signs it anew.
+    assert laptop.roll_back(0) == former.id
+    assert laptop.deploy(0, release).summary == "runs"
+    laptop.deploy(0)
 
 
 @pytest.mark.parametrize("mishap", ["cut", "full"])
