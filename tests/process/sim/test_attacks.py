@@ -6,16 +6,18 @@ or another fleet's keys, or those of a stolen robot.
 
 import json
 import secrets
+import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
 import zenoh
 
-from edge.drivers.identity_folder import load_identity
+from edge.drivers.identity_folder import Identity, load_identity
 from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.card import Role
 from edge.identity.guard import SignedGuard
@@ -34,6 +36,8 @@ pytestmark = pytest.mark.real_time
 
 ROBOTS = range(2)
 STOLEN = 1
+# A TLS record that promises more than comes: the first bytes of a ClientHello.
+HALF_A_HELLO = bytes.fromhex("1603010200010001fc0303")
 _S = FlightState
 
 
@@ -52,11 +56,14 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
 
 
 @contextmanager
-def session(fleet: Fleet, tls: Mapping[str, object] | None) -> Iterator[zenoh.Session]:
+def session(
+    fleet: Fleet, tls: Mapping[str, object] | None, mode: str = "peer"
+) -> Iterator[zenoh.Session]:
     """A session on the robots' radio that keeps to no rule."""
     scheme = "tcp" if tls is None else "tls"
     config = zenoh.Config()
     for key, value in {
+        "mode": mode,
         "scouting/multicast/enabled": False,
         "listen/endpoints": [f"{scheme}/127.0.0.1:0"],
         "connect/endpoints": [e.replace("tls/", f"{scheme}/") for e in fleet.endpoints],
@@ -172,15 +179,15 @@ def test_another_fleet_of_the_same_name_does_not_meet_this_one(
     assert not heard.is_set()
 
 
-def test_a_stolen_robots_key_commands_nobody(rig: FaultRig, tmp_path: Path) -> None:
-    """Nor do the operator's own messages, said again by whoever has heard them."""
-    folder = rig.fleet.robots[STOLEN].folder / "identity"
-    stolen = load_identity(folder, fleet=rig.fleet.name, unix_s=1.0)
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_a_stolen_robots_key_commands_nobody(rig: FaultRig, mode: str) -> None:
+    """Nor do the operator's own messages, said again by whoever has heard them, or routes them."""
+    stolen = stolen_identity(rig)
     # It does not speak as itself here: then the others would take it for that robot's next start.
     guard = SignedGuard(stolen.membership, lambda: 0.0)
     recorded: dict[str, bytes] = {}
     prefix = f"lpac/{rig.fleet.name}/"
-    with session(rig.fleet, certified(stolen.tls)) as opened:
+    with session(rig.fleet, certified(stolen.tls), mode) as opened:
         for topic in TOPICS:
             opened.declare_subscriber(
                 prefix + topic.pattern,
@@ -198,8 +205,58 @@ def test_a_stolen_robots_key_commands_nobody(rig: FaultRig, tmp_path: Path) -> N
 
         nothing_comes_of(rig, once)
         # It was in, and heard what members hear.
-        assert len(opened.info.peers_zid()) >= len(ROBOTS)
+        if mode == "peer":
+            assert len(opened.info.peers_zid()) >= len(ROBOTS)
         assert f"{prefix}ground/state" in recorded
+
+
+def stolen_identity(rig: FaultRig) -> Identity:
+    folder = rig.fleet.robots[STOLEN].folder / "identity"
+    return load_identity(folder, fleet=rig.fleet.name, unix_s=1.0)
+
+
+def test_half_open_connections_hold_nobody_up(rig: FaultRig) -> None:
+    """Those that say nothing, and those that begin with TLS and do not go on."""
+    places = [e.removeprefix("tls/").rsplit(":", 1) for e in rig.fleet.endpoints]
+    with ExitStack() as stack:
+        for i in range(300):
+            host, port = places[i % len(places)]
+            half = stack.enter_context(socket.create_connection((host, int(port)), 5.0))
+            if i % 2:
+                half.sendall(HALF_A_HELLO)
+        nothing_comes_of(rig, lambda: None)
+        rig.done(SafetyCommand("hold"))
+        rig.command(Resume())
+        rig.start()
+
+
+def test_a_hold_acts_after_any_single_forged_message(
+    rig: FaultRig, pytestconfig: pytest.Config
+) -> None:
+    """From within, with a robot's certificate, in the ground's name and another robot's."""
+    rounds = 20 if pytestconfig.getoption("tries") >= 1000 else 4
+    stolen = stolen_identity(rig)
+    guard = SignedGuard(stolen.membership, lambda: 0.0)
+    prefix = f"lpac/{rig.fleet.name}/"
+    with session(rig.fleet, certified(stolen.tls)) as opened:
+        for i in range(rounds):
+            status = rig.status(0)
+            kill = Order(
+                secrets.token_hex(6), 0, status.boot_nonce, "kill", status.uptime_s + 5.0,
+                status.operator,
+            )  # fmt: skip
+            lie = replace(status, sequence=10**6 + i, operator="mallory", obeyed_sequence=2**48)
+            key, data = (
+                ("ground/order", guard.seal(ORDER, encode(kill))),
+                ("robot/0/status", guard.seal(STATUS, encode(lie))),
+                ("ground/state", guard.seal(STATE, b"[" * 100_000)),
+                ("ground/state", secrets.token_bytes(500)),
+            )[i % 4]
+            opened.put(prefix + key, data)
+            rig.done(SafetyCommand("hold"))
+            assert {rig.status(robot).state for robot in ROBOTS} == {_S.HOLD}
+            rig.command(Resume())
+            rig.start()
 
 
 def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
