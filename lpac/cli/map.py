@@ -23,19 +23,25 @@ def live_map(
     token: Annotated[
         str | None, typer.Option(help="What a browser must know; made up where it is needed.")
     ] = None,
+    over_tls: Annotated[
+        bool, typer.Option("--tls", help="Serve over TLS, from the laptop with the authority.")
+    ] = False,
     open_page: Annotated[bool, typer.Option("--open", help="Open it in the browser.")] = False,
 ) -> None:
     """Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.
 
-    It only observes, unless --operate, and then asks for a token, which the address has.
+    It only observes, unless --operate, and then asks for a token, which the address has. Who
+    listens on the network hears the token, unless --tls; browsers import its authority once.
     """
     import asyncio
+    import datetime
     import re
     import secrets
+    import ssl
     import webbrowser
 
     from lpac.fleet.settings import load_fleet
-    from lpac.ground.map.access import Access, is_loopback
+    from lpac.ground.map.access import Access, is_loopback, reached_at
     from lpac.ground.map.server import serve
 
     config = load_fleet(fleet)
@@ -47,6 +53,18 @@ def live_map(
     local = is_loopback(host)
     if token is None and (operate or not local):
         token = secrets.token_urlsafe(16)
+    context = None
+    if over_tls:
+        from lpac.fleet.cards import open_authority
+        from lpac.fleet.web_certificate import web_certificate
+
+        addresses = ["127.0.0.1" if a == "localhost" else a for a in reached_at(host)]
+        files = web_certificate(
+            open_authority(config), addresses, datetime.datetime.now(datetime.UTC)
+        )
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        context.load_cert_chain(files.certificate, files.key)
+        typer.echo(f"browsers import {files.authority}")
 
     def ready(addresses: list[str]) -> None:
         for address in addresses:
@@ -58,7 +76,7 @@ def live_map(
 
     asyncio.run(
         serve(
-            config.fleet, host=host, port=port, access=Access(local, token), operate=operate,
-            ready=ready,
+            config.fleet, host=host, port=port, operate=operate, tls=context, ready=ready,
+            access=Access(local, token, "https" if over_tls else "http"),
         )
     )  # fmt: skip

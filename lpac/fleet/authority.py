@@ -218,7 +218,7 @@ class Authority:
             )
         ledger.revocations += 1
         data = signed(Revocations(ledger.revocations, fingerprints), self._signer)
-        _write(self.folder / _REVOKED, data, 0o644)
+        write_file(self.folder / _REVOKED, data, 0o644)
 
     def _read(self) -> _Ledger:
         path = self.folder / _MEMBERS
@@ -236,7 +236,9 @@ class Authority:
             fcntl.flock(lock, fcntl.LOCK_EX)
             ledger = self._read()
             yield ledger
-            _write(self.folder / _MEMBERS, msgspec.json.format(msgspec.json.encode(ledger)), 0o600)
+            write_file(
+                self.folder / _MEMBERS, msgspec.json.format(msgspec.json.encode(ledger)), 0o600
+            )
 
 
 def create_authority(folder: Path, fleet: str) -> Authority:
@@ -247,18 +249,18 @@ def create_authority(folder: Path, fleet: str) -> Authority:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     key = Ed25519PrivateKey.generate()
     ledger = _Ledger(fleet, revocations=1)
-    _write(folder / _MEMBERS, msgspec.json.encode(ledger), 0o600)
-    _write(folder / _REVOKED, signed(Revocations(1), Signer(key.private_bytes_raw())), 0o644)
-    _write(folder / _SECRET, _pem(key), 0o600)
+    write_file(folder / _MEMBERS, msgspec.json.encode(ledger), 0o600)
+    write_file(folder / _REVOKED, signed(Revocations(1), Signer(key.private_bytes_raw())), 0o644)
+    write_file(folder / _SECRET, _pem(key), 0o600)
     return Authority(folder, fleet)
 
 
 def write_member(folder: Path, issued: Issued, key: Ed25519PrivateKey) -> None:
     """A member's folder, complete, for a key that was made here."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    _write(folder / KEY_PEM, _pem(key), 0o600)
+    write_file(folder / KEY_PEM, _pem(key), 0o600)
     for name, data in issued.files.items():
-        _write(folder / name, data, 0o644)
+        write_file(folder / name, data, 0o644)
 
 
 def new_member(
@@ -326,7 +328,8 @@ def _pem(key: Ed25519PrivateKey) -> bytes:
     )
 
 
-def _write(path: Path, data: bytes, mode: int) -> None:
+def write_file(path: Path, data: bytes, mode: int) -> None:
+    """Write a file that is whole whenever it is there, and never readable for more than `mode`."""
     new = path.with_name(f"{path.name}-new")
     new.unlink(missing_ok=True)
     with os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

@@ -66,7 +66,7 @@ ONLY_IN = {
     "aiohttp": {"lpac/ground/map/"},
     "tomlkit": {"lpac/fleet/writer.py"},
     "nacl": {"edge/identity/signature.py"},
-    "cryptography": {"lpac/fleet/authority.py"},
+    "cryptography": {"lpac/fleet/authority.py", "lpac/fleet/web_certificate.py"},
 }
 # No clock, thread, file or socket: all of it is called by somebody who has them. What several
 # threads call has a lock; a bundle and a configuration are read from their paths.

@@ -13,6 +13,7 @@ import socket
 import struct
 import sys
 from dataclasses import dataclass
+from typing import Literal
 from urllib.parse import urlsplit
 
 # An interface's first address: netintro(4) of macOS, netdevice(7) of Linux.
@@ -49,10 +50,11 @@ def _own_addresses() -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """`local`: bound to loopback. `token` None: none is asked for."""
+    """`local`: bound to loopback. `token` None: none is asked for. `scheme` as in addresses."""
 
     local: bool
     token: str | None
+    scheme: Literal["http", "https"] = "http"
 
     def refusal(self, host: str, origin: str | None, tokens: tuple[str | None, ...]) -> str | None:
         """Why a request is refused, or None.
@@ -65,7 +67,7 @@ class Access:
             return "the Host header is malformed"
         if self.local and not is_loopback(name):
             return "this map is only for the laptop that it runs on"
-        if origin is not None and origin != f"http://{host}":
+        if origin is not None and origin != f"{self.scheme}://{host}":
             return "another page must not speak to this map"
         if self.token is not None and not self._knows(tokens):
             return "the token is missing or wrong: open the address that `lpac map` printed"

@@ -8,6 +8,7 @@ import asyncio
 import contextlib
 import json
 import signal
+import ssl
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable
@@ -306,7 +307,10 @@ class LiveMap:
         if query is not None and self._access.token is not None and request.path == "/":
             # Out of the address, which others may see on the screen.
             response = web.Response(status=303, headers={**_HEADERS, "Location": "/"})
-            response.set_cookie(cookie, self._access.token, httponly=True, samesite="Strict")
+            response.set_cookie(
+                cookie, self._access.token, httponly=True, samesite="Strict",
+                secure=self._access.scheme == "https",
+            )  # fmt: skip
             return response
         answer: web.StreamResponse = await handler(request)
         return answer
@@ -417,10 +421,17 @@ def _cookie(request: web.Request) -> str:
 
 @contextlib.asynccontextmanager
 async def serving(
-    fleet: str, *, host: str, port: int, access: Access, operate: bool
+    fleet: str,
+    *,
+    host: str,
+    port: int,
+    access: Access,
+    operate: bool,
+    tls: ssl.SSLContext | None = None,
 ) -> AsyncIterator[list[str]]:
     """Serve the map of a fleet as long as this context lasts; gives its addresses.
 
+    With `tls` over TLS; the scheme of `access` is then https.
     Port 0 takes a free one. Raises OSError if it cannot listen there.
     """
     live_map = LiveMap(fleet, access, operate=operate)
@@ -428,7 +439,7 @@ async def serving(
     await runner.setup()
     try:
         try:
-            await web.TCPSite(runner, host, port).start()
+            await web.TCPSite(runner, host, port, ssl_context=tls).start()
         except OSError as error:
             reason = error.strerror or error
             raise OSError(f"--host {host} --port {port}: cannot serve there: {reason}") from None
@@ -438,7 +449,7 @@ async def serving(
         async with asyncio.TaskGroup() as group:
             tasks = [group.create_task(live_map.follow()), group.create_task(live_map.compute())]
             try:
-                yield [f"http://{name}:{own_port}/{query}" for name in names]
+                yield [f"{access.scheme}://{name}:{own_port}/{query}" for name in names]
             finally:
                 for task in tasks:
                     task.cancel()
@@ -453,6 +464,7 @@ async def serve(
     port: int,
     access: Access,
     operate: bool,
+    tls: ssl.SSLContext | None,
     ready: Callable[[list[str]], None],
 ) -> None:
     """Serve until SIGINT or SIGTERM; `ready` is told the addresses. Raises OSError."""
@@ -460,6 +472,8 @@ async def serve(
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ended.set)
-    async with serving(fleet, host=host, port=port, access=access, operate=operate) as addresses:
+    async with serving(
+        fleet, host=host, port=port, access=access, operate=operate, tls=tls
+    ) as addresses:
         ready(addresses)
         await ended.wait()

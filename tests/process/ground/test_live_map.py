@@ -1,7 +1,9 @@
 """The live map: who gets it, that it keeps up, and a real browser on it."""
 
 import asyncio
+import datetime
 import json
+import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import replace
@@ -17,6 +19,8 @@ import pytest
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import ON_GROUND
 from lpac.analysis.snapshot import FleetSnapshot
+from lpac.fleet.authority import AuthorityError, create_authority
+from lpac.fleet.web_certificate import web_certificate
 from lpac.ground.map.access import Access, is_loopback, reached_at
 from lpac.ground.map.server import Outbox, serving
 from lpac.ground.station.client import command, listen
@@ -106,6 +110,44 @@ def test_on_the_network_the_address_has_a_token(fleet: FlownFleet) -> None:
         assert name in reached_at("0.0.0.0") and name is not None and not is_loopback(name)
         asyncio.run(ask(address))
     assert reached_at("127.0.0.1") == ["127.0.0.1"]
+
+
+def test_over_tls_browsers_know_the_fleets_authority(tmp_path: Path) -> None:
+    now = datetime.datetime.now(datetime.UTC)
+    files, stranger = (
+        web_certificate(create_authority(tmp_path / name, "field"), ["127.0.0.1"], now)
+        for name in ("keys", "strangers")
+    )
+    tls = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    tls.load_cert_chain(files.certificate, files.key)
+    assert files.key.stat().st_mode & 0o077 == 0
+    access = Access(local=True, token="correct-horse", scheme="https")
+
+    async def ask() -> None:
+        async with (
+            serving("nobody", host="127.0.0.1", port=0, access=access, operate=True, tls=tls) as (
+                address,
+            ),
+            aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session,
+        ):
+            assert address.startswith("https://127.0.0.1:")
+            known = ssl.create_default_context(cafile=str(files.authority))
+            assert (await session.get(address, ssl=known)).status == 200
+            bare = address.partition("?")[0]
+            origin = {"Origin": bare[:-1]}
+            async with session.ws_connect(bare + "live", ssl=known, headers=origin) as stream:
+                assert (await stream.receive_json())["kind"] == "hello"
+            other = ssl.create_default_context(cafile=str(stranger.authority))
+            with pytest.raises(aiohttp.ClientConnectorCertificateError):
+                await session.get(bare, ssl=other)
+
+    asyncio.run(ask())
+
+
+def test_no_authority_vouches_for_a_public_address(tmp_path: Path) -> None:
+    authority = create_authority(tmp_path / "keys", "field")
+    with pytest.raises(AuthorityError, match="private networks"):
+        web_certificate(authority, ["8.8.8.8"], datetime.datetime.now(datetime.UTC))
 
 
 def test_a_port_that_is_taken_is_told_in_one_line() -> None:

@@ -96,7 +96,7 @@ const take = {
 
 function connect() {
   const address = new URL("live", location.href);
-  address.protocol = "ws:";
+  address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
   socket = new WebSocket(address);
   socket.addEventListener("message", ({ data }) => {
     const message = JSON.parse(data);

@@ -1,0 +1,128 @@
+"""The live map over TLS: a certificate that browsers understand.
+
+They know no Ed25519, so the fleet's authority has a second key for this alone, of which nothing
+else in the fleet depends. Its certificate is imported once in each browser, and vouches for
+addresses of private networks only, so that its key is worth little to whoever has it.
+"""
+
+import datetime
+import ipaddress
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from lpac.fleet.authority import Authority, AuthorityError, write_file
+
+_KEY, _CERTIFICATE = "web-authority.key", "web-authority.pem"
+_MAP_KEY, _MAP_CERTIFICATE = "map.key", "map.pem"
+_NETWORKS = tuple(
+    map(
+        ipaddress.ip_network,
+        ("127.0.0.0/8", "10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16",
+         "::1/128", "fc00::/7", "fe80::/10"),
+    )
+)  # fmt: skip
+_DAY = datetime.timedelta(days=1)
+# Some browsers take none that is good for longer.
+_MAP_VALID = 397 * _DAY
+_AUTHORITY_VALID = 3650 * _DAY
+
+
+class WebCertificate(NamedTuple):
+    """Files of PEM: what browsers import, and the server's own certificate and key."""
+
+    authority: Path
+    certificate: Path
+    key: Path
+
+
+def web_certificate(
+    authority: Authority, addresses: Sequence[str], now: datetime.datetime
+) -> WebCertificate:
+    """A new one for a server at these IP addresses, in the keys' folder.
+
+    Raises AuthorityError if an address is none of a private network.
+    """
+    found = [ipaddress.ip_address(address) for address in addresses]
+    for address in found:
+        if not any(address in network for network in _NETWORKS):
+            raise AuthorityError(f"{address}: --tls is for addresses of private networks")
+    folder = authority.folder
+    if not (folder / _CERTIFICATE).exists():
+        _make_authority(authority, now)
+    issuer = x509.load_pem_x509_certificate((folder / _CERTIFICATE).read_bytes())
+    issuer_key = serialization.load_pem_private_key((folder / _KEY).read_bytes(), None)
+    assert isinstance(issuer_key, ec.EllipticCurvePrivateKey)
+    key = ec.generate_private_key(ec.SECP256R1())
+    names = x509.SubjectAlternativeName([x509.IPAddress(address) for address in found])
+    certificate = (
+        _unsigned(_name(authority.fleet, "map"), issuer.subject, key, now, _MAP_VALID)
+        .add_extension(x509.BasicConstraints(False, None), True)
+        .add_extension(names, False)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), False)
+        .sign(issuer_key, hashes.SHA256())
+    )
+    files = WebCertificate(folder / _CERTIFICATE, folder / _MAP_CERTIFICATE, folder / _MAP_KEY)
+    write_file(files.key, _pem(key), 0o600)
+    write_file(files.certificate, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    return files
+
+
+def _make_authority(authority: Authority, now: datetime.datetime) -> None:
+    key, name = ec.generate_private_key(ec.SECP256R1()), _name(authority.fleet, "web authority")
+    certificate = (
+        _unsigned(name, name, key, now, _AUTHORITY_VALID)
+        .add_extension(x509.BasicConstraints(True, 0), True)
+        .add_extension(
+            # Without a name that is permitted, all names would be.
+            x509.NameConstraints(
+                [*map(x509.IPAddress, _NETWORKS), x509.DNSName("lpac.invalid")], None
+            ),
+            True,
+        )
+        .sign(key, hashes.SHA256())
+    )
+    write_file(authority.folder / _KEY, _pem(key), 0o600)
+    data = certificate.public_bytes(serialization.Encoding.PEM)
+    write_file(authority.folder / _CERTIFICATE, data, 0o644)
+
+
+def _unsigned(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    now: datetime.datetime,
+    valid: datetime.timedelta,
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        # The tablet's clock may be behind.
+        .not_valid_before(now - _DAY)
+        .not_valid_after(now - _DAY + valid)
+    )
+
+
+def _name(fleet: str, common_name: str) -> x509.Name:
+    return x509.Name(
+        [
+            x509.NameAttribute(NameOID.ORGANIZATION_NAME, f"LPAC fleet {fleet}"),
+            x509.NameAttribute(NameOID.COMMON_NAME, f"{fleet}: {common_name}"),
+        ]
+    )
+
+
+def _pem(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
