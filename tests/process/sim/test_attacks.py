@@ -254,7 +254,8 @@ def test_a_hold_acts_after_any_single_forged_message(
             )[i % 4]
             opened.put(prefix + key, data)
             rig.done(SafetyCommand("hold"))
-            assert {rig.status(robot).state for robot in ROBOTS} == {_S.HOLD}
+            for robot in ROBOTS:
+                rig.wait_state(robot, _S.HOLD)
             rig.command(Resume())
             rig.start()
 
@@ -262,7 +263,8 @@ def test_a_hold_acts_after_any_single_forged_message(
 def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
     rig.start()
     rig.done(SafetyCommand("hold"))
-    assert {rig.status(robot).state for robot in ROBOTS} == {_S.HOLD}
+    for robot in ROBOTS:
+        rig.wait_state(robot, _S.HOLD)
 
 
 def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FaultRig) -> None:
