@@ -149,14 +149,14 @@ def test_what_keeps_it_from_starting_is_one_line(
 
 @pytest.mark.parametrize("command", ["run", "check"])
 def test_a_vehicle_that_another_program_has(tmp_path: Path, command: str) -> None:
-    path = write_config(tmp_path, url="udpin://127.0.0.1:14999", endpoint="tcp/127.0.0.1:1")
+    path = write_config(tmp_path, url="udpin://127.0.0.1:14998", endpoint="tcp/127.0.0.1:1")
     with socket.socket(socket.AF_UNIX) as held:
-        held.bind("\0lpac the autopilot's port 14999")
+        held.bind("\0lpac the autopilot's port 14998")
         held.listen()
         result = lpac_robot(command, "--config", path)
     assert result.returncode == 1
     assert result.stderr == (
-        f"lpac: the autopilot's port 14999 is in use by process {os.getpid()} on this machine: "
+        f"lpac: the autopilot's port 14998 is in use by process {os.getpid()} on this machine: "
         "stop that first\n"
     )
 
