@@ -81,7 +81,8 @@ def _fly(folder: Path) -> None:
         lost_s = fleet.vehicles.lost_s()
         subprocess.run(LOSE_ALL, check=True)
         for robot in range(ROBOTS):
-            rig.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed)
+            # What is judged is what was written down, which is a little later than it was so.
+            rig.wait_vehicle(robot, lambda v: v.truth[-1].landed and not v.truth[-1].armed)
         for robot in range(ROBOTS):
             truth = [
                 asdict(entry) | {"after_s": entry.time_s - began_s[robot]}
