@@ -19,6 +19,8 @@ BENCHES = (
     "simulated",
     "closed_loop",
     "payloads",
+    "stolen_key",
+    "flood",
     "loops",
     "release",
     "position",

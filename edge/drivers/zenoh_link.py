@@ -178,6 +178,10 @@ class ZenohLink:
         except zenoh.ZError:  # closed
             return 0
 
+    def refused(self) -> int:
+        """How many messages it did not look at: too many at once, or too large."""
+        return self._admission.refused
+
     def failures(self) -> int:
         """How many calls of callbacks and of `publish` failed; each kind's first is logged."""
         with self._lock:

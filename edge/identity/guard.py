@@ -84,6 +84,9 @@ class Guard(Protocol):
     def revoked_robots(self) -> frozenset[int]:
         """Robots that are listened to no more, and may still fly."""
 
+    def refused(self) -> dict[str, int]:
+        """How many messages were nobody's, by why."""
+
 
 class Unguarded:
     """Messages go as they are, and are taken for those of the keys that they come on.
@@ -112,6 +115,10 @@ class Unguarded:
     def revoked_robots(self) -> frozenset[int]:
         """See `Guard`."""
         return frozenset()
+
+    def refused(self) -> dict[str, int]:
+        """See `Guard`."""
+        return {}
 
 
 def _hear_by_key(hear: Hear, key: str, data: bytes) -> None:
@@ -213,7 +220,7 @@ class SignedGuard:
         return frozenset(card.robot_id for card in revoked if card.robot_id is not None)
 
     def refused(self) -> dict[str, int]:
-        """How many messages were nobody's, by why."""
+        """See `Guard`."""
         with self._lock:
             return {reason.value: count for reason, count in self._refused.items()}
 
@@ -353,6 +360,10 @@ class _SigningLink:
     def peers(self) -> int:
         """How many others it reaches now."""
         return self._link.peers()
+
+    def refused(self) -> int:
+        """How many messages it did not look at."""
+        return self._link.refused()
 
 
 def _is_of(card: Card, topic: Topic, key: str) -> bool:

@@ -4,7 +4,6 @@ A robot must fly on whatever anybody sends: how many messages, of how many sende
 """
 
 import math
-from collections import Counter
 
 from edge.messages.topics import Topic
 
@@ -15,7 +14,6 @@ _LONGEST_KEY = 40
 _BURST_S = 2.0
 _FORGOTTEN_AFTER_S = 10.0
 _SWEPT_EVERY_S = 1.0
-_MOST_COUNTED = 100
 
 
 class _Heard:
@@ -30,31 +28,26 @@ class _Heard:
 class Admission:
     """Bounds what comes: each key to its topic's `most_hz`, and the number of keys.
 
-    Whoever speaks keeps its place: new keys come in once there is room. One thread at a time.
+    Whoever speaks keeps its place: new keys come in once there is room. `refused` counts what was
+    not looked at. One thread at a time.
     """
 
     def __init__(self, most_keys: int = _MOST_KEYS) -> None:
         self._most_keys = most_keys
         self._heard: dict[str, _Heard] = {}
         self._swept_at_s = -math.inf
-        self._refused: Counter[str] = Counter()
+        self.refused = 0
 
     def admits(self, topic: Topic, key: str, size: int, now_s: float) -> bool:
         """Whether a message of so many bytes, which came now by the monotonic clock, is looked at.
 
         `key` is the sender's and the topic's, such as robot/3/status.
         """
-        if len(key) > _LONGEST_KEY:
-            return False
-        if size <= topic.limit_bytes and self._has_left(topic, key, now_s):
-            return True
-        if key in self._refused or len(self._refused) < _MOST_COUNTED:
-            self._refused[key] += 1
-        return False
-
-    def refused(self) -> dict[str, int]:
-        """How many messages of each key were not looked at; of the first hundred keys."""
-        return dict(self._refused)
+        fits = len(key) <= _LONGEST_KEY and size <= topic.limit_bytes
+        admitted = fits and self._has_left(topic, key, now_s)
+        if not admitted:
+            self.refused += 1
+        return admitted
 
     def _has_left(self, topic: Topic, key: str, now_s: float) -> bool:
         most = topic.most_hz * _BURST_S

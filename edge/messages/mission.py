@@ -271,7 +271,8 @@ class RobotStatus:
     `not_taken` says what of the ground's state the robot does not take up now, and why.
     `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
     for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
-    `neighbour_messages` counts each neighbour's messages since the start. `ground_age_s` is how
+    `message_counts` is what became of all messages since the start: "accepted", or why not.
+    `neighbour_messages` counts each neighbour's. `ground_age_s` is how
     long ago the state that it obeys was heard, None if never. `position_quality` is what its
     position is worth, `position_cause` what speaks against it; `gps_accuracy_m` is the receiver's
     own figure. `remote_control` tells whether its pilot's is heard, None where there is none.

@@ -66,6 +66,9 @@ class Link(Protocol):
     def peers(self) -> int:
         """How many others it reaches now."""
 
+    def refused(self) -> int:
+        """How many messages it did not look at: too many at once, or too large."""
+
 
 # Of the key below `lpac/<fleet>/` and the data; from any thread, and it only stores.
 ReceiveCallback = Callable[[str, bytes], None]

@@ -370,7 +370,7 @@ class RobotNode:
             armed=vehicle.armed,
             battery=vehicle.battery,
             satellites=None if gps is None else gps.satellites,
-            message_counts=self._pac.mailbox.counts(),
+            message_counts=self._message_counts(),
             neighbour_ages_s={str(n.robot_id): round(n.age_s, 3) for n in neighbours},
             loops=dict(loops),
             fence=robot.fence,
@@ -428,6 +428,12 @@ class RobotNode:
     def _publish(self, topic: Topic, data: bytes) -> None:
         if self._link is not None:
             self._link.publish(topic, data)
+
+    def _message_counts(self) -> dict[str, int]:
+        """What became of all that came, from the policy's messages out to the radio's."""
+        not_admitted = 0 if self._link is None else self._link.refused()
+        counts = self._pac.mailbox.counts() | self._guard.refused()
+        return counts | ({"not_admitted": not_admitted} if not_admitted else {})
 
     def _is_duplicate(self) -> bool:
         return self._link is not None and self._link.is_claimed(self._config.robot_id)

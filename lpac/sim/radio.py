@@ -133,6 +133,10 @@ class RadioLink:
         """How many other stations there are, in range or not."""
         return len(self._radio.others(self))
 
+    def refused(self) -> int:
+        """None: what is too large is dropped on its way, and nobody floods it."""
+        return 0
+
     def is_claimed(self, robot_id: int) -> bool:
         """Whether another program says that it is that robot."""
         return robot_id in self._radio.others(self)

@@ -130,6 +130,44 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
     field.until(lambda: {robot.state for robot in honest} == {_S.LAND}, 3.0)
 
 
+def test_a_man_in_the_middle_makes_nobody_do_what_was_not_asked(
+    request: pytest.FixtureRequest,
+) -> None:
+    """He drops, holds back, repeats and reorders what he likes, while the operator commands."""
+    for seed in range(max(10, request.config.getoption("--tries") // 10)):
+        with_a_man_in_the_middle(a_field(3, "flying", secure=True, seed=seed), random.Random(seed))
+
+
+def with_a_man_in_the_middle(field: Field, rng: random.Random) -> None:
+    clear, commands = field.air, field.commands["alice"]
+    for _ in range(6):
+        field.air = replace(
+            clear,
+            loss=rng.choice((0.0, 0.5, 0.9)),
+            delay_s=rng.choice((0.01, 1.0, 5.0)),
+            duplication=rng.choice((0.0, 0.9)),
+        )
+        if not commands.running:
+            field.begin(rng.choice((SafetyCommand("hold"), Resume(), Start())))
+        field.run(rng.uniform(0.5, 4.0))
+        # Shorter than what robots wait for a silent ground before they land.
+        field.air = clear
+        field.run(1.0)
+    # Nobody landed, or was armed or disarmed: neither was asked, nor did the ground fall silent.
+    field.until(lambda: not commands.running, 120.0)
+    for robot in field.robots:
+        assert all(entry.armed and not entry.landed for entry in robot.vehicle.truth)
+    assert field.states() <= {_S.MISSION, _S.HOLD}
+    # What he has held back comes to nothing once it is out of date.
+    field.done(SafetyCommand("hold"))
+    field.run(15.0)
+    assert field.states() == {_S.HOLD}
+    field.done(Resume())
+    field.done(Start())
+    field.run(15.0)
+    assert field.states() == {_S.MISSION}
+
+
 class Enemy:
     """Whoever has heard this fleet's messages, has robot 1's key, and another fleet's."""
 

@@ -65,6 +65,9 @@ class Member:
     def peers(self) -> int:
         return 3
 
+    def refused(self) -> int:
+        return 11
+
     def say(self, topic: Topic, data: bytes) -> list[tuple[Topic, bytes]]:
         """What goes out for it."""
         self.sent = []
@@ -265,3 +268,4 @@ def test_without_a_guard_a_message_is_its_keys() -> None:
 
 def test_the_link_itself_is_asked_for_the_rest(one: Member) -> None:
     assert one._link.is_claimed(7) and not one._link.is_claimed(1) and one._link.peers() == 3
+    assert one._link.refused() == 11
