@@ -25,11 +25,12 @@ from edge.messages.codec import encode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
 from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
 from lpac.fleet.authority import Authority, create_authority, new_member
-from lpac.ground.station.protocol import Resume, SafetyCommand
+from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from tests.conftest import SHIPPED
+from tests.flown import QUICK
 from tests.process.sim.fault_rig import FaultRig, flies_on
 
 pytestmark = pytest.mark.real_time
@@ -46,6 +47,9 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     """A fleet with keys, in its mission."""
     scenario = FleetScenario(robots=len(ROBOTS), secure=True)
     fleet = Fleet(scenario, tmp_path_factory.mktemp("secure"), SHIPPED)
+    assert fleet.simulated is not None
+    for vehicle in fleet.simulated.vehicles:
+        vehicle.parameters |= QUICK
     with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
         rig = FaultRig(fleet, ground, ROBOTS, fleet.vehicles)  # type: ignore[arg-type]
         rig.assemble()
@@ -234,30 +238,60 @@ def test_a_hold_acts_after_any_single_forged_message(
     rig: FaultRig, pytestconfig: pytest.Config
 ) -> None:
     """From within, with a robot's certificate, in the ground's name and another robot's."""
-    rounds = 20 if pytestconfig.getoption("tries") >= 1000 else 4
-    stolen = stolen_identity(rig)
-    guard = SignedGuard(stolen.membership, lambda: 0.0)
-    prefix = f"lpac/{rig.fleet.name}/"
-    with session(rig.fleet, certified(stolen.tls)) as opened:
-        for i in range(rounds):
-            status = rig.status(0)
-            kill = Order(
-                secrets.token_hex(6), 0, status.boot_nonce, "kill", status.uptime_s + 5.0,
-                status.operator,
-            )  # fmt: skip
-            lie = replace(status, sequence=10**6 + i, operator="mallory", obeyed_sequence=2**48)
-            key, data = (
-                ("ground/order", guard.seal(ORDER, encode(kill))),
-                ("robot/0/status", guard.seal(STATUS, encode(lie))),
-                ("ground/state", guard.seal(STATE, b"[" * 100_000)),
-                ("ground/state", secrets.token_bytes(500)),
-            )[i % 4]
-            opened.put(prefix + key, data)
+    with thief(rig) as says:
+        for i in range(rounds(pytestconfig, 4)):
+            says(i)
             rig.done(SafetyCommand("hold"))
             for robot in ROBOTS:
                 rig.wait_state(robot, _S.HOLD)
             rig.command(Resume())
             rig.start()
+
+
+def test_a_landing_and_a_kill_act_after_any_single_forged_message(
+    rig: FaultRig, pytestconfig: pytest.Config
+) -> None:
+    with thief(rig) as says:
+        for i in range(rounds(pytestconfig, 1)):
+            for command in (SafetyCommand("land"), RobotCommand("kill", rig.names)):
+                says(i)
+                rig.done(command)
+                for robot in ROBOTS:
+                    rig.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed)
+                rig.command(Resume())
+                rig.make_ready()
+                rig.take_off()
+                rig.start()
+
+
+def rounds(config: pytest.Config, few: int) -> int:
+    return 20 if config.getoption("tries") >= 1000 else few
+
+
+@contextmanager
+def thief(rig: FaultRig) -> Iterator[Callable[[int], None]]:
+    """On the radio with a stolen robot's certificate; says one of four forged messages."""
+    stolen = stolen_identity(rig)
+    guard = SignedGuard(stolen.membership, lambda: 0.0)
+    prefix = f"lpac/{rig.fleet.name}/"
+    with session(rig.fleet, certified(stolen.tls)) as opened:
+
+        def says(which: int) -> None:
+            status = rig.status(0)
+            kill = Order(
+                secrets.token_hex(6), 0, status.boot_nonce, "kill", status.uptime_s + 5.0,
+                status.operator,
+            )  # fmt: skip
+            lie = replace(status, sequence=10**6 + which, operator="mallory", obeyed_sequence=2**48)
+            key, data = (
+                ("ground/order", guard.seal(ORDER, encode(kill))),
+                ("robot/0/status", guard.seal(STATUS, encode(lie))),
+                ("ground/state", guard.seal(STATE, b"[" * 100_000)),
+                ("ground/state", secrets.token_bytes(500)),
+            )[which % 4]
+            opened.put(prefix + key, data)
+
+        yield says
 
 
 def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:

@@ -12,7 +12,7 @@ from edge.identity.card import Role
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, Order, RobotStatus, SafetyAction
 from edge.messages.topics import ORDER, REVOKED, STATE, STATUS, TOPICS, Topic
-from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
+from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand, Start
 from lpac.sim.fleet.members import SimulatedMembers
 from tests.flown import FlownRobot
 from tests.sim.ground.field import Field, a_field
@@ -139,7 +139,8 @@ def test_a_man_in_the_middle_makes_nobody_do_what_was_not_asked(
 
 
 def with_a_man_in_the_middle(field: Field, rng: random.Random) -> None:
-    clear, commands = field.air, field.commands["alice"]
+    clear = field.air
+    running = field.begin(Start())
     for _ in range(6):
         field.air = replace(
             clear,
@@ -147,14 +148,14 @@ def with_a_man_in_the_middle(field: Field, rng: random.Random) -> None:
             delay_s=rng.choice((0.01, 1.0, 5.0)),
             duplication=rng.choice((0.0, 0.9)),
         )
-        if not commands.running:
-            field.begin(rng.choice((SafetyCommand("hold"), Resume(), Start())))
+        if running.report is not None:
+            running = field.begin(rng.choice((SafetyCommand("hold"), Resume(), Start())))
         field.run(rng.uniform(0.5, 4.0))
         # Shorter than what robots wait for a silent ground before they land.
         field.air = clear
         field.run(1.0)
     # Nobody landed, or was armed or disarmed: neither was asked, nor did the ground fall silent.
-    field.until(lambda: not commands.running, 120.0)
+    field.until(lambda: running.report, 120.0)
     for robot in field.robots:
         assert all(entry.armed and not entry.landed for entry in robot.vehicle.truth)
     assert field.states() <= {_S.MISSION, _S.HOLD}
