@@ -30,6 +30,7 @@ from lpac.ground.station.protocol import (
     Resume,
     SafetyCommand,
     SetOrigin,
+    TakeCommand,
     Takeoff,
 )
 from lpac.sim.fleet.ground import GroundProgram
@@ -44,6 +45,7 @@ from tests.raw_ground import RawGround
 
 SYSTEM_ID = 7
 ROBOT_ID, NAME = 3, "r3"
+OPERATOR = "test"
 # The mission's y axis does not point north, and the vehicle does not stand on its origin.
 ORIGIN = Origin(WorldOrigin().latitude_deg, WorldOrigin().longitude_deg, heading_deg=30.0)
 PAD_M = (12.0, 10.0)
@@ -164,7 +166,7 @@ class Rig:
         """Its `lpac ground`, which runs from now on."""
         if self._ground is None:
             fleet_toml = write_fleet_of(self.config_path, self.config)
-            program = GroundProgram(fleet_toml, self.config.fleet, "test")
+            program = GroundProgram(fleet_toml, self.config.fleet, OPERATOR)
             self._ground = self.stack.enter_context(program)
         return self._ground
 
@@ -202,6 +204,9 @@ class Rig:
             (result,) = report.results
             for_a_moment = result.refusal in HELD_UP or result.code in NOT_YET
             assert for_a_moment and time.monotonic() < until_s, report
+        if isinstance(request, TakeCommand):
+            # The robot is heard here by a link of its own, which may be behind the ground's.
+            self.wait(lambda status: status.operator == OPERATOR)
 
     def tell(self, request: Request) -> None:
         """Command it, and do not wait for what comes of it."""
