@@ -31,8 +31,9 @@ from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_bea
 from edge.messages.mission import FlightState, RobotStatus
 from edge.messages.topics import MESSAGE, REVOKED
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
+from lpac.sim.description import ERRORS
 from lpac.sim.fleet.flight import least_separation
-from lpac.sim.fleet.layout import ORIGIN, FleetScenario, Layout
+from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.simulated import SimulatedFleet
 from lpac.sim.fleet.vehicles import TrueTrack
 from lpac.sim.radio import GROUND
@@ -44,6 +45,8 @@ _BESIDE_M = 0.5
 _ABOVE_M = 5.0
 _READY_S = 60.0
 _STEP_S = 0.5
+# Of a Starling 2, from propeller to propeller.
+_WIDEST_M = 0.4
 # The thief's program began after all others.
 _START = 10**9
 
@@ -309,7 +312,6 @@ def measure(missions: int = 20, robots: int = 5, mission_s: float = 30.0) -> Rep
     of_lies = {lie: [harm[lie] for harm, _ in results] for lie in _LIES}
     kept = [kept for _, kept in results]
     all_harms = [harm for each in of_lies.values() for harm in each]
-    layout = Layout(FleetScenario(robots=robots, secure=True), BUNDLE)
     return Report(
         "stolen_key",
         {
@@ -352,18 +354,26 @@ def measure(missions: int = 20, robots: int = 5, mission_s: float = 30.0) -> Rep
         [
             Target("robots that land or are disarmed", sum(h.down for h in all_harms), 0.0, False),
             Target(
-                "least inside the fence, m", min(h.fence_m for h in all_harms), 0.0, at_least=True
+                "furthest beyond the fence, of the position error",
+                max(-h.fence_m for h in all_harms) / ERRORS.position_m,
+                1.0,
+                at_least=False,
             ),
             Target(
-                "fastest, of the speed limit",
-                max(h.speed_m_s for h in all_harms) / layout.max_speed_m_s,
+                "least apart, m", min(h.separation_m for h in all_harms), _WIDEST_M, at_least=True
+            ),
+            Target(
+                "fastest, of the same without a lie",
+                max(h.speed_m_s for h in all_harms)
+                / max(h.speed_m_s for h in of_lies[Lie.NOTHING]),
                 1.1,
                 at_least=False,
             ),
         ],
         [
             "Pushed: the most that a robot is from where it would be without the lie. In truth, "
-            "with the errors of receivers, and wind, as in `lpac sim`."
+            "with the errors of receivers, and wind, as in `lpac sim`; the fence is one of the "
+            "estimate, so that a robot at its edge may truly be beyond it by the position error."
         ],
     )
 

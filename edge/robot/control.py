@@ -123,15 +123,16 @@ class FlightControl:
             self._take_up(ground, vehicle)
         self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
-        neighbours = self._neighbours(now_s)
+        heard = self._neighbours(now_s)
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
             position=self._navigation.position,
             odometry=odometry,
             policy_velocity_m_s=self._pac.control(now_s),
-            neighbours=neighbours,
-            closest=self._closest(odometry, neighbours),
+            neighbours=(*heard, *self._revoked_places(heard, now_s)),
+            # A thief's last word brakes, but keeps nobody from a mission.
+            closest=self._closest(odometry, heard),
             busy_neighbours=tuple(
                 peer.beacon.robot_id for peer in self.peers if peer.beacon.state in _BUSY
             ),
@@ -340,10 +341,10 @@ class FlightControl:
                 told.append(
                     Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
                 )
-        return self._with_revoked((*heard, *told), now_s)
+        return (*heard, *told)
 
-    def _with_revoked(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Besides, who is not listened to any more, where it was: it may still hover there."""
+    def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
+        """Who is not listened to any more, where it was: it may still hover there."""
         for neighbour in heard:
             self._last_places[neighbour.robot_id] = neighbour, now_s - neighbour.age_s
         silent = self.revoked.intersection(self._last_places) - {n.robot_id for n in heard}
@@ -352,7 +353,7 @@ class FlightControl:
             last, at_s = self._last_places[robot_id]
             if now_s - at_s <= _REVOKED_STAYS_S:
                 stay.append(Neighbour(robot_id, last.position_m, (0.0, 0.0, 0.0), 0.0))
-        return (*heard, *stay)
+        return tuple(stay)
 
     def _closest(
         self, odometry: Odometry | None, neighbours: tuple[Neighbour, ...]

@@ -1,6 +1,7 @@
 """One robot's control ticks in simulated time: no thread, no socket, a simulated vehicle."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -597,16 +598,24 @@ def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: F
 def test_a_revoked_robot_is_kept_away_from_where_it_was_last(flown: Flown) -> None:
     flown.take_off()
     x_m, y_m, height_m = flown.odometry()
-    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))
-    flown.tick()
-    flown.control.revoked = frozenset({5, 6})
-    flown.peers()
-    for _ in range(100):
-        flown.tick()
+    around = ((1.2, 0.0), (-1.2, 0.0), (0.0, 1.2), (0.0, -1.2))
+    flown.peers(
+        *(
+            peer(5 + i, FlightState.HOLD, (x_m + dx_m, y_m + dy_m, height_m))
+            for i, (dx_m, dy_m) in enumerate(around)
+        )
+    )
     assert why(flown.order("start", "a")) is RefusalCode.TOO_CLOSE
-    # It has a new card, and is silent.
+    flown.control.revoked = frozenset({5, 6, 7, 8, 9})
+    flown.peers()
+    # It may have been a lie: the mission begins, and nothing flies there.
+    flown.explore("a")
+    assert math.dist(flown.odometry()[:2], (x_m, y_m)) < 0.3
+    # They have new cards, and are silent.
     flown.control.revoked = frozenset()
-    assert flown.order("start", "a").accepted
+    for _ in range(60):
+        flown.tick()
+    assert math.dist(flown.odometry()[:2], (x_m, y_m)) > 1.0
 
 
 @pytest.mark.parametrize("on_stop", [Action.HOLD, Action.LAND])
