@@ -98,6 +98,7 @@ class _ChangedLink:
         self._says = says
         self.is_claimed = link.is_claimed
         self.peers = link.peers
+        self.refused = link.refused
         self.close = link.close
 
     def publish(self, topic: Topic, data: bytes) -> None:

@@ -5,14 +5,17 @@ import secrets
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 
+from bench.stolen_key import Lie, harms, held_up, ready_fleet
 from edge.identity.card import Role
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, Order, RobotStatus, SafetyAction
 from edge.messages.topics import ORDER, REVOKED, STATE, STATUS, TOPICS, Topic
-from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand, Start
+from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand, Start, Takeoff
+from lpac.sim.description import ERRORS
 from lpac.sim.fleet.members import SimulatedMembers
 from tests.flown import FlownRobot
 from tests.sim.ground.field import Field, a_field
@@ -128,6 +131,20 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
     field.until(lambda: {robot.state for robot in honest} == {_S.MISSION}, 10.0)
     field.begin(SafetyCommand("land"), "bob")
     field.until(lambda: {robot.state for robot in honest} == {_S.LAND}, 3.0)
+
+
+def test_a_stolen_robots_lies_move_nobody_beyond_the_limits(tmp_path: Path) -> None:
+    lies = (Lie.BESIDE_EACH, Lie.PAYLOAD, Lie.BOTH)
+    ready = ready_fleet(3, 1, tmp_path)
+    hovering = ready.copy()
+    assert hovering.ground.command(Takeoff(interval_s=0.0)).done
+    for lie, harm in harms(hovering.copy(), (Lie.NOTHING, *lies), 1, 20.0).items():
+        # It was heard.
+        assert (harm.pushed_m > 1.0) == (lie is not Lie.NOTHING), lie
+        assert harm.down == 0 and harm.separation_m > 1.5, lie
+        assert harm.fence_m > -ERRORS.position_m and harm.speed_m_s < 2.0, lie
+    kept = held_up(ready, hovering, 1)
+    assert kept.from_mission == 3 and kept.from_mission_after == 0
 
 
 def test_a_man_in_the_middle_makes_nobody_do_what_was_not_asked(
