@@ -80,6 +80,8 @@ class Loop:
             self._succeeded_s = time.monotonic()
         except Exception as error:
             self._failures += 1
+            if self._stop.is_set():
+                return  # The program ends, and has closed what the step waited for.
             # The first of a row says all; a log that fills the disk helps nobody.
             if self._failures & (self._failures - 1) == 0:
                 log.error("loop step failed", error, loop=self.name, failures=self._failures)

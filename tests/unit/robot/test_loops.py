@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from edge.core import log
+from edge.core.log import Line
 from edge.robot.loops import Loop
 
 
@@ -99,3 +101,24 @@ def test_a_loop_that_hangs_does_not_hold_up_its_stop() -> None:
     assert not loop.stop(0.05)
     release.set()
     assert loop.stop(20.0)
+
+
+def test_what_fails_because_the_program_ends_is_no_defect() -> None:
+    began, closed, lines = threading.Event(), threading.Event(), list[Line]()
+
+    def step() -> None:
+        began.set()
+        closed.wait()
+        raise RuntimeError("closed")
+
+    loop = Loop("test", 0.01, step)
+    before = log.listen(lines.append)
+    try:
+        loop.start()
+        assert began.wait(20.0)
+        assert not loop.stop(0.05)
+        closed.set()
+        assert loop.stop(20.0)
+    finally:
+        log.listen(before)
+    assert not lines and loop.status().failures == 1
