@@ -39,10 +39,12 @@ _VICTIM, _STOLEN = 0, 1
 class Flooded:
     """A mission of robot 0: the lateness of its control loop over the last minute, memory, holds.
 
-    `sent_hz` is what the flood had of messages a second, `holds` how often it held.
+    `sent_hz` is what the flood had of messages a second, `refused` how many of all the robot did
+    not look at, `holds` how often it held.
     """
 
     sent_hz: float
+    refused: int
     lateness_p50_ms: float
     lateness_p99_ms: float
     lateness_max_ms: float
@@ -67,12 +69,12 @@ def measure(mission_s: float = 70.0, rate_hz: int = _RATE_HZ) -> Report:
             Table(
                 f"A robot under {rate_hz} messages a second, for {mission_s:g} s",
                 (
-                    "", "sent, 1/s", "control late by, ms: p50", "p99", "max", "resident, MB",
+                    "", "sent, 1/s", "not looked at", "control late by, ms: p50", "p99", "max", "resident, MB",
                     "holds",
                 ),
                 [
                     (
-                        name, f"{f.sent_hz:.0f}", f"{f.lateness_p50_ms:.1f}",
+                        name, f"{f.sent_hz:.0f}", f"{f.refused}", f"{f.lateness_p50_ms:.1f}",
                         f"{f.lateness_p99_ms:.1f}", f"{f.lateness_max_ms:.1f}",
                         f"{f.resident_mb:.0f}", f"{f.holds}",
                     )
@@ -114,6 +116,7 @@ def _fly(mission_s: float, rate_hz: int, *, secure: bool) -> Flooded:
     began_s, until_s = flight.began_s["mission"], flight.began_s["return"]
     return Flooded(
         flood.sent_hz,
+        victim.last.message_counts.get("not_admitted", 0),
         control.lateness_p50_ms,
         control.lateness_p99_ms,
         control.lateness_max_ms,
@@ -158,7 +161,7 @@ def _flood(
     tls: TlsFiles | None,
     rate_hz: int,
     stop: Event,
-    sent_hz: Queue[float],
+    sent_hz: "Queue[float]",
 ) -> None:
     config = zenoh.Config()
     for key, value in {
