@@ -6,6 +6,7 @@ or another fleet's keys, or those of a stolen robot.
 
 import json
 import secrets
+import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -29,6 +30,7 @@ from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
+from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import SHIPPED
 from tests.flown import QUICK
 from tests.process.sim.fault_rig import FaultRig, flies_on
@@ -258,10 +260,29 @@ def test_a_landing_and_a_kill_act_after_any_single_forged_message(
                 rig.done(command)
                 for robot in ROBOTS:
                     rig.wait_vehicle(robot, lambda vehicle: vehicle.landed and not vehicle.armed)
+                # It hears of it a moment later.
+                assert rig.ground.told.wait_for(
+                    lambda told: all(r.status and r.status.armed is False for r in told.robots),
+                    60.0,
+                )
                 rig.command(Resume())
+                if isinstance(command, RobotCommand):
+                    begin_again(rig)
                 rig.make_ready()
                 rig.take_off()
                 rig.start()
+
+
+def begin_again(rig: FaultRig) -> None:
+    """Who was killed in offboard needs a pilot's mode, and a new start of its program."""
+    for robot in ROBOTS:
+        with rig.simulated.stepped:
+            rig.simulated_vehicle(robot).set_mode(Px4Mode.HOLD)
+        program, before = rig.fleet.robots[robot], rig.status(robot).boot_nonce
+        program.send_signal(signal.SIGTERM)
+        assert program.wait(60.0) == 0
+        program.start()
+        rig.wait_status(robot, lambda status, before=before: status.boot_nonce != before)
 
 
 def rounds(config: pytest.Config, few: int) -> int:
