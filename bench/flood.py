@@ -69,8 +69,8 @@ def measure(mission_s: float = 70.0, rate_hz: int = _RATE_HZ) -> Report:
             Table(
                 f"A robot under {rate_hz} messages a second, for {mission_s:g} s",
                 (
-                    "", "sent, 1/s", "not looked at", "control late by, ms: p50", "p99", "max", "resident, MB",
-                    "holds",
+                    "", "sent, 1/s", "not looked at", "control late by, ms: p50", "p99", "max",
+                    "resident, MB", "holds",
                 ),
                 [
                     (

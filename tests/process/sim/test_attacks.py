@@ -282,7 +282,11 @@ def begin_again(rig: FaultRig) -> None:
         program.send_signal(signal.SIGTERM)
         assert program.wait(60.0) == 0
         program.start()
-        rig.wait_status(robot, lambda status, before=before: status.boot_nonce != before)
+        rig.wait_status(robot, partial(_is_another_start, before))
+
+
+def _is_another_start(before: int, status: RobotStatus) -> bool:
+    return status.boot_nonce != before
 
 
 def rounds(config: pytest.Config, few: int) -> int:
