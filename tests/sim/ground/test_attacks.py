@@ -252,19 +252,22 @@ class Enemy:
         return STATUS, seal(STATUS, encode(status))
 
 
-def test_hold_and_kill_act_whatever_single_message_came_before(
+def test_hold_land_and_kill_act_whatever_single_message_came_before(
     request: pytest.FixtureRequest,
 ) -> None:
     for seed in range(request.config.getoption("--tries")):
-        hold_and_kill_act(a_field(2, "flying", secure=True, seed=seed), random.Random(seed))
+        hold_land_and_kill_act(a_field(2, "flying", secure=True, seed=seed), random.Random(seed))
 
 
-def hold_and_kill_act(field: Field, rng: random.Random) -> None:
-    enemy, first = Enemy(field, rng), field.robots[0]
+def hold_land_and_kill_act(field: Field, rng: random.Random) -> None:
+    enemy, (first, second) = Enemy(field, rng), field.robots
     enemy.says()
     field.run(0.3)
     field.begin(SafetyCommand("hold"))
     field.until(lambda: first.state is _S.HOLD, 1.0)
+    enemy.says()
+    field.begin(SafetyCommand("land", ("r1",)))
+    field.until(lambda: second.state is _S.LAND, 1.0)
     enemy.says()
     field.begin(RobotCommand("kill", ("r0",)))
     field.until(lambda: not first.vehicle.armed, 1.0)
