@@ -102,6 +102,8 @@ def _look(t: Tick) -> FlightMemory:
             flight = _with(flight, armed_by="")
     if vehicle.remote_control:
         flight = replace(flight, remote_control_at_s=now_s)
+    if t.ground_heard:
+        flight = replace(flight, ground_at_s=now_s)
     flight = _with(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
