@@ -27,6 +27,7 @@ from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
+    OrderForm,
     OrderResult,
     Place,
     SafetyAction,
@@ -147,8 +148,8 @@ class FlightInputs:
     answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
     take off. `safety_form` is what a ground asks whose states are not understood.
     `failed_checks` are preflight's; None before the first. `not_taken` is what of the
-    ground's state the robot does not fly by. `order` is new in this tick. `energy` is
-    None when the battery is not known.
+    ground's state the robot does not fly by. `order` is new in this tick; of one that is not
+    understood there is the form. `energy` is None when the battery is not known.
     """
 
     now_s: float
@@ -164,7 +165,7 @@ class FlightInputs:
     safety_form: SafetyAction
     failed_checks: tuple[FailedCheck, ...] | None
     not_taken: tuple[FailedCheck, ...]
-    order: Order | None
+    order: Order | OrderForm | None
     uptime_s: float
     energy: Energy | None
 

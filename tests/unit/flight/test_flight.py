@@ -64,6 +64,7 @@ from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
+    OrderForm,
     OrderKind,
     OrderResult,
     Origin,
@@ -152,7 +153,7 @@ class World:
         self.failed_checks: tuple[FailedCheck, ...] | None = ()
         self.not_taken: tuple[FailedCheck, ...] = ()
         self.safety_form: SafetyAction = "none"
-        self.order: Order | None = None
+        self.order: Order | OrderForm | None = None
         self.orders = 0
         # The program, and what it did.
         self.restart()
@@ -212,7 +213,7 @@ class World:
         expires_s = self.now_s - self.started_s + 9.0
         return Order(f"o{self.orders}", ROBOT.robot_id, 77, kind, expires_s, "op", trial)
 
-    def give(self, order: Order) -> OrderResult:
+    def give(self, order: Order | OrderForm) -> OrderResult:
         self.order = order
         self.tick()
         self.order = None
@@ -615,6 +616,14 @@ def test_orders_are_refused_with_the_reason(world: World) -> None:
     world.give(replace(world.new_order("takeoff"), boot_nonce=1))
     refusal = world.flight.answers[-1].refusal
     assert refusal is not None and refusal.code is RefusalCode.OTHER_START
+    order = world.new_order("takeoff")
+    form = OrderForm(
+        "new", order.robot_id, order.boot_nonce, "dock", order.expires_at_uptime_s, "op"
+    )
+    assert world.give(form).refusal == Refusal(
+        RefusalCode.NOT_UNDERSTOOD, "this program does not understand dock"
+    )
+    assert world.state() is FlightState.PREFLIGHT
     world.enable(safety_action="hold")
     assert world.refuse("takeoff") is RefusalCode.GROUND_COMMANDS
     assert world.said == "the ground commands hold"
