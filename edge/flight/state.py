@@ -27,6 +27,7 @@ from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
+    OrderForm,
     OrderResult,
     Place,
     SafetyAction,
@@ -149,9 +150,9 @@ class FlightInputs:
     answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
     take off. `safety_form` is what a ground asks whose states are not understood.
     `failed_checks` are preflight's; None before the first. `not_taken` is what of the
-    ground's state the robot does not fly by. `order` is new in this tick. `energy` is
-    None when the battery is not known. `lands_beside_m` (2,) is where it comes down since another
-    robot stands at its landing point; None: there.
+    ground's state the robot does not fly by. `order` is new in this tick; of one that is not
+    understood there is the form. `energy` is None when the battery is not known. `lands_beside_m`
+    (2,) is where it comes down since another robot stands at its landing point; None: there.
     """
 
     now_s: float
@@ -167,7 +168,7 @@ class FlightInputs:
     safety_form: SafetyAction
     failed_checks: tuple[FailedCheck, ...] | None
     not_taken: tuple[FailedCheck, ...]
-    order: Order | None
+    order: Order | OrderForm | None
     uptime_s: float
     energy: Energy | None
     lands_beside_m: tuple[float, float] | None = None

@@ -198,6 +198,7 @@ class RefusalCode(_Code):
     """Why an order is not obeyed."""
 
     OTHER = "other"
+    NOT_UNDERSTOOD = "not_understood"
     OTHER_START = "other_start"
     EXPIRED = "expired"
     VALID_TOO_LONG = "valid_too_long"

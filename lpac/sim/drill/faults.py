@@ -612,7 +612,7 @@ _PEOPLE = (
         bounds=(StaysDown(), StaysDown("next")),
     ),
     Fault(
-        name="pad-taken-before", what="a robot stands 2 m from another's landing point before takeoff",
+        name="pad-taken-before", what="a robot stands beside another's landing point at first",
         promise="the other one does not take off",
         phase="ready", does=_once(CarriedToPad(beside_m=2.0)), watched_s=30.0,
         bounds=(StaysDown("next"),),
