@@ -25,7 +25,7 @@ from edge.identity.guard import SignedGuard
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
 from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
-from lpac.fleet.authority import Authority, create_authority, new_member
+from lpac.fleet.authority import create_authority, new_member
 from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
@@ -33,6 +33,7 @@ from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import SHIPPED
 from tests.flown import QUICK
+from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.fault_rig import FaultRig, flies_on
 
 pytestmark = pytest.mark.real_time
@@ -329,8 +330,16 @@ def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
 def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FaultRig) -> None:
     rig.command(Resume())
     rig.start()
-    # As `lpac fleet revoke` does it: the ground that runs tells the robots.
-    Authority(rig.fleet.folder / "keys", rig.fleet.name).revoke(f"r{STOLEN}")
+    stolen, fleet = f"r{STOLEN}", ("--fleet", rig.fleet.fleet_toml)
+    for command, why in (
+        (("revoke", stolen), f"{stolen} was heard in the air last: add --in-flight"),
+        (("revoke", "sim"), "sim commands the fleet: add --in-flight"),
+        (("rotate",), "r0, r1 flew when last heard, and would lose this computer's ground"),
+    ):
+        assert why in error_line(lpac("fleet", *command, *fleet))
+    assert flies_on(rig.status(0)) and flies_on(rig.status(STOLEN))
+    done = lpac("fleet", "revoke", stolen, "--in-flight", *fleet)
+    assert done.returncode == 0, done.stderr
     rig.wait_status(0, lambda status: not status.neighbour_ages_s)
     assert flies_on(rig.status(0))
     assert rig.ground.told.wait_for(
