@@ -47,7 +47,10 @@ def operator(
         bool, typer.Option("--observer", help="It may ask the fleet to hold, and nothing else.")
     ] = False,
 ) -> None:
-    """Make another laptop a ground station of the fleet: the folder OUT, for it alone."""
+    """Make another laptop a ground station of the fleet: the folder OUT, for it alone.
+
+    Of a NAME that has a card already the former key is revoked.
+    """
     from edge.identity.card import Role
     from lpac.fleet.authority import new_member
     from lpac.fleet.cards import open_authority
@@ -57,7 +60,13 @@ def operator(
         raise ValueError(f"{out}: is there already: give a new folder")
     role = Role.OBSERVER if observer else Role.OPERATOR
     config = load_fleet(fleet)
-    new_member(open_authority(config), out, role, name)
+    authority, snapshot = open_authority(config), _snapshot(config)
+    if snapshot is not None and snapshot.commander == name:
+        raise ValueError(
+            f"{name} commands the fleet, and a new card would revoke its key: let another ground "
+            "station command first (`lpac mission command`), or end it"
+        )
+    new_member(authority, out, role, name)
     typer.echo(f"{out}: {name} is an {role} of fleet {config.fleet}")
     typer.echo(
         f"move the folder to that laptop, by a way that nobody else can read, and name it there "

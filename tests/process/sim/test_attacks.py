@@ -334,6 +334,7 @@ def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FaultRig
     for command, why in (
         (("revoke", stolen), f"{stolen} was heard in the air last: add --in-flight"),
         (("revoke", "sim"), "sim commands the fleet: add --in-flight"),
+        (("operator", "sim", "--out", rig.fleet.folder / "new"), "a new card would revoke its key"),
         (("rotate",), "r0, r1 flew when last heard, and would lose this computer's ground"),
     ):
         assert why in error_line(lpac("fleet", *command, *fleet))
