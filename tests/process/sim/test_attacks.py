@@ -25,7 +25,7 @@ from edge.identity.guard import SignedGuard
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, GroundState, Order, RobotStatus
 from edge.messages.topics import ORDER, STATE, STATUS, TOPICS, TlsFiles, Topic
-from lpac.fleet.authority import create_authority, new_member
+from lpac.fleet.authority import Authority, create_authority, new_member
 from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
@@ -318,6 +318,36 @@ def thief(rig: FaultRig) -> Iterator[Callable[[int], None]]:
             opened.put(prefix + key, data)
 
         yield says
+
+
+def test_a_flood_with_an_observers_key_drowns_no_command(rig: FaultRig, tmp_path: Path) -> None:
+    """It may say states, of which robots take a hold alone; a revoked laptop can say as many."""
+    new_member(Authority(rig.fleet.folder / "keys", rig.fleet.name), tmp_path, Role.OBSERVER, "eve")
+    eve = load_identity(tmp_path, fleet=rig.fleet.name, unix_s=1.0)
+    over = threading.Event()
+    with session(rig.fleet, certified(eve.tls)) as opened:
+
+        def flood() -> None:
+            # The vehicles are simulated in this process, too.
+            while not over.wait(0.002):
+                for _ in range(20):
+                    opened.put(f"lpac/{rig.fleet.name}/ground/state", bytes(100))
+
+        flooding = threading.Thread(target=flood)
+        flooding.start()
+        try:
+            for _ in range(5):
+                rig.done(SafetyCommand("hold"))
+                for robot in ROBOTS:
+                    rig.wait_state(robot, _S.HOLD)
+                rig.command(Resume())
+                rig.start()
+        finally:
+            over.set()
+            flooding.join()
+    for robot in ROBOTS:
+        assert flies_on(rig.status(robot))
+        assert rig.status(robot).message_counts["no_envelope"] > 100
 
 
 def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
