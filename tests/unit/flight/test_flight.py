@@ -661,7 +661,7 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
         FailedCheck(CheckCode.CARD_NOT_GOOD, "its card is expired"),
     )
     assert world.refuse("start") is RefusalCode.NOT_READY
-    assert world.said == "its card is expired"
+    world.reads(world.said, "its card is expired")
     world.failed_checks = world.failed_checks[:1]
     world.position_m[0] = 33.0
     assert world.refuse("start") is RefusalCode.OUTSIDE_FENCE
