@@ -18,7 +18,7 @@ from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, Ro
 from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
-LLOYD = "Lloyd's algorithm, which knows the world"
+LLOYD = "Lloyd, who knows the world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
 _MOST_NAMES, _MOST_TICKS = 12, 8
 _LONGEST_IN_DISC = 2
@@ -71,15 +71,18 @@ def overview(flight: FlightRecord) -> Figure:
         )  # fmt: skip
         _draw_heights(middle, flight)
         if len(flight.normalized):
-            _draw_cost(lower, flight, style.BLACK, "-", "as the robots said")
+            _draw_cost(lower, flight, style.BLACK, "-", "as they said")
             if np.isfinite(flight.true_cost).any():
                 lower.plot(
                     flight.curve_time_s, flight.normalized_true, color=style.VERMILLION, ls="--",
                     lw=1.2, label=f"{flight.normalized_true[-1]:.2f}  where they were",
                 )  # fmt: skip
             _draw_lloyd(lower, flight)
-            lower.legend(loc="upper right", fontsize=6.5, handlelength=2.4, borderpad=0.1)
-        lower.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, 1.45), yticks=(0.0, 0.5, 1.0))
+            lower.legend(
+                loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=2, fontsize=6.5,
+                handlelength=1.8, columnspacing=1.0, handletextpad=0.5, borderpad=0.1,
+            )  # fmt: skip
+        lower.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, None))
         tidy(lower)
         lower.set(xlabel="time since the mission began (s)", xlim=(flight.from_s, flight.to_s))
         right.align_ylabels([upper, middle, lower])
@@ -256,17 +259,12 @@ def _draw_snapshots(
     for axes in panels.ravel()[len(times_s) - columns : len(times_s)]:
         axes.tick_params(labelbottom=True)
         axes.set_xlabel("x (m)")
-    handles = [
+    handles: list[Any] = [
         _robot_handle(style.SWARM, "robot, its number"),
         Line2D([], [], color=style.SWARM, lw=1.0, label="path so far"),
-        Line2D([], [], color=GREY, lw=0.6, label="Voronoi cells"),
     ]
     if flight.coverage is not None:
-        handles += [
-            Patch(color=style.DENSITY(0.9), label="density, seen"),
-            Patch(color=style.DENSITY(0.9 * style.UNSEEN_STRENGTH), label="not yet seen"),
-            Line2D([], [], color=style.SEEN, lw=0.8, ls=style.DOTTED, label="edge of the seen"),
-        ]
+        handles += _world_handles()
     figure.legend(
         handles=handles, loc="outside upper center", ncols=len(handles), fontsize=6.5,
         handlelength=1.6, handleheight=0.9, columnspacing=1.0, handletextpad=0.5,
@@ -274,10 +272,10 @@ def _draw_snapshots(
 
 
 def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
-    """Fence, density, cells, each robot's paths, pad and landing point; gives the legend's."""
-    _draw_world(axes, flight)
+    """The world as it was seen in the end, the fence, and each robot; gives the legend's."""
+    _draw_world(axes, flight, flight.duration_s)
     _draw_cells(axes, flight, flight.duration_s)
-    handles: list[Any] = [_robot_handle(FAINT, "at the mission's end")]
+    handles: list[Any] = [_robot_handle(FAINT, "robot at the end, its number")]
     begin_s, end_s = (0.0, flight.duration_s) if flight.duration_s else (flight.from_s, flight.to_s)
     colours = {r.name: style.robot_colour(i) for i, r in enumerate(flight.robots)}
     for robot in flight.robots:
@@ -311,10 +309,7 @@ def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
         ]
     handles.append(Line2D([], [], color=INK, marker="x", ms=4, ls="", label="landing point"))
     if flight.coverage is not None:
-        handles += [
-            Line2D([], [], color=GREY, lw=0.6, label="Voronoi cells"),
-            Patch(color=style.DENSITY(0.7), label="density"),
-        ]
+        handles += _world_handles()
     if flight.fence is not None:
         axes.add_patch(
             Polygon(flight.fence.vertices_m, fill=False, ec=style.FENCE, lw=0.9, ls=(0, (6, 3)))
@@ -466,6 +461,15 @@ def _draw_robots(
             fontsize=4.5 if small else 5.5, color="w" if white else "k",
             path_effects=None if inside else _HALO,
         )  # fmt: skip
+
+
+def _world_handles() -> list[Any]:
+    return [
+        Line2D([], [], color=GREY, lw=0.6, label="Voronoi cells"),
+        Patch(color=style.DENSITY(0.9), label="density, seen"),
+        Patch(color=style.DENSITY(0.9 * style.UNSEEN_STRENGTH), label="density, not yet seen"),
+        Line2D([], [], color=style.SEEN, lw=0.8, ls=style.DOTTED, label="edge of the seen"),
+    ]
 
 
 def _robot_handle(colour: str, label: str) -> Line2D:

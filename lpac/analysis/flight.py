@@ -22,7 +22,7 @@ say the same of one flight, to the last digit. What the numbers mean:
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -36,8 +36,9 @@ from edge.core.perception import part_in_world, window_corner
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import FlightState
 from lpac.analysis.coverage import Coverage
-from lpac.analysis.logs import LoggedStatus, TrueTrack
+from lpac.analysis.logs import LoggedStatus
 from lpac.analysis.snapshot import FRESH_S
+from lpac.analysis.truth import TrueTrack
 
 LOOPS = ("perception", "policy", "control")
 COST_PERIOD_S = 1.0
@@ -110,14 +111,6 @@ class RobotRecord:
             else:
                 found.append(Interval(said.state, begin_s, until_s))
         return found
-
-    def changes(self) -> tuple[StateChange, ...]:
-        """Each state that it entered, with why."""
-        return tuple(
-            StateChange(time_s, said.state, said.reason)
-            for k, (time_s, said) in enumerate(zip(self.time_s.tolist(), self.said, strict=True))
-            if k == 0 or said.state is not self.said[k - 1].state
-        )
 
 
 class Separation(NamedTuple):
@@ -363,6 +356,15 @@ class FlightRecord:
                 in_world, _ = part_in_world(corner, self.sensor_size, world_size)
                 seen[in_world] = True
         return seen
+
+
+def changes_of(times_s: Sequence[float], said: Sequence[LoggedStatus]) -> tuple[StateChange, ...]:
+    """Each state that a robot entered by what it said at these times, with why."""
+    return tuple(
+        StateChange(time_s, status.state, status.reason)
+        for k, (time_s, status) in enumerate(zip(times_s, said, strict=True))
+        if k == 0 or status.state is not said[k - 1].state
+    )
 
 
 def least_separation(tracks: Mapping[str, TrueTrack]) -> Separation | None:

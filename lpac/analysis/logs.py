@@ -168,8 +168,9 @@ class _LogReader:
         self._events: set[GroundEvent] = set()
 
     def take_status(self, status: RobotStatus) -> None:
-        """Take what a robot said."""
-        self._take_status((status.robot_id, status.boot_nonce), asdict(status))
+        """Take what a robot said, as its log would have it."""
+        logged = json.loads(json.dumps(asdict(status)))
+        self._take_status((status.robot_id, status.boot_nonce), logged)
 
     def read(self, path: Path) -> None:
         """Take what is understood of a file; a note tells of the rest."""

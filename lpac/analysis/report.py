@@ -16,7 +16,7 @@ from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import LOOPS, FlightRecord, Separation
 from lpac.analysis.logs import Logs, Progress, configured_fence, read_logs
 from lpac.analysis.page import Drawn, page
-from lpac.analysis.trials import Mission, find_missions, flight_of
+from lpac.analysis.trials import Mission, find_missions, record_of
 
 PAGE = "report.html"
 SUMMARY = "report.json"
@@ -89,7 +89,7 @@ def examine(folders: Sequence[Path], wanted: Wanted, progress: Progress) -> Exam
     trials = []
     for index, mission in enumerate(chosen):
         progress(f"examining {mission.name}", index / len(chosen))
-        trial = flight_of(
+        trial = record_of(
             logs, mission, [other for other in missions if other is not mission],
             *worlds.of(mission), fences.get(mission.robots[0]),
         )  # fmt: skip

@@ -40,9 +40,9 @@ CURVES: tuple[tuple[str, Any], ...] = (
     (SKY, (0, (3, 1, 1, 1))),
     (VERMILLION, "-"),
 )
-_ROBOTS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW)
+_ROBOTS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
 # What is written on these is white.
-DARK = (BLUE, GREEN, VERMILLION)
+DARK = (BLUE, GREEN, VERMILLION, BLACK)
 _S = FlightState
 STATE_COLOURS = {
     _S.INIT: NOTHING,

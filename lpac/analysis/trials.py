@@ -72,7 +72,7 @@ def _in_order(logs: Logs) -> Iterator[tuple[int, LoggedStatus]]:
     return heapq.merge(*said, key=lambda one: one[1].time_s)
 
 
-def flight_of(
+def record_of(
     logs: Logs, mission: Mission, others: Sequence[Mission], coverage: Coverage | None,
     sensor_size: int, configured_fence: Fence | None,
 ) -> FlightRecord:  # fmt: skip
@@ -98,7 +98,7 @@ def flight_of(
     )  # fmt: skip
 
 
-def whole_flight(
+def whole_record(
     logs: Logs, robots: Sequence[int], coverage: Coverage | None, sensor_size: int,
     configured_fence: Fence | None,
 ) -> FlightRecord:  # fmt: skip

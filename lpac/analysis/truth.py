@@ -63,7 +63,7 @@ def write_truth(tracks: Mapping[int, TrueTrack], path: Path) -> None:
         for robot_id, track in tracks.items()
         for name in _COLUMNS
     }
-    np.savez(path, **arrays)  # type: ignore[arg-type]
+    np.savez(path, **arrays)
 
 
 def load_truth(path: Path) -> dict[int, TrueTrack]:
@@ -84,7 +84,7 @@ def _track(time_s: F64, position_m: F64, airborne: npt.NDArray[np.bool_]) -> Tru
     count = len(time_s)
     if (
         (time_s.shape, position_m.shape, airborne.shape) != ((count,), (count, 3), (count,))
-        or (time_s.dtype, position_m.dtype, airborne.dtype) != (float, float, bool)
+        or [column.dtype.kind for column in (time_s, position_m, airborne)] != ["f", "f", "b"]
         or not (np.diff(time_s) >= 0.0).all()
     ):
         raise ValueError("its arrays are others")

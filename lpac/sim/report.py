@@ -1,15 +1,19 @@
-"""Flights of points as figures and files."""
+"""Simulated flights as figures and files."""
 
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from edge.core.world import format_world
-from lpac.analysis.figures import snapshots_and_costs
+from lpac.analysis.figures import overview, snapshots_and_costs
 from lpac.analysis.style import save
 from lpac.sim.experiment import SimulatedFlight
+
+if TYPE_CHECKING:
+    from lpac.sim.fleet.flight import FleetFlight
 
 
 def write_flight(flight: SimulatedFlight, folder: Path) -> None:
@@ -35,3 +39,10 @@ def write_demo(flights: Mapping[str, SimulatedFlight], folder: Path) -> None:
     (folder / "demo.json").write_text(json.dumps(summaries, indent=2) + "\n")
     records = {name: flight.record for name, flight in flights.items()}
     save(snapshots_and_costs(records), folder / "demo")
+
+
+def write_fleet_flight(flight: "FleetFlight", folder: Path) -> None:
+    """Write flight.json and flight.png / flight.pdf into `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "flight.json").write_text(json.dumps(flight.summary(), indent=2) + "\n")
+    save(overview(flight.record), folder / "flight")
