@@ -3,10 +3,10 @@
 A simulator leaves it as truth.npz beside its robots' logs, for `lpac report`.
 """
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import numpy.typing as npt
@@ -69,14 +69,15 @@ def write_truth(tracks: Mapping[int, TrueTrack], path: Path) -> None:
 def load_truth(path: Path) -> dict[int, TrueTrack]:
     """What `write_truth` wrote. Raises ValueError that says what is wrong, OSError."""
     try:
-        with zipfile.ZipFile(path) as file:
+        with ZipFile(path) as file:
             # As it is written: nothing unpacks to more.
             if sum(member.file_size for member in file.infolist()) > path.stat().st_size:
                 raise ValueError("is compressed")
         with np.load(path, allow_pickle=False) as arrays:
             robots = sorted({int(name.partition(".")[0]) for name in arrays.files})
             return {robot: _track(*(arrays[f"{robot}.{c}"] for c in _COLUMNS)) for robot in robots}
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    # Whoever reads it may not know who made it: such is raised, too, of what cannot be.
+    except (ValueError, LookupError, EOFError, MemoryError, RuntimeError, BadZipFile) as error:
         raise ValueError(f"{path}: is no record of vehicles: {error}") from None
 
 
