@@ -11,6 +11,7 @@ has its own, see `lpac.ground.record`):
 | `policy` | a tick of the policy loop: features, neighbours' payloads, velocity, message sent |
 | `received` | a neighbour's message, and why it was refused if it was |
 | `control` | a tick of the control loop: state, position, setpoint, and what was sent of it |
+| `flight` | the same tick, for `lpac replay`: all that it was given, and made (`flight.record`) |
 | `status`, `ground`, `vehicle` | `RobotStatus`, `GroundState`, `VehicleState` |
 | `order` | `Order`, and the answer to it |
 | `/pose` | `position_m` (3,) and `yaw_rad` (from x to y, or None) in the mission frame |
@@ -640,6 +641,9 @@ _ROBOT_TOPICS = {
             actions=_list(_STRING),
             closest_m=_NUMBER,
         ),
+    ),
+    "flight": _topic(
+        "Flight", _object(number=_INTEGER, whole=_BOOLEAN, given=_object(), made=_object())
     ),
     "status": topic("Status", RobotStatus),
     "order": topic("Order", Order, answer=OrderResult),

@@ -12,6 +12,7 @@ from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
+from edge.flight.record import FlightTick, Given, TickWriter, made
 from edge.flight.safety import Closest, nearest
 from edge.flight.state import (
     FlightInputs,
@@ -86,6 +87,7 @@ class FlightControl:
         self._unix_clock_s = unix_clock_s
         self._started_s = started_s
         self._guidance = Guidance()
+        self._ticks = TickWriter()
         self._last_tick_s: float | None = None
         self._has_flown = False
         self._time_heard_at_s = -math.inf
@@ -157,6 +159,7 @@ class FlightControl:
             self._vehicle.command(action)
         dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s
         self._last_tick_s = now_s
+        given = Given(robot, before, inputs, self._guidance, dt_s)
         setpoint, self._guidance = guide(robot, decision.flight, inputs, self._guidance, dt_s)
         local = None if setpoint is None else self._navigation.to_local(setpoint, vehicle)
         sent = None if local is None else self._vehicle.send(local)
@@ -166,6 +169,8 @@ class FlightControl:
                 "flight state", state=flight.state, was=before.state, reason=flight.reason.text
             )
         self._record(inputs, setpoint, sent, decision.actions)
+        tick = FlightTick(given, made(decision, setpoint, self._guidance))
+        self._recorder.record("flight", self._unix_clock_s(), self._ticks.message(tick))
         return sent is not None and not failsafe_acts(vehicle)
 
     def _hear_time(self, ground: GroundState, at_s: float) -> None:
