@@ -5,8 +5,9 @@ Two values are the same if they are so bit by bit: 0.0 and -0.0 are not, and NaN
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import msgspec
@@ -40,21 +41,25 @@ def changes(before: object, after: object) -> dict[str, Any]:
 
     All of them if `before` is none of its kind. Of dataclasses in it, again the changes.
     """
-    kind = type(after)
-    known = type(before) is kind
-    changed: dict[str, Any] = {}
-    for name in _names(kind):
-        now = getattr(after, name)
-        was = getattr(before, name) if known else None
-        if known and now is was:
+    names, values = _fields(type(after))
+    if type(before) is not type(after):
+        return dict(zip(names, map(plain, values(after)), strict=True))
+    told: dict[str, Any] = {}
+    for name, was, now in zip(names, values(before), values(after), strict=True):
+        if now is was:
             # Mostly: whoever replaces some fields keeps the others.
             continue
-        if known and type(was) is type(now) and dataclasses.is_dataclass(now):
+        kind = type(now)
+        if kind is float:
+            # Mostly, again. A zero is told anew: it may have another sign.
+            if now != was or not now:
+                told[name] = now
+        elif type(was) is kind and hasattr(kind, "__dataclass_fields__"):
             if inner := changes(was, now):
-                changed[name] = inner
-        elif not (known and same(was, now)):
-            changed[name] = plain(now)
-    return changed
+                told[name] = inner
+        elif _encode(was) != _encode(now):
+            told[name] = plain(now)
+    return told
 
 
 def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
@@ -63,7 +68,10 @@ def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
     Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
     """
     hints = _hints(kind)
-    values = {} if before is None else {name: getattr(before, name) for name in _names(kind)}
+    values: dict[str, Any] = {}
+    if before is not None:
+        names, now = _fields(kind)
+        values.update(zip(names, now(before), strict=True))
     for name, value in told.items():
         if name not in hints:
             raise ValueError(f"{kind.__name__} has no {name}")
@@ -84,10 +92,14 @@ def _array(_: type, value: object) -> object:
 
 
 @cache
-def _names(kind: type) -> tuple[str, ...]:
-    return tuple(field.name for field in dataclasses.fields(kind))
+def _fields(kind: Any) -> tuple[tuple[str, ...], Callable[[object], tuple[Any, ...]]]:
+    """A dataclass's names of fields, and what takes their values."""
+    names = tuple(field.name for field in dataclasses.fields(kind))
+    if len(names) > 1:
+        return names, attrgetter(*names)
+    return names, lambda value: tuple(getattr(value, name) for name in names)
 
 
 @cache
-def _hints(kind: type) -> dict[str, Any]:
+def _hints(kind: Any) -> dict[str, Any]:
     return typing.get_type_hints(kind, include_extras=True)

@@ -46,10 +46,11 @@ class FlightReplay:
     """Runs the ticks of one program again, in their order.
 
     `ticks` were run, of which `differing` differ; `passed_over` could not, since messages before
-    them are missing.
+    them are missing. `began_unix_s` is when the first one was.
     """
 
     def __init__(self) -> None:
+        self.began_unix_s = math.nan
         self.ticks = self.differing = self.passed_over = 0
         self.differences: list[FlightDifference] = []
         self._reader = TickReader()
@@ -63,6 +64,8 @@ class FlightReplay:
             self.passed_over += 1
             self._going_on = {}
             return
+        if not self.ticks:
+            self.began_unix_s = unix_time_s
         self.ticks += 1
         before, self._going_on = self._going_on, {}
         for each in differing(tick):

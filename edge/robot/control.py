@@ -12,7 +12,7 @@ from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
-from edge.flight.record import FlightTick, Given, TickWriter, made
+from edge.flight.record import Given, made
 from edge.flight.safety import Closest, nearest
 from edge.flight.state import (
     FlightInputs,
@@ -87,7 +87,6 @@ class FlightControl:
         self._unix_clock_s = unix_clock_s
         self._started_s = started_s
         self._guidance = Guidance()
-        self._ticks = TickWriter()
         self._last_tick_s: float | None = None
         self._has_flown = False
         self._time_heard_at_s = -math.inf
@@ -169,8 +168,11 @@ class FlightControl:
                 "flight state", state=flight.state, was=before.state, reason=flight.reason.text
             )
         self._record(inputs, setpoint, sent, decision.actions)
-        tick = FlightTick(given, made(decision, setpoint, self._guidance))
-        self._recorder.record("flight", self._unix_clock_s(), self._ticks.message(tick))
+        self._recorder.record(
+            "flight",
+            self._unix_clock_s(),
+            {"given": given, "made": made(decision, setpoint, self._guidance)},
+        )
         return sent is not None and not failsafe_acts(vehicle)
 
     def _hear_time(self, ground: GroundState, at_s: float) -> None:
