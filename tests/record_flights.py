@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from edge.core.vehicle import Mode
 from edge.drivers.flight_log import ROBOT_TOPICS, FlightLog, read, read_metadata
-from edge.flight.record import FlightTick, TickReader, TickWriter
+from edge.flight.record import TickReader, TickWriter
 from edge.messages.mission import FlightState
 from lpac.ground.procedure import Until
 from lpac.ground.station.protocol import (
     Enable,
     Request,
+    Resume,
     RobotCommand,
     SafetyCommand,
     SetOrigin,
@@ -74,19 +74,19 @@ class _Flight:
     @property
     def state(self) -> FlightState | None:
         """What it says of itself, heard or not."""
-        return self.robot.status and self.robot.status.state
+        return None if self.robot.status is None else self.robot.status.state
 
     def run(self, duration_s: float) -> None:
         self.fleet.schedule.run_until(self.fleet.schedule.monotonic_s() + duration_s)
 
-    def until(self, *states: FlightState, at_most_s: float = 60.0) -> None:
-        """Let time pass until robot 0 is in one of these states, and a second more."""
+    def until(self, *states: FlightState, more_s: float = 1.0, at_most_s: float = 60.0) -> None:
+        """Let time pass until robot 0 is in one of these states, and a little more."""
         end_s = self.fleet.schedule.monotonic_s() + at_most_s
         while self.state not in states:
             if self.fleet.schedule.monotonic_s() > end_s:
                 raise RuntimeError(f"is {self.robot.status and self.robot.status.reason}")
             self.run(0.1)
-        self.run(1.0)
+        self.run(more_s)
 
     def do(self, request: Request) -> None:
         report = self.fleet.ground.command(request)
@@ -143,7 +143,7 @@ def _ordered(f: _Flight) -> None:
     f.fly()
     f.do(SafetyCommand("hold"))
     f.run(1.5)
-    f.do(Start())
+    f.do(Resume())
     f.run(1.5)
     f.do(RobotCommand("pilot", ("r0",)))
     f.run(1.5)
@@ -231,6 +231,14 @@ def _battery_low(f: _Flight) -> None:
     f.until(_S.LAND)
 
 
+def _battery_low_in_hold(f: _Flight) -> None:
+    f.ready()
+    f.do(Takeoff())
+    f.begin()
+    f.vehicle.battery_remaining = 0.24
+    f.until(_S.LAND)
+
+
 def _battery_critical(f: _Flight) -> None:
     f.fly()
     f.vehicle.battery_remaining = 0.14
@@ -283,12 +291,19 @@ def _remote_control_lost(f: _Flight) -> None:
 
 
 def _near_neighbour(f: _Flight) -> None:
+    """A pilot takes robot 1 down to the height of robot 0, in whose way it then stands."""
     f.fly()
     other = f.fleet.vehicles[1].vehicle
-    other.position_m = f.vehicle.position_m + np.array([3.5, 0.0, 0.3])
-    f.run(2.0)
-    other.position_m = f.vehicle.position_m + np.array([0.9, 0.0, 0.3])
-    f.run(4.0)
+    other.pilot(Px4Mode.POSCTL, (0.0, 0.0, 1.0))
+    while other.position_m[2] < f.vehicle.position_m[2] - 0.3:
+        f.run(0.1)
+    other.move_sticks(())
+    f.begin()
+    for away_m in (3.5, 0.9):
+        place_m = f.vehicle.estimated_position_m + np.array([away_m, 0.0, 0.0])
+        x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
+        other.position_m = np.array([x_m, y_m, other.position_m[2]])
+        f.run(3.0)
 
 
 def _offboard_refused(f: _Flight) -> None:
@@ -301,7 +316,7 @@ def _offboard_refused(f: _Flight) -> None:
 def _arming_refused(f: _Flight) -> None:
     f.ready()
     f.begin()
-    f.vehicle.arm = partial(_refused)  # type: ignore[method-assign]
+    f.vehicle.arm = _refused  # type: ignore[method-assign]
     f.fleet.ground.command(Takeoff(robots=("r0",)))
     f.run(3.0)
 
@@ -310,8 +325,17 @@ def _ground_ends_arming(f: _Flight) -> None:
     f.ready()
     f.begin()
     f.fleet.ground.node.begin(Takeoff(robots=("r0",)))
-    f.until(_S.ARMING)
+    f.until(_S.ARMING, more_s=0.1)
     f.do(SafetyCommand("hold"))
+    f.run(4.0)
+
+
+def _ground_holds_takeoff(f: _Flight) -> None:
+    f.ready()
+    f.begin()
+    f.fleet.ground.node.begin(Takeoff(robots=("r0",)))
+    f.until(_S.TAKEOFF, more_s=0.0)
+    f.fleet.ground.node.begin(SafetyCommand("hold"))
     f.run(4.0)
 
 
@@ -323,6 +347,22 @@ def _ground_ends_takeoff(f: _Flight) -> None:
     f.run(1.0)
     f.do(SafetyCommand("land", wait=True))
     f.run(3.0)
+
+
+def _orders_refused(f: _Flight) -> None:
+    """Beyond the fence nothing starts, and in the air nothing disarms."""
+    f.ready()
+    f.do(Takeoff())
+    f.begin()
+    for request in (
+        RobotCommand("disarm", ("r0",)),
+        RobotCommand("rejoin", ("r0",)),
+        Start(robots=("r0",)),
+    ):
+        if isinstance(request, Start):
+            f.vehicle.position_m = f.vehicle.position_m + _to_the_line_m(f) + 1.5 * _outwards(f)
+            f.run(1.0)
+        f.fleet.ground.command(request)
 
 
 def _does_not_climb(f: _Flight) -> None:
@@ -339,8 +379,8 @@ def _armed_by_others(f: _Flight) -> None:
     f.begin()
     f.vehicle.arm(force=True)
     f.run(3.0)
-    f.vehicle.disarm()
-    f.run(3.0)
+    f.do(RobotCommand("disarm", ("r0",)))
+    f.run(2.0)
 
 
 def _wind_over_the_fence(f: _Flight) -> None:
@@ -365,22 +405,25 @@ def _px4_lands(f: _Flight) -> None:
     f.run(8.0)
 
 
-def _autopilot_silent(f: _Flight) -> None:
+def _autopilot_silent(f: _Flight, duration_s: float) -> None:
     f.fly()
-    # Whatever it says is lost.
-    vars(f.fleet.vehicles[0])["_said"] = tuple
-    f.run(5.0)
-    del vars(f.fleet.vehicles[0])["_said"]
+    _silence(f, duration_s)
     f.run(4.0)
 
 
 def _autopilot_silent_on_the_ground(f: _Flight) -> None:
     f.ready()
     f.begin()
-    vars(f.fleet.vehicles[0])["_said"] = tuple
-    f.run(4.0)
-    del vars(f.fleet.vehicles[0])["_said"]
+    _silence(f, 4.0)
     f.run(6.0)
+
+
+def _autopilot_silent_while_arming(f: _Flight) -> None:
+    f.ready()
+    f.begin()
+    f.fleet.ground.node.begin(Takeoff(robots=("r0",)))
+    f.until(_S.ARMING, more_s=0.0)
+    _silence(f, 4.0)
 
 
 def _battery_not_told(f: _Flight) -> None:
@@ -394,6 +437,13 @@ def _not_enabled(f: _Flight) -> None:
     f.begin()
     f.do(Enable(False))
     f.run(3.0)
+
+
+def _silence(f: _Flight, duration_s: float) -> None:
+    """Whatever the vehicle says is lost."""
+    vars(f.fleet.vehicles[0])["_said"] = tuple
+    f.run(duration_s)
+    del vars(f.fleet.vehicles[0])["_said"]
 
 
 def _refused(*_: object, **__: object) -> MavResult:
@@ -412,12 +462,12 @@ def _refuse(vehicle: Px4Vehicle, refused: Px4Mode) -> None:
 def _outwards(f: _Flight) -> Any:
     """(3,), world frame: to the west of the mission."""
     layout = f.fleet.layout
-    west = layout.to_world_m(np.array([0.0, 0.0])) - layout.to_world_m(np.array([1.0, 0.0]))
-    return np.array([*west, 0.0])
+    (x_m, y_m), (east_x_m, east_y_m) = map(layout.to_world_m, (np.zeros(2), np.array([1.0, 0.0])))
+    return np.array([x_m - east_x_m, y_m - east_y_m, 0.0])
 
 
 def _to_the_line_m(f: _Flight) -> Any:
-    place_m = f.fleet.true_positions_m()[0]
+    place_m = f.fleet.layout.to_mission.local_to_mission(f.vehicle.estimated_position_m)
     left_m = -min(x_m for x_m, _ in f.robot.config.fence.vertices_m) + place_m[0]
     return left_m * _outwards(f)
 
@@ -437,6 +487,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "position_frozen": (_position_frozen, {}),
     "origin_jumps": (_origin_jumps, {}),
     "battery_low": (_battery_low, {}),
+    "battery_low_in_hold": (_battery_low_in_hold, {}),
     "battery_critical": (_battery_critical, {}),
     "battery_not_told": (_battery_not_told, {}),
     "ground_lost": (_ground_lost, {}),
@@ -455,13 +506,17 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "offboard_refused": (_offboard_refused, {}),
     "arming_refused": (_arming_refused, {}),
     "ground_ends_arming": (_ground_ends_arming, {}),
+    "ground_holds_takeoff": (_ground_holds_takeoff, {}),
     "ground_ends_takeoff": (_ground_ends_takeoff, {}),
+    "orders_refused": (_orders_refused, {}),
     "does_not_climb": (_does_not_climb, {}),
     "armed_by_others": (_armed_by_others, {}),
     "wind_over_the_fence": (_wind_over_the_fence, {}),
     "px4_fence": (_px4_fence, {}),
     "px4_lands": (_px4_lands, {}),
-    "autopilot_silent": (_autopilot_silent, {}),
+    "autopilot_silent": (partial(_autopilot_silent, duration_s=5.0), {}),
+    "autopilot_silent_until_down": (partial(_autopilot_silent, duration_s=12.0), {}),
+    "autopilot_silent_while_arming": (_autopilot_silent_while_arming, {}),
     "autopilot_silent_on_the_ground": (_autopilot_silent_on_the_ground, {}),
 }  # fmt: skip
 

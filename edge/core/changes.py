@@ -6,9 +6,8 @@ Two values are the same if they are so bit by bit: 0.0 and -0.0 are not, and NaN
 import dataclasses
 import typing
 from collections.abc import Callable, Mapping
-from functools import cache
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -41,7 +40,7 @@ def changes(before: object, after: object) -> dict[str, Any]:
 
     All of them if `before` is none of its kind. Of dataclasses in it, again the changes.
     """
-    names, values = _fields(type(after))
+    names, values, _ = _kind(type(after))
     if type(before) is not type(after):
         return dict(zip(names, map(plain, values(after)), strict=True))
     told: dict[str, Any] = {}
@@ -67,11 +66,10 @@ def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
 
     Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
     """
-    hints = _hints(kind)
+    names, values_of, hints = _kind(kind)
     values: dict[str, Any] = {}
     if before is not None:
-        names, now = _fields(kind)
-        values.update(zip(names, now(before), strict=True))
+        values.update(zip(names, values_of(before), strict=True))
     for name, value in told.items():
         if name not in hints:
             raise ValueError(f"{kind.__name__} has no {name}")
@@ -91,15 +89,21 @@ def _array(_: type, value: object) -> object:
     return np.array(value, np.float64)
 
 
-@cache
-def _fields(kind: Any) -> tuple[tuple[str, ...], Callable[[object], tuple[Any, ...]]]:
-    """A dataclass's names of fields, and what takes their values."""
-    names = tuple(field.name for field in dataclasses.fields(kind))
-    if len(names) > 1:
-        return names, attrgetter(*names)
-    return names, lambda value: tuple(getattr(value, name) for name in names)
+class _Kind(NamedTuple):
+    """A dataclass: its fields' names, what takes their values, and their types."""
+
+    names: tuple[str, ...]
+    values: Callable[[object], tuple[Any, ...]]
+    hints: dict[str, Any]
 
 
-@cache
-def _hints(kind: Any) -> dict[str, Any]:
-    return typing.get_type_hints(kind, include_extras=True)
+_kinds: dict[type, _Kind] = {}
+
+
+def _kind(kind: type) -> _Kind:
+    if kind not in _kinds:
+        names = tuple(field.name for field in dataclasses.fields(kind))
+        # The one of a single name gives no tuple.
+        values = attrgetter(*names) if len(names) > 1 else lambda o: (getattr(o, names[0]),)
+        _kinds[kind] = _Kind(names, values, typing.get_type_hints(kind, include_extras=True))
+    return _kinds[kind]

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.drivers.flight_log import FlightLog, FlightMetadata, read
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.policy import LpacPolicy
 from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
+from tests.record_flights import RECORDED
 from tests.unit.policy.test_replay import Messages, fly
 
 
@@ -71,6 +72,41 @@ def test_a_difference_is_shown_and_fails(
     result = lpac("replay", log, "--json")
     assert result.returncode != 0
     assert json.loads(result.stdout)["outputs"]["velocity"]["differing"] == 1
+
+
+def test_flights_are_decided_again(tmp_path: Path) -> None:
+    """Logs without a policy need no bundle."""
+    result = lpac("replay", RECORDED / "normal.mcap", RECORDED / "killed.mcap", "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["bundle"] is None and report["outputs"] == {}
+    for flight in report["flights"]:
+        assert flight["robot"] == 0 and flight["ticks"] > 30
+        assert flight["differing"] == 0 and flight["differences"] == []
+    assert "robot 0          39 ticks, 0 differ" in lpac("replay", RECORDED / "killed.mcap").stdout
+
+
+def test_a_decision_that_differs_is_shown_and_fails(tmp_path: Path, shipped_bundle: Bundle) -> None:
+    messages = list(read(RECORDED / "ground_lost.mcap"))
+    at = next(n for n, (_, _, m) in enumerate(messages) if "reason" in m["made"].get("flight", {}))
+    messages[at][2]["made"]["flight"]["state"] = "land"
+    log = write_log(tmp_path, shipped_bundle, messages)
+    result = lpac("replay", log)
+    assert "1 differ" in result.stdout
+    (row,) = [line for line in result.stdout.splitlines() if " state " in line]
+    assert row.split() == ["4.0", "s", "robot", "0", "1", "state", "land", "hold"]
+    assert "not what was decided in flight: 1 ticks differ" in error_line(result)
+    (flight,) = json.loads(lpac("replay", log, "--json").stdout)["flights"]
+    (difference,) = [d for d in flight["differences"] if d["what"] == "state"]
+    assert (difference["then"], difference["now"], difference["ticks"]) == ("land", "hold", 1)
+
+
+def test_logs_of_the_version_before_say_that_they_hold_no_flight(
+    tmp_path: Path, shipped_bundle: Bundle, flown: Messages
+) -> None:
+    result = lpac("replay", write_log(tmp_path, shipped_bundle, flown))
+    assert result.returncode == 0, result.stderr
+    assert "robot 0      holds nothing that its flight was decided by" in result.stdout
 
 
 def test_another_place_for_the_bundle(
