@@ -43,17 +43,18 @@ class FlightDifference:
 
 
 class FlightReplay:
-    """Runs the ticks of one program again, in their order.
+    """Runs the ticks of a log again, in their order.
 
     `ticks` were run, of which `differing` differ; `passed_over` could not, since messages before
     them are missing. `began_unix_s` is when the first one was.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, reader: TickReader | None = None) -> None:
+        """`reader` has read what the same program logged before."""
         self.began_unix_s = math.nan
         self.ticks = self.differing = self.passed_over = 0
         self.differences: list[FlightDifference] = []
-        self._reader = TickReader()
+        self._reader = reader or TickReader()
         # By what differs: those that the tick before had.
         self._going_on: dict[str, FlightDifference] = {}
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 app = new_app()
 
-# Of each robot; `--json` has all.
+# Of each log; `--json` has all.
 _MOST_ROWS = 20
 _ROUNDS = "another kind of processor rounds otherwise in the last digits, the same one does not"
 
@@ -54,7 +54,9 @@ def replay(
                     "robots": sorted({each.robot_id for each in metadata.values()}),
                     "logs": [str(path) for path in paths],
                     "outputs": {c.name: _output(c) for c in comparisons},
-                    "flights": [_flight(name, flight) for name, flight in flights.items()],
+                    "flights": [
+                        _flight(path, metadata[path], flight) for path, flight in flights.items()
+                    ],
                 },
                 indent=2,
             )
@@ -65,7 +67,7 @@ def replay(
                 f"{c.name:12} {c.ticks:7,} ticks, {c.differing:,} differ, "
                 f"largest difference {c.largest_difference:g}"
             )
-        _print_flights(flights)
+        _print_flights(flights, metadata)
     problems = []
     differing = [c for c in comparisons if c.differing]
     if differing:
@@ -123,15 +125,16 @@ def _has_policy_ticks(paths: Iterable[Path]) -> bool:
     return any(True for path in paths for _ in read(path, "policy"))
 
 
-def _flights(metadata: "Mapping[Path, FlightMetadata]") -> "dict[FlightMetadata, FlightReplay]":
-    """What the programs decide now. Their segments are in order."""
+def _flights(metadata: "Mapping[Path, FlightMetadata]") -> "dict[Path, FlightReplay]":
+    """What the programs decide now, by their logs. A program's segments are in order."""
     from edge.drivers.flight_log import read
-    from edge.flight.record import TickError
+    from edge.flight.record import TickError, TickReader
     from edge.flight.replay import FlightReplay
 
-    flights: dict[FlightMetadata, FlightReplay] = {}
+    readers: dict[FlightMetadata, TickReader] = {}
+    flights = {}
     for path, program in metadata.items():
-        flight = flights.setdefault(program, FlightReplay())
+        flights[path] = flight = FlightReplay(readers.setdefault(program, TickReader()))
         for _, unix_time_s, message in read(path, "flight"):
             try:
                 flight.run(unix_time_s, message)
@@ -143,30 +146,35 @@ def _flights(metadata: "Mapping[Path, FlightMetadata]") -> "dict[FlightMetadata,
     return flights
 
 
-def _print_flights(flights: "Mapping[FlightMetadata, FlightReplay]") -> None:
+def _print_flights(
+    flights: "Mapping[Path, FlightReplay]", metadata: "Mapping[Path, FlightMetadata]"
+) -> None:
     from lpac.cli.printing import print_table
 
     rows = []
-    for program, flight in flights.items():
-        name = f"robot {program.robot_id}"
+    width = max(12, *(len(path.stem) for path in flights))
+    for path, flight in flights.items():
+        name, robot = f"{path.stem:{width}}", str(metadata[path].robot_id)
         if not flight.ticks:
             typer.echo(
-                f"{name:12} holds nothing that its flight was decided by "
-                f"(written by lpac-edge {program.version})"
+                f"{name} holds nothing that its flight was decided by "
+                f"(written by lpac-edge {metadata[path].version})"
             )
             continue
         passed = f", {flight.passed_over:,} passed over" if flight.passed_over else ""
-        typer.echo(f"{name:12} {flight.ticks:7,} ticks, {flight.differing:,} differ{passed}")
+        typer.echo(f"{name} {flight.ticks:7,} ticks, {flight.differing:,} differ{passed}")
         for difference in flight.differences[:_MOST_ROWS]:
             what, then, now, _ = difference.differing
             at_s = difference.since_unix_s - flight.began_unix_s
-            rows.append((f"{at_s:.1f} s", name, f"{difference.ticks:,}", what, then, now))
+            rows.append(
+                (path.stem, robot, f"{at_s:.1f} s", f"{difference.ticks:,}", what, then, now)
+            )
         left = len(flight.differences) - _MOST_ROWS
         if left > 0:
-            rows.append(("", name, "", f"{left:,} more: --json", "", ""))
+            rows.append((path.stem, robot, "", "", f"{left:,} more: --json", "", ""))
     if rows:
         print_table(
-            ("time", "robot", "ticks", "what", "decided then", "decides now"),
+            ("log", "robot", "time", "ticks", "what", "decided then", "decides now"),
             rows,
             right=("time", "ticks"),
         )
@@ -180,8 +188,9 @@ def _output(comparison: "Comparison") -> dict[str, Any]:
     }
 
 
-def _flight(program: "FlightMetadata", flight: "FlightReplay") -> dict[str, Any]:
+def _flight(path: Path, program: "FlightMetadata", flight: "FlightReplay") -> dict[str, Any]:
     return {
+        "log": str(path),
         "robot": program.robot_id,
         "boot_nonce": program.boot_nonce,
         "version": program.version,
