@@ -33,7 +33,7 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Run policy and flight decisions again on flight logs; say what differs from the flight."""
+    """Run policy and flight decisions again on flight logs; say what differs."""
     from edge.drivers.flight_log import read_metadata
 
     paths = list(_segments(logs))
