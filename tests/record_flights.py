@@ -182,6 +182,9 @@ def _nobody_answers(f: _Flight) -> None:
 
 def _program_restarts(f: _Flight) -> None:
     f.fly()
+    # The watchdog holds the vehicle meanwhile.
+    f.robot.loops["control"].hang(10.0)
+    f.run(1.0)
     f.robot.start()
     f.begin()
     f.run(6.0)

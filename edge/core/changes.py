@@ -40,9 +40,12 @@ def changes(before: object, after: object) -> dict[str, Any]:
 
     All of them if `before` is none of its kind. Of dataclasses in it, again the changes.
     """
-    names, values, _ = _kind(type(after))
+    names, values, _, choices = _kind(type(after))
     if type(before) is not type(after):
-        return dict(zip(names, map(plain, values(after)), strict=True))
+        return {
+            name: _chosen(now) if name in choices else _whole(now)
+            for name, now in zip(names, values(after), strict=True)
+        }
     told: dict[str, Any] = {}
     for name, was, now in zip(names, values(before), values(after), strict=True):
         if now is was:
@@ -53,12 +56,19 @@ def changes(before: object, after: object) -> dict[str, Any]:
             # Mostly, again. A zero is told anew: it may have another sign.
             if now != was or not now:
                 told[name] = now
+        elif name in choices:
+            if kind is not type(was) or _encode(was) != _encode(now):
+                told[name] = _chosen(now)
         elif type(was) is kind and hasattr(kind, "__dataclass_fields__"):
             if inner := changes(was, now):
                 told[name] = inner
         elif _encode(was) != _encode(now):
-            told[name] = plain(now)
+            told[name] = _whole(now)
     return told
+
+
+def _whole(value: object) -> Any:
+    return changes(None, value) if hasattr(type(value), "__dataclass_fields__") else plain(value)
 
 
 def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
@@ -66,7 +76,7 @@ def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
 
     Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
     """
-    names, values_of, hints = _kind(kind)
+    names, values_of, hints, choices = _kind(kind)
     values: dict[str, Any] = {}
     if before is not None:
         values.update(zip(names, values_of(before), strict=True))
@@ -74,8 +84,15 @@ def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
         if name not in hints:
             raise ValueError(f"{kind.__name__} has no {name}")
         was = values.get(name)
-        if was is not None and dataclasses.is_dataclass(was) and isinstance(value, Mapping):
+        if name in choices:
+            values[name] = None
+            if value is not None:
+                ((chosen, of_it),) = value.items()
+                values[name] = _typed(of_it, choices[name][chosen])
+        elif was is not None and dataclasses.is_dataclass(was) and isinstance(value, Mapping):
             values[name] = changed(type(was), was, value)
+        elif dataclasses.is_dataclass(hints[name]):
+            values[name] = changed(hints[name], None, value)
         else:
             values[name] = _typed(value, hints[name])
     return kind(**values)
@@ -90,11 +107,16 @@ def _array(_: type, value: object) -> object:
 
 
 class _Kind(NamedTuple):
-    """A dataclass: its fields' names, what takes their values, and their types."""
+    """A dataclass: its fields' names, what takes their values, and their types.
+
+    `choices` are the fields that may be one of several dataclasses, by their names: they are told
+    whole, `{name: fields}`.
+    """
 
     names: tuple[str, ...]
     values: Callable[[object], tuple[Any, ...]]
     hints: dict[str, Any]
+    choices: dict[str, dict[str, type]]
 
 
 _kinds: dict[type, _Kind] = {}
@@ -105,5 +127,15 @@ def _kind(kind: type) -> _Kind:
         names = tuple(field.name for field in dataclasses.fields(kind))
         # The one of a single name gives no tuple.
         values = attrgetter(*names) if len(names) > 1 else lambda o: (getattr(o, names[0]),)
-        _kinds[kind] = _Kind(names, values, typing.get_type_hints(kind, include_extras=True))
+        hints = typing.get_type_hints(kind, include_extras=True)
+        choices: dict[str, dict[str, type]] = {}
+        for name, hint in hints.items():
+            several = [each for each in typing.get_args(hint) if dataclasses.is_dataclass(each)]
+            if len(several) > 1:
+                choices[name] = {each.__name__: each for each in several if isinstance(each, type)}
+        _kinds[kind] = _Kind(names, values, hints, choices)
     return _kinds[kind]
+
+
+def _chosen(value: object) -> Any:
+    return None if value is None else {type(value).__name__: plain(value)}

@@ -43,7 +43,10 @@ class PositionQuality(StrEnum):
 
 
 class PositionCause(StrEnum):
-    """What speaks against a position, the gravest first."""
+    """What speaks against a position, the gravest first.
+
+    What a newer program says, and this one has no name for, is UNKNOWN.
+    """
 
     UNKNOWN = "unknown"
     OLD = "old"
@@ -56,6 +59,10 @@ class PositionCause(StrEnum):
     GLITCH = "glitch"
     JUMPED = "jumped"
     FEW_SATELLITES = "few_satellites"
+
+    @classmethod
+    def _missing_(cls, value: object) -> "PositionCause | None":
+        return cls.UNKNOWN if isinstance(value, str) else None
 
 
 _WORDS = {

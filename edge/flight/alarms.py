@@ -63,6 +63,14 @@ def outside(t: Tick) -> str | None:
     return reason_if(bool(outside), "outside the fence")
 
 
+def lands_beside(t: Tick) -> str | None:
+    beside_m = t.inputs.lands_beside_m
+    if beside_m is None:
+        return None
+    away_m = math.dist(beside_m, t.robot.parameters.landing_point_m)
+    return f"somebody stands at its landing point: lands {away_m:.0f} m beside it"
+
+
 def battery_low(t: Tick) -> str | None:
     energy = t.inputs.energy
     below = battery_below(t, t.robot.parameters.battery_low, "low")
@@ -91,6 +99,7 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.POSITION_DOUBTFUL: position_doubtful,
     ReasonCode.TOO_CLOSE: too_close,
     ReasonCode.OUTSIDE_FENCE: outside,
+    ReasonCode.LANDS_BESIDE: lands_beside,
     ReasonCode.BATTERY_LOW: battery_low,
     ReasonCode.BATTERY_NOT_KNOWN: battery_not_known,
     ReasonCode.GROUND_LOST: ground_lost,

@@ -91,7 +91,7 @@ def guide(
         return _towards(flight.target_m, highest_m, position_m, limits), Guidance()
     wanted_m_s = np.zeros(3)
     if state is FlightState.RETURN:
-        wanted_m_s[:2] = _homewards(robot, position_m)
+        wanted_m_s[:2] = _homewards(robot, inputs, position_m)
     elif inputs.policy_velocity_m_s is not None:
         wanted_m_s[:2] = inputs.policy_velocity_m_s
     wanted_m_s = limit_acceleration(
@@ -143,11 +143,12 @@ def _towards(
     return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
 
 
-def _homewards(robot: Robot, position_m: F64) -> F64:
-    """(2,): towards the landing point, once at the robot's own height."""
+def _homewards(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:
+    """(2,): towards where it comes down, once at the robot's own height."""
     if abs(position_m[2] - robot.parameters.slot_height_m) >= _AT_OWN_HEIGHT_M:
         return np.zeros(2)
-    offset_m = np.array(robot.parameters.landing_point_m) - position_m[:2]
+    landing_m = inputs.lands_beside_m or robot.parameters.landing_point_m
+    offset_m = np.array(landing_m) - position_m[:2]
     distance_m = float(np.hypot(*offset_m))
     speed_m_s = min(approach_speed(distance_m, robot.limits), robot.limits.max_speed_m_s)
     return offset_m * (speed_m_s / max(distance_m, 1e-9))

@@ -22,6 +22,7 @@ from edge.messages.mission import (
     ORDER_LIFETIME_S,
     FlightState,
     Order,
+    OrderForm,
     OrderKind,
     OrderResult,
 )
@@ -139,7 +140,7 @@ ORDERS: Mapping[OrderKind, OrderRule] = {
 }  # fmt: skip
 
 
-def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order | None:
+def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order | OrderForm | None:
     """The tick's order, unless it is another robot's, or was answered before."""
     order = inputs.order
     if order is None or order.robot_id != robot.robot_id:
@@ -147,7 +148,7 @@ def new_order(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Order
     return None if any(a.order_id == order.order_id for a in flight.answers) else order
 
 
-def refusal(t: Tick, order: Order) -> Refusal | None:
+def refusal(t: Tick, order: Order | OrderForm) -> Refusal | None:
     """Why the order is refused; None if it is taken."""
     if order.boot_nonce != t.robot.boot_nonce:
         return Refusal(RefusalCode.OTHER_START, "meant for another start of this robot's program")
@@ -157,6 +158,8 @@ def refusal(t: Tick, order: Order) -> Refusal | None:
             return Refusal(RefusalCode.EXPIRED, "expired")
         text = f"would be valid for {left_s:.0f} s: too long"
         return Refusal(RefusalCode.VALID_TOO_LONG, text)
+    if isinstance(order, OrderForm):
+        return Refusal(RefusalCode.NOT_UNDERSTOOD, f"this program does not understand {order.kind}")
     rule, ground = ORDERS[order.kind], t.inputs.ground
     if rule.from_anybody:
         return None
@@ -182,7 +185,9 @@ def refusal(t: Tick, order: Order) -> Refusal | None:
     return _first_problem(t, rule.checks)
 
 
-def answered(flight: FlightMemory, order: Order, refused: Refusal | None) -> FlightMemory:
+def answered(
+    flight: FlightMemory, order: Order | OrderForm, refused: Refusal | None
+) -> FlightMemory:
     """The memory, with the order's answer in it; `refused` is None if it was obeyed."""
     answer = OrderResult(order.order_id, refused)
     expiry_s = flight.obeyed_expiry_s

@@ -9,6 +9,7 @@ from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.vehicle import Gps, VehicleState
 from edge.flight.failsafe import RemoteControl
+from edge.flight.landing import in_the_way, standing_robots
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.messages.beacon import Beacon, HeardBeacon, tag
@@ -344,6 +345,7 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
                 f"{other} has another mission origin: set it again on the ground",
             )
         yield from _apart(inputs, beacon, other)
+    yield from _in_the_way(inputs, [heard.beacon for heard in others])
     if not inputs.vehicle.armed:
         yield from _too_late(inputs.errors, [heard.beacon for heard in others])
 
@@ -365,6 +367,20 @@ def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedC
             CheckCode.TAKEOFFS_TOO_FAR_APART,
             f"robot {robot_id} has been in the air {since}: heights have walked since then; wait "
             "until all are down, or raise takeoffs_height_m of [errors]",
+        )
+
+
+def _in_the_way(inputs: PreflightInputs, others: Sequence[Beacon]) -> Iterator[FailedCheck]:
+    """Whether somebody stands where this robot would come down."""
+    frame_id = None if inputs.origin is None else inputs.origin.frame().frame_id
+    standing = standing_robots(beacon for beacon in others if beacon.frame_id == frame_id)
+    x_m, y_m = inputs.landing_point_m
+    for other, _ in in_the_way((x_m, y_m), standing, inputs.errors):
+        least_m = places_apart(inputs.errors.position_m, inputs.errors.position_m).least_m
+        yield FailedCheck(
+            CheckCode.LANDING_POINT_TAKEN,
+            f"robot {other.robot_id} stands less than {least_m:.3g} m from this robot's landing "
+            "point, and not at its own: carry it there, or change the places on the ground",
         )
 
 

@@ -27,6 +27,7 @@ from edge.messages.mission import (
     FlightState,
     GroundState,
     Order,
+    OrderForm,
     OrderResult,
     Place,
     SafetyAction,
@@ -105,8 +106,9 @@ class FlightMemory:
     in LAND landing, in FAULT disarmed. `alarming`: the operator must see `reason`.
     After a lapse of the control loop nothing is sent before `silent_until_s`, which stays set until
     the vehicle is in offboard again. `failsafe_at_s` is when the autopilot's own failsafe was last
-    seen to act, `remote_control_at_s` when the remote control was last heard. `alone_since_s` is
-    set while the vehicle hovers for no reason that anybody gave: since when nobody has answered.
+    seen to act, `remote_control_at_s` when the remote control was last heard, `ground_at_s` when
+    the ground was last not lost. `alone_since_s` is set while the vehicle hovers for no reason that
+    anybody gave: since when nobody has answered.
     `armed_by` is whose takeoff order this program armed it by, `disarmed_at_s` when the vehicle was
     last known to be disarmed.
     `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
@@ -123,6 +125,7 @@ class FlightMemory:
     silent_until_s: float = -math.inf
     failsafe_at_s: float = -math.inf
     remote_control_at_s: float = -math.inf
+    ground_at_s: float = -math.inf
     alone_since_s: float | None = None
     rejoined_at_s: float = -math.inf
     asked_at_s: float = -math.inf
@@ -147,8 +150,9 @@ class FlightInputs:
     answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
     take off. `safety_form` is what a ground asks whose states are not understood.
     `failed_checks` are preflight's; None before the first. `not_taken` is what of the
-    ground's state the robot does not fly by. `order` is new in this tick. `energy` is
-    None when the battery is not known.
+    ground's state the robot does not fly by. `order` is new in this tick; of one that is not
+    understood there is the form. `energy` is None when the battery is not known. `lands_beside_m`
+    (2,) is where it comes down since another robot stands at its landing point; None: there.
     """
 
     now_s: float
@@ -164,9 +168,10 @@ class FlightInputs:
     safety_form: SafetyAction
     failed_checks: tuple[FailedCheck, ...] | None
     not_taken: tuple[FailedCheck, ...]
-    order: Order | None
+    order: Order | OrderForm | None
     uptime_s: float
     energy: Energy | None
+    lands_beside_m: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,6 +248,11 @@ class Tick:
     robot: Robot
     flight: FlightMemory
     inputs: FlightInputs
+
+    @property
+    def comes_down_m(self) -> tuple[float, ...]:
+        """Where RETURN leads, (2,): the landing point, or beside it."""
+        return self.inputs.lands_beside_m or self.robot.parameters.landing_point_m
 
     @property
     def age_s(self) -> float:

@@ -21,7 +21,7 @@ from edge.flight.state import (
 )
 from edge.flight.transitions import TRANSITIONS, Transition
 from edge.messages.codes import Reason, Refusal, RefusalCode
-from edge.messages.mission import ON_GROUND, STEERED, FlightState, OrderKind
+from edge.messages.mission import ON_GROUND, STEERED, FlightState, Order, OrderKind
 
 _S = FlightState
 
@@ -50,7 +50,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     order = new_order(robot, flight, inputs)
     tick = Tick(robot, flight, inputs)
     refused = None if order is None else refusal(tick, order)
-    taken = None if order is None or refused is not None else order
+    taken = order if isinstance(order, Order) and refused is None else None
     row, reason = _first_row(tick, None if taken is None else taken.kind)
     overruled = row is not None and row.order is None
     if taken is not None and overruled and not ORDERS[taken.kind].moves_nothing:
@@ -102,6 +102,8 @@ def _look(t: Tick) -> FlightMemory:
             flight = _with(flight, armed_by="")
     if vehicle.remote_control:
         flight = replace(flight, remote_control_at_s=now_s)
+    if t.ground_heard:
+        flight = replace(flight, ground_at_s=now_s)
     flight = _with(flight, alone_since_s=_alone_since_s(t))
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))

@@ -198,9 +198,14 @@ def _lands_without_remote_control(t: Tick) -> str | None:
 
 def _ground_long_lost(t: Tick) -> str | None:
     parameters = t.robot.parameters
-    limit_s = parameters.ground_timeout_s + parameters.ground_lost_land_s
-    lost = t.inputs.ground_age_s > limit_s and not t.silent
-    return reason_if(lost, f"ground lost for {limit_s:g} s")
+    # Not by the age of its newest word: one that is always late would never be lost for long.
+    at_s, age_s = t.flight.ground_at_s, t.inputs.ground_age_s
+    never = at_s == -math.inf
+    lost_s = age_s - parameters.ground_timeout_s if never else t.inputs.now_s - at_s
+    lost = lost_s > parameters.ground_lost_land_s and not t.silent
+    return reason_if(
+        lost, f"ground lost for {parameters.ground_timeout_s + parameters.ground_lost_land_s:g} s"
+    )
 
 
 def _battery_low_in_hold(t: Tick) -> str | None:
@@ -289,7 +294,7 @@ def _at_landing_point(t: Tick) -> str | None:
     odometry = t.inputs.odometry
     if odometry is None:
         return None
-    away_m = math.dist(odometry.position_m[:2], t.robot.parameters.landing_point_m)
+    away_m = math.dist(odometry.position_m[:2], t.comes_down_m)
     speed_m_s = math.hypot(*odometry.velocity_m_s[:2])
     return reason_if(
         away_m < _AT_LANDING_POINT_M and speed_m_s < _AT_REST_M_S, "at the landing point"

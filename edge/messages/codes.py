@@ -73,6 +73,7 @@ class CheckCode(_Code):
     OTHER_ORIGIN = "other_origin"
     HEIGHTS_TOO_NEAR = "heights_too_near"
     LANDINGS_TOO_NEAR = "landings_too_near"
+    LANDING_POINT_TAKEN = "landing_point_taken"
     TAKEOFFS_TOO_FAR_APART = "takeoffs_too_far_apart"
     # What of the ground's state it does not take up: in flight, or because it cannot.
     KEEPS_ORIGIN = "keeps_origin"
@@ -149,6 +150,7 @@ class ReasonCode(_Code):
     ON_GROUND = "on_ground"
     TOO_CLOSE = "too_close"
     OUTSIDE_FENCE = "outside_fence"
+    LANDS_BESIDE = "lands_beside"
     REMOTE_CONTROL_LOST = "remote_control_lost"
     NOBODY_ANSWERED = "nobody_answered"
     HOVERS_ALONE = "hovers_alone"
@@ -196,6 +198,7 @@ class RefusalCode(_Code):
     """Why an order is not obeyed."""
 
     OTHER = "other"
+    NOT_UNDERSTOOD = "not_understood"
     OTHER_START = "other_start"
     EXPIRED = "expired"
     VALID_TOO_LONG = "valid_too_long"

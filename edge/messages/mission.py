@@ -225,13 +225,17 @@ class SafetyForm:
 
 
 @dataclass(frozen=True, slots=True)
-class KillForm:
-    """The part of an `Order` to kill that every version of this program obeys. It never changes."""
+class OrderForm:
+    """The part of an `Order` that never changes.
+
+    Who cannot understand the rest of an order obeys it by this if its kind is kill, and else
+    refuses it.
+    """
 
     order_id: Name
     robot_id: RobotId
     boot_nonce: Nonce
-    kind: Literal["kill"]
+    kind: Name
     expires_at_uptime_s: Seconds
     operator: Name
 

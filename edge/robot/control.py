@@ -12,6 +12,7 @@ from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
+from edge.flight.landing import Point, place_to_land, standing_robots
 from edge.flight.record import Given, made
 from edge.flight.safety import Closest, nearest
 from edge.flight.state import (
@@ -23,7 +24,7 @@ from edge.flight.state import (
     height_m,
 )
 from edge.flight.step import step
-from edge.messages.beacon import HeardBeacon
+from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codes import CheckCode, FailedCheck, Reason
 from edge.messages.mission import (
     AIRBORNE,
@@ -101,6 +102,9 @@ class FlightControl:
         self.revoked: frozenset[int] = frozenset()
         # By robot id: the last that was heard of it in this frame, and when that was so.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
+        # The last beacon of each, in this frame: who stands somewhere may have been switched off.
+        self._last_beacons: dict[int, Beacon] = {}
+        self._lands_beside_m: Point | None = None
         self.assignment = Assignment(None, robot, world_id)
         self.not_taken: tuple[FailedCheck, ...] = ()
         self.wanted_world_id: str | None = None
@@ -145,6 +149,7 @@ class FlightControl:
             order=self._inbox.order(now_s),
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
+            lands_beside_m=self._look_where_to_land(),
         )
         self.energy = inputs.energy
         before, robot = self.flight, self.assignment.robot
@@ -319,6 +324,7 @@ class FlightControl:
             frame = origin.frame()
             self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
             self._last_places.clear()
+            self._last_beacons.clear()
             self._pac.forget()
         if sensor is not None:
             self._pac.sensor = sensor
@@ -361,6 +367,23 @@ class FlightControl:
             if now_s - at_s <= _REVOKED_STAYS_S:
                 stay.append(Neighbour(robot_id, last.position_m, (0.0, 0.0, 0.0), 0.0))
         return tuple(stay)
+
+    def _look_where_to_land(self) -> Point | None:
+        frame_id, robot = self._pac.frame_id, self.assignment.robot
+        for beacon, _ in self.peers:
+            if beacon.frame_id == frame_id and beacon.robot_id != robot.robot_id:
+                self._last_beacons[beacon.robot_id] = beacon
+        others = self._last_beacons.values()
+        x_m, y_m = robot.parameters.landing_point_m
+        self._lands_beside_m = place_to_land(
+            (x_m, y_m),
+            self._lands_beside_m,
+            standing_robots(others),
+            [beacon.landing_point_m for beacon in others],
+            robot.fence,
+            robot.errors,
+        )
+        return self._lands_beside_m
 
     def _closest(
         self, odometry: Odometry | None, neighbours: tuple[Neighbour, ...]

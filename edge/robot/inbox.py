@@ -15,8 +15,8 @@ from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import MessageError, decode
 from edge.messages.mission import (
     GroundState,
-    KillForm,
     Order,
+    OrderForm,
     SafetyAction,
     SafetyForm,
 )
@@ -77,7 +77,7 @@ class Inbox:
         self.world: bytes | None = None
         # Who said lately what could not be read, as `peers` found it.
         self.not_understood: tuple[str, ...] = ()
-        self.malformed = 0
+        self.not_understood_count = 0
 
     def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """A ground's state arrived."""
@@ -104,7 +104,7 @@ class Inbox:
     def put_stranger(self, name: str, now_s: float) -> None:
         """A robot's message arrived that could not be read."""
         with self._lock:
-            self.malformed += 1
+            self.not_understood_count += 1
             self._strangers[name] = now_s
 
     def ground(self, now_s: float) -> tuple[GroundState | None, float]:
@@ -114,7 +114,7 @@ class Inbox:
             try:
                 state = decode(GroundState, arrived.data)
             except MessageError as error:
-                self.malformed += 1
+                self.not_understood_count += 1
                 self.ground_refusal = str(error)
                 self._take_safety_form(arrived)
                 continue
@@ -184,9 +184,10 @@ class Inbox:
             return None
         return ground.unix_time_s + now_s - at_s
 
-    def order(self, now_s: float) -> Order | None:
+    def order(self, now_s: float) -> Order | OrderForm | None:
         """The next order for this robot, if one has come by then. Control thread.
 
+        Of one that is not understood, to be refused, there is the form; to kill is understood.
         What came since was made by a later uptime than the tick's, and would seem valid too long.
         """
         while self._orders and self._orders[0].at_s <= now_s:
@@ -196,18 +197,19 @@ class Inbox:
                 return order
         return None
 
-    def _order(self, data: bytes) -> Order | None:
-        """An order; of one that is not understood, the form to kill that every version obeys."""
+    def _order(self, data: bytes) -> Order | OrderForm | None:
         try:
             return decode(Order, data)
         except MessageError:
-            self.malformed += 1
+            self.not_understood_count += 1
         try:
-            form = decode(KillForm, data)
+            form = decode(OrderForm, data)
         except MessageError:
             return None
+        if form.kind != "kill":
+            return form
         return Order(
-            form.order_id, form.robot_id, form.boot_nonce, form.kind,
+            form.order_id, form.robot_id, form.boot_nonce, "kill",
             form.expires_at_uptime_s, form.operator,
         )  # fmt: skip
 

@@ -432,8 +432,9 @@ class RobotNode:
     def _message_counts(self) -> dict[str, int]:
         """What became of all that came, from the policy's messages out to the radio's."""
         not_admitted = 0 if self._link is None else self._link.refused()
+        besides = {"not_admitted": not_admitted, "not_understood": self._inbox.not_understood_count}
         counts = self._pac.mailbox.counts() | self._guard.refused()
-        return counts | ({"not_admitted": not_admitted} if not_admitted else {})
+        return counts | {what: count for what, count in besides.items() if count}
 
     def _is_duplicate(self) -> bool:
         return self._link is not None and self._link.is_claimed(self._config.robot_id)

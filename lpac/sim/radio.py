@@ -70,7 +70,7 @@ class Radio:
         self.air = air or Air()
         self.sent_bytes = 0
         self.lost = 0
-        self._schedule = schedule
+        self.schedule = schedule
         self._positions_m = positions_m
         self.rng = rng
         self._links: list[RadioLink] = []
@@ -80,6 +80,12 @@ class Radio:
         link = RadioLink(self, station, subscriptions)
         self._links.append(link)
         return link
+
+    def suspend(self, station: int, duration_s: float) -> None:
+        """What comes to that station's programs within that time waits until it is over."""
+        for link in self._links:
+            if link.station == station:
+                link.suspended_until_s = self.schedule.monotonic_s() + duration_s
 
     def leave(self, link: "RadioLink") -> None:
         """That one is gone."""
@@ -105,8 +111,8 @@ class Radio:
                 self.lost += 1
                 continue
             for travel in travels[: 2 if twice < self.air.duplication else 1]:
-                at_s = self._schedule.monotonic_s() + self.air.delay_s * (0.5 + travel)
-                self._schedule.at(at_s, partial(receiver.hear, topic, key, data))
+                at_s = self.schedule.monotonic_s() + self.air.delay_s * (0.5 + travel)
+                self.schedule.at(at_s, partial(receiver.hear, topic, key, data))
 
     def _apart(self, sender: int, receiver: int) -> bool:
         if self.air.keeps_apart(sender, receiver):
@@ -123,6 +129,7 @@ class RadioLink:
     def __init__(self, radio: Radio, station: int, subscriptions: Subscriptions) -> None:
         self.station = station
         self._radio = radio
+        self.suspended_until_s = -math.inf
         self._subscriptions: Subscriptions = dict(subscriptions)
 
     def publish(self, topic: Topic, data: bytes) -> None:
@@ -147,6 +154,9 @@ class RadioLink:
 
     def hear(self, topic: Topic, key: str, data: bytes) -> None:
         """Something has come, unless the program ended while it was on its way."""
+        if self._radio.schedule.monotonic_s() < self.suspended_until_s:
+            self._radio.schedule.at(self.suspended_until_s, partial(self.hear, topic, key, data))
+            return
         callback = self._subscriptions.get(topic)
         if callback is not None:
             callback(key, data)

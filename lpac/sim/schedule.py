@@ -46,6 +46,22 @@ class Schedule:
         self._now_s = max(self._now_s, time_s)
 
 
+class WallClock:
+    """One computer's `Clock`: its wall clock is `ahead_s` ahead of the schedule's."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self.ahead_s = 0.0
+        self._schedule = schedule
+
+    def monotonic_s(self) -> float:
+        """Since the beginning."""
+        return self._schedule.monotonic_s()
+
+    def unix_s(self) -> float:
+        """What this computer takes the time to be."""
+        return self._schedule.unix_s() + self.ahead_s
+
+
 class Recurrence:
     """What a schedule does again and again, next at `due_s`."""
 

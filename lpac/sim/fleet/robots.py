@@ -28,7 +28,7 @@ from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.fleet.recorded import RecordedPolicy, recorded_steps
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.radio import Subscriptions
-from lpac.sim.schedule import Recurrence, Schedule
+from lpac.sim.schedule import Recurrence, Schedule, WallClock
 
 # Of a vehicle's physics, unless somebody is content with less.
 VEHICLE_STEP_S = 0.02
@@ -50,7 +50,8 @@ class OpenLink(Link, Protocol):
 class SimulatedRobot:
     """A vehicle, which is always there, and a robot's program, while that runs.
 
-    `status` is what the program said of itself last, whoever heard it; None before it did.
+    `status` is what the program said of itself last, whoever heard it; None before it did. `clock`
+    is its computer's.
     """
 
     def __init__(
@@ -72,7 +73,10 @@ class SimulatedRobot:
         self.config = config
         self.vehicle = vehicle
         self.world = world
+        self.clock = WallClock(schedule)
         self.node: RobotNode | None = None
+        self.watchdog: SimulatedWatchdog | None = None
+        self._no_log = _NoLog()
         self._said: RobotStatus | None = None
         self.loops: dict[str, Recurrence] = {}
         self._policy = policy
@@ -98,26 +102,27 @@ class SimulatedRobot:
         schedule, boot = self._schedule, self._next_boot()
         if self._logs:
             self._log = open_log(self.config, self._policy.policy.bundle_id.hex(), boot)
+        self.watchdog = SimulatedWatchdog(
+            self.vehicle,
+            schedule,
+            self.config.flight.command_timeout_s,
+            self.config.flight.hover_land_s,
+        )
         self.node = node = RobotNode(
             self.config,
             Ports(
-                clock=schedule,
+                clock=self.clock,
                 vehicle=self.vehicle,
                 vehicle_setup=self.vehicle,
-                watchdog=SimulatedWatchdog(
-                    self.vehicle,
-                    schedule,
-                    self.config.flight.command_timeout_s,
-                    self.config.flight.hover_land_s,
-                ),
-                recorder=self._log or _NoLog(),
+                watchdog=self.watchdog,
+                recorder=self._log or self._no_log,
                 sensor_over=self._sensor_over,
             ),
             self._policy,
             self.world,
             self._new_guard(self, boot),
             boot_nonce=boot,
-            boot_epoch=int(schedule.unix_s() * 1e3) + boot,
+            boot_epoch=int(self.clock.unix_s() * 1e3) + boot,
         )
         self._link = self._open_link(self, node.subscriptions)
         node.attach(self._link)
@@ -137,11 +142,22 @@ class SimulatedRobot:
         if self._log is not None:
             self.loops["log"] = schedule.every(_CHORE_S, self._log.flush)
 
+    def hang(self, duration_s: float) -> None:
+        """All loops of its program stand still, and then go on."""
+        for loop in self.loops.values():
+            loop.hang(duration_s)
+
+    def fill_disk(self) -> None:
+        """Nothing more can be written: its log says so, as `FlightLog` does."""
+        self._no_log.recording = False
+
     def stop(self) -> None:
         """Its program ends, as by a loss of power."""
         self._said = self.status
         for loop in self.loops.values():
             loop.stop()
+        if self.watchdog is not None:
+            self.watchdog.program_ended()
         if self._link is not None:
             self._link.close()
         if self._log is not None:
@@ -283,15 +299,26 @@ class SimulatedWatchdog:
         self._flying = False
         self._fed_s = schedule.monotonic_s()
         self._held: Literal["no", "holds", "left"] = "no"
-        schedule.every(_WATCH_S, self._look, _WATCH_S)
+        self._looks = schedule.every(_WATCH_S, self._look, _WATCH_S)
+        self._alive = True
+
+    def program_ended(self) -> None:
+        """A hold that it asked for it sees to its end; else PX4 misses the program itself."""
+        if self._held != "holds":
+            self.die()
+
+    def die(self) -> None:
+        """It ends, as by kill -9."""
+        self._alive = False
+        self._looks.stop()
 
     def feed(self, *, flying: bool) -> None:
         """The control loop lives."""
         self._flying, self._fed_s, self._held = flying, self._schedule.monotonic_s(), "no"
 
     def alive(self) -> bool:
-        """Always."""
-        return True
+        """Whether it has not ended."""
+        return self._alive
 
     def _look(self) -> None:
         """Hold what was flown and is not any more; land what still holds so, a while later."""
@@ -308,7 +335,8 @@ class SimulatedWatchdog:
 class _NoLog:
     """A recorder that keeps nothing."""
 
-    recording = True
+    def __init__(self) -> None:
+        self.recording = True
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
         """Not kept."""

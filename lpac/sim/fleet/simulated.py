@@ -33,7 +33,7 @@ from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.members import SimulatedMembers
 from lpac.sim.fleet.robots import VEHICLE_STEP_S, Settings, SimulatedRobot, SimulatedRobots
 from lpac.sim.radio import GROUND, Radio, RadioLink, Subscriptions
-from lpac.sim.schedule import Schedule
+from lpac.sim.schedule import Schedule, WallClock
 
 # Long after any date that a robot takes for a wrong clock.
 _EPOCH_S = 1_800_000_000.0
@@ -136,7 +136,7 @@ class SimulatedFleet(SimulatedRobots):
 class SimulatedGround:
     """The real ground on the simulated clock: a `Ground` for procedures, which it carries out.
 
-    `runs` until it leaves; `station_id` is who it is on the radio.
+    `runs` until it leaves; `station_id` is who it is on the radio, `clock` its computer's.
     """
 
     def __init__(
@@ -145,7 +145,8 @@ class SimulatedGround:
         self.events: list[GroundEvent] = []
         self.station_id = station
         self.runs = True
-        self.node = GroundNode(setup, schedule, self, guard)
+        self.clock = WallClock(schedule)
+        self.node = GroundNode(setup, self.clock, self, guard)
         self._schedule = schedule
         self._snapshot = self.node.snapshot
         # What outlives it, on its disk.
@@ -165,6 +166,11 @@ class SimulatedGround:
             self._ticks.stop()
             self._link.close()
             self.node.detach()
+
+    def suspend(self, duration_s: float) -> None:
+        """It stands still, as a laptop that sleeps, and then goes on with all that has come."""
+        self._link.suspended_until_s = self.now_s + duration_s
+        self._ticks.hang(duration_s)
 
     def recall(self, former: "SimulatedGround") -> None:
         """Know what the one before left on its disk."""
@@ -191,8 +197,8 @@ class SimulatedGround:
 
     @property
     def unix_now_s(self) -> float:
-        """The simulated wall clock."""
-        return self._schedule.unix_s()
+        """Its computer's wall clock."""
+        return self.clock.unix_s()
 
     def carry_out(self, procedure: Procedure[T]) -> T:
         """Let time pass until the procedure is through; what it comes to. Raises what it raises."""
@@ -209,7 +215,7 @@ class SimulatedGround:
         """Have a command done. Raises NothingComesError if it does not end."""
         task = self.node.begin(request)
         end_s = self.now_s + _PATIENCE_S * len(self.setup.robots)
-        while task is not None and task.report is None and self.now_s < end_s:
+        while task is not None and task.report is None and self.now_s < end_s and self.runs:
             self._schedule.run_until(self.now_s + SNAPSHOT_PERIOD_S)
         if task is None or task.report is None:
             raise NothingComesError(f"{type(request).__name__} does not end")

@@ -32,12 +32,15 @@ _MODES = {Action.OFFBOARD: Px4Mode.OFFBOARD, Action.HOLD: Px4Mode.HOLD}
 class DirectVehicle:
     """A `Vehicle` and its `VehicleSetup`; `step` lets its time pass.
 
+    `is_cut`: the wire to the computer is, so that neither hears the other.
+
     It says and hears MAVLink, message by message, as over a wire, and rounded as on one: what the
     robot knows of it is what PX4 tells, at PX4's rates.
     """
 
     def __init__(self, vehicle: Px4Vehicle, system_id: int, clock: Clock) -> None:
         self.vehicle = vehicle
+        self.is_cut = False
         self._system_id = system_id
         self._clock = clock
         self._link = Px4Link(vehicle, system_id=system_id)
@@ -56,7 +59,8 @@ class DirectVehicle:
         """Let the vehicle fly on, and hear what it says."""
         self.vehicle.step(dt_s)
         now_s = self._clock.monotonic_s()
-        for name, fields in self._said():
+        said = self._said()
+        for name, fields in () if self.is_cut else said:
             if name == "COMMAND_ACK":
                 self._hear_answer(fields, now_s)
             elif name in self._telemetry.messages:
@@ -137,6 +141,8 @@ class DirectVehicle:
     # The wire
 
     def _send(self, message: Any) -> None:
+        if self.is_cut:
+            return
         header = message.get_header()
         header.srcSystem, header.srcComponent = self._system_id, _COMPANION
         self._link.hear(_rounded(message))

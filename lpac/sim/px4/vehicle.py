@@ -13,6 +13,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 
@@ -141,7 +142,11 @@ _CAUSES = {FailsafeCause.MANUAL_CONTROL_LOST: 1, FailsafeCause.GROUND_STATION_LO
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is really so at one time: world frame, m and m/s."""
+    """What is really so at one time: world frame, m and m/s.
+
+    `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
+    asked for.
+    """
 
     time_s: float
     position_m: tuple[float, float, float]
@@ -149,6 +154,8 @@ class Truth:
     mode: Px4Mode
     armed: bool
     landed: bool
+    setpoint_at_s: float = -math.inf
+    follows: Literal["position", "velocity"] | None = None
 
 
 class Px4Vehicle:
@@ -157,9 +164,11 @@ class Px4Vehicle:
     Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
     deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m` (3,)
     (its fix is off by that much at once, and the estimator must see what to make of it),
+    `gps_drift_m_s` (3,) (both it and the estimate go on drifting so), `compass_jump_rad`,
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
     and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
-    any more), `battery_remaining` (0 to 1), `rc_connected`.
+    any more), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (the share of its thrust
+    that a motor which weakens in flight costs it).
     `truth` grows by one entry every 0.04 s.
     """
 
@@ -190,7 +199,7 @@ class Px4Vehicle:
         )
         self._errors = errors
         self._walk_m: F64 = np.zeros(3)
-        self._compass_rad = 0.0
+        self._compass_rad = self.compass_jump_rad = self.motor_loss = 0.0
         self.parameters: dict[str, int | float] = dict(PARAMETERS)
         self.fence: tuple[FencePolygon, ...] = ()
         self.truth: list[Truth] = []
@@ -206,7 +215,7 @@ class Px4Vehicle:
         self.battery_remaining, self._battery_warning = 1.0, 1
 
         self.gps_lost = self.estimate_frozen = False
-        self.gps_jump_m: F64 = np.zeros(3)
+        self.gps_jump_m = self.gps_drift_m_s = np.zeros(3)
         self.gps_told_m: float | None = None
         self._frozen: tuple[F64, F64] | None = None
         self.dead_sensors: set[SimulatedSensor] = set()
@@ -491,10 +500,11 @@ class Px4Vehicle:
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
+        self.gps_bias_m = self.gps_bias_m + self.gps_drift_m_s * dt_s
         self.air_m_s = self.wind_m_s + self._gust
         if self._errors is not None:
             self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m
-            self._compass_rad = self._errors.heading_rad(self.time_s)
+            self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
             self.air_m_s = self.air_m_s + self._errors.wind_m_s(self.time_s)
         if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
             self.home_m = self.estimated_position_m
@@ -770,7 +780,8 @@ class Px4Vehicle:
             cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
             north, east = acceleration[:2].tolist()
             acceleration[:2] = cos * north + sin * east, cos * east - sin * north
-        thrust = 1.0 if self._errors is None else 1.0 - self._errors.thrust_loss
+        built_in_loss = 0.0 if self._errors is None else self._errors.thrust_loss
+        thrust = 1.0 - max(built_in_loss, self.motor_loss)
         acceleration[2] = min(
             max(acceleration[2], -thrust * parameters["MPC_ACC_UP_MAX"]),
             parameters["MPC_ACC_DOWN_MAX"],
@@ -972,8 +983,15 @@ class Px4Vehicle:
                 self.mode,
                 self.armed,
                 self.landed,
+                self._setpoint_at_s,
+                self._follows(),
             )
         )
+
+    def _follows(self) -> Literal["position", "velocity"] | None:
+        if self._setpoint is None:
+            return None
+        return "velocity" if math.isnan(self._setpoint.position_m[0]) else "position"
 
 
 def _shorten(vector: F64, length: float) -> F64:

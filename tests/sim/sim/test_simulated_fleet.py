@@ -140,7 +140,7 @@ def test_whose_loop_hangs_is_held_and_whose_program_ends_lands() -> None:
     fleet.robots[0].loops["control"].hang(3.0)
     fleet.robots[1].stop()
     ground.carry_out(_pass(2.0))
-    assert [each.vehicle.mode for each in fleet.vehicles] == [Px4Mode.HOLD] * 2
+    assert [each.vehicle.mode for each in fleet.vehicles] == [Px4Mode.HOLD, Px4Mode.LAND]
     ground.carry_out(_pass(3.0))
     said = fleet.robots[0].status
     assert said is not None

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from edge.core.position import PositionCause
 from edge.messages.bounds import MOST_LETTERS
 from edge.messages.codec import decode, encode
 from edge.messages.codes import (
@@ -32,9 +33,11 @@ def test_a_newer_robots_status_is_understood() -> None:
     tomorrow = {"code": "of_tomorrow", "text": "what nobody knows yet", "new": 1}
     said |= {"reason": tomorrow, "alarms": [tomorrow], "failed_checks": [tomorrow]}
     said["orders"][0]["refusal"] = tomorrow
+    said["position_cause"] = "of_tomorrow"
     heard = decode(RobotStatus, json.dumps(said).encode())
     assert heard.reason == Reason(ReasonCode.OTHER, "what nobody knows yet")
     assert heard.alarms == (heard.reason,)
+    assert heard.position_cause is PositionCause.UNKNOWN
     assert heard.failed_checks == (FailedCheck(CheckCode.OTHER, "what nobody knows yet"),)
     assert heard.orders[0].refusal == Refusal(RefusalCode.OTHER, "what nobody knows yet")
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from edge.identity.card import Role
 from edge.identity.guard import Speaker
 from edge.messages.codec import encode
-from edge.messages.mission import GroundState, Order, Origin
+from edge.messages.mission import GroundState, Order, OrderForm, Origin
 from edge.robot.inbox import Inbox
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
@@ -106,7 +106,7 @@ def test_what_is_broken_is_counted_and_changes_nothing(data: bytes) -> None:
     assert inbox.ground(2.0) == (STATE, 1.0)
     assert inbox.order(0.0) is None
     assert inbox.peers(2.0) == ()
-    assert inbox.malformed == 2
+    assert inbox.not_understood_count == 2
 
 
 def newer(message: GroundState | Order, **changes: object) -> bytes:
@@ -146,11 +146,16 @@ def test_an_older_state_that_is_not_understood_commands_nothing() -> None:
 
 def test_of_orders_that_are_not_understood_only_kill_is_obeyed() -> None:
     inbox = make_inbox()
-    inbox.put_order(newer(ORDER), ANYBODY, 0.0)
+    for said in (newer(ORDER), newer(ORDER, kind="dock")):
+        inbox.put_order(said, ANYBODY, 0.0)
+        assert isinstance(inbox.order(0.0), OrderForm)  # to be refused
+    inbox.put_order(newer(ORDER, robot_id=2), ANYBODY, 0.0)
     assert inbox.order(0.0) is None
     inbox.put_order(newer(ORDER, kind="kill"), ANYBODY, 0.0)
     kill = inbox.order(0.0)
-    assert kill is not None and (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)
+    assert isinstance(kill, Order)
+    assert (kill.kind, kill.boot_nonce) == ("kill", ORDER.boot_nonce)
+    assert inbox.not_understood_count == 4
 
 
 def test_peers_are_who_was_heard_lately_and_the_newest_counts() -> None:

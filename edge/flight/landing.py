@@ -1,0 +1,96 @@
+"""Where a robot may come down: its landing point, or beside it where another robot stands there.
+
+LAND looks for nobody, so a robot that comes home looks before. Mission frame, m; pure.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.fence import Fence
+from edge.flight.margins import ErrorBudget, places_apart
+from edge.messages.beacon import Beacon
+
+Point = tuple[float, float]
+
+# Who stands that near to its own landing point has landed on it: errors walk, and gusts blow.
+_ON_ITS_OWN_M = 2.0
+# A place that was chosen is kept though who stands there seems to move a little.
+_KEPT_M = 2.0
+_GRID_M = 2.0
+
+
+class StandingRobot(NamedTuple):
+    """Another robot on the ground, motors off: where it is, and where it lands itself."""
+
+    robot_id: int
+    place_m: Point
+    landing_point_m: Point
+
+    @property
+    def is_on_its_own(self) -> bool:
+        """Whether that is the same, which is checked to be far from all other landing points."""
+        return math.dist(self.place_m, self.landing_point_m) <= _ON_ITS_OWN_M
+
+
+def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
+    """Those who say that they are on the ground, and where; all of one frame."""
+    return [
+        StandingRobot(beacon.robot_id, beacon.position_m[:2], beacon.landing_point_m)
+        for beacon in beacons
+        if beacon.armed is False and beacon.position_m is not None
+    ]
+
+
+def in_the_way(
+    landing_point_m: Point, standing: Iterable[StandingRobot], errors: ErrorBudget
+) -> list[tuple[StandingRobot, float]]:
+    """Who stands where that landing point is, though not on its own; and how far from it, m."""
+    apart = places_apart(errors.position_m, errors.position_m)
+    away = [(each, math.dist(each.place_m, landing_point_m)) for each in standing]
+    return [(each, m) for each, m in away if not each.is_on_its_own and not apart.holds(m)]
+
+
+def place_to_land(
+    landing_point_m: Point,
+    before_m: Point | None,
+    standing: Sequence[StandingRobot],
+    landing_points_m: Sequence[Point],
+    fence: Fence,
+    errors: ErrorBudget,
+) -> Point | None:
+    """The nearest place inside the fence that is free, or as free as any; None: the landing point.
+
+    Free is what is as far from who stands, and from the others' `landing_points_m`, as landing
+    points must be from each other. `before_m` is what was chosen last, and is kept while it is
+    free.
+    """
+    if not in_the_way(landing_point_m, standing, errors):
+        return None
+    apart_m = places_apart(errors.position_m, errors.position_m).least_m
+    taken_m = np.array([*(each.place_m for each in standing), *landing_points_m])
+    if before_m is not None:
+        kept_m = float(np.hypot(*(taken_m - before_m).T).min())
+        if kept_m >= apart_m - _KEPT_M:
+            return before_m
+    corners = np.array(fence.vertices_m)
+    grid = np.stack(
+        np.meshgrid(*(np.arange(low, high, _GRID_M) for low, high in _ranges(corners))), axis=-1
+    ).reshape(-1, 2)
+    edges = fence.edges()
+    places_m = grid[(grid @ edges.inward.T - edges.offsets_m).min(axis=1) >= fence.buffer_m]
+    if not len(places_m):
+        return None
+    clear_m = np.linalg.norm(places_m[:, None] - taken_m, axis=-1).min(axis=1)
+    away_m = np.hypot(*(places_m - landing_point_m).T)
+    best = np.lexsort((away_m, -np.minimum(clear_m, apart_m)))[0]
+    x_m, y_m = places_m[best].tolist()
+    return x_m, y_m
+
+
+def _ranges(corners: F64) -> list[tuple[float, float]]:
+    lows, highs = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+    return list(zip(lows, highs, strict=True))

@@ -1,0 +1,458 @@
+"""What is promised of a flight, as figures of the vehicles' truth with limits stated beforehand.
+
+`ALWAYS` counts in every flight, whatever is done to the fleet. Everything here is pure.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+
+from edge.core import F64, Bools
+from edge.flight.margins import ErrorBudget
+from lpac.sim.drill.truth import FlightTruth, VehicleTruth
+from lpac.sim.px4.errors import GREATEST_BIAS_M
+from lpac.sim.px4.modes import Px4Mode
+
+Whose = Literal["hit", "next", "others", "all"]
+
+_BUDGET = ErrorBudget()
+# What a simulated receiver errs by at worst, and how far wind carries half a drone.
+POSITION_ERROR_M = GREATEST_BIAS_M + _BUDGET.wind_m + _BUDGET.drone_m / 2.0
+# A mode is told once a second, and a tick later it is obeyed.
+PILOT_NOTICED_S = 1.1
+# The operator wants the vehicle's mode ended, which PX4 tells late.
+_REJOIN_S = 4.0
+# What holds its place in gusts of 8 m/s does not go faster.
+AT_REST_M_S = 0.5
+_STEP_S = 0.06
+# How long an operator's order may take to start a motor, once it is answered.
+_ARMED_AFTER_S = 1.0
+
+LANDING = (Px4Mode.LAND, Px4Mode.DESCEND)
+
+
+class Figure(NamedTuple):
+    """Something measured: it must be `at_least` the limit, or else at most that."""
+
+    name: str
+    value: float
+    limit: float
+    unit: str
+    at_least: bool = False
+
+    @property
+    def broken(self) -> bool:
+        """Whether it is beyond its limit, or not known."""
+        return not (self.value >= self.limit if self.at_least else self.value <= self.limit)
+
+    @property
+    def room(self) -> float:
+        """How far it is from its limit, as a share of that; below 0 if it is beyond."""
+        room = (self.value - self.limit) * (1.0 if self.at_least else -1.0)
+        if not math.isfinite(self.value):
+            return -math.inf if self.broken else math.inf
+        return room / max(abs(self.limit), 1e-3)
+
+
+class Criterion(Protocol):
+    """One promise."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        """What came of it in this flight."""
+        ...
+
+
+# In every flight
+
+
+@dataclass(frozen=True, slots=True)
+class Apart:
+    """No two vehicles touch in the air, and nobody comes down on one that stands."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        least_m = math.inf
+        for one, other in combinations(flight.vehicles, 2):
+            distance_m = _distances_m(one, other)
+            if len(distance_m):
+                least_m = min(least_m, float(distance_m.min()))
+        return Figure("true separation", least_m, flight.drone_m, "m", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class InsideFence:
+    """Nobody but a pilot goes further beyond the fence's line than stated."""
+
+    beyond_m: float = POSITION_ERROR_M
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        edges, margins_m = flight.fence.edges(), [math.inf]
+        for vehicle in flight.vehicles:
+            flown_m = vehicle.position_m[vehicle.airborne & vehicle.armed & ~vehicle.piloted]
+            margins_m += [float(edges.distances_m(place_m).min()) for place_m in flown_m[:, :2]]
+        least_m = min(margins_m)
+        return Figure("true fence margin", least_m, -self.beyond_m, "m", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class BelowCeiling:
+    """Nobody but a pilot flies higher above the fence's ceiling than stated."""
+
+    above_m: float = _BUDGET.height_m
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        highest_m = max(
+            float(np.where(v.piloted, 0.0, v.position_m[:, 2]).max(initial=0.0))
+            for v in flight.vehicles
+        )
+        limit_m = flight.fence.ceiling_m + self.above_m
+        return Figure("greatest height", highest_m, limit_m, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class NoUnorderedStart:
+    """No motor starts but on a takeoff order that was just given to that robot."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        unordered = 0
+        for robot, vehicle in enumerate(flight.vehicles):
+            for at_s in _rises_s(vehicle):
+                unordered += not any(
+                    order.began_s <= at_s <= order.ended_s + _ARMED_AFTER_S
+                    for order in flight.ordered("takeoff", robot)
+                )
+        return Figure("motors started without an order", unordered, 0, "")
+
+
+@dataclass(frozen=True, slots=True)
+class PilotIsAlone:
+    """A vehicle that a pilot flies is sent nothing, once that can be known."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        latest_s = 0.0
+        for robot, vehicle in enumerate(flight.vehicles):
+            rejoined_s = [order.began_s for order in flight.ordered("rejoin", robot)]
+            for begin_s, end_s in _spans_s(vehicle, vehicle.piloted & vehicle.armed):
+                sent_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
+                sent_s = sent_s[(sent_s > begin_s) & (sent_s <= end_s)]
+                for at_s in rejoined_s:
+                    sent_s = sent_s[(sent_s < at_s) | (sent_s > at_s + _REJOIN_S)]
+                if len(sent_s):
+                    latest_s = max(latest_s, float(sent_s.max()) - begin_s)
+        return Figure("last setpoint to a pilot's vehicle", latest_s, PILOT_NOTICED_S, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class AllDown:
+    """In the end all stand on the ground, with their motors off."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        up = sum(bool(v.armed[-1] or v.airborne[-1]) for v in flight.vehicles)
+        return Figure("not down in the end", up, 0, "")
+
+
+def always(beyond_fence_m: float = POSITION_ERROR_M) -> tuple[Criterion, ...]:
+    """What counts in every flight; `beyond_fence_m` is where the fault itself may carry them."""
+    return (
+        Apart(), InsideFence(beyond_fence_m), BelowCeiling(), NoUnorderedStart(), PilotIsAlone(),
+        AllDown(),
+    )  # fmt: skip
+
+
+# Of one fault; times count from it, or from a mark
+
+
+@dataclass(frozen=True, slots=True)
+class Lands:
+    """The vehicle is told to land, or lands by itself, in time, and not sooner than stated."""
+
+    within_s: float
+    whose: Whose = "hit"
+    after: str = ""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        since_s = _since_s(flight, self.after)
+        delays_s = []
+        for vehicle in _of(flight, self.whose):
+            later = vehicle.between(since_s, math.inf)
+            at_s = later.time_s[later.is_in(*LANDING) | ~later.armed]
+            delays_s.append(float(at_s[0]) - since_s if len(at_s) else math.inf)
+        return Figure("lands", max(delays_s), self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class NotLandedBefore:
+    """It does not land, or return, sooner than that."""
+
+    before_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        delays_s = []
+        for vehicle in _of(flight, self.whose):
+            later = vehicle.between(flight.fault_s, math.inf)
+            at_s = later.time_s[later.is_in(*LANDING) | ~later.armed]
+            delays_s.append(float(at_s[0]) - flight.fault_s if len(at_s) else math.inf)
+        return Figure("lands no sooner", min(delays_s), self.before_s, "s", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Down:
+    """It stands on the ground, motors off, in time."""
+
+    within_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        latest_s = 0.0
+        for vehicle in _of(flight, self.whose):
+            later = vehicle.between(flight.fault_s, math.inf)
+            up = np.flatnonzero(later.armed | later.airborne)
+            down = not len(up) or up[-1] + 1 < len(later.time_s)
+            at_s = float(later.time_s[up[-1]]) if len(up) else flight.fault_s
+            latest_s = max(latest_s, at_s - flight.fault_s if down else math.inf)
+        return Figure("down", latest_s, self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class Stands:
+    """From then on, and until then, it is not faster than what holds its place in wind."""
+
+    from_s: float
+    until_s: float
+    whose: Whose = "hit"
+    speed_m_s: float = AT_REST_M_S
+    after: str = ""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        since_s, fastest_m_s = _since_s(flight, self.after), 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
+            moving = part.airborne & part.armed & ~part.is_in(*LANDING)
+            speeds_m_s = np.hypot(*part.velocity_m_s[moving, :2].T)
+            fastest_m_s = max(fastest_m_s, float(speeds_m_s.max(initial=0.0)))
+        return Figure("speed at rest", fastest_m_s, self.speed_m_s, "m/s")
+
+
+@dataclass(frozen=True, slots=True)
+class StraightDown:
+    """From where it began to land it comes down within so many metres."""
+
+    within_m: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        farthest_m = 0.0
+        for vehicle in _of(flight, self.whose):
+            later = vehicle.between(flight.fault_s, math.inf)
+            landing = later.position_m[later.is_in(*LANDING)]
+            if len(landing):
+                offset_m = landing[:, :2] - landing[0, :2]
+                farthest_m = max(farthest_m, float(np.hypot(*offset_m.T).max()))
+            else:
+                farthest_m = math.inf
+        return Figure("drift while it lands", farthest_m, self.within_m, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class LandsAtPad:
+    """It lands within so many metres of the pad it stood on."""
+
+    within_m: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        farthest_m = 0.0
+        for robot in _robots(flight, self.whose):
+            place_m = flight.vehicles[robot].position_m[-1, :2]
+            farthest_m = max(farthest_m, math.dist(place_m, flight.pads_m[robot]))
+        return Figure("from its pad", farthest_m, self.within_m, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class FliesOn:
+    """It flies its mission for at least that share of the time."""
+
+    until_s: float
+    share: float = 0.9
+    whose: Whose = "others"
+    from_s: float = 0.0
+    after: str = ""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        since_s, least = _since_s(flight, self.after), 1.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
+            flown = part.is_in(Px4Mode.OFFBOARD) & part.is_velocity & part.airborne
+            least = min(least, float(flown.mean()) if len(flown) else math.nan)
+        return Figure("share of the mission", least, self.share, "", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class MissionEnds:
+    """The last velocity setpoint comes in time; until then nothing like it comes again."""
+
+    within_s: float
+    until_s: float = math.inf
+    whose: Whose = "hit"
+    after: str = ""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        since_s, latest_s = _since_s(flight, self.after), 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(since_s, since_s + self.until_s)
+            flown = part.setpoint_at_s[part.is_velocity & part.is_in(Px4Mode.OFFBOARD)]
+            latest_s = max(latest_s, float(flown.max(initial=since_s)) - since_s)
+        return Figure("last of the mission", latest_s, self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class FallsSilent:
+    """Nothing is sent to the vehicle any more."""
+
+    within_s: float
+    until_s: float = math.inf
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        latest_s = 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
+            sent_s = float(part.setpoint_at_s.max(initial=flight.fault_s))
+            latest_s = max(latest_s, sent_s - flight.fault_s)
+        return Figure("last setpoint", latest_s, self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class StaysDown:
+    """Its motors never start."""
+
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        started = sum(
+            bool(v.between(flight.fault_s, math.inf).armed.any()) for v in _of(flight, self.whose)
+        )
+        return Figure("took off", started, 0, "")
+
+
+@dataclass(frozen=True, slots=True)
+class TakesOff:
+    """It flies, somewhen after the fault."""
+
+    whose: Whose = "all"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        flew = min(
+            bool((v.armed & v.airborne)[v.time_s > flight.fault_s].any())
+            for v in _of(flight, self.whose)
+        )
+        return Figure("took off", flew, 1, "", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class MotorsOff:
+    """They stop in time, also in the air."""
+
+    within_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        latest_s = 0.0
+        for vehicle in _of(flight, self.whose):
+            later = vehicle.between(flight.fault_s, math.inf)
+            off_s = later.time_s[~later.armed]
+            latest_s = max(latest_s, float(off_s[0]) - flight.fault_s if len(off_s) else math.inf)
+        return Figure("motors off", latest_s, self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class KeepsHeight:
+    """As long as it flies offboard it is not further from its height at the fault than that."""
+
+    within_m: float
+    until_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        farthest_m = 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
+            heights_m = part.position_m[part.is_in(Px4Mode.OFFBOARD), 2]
+            if len(heights_m):
+                farthest_m = max(farthest_m, float(np.abs(heights_m - heights_m[0]).max()))
+        return Figure("leaves its height", farthest_m, self.within_m, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class NotFaster:
+    """As long as it flies offboard, no dash: it stays below that speed, in the plane."""
+
+    speed_m_s: float
+    until_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        fastest_m_s = 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
+            flown = part.velocity_m_s[part.is_in(Px4Mode.OFFBOARD) & part.airborne, :2]
+            fastest_m_s = max(fastest_m_s, float(np.hypot(*flown.T).max(initial=0.0)))
+        return Figure("greatest speed", fastest_m_s, self.speed_m_s, "m/s")
+
+
+def judge(bounds: Sequence[Criterion], flight: FlightTruth) -> tuple[Figure, ...]:
+    """All figures, those of every flight and the fault's own."""
+    return tuple(bound.figure(flight) for bound in bounds)
+
+
+def _robots(flight: FlightTruth, whose: Whose) -> tuple[int, ...]:
+    everybody = tuple(range(len(flight.vehicles)))
+    following = tuple((robot + 1) % len(everybody) for robot in flight.hit)
+    return {
+        "hit": flight.hit, "next": following, "others": flight.others, "all": everybody,
+    }[whose]  # fmt: skip
+
+
+def _of(flight: FlightTruth, whose: Whose) -> Iterator[VehicleTruth]:
+    return (flight.vehicles[robot] for robot in _robots(flight, whose))
+
+
+def _since_s(flight: FlightTruth, mark: str) -> float:
+    return flight.marks[mark] if mark else flight.fault_s
+
+
+def _rises_s(vehicle: VehicleTruth) -> list[float]:
+    rises = np.flatnonzero(vehicle.armed[1:] & ~vehicle.armed[:-1]) + 1
+    starts: list[float] = vehicle.time_s[rises].tolist()
+    return starts
+
+
+def _spans_s(vehicle: VehicleTruth, holds: Bools) -> list[tuple[float, float]]:
+    """From when to when something holds."""
+    steps = np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8))
+    begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
+    times_s = vehicle.time_s
+    return [(float(times_s[b]), float(times_s[e])) for b, e in zip(begins, ends, strict=True)]
+
+
+def _distances_m(one: VehicleTruth, other: VehicleTruth) -> F64:
+    """3-D, at all times when at least one of the two is in the air."""
+    times_s = one.time_s
+    if len(times_s) == len(other.time_s) and np.abs(times_s - other.time_s).max(initial=0) < 1e-6:
+        first_m, second_m, second_up = one.position_m, other.position_m, other.airborne
+    else:
+        first_s, last_s = max(times_s[0], other.time_s[0]), min(times_s[-1], other.time_s[-1])
+        times_s = times_s[(times_s >= first_s) & (times_s <= last_s)]
+        keep = np.searchsorted(one.time_s, times_s)
+        first_m = one.position_m[keep]
+        second_m = np.stack(
+            [np.interp(times_s, other.time_s, other.position_m[:, a]) for a in range(3)], axis=1
+        )
+        second_up = other.airborne[np.searchsorted(other.time_s, times_s)]
+        one = one.between(times_s[0], times_s[-1] + _STEP_S / 2.0)
+    distances_m: F64 = np.linalg.norm(first_m - second_m, axis=1)
+    return distances_m[(one.airborne[: len(distances_m)]) | second_up]

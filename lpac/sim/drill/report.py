@@ -1,0 +1,128 @@
+"""What a drill comes to: a table, JSON, and JUnit's XML."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+from lpac.sim.drill.bounds import Figure
+from lpac.sim.drill.campaign import FlightOutcome
+from lpac.sim.drill.faults import FAULTS
+
+_CONFIDENCE = 0.95
+
+
+class FaultSummary(NamedTuple):
+    """All flights of one fault; `worst` has each figure where it came nearest its limit."""
+
+    fault: str
+    flights: int
+    broken: int
+    worst: tuple[Figure, ...]
+
+    @property
+    def tightest(self) -> Figure | None:
+        """The figure with the least room."""
+        return min(self.worst, key=lambda figure: figure.room, default=None)
+
+
+def summaries(outcomes: Iterable[FlightOutcome]) -> list[FaultSummary]:
+    """By fault, in the catalogue's order."""
+    by_fault: dict[str, list[FlightOutcome]] = {}
+    for outcome in outcomes:
+        by_fault.setdefault(outcome.fault, []).append(outcome)
+    return [
+        FaultSummary(name, len(flown), sum(not outcome.held for outcome in flown), _worst(flown))
+        for name in FAULTS
+        if (flown := by_fault.get(name))
+    ]
+
+
+def _worst(outcomes: Sequence[FlightOutcome]) -> tuple[Figure, ...]:
+    columns = zip(*(outcome.figures for outcome in outcomes if outcome.figures), strict=True)
+    return tuple(min(column, key=lambda figure: figure.room) for column in columns)
+
+
+def at_most_share(flights: int, broken: int) -> float:
+    """The greatest share of broken flights that is still likely, at 95 % confidence, one-sided.
+
+    Clopper and Pearson's bound; of n flights without any it is 1 - 0.05^(1/n), about 3 / n.
+    """
+    if broken >= flights:
+        return 1.0
+    low, high = broken / flights, 1.0
+    while high - low > 1e-6:
+        share = (low + high) / 2.0
+        if _at_most(broken, flights, share) > 1.0 - _CONFIDENCE:
+            low = share
+        else:
+            high = share
+    return high
+
+
+def _at_most(broken: int, flights: int, share: float) -> float:
+    """How likely it is that no more than so many of the flights are broken."""
+    return math.fsum(
+        math.comb(flights, k) * share**k * (1.0 - share) ** (flights - k) for k in range(broken + 1)
+    )
+
+
+def shown(figure: Figure) -> str:
+    """ "lands 2.4 s (at most 3.3)"."""
+    unit = f" {figure.unit}" if figure.unit else ""
+    value = f"{figure.value:.3g}" if math.isfinite(figure.value) else "never"
+    if figure.value == math.inf and figure.at_least:
+        return f"{figure.name}: as wanted"
+    how = "at least" if figure.at_least else "at most"
+    return f"{figure.name} {value}{unit} ({how} {figure.limit:.3g})"
+
+
+def as_json(outcomes: Sequence[FlightOutcome]) -> dict[str, Any]:
+    """For scripts: each fault with its worst figures, and each flight that broke a promise."""
+    return {
+        "faults": [
+            {
+                "fault": summary.fault,
+                "what": FAULTS[summary.fault].what,
+                "promise": FAULTS[summary.fault].promise,
+                "flights": summary.flights,
+                "broken": summary.broken,
+                "at_most_share": round(at_most_share(summary.flights, summary.broken), 5),
+                "worst": [_figure_json(figure) for figure in summary.worst],
+            }
+            for summary in summaries(outcomes)
+        ],
+        "broken": [
+            {
+                "fault": outcome.fault,
+                "seed": outcome.seed,
+                "error": outcome.error,
+                "figures": [_figure_json(figure) for figure in outcome.broken],
+            }
+            for outcome in outcomes
+            if not outcome.held
+        ],
+    }
+
+
+def _figure_json(figure: Figure) -> dict[str, Any]:
+    # JSON has no infinity.
+    value = figure.value if math.isfinite(figure.value) else None
+    return {**figure._asdict(), "value": value}
+
+
+def as_junit(outcomes: Sequence[FlightOutcome]) -> bytes:
+    """A test suite whose cases are the flights."""
+    failed = [outcome for outcome in outcomes if not outcome.held]
+    suite = ElementTree.Element(
+        "testsuite", name="lpac drill", tests=str(len(outcomes)), failures=str(len(failed))
+    )
+    for outcome in outcomes:
+        case = ElementTree.SubElement(
+            suite, "testcase", classname=outcome.fault, name=f"seed {outcome.seed}"
+        )
+        if not outcome.held:
+            message = outcome.error or "; ".join(map(shown, outcome.broken))
+            ElementTree.SubElement(case, "failure", message=message)
+    xml: bytes = ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
+    return xml
