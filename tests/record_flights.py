@@ -309,6 +309,25 @@ def _near_neighbour(f: _Flight) -> None:
         f.run(3.0)
 
 
+def _landing_point_taken(f: _Flight) -> None:
+    """Robot 1 has come down where robot 0 lands."""
+    f.fly()
+    f.do(SafetyCommand("land", robots=("r1",)))
+    other = f.fleet.vehicles[1].vehicle
+    while other.armed:
+        f.run(0.5)
+    layout = f.fleet.layout
+    there_m = layout.to_world_m(np.array(f.robot.config.flight.landing_point_m))
+    error_m = f.vehicle.estimated_position_m - f.vehicle.position_m
+    place_m = np.array([*there_m, 0.0]) - error_m
+    other.gps_bias_m = f.vehicle.gps_bias_m
+    other.position_m = np.array([*place_m[:2], other.position_m[2]])
+    f.run(5.0)
+    f.begin()
+    f.do(SafetyCommand("return", robots=("r0",)))
+    f.until(_S.LAND)
+
+
 def _offboard_refused(f: _Flight) -> None:
     f.fly()
     _refuse(f.vehicle, Px4Mode.OFFBOARD)
@@ -506,6 +525,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
         _remote_control_lost, {"failsafe": {"rc": "pilot", "rc_lost": "land"}},
     ),
     "near_neighbour": (_near_neighbour, {}),
+    "landing_point_taken": (_landing_point_taken, {}),
     "offboard_refused": (_offboard_refused, {}),
     "arming_refused": (_arming_refused, {}),
     "ground_ends_arming": (_ground_ends_arming, {}),

@@ -130,6 +130,13 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
         ),
         ("orders_refused",),
     ),
+    "a landing on who stands there": (
+        lambda patch: patch.setattr(
+            state.Tick, "comes_down_m",
+            property(lambda tick: tick.robot.parameters.landing_point_m),
+        ),
+        ("landing_point_taken",),
+    ),
     "an operator whose orders nobody answers": (
         lambda patch: patch.setattr(step, "answered", lambda flight, *_: flight),
         ("ordered",),
