@@ -251,6 +251,18 @@ class ZenohLink:
                 }
                 for topic in TOPICS
             ],
+            # A state of its own for each connection, and before anything reaches this program.
+            "downsampling": [
+                {
+                    "flows": ["ingress"],
+                    "messages": ["put"],
+                    "rules": [
+                        {"key_expr": self._prefix + topic.pattern, "freq": topic.most_of_one_hz}
+                        for topic in TOPICS
+                        if topic.most_of_one_hz is not None
+                    ],
+                }
+            ],
             # 200 MB among ten robots, for no gain.
             "transport/shared_memory/enabled": False,
         }.items():

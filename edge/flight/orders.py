@@ -15,7 +15,7 @@ from edge.flight.alarms import (
     too_close,
 )
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick
-from edge.messages.codes import Refusal, RefusalCode, texts
+from edge.messages.codes import CheckCode, Refusal, RefusalCode, texts
 from edge.messages.mission import (
     AIRBORNE,
     AT_SLOT_M,
@@ -80,6 +80,12 @@ def _not_ready(t: Tick) -> Refusal | None:
     return Refusal(RefusalCode.NOT_READY, f"not ready: {texts(failed)}") if failed else None
 
 
+def _card_not_good(t: Tick) -> Refusal | None:
+    """The one preflight check that a flight goes on without, and no mission begins without."""
+    failed = [c for c in t.inputs.failed_checks or () if c.code is CheckCode.CARD_NOT_GOOD]
+    return Refusal(RefusalCode.NOT_READY, texts(failed)) if failed else None
+
+
 def _not_in_place(t: Tick) -> Refusal | None:
     """Why the mission cannot be flown from here."""
     odometry, height = t.inputs.odometry, t.height_m
@@ -125,7 +131,8 @@ ORDERS: Mapping[OrderKind, OrderRule] = {
         taken_in=(_S.PREFLIGHT,), checks=(_ground_commands, _not_ready), arms=True
     ),
     "start": OrderRule(
-        taken_in=(_S.HOLD,), checks=(_ground_commands, _not_in_place, _cannot_start),
+        taken_in=(_S.HOLD,),
+        checks=(_ground_commands, _card_not_good, _not_in_place, _cannot_start),
         trial="begins",
     ),
     # PILOT too, since there it is so already.

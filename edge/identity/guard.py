@@ -30,6 +30,8 @@ _MOST_CARDS = 1000
 # How often a card is shown anyway, and at most when somebody new is heard.
 _SHOWN_EVERY_S = 1.0 / CARD.rate_hz
 _SHOWN_AT_MOST_EVERY_S = 0.25
+# What was on its way when a member's program started again has come by then.
+_LONGEST_TRANSIT_S = 5.0
 
 
 class Speaker(NamedTuple):
@@ -52,6 +54,14 @@ class RefusedMessage(StrEnum):
     NOT_ALLOWED = "not_allowed"
     FORGED = "forged"
     REPLAYED = "replayed"
+
+
+class _Behind(NamedTuple):
+    """What a member says behind its own newest word: since when, until when, and the newest."""
+
+    since_s: float
+    at_s: float
+    said: tuple[int, int]
 
 
 class CardProblem(StrEnum):
@@ -84,6 +94,9 @@ class Guard(Protocol):
     def revoked_robots(self) -> frozenset[int]:
         """Robots that are listened to no more, and may still fly."""
 
+    def robots_said_twice(self) -> frozenset[int]:
+        """Robots whose key two programs have, or whose messages somebody says again."""
+
     def refused(self) -> dict[str, int]:
         """How many messages were nobody's, by why."""
 
@@ -113,6 +126,10 @@ class Unguarded:
         """See `Guard`."""
 
     def revoked_robots(self) -> frozenset[int]:
+        """See `Guard`."""
+        return frozenset()
+
+    def robots_said_twice(self) -> frozenset[int]:
         """See `Guard`."""
         return frozenset()
 
@@ -168,6 +185,7 @@ class SignedGuard:
         self._revoked: frozenset[bytes] = frozenset()
         self.revocations = b""
         self._heard: dict[tuple[bytes, str], tuple[int, int]] = {}
+        self._behind: dict[tuple[bytes, str], _Behind] = {}
         self._refused: Counter[RefusedMessage] = Counter()
         self._sequence = 0
         self._shown_at_s = -math.inf
@@ -218,6 +236,18 @@ class SignedGuard:
         with self._lock:
             revoked = [c for c in self._members.values() if c.fingerprint in self._revoked]
         return frozenset(card.robot_id for card in revoked if card.robot_id is not None)
+
+    def robots_said_twice(self) -> frozenset[int]:
+        """See `Guard`."""
+        now_s = self._clock_s()
+        with self._lock:
+            twice = [
+                self._cards.get(fingerprint)
+                for (fingerprint, _), behind in self._behind.items()
+                if behind.at_s - behind.since_s > _LONGEST_TRANSIT_S
+                and now_s - behind.at_s <= _LONGEST_TRANSIT_S
+            ]
+        return frozenset(card.robot_id for card in twice if card and card.robot_id is not None)
 
     def refused(self) -> dict[str, int]:
         """See `Guard`."""
@@ -288,12 +318,21 @@ class SignedGuard:
         return envelope.payload, Speaker(card.role, card.name)
 
     def _is_news(self, key: str, envelope: Envelope) -> bool:
-        said = envelope.start, envelope.sequence
+        said, whose = (envelope.start, envelope.sequence), (envelope.fingerprint, key)
         with self._lock:
-            if said <= self._heard.get((envelope.fingerprint, key), (-1, -1)):
+            if said <= self._heard.get(whose, (-1, -1)):
+                self._keep_behind(whose, said)
                 return False
-            self._heard[envelope.fingerprint, key] = said
+            self._heard[whose] = said
         return True
+
+    def _keep_behind(self, whose: tuple[bytes, str], said: tuple[int, int]) -> None:
+        """Of two programs with one key the one that started last is heard; the other goes on."""
+        now_s, before = self._clock_s(), self._behind.get(whose)
+        if before is None or now_s - before.at_s > _LONGEST_TRANSIT_S:
+            self._behind[whose] = _Behind(now_s, now_s, said)
+        elif said > before.said:
+            self._behind[whose] = _Behind(before.since_s, now_s, said)
 
     def _receive_card(self, key: str, data: bytes) -> None:
         try:

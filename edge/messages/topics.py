@@ -19,8 +19,9 @@ class Topic:
     """One kind of message.
 
     `content` names what its bytes are, `rate_hz` is how often one sender says it, `most_hz` how
-    often it is listened to at most, `limit_bytes` the largest that is listened to, `logged` the
-    flight log's topic that holds what came or went.
+    often a key is listened to at most, and `most_of_one_hz` of that one connection, if several
+    speak on the key; `limit_bytes` is the largest that is listened to, `logged` the flight log's
+    topic that holds what came or went.
     Of what is sent at once, "later" goes when nothing else waits.
     """
 
@@ -32,6 +33,7 @@ class Topic:
     limit_bytes: int
     priority: Priority
     logged: str | None
+    most_of_one_hz: float | None = None
 
     @property
     def pattern(self) -> str:
@@ -43,13 +45,16 @@ class Topic:
 MESSAGE = Topic("message", "robot", "Beacon, AggregatedMessage", 2.5, 100, 2**20, "now", "received")
 STATUS = Topic("status", "robot", "RobotStatus", 2.0, 20, 2**16, "now", "status")
 EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
-STATE = Topic("state", "ground", "GroundState", 5.0, 50, 2**16, "now", "ground")
+# Of ten grounds, so that one that floods, such as a revoked laptop, drowns no other's hold. What is
+# said within such a time of the last is not heard, which is why an order has none: those for all
+# robots of a fleet go at once.
+STATE = Topic("state", "ground", "GroundState", 5.0, 500, 2**16, "now", "ground", 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
-WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 10, 400_000, "later", None)
+WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 50, 400_000, "later", None, 5)
 # Who is a member, and whose key is not good any more: signed by the fleet's authority.
 CARD = Topic("card", "robot", "Card", 0.5, 10, 2**11, "now", None)
-GROUND_CARD = Topic("card", "ground", "Card", 0.5, 50, 2**11, "now", None)
-REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 20, 2**15, "now", None)
+GROUND_CARD = Topic("card", "ground", "Card", 0.5, 100, 2**11, "now", None, 10)
+REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 100, 2**15, "now", None, 10)
 
 TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD, CARD, GROUND_CARD, REVOKED)
 

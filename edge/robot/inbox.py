@@ -119,7 +119,10 @@ class Inbox:
                 self._take_safety_form(arrived)
                 continue
             if not _is_own(state.operator, arrived.speaker):
-                if state.safety_action_for(self._robot_id) == "hold":
+                # One that cannot count takes no other's place.
+                if state.safety_action_for(self._robot_id) == "hold" and self._is_a_little_ahead(
+                    state.sequence
+                ):
                     self._asked_hold = _AskedHold(
                         arrived.speaker.name, state.sequence, arrived.at_s
                     )
@@ -134,7 +137,7 @@ class Inbox:
             ground is None
             or asked is None
             or now_s - asked.at_s > _ASKED_HOLD_LASTS_S
-            or not 0 < asked.sequence - ground.sequence <= _MOST_SEQUENCES_AHEAD
+            or not self._is_a_little_ahead(asked.sequence)
             or ground.safety_action_for(self._robot_id) != "none"
         ):
             return ground
@@ -144,6 +147,10 @@ class Inbox:
             robot_safety_actions=ground.robot_safety_actions | {str(self._robot_id): "hold"},
             safety_action_by=asked.by,
         )
+
+    def _is_a_little_ahead(self, sequence: int) -> bool:
+        ground = self._ground
+        return ground is not None and 0 < sequence - ground.sequence <= _MOST_SEQUENCES_AHEAD
 
     def safety_form(self, now_s: float) -> SafetyAction:
         """What a ground asks whose states are not understood: hold, land, or none. Control thread.
@@ -162,8 +169,9 @@ class Inbox:
             return
         asked = form.robot_safety_actions.get(str(self._robot_id), form.safety_action)
         known: dict[str, SafetyAction] = {"hold": "hold", "land": "land"}
-        if not _is_own(form.operator, arrived.speaker):
-            del known["land"]
+        is_own = _is_own(form.operator, arrived.speaker)
+        if not is_own and (asked != "hold" or self.safety_form(arrived.at_s) == "land"):
+            return
         self._safety_form = known.get(asked, "none")
         self._safety_form_at_s = arrived.at_s
 

@@ -39,11 +39,14 @@ def report(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Make figures and one HTML page of flight logs; of several trials, how they repeat."""
-    from lpac.analysis.report import Wanted, examine, write
+    from lpac.analysis.report import Wanted, examine
 
     wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
     with _Bar() as bar:
         examined = examine(folders, wanted, bar.show)
+        # Only once there is something to draw: what draws takes a second to load.
+        from lpac.analysis.write_report import write
+
         page = write(examined, out or folders[0] / "report", wanted.times_s, bar.show)
     summary = examined.summary()
     if as_json:

@@ -256,6 +256,10 @@ def _not_obeyed(fleet: _Fleet, seen: _Seen) -> _Found:
         return severity, "does not obey what the ground says"
     if status.operator not in ("", said.operator, fleet.ground.operator):
         return severity, f"obeys {status.operator}, not {fleet.ground.operator}"
+    # An observer's hold, or another station, is heard here by the second picture.
+    known, obeyed = fleet.ground.sequence, status.obeyed_sequence
+    if seen.before is not None and min(obeyed, seen.before.obeyed_sequence) > known:
+        return severity, f"obeys sequence {obeyed}, and the ground is at {known}"
     return None
 
 

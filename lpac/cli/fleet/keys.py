@@ -15,6 +15,7 @@ from lpac.cli.printing import BAD, GOOD, print_table, styled
 if TYPE_CHECKING:
     from rich.text import Text
 
+    from lpac.analysis.snapshot import FleetSnapshot
     from lpac.fleet.authority import Member
     from lpac.fleet.hold import Report
     from lpac.fleet.settings import FleetConfig, RobotHost
@@ -46,7 +47,10 @@ def operator(
         bool, typer.Option("--observer", help="It may ask the fleet to hold, and nothing else.")
     ] = False,
 ) -> None:
-    """Make another laptop a ground station of the fleet: the folder OUT, for it alone."""
+    """Make another laptop a ground station of the fleet: the folder OUT, for it alone.
+
+    Of a NAME that has a card already the former key is revoked.
+    """
     from edge.identity.card import Role
     from lpac.fleet.authority import new_member
     from lpac.fleet.cards import open_authority
@@ -56,7 +60,13 @@ def operator(
         raise ValueError(f"{out}: is there already: give a new folder")
     role = Role.OBSERVER if observer else Role.OPERATOR
     config = load_fleet(fleet)
-    new_member(open_authority(config), out, role, name)
+    authority, snapshot = open_authority(config), _snapshot(config)
+    if snapshot is not None and snapshot.commander == name:
+        raise ValueError(
+            f"{name} commands the fleet, and a new card would revoke its key: let another ground "
+            "station command first (`lpac mission command`), or end it"
+        )
+    new_member(authority, out, role, name)
     typer.echo(f"{out}: {name} is an {role} of fleet {config.fleet}")
     typer.echo(
         f"move the folder to that laptop, by a way that nobody else can read, and name it there "
@@ -126,27 +136,38 @@ def revoke(
 
 def _why_not_now(config: "FleetConfig", name: str) -> str:
     """What speaks against it as far as this laptop's ground knows; "" if nothing does."""
-    from lpac.analysis.snapshot import FleetSnapshot
-    from lpac.ground.station.client import GroundError, subscribe
-    from lpac.ground.station.station import is_down
-
-    try:
-        with subscribe(config.fleet) as told:
-            snapshot = next(t for t in told if isinstance(t, FleetSnapshot))
-    except GroundError:
+    snapshot = _snapshot(config)
+    if snapshot is None:
         return f"no `lpac ground` runs here, so nobody knows what {name} does now"
     if snapshot.commander == name:
         return f"{name} commands the fleet"
-    for robot in snapshot.robots:
-        if robot.name == name and robot.status is not None and not is_down(robot.status):
-            return f"{name} was heard in the air last"
-    return ""
+    return f"{name} was heard in the air last" if name in _flying(snapshot) else ""
+
+
+def _snapshot(config: "FleetConfig") -> "FleetSnapshot | None":
+    """The fleet as this laptop's ground sees it; None if none runs."""
+    from lpac.analysis.snapshot import FleetSnapshot
+    from lpac.ground.station.client import GroundError, subscribe
+
+    try:
+        with subscribe(config.fleet) as told:
+            return next(t for t in told if isinstance(t, FleetSnapshot))
+    except GroundError:
+        return None
+
+
+def _flying(snapshot: "FleetSnapshot") -> list[str]:
+    """Who was heard in the air last."""
+    from lpac.ground.station.station import is_down
+
+    return [r.name for r in snapshot.robots if r.status is not None and not is_down(r.status)]
 
 
 def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
     """Renew everybody's keys: robots on the ground get new ones, and this computer.
 
-    The old keys are revoked. A robot in flight refuses, and keeps its own.
+    The old keys are revoked. A robot in flight refuses, and keeps its own; so does this computer
+    while one flies that its `lpac ground` may command.
     """
     from edge.identity.card import Role
     from lpac.fleet.authority import new_member
@@ -154,6 +175,12 @@ def rotate(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None) -> None:
 
     config, chosen = open_fleet(fleet, robots)
     authority = open_authority(config)
+    snapshot = _snapshot(config) if robots is None else None
+    if snapshot is not None and (flying := _flying(snapshot)):
+        raise ValueError(
+            f"{', '.join(flying)} flew when last heard, and would lose this computer's ground: "
+            "land them first, or name the robots that are to get new keys"
+        )
 
     async def one(robot: "RobotHost", report: "Report") -> None:
         report("new key", None)

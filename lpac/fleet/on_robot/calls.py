@@ -71,10 +71,15 @@ def must(command: List[str], timeout_s: float = 60.0) -> str:
     return done.stdout
 
 
-def write_whole(path: str, data: bytes) -> None:
-    """Write a file that, whenever the power goes, is the old one or the new one."""
+def write_whole(path: str, data: bytes, mode: int = 0o644) -> None:
+    """Write a file that, whenever the power goes, is the old one or the new one.
+
+    Also in a folder of somebody else's, who may have put a link there for root to follow.
+    """
     part = path + ".part"
-    with open(part, "wb") as file:
+    if os.path.lexists(part):
+        os.unlink(part)
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())

@@ -56,10 +56,8 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
     _make_identity()
     key = os.path.join(_MEMBERSHIP, _NEXT_KEY if fresh else _KEY)
     if fresh or not os.path.exists(key):
-        part = key + ".part"
-        must(["openssl", "genpkey", "-algorithm", "ed25519", "-out", part])
-        os.chmod(part, 0o600)
-        os.replace(part, key)
+        made = must(["openssl", "genpkey", "-algorithm", "ed25519"])
+        write_whole(key, made.encode(), 0o600)
         _own_identity()
     pem = must(["openssl", "pkey", "-in", key, "-pubout"])
     der = base64.b64decode("".join(pem.strip().split("\n")[1:-1]))
@@ -102,7 +100,7 @@ def _own_identity() -> None:
     """For the program's user, who owns the folder around, or will when it starts first."""
     owner = os.stat(os.path.dirname(_MEMBERSHIP))
     for path in [_MEMBERSHIP, *(os.path.join(_MEMBERSHIP, n) for n in os.listdir(_MEMBERSHIP))]:
-        os.chown(path, owner.st_uid, owner.st_gid)
+        os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 @call

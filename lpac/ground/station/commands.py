@@ -135,7 +135,7 @@ class CommandTask:
             raise _ProblemError(ProblemCode.NO_ROBOT, "no robot is named, or sits in a slot")
         do, check = _DO[type(self.request)]
         try:
-            self._refuse_observer()
+            self._refuse_who_may_not()
             if check is not None:
                 check(self, self.request)
         except _ProblemError:
@@ -151,11 +151,18 @@ class CommandTask:
         station = self._station
         return station.age_s > _GATHER_S or all(self._status(name) for name in self.names)
 
-    def _refuse_observer(self) -> None:
+    def _refuse_who_may_not(self) -> None:
+        """Raises _ProblemError if this station's operator may not ask for it."""
         station = self._station
         commander = station.commander
         if not station.may_command and not _is_hold(self.request):
             text = f"{station.operator} is an observer of this fleet: it may ask for hold alone"
+            raise _ProblemError(ProblemCode.MAY_NOT, text)
+        if station.card_problem is not None and isinstance(self.request, (Takeoff, Start)):
+            text = (
+                f"the card of {station.operator} is {station.card_problem.value}: it needs a new "
+                "one (`lpac fleet rotate`, or `lpac fleet operator`)"
+            )
             raise _ProblemError(ProblemCode.MAY_NOT, text)
         own = station.commands or commander in ("", station.operator)
         if own or _is_everybodys(self.request):

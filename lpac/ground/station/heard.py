@@ -118,6 +118,8 @@ class HeardRobots:
     ) -> None:
         self.names = {robot_id: name for name, robot_id in robots.items()}
         self._robots = {id_: _Robot(name, id_) for id_, name in self.names.items()}
+        # By what their messages' envelopes tell: who is there twice, though one alone is heard.
+        self.said_twice: frozenset[int] = frozenset()
         self._tell_presence = tell_presence
         self._tell_state = tell_state
 
@@ -149,7 +151,7 @@ class HeardRobots:
         if present != robot.present:
             robot.present = present
             self._tell_presence(robot.name, "heard" if present else f"silent for {FRESH_S:g} s")
-        duplicate = robot.two_speak(now_s)
+        duplicate = robot.two_speak(now_s) or robot.robot_id in self.said_twice
         if duplicate and not robot.duplicate:
             self._tell_presence(robot.name, "two programs say that they are this robot")
         robot.duplicate = duplicate

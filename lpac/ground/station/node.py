@@ -105,6 +105,7 @@ class GroundNode:
     def tick(self) -> None:
         """Time has passed; some five times a second."""
         self._set_time()
+        self.station.hear_twice(self._guard.robots_said_twice())
         try:
             self.station.tick()
             self._step()
@@ -133,7 +134,9 @@ class GroundNode:
         self._step()
 
     def _set_time(self) -> None:
-        self.station.set_time(self._clock.monotonic_s(), self._clock.unix_s())
+        unix_s = self._clock.unix_s()
+        self.station.set_time(self._clock.monotonic_s(), unix_s)
+        self.station.card_problem = self._guard.card_problem(unix_s)
 
     def _receive(self, key: str, data: bytes, speaker: Speaker) -> None:
         source, _, topic = key.rpartition("/")

@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 from edge.identity.card import Role
-from edge.identity.guard import Speaker
+from edge.identity.guard import CardProblem, Speaker
 from edge.messages.codes import CheckCode, Refusal, RefusalCode
 from edge.messages.mission import (
     ON_GROUND,
@@ -91,6 +91,8 @@ class Station:
         self, setup: FleetSetup, now_s: float, unix_now_s: float, *, may_command: bool = True
     ) -> None:
         self.may_command = may_command
+        # What is wrong with this station's own card; None: nothing.
+        self.card_problem: CardProblem | None = None
         self.state: GroundState | None = None
         self.commands = False
         # What became of orders, by their id.
@@ -290,6 +292,10 @@ class Station:
     def set_time(self, now_s: float, unix_now_s: float) -> None:
         """It is now so late; everything else follows."""
         self._now_s, self._unix_now_s = now_s, unix_now_s
+
+    def hear_twice(self, robots: frozenset[int]) -> None:
+        """These robots' keys speak twice now, by robot id."""
+        self._robots.said_twice = robots
 
     def hear_status(self, status: RobotStatus) -> None:
         """A robot's status came. One that is not of this fleet is nobody's."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from itertools import permutations
+from threading import Event, Thread
 from typing import Any, Self
 
 import pytest
@@ -62,12 +63,14 @@ class Inbox:
 
     def __init__(self) -> None:
         self.newest: dict[str, bytes] = {}
+        self.all: set[bytes] = set()
         self.count = 0
         # Of what is explored.
         self.largest = 0
 
     def __call__(self, key: str, data: bytes) -> None:
         self.newest[key] = data
+        self.all.add(data)
         self.count += 1
         if key.endswith("explored"):
             self.largest = max(self.largest, len(data))
@@ -455,6 +458,38 @@ def test_whoever_floods_the_radio_costs_little_and_makes_nobody_deaf() -> None:
         assert robot.failures() == 0
         # What zenoh itself refuses ends the stranger's connection, and nobody else's.
         eventually(partial(is_present, robot, {1}))
+
+
+def test_a_ground_that_floods_drowns_no_other() -> None:
+    known, inbox, over = endpoint(), Inbox(), Event()
+    with (
+        ZenohLink(fleet="test", robot_id=0, listen=[known], subscriptions={STATE: inbox}) as robot,
+        ZenohLink(fleet="test", connect=[known]) as ground,
+        zenoh.open(attacker(known)) as stranger,
+    ):
+        eventually(partial(has_peers, robot, 2))
+
+        def flood() -> None:
+            while not over.is_set():
+                stranger.put("lpac/test/ground/state", b"flood")
+
+        flooding = Thread(target=flood)
+        flooding.start()
+        said: list[bytes] = []
+
+        def say(number: int) -> bool:
+            said.append(b"%d" % number)
+            ground.publish(STATE, said[-1])
+            return said[-1] in inbox.all
+
+        try:
+            for number in range(60):
+                eventually(partial(say, number))
+        finally:
+            over.set()
+            flooding.join()
+        # Of what is said every 10 ms each third is heard.
+        assert len(said) < 8 * 60
 
 
 def attacker(known: str) -> zenoh.Config:

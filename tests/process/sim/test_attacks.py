@@ -33,6 +33,7 @@ from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import SHIPPED
 from tests.flown import QUICK
+from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.fault_rig import FaultRig, flies_on
 
 pytestmark = pytest.mark.real_time
@@ -319,6 +320,36 @@ def thief(rig: FaultRig) -> Iterator[Callable[[int], None]]:
         yield says
 
 
+def test_a_flood_with_an_observers_key_drowns_no_command(rig: FaultRig, tmp_path: Path) -> None:
+    """It may say states, of which robots take a hold alone; a revoked laptop can say as many."""
+    new_member(Authority(rig.fleet.folder / "keys", rig.fleet.name), tmp_path, Role.OBSERVER, "eve")
+    eve = load_identity(tmp_path, fleet=rig.fleet.name, unix_s=1.0)
+    over = threading.Event()
+    with session(rig.fleet, certified(eve.tls)) as opened:
+
+        def flood() -> None:
+            # The vehicles are simulated in this process, too.
+            while not over.wait(0.002):
+                for _ in range(20):
+                    opened.put(f"lpac/{rig.fleet.name}/ground/state", bytes(100))
+
+        flooding = threading.Thread(target=flood)
+        flooding.start()
+        try:
+            for _ in range(5):
+                rig.done(SafetyCommand("hold"))
+                for robot in ROBOTS:
+                    rig.wait_state(robot, _S.HOLD)
+                rig.command(Resume())
+                rig.start()
+        finally:
+            over.set()
+            flooding.join()
+    for robot in ROBOTS:
+        assert flies_on(rig.status(robot))
+        assert rig.status(robot).message_counts["no_envelope"] > 100
+
+
 def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
     rig.start()
     rig.done(SafetyCommand("hold"))
@@ -329,8 +360,17 @@ def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
 def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FaultRig) -> None:
     rig.command(Resume())
     rig.start()
-    # As `lpac fleet revoke` does it: the ground that runs tells the robots.
-    Authority(rig.fleet.folder / "keys", rig.fleet.name).revoke(f"r{STOLEN}")
+    stolen, fleet = f"r{STOLEN}", ("--fleet", rig.fleet.fleet_toml)
+    for command, why in (
+        (("revoke", stolen), f"{stolen} was heard in the air last: add --in-flight"),
+        (("revoke", "sim"), "sim commands the fleet: add --in-flight"),
+        (("operator", "sim", "--out", rig.fleet.folder / "new"), "a new card would revoke its key"),
+        (("rotate",), "r0, r1 flew when last heard, and would lose this computer's ground"),
+    ):
+        assert why in error_line(lpac("fleet", *command, *fleet))
+    assert flies_on(rig.status(0)) and flies_on(rig.status(STOLEN))
+    done = lpac("fleet", "revoke", stolen, "--in-flight", *fleet)
+    assert done.returncode == 0, done.stderr
     rig.wait_status(0, lambda status: not status.neighbour_ages_s)
     assert flies_on(rig.status(0))
     assert rig.ground.told.wait_for(

@@ -14,7 +14,16 @@ from edge.identity.card import Role
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, Order, RobotStatus, SafetyAction
 from edge.messages.topics import ORDER, REVOKED, STATE, STATUS, TOPICS, Topic
-from lpac.ground.station.protocol import Resume, RobotCommand, SafetyCommand, Start, Takeoff
+from lpac.analysis.snapshot import FleetSnapshot
+from lpac.ground.alarms import AlarmCode, alarms
+from lpac.ground.station.protocol import (
+    ProblemCode,
+    Resume,
+    RobotCommand,
+    SafetyCommand,
+    Start,
+    Takeoff,
+)
 from lpac.sim.description import ERRORS
 from lpac.sim.fleet.members import SimulatedMembers
 from tests.flown import FlownRobot
@@ -97,6 +106,33 @@ def test_who_is_revoked_is_heard_no_more() -> None:
     assert status_of(field.robots[1]).neighbour_ages_s.keys() == {"0"}
 
 
+def test_a_ground_whose_card_was_revoked_starts_nothing() -> None:
+    field = a_field(1, "ready", secure=True)
+    assert field.fleet.members is not None
+    revoked = field.fleet.members.revoke(Role.OPERATOR, "alice")
+    field.fleet.radio.link(ENEMY, {}).publish(REVOKED, revoked)
+    field.run(1.0)
+    for request in (Takeoff(), Start()):
+        problem = field.do(request).problem
+        assert problem is not None and problem.code is ProblemCode.MAY_NOT
+        assert problem.text.startswith("the card of alice is revoked")
+
+
+def test_two_programs_with_one_key_are_an_alarm() -> None:
+    """Of a key that was copied; the one that started first is heard no more."""
+    field = a_field(2, "ready", secure=True)
+    field.second_program(1)
+    field.until(lambda: AlarmCode.DUPLICATE_ID in alarms_of(field, "r1"), 15.0)
+    assert AlarmCode.DUPLICATE_ID not in alarms_of(field, "r0")
+
+
+def alarms_of(field: Field, robot: str, before: FleetSnapshot | None = None) -> set[AlarmCode]:
+    """What alice's views show of a robot."""
+    alice = field.stations["alice"]
+    told = alarms(alice.setup, alice.snapshot(), before)
+    return {alarm.code for alarm in told if alarm.robot == robot}
+
+
 @pytest.mark.parametrize("name", ["alice", "mallory"])
 @pytest.mark.parametrize("sequences_ahead", [5, 10**5, 2**48])
 def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
@@ -117,6 +153,9 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
         )  # fmt: skip
         link.publish(STATUS, seal(STATUS, encode(told)))
         field.run(0.1)
+        if i == 19:
+            before = alice.snapshot()
+    assert AlarmCode.NOT_OBEYED in alarms_of(field, "r2", before)
     honest = field.robots[:2]
     assert alice.commands and alice.state.sequence < 2**47
     assert {robot.state for robot in honest} == {_S.MISSION}

@@ -55,6 +55,21 @@ def test_who_hears_its_ground_late_from_the_start_does_not_take_off() -> None:
     field.until(lambda: field.robots[0].said.ready, 20.0)
 
 
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_a_wall_clock_that_is_stepped_in_flight_changes_nothing(step_s: float) -> None:
+    field = a_field(2, "flying", secure=True)
+    field.fleet.schedule.epoch_s += step_s
+    for _ in range(40):
+        field.run(0.25)
+        assert heard_by(field.robots[0]) == {"1"}
+        assert field.states() == {FlightState.MISSION}
+    # Nor does it matter to a program that starts by it, while others remember the old time.
+    field.robots[1].program.stop()
+    field.until(lambda: heard_by(field.robots[0]) == set())
+    field.robots[1].program.start()
+    field.until(lambda: heard_by(field.robots[0]) == {"1"}, 60.0)
+
+
 def test_a_ground_that_takes_over_leaves_robots_blind_for_a_moment_only() -> None:
     field = a_field(2, "flying")
     field.join("bob")

@@ -27,9 +27,10 @@ from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import load_bundle
 from lpac.analysis.logs import read_logs
 from lpac.analysis.page import Drawn, page
-from lpac.analysis.report import Examined, Wanted, examine, write
+from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.trials import find_missions
+from lpac.analysis.write_report import write
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata
 from tests.conftest import SHIPPED

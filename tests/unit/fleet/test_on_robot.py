@@ -3,6 +3,7 @@
 import ast
 import hashlib
 import json
+import stat
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from edge.drivers.px4 import raw_mavlink
 from lpac.fleet.enroll import _predecessors_step
 from lpac.fleet.on_robot import enrolment, probes, releases, service
-from lpac.fleet.on_robot.calls import Refused
+from lpac.fleet.on_robot.calls import Refused, write_whole
 from lpac.fleet.release import _entry
 from tests.conftest import ROOT
 
@@ -24,6 +25,15 @@ from tests.conftest import ROOT
 )
 def test_the_robots_python_3_6_can_read_it(path: Path) -> None:
     ast.parse(path.read_text(), feature_version=(3, 6))
+
+
+def test_a_file_is_written_past_a_link_that_somebody_put_there(tmp_path: Path) -> None:
+    others, path = tmp_path / "others", tmp_path / "key.pem"
+    others.write_text("theirs")
+    (tmp_path / "key.pem.part").symlink_to(others)
+    write_whole(str(path), b"ours", 0o600)
+    assert (path.read_text(), others.read_text()) == ("ours", "theirs")
+    assert not path.is_symlink() and stat.S_IMODE(path.stat().st_mode) == 0o600
 
 
 def make(folder: Path, files: dict[str, str]) -> str:

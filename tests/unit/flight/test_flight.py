@@ -656,6 +656,13 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
     world.closest = Closest(4, 1.2)
     assert world.refuse("start") is RefusalCode.TOO_CLOSE
     world.closest = None
+    world.failed_checks = (
+        FailedCheck(CheckCode.NOT_DISARMED, "vehicle is armed"),
+        FailedCheck(CheckCode.CARD_NOT_GOOD, "its card is expired"),
+    )
+    assert world.refuse("start") is RefusalCode.NOT_READY
+    world.reads(world.said, "its card is expired")
+    world.failed_checks = world.failed_checks[:1]
     world.position_m[0] = 33.0
     assert world.refuse("start") is RefusalCode.OUTSIDE_FENCE
     world.reads(world.said, "outside the fence")

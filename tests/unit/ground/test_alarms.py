@@ -225,6 +225,14 @@ def test_a_robot_obeys_another_operator() -> None:
     assert told(seen, seen) == (Alarm("critical", "r1", _C.NOT_OBEYED, "obeys bob, not alice"),)
 
 
+def test_a_robot_obeys_what_nobody_is_known_to_have_said() -> None:
+    seen = fleet(said={"obeyed_sequence": 2**48})
+    assert told(seen, fleet()) == ()
+    (alarm,) = told(seen, seen)
+    assert alarm[:3] == ("critical", "r1", _C.NOT_OBEYED)
+    assert alarm.text == "obeys sequence 281474976710656, and the ground is at 4"
+
+
 def test_loops_that_miss_ticks_or_fail() -> None:
     def with_loop(loop: LoopStatus) -> FleetSnapshot:
         return fleet(said={"loops": {"control": loop}})

@@ -164,6 +164,30 @@ def test_a_message_counts_once_and_for_its_own_place_only(one: Member, two: Memb
     assert one.guard.refused()["replayed"] == 3
 
 
+def test_two_programs_with_one_key_are_told_from_a_new_start(one: Member, two: Member) -> None:
+    again = robot(2, start=2)
+
+    def both_speak(until_s: float) -> None:
+        while one.now_s < until_s:
+            one.now_s += 0.5
+            one.hear(again, again.say(MESSAGE, b"new")[-1:])
+            one.hear(two, two.say(MESSAGE, b"old")[-1:])
+
+    # What was on its way when the program started again, and then a second program.
+    both_speak(4.0)
+    assert one.guard.robots_said_twice() == Unguarded().robots_said_twice() == set()
+    both_speak(8.0)
+    assert one.guard.robots_said_twice() == {2}
+    one.now_s += 6.0
+    assert one.guard.robots_said_twice() == set()
+    # One and the same message over and over is no program.
+    ((_, data),) = two.say(MESSAGE, b"once")[-1:]
+    for _ in range(20):
+        one.now_s += 0.5
+        assert not one.takes(MESSAGE, "robot/2/message", data)
+    assert one.guard.robots_said_twice() == set()
+
+
 def test_a_robots_key_is_no_operators_and_no_other_robots(one: Member, two: Member) -> None:
     data = two.guard.seal(STATE, b"land")
     for topic, key in (

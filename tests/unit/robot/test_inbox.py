@@ -207,6 +207,11 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
         assert obeyed(safety_action="hold") == ("hold", after)
         ground, _ = inbox.ground(2.4)
         assert ground is not None and ground.safety_action_by == speaker.name
+        # One that cannot count does not take its place.
+        far = dataclasses.replace(state, sequence=after + 10**6, safety_action="hold")
+        inbox.put_ground(encode(far), guest, 2.4)
+        ground, _ = inbox.ground(2.4)
+        assert ground is not None and ground.safety_action_for(3) == "hold"
         # It ends with whoever says it, and with what the commander says next.
         assert inbox.ground(2.5)[0] == state
         assert obeyed(robot_safety_actions={"3": "hold"}) == ("hold", after)
@@ -220,6 +225,13 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
         inbox.put_ground(data, guest, 1.0)
         inbox.ground(1.0)
         assert inbox.safety_form(1.0) == known
+    # Or takes back what somebody else asks for.
+    for action, taken_back in (("hold", ("none", "land")), ("land", ("none", "hold", "land"))):
+        inbox.put_ground(newer(state, sequence=after, safety_action=action), ann, 2.0)
+        for other in taken_back:
+            inbox.put_ground(newer(state, sequence=after, safety_action=other), guest, 2.0)
+        inbox.ground(2.0)
+        assert inbox.safety_form(2.0) == action
 
 
 def test_an_order_is_its_operators_own() -> None:
