@@ -13,6 +13,7 @@ import pytest
 
 from edge.core import F64
 from edge.drivers.flight_log import read
+from edge.flight.replay import FlightReplay
 from edge.identity.guard import Unguarded
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
@@ -391,6 +392,12 @@ def test_what_the_robots_logged_is_what_they_computed(
         assert {FlightState.MISSION, FlightState.LANDED} <= states
         for compared in replay(shipped_policy, messages):
             assert compared.ticks > 0 and compared.differing == 0
+        flight = FlightReplay()
+        for topic, unix_time_s, message in messages:
+            if topic == "flight":
+                flight.run(unix_time_s, message)
+        ticks = sum(topic == "control" for topic, _, _ in messages)
+        assert (flight.ticks, flight.passed_over, flight.differing) == (ticks, 0, 0)
 
 
 def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
