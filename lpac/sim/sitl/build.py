@@ -32,9 +32,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
 from lpac.sim.fleet.vehicles import AutopilotAddress, TrueTrack, VehicleError
+from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vehicle import Truth
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl import ordinary
-from lpac.sim.sitl.log import read_truth, setpoint_times_s
+from lpac.sim.sitl.log import read_setpoints, read_truth
 
 MAX_INSTANCES = 10
 LISTEN_PORT = 14580
@@ -233,8 +235,39 @@ class Px4Build:
         """When the last setpoint had reached a PX4, by its log: `time.monotonic()`."""
         instance = self._instances[number]
         with self._heard_lock:
-            setpoints_s = setpoint_times_s(instance.logs())
+            setpoints_s = read_setpoints(instance.logs()).time_s
             return float(instance.to_monotonic_s(setpoints_s)[-1])
+
+    def logged_truth(self, number: int) -> list[Truth]:
+        """What a PX4's own log says, which is whole once PX4 has ended; [] if it says nothing.
+
+        Times are `time.monotonic()`.
+        """
+        instance = self._instances[number]
+        truth = read_truth(instance.logs(), self._world) if instance.clock else None
+        if truth is None or not len(truth.status_s):
+            return []
+        setpoints = read_setpoints(instance.logs())
+        setpoints_s = instance.to_monotonic_s(setpoints.time_s).tolist()
+        statuses = np.maximum(np.searchsorted(truth.status_s, truth.time_s, "right") - 1, 0)
+        lasts = np.searchsorted(setpoints.time_s, truth.time_s, "right") - 1
+        entries = []
+        for at_s, place_m, velocity_m_s, status, last in zip(
+            instance.to_monotonic_s(truth.time_s).tolist(), truth.position_m.tolist(),
+            truth.velocity_m_s.tolist(), statuses.tolist(), lasts.tolist(), strict=True,
+        ):  # fmt: skip
+            heard = last >= 0
+            entries.append(
+                Truth(
+                    time_s=at_s, position_m=tuple(place_m), velocity_m_s=tuple(velocity_m_s),
+                    mode=Px4Mode(int(truth.navigation_state[status])),
+                    armed=bool(truth.armed[status]), landed=place_m[2] > -_AIRBORNE_ABOVE_M,
+                    setpoint_at_s=setpoints_s[last] if heard else -math.inf,
+                    follows=("velocity" if setpoints.is_velocity[last] else "position")
+                    if heard else None,
+                )
+            )  # fmt: skip
+        return entries
 
     def logs(self, number: int) -> list[Path]:
         """What a PX4 has logged so far, some tenths of a second old."""
