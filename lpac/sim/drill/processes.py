@@ -13,7 +13,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
@@ -22,7 +21,7 @@ from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
 from lpac.ground.station.client import GroundError
 from lpac.ground.station.protocol import CommandReport, Request
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.field import FaultyFleet, has_remote_control, scenario_of, settings_of
+from lpac.sim.drill.field import FaultyFleet
 from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
     Do,
@@ -41,7 +40,7 @@ from lpac.sim.drill.injections import (
     ProgramStops,
     VehicleInjection,
 )
-from lpac.sim.drill.truth import FlightTruth, VehicleTruth, vehicle_truth
+from lpac.sim.drill.truth import VehicleTruth, vehicle_truth
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.processes import Fleet
@@ -198,7 +197,7 @@ class ProcessField(FaultyFleet):
 
     def _late_since_s(self, began_s: float) -> float:
         """By the vehicles' time left out, or a robot's control; of those that nothing stopped."""
-        late_s = [self.fleet.lateness().vehicles_s]
+        late_s = [self.vehicles_late_s(began_s)]
         for robot in self.robots_by_name.values():
             overruns = [
                 heard.status.loops["control"].overruns
@@ -212,6 +211,10 @@ class ProcessField(FaultyFleet):
     @abstractmethod
     def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
         """Now, while `stepped` is held."""
+
+    @abstractmethod
+    def vehicles_late_s(self, began_s: float) -> float:
+        """How long the vehicles stood still since then (`time.monotonic()`)."""
 
     @abstractmethod
     def all_down(self) -> bool:
@@ -312,6 +315,10 @@ class MavlinkField(ProcessField):
                 for vehicle in self.vehicles
             )
 
+    def vehicles_late_s(self, began_s: float) -> float:
+        """In all."""
+        return self.fleet.lateness().vehicles_s
+
     def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
         """To the vehicle itself."""
         injection.apply(self.vehicles[robot], robot, self)
@@ -344,6 +351,14 @@ class Px4Field(ProcessField):
         with self.stepped:
             return all(vehicle.landed and not vehicle.armed for vehicle in self.vehicles)
 
+    def vehicles_late_s(self, began_s: float) -> float:
+        """At once: a PX4's clock runs slow by some per cent on a busy machine, and its timers do.
+
+        That is part of a flight.
+        """
+        assert isinstance(self.fleet.vehicles, Px4Build)
+        return self.fleet.vehicles.stood_still_s(began_s)
+
     def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
         """By its ground station's link."""
         vehicle = self.vehicles[robot]
@@ -371,33 +386,9 @@ class Px4Field(ProcessField):
         return tuple(truths)
 
 
-class RealTimeDrill:
-    """Flies faults with processes, each on a fleet of its own that is in the flight's folder."""
-
-    def __init__(self, robots: int, bundle: Path, px4_build: Path | None = None) -> None:
-        """With `px4_build` on real PX4s of that build."""
-        self._robots, self._bundle, self._px4_build = robots, bundle, px4_build
-
-    def fly(self, fault: Fault, seed: int, folder: Path) -> FlightTruth:
-        """One flight. Raises what `Fleet` and its parts do, and OverloadError."""
-        fleet = Fleet(
-            scenario_of(fault, seed, self._robots), folder, self._bundle,
-            px4_build=self._px4_build, settings=settings_of(fault),
-        )  # fmt: skip
-        if fleet.simulated is not None and has_remote_control(fault):
-            for vehicle in fleet.simulated.vehicles:
-                vehicle.rc_connected = True
-        with (
-            fleet,
-            GroundProgram(fleet.fleet_toml, fleet.name) as ground,
-            _field(fleet, ground) as field,
-        ):
-            timeline = field.fly(fault, seed)
-        return field.truth(timeline)
-
-
 @contextmanager
-def _field(fleet: Fleet, ground: GroundProgram) -> Iterator[ProcessField]:
+def process_field(fleet: Fleet, ground: GroundProgram) -> Iterator[ProcessField]:
+    """The field of these programs, whatever they fly; it ends before they do."""
     with ExitStack() as stack:
         field: ProcessField
         if fleet.simulated is not None:

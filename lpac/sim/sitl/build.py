@@ -146,10 +146,7 @@ class Px4Build:
                 f"robots = {len(starts_m)}: must be from 1 to {MAX_INSTANCES} with --vehicle px4, "
                 "since PX4 sends to one port from instance 10 on"
             )
-        build = build.expanduser().resolve()
-        fault = _build_fault(build)
-        if fault:
-            raise ValueError(f"--px4 {build}: {fault}")
+        build = require_build(build)
         if " " in str(build) or " " in str(folder):
             raise ValueError(f"--px4 {build}, --out {folder}: PX4 does not take spaces in paths")
         for number in range(len(starts_m)):
@@ -230,6 +227,16 @@ class Px4Build:
             for (first_s, px4_first_s), (last_s, px4_last_s) in clocks
         ]
         return max(0.0, *lost_s, 0.0)
+
+    def stood_still_s(self, since_s: float) -> float:
+        """The longest that one PX4's clock stood still at once, since then (`time.monotonic()`)."""
+        longest_s = 0.0
+        with self._heard_lock:
+            for instance in self._instances:
+                clock_s = np.array([pair for pair in instance.clock if pair[0] >= since_s])
+                passed_s = np.diff(clock_s.reshape(-1, 2), axis=0)
+                longest_s = max(longest_s, (passed_s[:, 0] - passed_s[:, 1]).max(initial=0.0))
+        return longest_s
 
     def last_setpoint_s(self, number: int) -> float:
         """When the last setpoint had reached a PX4, by its log: `time.monotonic()`."""
@@ -388,6 +395,15 @@ def frames(datagram: bytes) -> Iterator[tuple[int, bytes]]:
 def payload(frame: bytes, size: int) -> bytes:
     """The first bytes of a message's payload, of which zeros at its end are not sent."""
     return frame[_HEADER_BYTES : _HEADER_BYTES + min(frame[1], size)].ljust(size, b"\0")
+
+
+def require_build(build: Path) -> Path:
+    """The whole path of a build of PX4's simulator. Raises ValueError if it is none."""
+    build = build.expanduser().resolve()
+    fault = _build_fault(build)
+    if fault:
+        raise ValueError(f"--px4 {build}: {fault}")
+    return build
 
 
 def _build_fault(build: Path) -> str:
