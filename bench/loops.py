@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
 from bench.usage import Usage, usage
-from edge.messages.mission import LoopStatus, RobotStatus
+from edge.messages.mission import LoopStatus
+from lpac.analysis.logs import LoggedStatus
 from lpac.sim.fleet.flight import fly
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
@@ -50,7 +51,7 @@ class _Taken(NamedTuple):
 class _Flight(NamedTuple):
     """The robots' last statuses of a mission, and what their programs took in it."""
 
-    statuses: list[RobotStatus]
+    statuses: list[LoggedStatus]
     taken: list[_Taken]
 
 

@@ -30,12 +30,12 @@ from edge.identity.guard import Speaker
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon
 from edge.messages.mission import FlightState, RobotStatus
 from edge.messages.topics import MESSAGE, REVOKED
+from lpac.analysis.flight import least_separation
+from lpac.analysis.truth import TrueTrack
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
 from lpac.sim.description import ERRORS
-from lpac.sim.fleet.flight import least_separation
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.simulated import SimulatedFleet
-from lpac.sim.fleet.vehicles import TrueTrack
 from lpac.sim.radio import GROUND
 
 _CORES = 2
@@ -240,7 +240,7 @@ class _Flown:
     """`position_m` (N, T, 3) and `speed_m_s` (N, T), in truth and the mission frame."""
 
     fleet: SimulatedFleet
-    tracks: list[TrueTrack]
+    tracks: dict[str, TrueTrack]
     position_m: F64
     speed_m_s: F64
     down: int
@@ -255,14 +255,14 @@ def _flown(before: SimulatedFleet, lie: Lie, seed: int, mission_s: float) -> _Fl
     truths = [each.vehicle.truth for each in fleet.vehicles]
     return _Flown(
         fleet,
-        [
-            TrueTrack(
+        {
+            str(robot): TrueTrack(
                 np.array([entry.time_s for entry in truth]),
                 np.array([entry.position_m for entry in truth]),
                 np.array([not entry.landed for entry in truth], np.bool_),
             )
-            for truth in truths
-        ],
+            for robot, truth in enumerate(truths)
+        },
         np.array(
             [
                 [fleet.layout.to_mission.local_to_mission(np.array(e.position_m)) for e in truth]

@@ -11,6 +11,7 @@ has its own, see `lpac.ground.record`):
 | `policy` | a tick of the policy loop: features, neighbours' payloads, velocity, message sent |
 | `received` | a neighbour's message, and why it was refused if it was |
 | `control` | a tick of the control loop: state, position, setpoint, and what was sent of it |
+| `flight` | the same tick, for `lpac replay`: all that it was given, and made, or the changes |
 | `status`, `ground`, `vehicle` | `RobotStatus`, `GroundState`, `VehicleState` |
 | `order` | `Order`, and the answer to it |
 | `/pose` | `position_m` (3,) and `yaw_rad` (from x to y, or None) in the mission frame |
@@ -159,7 +160,7 @@ class FlightLog:
             raise ValueError(f"max_queued_messages = {max_queued_messages}: must be at least 1")
         self._directory = directory
         self._metadata = metadata
-        self._topics = _ROBOT_TOPICS if topics is None else topics
+        self._topics = ROBOT_TOPICS if topics is None else topics
         self._max_segment_bytes = max_segment_bytes
         self._max_total_bytes = max_total_bytes
         self._lock = Lock()
@@ -605,7 +606,7 @@ def _topic(name: str, schema: _Schema) -> LoggedTopic:
     return LoggedTopic(f"lpac.{name}", json.dumps(schema).encode(), _as_it_is)
 
 
-_ROBOT_TOPICS = {
+ROBOT_TOPICS = {
     "perception": _topic(
         "Perception", _object(images=_ARRAY, position_feature=_ARRAY, features=_ARRAY)
     ),
@@ -640,6 +641,9 @@ _ROBOT_TOPICS = {
             actions=_list(_STRING),
             closest_m=_NUMBER,
         ),
+    ),
+    "flight": _topic(
+        "Flight", _object(number=_INTEGER, whole=_BOOLEAN, given=_object(), made=_object())
     ),
     "status": topic("Status", RobotStatus),
     "order": topic("Order", Order, answer=OrderResult),

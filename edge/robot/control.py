@@ -13,6 +13,7 @@ from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
 from edge.flight.landing import Point, place_to_land, standing_robots
+from edge.flight.record import Given, made
 from edge.flight.safety import Closest, nearest
 from edge.flight.state import (
     FlightInputs,
@@ -162,6 +163,7 @@ class FlightControl:
             self._vehicle.command(action)
         dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s
         self._last_tick_s = now_s
+        given = Given(robot, before, inputs, self._guidance, dt_s)
         setpoint, self._guidance = guide(robot, decision.flight, inputs, self._guidance, dt_s)
         local = None if setpoint is None else self._navigation.to_local(setpoint, vehicle)
         sent = None if local is None else self._vehicle.send(local)
@@ -171,6 +173,11 @@ class FlightControl:
                 "flight state", state=flight.state, was=before.state, reason=flight.reason.text
             )
         self._record(inputs, setpoint, sent, decision.actions)
+        self._recorder.record(
+            "flight",
+            self._unix_clock_s(),
+            {"given": given, "made": made(decision, setpoint, self._guidance)},
+        )
         return sent is not None and not failsafe_acts(vehicle)
 
     def _hear_time(self, ground: GroundState, at_s: float) -> None:

@@ -5,7 +5,8 @@ import json
 from importlib.metadata import version
 from pathlib import Path
 
-from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.drivers.flight_log import ROBOT_TOPICS, FlightLog, FlightMetadata
+from edge.flight.record import FlightTick, TickWriter
 from edge.robot.config import RobotConfig
 
 
@@ -19,5 +20,14 @@ def open_log(config: RobotConfig, bundle_id: str, boot_nonce: int) -> FlightLog:
         configuration=json.dumps(dataclasses.asdict(config), default=str),
         version=version("lpac-edge"),
     )
-    max_total_bytes = int(config.log.max_total_mb * 1e6)
-    return FlightLog(Path(config.log.folder), metadata, max_total_bytes=max_total_bytes)
+    # The log's thread makes the messages: nothing of them can delay or end a control tick.
+    ticks = TickWriter()
+    flight = ROBOT_TOPICS["flight"]._replace(
+        convert=lambda _, tick: ticks.message(FlightTick(**tick))
+    )
+    return FlightLog(
+        Path(config.log.folder),
+        metadata,
+        {**ROBOT_TOPICS, "flight": flight},
+        max_total_bytes=int(config.log.max_total_mb * 1e6),
+    )

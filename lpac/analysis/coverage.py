@@ -1,4 +1,4 @@
-"""What a fleet's positions are worth: the paper's coverage cost, its bound, and Voronoi cells."""
+"""What a fleet's positions are worth: the paper's coverage cost, Lloyd's, and Voronoi cells."""
 
 import math
 from typing import Protocol
@@ -26,7 +26,7 @@ _FURTHEST_M = 1e6
 
 
 class World(Protocol):
-    """What `Coverage` needs to know of the world; `Setup` says what each is."""
+    """What `Coverage` is made of; `lpac.analysis.snapshot.FleetSetup` says what each is."""
 
     @property
     def world(self) -> str: ...
@@ -48,26 +48,30 @@ class Coverage:
     `importance` is (world_size, world_size), indexed [x, y]; `size_m` is the world's side.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, importance: F32, cells_per_m: float) -> None:
+        self.importance = importance
+        self.size_m = len(importance) / cells_per_m
+        self.cells_per_m = cells_per_m
+
+    @classmethod
+    def of(cls, world: World) -> "Coverage":
         """Raises ValueError if the world's text is no world file."""
         features = parse_world(world.world, f"world {world.world_id}")
-        self.importance: F32 = rasterize(features, world.world_size, world.truncation, world.norm)
-        self.size_m = world.world_size / world.env_scale
-        self._cells_per_m = world.env_scale
+        importance = rasterize(features, world.world_size, world.truncation, world.norm)
+        return cls(importance, world.env_scale)
 
     def cost(self, positions_m: F64) -> float:
         """The coverage cost J of the paper in model units (see `coverage_cost`); N >= 1."""
-        return coverage_cost(self.importance, positions_m * self._cells_per_m)
+        return coverage_cost(self.importance, positions_m * self.cells_per_m)
 
-    def clairvoyant(self, positions_m: F64) -> float:
+    def lloyd(self, positions_m: F64) -> float:
         """The least J that as many robots come to by Lloyd's algorithm, which knows the world.
 
-        From `positions_m`, and from random starts that are the same each time; N >= 1. This is a
-        bound for comparison, not the least J that there is. It takes 0.5 s for 10 robots, 2 s for
-        30.
+        From `positions_m`, and from random starts that are the same each time; N >= 1. It ends in
+        local minima: other starts may come to less. It takes 0.5 s for 10 robots, 2 s for 30.
         """
         coarse, cells = _shrink(self.importance, _COARSE_CELLS)
-        cells_per_m = self._cells_per_m / cells
+        cells_per_m = self.cells_per_m / cells
         best = self.cost(positions_m)
         for start in (positions_m * cells_per_m, *_random_starts(coarse, len(positions_m))):
             best = min(best, self.cost(_lloyd(coarse, start) / cells_per_m))

@@ -1,275 +1,167 @@
-"""The report's figures: made for print, for the screen, and for the colour-blind."""
+"""All figures of flights, from their records. Times are s from the mission's begin."""
 
-import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap, to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from edge.core import F64
 from edge.messages.mission import FlightState
-from lpac.analysis.trials import LOOPS, LoopLateness, Messages, RobotTrack, Trial
+from lpac.analysis import style
+from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, RobotRecord
+from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 
-_STYLE: dict[Any, Any] = {
-    "font.family": "serif",
-    "font.serif": ["DejaVu Serif"],
-    "mathtext.fontset": "dejavuserif",
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.linewidth": 0.6,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "xtick.direction": "in",
-    "ytick.direction": "in",
-    "legend.frameon": False,
-    "savefig.dpi": 200,
-}
-_WIDTH_IN = 7.16
-_DENSITY = LinearSegmentedColormap.from_list(
-    "density", ["#ffffff", "#c6dbef", "#6baed6", "#2171b5", "#08306b"]
-)
-_SCALE = LinearSegmentedColormap.from_list("scale", ["#fff7ec", "#fdbb84", "#d7301f", "#7f0000"])
-_UNSEEN_STRENGTH = 0.25
-_INK, _GREY, _FAINT, _PATH, _FENCE = "#252525", "#636363", "#bdbdbd", "#d95f0e", "#7a0177"
-# By position: told apart in print and by the colour-blind (Okabe and Ito's colours).
-_CURVES: tuple[tuple[str, Any], ...] = (
-    ("#000000", "-"),
-    ("#d55e00", "--"),
-    ("#0072b2", "-."),
-    ("#009e73", (0, (5, 1))),
-    ("#cc79a7", ":"),
-    ("#e69f00", (0, (3, 1, 1, 1))),
-    ("#56b4e9", (0, (1, 1))),
-)
-_S = FlightState
-_STATE_COLOURS = {
-    _S.INIT: "#f0f0f0",
-    _S.IDLE: "#f0f0f0",
-    _S.PREFLIGHT: "#d0d0d0",
-    _S.ARMING: "#f6d7a0",
-    _S.TAKEOFF: "#e69f00",
-    _S.HOLD: "#f0e442",
-    _S.MISSION: "#009e73",
-    _S.RETURN: "#56b4e9",
-    _S.LAND: "#0072b2",
-    _S.LANDED: "#d0d0d0",
-    _S.PILOT: "#cc79a7",
-    _S.FAULT: "#000000",
-}
-_MOST_CURVES = len(_CURVES)
+SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
+LLOYD = "Lloyd, who knows the world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
 _MOST_NAMES, _MOST_TICKS = 12, 8
+_LONGEST_IN_DISC = 2
+_HALO = [withStroke(linewidth=1.6, foreground="white")]
 
 
-class Pictures:
-    """Figures on their way to files: `folder`/`name`.png and .pdf. `drawn` is PNG by name."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.drawn: dict[str, bytes] = {}
-
-    def save(self, name: str, figure: Figure) -> None:
-        """Raises OSError if it cannot be written."""
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with mpl.rc_context(_STYLE):
-            figure.savefig(self._folder / f"{name}.pdf")
-            # It is laid out now: that takes as long again as drawing.
-            figure.set_layout_engine("none")
-            png = io.BytesIO()
-            figure.savefig(png, format="png")
-        self.drawn[name] = png.getvalue()
-        (self._folder / f"{name}.png").write_bytes(png.getvalue())
-
-
-def snapshots(trial: Trial, times_s: Sequence[float]) -> Figure:
+def snapshots(flight: FlightRecord, times_s: Sequence[float]) -> Figure:
     """Robots, Voronoi cells and paths so far, over the density that was seen by then."""
     rows = -(-len(times_s) // 4)
     columns = -(-len(times_s) // rows)
-    with mpl.rc_context(_STYLE):
-        side_in = _WIDTH_IN / columns
-        figure = Figure(figsize=(_WIDTH_IN, rows * (side_in + 0.35)), layout="constrained")
-        panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-        for axes in panels.ravel()[len(times_s) :]:
-            axes.set_visible(False)
-        for axes, time_s in zip(panels.ravel(), times_s, strict=False):
-            _draw_world(axes, trial, time_s)
-            _draw_cells(axes, trial, time_s)
-            for track in trial.tracks:
-                _draw_path(axes, track, 0.0, time_s)
-            _draw_robots(axes, trial.places_at(time_s))
-            axes.set_title(f"$t$ = {round(time_s, 1):g} s")
-        _frame(panels, trial, margin=False)
-        for axes in panels.ravel()[len(times_s) - columns : len(times_s)]:
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel("x (m)")
+    with style.figure(WIDTH_IN, rows * (WIDTH_IN / columns + 0.35) + 0.25) as figure:
+        _draw_snapshots(figure, flight, times_s, rows, columns)
         return figure
 
 
-def start_and_end(trial: Trial) -> Figure:
-    """Where the robots began and ended the mission, and their paths between."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(5.5, 3.5), layout="constrained")
-        panels = figure.subplots(1, 1, squeeze=False)
-        axes = panels[0, 0]
-        _draw_world(axes, trial)
-        _draw_cells(axes, trial, trial.duration_s)
-        for track in trial.tracks:
-            _draw_path(axes, track, 0.0, trial.duration_s)
-            axes.plot(
-                *track.said[-1].landing_point_m,
-                ls="", marker="x", ms=4.5, color=_INK, mew=1.0, zorder=7,
-            )  # fmt: skip
-        _draw_robots(axes, trial.places_at(0.0), filled=False)
-        _draw_robots(axes, trial.places_at(trial.duration_s), names=True)
-        handles: list[Any] = [
-            Line2D([], [], ls="", marker="o", ms=5, mfc="white", mec=_PATH, mew=1.2, label="start"),
-            Line2D([], [], ls="", marker="o", ms=5, color=_PATH, mec="k", mew=0.5, label="end"),
-            Line2D([], [], color=_PATH, lw=0.9, label="path"),
-            Line2D([], [], ls="", marker="x", ms=4.5, color=_INK, label="landing point"),
-            Line2D([], [], color=_GREY, lw=0.7, label="Voronoi cell at the end"),
-        ]
-        if trial.fence is not None:
-            axes.add_patch(
-                Polygon(trial.fence.vertices_m, fill=False, ec=_FENCE, lw=0.9, ls=(0, (6, 3)))
-            )
-            handles.append(Line2D([], [], color=_FENCE, lw=0.9, ls=(0, (6, 3)), label="fence"))
-        _frame(panels, trial, margin=True)
-        figure.legend(handles=handles, loc="outside right center", handlelength=2.2)
+def snapshots_and_costs(flights: Mapping[str, FlightRecord]) -> Figure:
+    """Snapshots of the first flight above the costs of all, by their names."""
+    first = next(iter(flights.values()))
+    with style.figure(WIDTH_IN, 4.3) as figure:
+        rows = figure.add_gridspec(2, 1, height_ratios=(1.12, 0.88))
+        above, below = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
+        _draw_snapshots(above, first, [share * first.duration_s for share in SNAPSHOTS], 1, 4)
+        axes = below.subplots()
+        for (name, flight), (colour, dashes) in zip(flights.items(), style.CURVES, strict=False):
+            _draw_cost(axes, flight, colour, dashes, name)
+        _frame_costs(axes, max(flight.duration_s for flight in flights.values()))
         return figure
 
 
-def costs(trials: Sequence[Trial]) -> Figure:
-    """Normalised coverage cost over time, beside the clairvoyant bound, of each trial."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 2.5), layout="constrained")
-        axes = figure.subplots()
-        for index, trial in enumerate(trials):
-            colour, style = _CURVES[index % _MOST_CURVES]
-            cost = trial.normalized
-            axes.plot(
-                trial.cost_time_s, cost, color=colour, ls=style, lw=1.4,
-                label=f"{cost[-1]:.2f}  {trial.name}",
-            )  # fmt: skip
-            axes.axhline(
-                trial.normalized_bound, color=colour, lw=0.8, ls=(0, (1, 2)),
-                label=f"{trial.normalized_bound:.2f}  bound, clairvoyant",
-            )  # fmt: skip
-        _draw_cost_axes(axes, max(trial.duration_s for trial in trials))
-        axes.legend(
-            loc="center left", bbox_to_anchor=(1.01, 0.5), title="$J$ at the end / $J(0)$",
-            alignment="left", handlelength=2.8,
+def start_and_end(flight: FlightRecord) -> Figure:
+    """The field: where the robots were in the mission, and where they took off and landed."""
+    with style.figure(6.2, 4.0) as figure:
+        handles = _draw_field(figure.subplots(), flight)
+        figure.legend(handles=handles, loc="outside right center")
+        return figure
+
+
+def overview(flight: FlightRecord) -> Figure:
+    """The field, beside states, heights and coverage cost over time."""
+    with style.figure(WIDTH_IN, 4.7) as figure:
+        columns = figure.add_gridspec(1, 2, width_ratios=(1.08, 1.0))
+        left, right = figure.add_subfigure(columns[0]), figure.add_subfigure(columns[1])
+        handles = _draw_field(left.subplots(), flight)
+        left.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=7)
+        upper, middle, lower = right.subplots(3, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0))
+        handles = _draw_states(upper, flight)
+        upper.legend(
+            handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=6.5,
+            handlelength=1.0, handleheight=0.8, columnspacing=1.0, borderpad=0.2,
         )  # fmt: skip
+        _draw_heights(middle, flight)
+        if len(flight.normalized):
+            _draw_cost(lower, flight, style.BLACK, "-", "as they said")
+            if np.isfinite(flight.true_cost).any():
+                lower.plot(
+                    flight.curve_time_s, flight.normalized_true, color=style.VERMILLION, ls="--",
+                    lw=1.2, label=f"{flight.normalized_true[-1]:.2f}  where they were",
+                )  # fmt: skip
+            _draw_lloyd(lower, flight)
+            lower.legend(
+                loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=2, fontsize=6.5,
+                handlelength=1.8, columnspacing=1.0, handletextpad=0.5, borderpad=0.1,
+            )  # fmt: skip
+        lower.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, None))
+        tidy(lower)
+        lower.set(xlabel="time since the mission began (s)", xlim=(flight.from_s, flight.to_s))
+        right.align_ylabels([upper, middle, lower])
         return figure
 
 
-def repeatability(trials: Sequence[Trial]) -> Figure:
+def costs(flights: Sequence[FlightRecord]) -> Figure:
+    """Normalised coverage cost over time, beside what Lloyd's algorithm comes to, of each."""
+    with style.figure(WIDTH_IN, 2.5) as figure:
+        axes = figure.subplots()
+        for index, flight in enumerate(flights):
+            colour, dashes = style.CURVES[index % len(style.CURVES)]
+            _draw_cost(axes, flight, colour, dashes, flight.name)
+            _draw_lloyd(axes, flight, colour)
+        _frame_costs(axes, max(flight.duration_s for flight in flights))
+        return figure
+
+
+def repeatability(flights: Sequence[FlightRecord]) -> Figure:
     """All trials' cost, their mean and spread; and where the robots ended, trial by trial."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 3.1), layout="constrained")
+    colours = style.trial_colours(len(flights))
+    with style.figure(WIDTH_IN, 3.1) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-        end_s = min(trial.duration_s for trial in trials)
+        end_s = min(flight.duration_s for flight in flights)
         times_s = np.linspace(0.0, end_s, 300)
-        curves = np.array([np.interp(times_s, t.cost_time_s, t.normalized) for t in trials])
-        for trial, colour in zip(trials, _trial_colours(len(trials)), strict=True):
-            left.plot(trial.cost_time_s, trial.normalized, color=colour, lw=0.8)
+        curves = np.array([np.interp(times_s, f.curve_time_s, f.normalized) for f in flights])
+        for flight, colour in zip(flights, colours, strict=True):
+            left.plot(flight.curve_time_s, flight.normalized, color=colour, lw=0.8)
         mean, deviation = curves.mean(axis=0), curves.std(axis=0, ddof=1)
-        left.fill_between(
-            times_s, mean - deviation, mean + deviation, color=_FAINT, alpha=0.6, lw=0
-        )
+        left.fill_between(times_s, mean - deviation, mean + deviation, color=FAINT, alpha=0.6, lw=0)
         left.plot(times_s, mean, color="k", lw=1.8)
-        bound = float(np.mean([trial.normalized_bound for trial in trials]))
-        left.axhline(bound, color="k", lw=0.8, ls=(0, (1, 2)))
+        lloyd = float(np.mean([flight.normalized_lloyd for flight in flights]))
+        left.axhline(lloyd, color="k", lw=0.8, ls=style.DOTTED)
         left.legend(
             handles=[
                 Line2D([], [], color="k", lw=1.8, label=f"mean, {mean[-1]:.2f} at {end_s:.0f} s"),
-                Patch(color=_FAINT, label=f"standard deviation, {deviation[-1]:.3f}"),
-                Line2D([], [], color="k", lw=0.8, ls=(0, (1, 2)), label=f"bound, {bound:.2f}"),
+                Patch(color=FAINT, label=f"standard deviation, {deviation[-1]:.3f}"),
+                Line2D([], [], color="k", lw=0.8, ls=style.DOTTED, label=f"{LLOYD}, {lloyd:.2f}"),
             ],
-            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, handlelength=1.6, fontsize=7,
+            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, handlelength=1.6, fontsize=7,
             columnspacing=1.0, borderaxespad=0.2,
         )  # fmt: skip
-        _draw_cost_axes(left, max(trial.duration_s for trial in trials))
-        if all(trial.coverage is trials[0].coverage for trial in trials):
-            _draw_world(right, trials[0])
-        for trial, colour in zip(trials, _trial_colours(len(trials)), strict=True):
-            places_m = np.array(list(trial.places_at(trial.duration_s).values())).reshape(-1, 2)
+        _frame_cost_axes(left, max(flight.duration_s for flight in flights))
+        if all(flight.coverage is flights[0].coverage for flight in flights):
+            _draw_world(right, flights[0])
+        for flight, colour in zip(flights, colours, strict=True):
+            places_m = np.array(list(flight.places_at(flight.duration_s).values())).reshape(-1, 2)
             right.plot(*places_m.T, ls="", marker="o", ms=4.5, color=colour, mec="k", mew=0.4)
         right.set_title("end positions, coloured by trial")
-        _frame(np.array([[right]]), trials[0], margin=False)
-        if len(trials) <= _MOST_NAMES:
+        _frame(np.array([[right]]), flights[0], margin=False)
+        if len(flights) <= _MOST_NAMES:
             handles = [
-                Line2D([], [], ls="", marker="o", ms=4.5, color=colour, mec="k", label=trial.name)
-                for trial, colour in zip(trials, _trial_colours(len(trials)), strict=True)
+                Line2D([], [], ls="", marker="o", ms=4.5, color=colour, mec="k", label=flight.name)
+                for flight, colour in zip(flights, colours, strict=True)
             ]
             figure.legend(
-                handles=handles, loc="outside lower center", ncols=min(len(trials), 6),
-                columnspacing=1.2, handlelength=1.0,
+                handles=handles, loc="outside lower center", ncols=min(len(flights), 6),
+                handlelength=1.0,
             )  # fmt: skip
         return figure
 
 
-def states(trial: Trial) -> Figure:
+def states(flight: FlightRecord) -> Figure:
     """A bar per robot, coloured by state, with alarms and restarts on it."""
-    with mpl.rc_context(_STYLE):
-        count = len(trial.tracks)
-        figure = Figure(figsize=(_WIDTH_IN, 0.9 + 0.2 * max(count, 3)), layout="constrained")
+    with style.figure(WIDTH_IN, 0.9 + 0.2 * max(len(flight.robots), 3)) as figure:
         axes = figure.subplots()
-        seen: set[FlightState] = set()
-        for row, track in enumerate(trial.tracks):
-            for state, begin_s, end_s in track.intervals(trial.to_s):
-                seen.add(state)
-                colour = _STATE_COLOURS[state]
-                axes.barh(row, end_s - begin_s, left=begin_s, height=0.8, color=colour, lw=0)
-            nonces = [said.boot_nonce for said in track.said]
-            for k in range(1, len(nonces)):
-                if nonces[k] != nonces[k - 1]:
-                    axes.plot(track.time_s[k], row, marker="|", ms=9, color="k", mew=1.5)
-        rows = {track.name: row for row, track in enumerate(trial.tracks)}
-        for time_s, robot, *_ in trial.alarms:
-            axes.plot(
-                time_s, rows[robot], ls="", marker="v", ms=5, color="#d55e00", mec="w", mew=0.5
-            )
-        for at_s in (0.0, trial.duration_s):
-            axes.axvline(at_s, color=_INK, lw=0.6, ls=(0, (4, 2)))
-        named = {state.value: c for state, c in _STATE_COLOURS.items() if state in seen}
-        # States of one colour share their entry.
-        labels = {
-            colour: ", ".join(name for name, c in named.items() if c == colour)
-            for colour in dict.fromkeys(named.values())
-        }
-        handles: list[Any] = [Patch(color=colour, label=label) for colour, label in labels.items()]
-        if trial.alarms:
-            handles.append(
-                Line2D([], [], ls="", marker="v", ms=5, color="#d55e00", mec="w", label="new alarm")
-            )
-        if trial.restarts:
-            handles.append(Line2D([], [], ls="", marker="|", ms=9, color="k", label="restart"))
+        handles = _draw_states(axes, flight)
         figure.legend(
             handles=handles, loc="outside upper center", ncols=len(handles), handlelength=1.0,
-            handleheight=0.8, columnspacing=1.2,
+            handleheight=0.8,
         )  # fmt: skip
-        axes.set(
-            xlabel="time (s)", xlim=(trial.from_s, trial.to_s), ylim=(count - 0.4, -0.6),
-            yticks=range(count), yticklabels=[track.name for track in trial.tracks],
-        )  # fmt: skip
-        axes.tick_params(axis="y", length=0)
-        axes.spines[["top", "right", "left"]].set_visible(False)
+        axes.set(xlabel="time (s)", xlim=(flight.from_s, flight.to_s))
         return figure
 
 
-def messages(trial: Trial, told: Messages) -> Figure:
+def messages(flight: FlightRecord, told: Messages) -> Figure:
     """How old messages were, and how many did not come: pair by pair, and over time."""
-    names = [track.name for track in trial.tracks]
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 4.6), layout="constrained")
+    names = [robot.name for robot in flight.robots]
+    with style.figure(WIDTH_IN, 4.6) as figure:
         rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1.0))
         upper, lower = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
         panels = upper.subplots(1, 2)
@@ -277,39 +169,40 @@ def messages(trial: Trial, told: Messages) -> Figure:
         _draw_matrix(upper, panels[0], age_ms, names, "median age (ms)", _MUCH_MS)
         _draw_matrix(upper, panels[1], loss, names, "lost (%)", _MUCH_LOSS)
         left, right = lower.subplots(1, 2)
-        edges_s = np.linspace(0.0, trial.duration_s, max(2, min(61, int(trial.duration_s) + 1)))
+        edges_s = np.linspace(0.0, flight.duration_s, max(2, min(61, int(flight.duration_s) + 1)))
         middles_s = (edges_s[1:] + edges_s[:-1]) / 2.0
         bins = np.digitize(told.heard_at_s, edges_s) - 1
-        for share, style, name in ((0.5, "-", "median"), (0.95, "--", "95th percentile")):
+        for share, dashes, name in ((0.5, "-", "median"), (0.95, "--", "95th percentile")):
             values = [_quantile(told.heard_age_s[bins == b], share) for b in range(len(middles_s))]
-            left.plot(middles_s, 1e3 * np.array(values), color="#0072b2", ls=style, label=name)
+            left.plot(middles_s, 1e3 * np.array(values), color=style.BLUE, ls=dashes, label=name)
         left.set(ylabel="message age (ms)")
         left.legend(loc="upper right", ncols=2)
         came = np.histogram(told.heard_at_s, edges_s)[0]
         missing = np.histogram(told.gaps[:, 0], edges_s, weights=told.gaps[:, 1])[0]
         share_lost = 100.0 * missing / np.maximum(came + missing, 1)
-        right.stairs(share_lost, edges_s, fill=True, color="#d55e00", alpha=0.4, lw=0, zorder=2)
-        right.stairs(share_lost, edges_s, baseline=None, color="#d55e00", lw=1.4, zorder=3)
+        right.stairs(
+            share_lost, edges_s, fill=True, color=style.VERMILLION, alpha=0.4, lw=0, zorder=2
+        )
+        right.stairs(share_lost, edges_s, baseline=None, color=style.VERMILLION, lw=1.4, zorder=3)
         right.set(ylabel="lost (%)")
         # That nothing was lost is a line to be seen, too: above the axis.
         for axes, least, below in ((left, 10.0, 0.0), (right, _MUCH_LOSS, 0.05)):
             highest = max(1.25 * axes.get_ylim()[1], least)
             axes.set(
-                xlabel="time (s)", xlim=(0.0, trial.duration_s), ylim=(-below * highest, highest)
+                xlabel="time (s)", xlim=(0.0, flight.duration_s), ylim=(-below * highest, highest)
             )
-            _tidy(axes)
+            tidy(axes)
         return figure
 
 
-def loops(trial: Trial) -> Figure:
+def loops(flight: FlightRecord) -> Figure:
     """How late the loops' ticks were: over time, and robot by robot at the end."""
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 3.6), layout="constrained")
+    with style.figure(WIDTH_IN, 3.6) as figure:
         panels = figure.subplots(2, len(LOOPS), sharey="row")
         for column, loop in enumerate(LOOPS):
-            _draw_lateness(panels[0, column], trial, trial.lateness[loop])
+            _draw_lateness(panels[0, column], flight, flight.lateness[loop])
             panels[0, column].set_title(f"{loop} loop")
-            _draw_robots_lateness(panels[1, column], trial.lateness[loop])
+            _draw_robots_lateness(panels[1, column], flight.lateness[loop])
         panels[0, 0].set_ylabel("lateness, 99th\npercentile (ms)")
         panels[1, 0].set_ylabel("lateness at\nthe end (ms)")
         panels[0, 0].legend(loc="upper left", handlelength=1.6, fontsize=7)
@@ -321,24 +214,24 @@ def loops(trial: Trial) -> Figure:
         return figure
 
 
-def _draw_lateness(axes: Axes, trial: Trial, robots: Mapping[str, LoopLateness]) -> None:
+def _draw_lateness(axes: Axes, flight: FlightRecord, robots: Mapping[str, LoopLateness]) -> None:
     for index, late in enumerate(robots.values()):
         label = "each robot" if index == 0 else None
-        axes.plot(late.time_s, late.p99_ms, color="#56b4e9", lw=0.6, alpha=0.8, label=label)
+        axes.plot(late.time_s, late.p99_ms, color=style.SKY, lw=0.6, alpha=0.8, label=label)
     if robots:
-        times_s = np.linspace(0.0, trial.duration_s, 200)
+        times_s = np.linspace(0.0, flight.duration_s, 200)
         curves = np.array([np.interp(times_s, r.time_s, r.p99_ms) for r in robots.values()])
-        axes.plot(times_s, curves.max(axis=0), color="#d55e00", lw=1.2, label="worst robot")
+        axes.plot(times_s, curves.max(axis=0), color=style.VERMILLION, lw=1.2, label="worst robot")
         axes.plot(times_s, np.median(curves, axis=0), color="k", lw=1.2, label="median robot")
-    axes.set(xlabel="time (s)", xlim=(0.0, trial.duration_s))
-    _tidy(axes)
+    axes.set(xlabel="time (s)", xlim=(0.0, flight.duration_s))
+    tidy(axes)
 
 
 def _draw_robots_lateness(axes: Axes, robots: Mapping[str, LoopLateness]) -> None:
     places = np.arange(len(robots))
     for key, colour, marker, label in (
-        ("max_ms", "#d55e00", "^", "maximum"),
-        ("p99_ms", "#0072b2", "s", "99 %"),
+        ("max_ms", style.VERMILLION, "^", "maximum"),
+        ("p99_ms", style.BLUE, "s", "99 %"),
         ("p50_ms", "k", "o", "median"),
     ):
         values = [getattr(late, key)[-1] for late in robots.values()]
@@ -346,64 +239,244 @@ def _draw_robots_lateness(axes: Axes, robots: Mapping[str, LoopLateness]) -> Non
     step = -(-len(robots) // _MOST_TICKS) or 1
     axes.set(xlim=(-0.6, max(len(robots) - 0.4, 0.6)), xlabel="robot")
     axes.set_xticks(places[::step], list(robots)[::step])
-    _tidy(axes)
+    tidy(axes)
 
 
-def _draw_world(axes: Axes, trial: Trial, time_s: float | None = None) -> None:
+def _draw_snapshots(
+    figure: Any, flight: FlightRecord, times_s: Sequence[float], rows: int, columns: int
+) -> None:
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for axes in panels.ravel()[len(times_s) :]:
+        axes.set_visible(False)
+    for axes, time_s in zip(panels.ravel(), times_s, strict=False):
+        _draw_world(axes, flight, time_s)
+        _draw_cells(axes, flight, time_s)
+        for robot in flight.robots:
+            _draw_path(axes, robot, 0.0, time_s, style.SWARM)
+        _draw_robots(axes, flight.places_at(time_s), small=True)
+        axes.set_title(f"$t$ = {round(time_s, 1):g} s")
+    _frame(panels, flight, margin=False)
+    for axes in panels.ravel()[len(times_s) - columns : len(times_s)]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("x (m)")
+    handles: list[Any] = [
+        _robot_handle(style.SWARM, "robot, its number"),
+        Line2D([], [], color=style.SWARM, lw=1.0, label="path so far"),
+    ]
+    if flight.coverage is not None:
+        handles += _world_handles()
+    figure.legend(
+        handles=handles, loc="outside upper center", ncols=len(handles), fontsize=6.5,
+        handlelength=1.6, handleheight=0.9, columnspacing=1.0, handletextpad=0.5,
+    )  # fmt: skip
+
+
+def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
+    """The world as it was seen in the end, the fence, and each robot; gives the legend's."""
+    _draw_world(axes, flight, flight.duration_s)
+    _draw_cells(axes, flight, flight.duration_s)
+    handles: list[Any] = [_robot_handle(FAINT, "robot at the end, its number")]
+    begin_s, end_s = (0.0, flight.duration_s) if flight.duration_s else (flight.from_s, flight.to_s)
+    colours = {r.name: style.robot_colour(i) for i, r in enumerate(flight.robots)}
+    for robot in flight.robots:
+        _draw_path(axes, robot, begin_s, end_s, colours[robot.name])
+        if robot.name in flight.truth:
+            track = flight.truth[robot.name]
+            true_m = track.position_m[(track.time_s >= begin_s) & (track.time_s <= end_s), :2]
+            axes.plot(*true_m.T, color=colours[robot.name], lw=0.7, ls=style.DASHED)
+            if len(track.position_m):
+                axes.plot(
+                    *track.position_m[0, :2], ls="", marker="s", ms=4.5, mfc="white",
+                    mec=colours[robot.name], mew=1.0, zorder=4,
+                )  # fmt: skip
+        if robot.said:
+            axes.plot(
+                *robot.said[-1].landing_point_m, ls="", marker="x", ms=4.5,
+                color=colours[robot.name], mew=1.2, zorder=4, path_effects=_HALO,
+            )  # fmt: skip
+    start_m, end_m = flight.places_at(0.0), flight.places_at(flight.duration_s)
+    for name, place_m in start_m.items():
+        axes.plot(*place_m, ls="", marker="o", ms=3.0, mfc="white", mec=colours[name], mew=1.0)
+    _draw_robots(axes, end_m, colours)
+    handles += [
+        Line2D([], [], ls="", marker="o", ms=3, mfc="white", mec=INK, label="where it began"),
+        Line2D([], [], color=INK, lw=0.9, label="path, as it said"),
+    ]
+    if flight.truth:
+        handles += [
+            Line2D([], [], color=INK, lw=0.7, ls=style.DASHED, label="path, in truth"),
+            Line2D([], [], mec=INK, marker="s", ms=4, mfc="white", ls="", label="pad, in truth"),
+        ]
+    handles.append(Line2D([], [], color=INK, marker="x", ms=4, ls="", label="landing point"))
+    if flight.coverage is not None:
+        handles += _world_handles()
+    if flight.fence is not None:
+        axes.add_patch(
+            Polygon(flight.fence.vertices_m, fill=False, ec=style.FENCE, lw=0.9, ls=(0, (6, 3)))
+        )
+        handles.append(Line2D([], [], color=style.FENCE, lw=0.9, ls=(0, (6, 3)), label="fence"))
+    _frame(np.array([[axes]]), flight, margin=True)
+    return handles
+
+
+def _draw_states(axes: Axes, flight: FlightRecord) -> list[Any]:
+    """Gives the legend's."""
+    seen: set[FlightState] = set()
+    for row, robot in enumerate(flight.robots):
+        for state, begin_s, end_s in robot.intervals(flight.to_s):
+            seen.add(state)
+            colour = style.STATE_COLOURS[state]
+            axes.barh(row, end_s - begin_s, left=begin_s, height=0.8, color=colour, lw=0)
+        nonces = [said.boot_nonce for said in robot.said]
+        for k in range(1, len(nonces)):
+            if nonces[k] != nonces[k - 1]:
+                axes.plot(robot.time_s[k], row, marker="|", ms=9, color="k", mew=1.5)
+    rows = {robot.name: row for row, robot in enumerate(flight.robots)}
+    alarm: Any = {"ls": "", "marker": "v", "ms": 5, "color": style.VERMILLION, "mec": "w"}
+    for time_s, name, *_ in flight.alarms:
+        axes.plot(time_s, rows[name], mew=0.5, **alarm)
+    for at_s in (0.0, flight.duration_s) if flight.duration_s else ():
+        axes.axvline(at_s, color=INK, lw=0.6, ls=(0, (4, 2)))
+    named = {state.value: c for state, c in style.STATE_COLOURS.items() if state in seen}
+    # States of one colour share their entry.
+    labels = {
+        colour: ", ".join(name for name, c in named.items() if c == colour)
+        for colour in dict.fromkeys(named.values())
+    }
+    handles: list[Any] = [Patch(color=colour, label=label) for colour, label in labels.items()]
+    if flight.alarms:
+        handles.append(Line2D([], [], label="new alarm", **alarm))
+    if flight.restarts:
+        handles.append(Line2D([], [], ls="", marker="|", ms=9, color="k", label="restart"))
+    count = len(flight.robots)
+    axes.set(
+        ylabel="robot", ylim=(count - 0.4, -0.6), yticks=range(count),
+        yticklabels=[robot.name for robot in flight.robots],
+    )  # fmt: skip
+    axes.tick_params(axis="y", length=0, labelsize=8 if count <= _MOST_NAMES else 5)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    return handles
+
+
+def _draw_heights(axes: Axes, flight: FlightRecord) -> None:
+    """In the air; each robot has its own colour, and its name at its greatest height."""
+    for index, robot in enumerate(flight.robots):
+        height_m = np.where(robot.flying, robot.position_m[:, 2], np.nan)
+        axes.plot(robot.time_s, height_m, color=style.robot_colour(index), lw=0.9)
+        at = np.searchsorted(robot.time_s, flight.duration_s)
+        if at < len(height_m) and np.isfinite(height_m[at]):
+            axes.annotate(
+                robot.name, (flight.duration_s, height_m[at]), (2, 0), va="center", fontsize=5,
+                textcoords="offset points", path_effects=_HALO,
+            )  # fmt: skip
+    axes.set(ylabel="height (m)", ylim=(0.0, None))
+    tidy(axes)
+
+
+def _draw_cost(axes: Axes, flight: FlightRecord, colour: str, dashes: Any, name: str) -> None:
+    if len(flight.normalized):
+        axes.plot(
+            flight.curve_time_s, flight.normalized, color=colour, ls=dashes, lw=1.3,
+            label=f"{flight.normalized[-1]:.2f}  {name}",
+        )  # fmt: skip
+
+
+def _draw_lloyd(axes: Axes, flight: FlightRecord, colour: str = style.LLOYD) -> None:
+    share = flight.normalized_lloyd
+    axes.plot(
+        (0.0, flight.duration_s), (share, share), color=colour, lw=1.0, ls=style.DOTTED,
+        label=f"{share:.2f}  {LLOYD}",
+    )  # fmt: skip
+
+
+def _frame_costs(axes: Axes, end_s: float) -> None:
+    _frame_cost_axes(axes, end_s)
+    axes.legend(
+        loc="center left", bbox_to_anchor=(1.01, 0.5), title="$J$ at the end / $J(0)$",
+        alignment="left", handlelength=2.8, fontsize=7,
+    )  # fmt: skip
+
+
+def _frame_cost_axes(axes: Axes, end_s: float) -> None:
+    axes.set(
+        xlabel="time (s)", ylabel=r"coverage cost $J(t)\,/\,J(0)$", xlim=(0.0, end_s),
+        ylim=(0.0, None),
+    )  # fmt: skip
+    tidy(axes)
+
+
+def _draw_world(axes: Axes, flight: FlightRecord, time_s: float | None = None) -> None:
     """The density; with a time faint where nobody had looked by then, which is outlined."""
-    coverage = trial.coverage
+    coverage = flight.coverage
     if coverage is None:
         return
     extent = (0.0, coverage.size_m, 0.0, coverage.size_m)
     shown = coverage.importance / max(float(coverage.importance.max()), 1e-9)
     if time_s is not None:
-        seen = trial.seen(time_s)
-        shown = shown * np.where(seen, 1.0, _UNSEEN_STRENGTH)
+        seen = flight.seen(time_s)
+        shown = shown * np.where(seen, 1.0, style.UNSEEN_STRENGTH)
         if seen.any() and not seen.all():
             axes.contour(
-                seen.T.astype(float), levels=[0.5], extent=extent, colors=_GREY, linewidths=0.4
-            )
+                seen.T.astype(float), levels=[0.5], extent=extent, colors=style.SEEN,
+                linewidths=0.7, linestyles=[style.DOTTED],
+            )  # fmt: skip
     axes.imshow(
-        shown.T, origin="lower", extent=extent, cmap=_DENSITY, vmin=0.0, vmax=1.0,
+        shown.T, origin="lower", extent=extent, cmap=style.DENSITY, vmin=0.0, vmax=1.0,
         interpolation="bilinear",
     )  # fmt: skip
-    axes.add_patch(Rectangle((0.0, 0.0), coverage.size_m, coverage.size_m, fill=False, ec=_FAINT))
+    axes.add_patch(Rectangle((0.0, 0.0), coverage.size_m, coverage.size_m, fill=False, ec=FAINT))
 
 
-def _draw_cells(axes: Axes, trial: Trial, time_s: float) -> None:
-    places_m = np.array(list(trial.places_at(time_s).values())).reshape(-1, 2)
-    if trial.coverage is None or len(places_m) < 2:
+def _draw_cells(axes: Axes, flight: FlightRecord, time_s: float) -> None:
+    places_m = np.array(list(flight.places_at(time_s).values())).reshape(-1, 2)
+    if flight.coverage is None or len(places_m) < 2:
         return
-    for cell_m in trial.coverage.cells_m(places_m):
+    for cell_m in flight.coverage.cells_m(places_m):
         if cell_m:
-            axes.add_patch(Polygon(cell_m, fill=False, ec=_GREY, lw=0.7, joinstyle="round"))
+            axes.add_patch(Polygon(cell_m, fill=False, ec=GREY, lw=0.5, joinstyle="round"))
 
 
-def _draw_path(axes: Axes, track: RobotTrack, begin_s: float, end_s: float) -> None:
-    shown = (track.time_s >= begin_s) & (track.time_s <= end_s)
-    path_m = np.where(track.flying[shown, None], track.position_m[shown, :2], np.nan)
-    axes.plot(*path_m.T, color=_PATH, lw=0.9, solid_capstyle="round")
+def _draw_path(
+    axes: Axes, robot: RobotRecord, begin_s: float, end_s: float, colour: str
+) -> None:  # fmt: skip
+    shown = (robot.time_s >= begin_s) & (robot.time_s <= end_s)
+    path_m = np.where(robot.flying[shown, None], robot.position_m[shown, :2], np.nan)
+    axes.plot(*path_m.T, color=colour, lw=1.0, solid_capstyle="round", path_effects=_HALO)
 
 
 def _draw_robots(
-    axes: Axes, places_m: Mapping[str, tuple[float, float]], *, filled: bool = True,
-    names: bool = False,
+    axes: Axes, places_m: Mapping[str, tuple[float, float]],
+    colours: Mapping[str, str] | None = None, *, small: bool = False,
 ) -> None:  # fmt: skip
-    if not places_m:
-        return
-    xy_m = np.array(list(places_m.values())).T
-    face, edge, width = (_PATH, "k", 0.5) if filled else ("white", _PATH, 1.2)
-    size = 5.0 if len(places_m) <= _MOST_NAMES else 3.5
-    axes.plot(*xy_m, ls="", marker="o", ms=size, color=face, mec=edge, mew=width, zorder=5)
-    if names:
-        for name, place_m in places_m.items():
-            axes.annotate(
-                name, place_m, (4, 4), textcoords="offset points", fontsize=6.5, zorder=6,
-                bbox={"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.75},
-            )  # fmt: skip
+    """Discs with the robots' names in them, or beside them if they are long."""
+    inside = all(len(name) <= _LONGEST_IN_DISC for name in places_m)
+    size = (6.5 if small else 8.0) if inside else 4.5
+    for name, place_m in places_m.items():
+        colour = style.SWARM if colours is None else colours[name]
+        axes.plot(*place_m, ls="", marker="o", ms=size, color=colour, mec="k", mew=0.5, zorder=5)
+        white = inside and colour in style.DARK
+        axes.annotate(
+            name, place_m, (0, 0) if inside else (4, 4), textcoords="offset points", zorder=6,
+            ha="center" if inside else "left", va="center_baseline" if inside else "bottom",
+            fontsize=4.5 if small else 5.5, color="w" if white else "k",
+            path_effects=None if inside else _HALO,
+        )  # fmt: skip
 
 
-def _frame(panels: Any, trial: Trial, *, margin: bool) -> None:
+def _world_handles() -> list[Any]:
+    return [
+        Line2D([], [], color=GREY, lw=0.6, label="Voronoi cells"),
+        Patch(color=style.DENSITY(0.9), label="density, seen"),
+        Patch(color=style.DENSITY(0.9 * style.UNSEEN_STRENGTH), label="density, not yet seen"),
+        Line2D([], [], color=style.SEEN, lw=0.8, ls=style.DOTTED, label="edge of the seen"),
+    ]
+
+
+def _robot_handle(colour: str, label: str) -> Line2D:
+    return Line2D([], [], ls="", marker="o", ms=5.5, color=colour, mec="k", mew=0.5, label=label)
+
+
+def _frame(panels: Any, flight: FlightRecord, *, margin: bool) -> None:
     """What maps have in common: the world's limits, or with a margin all that was flown in."""
     for axes in panels.ravel():
         axes.set_aspect("equal")
@@ -413,11 +486,11 @@ def _frame(panels: Any, trial: Trial, *, margin: bool) -> None:
         axes.set_xlabel("x (m)")
     for axes in panels[:, 0]:
         axes.set_ylabel("y (m)")
-    points_m = [track.position_m[track.flying, :2] for track in trial.tracks]
-    if trial.coverage is not None:
-        points_m.append(np.array([(0.0, 0.0), (trial.coverage.size_m, trial.coverage.size_m)]))
-    if margin and trial.fence is not None:
-        points_m.append(np.array(trial.fence.vertices_m))
+    points_m = [robot.position_m[robot.flying, :2] for robot in flight.robots]
+    if flight.coverage is not None:
+        points_m.append(np.array([(0.0, 0.0), (flight.coverage.size_m, flight.coverage.size_m)]))
+    if margin and flight.fence is not None:
+        points_m.append(np.array(flight.fence.vertices_m))
     known_m = np.concatenate(points_m)
     known_m = known_m[np.isfinite(known_m[:, 0])]
     if len(known_m) == 0:
@@ -426,30 +499,22 @@ def _frame(panels: Any, trial: Trial, *, margin: bool) -> None:
     panels[0, 0].set(xlim=(x_low, x_high), ylim=(y_low, y_high))
 
 
-def _draw_cost_axes(axes: Axes, end_s: float) -> None:
-    axes.set(
-        xlabel="time (s)", ylabel=r"coverage cost $J(t)\,/\,J(0)$", xlim=(0.0, end_s),
-        ylim=(0.0, None),
-    )  # fmt: skip
-    _tidy(axes)
-
-
 def _draw_matrix(
     figure: Any, axes: Axes, values: F64, names: list[str], label: str, much: float
 ) -> None:
     """`much` has the strongest colour, unless there is more."""
     highest = max(values[np.isfinite(values)].max(initial=0.0), much)
-    image = axes.imshow(values, cmap=_SCALE, vmin=0.0, vmax=highest)
+    image = axes.imshow(values, cmap=style.SCALE, vmin=0.0, vmax=highest)
     step = 1 if len(names) <= _MOST_NAMES else -(-len(names) // _MOST_TICKS)
     ticks = np.arange(0, len(names), step)
     axes.set_xticks(ticks, names[::step])
     axes.set_yticks(ticks, names[::step])
     axes.tick_params(length=0)
-    axes.set(xlabel="sender", ylabel="receiver", facecolor="#f0f0f0")
+    axes.set(xlabel="sender", ylabel="receiver", facecolor=style.NOTHING)
     if len(names) <= _MOST_NAMES:
         for row, column in np.argwhere(np.isfinite(values)):
             value = values[row, column]
-            colour = "white" if value > 0.6 * highest else _INK
+            colour = "white" if value > 0.6 * highest else INK
             axes.text(
                 column, row, f"{value:.1f}" if value < 10.0 else f"{value:.0f}", ha="center",
                 va="center", fontsize=6.5, color=colour,
@@ -460,14 +525,3 @@ def _draw_matrix(
 def _quantile(values: F64, share: float) -> float:
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if len(known) else float("nan")
-
-
-def _trial_colours(count: int) -> list[str]:
-    if count < _MOST_CURVES:  # black is the mean
-        return [colour for colour, _ in _CURVES[1 : count + 1]]
-    return [to_hex(colour) for colour in mpl.colormaps["viridis"](np.linspace(0.0, 0.9, count))]
-
-
-def _tidy(axes: Axes) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y", color="#d9d9d9", linewidth=0.4)

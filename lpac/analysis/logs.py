@@ -8,8 +8,8 @@ whose clocks were wrong line up. Without a ground's log their own clocks must do
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -21,8 +21,9 @@ from edge.core.fence import Fence
 from edge.core.schema import from_mapping
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, read, read_metadata
 from edge.messages.codes import Reason, Refusal
-from edge.messages.mission import FlightState, LoopStatus
+from edge.messages.mission import FlightState, LoopStatus, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
+from lpac.analysis.truth import TRUTH, TrueTrack, load_truth
 
 # Of the times from saying to hearing, the share that may be shorter than the one that is believed.
 _EARLY = 0.1
@@ -44,11 +45,13 @@ class LoggedStatus:
     time_s: float
     boot_nonce: int
     state: FlightState
+    reason: Reason
     trial: str
     armed: bool | None
     position_m: tuple[float, float, float] | None
     alarms: tuple[Reason, ...]
     loops: Mapping[str, LoopStatus]
+    message_counts: Mapping[str, int]
     fence: Fence | None
     battery: float | None
     landing_point_m: tuple[float, float]
@@ -88,7 +91,8 @@ class Logs:
 
     `clocks_known` are the programs that a ground heard; of the others' clocks nothing is known.
     `programs_logged` are those whose own logs were found. `setups` are in the order of the times,
-    Unix s, at which they were told. `notes` are for the reader.
+    Unix s, at which they were told. `truths` are where vehicles were, by robot id, of one
+    simulation each. `notes` are for the reader.
     """
 
     names: dict[int, str] = field(default_factory=dict)
@@ -100,6 +104,7 @@ class Logs:
     setups: list[tuple[float, FleetSetup]] = field(default_factory=list)
     events: list[GroundEvent] = field(default_factory=list)
     orders: list[Ordered] = field(default_factory=list)
+    truths: list[Mapping[int, TrueTrack]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def name(self, robot_id: int) -> str:
@@ -108,7 +113,7 @@ class Logs:
 
 
 def read_logs(folders: Sequence[Path], progress: Progress) -> Logs:
-    """Read all robots' and grounds' logs below `folders`.
+    """Read all robots' and grounds' logs below `folders`, and what vehicles tell beside them.
 
     Raises ValueError if there are none, or a folder is not there.
     """
@@ -123,11 +128,25 @@ def read_logs(folders: Sequence[Path], progress: Progress) -> Logs:
         raise ValueError(
             f"{where}: holds no logs (robot-*.mcap, ground-*.mcap): `lpac fleet pull` fetches them"
         )
+    truths = [path for folder in folders for path in sorted(folder.rglob(TRUTH))]
+    return read_files([*paths, *truths], progress)
+
+
+def read_files(paths: Sequence[Path], progress: Progress = lambda *_: None) -> Logs:
+    """Read these logs of robots and grounds, and files that tell where vehicles were."""
     reader = _LogReader()
     paths = list(dict.fromkeys(path.resolve() for path in paths))
     for index, path in enumerate(paths):
         progress(f"reading {path.name}", index / len(paths))
         reader.read(path)
+    return reader.logs()
+
+
+def logs_of(statuses: Iterable[RobotStatus]) -> Logs:
+    """As if the robots' logs had been read, of which only what they said was kept."""
+    reader = _LogReader()
+    for status in statuses:
+        reader.take_status(status)
     return reader.logs()
 
 
@@ -148,9 +167,20 @@ class _LogReader:
         self._orders: list[tuple[Program, Ordered]] = []  # in the robot's clock
         self._events: set[GroundEvent] = set()
 
+    def take_status(self, status: RobotStatus) -> None:
+        """Take what a robot said, as its log would have it."""
+        logged = json.loads(json.dumps(asdict(status)))
+        self._take_status((status.robot_id, status.boot_nonce), logged)
+
     def read(self, path: Path) -> None:
         """Take what is understood of a file; a note tells of the rest."""
         notes = self._logs.notes
+        if path.name == TRUTH:
+            try:
+                self._logs.truths.append(load_truth(path))
+            except ValueError as error:
+                notes.append(f"{error}: left out")
+            return
         # topic -> why each message was not understood
         odd: dict[str, list[str]] = defaultdict(list)
         begun = False
@@ -254,6 +284,7 @@ class _LogReader:
             time_s=_time_s(status, "uptime_s"),
             boot_nonce=int(status["boot_nonce"]),
             state=FlightState(status["state"]),
+            reason=_known(Reason, status["reason"], "reason"),
             trial=status["trial"],
             armed=bool(status["armed"]),
             position_m=position_m,
@@ -263,6 +294,7 @@ class _LogReader:
                 for name, loop in status["loops"].items()
                 if None not in [_finite(loop[key]) for key in _LATENESS]
             },
+            message_counts={name: int(count) for name, count in status["message_counts"].items()},
             fence=fence,
             battery=_finite(status["battery"]),
             landing_point_m=(landing_x_m, landing_y_m),

@@ -7,14 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import NamedTuple
 
-from lpac.analysis.trials import LOOPS, LoopLateness, Trial
+from edge.core import F64
+from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness
 
 _CAPTIONS = {
     "snapshots": "Robots, their paths so far and Voronoi cells over the density, which is faint "
     "where no robot had looked by then.",
     "start-and-end": "Where the robots began and ended the mission.",
-    "cost": "Coverage cost over that at the begin, beside the clairvoyant bound: what Lloyd's "
-    "algorithm comes to that knows the whole density.",
+    "cost": "Coverage cost over that at the begin, beside what Lloyd's algorithm comes to, which "
+    "knows the whole density: a mark for comparison, and not the least that there is.",
     "states": "What each robot did; dashed: begin and end of the mission.",
     "messages": "Messages between the robots during the mission: age when they came, and the share "
     "that did not come, by the gaps in the senders' numbering.",
@@ -47,7 +48,7 @@ td.number { font-variant-numeric: tabular-nums; white-space: nowrap; }
 class Drawn(NamedTuple):
     """A trial, and its figures: PNG by name."""
 
-    trial: Trial
+    trial: FlightRecord
     figures: Mapping[str, bytes]
 
 
@@ -82,9 +83,9 @@ def page(
     return "\n".join(part for part in parts if part) + "\n"
 
 
-def _summary(trials: Sequence[Trial]) -> str:
+def _summary(trials: Sequence[FlightRecord]) -> str:
     header = (
-        "trial", "began", "s", "robots", "J at begin", "J at end", "J/J(0)", "bound",
+        "trial", "began", "s", "robots", "J at begin", "J at end", "J/J(0)", "Lloyd",
         "least distance", "inside fence", "messages lost", "alarms", "restarts",
     )  # fmt: skip
     rows = []
@@ -96,11 +97,11 @@ def _summary(trials: Sequence[Trial]) -> str:
                 f'<a href="#trial-{number}">{_text(trial.name)}</a>',
                 f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S}",
                 f"{trial.duration_s:.0f}",
-                str(len(trial.tracks)),
+                str(len(trial.robots)),
                 f"{cost[0]:.3g}" if len(cost) else "",
                 f"{cost[-1]:.3g}" if len(cost) else "",
                 f"{trial.normalized[-1]:.2f}" if len(trial.normalized) else "",
-                _number(trial.normalized_bound, "{:.2f}"),
+                _number(trial.normalized_lloyd, "{:.2f}"),
                 "" if separation is None else f"{separation.distance_m:.2f} m",
                 _marked(f"{trial.fence_margin_m:.2f} m", trial.fence_margin_m < 0.0)
                 if math.isfinite(trial.fence_margin_m)
@@ -113,9 +114,9 @@ def _summary(trials: Sequence[Trial]) -> str:
     return _table(header, rows, numbers=range(1, len(header)))
 
 
-def _about(trial: Trial) -> str:
+def _about(trial: FlightRecord) -> str:
     words = [
-        f"{len(trial.tracks)} robots, {trial.duration_s:.0f} s, from "
+        f"{len(trial.robots)} robots, {trial.duration_s:.0f} s, from "
         f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S %Z}."
     ]
     if trial.separation is not None:
@@ -124,27 +125,35 @@ def _about(trial: Trial) -> str:
             f"Least distance, as the robots said: {trial.separation.distance_m:.2f} m between "
             f"{one} and {other}, at {trial.separation.time_s:.1f} s."
         )
+    if trial.true_separation is not None:
+        one, other = trial.true_separation.robots
+        words.append(
+            f"In truth: {trial.true_separation.distance_m:.2f} m between {one} and {other}, at "
+            f"{trial.true_separation.time_s:.1f} s; {trial.true_fence_margin_m:.2f} m inside the "
+            f"fence; cost at the end {_number(_last(trial.normalized_true), '{:.2f}')} of the "
+            "initial."
+        )
     if not trial.clocks_known:
         words.append("Each robot's times are its own clock's: no ground log tells the offsets.")
     return f"<p>{_text(' '.join(words))}</p>"
 
 
-def _robots(trial: Trial) -> str:
+def _robots(trial: FlightRecord) -> str:
     header = (
         "robot", "battery at end", *(f"{loop} late, 99 % / max" for loop in LOOPS), "overruns",
         "restarts",
     )  # fmt: skip
     rows = []
-    for track in trial.tracks:
-        late = [trial.lateness[loop].get(track.name) for loop in LOOPS]
-        battery = track.said[-1].battery
+    for robot in trial.robots:
+        late = [trial.lateness[loop].get(robot.name) for loop in LOOPS]
+        battery = robot.said[-1].battery
         rows.append(
             (
-                _text(track.name),
+                _text(robot.name),
                 "" if battery is None else f"{100.0 * battery:.0f} %",
                 *map(_late, late),
                 str(sum(loop.overruns for loop in late if loop is not None)),
-                str(trial.restarts.get(track.name, 0)),
+                str(trial.restarts.get(robot.name, 0)),
             )
         )
     return "<h3>Robots</h3>" + _table(header, rows, numbers=range(1, len(header)))
@@ -154,14 +163,14 @@ def _late(loop: LoopLateness | None) -> str:
     return "" if loop is None else f"{loop.p99_ms[-1]:.1f} / {loop.max_ms[-1]:.1f} ms"
 
 
-def _alarms(trial: Trial) -> str:
+def _alarms(trial: FlightRecord) -> str:
     if not trial.alarms:
         return ""
     rows = [(_time(a.time_s), _text(a.robot), _text(a.text)) for a in trial.alarms]
     return "<h3>Alarms</h3>" + _table(("s", "robot", "alarm"), rows, numbers=(0,))
 
 
-def _commands(trial: Trial) -> str:
+def _commands(trial: FlightRecord) -> str:
     if not trial.commands:
         return ""
     rows = [
@@ -200,6 +209,10 @@ def _figure(png: bytes, caption: str, *, narrow: bool = False) -> str:
 
 def _marked(text: str, bad: bool) -> str:
     return f'<span class="bad">{text}</span>' if bad else text
+
+
+def _last(values: F64) -> float:
+    return float(values[-1]) if len(values) else math.nan
 
 
 def _time(time_s: float) -> str:

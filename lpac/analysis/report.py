@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac.analysis.coverage import Coverage
+from lpac.analysis.flight import FlightRecord, Separation
 from lpac.analysis.logs import Logs, Progress, configured_fence, read_logs
-from lpac.analysis.trials import Mission, Trial, find_missions, trial_of
+from lpac.analysis.trials import Mission, find_missions, record_of
 
 _MOST_NOTES = 3  # in one line
 
@@ -60,7 +61,7 @@ class Wanted:
 class Examined(NamedTuple):
     """The trials in some logs, and what a reader should know of these."""
 
-    trials: tuple[Trial, ...]
+    trials: tuple[FlightRecord, ...]
     notes: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
@@ -83,7 +84,7 @@ def examine(folders: Sequence[Path], wanted: Wanted, progress: Progress) -> Exam
     trials = []
     for index, mission in enumerate(chosen):
         progress(f"examining {mission.name}", index / len(chosen))
-        trial = trial_of(
+        trial = record_of(
             logs, mission, [other for other in missions if other is not mission],
             *worlds.of(mission), fences.get(mission.robots[0]),
         )  # fmt: skip
@@ -164,7 +165,7 @@ class _Worlds:
             return None
         name = id_of(text)
         if (name, sizes) not in self._coverages:
-            self._coverages[name, sizes] = Coverage(
+            self._coverages[name, sizes] = Coverage.of(
                 _World(text, name, sizes.world_size, sizes.env_scale, sizes.truncation, sizes.norm)
             )
         return self._coverages[name, sizes]
@@ -218,19 +219,19 @@ def _policy(configuration: str) -> dict[str, Any]:
     return policy if isinstance(policy, dict) else {}
 
 
-def _notes(logs: Logs, trial: Trial, wanted: Wanted) -> Iterable[str]:
+def _notes(logs: Logs, trial: FlightRecord, wanted: Wanted) -> Iterable[str]:
     late_s = [f"{time_s:g}" for time_s in wanted.times_s if time_s > trial.duration_s]
     if late_s:
         yield f"{trial.name}: lasted {trial.duration_s:.1f} s: no snapshot at {', '.join(late_s)} s"
     if len(trial.cost) and not len(trial.normalized):
         yield f"{trial.name}: the world holds no importance: no normalised cost"
     silent = [
-        track.name
-        for track in trial.tracks
-        if not {(track.robot_id, said.boot_nonce) for said in track.said} & logs.programs_logged
+        robot.name
+        for robot in trial.robots
+        if not {(robot.robot_id, said.boot_nonce) for said in robot.said} & logs.programs_logged
     ]
     if silent:
-        whose = "any robot" if len(silent) == len(trial.tracks) else ", ".join(silent)
+        whose = "any robot" if len(silent) == len(trial.robots) else ", ".join(silent)
         yield (
             f"{trial.name}: no log of {whose} is here, only what the ground heard: nothing is "
             "known of the messages that came there"
@@ -245,26 +246,38 @@ def _notes(logs: Logs, trial: Trial, wanted: Wanted) -> Iterable[str]:
             )
 
 
-def _values(trial: Trial) -> dict[str, Any]:
+def _values(trial: FlightRecord) -> dict[str, Any]:
     """What is to be said of a trial, as JSON values."""
     told = trial.messages
     return {
         "trial": trial.name,
         "began_unix_s": round(trial.begin_s, 3),
         "duration_s": round(trial.duration_s, 3),
-        "robots": [track.name for track in trial.tracks],
+        "robots": [robot.name for robot in trial.robots],
         "worlds": list(trial.world_ids),
         "cost": {
             "initial": _first(trial.cost, 0),
             "final": _first(trial.cost, -1),
             "normalized": _first(trial.normalized, -1),
-            "bound": _number(trial.bound),
-            "normalized_bound": _number(trial.normalized_bound),
-            "time_s": trial.cost_time_s[: len(trial.normalized)].round(3).tolist(),
+            # Of Lloyd's algorithm, which knows the world; scripts know it by this name.
+            "bound": _number(trial.lloyd),
+            "normalized_bound": _number(trial.normalized_lloyd),
+            "time_s": trial.curve_time_s[: len(trial.normalized)].round(3).tolist(),
             "curve": trial.normalized.round(6).tolist(),
         },
-        "separation": None if trial.separation is None else trial.separation._asdict(),
+        "separation": _apart(trial.separation),
         "fence_margin_m": _number(trial.fence_margin_m),
+        "truth": {
+            "cost": {
+                "initial": _first(trial.true_cost, 0),
+                "final": _first(trial.true_cost, -1),
+                "normalized": _first(trial.normalized_true, -1),
+            },
+            "separation": _apart(trial.true_separation),
+            "fence_margin_m": _number(trial.true_fence_margin_m),
+        }
+        if trial.truth
+        else None,
         "restarts": dict(trial.restarts),
         "alarms": [alarm._asdict() for alarm in trial.alarms],
         "commands": [command._asdict() for command in trial.commands],
@@ -292,6 +305,10 @@ def _values(trial: Trial) -> dict[str, Any]:
         "start_m": trial.places_at(0.0),
         "end_m": trial.places_at(trial.duration_s),
     }
+
+
+def _apart(separation: Separation | None) -> dict[str, Any] | None:
+    return None if separation is None else separation._asdict()
 
 
 def _first(values: Any, index: int) -> float | None:

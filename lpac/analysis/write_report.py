@@ -8,15 +8,14 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from lpac.analysis import figures
+from lpac.analysis import figures, style
+from lpac.analysis.flight import LOOPS, FlightRecord
 from lpac.analysis.logs import Progress
 from lpac.analysis.page import Drawn, page
 from lpac.analysis.report import Examined
-from lpac.analysis.trials import LOOPS, Trial
 
 PAGE = "report.html"
 SUMMARY = "report.json"
-_SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a trial's duration
 
 
 def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Progress) -> Path:
@@ -30,10 +29,8 @@ def write(examined: Examined, out: Path, times_s: Sequence[float], progress: Pro
     with_cost = [trial for trial in examined.trials if len(trial.normalized)]
     if len(with_cost) > 1:
         progress("drawing all trials", 1.0)
-        pictures = figures.Pictures(out)
-        pictures.save("repeatability", figures.repeatability(with_cost))
-        pictures.save("costs", figures.costs(with_cost))
-        repeatability = pictures.drawn["repeatability"]
+        repeatability = style.save(figures.repeatability(with_cost), out / "repeatability")
+        style.save(figures.costs(with_cost), out / "costs")
     (out / SUMMARY).write_text(json.dumps(examined.summary(), indent=2) + "\n")
     names = ", ".join(trial.name for trial in examined.trials[:3])
     names += ", …" if len(drawn) > 3 else ""
@@ -54,18 +51,19 @@ def _slug(name: str, taken: set[str]) -> str:
     return slug
 
 
-def _draw(trial: Trial, folder: Path, times_s: Sequence[float]) -> dict[str, bytes]:
+def _draw(trial: FlightRecord, folder: Path, times_s: Sequence[float]) -> dict[str, bytes]:
     """PNG by figure."""
-    pictures = figures.Pictures(folder)
     shown_s = [time_s for time_s in times_s if time_s <= trial.duration_s]
-    shown_s = shown_s or [share * trial.duration_s for share in _SNAPSHOTS]
-    pictures.save("snapshots", figures.snapshots(trial, shown_s))
-    pictures.save("start-and-end", figures.start_and_end(trial))
+    shown_s = shown_s or [share * trial.duration_s for share in figures.SNAPSHOTS]
+    drawn = {
+        "snapshots": figures.snapshots(trial, shown_s),
+        "start-and-end": figures.start_and_end(trial),
+    }
     if len(trial.normalized):
-        pictures.save("cost", figures.costs([trial]))
-    pictures.save("states", figures.states(trial))
+        drawn["cost"] = figures.costs([trial])
+    drawn["states"] = figures.states(trial)
     if trial.messages is not None and len(trial.messages.heard_at_s):
-        pictures.save("messages", figures.messages(trial, trial.messages))
+        drawn["messages"] = figures.messages(trial, trial.messages)
     if any(trial.lateness[loop] for loop in LOOPS):
-        pictures.save("loops", figures.loops(trial))
-    return pictures.drawn
+        drawn["loops"] = figures.loops(trial)
+    return {name: style.save(figure, folder / name) for name, figure in drawn.items()}

@@ -27,7 +27,7 @@ _COMMANDS = {
     "site": "Places to fly at: origin, fence, pads and landing points, beside fleet.toml.",
     "record": "Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs.",
     "report": "Make figures and one HTML page of flight logs; of several trials, how they repeat.",
-    "replay": "Run the policy again on what flight logs hold, and compare with what it computed.",
+    "replay": "Run policy and flight decisions again on flight logs; say what differs.",
     "fleet": "Deploy to the robots, start and stop them.",
     "export": "Export a trained torch checkpoint as a bundle that runs without torch.",
     "bundle": "Look at a policy bundle; verify or time it on this machine.",

@@ -1,16 +1,26 @@
-"""`lpac replay`: run the policy again on what a flight log holds."""
+"""`lpac replay`: run again what a flight log holds."""
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lpac.cli.apps import new_app
 
+if TYPE_CHECKING:
+    from edge.drivers.flight_log import FlightMetadata
+    from edge.flight.replay import FlightReplay
+    from edge.policy.bundle import Bundle
+    from edge.policy.lpac.replay import Comparison
+
 app = new_app()
+
+# Of each log; `--json` has all.
+_MOST_ROWS = 20
+_ROUNDS = "another kind of processor rounds otherwise in the last digits, the same one does not"
 
 
 @app.command()
@@ -23,68 +33,183 @@ def replay(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Run the policy again on what flight logs hold, and compare with what it computed."""
-    from itertools import chain
-
-    from edge.drivers.flight_log import read, read_metadata
-    from edge.policy.bundle import BundleError, load_bundle
-    from edge.policy.lpac.policy import LpacPolicy
-    from edge.policy.lpac.replay import replay as run_again
+    """Run policy and flight decisions again on flight logs; say what differs."""
+    from edge.drivers.flight_log import read_metadata
 
     paths = list(_segments(logs))
     metadata = {path: read_metadata(path) for path in paths}
-    bundle_path = bundle or Path(metadata[paths[0]].bundle_path)
-    try:
-        policy_bundle = load_bundle(bundle_path)
-    except BundleError as error:
-        if bundle:
-            raise
-        raise ValueError(f"{error} (where the robot had its bundle: give --bundle)") from None
-    for path, flown in metadata.items():
-        if flown.bundle_id != policy_bundle.id:
-            raise ValueError(
-                f"{path}: flew with bundle {flown.bundle_id[:12]}, "
-                f"and {bundle_path} is {policy_bundle.id[:12]}"
-            )
-    comparisons = run_again(
-        LpacPolicy(policy_bundle), chain.from_iterable(read(path) for path in paths)
-    )
-    _, velocity, _ = comparisons
-    if not velocity.ticks:
+    flights = _flights(metadata)
+    flown = any(flight.ticks for flight in flights.values())
+    policy_bundle: Bundle | None = None
+    comparisons: tuple[Comparison, ...] = ()
+    if _has_policy_ticks(paths):
+        policy_bundle, comparisons = _policy(metadata, bundle)
+    elif not flown:
         raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
-    differing = [c for c in comparisons if c.differing]
     if as_json:
-        report = {
-            "bundle": policy_bundle.id,
-            "robots": sorted({flown.robot_id for flown in metadata.values()}),
-            "logs": [str(path) for path in paths],
-            "outputs": {
-                c.name: {
-                    "ticks": c.ticks,
-                    "differing": c.differing,
-                    "largest_difference": _or_none(c.largest_difference),
-                }
-                for c in comparisons
-            },
-        }
-        typer.echo(json.dumps(report, indent=2))
+        typer.echo(
+            json.dumps(
+                {
+                    "bundle": policy_bundle and policy_bundle.id,
+                    "robots": sorted({each.robot_id for each in metadata.values()}),
+                    "logs": [str(path) for path in paths],
+                    "outputs": {c.name: _output(c) for c in comparisons},
+                    "flights": [
+                        _flight(path, metadata[path], flight) for path, flight in flights.items()
+                    ],
+                },
+                indent=2,
+            )
+        )
     else:
         for c in comparisons:
             typer.echo(
                 f"{c.name:12} {c.ticks:7,} ticks, {c.differing:,} differ, "
                 f"largest difference {c.largest_difference:g}"
             )
+        _print_flights(flights, metadata)
+    problems = []
+    differing = [c for c in comparisons if c.differing]
     if differing:
         offs = ", ".join(f"{c.name} by up to {c.largest_difference:g}" for c in differing)
-        raise ValueError(
-            f"not what was computed in flight: {offs}: another kind of processor rounds otherwise "
-            "in the last digits, the same one does not"
+        problems.append(f"not what was computed in flight: {offs}: {_ROUNDS}")
+    if any(flight.differing for flight in flights.values()):
+        ticks = sum(flight.differing for flight in flights.values())
+        rounds = all(d.differing.is_rounding for f in flights.values() for d in f.differences)
+        problems.append(
+            f"not what was decided in flight: {ticks:,} ticks differ"
+            + (f" in the last digits alone: {_ROUNDS}" if rounds else "")
         )
-    if not as_json:
+    if problems:
+        raise ValueError("; ".join(problems))
+    if not as_json and policy_bundle is not None:
         typer.echo(
             f"{policy_bundle.manifest.name} {policy_bundle.id[:12]}: "
             "computes what it computed in flight"
         )
+    if not as_json and flown:
+        typer.echo("flight: decides what it decided in flight")
+
+
+def _policy(
+    metadata: "Mapping[Path, FlightMetadata]", given: Path | None
+) -> "tuple[Bundle, tuple[Comparison, ...]]":
+    """The bundle, and what it computes now of all its ticks."""
+    from itertools import chain
+
+    from edge.drivers.flight_log import read
+    from edge.policy.bundle import BundleError, load_bundle
+    from edge.policy.lpac.policy import LpacPolicy
+    from edge.policy.lpac.replay import replay as run_again
+
+    bundle_path = given or Path(next(iter(metadata.values())).bundle_path)
+    try:
+        bundle = load_bundle(bundle_path)
+    except BundleError as error:
+        if given:
+            raise
+        raise ValueError(f"{error} (where the robot had its bundle: give --bundle)") from None
+    for path, flown in metadata.items():
+        if flown.bundle_id != bundle.id:
+            raise ValueError(
+                f"{path}: flew with bundle {flown.bundle_id[:12]}, "
+                f"and {bundle_path} is {bundle.id[:12]}"
+            )
+    messages = chain.from_iterable(read(path, "perception", "policy") for path in metadata)
+    return bundle, run_again(LpacPolicy(bundle), messages)
+
+
+def _has_policy_ticks(paths: Iterable[Path]) -> bool:
+    from edge.drivers.flight_log import read
+
+    return any(True for path in paths for _ in read(path, "policy"))
+
+
+def _flights(metadata: "Mapping[Path, FlightMetadata]") -> "dict[Path, FlightReplay]":
+    """What the programs decide now, by their logs. A program's segments are in order."""
+    from edge.drivers.flight_log import read
+    from edge.flight.record import TickError, TickReader
+    from edge.flight.replay import FlightReplay
+
+    readers: dict[FlightMetadata, TickReader] = {}
+    flights = {}
+    for path, program in metadata.items():
+        flights[path] = flight = FlightReplay(readers.setdefault(program, TickReader()))
+        for _, unix_time_s, message in read(path, "flight"):
+            try:
+                flight.run(unix_time_s, message)
+            except TickError as error:
+                raise ValueError(
+                    f"{path}: flight at {unix_time_s:.3f} s: {error} "
+                    f"(written by lpac-edge {program.version})"
+                ) from None
+    return flights
+
+
+def _print_flights(
+    flights: "Mapping[Path, FlightReplay]", metadata: "Mapping[Path, FlightMetadata]"
+) -> None:
+    from lpac.cli.printing import print_table
+
+    rows = []
+    width = max(12, *(len(path.stem) for path in flights))
+    for path, flight in flights.items():
+        name, robot = f"{path.stem:{width}}", str(metadata[path].robot_id)
+        if not flight.ticks:
+            typer.echo(
+                f"{name} holds nothing that its flight was decided by "
+                f"(written by lpac-edge {metadata[path].version})"
+            )
+            continue
+        passed = f", {flight.passed_over:,} passed over" if flight.passed_over else ""
+        typer.echo(f"{name} {flight.ticks:7,} ticks, {flight.differing:,} differ{passed}")
+        for difference in flight.differences[:_MOST_ROWS]:
+            what, then, now, _ = difference.differing
+            at_s = difference.since_unix_s - flight.began_unix_s
+            rows.append(
+                (path.stem, robot, f"{at_s:.1f} s", f"{difference.ticks:,}", what, then, now)
+            )
+        left = len(flight.differences) - _MOST_ROWS
+        if left > 0:
+            rows.append((path.stem, robot, "", "", f"{left:,} more: --json", "", ""))
+    if rows:
+        print_table(
+            ("log", "robot", "time", "ticks", "what", "decided then", "decides now"),
+            rows,
+            right=("time", "ticks"),
+        )
+
+
+def _output(comparison: "Comparison") -> dict[str, Any]:
+    return {
+        "ticks": comparison.ticks,
+        "differing": comparison.differing,
+        "largest_difference": _or_none(comparison.largest_difference),
+    }
+
+
+def _flight(path: Path, program: "FlightMetadata", flight: "FlightReplay") -> dict[str, Any]:
+    return {
+        "log": str(path),
+        "robot": program.robot_id,
+        "boot_nonce": program.boot_nonce,
+        "version": program.version,
+        "ticks": flight.ticks,
+        "passed_over": flight.passed_over,
+        "differing": flight.differing,
+        "differences": [
+            {
+                "what": d.differing.what,
+                "then": d.differing.then,
+                "now": d.differing.now,
+                "is_rounding": d.differing.is_rounding,
+                "ticks": d.ticks,
+                "since_unix_s": d.since_unix_s,
+                "until_unix_s": d.until_unix_s,
+            }
+            for d in flight.differences
+        ],
+    }
 
 
 def _segments(logs: Iterable[Path]) -> Iterable[Path]:

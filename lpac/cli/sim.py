@@ -321,7 +321,7 @@ def _show_fleet_flight(flight: "FleetFlight", as_json: bool, out: Path | None) -
     from lpac.sim.fleet.flight import summary_lines
 
     if out:
-        from lpac.sim.fleet.report import write_fleet_flight
+        from lpac.sim.report import write_fleet_flight
 
         write_fleet_flight(flight, out)
     if as_json:

@@ -51,8 +51,8 @@ class Cost:
     `robots` are those that count, by name (see `lpac.analysis.coverage.Whereabouts`);
     `flying_mission` whether one of them flies its mission, which begins anew as
     `lpac.analysis.mission_tracker` says. `initial` is J when the first of this trial did;
-    `normalized` is J over that; `bound` is the clairvoyant bound for so many robots. These are None
-    before.
+    `normalized` is J over that; `bound` is what Lloyd's algorithm comes to, which
+    knows the world, with so many robots: no bound, though logs call it so. These are None before.
     """
 
     trial: str
@@ -137,7 +137,7 @@ class Recording:
             self._coverage = None
             # Nothing else depends on a world that cannot be read, or is not known.
             with contextlib.suppress(ValueError):
-                self._coverage = Coverage(setup) if setup.world else None
+                self._coverage = Coverage.of(setup) if setup.world else None
         self._setup, self._setup_at_s = setup, unix_now_s
         self._record("setup", unix_now_s, dataclasses.asdict(setup))
 
@@ -204,7 +204,7 @@ class Recording:
         assert self._setup is not None
         key = (self._setup.world_id, trial, len(positions_m))
         if key not in self._bounds:
-            self._bounds[key] = self._pool.submit(coverage.clairvoyant, positions_m)
+            self._bounds[key] = self._pool.submit(coverage.lloyd, positions_m)
         return self._bounds[key].result() if self._bounds[key].done() else None
 
 
@@ -314,5 +314,5 @@ def _line(snapshot: FleetSnapshot, cost: Cost | None) -> str:
             f"cost {cost.normalized:.2f} of the initial",
         ]
         if cost.bound is not None:
-            words.append(f"bound {cost.bound / cost.initial:.2f}")
+            words.append(f"Lloyd, who knows the world, {cost.bound / cost.initial:.2f}")
     return "  ".join(words)

@@ -8,7 +8,6 @@ from typing import Any, Literal
 import numpy as np
 
 from edge.core import F32, F64
-from edge.core.coverage import coverage_cost
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
 from edge.core.wire import MAX_ROBOT_ID
@@ -16,6 +15,8 @@ from edge.core.world import Feature, random_features, rasterize
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle, BundleError
 from edge.robot.pac import PacParameters
+from lpac.analysis.coverage import Coverage
+from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
 from lpac.sim.medium import Medium
 from lpac.sim.swarm import Swarm
@@ -74,22 +75,32 @@ class Scenario:
 class SimulatedFlight:
     """What a simulated flight was like; times in s, positions in m of the mission frame.
 
-    `time_s` (T,) and `positions_m` (T, N, 2) sample the flight; `cost_time_s` (C,) and `cost` (C,)
-    are the coverage cost J at fewer of these times, from the start to the end. `messages` counts
-    what became of them; `largest_payload` is the largest number in one, by its absolute value.
+    `time_s` (T,) and `positions_m` (T, N, 2) sample the flight; `cost` (C,) is the coverage cost J
+    at fewer of these times, from the start to the end. `messages` counts what became of them;
+    `largest_payload` is the largest number in one, by its absolute value.
     """
 
     scenario: Scenario
     bundle_id: str
     perception: PerceptionParameters
     features: tuple[Feature, ...]
-    importance: F32
+    record: FlightRecord
     time_s: F64
     positions_m: F64
-    cost_time_s: F64
     cost: F64
     messages: dict[str, int]
     largest_payload: float
+
+    @property
+    def importance(self) -> F32:
+        """The world that was covered."""
+        assert self.record.coverage is not None
+        return self.record.coverage.importance
+
+    @property
+    def cost_time_s(self) -> F64:
+        """(C,): when `cost` was so."""
+        return self.record.cost_time_s
 
     @property
     def normalized_cost(self) -> F64:
@@ -176,27 +187,53 @@ def fly(
             max_speed_m_s,
         )
     times_s = _sample_times_s(scenario.duration_s)
-    positions, costs = [], {}
-    for sample, positions_m in enumerate(swarm.run(times_s)):
-        time_s = times_s[sample]
+    positions = []
+    for time_s, positions_m in zip(times_s, swarm.run(times_s), strict=True):
         positions.append(positions_m)
-        if sample % SAMPLES_PER_COST == 0 or time_s == times_s[-1]:
-            model_positions = scenario.scale.position_to_model(positions_m)
-            costs[time_s] = coverage_cost(importance, model_positions)
         if progress:
             progress(time_s)
+    record = _record(scenario, perception, importance, np.array(times_s), np.array(positions))
     return SimulatedFlight(
         scenario=scenario,
         bundle_id=bundle.id,
         perception=perception,
         features=features,
-        importance=importance,
+        record=record,
         time_s=np.array(times_s),
         positions_m=np.array(positions),
-        cost_time_s=np.array(list(costs)),
-        cost=np.array(list(costs.values())),
+        cost=record.cost,
         messages=swarm.message_counts(),
         largest_payload=swarm.largest_payload,
+    )
+
+
+def _record(
+    scenario: Scenario,
+    perception: PerceptionParameters,
+    importance: F32,
+    time_s: F64,
+    positions_m: F64,
+) -> FlightRecord:
+    """Points are in the air from the first to the last, and say nothing."""
+    heights_m = np.zeros(len(time_s))
+    return FlightRecord(
+        name=scenario.controller,
+        duration_s=scenario.duration_s,
+        from_s=0.0,
+        to_s=scenario.duration_s,
+        robots=tuple(
+            RobotRecord(
+                robot_id=robot,
+                name=str(robot),
+                time_s=time_s,
+                position_m=np.column_stack([positions_m[:, robot], heights_m]),
+                flying=np.ones(len(time_s), np.bool_),
+            )
+            for robot in range(scenario.robots)
+        ),
+        coverage=Coverage(importance, scenario.scale.env_scale),
+        sensor_size=perception.sensor_size,
+        cost_time_s=np.array([*time_s[:-1:SAMPLES_PER_COST], time_s[-1]]),
     )
 
 

@@ -28,7 +28,7 @@ ALLOWED = {
         "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.policy",
     },
     "edge.robot.process": {*_EDGE, "edge.robot.log"},
-    "edge.robot.log": {"edge.core", "edge.robot", "edge.drivers"},
+    "edge.robot.log": {"edge.core", "edge.flight", "edge.robot", "edge.drivers"},
     "export": {"edge.core", "edge.policy"},
     "lpac.shipped": set(),
     "lpac.analysis": _EDGE,

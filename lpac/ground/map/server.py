@@ -184,7 +184,7 @@ class LiveMap:
             # Nothing else depends on a world that cannot be read, or is not known.
             with contextlib.suppress(ValueError):
                 if setup.world:
-                    self._coverage = await asyncio.to_thread(Coverage, setup)
+                    self._coverage = await asyncio.to_thread(Coverage.of, setup)
             self._missions.change_world()
         self._setup = setup
         self._setup_text = _text(setup_view(setup, self._coverage))
@@ -239,7 +239,7 @@ class LiveMap:
         if self._missions.begins(snapshot):
             curve = self._missions.begin(snapshot, cost)
             self._put(curve.view())
-            self._start(self._find_bound(coverage, positions_m))
+            self._start(self._find_lloyd(coverage, positions_m))
         time_s = self._missions.time_s(snapshot)
         curve_now = self._missions.curve
         share = None
@@ -254,11 +254,11 @@ class LiveMap:
             {"kind": "coverage", "cost": cost, "share": share, "time_s": time_s, "cells": cells}
         )
 
-    async def _find_bound(self, coverage: Coverage, positions_m: F64) -> None:
+    async def _find_lloyd(self, coverage: Coverage, positions_m: F64) -> None:
         curve = self._missions.curve
-        bound = await asyncio.to_thread(coverage.clairvoyant, positions_m)
+        lloyd = await asyncio.to_thread(coverage.lloyd, positions_m)
         if curve is not None and curve is self._missions.curve:
-            curve.bound = curve.share(bound)
+            curve.lloyd = curve.share(lloyd)
             self._put(curve.view())
 
     # To the pages

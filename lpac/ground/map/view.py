@@ -139,14 +139,15 @@ class Curve:
     """The coverage cost of one trial: `points` are (mission time, s; J over `first_cost`).
 
     The mission began at `began_s` (unix time) with J = `first_cost`, unless not `whole`: then the
-    first snapshot showed it under way. `bound` is the clairvoyant's J over `first_cost`.
+    first snapshot showed it under way. `lloyd` is over `first_cost`,
+    too: the J of Lloyd's algorithm, which knows the world.
     """
 
     trial: str
     began_s: float
     whole: bool
     first_cost: float
-    bound: float | None = None
+    lloyd: float | None = None
     points: list[tuple[float, float]] = field(default_factory=list)
 
     def add(self, time_s: float, cost: float) -> None:

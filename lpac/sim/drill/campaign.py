@@ -76,11 +76,11 @@ def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> Fli
         figures = judge((*always(fault.beyond_fence_m), *fault.bounds), truth)
     except Exception as error:
         return FlightOutcome(fault.name, seed, (), f"{type(error).__name__}: {error}")
-    error = ""
+    unjudged = ""
     if truth.late_s > LATE_S and any(figure.broken for figure in figures):
         broken = ", ".join(figure.name for figure in figures if figure.broken)
-        error = f"not judged ({broken}): this machine was {truth.late_s:.1f} s behind real time"
-    return FlightOutcome(fault.name, seed, figures, error, truth.late_s)
+        unjudged = f"not judged ({broken}): this machine was {truth.late_s:.1f} s behind real time"
+    return FlightOutcome(fault.name, seed, figures, unjudged, truth.late_s)
 
 
 def fly_order(order: FlightTask) -> FlightOutcome:

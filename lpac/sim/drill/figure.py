@@ -2,30 +2,26 @@
 
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from lpac.analysis import style
 from lpac.sim.drill.bounds import LANDING
 from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.truth import FlightTruth
 from lpac.sim.px4.modes import Px4Mode
-from lpac.sim.report import STYLE
 
-_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442", "#000000")
 _MODES = (
-    ((Px4Mode.OFFBOARD,), "offboard", "#41ab5d"),
-    ((Px4Mode.HOLD,), "hold", "#fee391"),
-    (LANDING, "land", "#2171b5"),
+    ((Px4Mode.OFFBOARD,), "offboard", style.GREEN),
+    ((Px4Mode.HOLD,), "hold", style.YELLOW),
+    (LANDING, "land", style.BLUE),
 )
-_OTHER_MODE = "#c51b8a"
+_OTHER_MODE = style.PURPLE
 
 
 def write_figure(fault: Fault, flight: FlightTruth, folder: Path) -> None:
     """drill.png and drill.pdf in `folder`."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.16, 4.0), layout="constrained")
+    with style.figure(style.WIDTH_IN, 4.0) as figure:
         columns = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.1))
         _draw_map(figure.add_subplot(columns[0]), flight)
         rows = columns[1].subgridspec(2, 1, height_ratios=(1.0, 1.4))
@@ -33,15 +29,14 @@ def write_figure(fault: Fault, flight: FlightTruth, folder: Path) -> None:
         _draw_modes(modes, flight)
         _draw_heights(figure.add_subplot(rows[1], sharex=modes), flight)
         figure.suptitle(f"{fault.name}: {fault.what}", x=0.01, ha="left")
-        for suffix in (".png", ".pdf"):
-            figure.savefig((folder / "drill").with_suffix(suffix))
+    style.save(figure, folder / "drill")
 
 
 def _draw_map(axes: Axes, flight: FlightTruth) -> None:
     corners = np.array([*flight.fence.vertices_m, flight.fence.vertices_m[0]])
-    axes.plot(*corners.T, color="#252525", linewidth=0.8, linestyle="--", label="fence")
+    axes.plot(*corners.T, color=style.INK, linewidth=0.8, linestyle="--", label="fence")
     for robot, vehicle in enumerate(flight.vehicles):
-        colour = _COLOURS[robot % len(_COLOURS)]
+        colour = style.robot_colour(robot)
         hit = robot in flight.hit
         label = f"r{robot}, hit" if hit else f"r{robot}"
         path_m = vehicle.position_m[:, :2]
@@ -65,7 +60,7 @@ def _draw_modes(axes: Axes, flight: FlightTruth) -> None:
         _bar(axes, vehicle.time_s, ~drawn, robot, _OTHER_MODE)
     for _, name, colour in (*_MODES, ((), "other", _OTHER_MODE)):
         axes.fill_between([], [], [], color=colour, label=name)
-    axes.axvline(flight.fault_s, color="#a50f15", linewidth=0.8)
+    axes.axvline(flight.fault_s, color=style.VERMILLION, linewidth=0.8)
     axes.set(ylabel="PX4's mode", ylim=(len(flight.vehicles) - 0.5, -0.5))
     axes.set_yticks(range(len(flight.vehicles)), [f"r{i}" for i in range(len(flight.vehicles))])
     axes.legend(fontsize=6, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
@@ -80,8 +75,8 @@ def _bar(axes: Axes, time_s: np.ndarray, chosen: np.ndarray, robot: int, colour:
 def _draw_heights(axes: Axes, flight: FlightTruth) -> None:
     for robot, vehicle in enumerate(flight.vehicles):
         axes.plot(
-            vehicle.time_s, vehicle.position_m[:, 2], color=_COLOURS[robot % len(_COLOURS)],
+            vehicle.time_s, vehicle.position_m[:, 2], color=style.robot_colour(robot),
             linewidth=1.6 if robot in flight.hit else 0.8,
         )  # fmt: skip
-    axes.axvline(flight.fault_s, color="#a50f15", linewidth=0.8)
+    axes.axvline(flight.fault_s, color=style.VERMILLION, linewidth=0.8)
     axes.set(xlabel="time (s)", ylabel="true height (m)")

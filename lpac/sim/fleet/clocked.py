@@ -1,19 +1,19 @@
 """One flight of a fleet on the simulated clock, by a script of the real ground."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from edge.messages.mission import RobotStatus
+from lpac.analysis.logs import logs_of
+from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
-from lpac.sim.fleet.flight import FleetFlight, RobotRecord, flight_of
+from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
 from lpac.sim.fleet.layout import FleetScenario
-from lpac.sim.fleet.listener import Heard, Say
+from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
-from lpac.sim.fleet.vehicles import TrueTrack
 
 
 def fly_simulated(
@@ -42,52 +42,49 @@ def fly_simulated(
     except NothingComesError as error:
         problem = str(error)
     fleet.close()
-    return notes.flight(flight, problem, sorted(set(folder.rglob("*.mcap")) - earlier))
+    return notes.flight(flight, problem, earlier, folder if logs else None)
 
 
 class _Notes:
-    """What the ground heard of each robot, as it came."""
+    """What each robot said of itself, as its own log would have it."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
         self._fleet = fleet
-        self._heard: list[list[Heard]] = [[] for _ in fleet.robots]
+        self._said: dict[tuple[int, int, int], RobotStatus] = {}
+        # More often than a robot says something.
         fleet.schedule.every(SNAPSHOT_PERIOD_S, self._look)
 
     def _look(self) -> None:
-        for robot, history in zip(
-            self._fleet.ground.node.snapshot.robots, self._heard, strict=True
-        ):
-            if robot.status is None or robot.age_s is None:
-                continue
-            if not history or history[-1].status.sequence != robot.status.sequence:
-                history.append(Heard(self._fleet.ground.now_s - robot.age_s, robot.status))
+        for robot in self._fleet.robots:
+            said = robot.status
+            if said is not None:
+                self._said[said.robot_id, said.boot_nonce, said.sequence] = said
 
     def flight(
-        self, flown: ScriptedFlight, problem: str | None, logs: Sequence[Path]
+        self, flown: ScriptedFlight, problem: str | None, earlier: set[Path], logged: Path | None
     ) -> FleetFlight:
         self._look()
-        began_s = flown.began_s | {"end": self._fleet.ground.now_s}
-        last_s = began_s.get("return", began_s["end"])
+        fleet = self._fleet
+        logs = sorted(set(fleet.folder.rglob("*.mcap")) - earlier)
         return flight_of(
-            self._fleet.layout,
+            fleet.layout,
             "simulated",
+            logs_of(self._said.values()),
+            self._tracks(),
+            fleet.schedule.unix_s() - fleet.schedule.monotonic_s(),
+            0.0,
+            flown.began_s | {"end": fleet.ground.now_s},
             [
-                RobotRecord(
-                    tuple(history),
-                    track,
-                    _last(history, last_s),
+                RobotUsage(
                     logs=tuple(
-                        str(path.relative_to(self._fleet.folder))
+                        str(path.relative_to(fleet.folder))
                         for path in logs
                         if path.is_relative_to(robot.config.log.folder)
-                    ),
+                    )
                 )
-                for history, track, robot in zip(
-                    self._heard, self._tracks(), self._fleet.robots, strict=True
-                )
+                for robot in fleet.robots
             ],
-            0.0,
-            began_s,
+            logged,
             problem=problem,
             commands=tuple(flown.commands),
         )
@@ -102,8 +99,3 @@ class _Notes:
             )
             for truth in truths
         ]
-
-
-def _last(history: list[Heard], until_s: float) -> RobotStatus | None:
-    past = [heard.status for heard in history if heard.at_s <= until_s]
-    return past[-1] if past else None

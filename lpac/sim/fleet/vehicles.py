@@ -2,14 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import TracebackType
 from typing import NamedTuple, Protocol, Self
 
 import numpy as np
-import numpy.typing as npt
 
-from edge.core import F64
+from lpac.analysis.truth import TrueTrack
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.server import Instance, Px4Server
@@ -25,18 +23,6 @@ class AutopilotAddress(NamedTuple):
 
 class VehicleError(ValueError):
     """A vehicle cannot start, or has ended; the text says which, why, and what to do."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueTrack:
-    """Where one vehicle really was: `time_s` (T,), ascending, is `time.monotonic()`.
-
-    `position_m` (T, 3) is north, east, down from the world's origin; `airborne` (T,).
-    """
-
-    time_s: F64
-    position_m: F64
-    airborne: npt.NDArray[np.bool_]
 
 
 class Vehicles(Protocol):
@@ -57,7 +43,10 @@ class Vehicles(Protocol):
         """Raises VehicleError if one has ended."""
 
     def tracks(self) -> tuple[TrueTrack, ...]:
-        """What they did so far, each."""
+        """What they did so far, each.
+
+        Times are `time.monotonic()`, positions north, east, down from the world's origin, m.
+        """
 
     def forget(self) -> None:
         """Keep of each only where it is."""

@@ -31,7 +31,8 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
-from lpac.sim.fleet.vehicles import AutopilotAddress, TrueTrack, VehicleError
+from lpac.analysis.truth import TrueTrack
+from lpac.sim.fleet.vehicles import AutopilotAddress, VehicleError
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Truth
 from lpac.sim.px4.world import WorldOrigin

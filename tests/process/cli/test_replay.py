@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge.drivers.flight_log import FlightLog, FlightMetadata
+from edge.drivers.flight_log import FlightLog, FlightMetadata, read
+from edge.flight.record import FlightTick, TickReader, TickWriter
+from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.policy import LpacPolicy
 from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
+from tests.record_flights import RECORDED
 from tests.unit.policy.test_replay import Messages, fly
 
 
@@ -71,6 +74,49 @@ def test_a_difference_is_shown_and_fails(
     result = lpac("replay", log, "--json")
     assert result.returncode != 0
     assert json.loads(result.stdout)["outputs"]["velocity"]["differing"] == 1
+
+
+def test_flights_are_decided_again() -> None:
+    """Logs without a policy need no bundle."""
+    result = lpac("replay", RECORDED / "normal.mcap", RECORDED / "killed.mcap", "--json")
+    assert result.returncode == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert report["bundle"] is None and report["outputs"] == {}
+    for flight in report["flights"]:
+        assert flight["robot"] == 0 and flight["ticks"] > 30
+        assert flight["differing"] == 0 and flight["differences"] == []
+    text = lpac("replay", RECORDED / "killed.mcap").stdout
+    ticks = report["flights"][1]["ticks"]
+    assert text.startswith(f"killed            {ticks} ticks, 0 differ\n")
+
+
+def test_a_decision_that_differs_is_shown_and_fails(tmp_path: Path, shipped_bundle: Bundle) -> None:
+    reader, writer = TickReader(), TickWriter()
+    messages: Messages = []
+    for topic, unix_time_s, message in read(RECORDED / "ground_lost.mcap"):
+        tick = reader.tick(message)
+        assert tick is not None
+        if len(messages) == 40:  # As if it had landed there.
+            landing = dataclasses.replace(tick.made.flight, state=FlightState.LAND)
+            tick = FlightTick(tick.given, dataclasses.replace(tick.made, flight=landing))
+        messages.append((topic, unix_time_s, writer.message(tick)))
+    log = write_log(tmp_path, shipped_bundle, messages)
+    result = lpac("replay", log)
+    assert "1 differ" in result.stdout
+    (row,) = [line for line in result.stdout.splitlines() if " state " in line]
+    assert row.split()[2:] == ["4.0", "s", "1", "state", "land", "hold"]
+    assert "not what was decided in flight: 1 ticks differ" in error_line(result)
+    (flight,) = json.loads(lpac("replay", log, "--json").stdout)["flights"]
+    (difference,) = [d for d in flight["differences"] if d["what"] == "state"]
+    assert (difference["then"], difference["now"], difference["ticks"]) == ("land", "hold", 1)
+
+
+def test_logs_of_the_version_before_say_that_they_hold_no_flight(
+    tmp_path: Path, shipped_bundle: Bundle, flown: Messages
+) -> None:
+    result = lpac("replay", write_log(tmp_path, shipped_bundle, flown))
+    assert result.returncode == 0, result.stderr
+    assert "robot-0-0001 holds nothing that its flight was decided by" in result.stdout
 
 
 def test_another_place_for_the_bundle(

@@ -375,8 +375,8 @@ def test_a_flight_by_clicks(few: FlownFleet) -> None:
         seen.act("start")
         seen.wait_for_states({"r0": "mission", "r1": "mission"})
         assert few.flown[0].said.trial == page.inner_text("#trial")
-        # The cost, and its bound.
-        page.wait_for_function("() => Number(document.querySelector('#bound').textContent) > 0")
+        # The cost, and that of Lloyd's algorithm.
+        page.wait_for_function("() => Number(document.querySelector('#lloyd').textContent) > 0")
         page.wait_for_function("() => Number(document.querySelector('#share').textContent) > 0")
         # One robot, from its drawer.
         page.click("tr[data-robot=r1]")
@@ -455,7 +455,7 @@ def test_a_page_that_observes(few: FlownFleet) -> None:
                 for robot in range(3):
                     few.says[robot] = lambda said: replace(said, world_id="feedbeef0000")
                 page.wait_for_selector("#importance >> text=no importance known")
-                costs = [page.inner_text(f"#{name}") for name in ("share", "bound", "absolute")]
+                costs = [page.inner_text(f"#{name}") for name in ("share", "lloyd", "absolute")]
                 assert costs == ["\N{EN DASH}"] * 3 and page.is_hidden("#ramp")
                 few.says.clear()
                 few.says |= said

@@ -13,19 +13,21 @@ import pytest
 
 from edge.core import F64
 from edge.drivers.flight_log import read
+from edge.flight.replay import FlightReplay
 from edge.identity.guard import Unguarded
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
+from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script
 from lpac.ground.site import Sites
 from lpac.ground.station.protocol import Enable, SafetyCommand, SetOrigin, Start, Takeoff
 from lpac.sim.fleet.clocked import fly_simulated
-from lpac.sim.fleet.flight import FleetFlight, normalized
+from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.recorded import RecordingError
 from lpac.sim.fleet.scripted import ScriptedFlight
@@ -257,8 +259,9 @@ def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
         FlightState.MISSION, FlightState.RETURN, FlightState.LAND, FlightState.LANDED,
     ]  # fmt: skip
     assert min(robot.mission_share for robot in flight.robots) > 0.9
-    assert flight.true_fence_margin_m() > 0.0
-    assert flight.separation is not None and flight.separation.distance_m > DRONE_M
+    assert flight.record.true_fence_margin_m > 0.0
+    least = flight.record.true_separation
+    assert least is not None and least.distance_m > DRONE_M
     assert flight.summary() == again.summary()
     assert [each["command"] for each in flight.summary()["commands"]] == [
         "origin", "again", "enable", "takeoff", "start", "return",
@@ -266,7 +269,7 @@ def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
     for each in flight.summary()["commands"]:
         assert each["problem"] is None
         assert each["results"] == dict.fromkeys(("r0", "r1", "r2"), "done")
-    assert normalized(flight.cost)[-1] < 1.0
+    assert flight.record.normalized[-1] < 1.0
 
 
 def test_who_flies_is_checked_once_a_second_and_who_has_landed_more_often(
@@ -389,6 +392,35 @@ def test_what_the_robots_logged_is_what_they_computed(
         assert {FlightState.MISSION, FlightState.LANDED} <= states
         for compared in replay(shipped_policy, messages):
             assert compared.ticks > 0 and compared.differing == 0
+        flight = FlightReplay()
+        for topic, unix_time_s, message in messages:
+            if topic == "flight":
+                flight.run(unix_time_s, message)
+        ticks = sum(topic == "control" for topic, _, _ in messages)
+        assert (flight.ticks, flight.passed_over, flight.differing) == (ticks, 0, 0)
+
+
+def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
+    """To the last digit: `lpac report` has the logs, the flight what the robots said to them."""
+    flight = logged.flight
+    (reported,) = examine([logged.folder], Wanted(), lambda *_: None).trials
+    told, summary = Examined((reported,), ()).summary()["trials"][0], flight.summary()
+    for cost, truly in ((told["cost"], "cost"), (told["truth"]["cost"], "true_cost")):
+        assert 0.0 < cost["final"] != cost["initial"]
+        assert [cost[key] for key in ("initial", "final", "normalized")] == [
+            summary[truly][key] for key in ("initial", "final", "final_normalized")
+        ]
+    assert told["cost"]["curve"] == summary["cost_curve"]["normalized_cost"]
+    for key in (
+        "duration_s", "curve_time_s", "cost", "true_cost", "lloyd", "separation", "true_separation",
+        "fence_margin_m", "true_fence_margin_m",
+    ):  # fmt: skip
+        np.testing.assert_equal(getattr(reported, key), getattr(flight.record, key), key)
+    assert told["fence_margin_m"] == summary["fence"]["margin_m"] is not None
+    assert told["truth"]["fence_margin_m"] == summary["fence"]["true_margin_m"] is not None
+    assert told["truth"]["separation"]["distance_m"] == summary["separation"]["distance_m"]
+    for robot, flown in zip(reported.robots, flight.robots, strict=True):
+        assert reported.mission_share(robot) == flown.mission_share > 0.5
 
 
 def test_recorded_steps_of_the_policy_are_the_same_flight(

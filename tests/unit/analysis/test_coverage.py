@@ -35,7 +35,7 @@ def model(seed: int = 0) -> Model:
     return Model(format_world(random_features(rng, 5, SIZE, sigma=(6.0, 15.0))))
 
 
-COVERAGE = Coverage(model())
+COVERAGE = Coverage.of(model())
 PLACE_M = st.tuples(st.floats(-10.0, 42.0), st.floats(-10.0, 42.0))
 FLEETS_M = st.lists(PLACE_M, min_size=1, max_size=12).map(np.array)
 
@@ -92,19 +92,19 @@ def test_robots_at_one_point_and_outside_have_cells_too() -> None:
 @settings(deadline=None, max_examples=5)
 @given(FLEETS_M)
 def test_the_bound_is_below_what_lloyd_reaches_from_there(positions_m: F64) -> None:
-    bound = COVERAGE.clairvoyant(positions_m)
-    assert bound == COVERAGE.clairvoyant(positions_m)
-    assert 0.0 < bound <= COVERAGE.cost(positions_m)
+    least = COVERAGE.lloyd(positions_m)
+    assert least == COVERAGE.lloyd(positions_m)
+    assert 0.0 < least <= COVERAGE.cost(positions_m)
     positions = positions_m * SCALE
     for _ in range(300):
         positions = voronoi_cells(COVERAGE.importance, positions).centroid
-    assert bound <= coverage_cost(COVERAGE.importance, positions) * 1.01
+    assert least <= coverage_cost(COVERAGE.importance, positions) * 1.01
 
 
 def test_the_bound_of_one_robot_is_the_centre_of_mass() -> None:
     centre = voronoi_cells(COVERAGE.importance, np.array([(1.0, 1.0)])).centroid
     least = coverage_cost(COVERAGE.importance, centre)
-    assert COVERAGE.clairvoyant(np.array([(1.0, 1.0)])) == pytest.approx(least, rel=1e-3)
+    assert COVERAGE.lloyd(np.array([(1.0, 1.0)])) == pytest.approx(least, rel=1e-3)
 
 
 @pytest.mark.parametrize("size", [50, SIZE, 200])
@@ -118,15 +118,15 @@ def test_the_density_keeps_the_worlds_shape(size: int) -> None:
 
 
 def test_an_empty_world_costs_nothing() -> None:
-    empty = Coverage(Model(""))
+    empty = Coverage.of(Model(""))
     positions_m = np.array([(1.0, 2.0), (3.0, 4.0)])
-    assert empty.cost(positions_m) == empty.clairvoyant(positions_m) == 0.0
+    assert empty.cost(positions_m) == empty.lloyd(positions_m) == 0.0
     assert empty.density(10).max() == 0 and len(empty.cells_m(positions_m)) == 2
 
 
 def test_a_broken_world_is_one_line() -> None:
     with pytest.raises(ValueError, match=r"world abc: record 1 \(Circle\): unknown kind"):
-        Coverage(Model("Circle 1 2"))
+        Coverage.of(Model("Circle 1 2"))
 
 
 STATUS = RobotStatus(

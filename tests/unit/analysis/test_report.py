@@ -25,11 +25,14 @@ from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, LoopStatus, Order, OrderResult, RobotStatus
 from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import load_bundle
+from lpac.analysis.coverage import Coverage
+from lpac.analysis.figures import overview
 from lpac.analysis.logs import read_logs
 from lpac.analysis.page import Drawn, page
 from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
-from lpac.analysis.trials import find_missions
+from lpac.analysis.style import CURVES, SWARM, save
+from lpac.analysis.trials import find_missions, whole_record
 from lpac.analysis.write_report import write
 from lpac.cli.main import app
 from lpac.ground.record import TOPICS, GroundMetadata
@@ -404,6 +407,29 @@ def test_logs_that_break_off_and_robots_that_are_missing(tmp_path: Path, flown: 
     assert values["cost"]["normalized"] == pytest.approx(FIRST.cost(30.0) / FIRST.cost(20.0))
 
 
+def test_a_flight_without_a_mission_has_a_record_and_a_figure(tmp_path: Path) -> None:
+    """As of a simulated fleet whose mission does not begin."""
+    writer = Writer((FIRST,))
+    writer.change = held_back
+    writer.robots(tmp_path)
+    logs = read_logs([tmp_path], lambda *_: None)
+    assert find_missions(logs) == []
+    record = whole_record(logs, range(4), Coverage(IMPORTANCE, SCALE), 64, FENCE)
+    assert (record.duration_s, len(record.cost), len(record.true_cost)) == (0.0, 0, 0)
+    assert math.isnan(record.lloyd) and not len(record.normalized)
+    assert record.separation is not None and record.true_separation is None
+    assert [record.mission_share(robot) for robot in record.robots] == [0.0] * 4
+    assert save(overview(record), tmp_path / "overview").startswith(b"\x89PNG")
+
+
+def held_back(status: RobotStatus, _: float) -> RobotStatus:
+    return dataclasses.replace(status, state=S.HOLD) if status.state is S.MISSION else status
+
+
+def test_the_swarm_shares_no_curves_colour() -> None:
+    assert SWARM not in {colour for colour, _ in CURVES}
+
+
 def test_restarts_and_alarms_are_told(tmp_path: Path) -> None:
     writer = Writer((FIRST,))
 
@@ -628,7 +654,7 @@ def test_the_command_prints_the_summary(tmp_path: Path, flown: Path) -> None:
     line, last = result.stdout.splitlines()
     assert re.fullmatch(
         r"t2: 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d, 3 robots, 12 s, "
-        r"cost \d\.\d\d of the initial, bound \d\.\d\d, "
+        r"cost \d\.\d\d of the initial, Lloyd, who knows the world, \d\.\d\d, "
         r"least distance \d\.\d\d m, \d\.\d % of the messages lost", line
     )  # fmt: skip
     assert last == f"see {tmp_path / 'report.html'}"

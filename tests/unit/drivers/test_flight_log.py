@@ -148,6 +148,7 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
         "policy": {"message": b"abc", "payloads": (np.zeros(3, np.float16),), "senders": (1,)},
         "received": {"sender": 1, "sequence": 2, "age_s": 0.1, "rejection": None},
         "control": {"state": FlightState.MISSION, "sent_local": Velocity((1.0, 0.0, 0.0))[0]},
+        "flight": {"number": 0, "whole": True, "given": {}, "made": {}},
         "status": {"origin": Origin(47.0, 8.0, 0.0)},
         "order": {**dataclasses.asdict(order), "answer": OrderResult("a")},
         "ground": dataclasses.asdict(STATE),

@@ -66,11 +66,11 @@ def test_a_page_that_opens_late_has_the_whole_curve() -> None:
     missions.take(flying)
     assert missions.begins(flying)
     curve = missions.begin(flying, 50.0)
-    curve.bound = curve.share(10.0)
+    curve.lloyd = curve.share(10.0)
     for n in range(5000):
         curve.add(0.4 * n, 50.0 - 0.005 * n)
     view = curve.view()
-    assert view["whole"] and view["began_s"] == 100.0 and view["bound"] == 0.2
+    assert view["whole"] and view["began_s"] == 100.0 and view["lloyd"] == 0.2
     assert view["points"][0] == (0.0, 1.0) and view["points"][-1] == (1999.6, 0.5001)
     assert len(view["points"]) <= 3000
     # Hold is part of a mission, landing is not.

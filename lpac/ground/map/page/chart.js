@@ -1,4 +1,5 @@
-// The coverage cost of the trial over the mission time, beside the clairvoyant bound.
+// The coverage cost of the trial over the mission time, beside that of Lloyd's algorithm, which
+// knows the world.
 
 import { clock, colour } from "./dom.js";
 
@@ -11,13 +12,13 @@ export class Chart {
   constructor(canvas) {
     this.canvas = canvas;
     this.points = [];
-    this.bound = null;
+    this.lloyd = null;
     new ResizeObserver(() => this.paint()).observe(canvas);
   }
 
-  set(points, bound) {
+  set(points, lloyd) {
     this.points = points;
-    this.bound = bound;
+    this.lloyd = lloyd;
     this.paint();
   }
 
@@ -29,8 +30,8 @@ export class Chart {
     canvas.height = Math.round(h * ratio);
     const c = canvas.getContext("2d");
     c.scale(ratio, ratio);
-    const [ink, faint, grid, accent, bound] =
-      ["ink", "faint", "grid", "accent", "bound"].map(colour);
+    const [ink, faint, grid, accent, lloyd] =
+      ["ink", "faint", "grid", "accent", "lloyd"].map(colour);
     const last = this.points.at(-1);
     const end = Math.max(60, (last?.[0] ?? 0) * 1.08);
     const highest = Math.max(1, ...this.points.map(([, share]) => share)) * 1.04;
@@ -55,13 +56,13 @@ export class Chart {
       c.textAlign = time === 0 ? "left" : "center";
       c.fillText(clock(time), x(time), h - 4);
     }
-    if (this.bound !== null) {
-      c.strokeStyle = bound;
+    if (this.lloyd !== null) {
+      c.strokeStyle = lloyd;
       c.lineWidth = 2;
       c.setLineDash([6, 4]);
       c.beginPath();
-      c.moveTo(LEFT, y(this.bound));
-      c.lineTo(w - RIGHT, y(this.bound));
+      c.moveTo(LEFT, y(this.lloyd));
+      c.lineTo(w - RIGHT, y(this.lloyd));
       c.stroke();
       c.setLineDash([]);
     }

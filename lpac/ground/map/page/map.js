@@ -248,9 +248,9 @@ function showNext(ours, enabled, action) {
 function showCost() {
   // Where nothing is known to be important, no cost means anything.
   const shown = map.known ? curve : null;
-  chart.set(shown?.points ?? [], shown?.bound ?? null);
+  chart.set(shown?.points ?? [], shown?.lloyd ?? null);
   setText($("#share"), number(shown?.points.at(-1)?.[1], 3));
-  setText($("#bound"), shown ? (shown.bound === null ? "…" : number(shown.bound, 3)) : "–");
+  setText($("#lloyd"), shown ? (shown.lloyd === null ? "…" : number(shown.lloyd, 3)) : "–");
   setText($("#absolute"), map.known && cost !== null ? cost.toExponential(2).replace("+", "") : "–");
   $("#cost").title = shown && !shown.whole ? "The map was opened during the mission: J₀ is the first that it saw." : "";
   $("#cost").classList.toggle("late", Boolean(shown && !shown.whole));

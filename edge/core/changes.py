@@ -1,0 +1,141 @@
+"""What of a frozen dataclass is not as it was, exactly: so that a log need not repeat the rest.
+
+Two values are the same if they are so bit by bit: 0.0 and -0.0 are not, and NaN is itself.
+"""
+
+import dataclasses
+import typing
+from collections.abc import Callable, Mapping
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+
+T = TypeVar("T")
+
+
+def _listed(value: object) -> object:
+    """What msgspec does not know: arrays, whose numbers are all that counts."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise NotImplementedError(f"a {type(value).__name__}")
+
+
+_encode = msgspec.msgpack.Encoder(enc_hook=_listed).encode
+
+
+def same(one: object, other: object) -> bool:
+    """Whether they are so bit by bit; dataclasses, named tuples, arrays, and what is in them."""
+    return one is other or _encode(one) == _encode(other)
+
+
+def plain(value: object) -> Any:
+    """The value in JSON's types; numbers that are not finite stay numbers."""
+    return msgspec.to_builtins(value, enc_hook=_listed)
+
+
+def changes(before: object, after: object) -> dict[str, Any]:
+    """The fields of `after`, a dataclass, that are not as in `before`; name -> plain value.
+
+    All of them if `before` is none of its kind. Of dataclasses in it, again the changes.
+    """
+    names, values, _, choices = _kind(type(after))
+    if type(before) is not type(after):
+        return {
+            name: _chosen(now) if name in choices else _whole(now)
+            for name, now in zip(names, values(after), strict=True)
+        }
+    told: dict[str, Any] = {}
+    for name, was, now in zip(names, values(before), values(after), strict=True):
+        if now is was:
+            # Mostly: whoever replaces some fields keeps the others.
+            continue
+        kind = type(now)
+        if kind is float:
+            # Mostly, again. A zero is told anew: it may have another sign.
+            if now != was or not now:
+                told[name] = now
+        elif name in choices:
+            if kind is not type(was) or _encode(was) != _encode(now):
+                told[name] = _chosen(now)
+        elif type(was) is kind and hasattr(kind, "__dataclass_fields__"):
+            if inner := changes(was, now):
+                told[name] = inner
+        elif _encode(was) != _encode(now):
+            told[name] = _whole(now)
+    return told
+
+
+def _whole(value: object) -> Any:
+    return changes(None, value) if hasattr(type(value), "__dataclass_fields__") else plain(value)
+
+
+def changed(kind: type[T], before: T | None, told: Mapping[str, Any]) -> T:
+    """What `before` has become by these `changes`; None: `told` is all of it.
+
+    Numbers that are not finite may be text. Raises ValueError or TypeError if `told` does not fit.
+    """
+    names, values_of, hints, choices = _kind(kind)
+    values: dict[str, Any] = {}
+    if before is not None:
+        values.update(zip(names, values_of(before), strict=True))
+    for name, value in told.items():
+        if name not in hints:
+            raise ValueError(f"{kind.__name__} has no {name}")
+        was = values.get(name)
+        if name in choices:
+            values[name] = None
+            if value is not None:
+                ((chosen, of_it),) = value.items()
+                values[name] = _typed(of_it, choices[name][chosen])
+        elif was is not None and dataclasses.is_dataclass(was) and isinstance(value, Mapping):
+            values[name] = changed(type(was), was, value)
+        elif dataclasses.is_dataclass(hints[name]):
+            values[name] = changed(hints[name], None, value)
+        else:
+            values[name] = _typed(value, hints[name])
+    return kind(**values)
+
+
+def _typed(value: object, hint: Any) -> Any:
+    return msgspec.convert(value, hint, strict=False, dec_hook=_array)
+
+
+def _array(_: type, value: object) -> object:
+    return np.array(value, np.float64)
+
+
+class _Kind(NamedTuple):
+    """A dataclass: its fields' names, what takes their values, and their types.
+
+    `choices` are the fields that may be one of several dataclasses, by their names: they are told
+    whole, `{name: fields}`.
+    """
+
+    names: tuple[str, ...]
+    values: Callable[[object], tuple[Any, ...]]
+    hints: dict[str, Any]
+    choices: dict[str, dict[str, type]]
+
+
+_kinds: dict[type, _Kind] = {}
+
+
+def _kind(kind: type) -> _Kind:
+    if kind not in _kinds:
+        names = tuple(field.name for field in dataclasses.fields(kind))
+        # The one of a single name gives no tuple.
+        values = attrgetter(*names) if len(names) > 1 else lambda o: (getattr(o, names[0]),)
+        hints = typing.get_type_hints(kind, include_extras=True)
+        choices: dict[str, dict[str, type]] = {}
+        for name, hint in hints.items():
+            several = [each for each in typing.get_args(hint) if dataclasses.is_dataclass(each)]
+            if len(several) > 1:
+                choices[name] = {each.__name__: each for each in several if isinstance(each, type)}
+        _kinds[kind] = _Kind(names, values, hints, choices)
+    return _kinds[kind]
+
+
+def _chosen(value: object) -> Any:
+    return None if value is None else {type(value).__name__: plain(value)}

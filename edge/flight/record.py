@@ -1,0 +1,121 @@
+"""What a control tick was given and what it made of it, as the flight log holds it.
+
+A message holds what is not as in the one before, exactly; every hundredth holds everything, so that
+a log can be read from the middle. The memory that a tick is given is mostly what the last one made.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from edge.core.changes import changed, changes
+from edge.core.vehicle import Action, Vector
+from edge.flight.guidance import Guidance, MissionPosition, MissionSetpoint, MissionVelocity
+from edge.flight.state import FlightInputs, FlightMemory, Robot
+from edge.flight.step import Decision
+from edge.messages.codes import Reason
+
+# At 10 Hz, every 10 s.
+_WHOLE_EVERY = 100
+
+
+class TickError(ValueError):
+    """A message is not that of a tick; the text says why."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """All that `step` and `guide` get in one tick."""
+
+    robot: Robot
+    flight: FlightMemory
+    inputs: FlightInputs
+    guidance: Guidance
+    dt_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Made:
+    """What comes of it. The setpoint is one of the two, in the mission frame, or None."""
+
+    flight: FlightMemory
+    actions: tuple[Action, ...]
+    alarms: tuple[Reason, ...]
+    new_trial: bool
+    velocity_m_s: Vector | None
+    position_m: Vector | None
+    guidance: Guidance
+
+
+def made(decision: Decision, setpoint: MissionSetpoint | None, guidance: Guidance) -> Made:
+    """What `step` and `guide` returned."""
+    return Made(
+        flight=decision.flight,
+        actions=decision.actions,
+        alarms=decision.alarms,
+        new_trial=decision.new_trial,
+        velocity_m_s=setpoint.velocity_m_s if isinstance(setpoint, MissionVelocity) else None,
+        position_m=setpoint.position_m if isinstance(setpoint, MissionPosition) else None,
+        guidance=guidance,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightTick:
+    """One control tick."""
+
+    given: Given
+    made: Made
+
+
+class TickWriter:
+    """Makes messages of one program's ticks, in their order."""
+
+    def __init__(self) -> None:
+        self._last: FlightTick | None = None
+        self._number = 0
+
+    def message(self, tick: FlightTick) -> dict[str, Any]:
+        """Of plain values."""
+        last = self._last if self._number % _WHOLE_EVERY else None
+        given = changes(None if last is None else _left(last), tick.given)
+        made = changes(None if last is None else _begun(last, tick.given), tick.made)
+        message = {"number": self._number, "whole": last is None, "given": given, "made": made}
+        self._last, self._number = tick, self._number + 1
+        return message
+
+
+class TickReader:
+    """Makes the ticks of the messages again."""
+
+    def __init__(self) -> None:
+        self._last: FlightTick | None = None
+        self._number = -1
+
+    def tick(self, message: Mapping[str, Any]) -> FlightTick | None:
+        """None if messages before it are missing. Raises TickError."""
+        try:
+            number, whole = int(message["number"]), bool(message["whole"])
+            if not whole and (self._last is None or number != self._number + 1):
+                self._last = None
+                return None
+            last = None if whole else self._last
+            given = changed(Given, None if last is None else _left(last), message["given"])
+            base = None if last is None else _begun(last, given)
+            self._last = FlightTick(given, changed(Made, base, message["made"]))
+        except KeyError as error:
+            raise TickError(f"{error} is missing") from None
+        except (AttributeError, TypeError, ValueError, RecursionError) as error:
+            raise TickError(str(error)) from None
+        self._number = number
+        return self._last
+
+
+def _left(last: FlightTick) -> Given:
+    """What the next tick is given if nothing changes."""
+    return replace(last.given, flight=last.made.flight, guidance=last.made.guidance)
+
+
+def _begun(last: FlightTick, given: Given) -> Made:
+    """What this tick makes if nothing changes."""
+    return replace(last.made, flight=given.flight, guidance=given.guidance)

@@ -1,0 +1,125 @@
+"""Does a robot decide what it decided in flight? From a flight log's messages alone.
+
+Every tick is run again from what it was given, its memory too: so each difference is one of that
+tick, and what follows from it is not told again and again.
+"""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+from edge.core.changes import plain, same
+from edge.flight.guidance import guide
+from edge.flight.record import FlightTick, Given, Made, TickReader, made
+from edge.flight.state import FlightMemory
+from edge.flight.step import step
+
+# Processors differ in the last of 16 digits.
+_ROUNDING = 1e-9
+_REST = tuple(f.name for f in fields(FlightMemory) if f.name not in ("state", "reason"))
+
+
+class Differing(NamedTuple):
+    """One thing of a tick, such as "state": what it was then, and what it is now, in words.
+
+    `is_rounding`: it is numbers alone, that differ in their last digits.
+    """
+
+    what: str
+    then: str
+    now: str
+    is_rounding: bool
+
+
+@dataclass(slots=True)
+class FlightDifference:
+    """What differs in `ticks` ticks in a row, as it was in the first of them."""
+
+    since_unix_s: float
+    until_unix_s: float
+    ticks: int
+    differing: Differing
+
+
+class FlightReplay:
+    """Runs the ticks of a log again, in their order.
+
+    `ticks` were run, of which `differing` differ; `passed_over` could not, since messages before
+    them are missing. `began_unix_s` is when the first one was.
+    """
+
+    def __init__(self, reader: TickReader | None = None) -> None:
+        """`reader` has read what the same program logged before."""
+        self.began_unix_s = math.nan
+        self.ticks = self.differing = self.passed_over = 0
+        self.differences: list[FlightDifference] = []
+        self._reader = reader or TickReader()
+        # By what differs: those that the tick before had.
+        self._going_on: dict[str, FlightDifference] = {}
+
+    def run(self, unix_time_s: float, message: Mapping[str, Any]) -> None:
+        """One message of the topic `flight`. Raises TickError."""
+        tick = self._reader.tick(message)
+        if tick is None:
+            self.passed_over += 1
+            self._going_on = {}
+            return
+        if not self.ticks:
+            self.began_unix_s = unix_time_s
+        self.ticks += 1
+        before, self._going_on = self._going_on, {}
+        for each in differing(tick):
+            difference = before.get(each.what)
+            if difference is None or difference.differing.is_rounding != each.is_rounding:
+                difference = FlightDifference(unix_time_s, unix_time_s, 0, each)
+                self.differences.append(difference)
+            difference.until_unix_s = unix_time_s
+            difference.ticks += 1
+            self._going_on[each.what] = difference
+        self.differing += bool(self._going_on)
+
+
+def differing(tick: FlightTick) -> Iterator[Differing]:
+    """What of a tick differs now; nothing if all is the same bit by bit."""
+    then, now = tick.made, run_again(tick.given)
+    for what, one, other in (
+        ("state", then.flight.state, now.flight.state),
+        ("reason", then.flight.reason, now.flight.reason),
+        ("actions", then.actions, now.actions),
+        ("alarms", then.alarms, now.alarms),
+        ("new trial", then.new_trial, now.new_trial),
+        ("velocity", then.velocity_m_s, now.velocity_m_s),
+        ("position", then.position_m, now.position_m),
+        *((f"memory: {n}", getattr(then.flight, n), getattr(now.flight, n)) for n in _REST),
+        ("guidance: velocity", then.guidance.velocity_m_s, now.guidance.velocity_m_s),
+        ("guidance: recovering", then.guidance.recovering, now.guidance.recovering),
+    ):
+        if not same(one, other):
+            rounding = _is_rounding(plain(one), plain(other))
+            yield Differing(what, _words(plain(one)), _words(plain(other)), rounding)
+
+
+def run_again(given: Given) -> Made:
+    """The tick as it is decided now."""
+    decision = step(given.robot, given.flight, given.inputs)
+    setpoint, guidance = guide(
+        given.robot, decision.flight, given.inputs, given.guidance, given.dt_s
+    )
+    return made(decision, setpoint, guidance)
+
+
+def _is_rounding(one: Any, other: Any) -> bool:
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_is_rounding, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=_ROUNDING, abs_tol=_ROUNDING)
+    return bool(one == other)
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ": ".join(_words(each) for each in value.values())
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_words, value)) or "none"
+    return "none" if value is None else str(value)

@@ -1,0 +1,397 @@
+"""One flight's record, wherever it was kept, and the numbers that follow from it.
+
+Robots' logs, a ground's log, the simulators and PX4's own log are all read into a `FlightRecord`;
+what is said and drawn of a flight follows from that alone, so that `lpac sim` and `lpac report`
+say the same of one flight, to the last digit. What the numbers mean:
+
+- The **mission** begins when its first robot says that it flies it, and ends when the last one says
+  so for the last time. Times are s from its begin, on the common clock (`lpac.analysis.logs`).
+- **J**, the coverage cost, is taken at the record's `cost_time_s`: of a fleet's flight each second,
+  and at the end. The mission's robots count that are in the air, as they say (`in_air`), where they
+  took themselves to be: on the straight line between two positions that they said, no more than
+  `FRESH_S` apart, else, for that long, where they said last. **True J** counts the same robots
+  where their vehicles were. Both are normalised by the first of their own.
+- The **least separation** is 3-D, of any two robots in the air; the **fence margin** the least
+  horizontal distance inside the fence in the air. They are told of where the robots took themselves
+  to be, from the mission's takeoff to its landing; and, where vehicles tell, of where all of these
+  were, from the mission before to the next.
+- A robot's **share of the mission** is the time in which it said that it flies it.
+- **Lloyd's algorithm** knows the world, and as many robots as there were begin where these began,
+  and at random places: the best that it comes to is a mark for comparison, and no bound.
+"""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F64
+from edge.core.fence import Fence
+from edge.core.perception import part_in_world, window_corner
+from edge.messages.codes import Reason, ReasonCode
+from edge.messages.mission import FlightState
+from lpac.analysis.coverage import Coverage
+from lpac.analysis.logs import LoggedStatus
+from lpac.analysis.snapshot import FRESH_S
+from lpac.analysis.truth import TrueTrack
+
+LOOPS = ("perception", "policy", "control")
+COST_PERIOD_S = 1.0
+_SEPARATION_PERIOD_S = 0.2
+_TRUE_SEPARATION_PERIOD_S = 0.04
+_SEEN_PERIOD_S = 0.2
+
+
+class StateChange(NamedTuple):
+    """A robot entered a state."""
+
+    time_s: float
+    state: FlightState
+    reason: Reason
+
+
+class Interval(NamedTuple):
+    """A robot was in a state; s."""
+
+    state: FlightState
+    begin_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotRecord:
+    """What a robot said in a flight; a point that is simulated says nothing but its places.
+
+    `time_s` (T,), `position_m` (T, 3) in the mission frame with heights above its own pad, NaN
+    where it did not know, `flying` (T,). `said` (T,) are the statuses, if there are any.
+    """
+
+    robot_id: int
+    name: str
+    time_s: F64
+    position_m: F64
+    flying: npt.NDArray[np.bool_]
+    said: tuple[LoggedStatus, ...] = ()
+
+    def places_at(self, times_s: F64) -> F64:
+        """(len(times_s), 3): where it was in the air, m; NaN where it was not, or is not known.
+
+        Between two positions that it knew, no more than a moment apart, it is on the way.
+        """
+        known = np.isfinite(self.position_m[:, 0])
+        if not known.any():
+            return np.full((len(times_s), 3), np.nan)
+        latest = np.searchsorted(self.time_s, times_s, side="right") - 1
+        in_air = (latest >= 0) & self.flying[latest]
+        in_air &= times_s - self.time_s[latest] <= FRESH_S
+        known_s, known_m = self.time_s[known], self.position_m[known]
+        before = np.searchsorted(known_s, times_s, side="right") - 1
+        after = np.minimum(before + 1, len(known_s) - 1)
+        at = np.maximum(before, 0)
+        in_air &= (before >= 0) & (times_s - known_s[at] <= FRESH_S)
+        span_s = known_s[after] - known_s[at]
+        share = np.clip((times_s - known_s[at]) / np.maximum(span_s, 1e-9), 0.0, 1.0)
+        share = np.where(span_s <= FRESH_S, share, 0.0)[:, None]
+        places_m = known_m[at] * (1.0 - share) + known_m[after] * share
+        return np.where(in_air[:, None], places_m, np.nan)
+
+    def intervals(self, end_s: float) -> list[Interval]:
+        """Its states, one after another."""
+        found: list[Interval] = []
+        begins_s = self.time_s.tolist()
+        ends_s = np.minimum([*begins_s[1:], end_s], self.time_s + FRESH_S).tolist()
+        for said, begin_s, until_s in zip(self.said, begins_s, ends_s, strict=True):
+            if found and found[-1].state is said.state and found[-1].end_s >= begin_s:
+                found[-1] = found[-1]._replace(end_s=until_s)
+            else:
+                found.append(Interval(said.state, begin_s, until_s))
+        return found
+
+
+class Separation(NamedTuple):
+    """The least distance of two robots in the air, 3-D, m."""
+
+    distance_m: float
+    robots: tuple[str, str]
+    time_s: float
+
+
+class CommandEntry(NamedTuple):
+    """Somebody commanded something, or a robot answered."""
+
+    time_s: float
+    operator: str
+    robot: str
+    text: str
+    done: bool
+
+
+class FirstAlarm(NamedTuple):
+    """A robot had an alarm, first at a time."""
+
+    time_s: float
+    robot: str
+    text: str
+    code: ReasonCode
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Messages:
+    """The messages between a trial's robots, while it lasted.
+
+    `age_s` and `loss` are (N, N), [receiver, sender]: the median age, and the share that did not
+    come of what was sent from the first to the last that did; NaN where nothing came. `heard` are
+    all that came: (M,) time, s, and age, s; `gaps` (G, 2) time and how many were missing before.
+    """
+
+    age_s: F64
+    loss: F64
+    heard_at_s: F64
+    heard_age_s: F64
+    gaps: F64
+    rejected: int
+
+    @property
+    def lost(self) -> int:
+        return int(self.gaps[:, 1].sum())
+
+    @property
+    def loss_share(self) -> float:
+        """NaN without any message."""
+        sent = len(self.heard_at_s) + self.lost
+        return self.lost / sent if sent else math.nan
+
+    def age_quantile_s(self, share: float) -> float:
+        """NaN without any message."""
+        ages = self.heard_age_s[np.isfinite(self.heard_age_s)]
+        return float(np.quantile(ages, share)) if len(ages) else math.nan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoopLateness:
+    """A loop of one robot over the trial: (T,) time, s, and lateness in the minute before, ms."""
+
+    time_s: F64
+    p50_ms: F64
+    p99_ms: F64
+    max_ms: F64
+    overruns: int
+    failures: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FlightRecord:
+    """One mission and its robots, from takeoff to landing; see above for what its numbers mean.
+
+    `begin_s` is Unix time, or 0; of a flight without a mission, when that began, and `duration_s`
+    is 0. `from_s` and `to_s` are what is shown. `robots` are the mission's. `truth` is where
+    vehicles were, by name: also others than the mission's, and beyond what is shown. Without a
+    world `coverage` is None, and the costs are empty. A robot's sensor sees `sensor_size` cells of
+    the world. `clocks_known`: the robots' clocks are corrected by what a ground heard.
+    """
+
+    name: str
+    duration_s: float
+    from_s: float
+    to_s: float
+    robots: tuple[RobotRecord, ...]
+    coverage: Coverage | None
+    sensor_size: int
+    cost_time_s: F64
+    begin_s: float = 0.0
+    truth: Mapping[str, TrueTrack] = field(default_factory=dict)
+    fence: Fence | None = None
+    commands: tuple[CommandEntry, ...] = ()
+    messages: Messages | None = None
+    lateness: Mapping[str, Mapping[str, LoopLateness]] = field(default_factory=dict)
+    world_ids: tuple[str, ...] = ()
+    clocks_known: bool = False
+
+    @cached_property
+    def _counted(self) -> tuple[F64, F64]:
+        """When anybody counts for J, (C,); and where these are, (C, N, 2), m, NaN who does not."""
+        if self.coverage is None or not len(self.cost_time_s):
+            return np.zeros(0), np.zeros((0, len(self.robots), 2))
+        places_m = np.stack([r.places_at(self.cost_time_s)[:, :2] for r in self.robots], axis=1)
+        counts = np.isfinite(places_m[..., 0]).any(axis=1)
+        return self.cost_time_s[counts], places_m[counts]
+
+    @property
+    def curve_time_s(self) -> F64:
+        """(C,): the times of `cost`, `true_cost` and what is normalised."""
+        return self._counted[0]
+
+    @cached_property
+    def cost(self) -> F64:
+        """(C,): J in model units, for where the robots took themselves to be."""
+        return self._costs(self._counted[1])
+
+    @cached_property
+    def true_cost(self) -> F64:
+        """(C,): J for where their vehicles were; NaN where that of one is not known."""
+        times_s, places_m = self._counted
+        true_m = np.full_like(places_m, np.nan)
+        for i, robot in enumerate(self.robots):
+            if robot.name in self.truth:
+                true_m[:, i] = self.truth[robot.name].positions_at(times_s)[:, :2]
+        counted = np.isfinite(places_m[..., 0])
+        known = (np.isfinite(true_m[..., 0]) | ~counted).all(axis=1)
+        true_m[~counted] = np.nan
+        cost = np.full(len(times_s), np.nan)
+        cost[known] = self._costs(true_m[known])
+        return cost
+
+    def _costs(self, places_m: F64) -> F64:
+        if self.coverage is None:
+            return np.zeros(0)
+        return np.array([self.coverage.cost(now_m[np.isfinite(now_m[:, 0])]) for now_m in places_m])
+
+    @property
+    def normalized(self) -> F64:
+        """J over the first; empty without a world, and over a world without importance."""
+        return _over_first(self.cost)
+
+    @property
+    def normalized_true(self) -> F64:
+        """True J over the first; NaN where it is not known."""
+        return _over_first(self.true_cost)
+
+    @cached_property
+    def lloyd(self) -> float:
+        """J that Lloyd's algorithm comes to, which knows the world; NaN if it is not known."""
+        _, places_m = self._counted
+        if self.coverage is None or not len(places_m):
+            return math.nan
+        return self.coverage.lloyd(places_m[0][np.isfinite(places_m[0, :, 0])])
+
+    @property
+    def normalized_lloyd(self) -> float:
+        """Over the first J; NaN if it is not known."""
+        return self.lloyd / self.cost[0] if len(self.cost) and self.cost[0] else math.nan
+
+    @cached_property
+    def separation(self) -> Separation | None:
+        """As the robots said; None if never two were in the air."""
+        times_s = np.arange(self.from_s, self.to_s, _SEPARATION_PERIOD_S)
+        return _least_distance(times_s, {r.name: r.places_at(times_s) for r in self.robots})
+
+    @cached_property
+    def true_separation(self) -> Separation | None:
+        """Of the vehicles; None also if that of one is not known."""
+        return least_separation(self.truth)
+
+    @cached_property
+    def fence_margin_m(self) -> float:
+        """How far inside the fence the robots said to be; NaN if there is no telling."""
+        return self._margin_m([robot.position_m[robot.flying] for robot in self.robots])
+
+    @cached_property
+    def true_fence_margin_m(self) -> float:
+        """How far inside the fence the vehicles were."""
+        return self._margin_m([track.position_m[track.airborne] for track in self.truth.values()])
+
+    def _margin_m(self, places_m: list[F64]) -> float:
+        if self.fence is None:
+            return math.nan
+        known_m = [(x_m, y_m) for of_one in places_m for x_m, y_m, _ in of_one.tolist()]
+        return min(
+            (self.fence.distance_m(x_m, y_m) for x_m, y_m in known_m if math.isfinite(x_m)),
+            default=math.nan,
+        )
+
+    @cached_property
+    def restarts(self) -> Mapping[str, int]:
+        """How often programs were started again, of those that were."""
+        starts = {r.name: len({said.boot_nonce for said in r.said}) for r in self.robots}
+        return {name: count - 1 for name, count in starts.items() if count > 1}
+
+    @cached_property
+    def alarms(self) -> tuple[FirstAlarm, ...]:
+        """Each robot's, as they came."""
+        first_s: dict[tuple[str, Reason], float] = {}
+        for robot in self.robots:
+            for said, time_s in zip(robot.said, robot.time_s.tolist(), strict=False):
+                for alarm in said.alarms:
+                    first_s.setdefault((robot.name, alarm), time_s)
+        return tuple(
+            sorted(
+                FirstAlarm(time_s, robot, alarm.text, alarm.code)
+                for (robot, alarm), time_s in first_s.items()
+            )
+        )
+
+    def mission_share(self, robot: RobotRecord) -> float:
+        """Which share of the mission's time it flew the mission."""
+        flown_s = sum(
+            max(0.0, min(end_s, self.duration_s) - max(begin_s, 0.0))
+            for state, begin_s, end_s in robot.intervals(self.to_s)
+            if state is FlightState.MISSION
+        )
+        return flown_s / self.duration_s if self.duration_s > 0.0 else 0.0
+
+    def places_at(self, time_s: float) -> dict[str, tuple[float, float]]:
+        """Who was in the air where, m, by name."""
+        found = {}
+        for robot in self.robots:
+            x_m, y_m, _ = robot.places_at(np.array([time_s]))[0].tolist()
+            if math.isfinite(x_m):
+                found[robot.name] = (x_m, y_m)
+        return found
+
+    def seen(self, time_s: float) -> npt.NDArray[np.bool_]:
+        """Which cells of the world lay in a robot's sensor view in the mission so far, [x, y]."""
+        assert self.coverage is not None
+        world_size = len(self.coverage.importance)
+        seen = np.zeros((world_size, world_size), np.bool_)
+        times_s = np.append(np.arange(0.0, time_s, _SEEN_PERIOD_S), time_s)
+        for robot in self.robots:
+            places_m = robot.places_at(times_s)[:, :2]
+            for place_m in places_m[np.isfinite(places_m[:, 0])]:
+                corner = window_corner(place_m * self.coverage.cells_per_m, self.sensor_size)
+                in_world, _ = part_in_world(corner, self.sensor_size, world_size)
+                seen[in_world] = True
+        return seen
+
+
+def changes_of(times_s: Sequence[float], said: Sequence[LoggedStatus]) -> tuple[StateChange, ...]:
+    """Each state that a robot entered by what it said at these times, with why."""
+    return tuple(
+        StateChange(time_s, status.state, status.reason)
+        for k, (time_s, status) in enumerate(zip(times_s, said, strict=True))
+        if k == 0 or status.state is not said[k - 1].state
+    )
+
+
+def least_separation(tracks: Mapping[str, TrueTrack]) -> Separation | None:
+    """The least distance of two vehicles while both are in the air.
+
+    None if never two were, and if of one nothing is known.
+    """
+    if not tracks or not all(len(track.time_s) for track in tracks.values()):
+        return None
+    first_s = min(track.time_s[0] for track in tracks.values())
+    last_s = max(track.time_s[-1] for track in tracks.values())
+    times_s = np.arange(first_s, last_s, _TRUE_SEPARATION_PERIOD_S)
+    return _least_distance(times_s, {n: track.places_at(times_s) for n, track in tracks.items()})
+
+
+def _least_distance(times_s: F64, places_m: Mapping[str, F64]) -> Separation | None:
+    """`places_m` (T, 3) by name; NaN where it does not count."""
+    least: Separation | None = None
+    for (one, at_m), (other, other_m) in itertools.combinations(places_m.items(), 2):
+        distances_m = np.linalg.norm(at_m - other_m, axis=1)
+        distances_m = np.where(np.isfinite(distances_m), distances_m, np.inf)
+        k = int(distances_m.argmin()) if len(distances_m) else 0
+        closest_m = float(distances_m[k]) if len(distances_m) else math.inf
+        if math.isfinite(closest_m) and (least is None or closest_m < least.distance_m):
+            least = Separation(closest_m, (one, other), float(times_s[k]))
+    return least
+
+
+def _over_first(cost: F64) -> F64:
+    return cost / cost[0] if len(cost) and cost[0] else np.zeros(0)
