@@ -36,8 +36,8 @@ def drill(
         DrillVehicle,
         typer.Option(
             help="simulated: on one simulated clock, over all cores; mavlink: one process per "
-            "robot in real time; px4: with real PX4s. The latter two fly what `--list` says, one "
-            "flight after another."
+            "robot in real time, a few flights at once; px4: with real PX4s, one after another. "
+            "The latter two fly what `--list` says."
         ),
     ] = DrillVehicle.SIMULATED,
     px4: Annotated[
@@ -94,7 +94,7 @@ def drill(
     else:
         campaign = Campaign(out, vehicle, robots, bundle)
         numbers = range(seeds) if seed is None else [seed]
-        pool = _pool(ray) if real_time is None else real_time.one_by_one()
+        pool = _pool(ray) if real_time is None else real_time.pool
         outcomes = _fly(campaign, chosen, list(numbers), pool)
         result = to_json(outcomes)
         (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")

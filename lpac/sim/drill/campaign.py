@@ -96,12 +96,18 @@ def _drill(robots: int, bundle: str) -> SimulatedDrill:
     return SimulatedDrill(robots, Path(bundle))
 
 
-def over_cores(orders: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+def over_cores(tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
     """A process for each core; outcomes as they come."""
-    workers = min(len(orders), len(os.sched_getaffinity(0)))
+    return over_processes(tasks, fly_order, len(os.sched_getaffinity(0)))
+
+
+def over_processes(
+    tasks: Sequence[FlightTask], fly: Callable[[FlightTask], FlightOutcome], at_most: int
+) -> Iterator[FlightOutcome]:
+    """So many processes at most that fly; outcomes as they come."""
     # A fork would inherit threads that do not run there.
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        flights = [pool.submit(fly_order, order) for order in orders]
+    with ProcessPoolExecutor(min(len(tasks), at_most), get_context("spawn")) as pool:
+        flights = [pool.submit(fly, task) for task in tasks]
         try:
             for flight in as_completed(flights):
                 yield flight.result()

@@ -1,10 +1,18 @@
-"""Flights of faults in real time, one after another, each with a fleet of its own."""
+"""Flights of faults in real time, each with a fleet of its own: some beside each other."""
 
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from lpac.sim.drill.campaign import LATE_S, FlightOutcome, FlightTask, Pool, outcome_of
+from edge.core import log
+from lpac.sim.drill.campaign import (
+    LATE_S,
+    FlightOutcome,
+    FlightTask,
+    outcome_of,
+    over_processes,
+)
 from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.field import has_remote_control, scenario_of, settings_of
 from lpac.sim.drill.figure import write_figure
@@ -14,6 +22,8 @@ from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.sitl.build import require_build
 
+# Of a robot with its vehicle and its part of a ground, with room for whatever else runs.
+_CORES_EACH = 0.33
 # What a late machine broke says nothing, and is flown again.
 _TRIES = 3
 
@@ -45,14 +55,18 @@ class RealTimeDrill:
                 break
         return outcome
 
-    def one_by_one(self) -> Pool:
-        """All of them, in this process."""
+    def pool(self, tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+        """All of them, as many at once as this machine carries; outcomes as they come."""
+        at_once = 1
+        # PX4's ports are the same for all fleets.
+        if self._px4_build is None:
+            at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * self._robots))
+        return over_processes(tasks, self.fly_task, max(1, at_once))
 
-        def pool(tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
-            for task in tasks:
-                yield self.outcome(FAULTS[task.fault], task.seed)
-
-        return pool
+    def fly_task(self, task: FlightTask) -> FlightOutcome:
+        """One flight, in whatever process this is."""
+        log.listen(log.show_errors)
+        return self.outcome(FAULTS[task.fault], task.seed)
 
     def _fly(self, fault: Fault, seed: int) -> FlightTruth:
         folder = self.folder(fault, seed)

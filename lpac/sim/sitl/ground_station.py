@@ -93,9 +93,9 @@ class RealVehicle:
         self.set_parameter("SIM_GPS_USED", satellites, mavlink.MAV_PARAM_TYPE_INT32)
 
     def drain(self, remaining: float) -> None:
-        """The battery falls to this share within seconds."""
+        """The battery falls to this share within a second."""
         self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining, mavlink.MAV_PARAM_TYPE_REAL32)
-        self.set_parameter("SIM_BAT_DRAIN", 40.0, mavlink.MAV_PARAM_TYPE_REAL32)
+        self.set_parameter("SIM_BAT_DRAIN", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
         """A ground station moves the estimator's origin."""
