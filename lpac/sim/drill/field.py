@@ -86,6 +86,10 @@ class FaultyFleet(ABC):
     def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
         """What the vehicles did."""
 
+    def lead_s(self, injection: Injection) -> float:
+        """How much earlier it has to happen to be felt in time."""
+        return 0.0
+
     def late_s(self) -> float:
         """How far the machine that flies them was behind real time."""
         return 0.0

@@ -65,6 +65,8 @@ _PATIENCE_S = 60.0
 # A vehicle steps every 0.02 s; after as long without a step somebody looks all the same.
 _LOOK_S = 0.5
 _KILLED_S = 10.0
+# Until PX4 (v1.17) tells of a battery that it is below 25 % or 15 %, once it fell to 0.5 % less.
+_BATTERY_TOLD_S = 5.5
 
 T = TypeVar("T")
 
@@ -336,6 +338,10 @@ class Px4Field(ProcessField):
     def __init__(self, fleet: Fleet, ground: GroundProgram, px4s: RealVehicles) -> None:
         super().__init__(fleet, ground, px4s.stepped)
         self._px4s = px4s
+
+    def lead_s(self, injection: Injection) -> float:
+        """A battery that falls at once is told by PX4 through a filter."""
+        return _BATTERY_TOLD_S if isinstance(injection, Drain) else 0.0
 
     def now_s(self) -> float:
         """This machine's."""

@@ -43,10 +43,6 @@ class RealTimeDrill:
         self._folder, self._robots, self._bundle = folder, robots, bundle
         self._px4_build = px4_build
 
-    def folder(self, fault: Fault, seed: int) -> Path:
-        """Where a flight has what it leaves."""
-        return self._folder / f"{fault.name}-{seed}"
-
     def outcome(self, fault: Fault, seed: int) -> FlightOutcome:
         """Fly and judge; again if it broke a promise while this machine was late."""
         for _ in range(_TRIES):
@@ -69,7 +65,7 @@ class RealTimeDrill:
         return self.outcome(FAULTS[task.fault], task.seed)
 
     def _fly(self, fault: Fault, seed: int) -> FlightTruth:
-        folder = self.folder(fault, seed)
+        folder = self._folder / f"{fault.name}-{seed}"
         shutil.rmtree(folder, ignore_errors=True)
         fleet = Fleet(
             scenario_of(fault, seed, self._robots), folder, self._bundle,
