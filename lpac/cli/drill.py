@@ -1,6 +1,7 @@
 """`lpac drill`: faults in flight, and whether what is promised then holds."""
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,15 +14,35 @@ from lpac.cli.printing import BAD, GOOD, print_table, styled
 if TYPE_CHECKING:
     from lpac.sim.drill.campaign import Campaign, FlightOutcome, Pool
     from lpac.sim.drill.faults import Fault
+    from lpac.sim.drill.real_time import RealTimeDrill
 
 app = new_app()
 
 _OUT = Path("out/drill")
 
 
+class DrillVehicle(StrEnum):
+    """What the robots of a drill fly."""
+
+    SIMULATED = "simulated"
+    MAVLINK = "mavlink"
+    PX4 = "px4"
+
+
 @app.command()
 def drill(
     *,
+    vehicle: Annotated[
+        DrillVehicle,
+        typer.Option(
+            help="simulated: on one simulated clock, over all cores; mavlink: one process per "
+            "robot in real time, a few flights at once; px4: with real PX4s, one after another. "
+            "The latter two fly what `--list` says."
+        ),
+    ] = DrillVehicle.SIMULATED,
+    px4: Annotated[
+        Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
+    ] = None,
     faults: Annotated[
         list[str] | None,
         typer.Option("--fault", metavar="NAME", help="Only this fault; may be repeated."),
@@ -42,8 +63,12 @@ def drill(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
     out: Annotated[
-        Path, typer.Option(help="Folder for drill.json, drill.xml (JUnit), and what was flown.")
-    ] = _OUT,
+        Path | None,
+        typer.Option(
+            help=f"Folder for drill.json, drill.xml (JUnit), and what was flown; if not given "
+            f"{_OUT}, or with mavlink and px4 {_OUT}-mavlink and so on."
+        ),
+    ] = None,
 ) -> None:
     """Do faults to a fleet in flight, and judge by the vehicles' truth what is promised."""
     from lpac.sim.drill.campaign import Campaign
@@ -58,19 +83,32 @@ def drill(
         raise ValueError(f"--seeds {seeds}: must be at least 1")
     if not 2 <= robots <= 10:
         raise ValueError(f"--robots {robots}: must be from 2 to 10")
-    if seed is not None and len(chosen) == 1:
+    chosen = _flown(chosen, vehicle, by_name=bool(faults))
+    if out is None:
+        out = _OUT if vehicle is DrillVehicle.SIMULATED else Path(f"{_OUT}-{vehicle}")
+    real_time = _real_time(vehicle, px4, ray, out, robots, bundle)
+    if seed is not None and len(chosen) == 1 and real_time is None:
         outcomes = [_fly_again(chosen[0], seed, robots, bundle, out / f"{chosen[0].name}-{seed}")]
+    elif seed is not None and len(chosen) == 1 and real_time is not None:
+        outcomes = [real_time.outcome(chosen[0], seed)]
     else:
-        campaign = Campaign(out, "simulated", robots, bundle)
+        campaign = Campaign(out, vehicle, robots, bundle)
         numbers = range(seeds) if seed is None else [seed]
-        outcomes = _fly(campaign, chosen, list(numbers), _pool(ray))
+        pool = _pool(ray) if real_time is None else real_time.pool
+        outcomes = _fly(campaign, chosen, list(numbers), pool)
         result = to_json(outcomes)
         (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")
         (out / "drill.xml").write_bytes(as_junit(outcomes))
     if as_json:
         typer.echo(json.dumps(to_json(outcomes), indent=2))
     else:
-        _show(outcomes, robots)
+        _show(outcomes, _again(vehicle, px4, robots))
+        if real_time is not None:
+            late_s = max(outcome.late_s for outcome in outcomes)
+            typer.echo(
+                f"this machine was at most {late_s:.1f} s behind real time in a flight; "
+                f"logs and figures are in {out}"
+            )
     if not all(outcome.held for outcome in outcomes):
         raise typer.Exit(1)
 
@@ -82,6 +120,62 @@ def _chosen(names: list[str] | None) -> list["Fault"]:
         if name not in FAULTS:
             raise ValueError(f"--fault {name}: there is none; `lpac drill --list` has all")
     return [FAULTS[name] for name in names or FAULTS]
+
+
+def _flies(vehicle: DrillVehicle, fault: "Fault") -> bool:
+    """Whether all that a fault does can be done to these vehicles."""
+    from lpac.sim.drill.field import supports
+    from lpac.sim.drill.processes import MAVLINK, PX4
+    from lpac.sim.drill.simulated import SUPPORTED
+
+    injections = {
+        DrillVehicle.SIMULATED: SUPPORTED, DrillVehicle.MAVLINK: MAVLINK, DrillVehicle.PX4: PX4,
+    }  # fmt: skip
+    return supports(injections[vehicle], fault)
+
+
+def _flown(faults: list["Fault"], vehicle: DrillVehicle, *, by_name: bool) -> list["Fault"]:
+    """Those that the vehicles fly; who names others is told."""
+    flown = [fault for fault in faults if _flies(vehicle, fault)]
+    if by_name and len(flown) < len(faults):
+        others = ", ".join(fault.name for fault in faults if fault not in flown)
+        raise ValueError(
+            f"--fault {others}: is not flown with --vehicle {vehicle}; `lpac drill --list` tells "
+            "what is"
+        )
+    return flown
+
+
+def _real_time(
+    vehicle: DrillVehicle,
+    px4: Path | None,
+    ray: str | None,
+    out: Path,
+    robots: int,
+    bundle: Path,
+) -> "RealTimeDrill | None":
+    """None on the simulated clock."""
+    if px4 is not None and vehicle is not DrillVehicle.PX4:
+        raise ValueError(f"--px4 does nothing with --vehicle {vehicle}")
+    if px4 is None and vehicle is DrillVehicle.PX4:
+        raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+    if vehicle is DrillVehicle.SIMULATED:
+        return None
+    if ray is not None:
+        raise ValueError(f"--ray does nothing with --vehicle {vehicle}")
+    from edge.core import log
+    from lpac.sim.drill.real_time import RealTimeDrill
+
+    log.listen(log.show_errors)
+    return RealTimeDrill(out, robots, bundle, px4)
+
+
+def _again(vehicle: DrillVehicle, px4: Path | None, robots: int) -> str:
+    """The options with which the same is flown again."""
+    options = f"-n {robots}"
+    if vehicle is not DrillVehicle.SIMULATED:
+        options += f" --vehicle {vehicle}"
+    return options if px4 is None else f"{options} --px4 {px4}"
 
 
 def _pool(ray: str | None) -> "Pool":
@@ -147,7 +241,7 @@ def _fly_again(
     return outcome
 
 
-def _show(outcomes: list["FlightOutcome"], robots: int) -> None:
+def _show(outcomes: list["FlightOutcome"], again: str) -> None:
     from lpac.sim.drill.faults import FAULTS
     from lpac.sim.drill.report import at_most_share, shown, summaries
 
@@ -173,11 +267,19 @@ def _show(outcomes: list["FlightOutcome"], robots: int) -> None:
     for outcome in broken:
         what = outcome.error or "; ".join(map(shown, outcome.broken))
         typer.echo(f"{outcome.fault}, seed {outcome.seed}: {what}")
-        typer.echo(f"    lpac drill --fault {outcome.fault} --seed {outcome.seed} -n {robots}")
+        typer.echo(f"    lpac drill --fault {outcome.fault} --seed {outcome.seed} {again}")
 
 
 def _list(faults: list["Fault"]) -> None:
     print_table(
-        ("fault", "what happens", "promise"),
-        [(fault.name, fault.what, fault.promise) for fault in faults],
+        ("fault", "what happens", "promise", "flown by"),
+        [
+            (
+                fault.name,
+                fault.what,
+                fault.promise,
+                ", ".join(vehicle for vehicle in DrillVehicle if _flies(vehicle, fault)),
+            )
+            for fault in faults
+        ],
     )

@@ -51,7 +51,12 @@ class Figure(NamedTuple):
 
     @property
     def room(self) -> float:
-        """How far it is from its limit, as a share of that; below 0 if it is beyond."""
+        """How far it is from its limit, as a share of that; below 0 if it is beyond.
+
+        What must not happen at all, and did not, is not near.
+        """
+        if not self.unit and self.limit == 0.0 and not self.broken:
+            return math.inf
         room = (self.value - self.limit) * (1.0 if self.at_least else -1.0)
         if not math.isfinite(self.value):
             return -math.inf if self.broken else math.inf

@@ -1,7 +1,8 @@
 """Many flights of many faults: over all cores or a Ray cluster; what was flown is kept on disk.
 
 A campaign that was killed goes on where it was: each flight's outcome is a line of `flights.jsonl`,
-below one that says what flew. Another version of the code, or another bundle, begins anew.
+below one that says what flew. Another version of the code, or another bundle, begins anew; and what
+ended early is flown again.
 """
 
 import hashlib
@@ -25,6 +26,8 @@ from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.drill.truth import FlightTruth
 
 _FLIGHTS = "flights.jsonl"
+# Two ticks of control that a robot left out in a flight, or as much of the vehicles' time.
+LATE_S = 0.25
 
 
 class FlightTask(NamedTuple):
@@ -38,12 +41,16 @@ class FlightTask(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FlightOutcome:
-    """What came of one flight. `error` is what ended it early, such as a defect; else ""."""
+    """What came of one flight. `error` is what ended it early, such as a defect; else "".
+
+    `late_s` is how far the machine was behind real time, if it was flown in that.
+    """
 
     fault: str
     seed: int
     figures: tuple[Figure, ...]
     error: str = ""
+    late_s: float = 0.0
 
     @property
     def broken(self) -> tuple[Figure, ...]:
@@ -60,14 +67,20 @@ Pool = Callable[[Sequence[FlightTask]], Iterator[FlightOutcome]]
 
 
 def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> FlightOutcome:
-    """Fly and judge. What raises is an outcome, too: no other flight is lost for it."""
+    """Fly and judge. What raises is an outcome, too: no other flight is lost for it.
+
+    Limits are the same in real time. So what breaks one while the machine is late is not judged.
+    """
     try:
         truth = flown()
-        return FlightOutcome(
-            fault.name, seed, judge((*always(fault.beyond_fence_m), *fault.bounds), truth)
-        )
+        figures = judge((*always(fault.beyond_fence_m), *fault.bounds), truth)
     except Exception as error:
         return FlightOutcome(fault.name, seed, (), f"{type(error).__name__}: {error}")
+    unjudged = ""
+    if truth.late_s > LATE_S and any(figure.broken for figure in figures):
+        broken = ", ".join(figure.name for figure in figures if figure.broken)
+        unjudged = f"not judged ({broken}): this machine was {truth.late_s:.1f} s behind real time"
+    return FlightOutcome(fault.name, seed, figures, unjudged, truth.late_s)
 
 
 def fly_order(order: FlightTask) -> FlightOutcome:
@@ -83,12 +96,18 @@ def _drill(robots: int, bundle: str) -> SimulatedDrill:
     return SimulatedDrill(robots, Path(bundle))
 
 
-def over_cores(orders: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+def over_cores(tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
     """A process for each core; outcomes as they come."""
-    workers = min(len(orders), len(os.sched_getaffinity(0)))
+    return over_processes(tasks, fly_order, len(os.sched_getaffinity(0)))
+
+
+def over_processes(
+    tasks: Sequence[FlightTask], fly: Callable[[FlightTask], FlightOutcome], at_most: int
+) -> Iterator[FlightOutcome]:
+    """So many processes at most that fly; outcomes as they come."""
     # A fork would inherit threads that do not run there.
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        flights = [pool.submit(fly_order, order) for order in orders]
+    with ProcessPoolExecutor(min(len(tasks), at_most), get_context("spawn")) as pool:
+        flights = [pool.submit(fly, task) for task in tasks]
         try:
             for flight in as_completed(flights):
                 yield flight.result()
@@ -142,7 +161,7 @@ class Campaign:
             first, *lines = self._path.read_text().splitlines() or [""]
             if _parsed(first) == self._flown_by:
                 outcomes = [_outcome(line) for line in lines]
-                return {(o.fault, o.seed): o for o in outcomes if o is not None}
+                return {(o.fault, o.seed): o for o in outcomes if o is not None and not o.error}
         self._path.write_text(json.dumps(self._flown_by) + "\n")
         return {}
 
@@ -171,4 +190,4 @@ def _outcome(line: str) -> FlightOutcome | None:
     if read is None:
         return None
     figures = tuple(Figure(*figure) for figure in read["figures"])
-    return FlightOutcome(read["fault"], read["seed"], figures, read["error"])
+    return FlightOutcome(**{**read, "figures": figures})

@@ -22,7 +22,7 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from lpac.sim.drill.faults import Fault, Phase
-from lpac.sim.drill.injections import Do
+from lpac.sim.drill.injections import Do, Injection
 from lpac.sim.fleet.layout import ORIGIN
 
 # When a fault begins, after its phase has.
@@ -51,6 +51,10 @@ class Field(Protocol):
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
         """Have something happen, so much later."""
+        ...
+
+    def lead_s(self, injection: Injection) -> float:
+        """How much earlier it has to happen to be felt in time."""
         ...
 
     def now_s(self) -> float:
@@ -100,11 +104,12 @@ def to_mission(field: Field) -> Procedure[None]:
 def fly(field: Field, fault: Fault, seed: int, robots: int) -> Procedure[Timeline]:
     """From `to_ready`, or for a fault in the mission or later from `to_mission`, to the end."""
     hit, delay_s = drawn(fault, seed, robots)
+    delay_s = max([delay_s, *(field.lead_s(do.injection) - do.at_s for do in fault.does)])
     began_s = field.now_s()
     fault_s = began_s + delay_s
     marks = {do.mark: fault_s + do.at_s for do in fault.does if do.mark}
     for do in fault.does:
-        field.at(delay_s + do.at_s, do, hit)
+        field.at(delay_s + do.at_s - field.lead_s(do.injection), do, hit)
     if fault.phase == "ready":
         yield from _wait(delay_s + _NOTICED_S)
     if fault.phase in ("ready", "takeoff"):

@@ -97,6 +97,7 @@ def as_json(outcomes: Sequence[FlightOutcome]) -> dict[str, Any]:
                 "fault": outcome.fault,
                 "seed": outcome.seed,
                 "error": outcome.error,
+                "late_s": round(outcome.late_s, 2),
                 "figures": [_figure_json(figure) for figure in outcome.broken],
             }
             for outcome in outcomes

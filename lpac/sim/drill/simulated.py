@@ -1,46 +1,31 @@
 """Faults on the simulated clock: whole robots and the real ground, in this process."""
 
-import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar, assert_never
+from typing import Any, NamedTuple, TypeVar, assert_never, get_args
 
-import numpy as np
-
-from edge.core import F64
-from edge.core.fence import Fence
-from edge.flight.margins import ErrorBudget
 from lpac.ground.procedure import NothingComesError, Procedure
 from lpac.ground.station.protocol import (
     Request,
-    Resume,
-    RobotCommand,
-    SafetyCommand,
-    SetFence,
-    Start,
-    Takeoff,
 )
-from lpac.sim.description import ERRORS
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
+from lpac.sim.drill.field import FaultyFleet, has_remote_control, scenario_of, settings_of
+from lpac.sim.drill.flight import fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
     AutopilotSilent,
     ClockSteps,
     Cut,
     DiskFills,
     Do,
-    FenceWithout,
     GroundClockSteps,
     GroundDies,
     GroundStarts,
     GroundStops,
     Injection,
     LoopHangs,
-    OperatorOrders,
-    OrderedKind,
     ProgramDies,
     ProgramStarts,
     ProgramStops,
@@ -50,31 +35,27 @@ from lpac.sim.drill.injections import (
     VehicleInjection,
     WatchdogDies,
 )
-from lpac.sim.drill.truth import FlightTruth, GivenOrder, vehicle_truth
-from lpac.sim.fleet.layout import WORLD, FleetScenario
+from lpac.sim.drill.truth import FlightTruth, VehicleTruth, vehicle_truth
+from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.radio import GROUND
 
-# Receivers with corrections, and heights that hardly walk.
-EXACT = ErrorBudget(
-    gps_m=0.25, height_apart_m=0.2, height_common_m=0.0, takeoffs_height_m=0.0, pads_height_m=0.2
-)
 # Where a second program's vehicle stands, north of the first.
 _BESIDE_M = 3.0
-# How long an order that nobody waits for is valid.
-_ORDER_S = 10.0
+# All that there is.
+SUPPORTED: tuple[type, ...] = get_args(Injection)
 
 T = TypeVar("T")
 
 
-class SimulatedField:
-    """A simulated fleet as a `Field` of the drill; `orders` are all that were given."""
+class SimulatedField(FaultyFleet):
+    """A simulated fleet as a `Field` of the drill."""
 
     def __init__(self, fleet: SimulatedFleet) -> None:
+        super().__init__(fleet.layout)
         self.fleet = fleet
-        self.orders: list[GivenOrder] = []
         self._operator = next(iter(fleet.grounds))
 
     def copy(self) -> "SimulatedField":
@@ -101,7 +82,7 @@ class SimulatedField:
 
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
         """Have something happen, so much later."""
-        self.fleet.schedule.at(self.now_s() + after_s, partial(self._happen, do, hit))
+        self.fleet.schedule.at(self.now_s() + after_s, partial(self.happen, do, hit))
 
     def all_down(self) -> bool:
         """Whether all vehicles really stand on the ground, motors off."""
@@ -109,18 +90,6 @@ class SimulatedField:
             each.vehicle.landed and not each.vehicle.armed and each.vehicle.position_m[2] >= 0.0
             for each in self.fleet.vehicles
         )
-
-    def noted(self, request: Request) -> Callable[[], None]:
-        """Note that something is commanded now; call the result when it is answered."""
-        index = len(self.orders)
-        self.orders.append(
-            GivenOrder(_kind(request), self._robots(request), self.now_s(), math.inf)
-        )
-
-        def answered() -> None:
-            self.orders[index] = self.orders[index]._replace(ended_s=self.now_s())
-
-        return answered
 
     def carry_out(self, procedure: Procedure[T]) -> T:
         """Let time pass until it is through; a command that does not end is answered by None."""
@@ -136,57 +105,36 @@ class SimulatedField:
             except NothingComesError:
                 answer = None
 
-    def truth(self, timeline: Timeline) -> FlightTruth:
-        """What the vehicles did."""
-        layout = self.fleet.layout
-        vehicles = tuple(
-            vehicle_truth(each.vehicle.truth, layout.to_mission) for each in self.fleet.vehicles
-        )
-        return FlightTruth(
-            vehicles, timeline.hit, timeline.fault_s, timeline.calm_s, timeline.marks,
-            tuple(self.orders), layout.fence, layout.pads_m, layout.scenario.budget.drone_m,
-        )  # fmt: skip
+    # What a kind of vehicles has of its own
 
-    # Where vehicles are
+    @property
+    def vehicles(self) -> Sequence[Px4Vehicle]:
+        """Those of second programs come last."""
+        return [each.vehicle for each in self.fleet.vehicles]
 
-    def outwards(self, robot: int) -> F64:
-        """(2,): the way to the nearest line of the fence, north and east."""
-        layout = self.fleet.layout
-        place_m = self.fleet.true_positions_m()[robot, :2]
-        edges = layout.fence.edges()
-        out = -edges.inward[int(np.argmin(edges.distances_m(place_m)))]
-        turned: F64 = (layout.to_mission.rotation @ np.array([*out, 0.0]))[:2]
-        return turned
-
-    def inside_m(self, robot: int) -> float:
-        """How far inside that line the vehicle takes itself to be."""
-        layout = self.fleet.layout
-        estimate_m = self.fleet.vehicles[robot].vehicle.estimated_position_m
-        return layout.fence.distance_m(*layout.to_mission.local_to_mission(estimate_m)[:2])
+    @property
+    def robots_by_name(self) -> dict[str, int]:
+        """By the ground's setup."""
+        return dict(self.ground.setup.robots)
 
     def height_m(self, robot: int) -> float:
         """The height that a robot flies at."""
         config = self.fleet.robots[robot % len(self.fleet.robots)].config
         return config.flight.slot_height_m
 
-    def place_m(self, robot: int) -> F64:
-        """(2,): the pad that a robot stood on at first, where it really is; north and east."""
-        pads_m = self.fleet.layout.pads_m
-        return np.array(self.fleet.layout.to_world_m(pads_m[robot % len(pads_m)]))
+    def send(self, request: Request) -> bool:
+        """The ground begins with it."""
+        if self.ground_runs:
+            self.ground.node.begin(request)
+        return self.ground_runs
 
-    # What happens
+    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+        """What they noted."""
+        to_mission = self.layout.to_mission
+        return tuple(vehicle_truth(vehicle.truth, to_mission) for vehicle in self.vehicles)
 
-    def _happen(self, do: Do, hit: tuple[int, ...]) -> None:
-        everybody = tuple(range(len(self.fleet.robots)))
-        robots = {
-            "hit": hit,
-            "all": everybody,
-            "others": tuple(robot for robot in everybody if robot not in hit),
-            "next": tuple((robot + 1) % len(everybody) for robot in hit),
-        }[do.to]
-        self._inject(do.injection, robots)
-
-    def _inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
+    def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
+        """Now."""
         fleet = self.fleet
         if isinstance(injection, VehicleInjection):
             for robot in robots:
@@ -208,12 +156,6 @@ class SimulatedField:
                 fleet.join(self._operator)
             case GroundClockSteps(by_s):
                 self.ground.clock.ahead_s += by_s
-            case OperatorOrders(kind):
-                self._order(_request(kind, tuple(f"r{robot}" for robot in robots)))
-            case FenceWithout():
-                self._order(
-                    SetFence(_fence_without(fleet.layout.fence, self._landing_points(robots)))
-                )
             case _:
                 for robot in robots:
                     self._inject_program(injection, robot)
@@ -249,21 +191,6 @@ class SimulatedField:
         vehicle = Px4Vehicle(seed=robot, start_m=(north_m + _BESIDE_M, east_m), origin=WORLD)
         direct = DirectVehicle(vehicle, robot + 1, self.fleet.schedule)
         self.fleet.second_program(robot, direct).start()
-
-    def _landing_points(self, robots: tuple[int, ...]) -> list[F64]:
-        return [self.fleet.layout.landing_points_m[robot] for robot in robots]
-
-    def _order(self, request: Request) -> None:
-        if self.ground_runs:
-            order = GivenOrder(
-                _kind(request), self._robots(request), self.now_s(), self.now_s() + _ORDER_S
-            )
-            self.orders.append(order)
-            self.ground.node.begin(request)
-
-    def _robots(self, request: Request) -> tuple[int, ...]:
-        names: tuple[str, ...] = getattr(request, "robots", ())
-        return tuple(self.ground.setup.robots[name] for name in names or self.ground.setup.robots)
 
 
 class _Bases(NamedTuple):
@@ -311,15 +238,11 @@ class SimulatedDrill:
     def _ready(
         self, fault: Fault, seed: int, folder: Path, *, logged: bool = False
     ) -> SimulatedField:
-        settings: dict[str, dict[str, object]] = {}
-        for table, key, value in fault.settings:
-            settings.setdefault(table, {})[key] = value
-        scenario = FleetScenario(
-            robots=self._robots, seed=seed, secure=True, errors=not fault.exact,
-            budget=EXACT if fault.exact else ERRORS,
-        )  # fmt: skip
-        fleet = SimulatedFleet(scenario, folder, self._bundle, settings=settings, logs=logged)
-        if settings.get("failsafe", {}).get("rc") == "pilot":
+        scenario = scenario_of(fault, seed, self._robots)
+        fleet = SimulatedFleet(
+            scenario, folder, self._bundle, settings=settings_of(fault), logs=logged
+        )
+        if has_remote_control(fault):
             for each in fleet.vehicles:
                 each.vehicle.rc_connected = True
         field = SimulatedField(fleet)
@@ -346,38 +269,3 @@ def _partition(cut: Cut, robots: int) -> tuple[frozenset[int], ...]:
         half = (robots + 1) // 2
         return ground | frozenset(range(half)), frozenset(range(half, robots))
     assert_never(cut)
-
-
-def _kind(request: Request) -> str:
-    """What an order is called in a flight's truth."""
-    if isinstance(request, RobotCommand):
-        return request.kind
-    return request.action if isinstance(request, SafetyCommand) else type(request).__name__.lower()
-
-
-def _request(kind: OrderedKind, robots: tuple[str, ...]) -> Request:
-    match kind:
-        case "takeoff":
-            return Takeoff(robots)
-        case "start":
-            return Start(robots)
-        case "resume":
-            return Resume(robots)
-        case "hold" | "return" | "land":
-            return SafetyCommand(kind, robots)
-        case "pilot" | "rejoin" | "kill" | "disarm":
-            return RobotCommand(kind, robots)
-
-
-def _fence_without(fence: Fence, places_m: list[F64]) -> Fence:
-    """As much of a square fence as leaves these places outside, by half a metre."""
-    corners = np.array(fence.vertices_m)
-    low_m, high_m = corners.min(axis=0), corners.max(axis=0)
-    x_m = min(place_m[0] for place_m in places_m)
-    # What is left on the side with more room.
-    if x_m - low_m[0] > high_m[0] - max(place_m[0] for place_m in places_m):
-        high_m[0] = x_m - 0.5
-    else:
-        low_m[0] = max(place_m[0] for place_m in places_m) + 0.5
-    (x0, y0), (x1, y1) = low_m.tolist(), high_m.tolist()
-    return replace(fence, vertices_m=((x0, y0), (x1, y0), (x1, y1), (x0, y1)))

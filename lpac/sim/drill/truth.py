@@ -80,7 +80,8 @@ class FlightTruth:
     """One flight of a fault. `hit` are the robots that it was done to.
 
     `fault_s` is when it began, `calm_s` when the operator began to bring all home. `marks` tell of
-    further times by their names. `pads_m` (N, 2) is where they really stood at first.
+    further times by their names. `pads_m` (N, 2) is where they really stood at first. `late_s` is
+    how far the machine that flew it was behind real time; 0 on a simulated clock.
     """
 
     vehicles: tuple[VehicleTruth, ...]
@@ -92,6 +93,7 @@ class FlightTruth:
     fence: Fence
     pads_m: F64
     drone_m: float
+    late_s: float = 0.0
 
     @property
     def others(self) -> tuple[int, ...]:

@@ -3,7 +3,7 @@
 import signal
 import subprocess
 import time
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -24,7 +24,6 @@ class GroundProgram:
     `pid` is its process. What it prints is in ground.log beside the fleet's file.
     """
 
-    told: GroundSubscriber
     pid: int
 
     def __init__(self, fleet_toml: Path, fleet: str, name: str = "sim") -> None:
@@ -34,24 +33,15 @@ class GroundProgram:
         self._name = name
         self._log = fleet_toml.with_name("ground.log")
         self._process: subprocess.Popen[bytes] | None = None
-        self._stack = ExitStack()
+        self._told: GroundSubscriber | None = None
 
     def __enter__(self) -> Self:
         """Comes back once it tells of the fleet. Raises GroundError if it does not start."""
-        with ExitStack() as stack:
-            with self._log.open("ab") as output:
-                self._process = subprocess.Popen(
-                    python_program("lpac.cli.main", "ground",
-                                   "--fleet", str(self._fleet_toml), "--name", self._name),
-                    stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                    # Ctrl-C is for the launcher alone, which lands the vehicles first.
-                    process_group=0,
-                )  # fmt: skip
-            self.pid = self._process.pid
-            stack.callback(self._end)
-            self.told = self._connected()
-            stack.push(self.told)
-            self._stack = stack.pop_all()
+        try:
+            self.start()
+        except BaseException:
+            self._end()
+            raise
         return self
 
     def __exit__(
@@ -60,22 +50,64 @@ class GroundProgram:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._stack.__exit__(kind, error, traceback)
+        self._end()
+
+    @property
+    def told(self) -> GroundSubscriber:
+        """What it tells, as long as it runs."""
+        assert self._told is not None
+        return self._told
 
     @property
     def running(self) -> bool:
         """Whether it has not ended."""
         return self._process is not None and self._process.poll() is None
 
-    def command(self, request: Request) -> CommandReport:
-        """Have a command done, and wait for what came of it. Raises GroundError."""
-        return command(self.fleet, request)
+    def command(
+        self, request: Request, meanwhile: Callable[[], None] = lambda: None
+    ) -> CommandReport:
+        """Have a command done, and wait for what came of it; `meanwhile` is called once a second.
+
+        Raises GroundError.
+        """
+        return command(self.fleet, request, meanwhile=meanwhile)
+
+    def start(self) -> None:
+        """Start it, also again, on what it left on its disk. Raises GroundError if it does not."""
+        with self._log.open("ab") as output:
+            self._process = subprocess.Popen(
+                python_program("lpac.cli.main", "ground",
+                               "--fleet", str(self._fleet_toml), "--name", self._name),
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                # Ctrl-C is for the launcher alone, which lands the vehicles first.
+                process_group=0,
+            )  # fmt: skip
+        self.pid = self._process.pid
+        self._listen()
 
     def kill(self) -> None:
         """It ends like a computer whose battery is empty."""
         assert self._process is not None
         self._process.kill()
         self._process.wait()
+
+    def suspend(self) -> None:
+        """It stands still, like a laptop that sleeps."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGSTOP)
+
+    def wake(self) -> None:
+        """It goes on. Raises GroundError if it tells nothing then."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGCONT)
+        self._listen()
+
+    def _listen(self) -> None:
+        """Who listens gives a ground up that is silent, so begin anew."""
+        told = self._connected()
+        if self._told is not None:
+            self._told.__exit__(None, None, None)
+        self._told = told
 
     def _connected(self) -> GroundSubscriber:
         until_s = time.monotonic() + _START_WITHIN_S
@@ -94,9 +126,11 @@ class GroundProgram:
         return next((line for line in reversed(lines) if line.strip()), "it printed nothing")
 
     def _end(self) -> None:
-        assert self._process is not None
-        if self.running:
+        if self._told is not None:
+            self._told.__exit__(None, None, None)
+        if self._process is not None and self.running:
             self._process.send_signal(signal.SIGTERM)
+            self._process.send_signal(signal.SIGCONT)
             try:
                 self._process.wait(_END_WITHIN_S)
             except subprocess.TimeoutExpired:

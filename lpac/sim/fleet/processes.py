@@ -6,6 +6,7 @@ import signal
 import subprocess
 import time
 from collections import deque
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -171,11 +172,13 @@ class Fleet:
         bundle_path: Path,
         *,
         px4_build: Path | None = None,
+        settings: Mapping[str, Mapping[str, object]] | None = None,
         say: Say = lambda _: None,
     ) -> None:
         """Prepare the fleet in `folder`: fleet.toml, world, a folder per robot. Starts nothing.
 
-        With `px4_build` the vehicles are real PX4s of that build folder.
+        With `px4_build` the vehicles are real PX4s of that build folder. `settings` are further
+        keys of robot.toml's tables, for all robots.
 
         Raises ValueError if that one is no build, or there is no room for so many robots;
         BundleError for a bundle that cannot be loaded, or has no perception.
@@ -223,6 +226,7 @@ class Fleet:
                     self.robots, ports, self.vehicles.autopilots, strict=True
                 )
             },
+            settings=settings,
             keys=True,
         )
 

@@ -33,9 +33,11 @@ from pymavlink.dialects.v20 import common as mavlink
 from edge.core import F64
 from lpac.analysis.truth import TrueTrack
 from lpac.sim.fleet.vehicles import AutopilotAddress, VehicleError
+from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vehicle import Truth
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl import ordinary
-from lpac.sim.sitl.log import read_truth, setpoint_times_s
+from lpac.sim.sitl.log import read_setpoints, read_truth
 
 MAX_INSTANCES = 10
 LISTEN_PORT = 14580
@@ -145,10 +147,7 @@ class Px4Build:
                 f"robots = {len(starts_m)}: must be from 1 to {MAX_INSTANCES} with --vehicle px4, "
                 "since PX4 sends to one port from instance 10 on"
             )
-        build = build.expanduser().resolve()
-        fault = _build_fault(build)
-        if fault:
-            raise ValueError(f"--px4 {build}: {fault}")
+        build = require_build(build)
         if " " in str(build) or " " in str(folder):
             raise ValueError(f"--px4 {build}, --out {folder}: PX4 does not take spaces in paths")
         for number in range(len(starts_m)):
@@ -230,12 +229,53 @@ class Px4Build:
         ]
         return max(0.0, *lost_s, 0.0)
 
+    def stood_still_s(self, since_s: float) -> float:
+        """The longest that one PX4's clock stood still at once, since then (`time.monotonic()`)."""
+        longest_s = 0.0
+        with self._heard_lock:
+            for instance in self._instances:
+                clock_s = np.array([pair for pair in instance.clock if pair[0] >= since_s])
+                passed_s = np.diff(clock_s.reshape(-1, 2), axis=0)
+                longest_s = max(longest_s, (passed_s[:, 0] - passed_s[:, 1]).max(initial=0.0))
+        return longest_s
+
     def last_setpoint_s(self, number: int) -> float:
         """When the last setpoint had reached a PX4, by its log: `time.monotonic()`."""
         instance = self._instances[number]
         with self._heard_lock:
-            setpoints_s = setpoint_times_s(instance.logs())
+            setpoints_s = read_setpoints(instance.logs()).time_s
             return float(instance.to_monotonic_s(setpoints_s)[-1])
+
+    def logged_truth(self, number: int) -> list[Truth]:
+        """What a PX4's own log says, which is whole once PX4 has ended; [] if it says nothing.
+
+        Times are `time.monotonic()`.
+        """
+        instance = self._instances[number]
+        truth = read_truth(instance.logs(), self._world) if instance.clock else None
+        if truth is None or not len(truth.status_s):
+            return []
+        setpoints = read_setpoints(instance.logs())
+        setpoints_s = instance.to_monotonic_s(setpoints.time_s).tolist()
+        statuses = np.maximum(np.searchsorted(truth.status_s, truth.time_s, "right") - 1, 0)
+        lasts = np.searchsorted(setpoints.time_s, truth.time_s, "right") - 1
+        entries = []
+        for at_s, place_m, velocity_m_s, status, last in zip(
+            instance.to_monotonic_s(truth.time_s).tolist(), truth.position_m.tolist(),
+            truth.velocity_m_s.tolist(), statuses.tolist(), lasts.tolist(), strict=True,
+        ):  # fmt: skip
+            heard = last >= 0
+            entries.append(
+                Truth(
+                    time_s=at_s, position_m=tuple(place_m), velocity_m_s=tuple(velocity_m_s),
+                    mode=Px4Mode(int(truth.navigation_state[status])),
+                    armed=bool(truth.armed[status]), landed=place_m[2] > -_AIRBORNE_ABOVE_M,
+                    setpoint_at_s=setpoints_s[last] if heard else -math.inf,
+                    follows=("velocity" if setpoints.is_velocity[last] else "position")
+                    if heard else None,
+                )
+            )  # fmt: skip
+        return entries
 
     def logs(self, number: int) -> list[Path]:
         """What a PX4 has logged so far, some tenths of a second old."""
@@ -356,6 +396,15 @@ def frames(datagram: bytes) -> Iterator[tuple[int, bytes]]:
 def payload(frame: bytes, size: int) -> bytes:
     """The first bytes of a message's payload, of which zeros at its end are not sent."""
     return frame[_HEADER_BYTES : _HEADER_BYTES + min(frame[1], size)].ljust(size, b"\0")
+
+
+def require_build(build: Path) -> Path:
+    """The whole path of a build of PX4's simulator. Raises ValueError if it is none."""
+    build = build.expanduser().resolve()
+    fault = _build_fault(build)
+    if fault:
+        raise ValueError(f"--px4 {build}: {fault}")
+    return build
 
 
 def _build_fault(build: Path) -> str:

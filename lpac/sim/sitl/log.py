@@ -4,14 +4,14 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from edge.core import F64
+from edge.core import F64, Bools
 from lpac.sim.px4.world import WorldOrigin
 
 _PLACE, _ATTITUDE, _STATUS = (
@@ -37,6 +37,13 @@ class Px4Truth:
     status_s: F64
     navigation_state: npt.NDArray[np.int64]
     armed: npt.NDArray[np.bool_]
+
+
+class Px4Setpoints(NamedTuple):
+    """When setpoints came from outside, (S,), PX4's time, s, ascending; whether of a velocity."""
+
+    time_s: F64
+    is_velocity: Bools
 
 
 def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
@@ -77,10 +84,13 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
     )
 
 
-def setpoint_times_s(paths: Sequence[Path]) -> F64:
-    """When setpoints came from outside, PX4's time; ascending."""
-    logs = [_topics(path, (_SETPOINT,)) for path in paths]
-    return np.sort(_joined([topics[_SETPOINT]["timestamp"] for topics in logs if topics])) * 1e-6
+def read_setpoints(paths: Sequence[Path]) -> Px4Setpoints:
+    """All setpoints that the logs of one PX4 tell; PX4 notes at most ten a second."""
+    logs = [topics[_SETPOINT] for path in paths if (topics := _topics(path, (_SETPOINT,)))]
+    time_s = _joined([log["timestamp"] for log in logs]) * 1e-6
+    is_velocity = _joined([(log["velocity"] > 0) & (log["position"] == 0) for log in logs]) > 0.0
+    order = np.argsort(time_s, kind="stable")
+    return Px4Setpoints(time_s[order], is_velocity[order])
 
 
 Topic = dict[str, npt.NDArray[Any]]

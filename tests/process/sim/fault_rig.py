@@ -55,8 +55,8 @@ from lpac.sim.fleet.processes import Fleet, RobotProcess
 from lpac.sim.fleet.vehicles import SimulatedVehicles
 from lpac.sim.px4.errors import GREATEST_WIND_M_S
 from lpac.sim.px4.vehicle import Px4Vehicle, Truth
+from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
 from tests.conftest import ROOT
-from tests.process.sim.px4_rig import RealVehicle, RealVehicles
 from tests.raw_ground import RawGround
 from tests.robot_rig import HELD_UP, NOT_YET
 from tests.said import why

@@ -37,9 +37,9 @@ from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.sitl.build import Px4Build
+from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
 from tests.conftest import SHIPPED
 from tests.process.sim.fault_rig import FaultRig, FaultyRobot, flies_on, speed_m_s
-from tests.process.sim.px4_rig import RealVehicle, RealVehicles
 from tests.said import codes
 
 pytestmark = pytest.mark.real_time

@@ -24,7 +24,7 @@ from lpac.sim.fleet.vehicles import VehicleError
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl import ordinary
 from lpac.sim.sitl.build import Px4Build, _require_alone
-from lpac.sim.sitl.log import read_truth
+from lpac.sim.sitl.log import read_setpoints, read_truth
 from tests.conftest import ROOT
 from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.test_fleet import launched, pid_of, read_until
@@ -258,9 +258,13 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
         + ulog("B", bytes(40))
         + ulog("F", b"vehicle_local_position_groundtruth:uint64_t timestamp;double ref_lat;"
                b"double ref_lon;float x;float y;float z;float vx;float vy;float vz;")
+        + ulog("F", b"offboard_control_mode:uint64_t timestamp;uint8_t position;uint8_t velocity;")
         + ulog("F", b"vehicle_status:uint64_t timestamp;uint8_t nav_state;uint8_t arming_state;")
         + ulog("A", struct.pack("<BH", 0, 0) + b"vehicle_local_position_groundtruth")
         + ulog("A", struct.pack("<BH", 0, 1) + b"vehicle_status")
+        + ulog("A", struct.pack("<BH", 0, 2) + b"offboard_control_mode")
+        + ulog("D", struct.pack("<HQBB", 2, 1_200_000, 0, 1))
+        + ulog("D", struct.pack("<HQBB", 2, 1_100_000, 1, 0))
         + ulog("D", struct.pack("<HQBB", 1, 500_000, 4, 1))
         + b"".join(
             ulog("D", struct.pack("<HQdd6f", 0, 1_000_000 * i, latitude, longitude,
@@ -278,6 +282,9 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.velocity_m_s, [[0.5, 0.0, -1.0]] * 3)
     assert truth.status_s.tolist() == [0.5, 1.5]
     assert truth.navigation_state.tolist() == [4, 14] and truth.armed.tolist() == [False, True]
+    setpoints = read_setpoints([log])
+    np.testing.assert_allclose(setpoints.time_s, [1.1, 1.2])
+    assert setpoints.is_velocity.tolist() == [False, True]
     (tmp_path / "torn.ulg").write_bytes(b"ULog")
     assert read_truth([tmp_path / "torn.ulg"], world) is None
 

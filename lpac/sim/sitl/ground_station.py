@@ -1,4 +1,4 @@
-"""Real PX4s as the fault rig sees vehicles: what is done to them, and what they do.
+"""Real PX4s for whoever does faults to them: what is done to them, and what they do.
 
 What is done to a PX4 comes from a ground station on its ground-station link; where the vehicle
 really is tells PX4's own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
@@ -20,13 +20,15 @@ from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
 from lpac.sim.px4.vehicle import Truth
 from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames, payload
-from lpac.sim.sitl.log import read_truth, setpoint_times_s
+from lpac.sim.sitl.log import read_setpoints, read_truth
 
 AIRBORNE_ABOVE_M = 0.15
 # PX4's DESCEND is told as LAND.
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
+# PX4's own default.
+_SATELLITES = 10
 # Of vehicle_status in PX4's log.
 NAVIGATION_LAND = 18
 # Not in pymavlink's dialect: custom_mode comes first. PX4 has it since v1.15.
@@ -85,14 +87,15 @@ class RealVehicle:
         custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, *CUSTOM_MODES[mode])
 
-    def lose_gps(self) -> None:
-        """Its receiver sees no satellite from now on."""
-        self.set_parameter("SIM_GPS_USED", 0, mavlink.MAV_PARAM_TYPE_INT32)
+    def lose_gps(self, *, lost: bool = True) -> None:
+        """Its receiver sees no satellite from now on, or sees them again."""
+        satellites = 0 if lost else _SATELLITES
+        self.set_parameter("SIM_GPS_USED", satellites, mavlink.MAV_PARAM_TYPE_INT32)
 
     def drain(self, remaining: float) -> None:
-        """The battery falls to this share within seconds."""
+        """The battery falls to this share within a second."""
         self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining, mavlink.MAV_PARAM_TYPE_REAL32)
-        self.set_parameter("SIM_BAT_DRAIN", 40.0, mavlink.MAV_PARAM_TYPE_REAL32)
+        self.set_parameter("SIM_BAT_DRAIN", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
         """A ground station moves the estimator's origin."""
@@ -162,7 +165,7 @@ class RealVehicle:
         truth = read_truth(logs, self._world)
         assert truth is not None
         landing_s = truth.status_s[truth.navigation_state == NAVIGATION_LAND][0]
-        return float(landing_s - setpoint_times_s(logs)[-1])
+        return float(landing_s - read_setpoints(logs).time_s[-1])
 
     def _receive(self) -> bytes:
         with suppress(ConnectionError, BlockingIOError):

@@ -1,0 +1,230 @@
+"""What all fleets of the drill share: who is meant, what was ordered, and where vehicles are."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.fence import Fence
+from edge.flight.margins import ErrorBudget
+from lpac.ground.station.protocol import (
+    Request,
+    Resume,
+    RobotCommand,
+    SafetyCommand,
+    SetFence,
+    Start,
+    Takeoff,
+)
+from lpac.sim.description import ERRORS
+from lpac.sim.drill.faults import Fault
+from lpac.sim.drill.flight import Timeline
+from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
+from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
+from lpac.sim.fleet.layout import FleetScenario, Layout
+
+# Receivers with corrections, and heights that hardly walk.
+EXACT = ErrorBudget(
+    gps_m=0.25, height_apart_m=0.2, height_common_m=0.0, takeoffs_height_m=0.0, pads_height_m=0.2
+)
+# How long an order that nobody waits for is valid.
+_ORDER_S = 10.0
+
+
+class FaultyVehicle(Protocol):
+    """Where a vehicle is, and takes itself to be: the world's frame, (3,), m."""
+
+    position_m: F64
+
+    @property
+    def estimated_position_m(self) -> F64: ...
+
+
+class FaultyFleet(ABC):
+    """A fleet that faults are done to; `orders` are all that were given, `layout` what it is.
+
+    It is a `Surroundings` of its vehicles.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+        self.orders: list[GivenOrder] = []
+
+    # What differs between kinds of vehicles
+
+    @abstractmethod
+    def now_s(self) -> float:
+        """The vehicles' clock."""
+
+    @property
+    @abstractmethod
+    def vehicles(self) -> Sequence[FaultyVehicle]:
+        """One for each robot, at least."""
+
+    @property
+    @abstractmethod
+    def robots_by_name(self) -> dict[str, int]:
+        """What the operator calls them."""
+
+    @abstractmethod
+    def height_m(self, robot: int) -> float:
+        """The height that a robot flies at."""
+
+    @abstractmethod
+    def send(self, request: Request) -> bool:
+        """The operator commands that, and does not wait; False if there is no ground."""
+
+    @abstractmethod
+    def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
+        """Do to these robots what is neither an order nor a fence."""
+
+    @abstractmethod
+    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+        """What the vehicles did."""
+
+    def lead_s(self, injection: Injection) -> float:
+        """How much earlier it has to happen to be felt in time."""
+        return 0.0
+
+    def late_s(self) -> float:
+        """How far the machine that flies them was behind real time."""
+        return 0.0
+
+    # What happens
+
+    def happen(self, do: Do, hit: tuple[int, ...]) -> None:
+        """Do it to those who are meant."""
+        everybody = tuple(range(self.layout.scenario.robots))
+        robots = {
+            "hit": hit,
+            "all": everybody,
+            "others": tuple(robot for robot in everybody if robot not in hit),
+            "next": tuple((robot + 1) % len(everybody) for robot in hit),
+        }[do.to]
+        match do.injection:
+            case OperatorOrders(kind):
+                self._order(_request(kind, tuple(f"r{robot}" for robot in robots)))
+            case FenceWithout():
+                places_m = [self.layout.landing_points_m[robot] for robot in robots]
+                self._order(SetFence(_fence_without(self.layout.fence, places_m)))
+            case injection:
+                self.inject(injection, robots)
+
+    def noted(self, request: Request) -> Callable[[], None]:
+        """Note that something is commanded now; call the result when it is answered."""
+        index = len(self.orders)
+        self.orders.append(
+            GivenOrder(_kind(request), self._addressed(request), self.now_s(), math.inf)
+        )
+
+        def answered() -> None:
+            self.orders[index] = self.orders[index]._replace(ended_s=self.now_s())
+
+        return answered
+
+    def truth(self, timeline: Timeline) -> FlightTruth:
+        """The whole flight."""
+        layout = self.layout
+        return FlightTruth(
+            self.vehicle_truths(), timeline.hit, timeline.fault_s, timeline.calm_s, timeline.marks,
+            tuple(self.orders), layout.fence, layout.pads_m, layout.scenario.budget.drone_m,
+            self.late_s(),
+        )  # fmt: skip
+
+    # Where vehicles are
+
+    def outwards(self, robot: int) -> F64:
+        """(2,): the way to the nearest line of the fence, north and east."""
+        to_mission = self.layout.to_mission
+        place_m = to_mission.local_to_mission(self.vehicles[robot].position_m)[:2]
+        edges = self.layout.fence.edges()
+        out = -edges.inward[int(np.argmin(edges.distances_m(place_m)))]
+        turned: F64 = (to_mission.rotation @ np.array([*out, 0.0]))[:2]
+        return turned
+
+    def inside_m(self, robot: int) -> float:
+        """How far inside that line the vehicle takes itself to be."""
+        estimate_m = self.vehicles[robot].estimated_position_m
+        place_m = self.layout.to_mission.local_to_mission(estimate_m)
+        return self.layout.fence.distance_m(*place_m[:2])
+
+    def place_m(self, robot: int) -> F64:
+        """(2,): the pad that a robot stood on at first, where it really is; north and east."""
+        pads_m = self.layout.pads_m
+        return np.array(self.layout.to_world_m(pads_m[robot % len(pads_m)]))
+
+    def _order(self, request: Request) -> None:
+        began_s = self.now_s()
+        if self.send(request):
+            robots = self._addressed(request)
+            self.orders.append(GivenOrder(_kind(request), robots, began_s, began_s + _ORDER_S))
+
+    def _addressed(self, request: Request) -> tuple[int, ...]:
+        names: tuple[str, ...] = getattr(request, "robots", ())
+        numbers = self.robots_by_name
+        return tuple(numbers[name] for name in names or numbers)
+
+
+def scenario_of(fault: Fault, seed: int, robots: int) -> FleetScenario:
+    """The fleet that flies it: members with keys, on vehicles that err, unless they are exact."""
+    return FleetScenario(
+        robots=robots, seed=seed, secure=True, errors=not fault.exact,
+        budget=EXACT if fault.exact else ERRORS,
+    )  # fmt: skip
+
+
+def settings_of(fault: Fault) -> dict[str, dict[str, object]]:
+    """Its further keys of robot.toml, by table."""
+    settings: dict[str, dict[str, object]] = {}
+    for table, key, value in fault.settings:
+        settings.setdefault(table, {})[key] = value
+    return settings
+
+
+def has_remote_control(fault: Fault) -> bool:
+    """Whether its robots are set up for a pilot's remote control, which is on then."""
+    return settings_of(fault).get("failsafe", {}).get("rc") == "pilot"
+
+
+def supports(injections: tuple[type, ...], fault: Fault) -> bool:
+    """Whether vehicles that take these injections fly a fault."""
+    return all(isinstance(do.injection, injections) for do in fault.does)
+
+
+def _kind(request: Request) -> str:
+    """What an order is called in a flight's truth."""
+    if isinstance(request, RobotCommand):
+        return request.kind
+    return request.action if isinstance(request, SafetyCommand) else type(request).__name__.lower()
+
+
+def _request(kind: OrderedKind, robots: tuple[str, ...]) -> Request:
+    match kind:
+        case "takeoff":
+            return Takeoff(robots)
+        case "start":
+            return Start(robots)
+        case "resume":
+            return Resume(robots)
+        case "hold" | "return" | "land":
+            return SafetyCommand(kind, robots)
+        case "pilot" | "rejoin" | "kill" | "disarm":
+            return RobotCommand(kind, robots)
+
+
+def _fence_without(fence: Fence, places_m: list[F64]) -> Fence:
+    """As much of a square fence as leaves these places outside, by half a metre."""
+    corners = np.array(fence.vertices_m)
+    low_m, high_m = corners.min(axis=0), corners.max(axis=0)
+    x_m = min(place_m[0] for place_m in places_m)
+    # What is left on the side with more room.
+    if x_m - low_m[0] > high_m[0] - max(place_m[0] for place_m in places_m):
+        high_m[0] = x_m - 0.5
+    else:
+        low_m[0] = max(place_m[0] for place_m in places_m) + 0.5
+    (x0, y0), (x1, y1) = low_m.tolist(), high_m.tolist()
+    return replace(fence, vertices_m=((x0, y0), (x1, y0), (x1, y1), (x0, y1)))

@@ -1,0 +1,406 @@
+"""Faults in real time: the robots' programs and the ground's, on simulated vehicles or real PX4s.
+
+Flights are judged by the same bounds as on the simulated clock. How far this machine was behind is
+part of a flight's truth.
+"""
+
+import heapq
+import itertools
+import signal
+import threading
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from edge.robot.config import Rates, load_config
+from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
+from lpac.ground.station.client import GroundError
+from lpac.ground.station.protocol import CommandReport, Request
+from lpac.sim.drill.faults import Fault
+from lpac.sim.drill.field import FaultyFleet
+from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
+from lpac.sim.drill.injections import (
+    Do,
+    Drain,
+    FenceWithout,
+    GroundDies,
+    GroundStarts,
+    GroundStops,
+    Injection,
+    LoseGps,
+    ModeIs,
+    OperatorOrders,
+    OriginJumps,
+    ProgramDies,
+    ProgramStarts,
+    ProgramStops,
+    VehicleInjection,
+)
+from lpac.sim.drill.truth import VehicleTruth, vehicle_truth
+from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.layout import WORLD
+from lpac.sim.fleet.processes import Fleet
+from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
+from lpac.sim.px4.vehicle import Px4Vehicle
+from lpac.sim.sitl.build import Px4Build
+from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
+
+# What is done to programs, and what their operator does, on whatever vehicles.
+_PROGRAMS = (
+    ProgramDies, ProgramStops, ProgramStarts, GroundDies, GroundStops, GroundStarts,
+    OperatorOrders, FenceWithout,
+)  # fmt: skip
+# Nobody cuts this machine's own network, fills its disk or steps its clock, and no loop of a
+# program that is as in the field hangs on demand.
+MAVLINK: tuple[type, ...] = (VehicleInjection, *_PROGRAMS)
+# What a ground station can do to a real one, and PX4's own simulator to its vehicle.
+PX4: tuple[type, ...] = (LoseGps, Drain, OriginJumps, ModeIs, *_PROGRAMS)
+
+# How long a command may take, each robot.
+_PATIENCE_S = 60.0
+# A vehicle steps every 0.02 s; after as long without a step somebody looks all the same.
+_LOOK_S = 0.5
+_KILLED_S = 10.0
+# Until PX4 (v1.17) tells of a battery that it is below 25 % or 15 %, once it fell to 0.5 % less.
+_BATTERY_TOLD_S = 5.5
+
+T = TypeVar("T")
+
+
+class ProcessField(FaultyFleet):
+    """A fleet of processes as a `Field` of the drill; a context, within those of its parts.
+
+    What is due is done by a thread of its own, on the vehicles' clock.
+    """
+
+    def __init__(self, fleet: Fleet, ground: GroundProgram, stepped: threading.Condition) -> None:
+        """`stepped` is held by whoever changes vehicles, and notified once they have stepped."""
+        super().__init__(fleet.layout)
+        self.fleet = fleet
+        self.stepped = stepped
+        self._ground = ground
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._count = itertools.count()
+        self._over = False
+        self._failed: Exception | None = None
+        self._heights_m = [
+            load_config(robot.folder / "robot.toml").flight.slot_height_m for robot in fleet.robots
+        ]
+        self._stopped: set[int] = set()
+        self._late_s = 0.0
+        self._thread = threading.Thread(target=self._run, name="faults", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with self.stepped:
+            self._over = True
+            self.stepped.notify_all()
+        self._thread.join()
+
+    # The drill's field
+
+    @property
+    def ground(self) -> Ground:
+        """The operator's, as it told last."""
+        return self._ground.told
+
+    @property
+    def ground_runs(self) -> bool:
+        """Whether it does."""
+        return self._ground.running
+
+    def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
+        """Have something happen, so much later."""
+        self._at(self.now_s() + after_s, partial(self.happen, do, hit))
+
+    def carry_out(self, procedure: Procedure[T]) -> T:
+        """Let time pass until it is through; a command that does not end is answered by None.
+
+        Raises what kept a fault from happening, and OverloadError or VehicleError.
+        """
+        answer: Any = None
+        while True:
+            try:
+                wanted = procedure.send(answer)
+            except StopIteration as done:
+                result: T = done.value
+                return result
+            answer = self._wait(wanted) if isinstance(wanted, Until) else self._command(wanted)
+
+    # What all kinds of vehicles have in common
+
+    @property
+    def robots_by_name(self) -> dict[str, int]:
+        """By their programs."""
+        return {robot.name: robot.robot_id for robot in self.fleet.robots}
+
+    def height_m(self, robot: int) -> float:
+        """By its robot.toml."""
+        return self._heights_m[robot % len(self._heights_m)]
+
+    def send(self, request: Request) -> bool:
+        """A client of the ground waits for the answer, beside the flight."""
+
+        def command() -> None:
+            # The ground may end before it answers; then there is no answer.
+            try:
+                self._ground.command(request)
+            except GroundError:
+                return
+
+        if self.ground_runs:
+            threading.Thread(target=command, name="operator", daemon=True).start()
+        return self.ground_runs
+
+    def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
+        """Now."""
+        match injection:
+            case VehicleInjection():
+                with self.stepped:
+                    for robot in robots:
+                        self.inject_vehicle(injection, robot)
+            case GroundDies():
+                self._ground.kill()
+            case GroundStarts():
+                self._ground.start()
+            case GroundStops(for_s):
+                self._ground.suspend()
+                self._at(self.now_s() + for_s, self._ground.wake)
+            case _:
+                for robot in robots:
+                    self._inject_program(injection, robot)
+
+    def late_s(self) -> float:
+        """As it was in `fly`."""
+        return self._late_s
+
+    def fly(self, fault: Fault, seed: int) -> Timeline:
+        """From the programs' start to the end. Raises what `carry_out` does."""
+        self.carry_out(to_ready(self))
+        self.fleet.begin()
+        began_s = time.monotonic()
+        if fault.phase in ("mission", "return"):
+            self.carry_out(to_mission(self))
+        timeline = self.carry_out(fly(self, fault, seed, len(self.fleet.robots)))
+        self._late_s = self._late_since_s(began_s)
+        return timeline
+
+    def _late_since_s(self, began_s: float) -> float:
+        """By the vehicles' time left out, or a robot's control; of those that nothing stopped."""
+        late_s = [self.vehicles_late_s(began_s)]
+        for robot in self.robots_by_name.values():
+            overruns = [
+                heard.status.loops["control"].overruns
+                for heard in self.fleet.heard.history(robot)
+                if heard.at_s >= began_s and "control" in heard.status.loops
+            ]
+            if overruns and robot not in self._stopped:
+                late_s.append((overruns[-1] - overruns[0]) / Rates().control_hz)
+        return max(late_s)
+
+    @abstractmethod
+    def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
+        """Now, while `stepped` is held."""
+
+    @abstractmethod
+    def vehicles_late_s(self, began_s: float) -> float:
+        """How long the vehicles stood still since then (`time.monotonic()`)."""
+
+    @abstractmethod
+    def all_down(self) -> bool:
+        """Whether all vehicles really stand on the ground, motors off."""
+
+    def _inject_program(self, injection: Injection, index: int) -> None:
+        robot = self.fleet.robots[index]
+        self._stopped.add(index)
+        match injection:
+            case ProgramDies():
+                robot.send_signal(signal.SIGKILL)
+            case ProgramStarts():
+                # What restarts a program that hangs kills it first.
+                robot.send_signal(signal.SIGKILL)
+                robot.wait(_KILLED_S)
+                robot.start()
+            case ProgramStops(for_s):
+                robot.send_signal(signal.SIGSTOP)
+                self._at(self.now_s() + for_s, partial(robot.send_signal, signal.SIGCONT))
+            case _:
+                raise TypeError(f"{injection} is not done to a program")
+
+    # Time
+
+    def _at(self, at_s: float, happen: Callable[[], None]) -> None:
+        with self.stepped:
+            heapq.heappush(self._due, (at_s, next(self._count), happen))
+
+    def _run(self) -> None:
+        def is_due() -> bool:
+            return self._over or bool(self._due and self._due[0][0] <= self.now_s())
+
+        while True:
+            with self.stepped:
+                self.stepped.wait_for(is_due)
+                if self._over:
+                    return
+                _, _, happen = heapq.heappop(self._due)
+            try:
+                happen()
+            except Exception as error:
+                self._failed = error
+                return
+
+    def _wait(self, until: Until) -> bool:
+        end_s = self.now_s() + until.at_most_s
+        while True:
+            self._look()
+            with self.stepped:
+                if until.condition(self.ground.snapshot):
+                    return True
+                if self.now_s() >= end_s:
+                    return False
+                self.stepped.wait(_LOOK_S)
+
+    def _command(self, request: Request) -> CommandReport | None:
+        end_s = time.monotonic() + _PATIENCE_S * len(self.fleet.robots)
+
+        def look() -> None:
+            self._look()
+            if time.monotonic() > end_s:
+                raise NothingComesError
+
+        try:
+            return self._ground.command(request, look)
+        except (GroundError, NothingComesError):
+            return None
+
+    def _look(self) -> None:
+        if self._failed is not None:
+            raise self._failed
+        self.fleet.vehicles.require_running()
+        self.fleet.require_keeping_up()
+
+
+class MavlinkField(ProcessField):
+    """On simulated vehicles, which a thread of this process flies."""
+
+    def __init__(self, fleet: Fleet, ground: GroundProgram, simulated: SimulatedVehicles) -> None:
+        super().__init__(fleet, ground, simulated.stepped)
+        self._simulated = simulated
+
+    def now_s(self) -> float:
+        """Of the vehicles, which are all of one time."""
+        with self.stepped:
+            return self.vehicles[0].time_s
+
+    @property
+    def vehicles(self) -> Sequence[Px4Vehicle]:
+        """Themselves."""
+        return self._simulated.vehicles
+
+    def all_down(self) -> bool:
+        """Whether all vehicles really stand on the ground, motors off."""
+        with self.stepped:
+            return all(
+                vehicle.landed and not vehicle.armed and vehicle.position_m[2] >= 0.0
+                for vehicle in self.vehicles
+            )
+
+    def vehicles_late_s(self, began_s: float) -> float:
+        """In all."""
+        return self.fleet.lateness().vehicles_s
+
+    def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
+        """To the vehicle itself."""
+        injection.apply(self.vehicles[robot], robot, self)
+
+    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+        """What they noted."""
+        with self.stepped:
+            truths = [tuple(vehicle.truth) for vehicle in self.vehicles]
+        return tuple(vehicle_truth(truth, self.layout.to_mission) for truth in truths)
+
+
+class Px4Field(ProcessField):
+    """On real PX4s, whose vehicles are PX4's own model; times are `time.monotonic()`."""
+
+    def __init__(self, fleet: Fleet, ground: GroundProgram, px4s: RealVehicles) -> None:
+        super().__init__(fleet, ground, px4s.stepped)
+        self._px4s = px4s
+
+    def lead_s(self, injection: Injection) -> float:
+        """A battery that falls at once is told by PX4 through a filter."""
+        return _BATTERY_TOLD_S if isinstance(injection, Drain) else 0.0
+
+    def now_s(self) -> float:
+        """This machine's."""
+        return time.monotonic()
+
+    @property
+    def vehicles(self) -> Sequence[RealVehicle]:
+        """As a ground station hears them."""
+        return self._px4s.vehicles
+
+    def all_down(self) -> bool:
+        """Whether all vehicles really stand on the ground, motors off."""
+        with self.stepped:
+            return all(vehicle.landed and not vehicle.armed for vehicle in self.vehicles)
+
+    def vehicles_late_s(self, began_s: float) -> float:
+        """At once: a PX4's clock runs slow by some per cent on a busy machine, and its timers do.
+
+        That is part of a flight.
+        """
+        assert isinstance(self.fleet.vehicles, Px4Build)
+        return self.fleet.vehicles.stood_still_s(began_s)
+
+    def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
+        """By its ground station's link."""
+        vehicle = self.vehicles[robot]
+        match injection:
+            case LoseGps(lost):
+                vehicle.lose_gps(lost=lost)
+            case Drain(remaining):
+                vehicle.drain(remaining)
+            case OriginJumps(by_m):
+                vehicle.jump_estimator_origin(*by_m)
+            case ModeIs(mode):
+                vehicle.set_mode(mode)
+            case _:
+                raise TypeError(f"{injection} is not done to a real PX4")
+
+    def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
+        """By PX4's own logs, which are whole once it has ended. Raises VehicleError without one."""
+        px4s, truths = self.fleet.vehicles, []
+        assert isinstance(px4s, Px4Build)
+        for robot, _ in enumerate(self.vehicles):
+            truth = px4s.logged_truth(robot)
+            if not truth:
+                raise VehicleError(f"the PX4 of r{robot} has left no log of its flight")
+            truths.append(vehicle_truth(truth, self.layout.to_mission))
+        return tuple(truths)
+
+
+@contextmanager
+def process_field(fleet: Fleet, ground: GroundProgram) -> Iterator[ProcessField]:
+    """The field of these programs, whatever they fly; it ends before they do."""
+    with ExitStack() as stack:
+        field: ProcessField
+        if fleet.simulated is not None:
+            field = MavlinkField(fleet, ground, fleet.simulated)
+        else:
+            assert isinstance(fleet.vehicles, Px4Build)
+            px4s = stack.enter_context(RealVehicles(fleet.vehicles, WORLD))
+            field = Px4Field(fleet, ground, px4s)
+        yield stack.enter_context(field)

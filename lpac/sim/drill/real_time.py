@@ -1,0 +1,85 @@
+"""Flights of faults in real time, each with a fleet of its own: some beside each other."""
+
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from edge.core import log
+from lpac.sim.drill.campaign import (
+    LATE_S,
+    FlightOutcome,
+    FlightTask,
+    outcome_of,
+    over_processes,
+)
+from lpac.sim.drill.faults import FAULTS, Fault
+from lpac.sim.drill.field import has_remote_control, scenario_of, settings_of
+from lpac.sim.drill.figure import write_figure
+from lpac.sim.drill.processes import process_field
+from lpac.sim.drill.truth import FlightTruth
+from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.processes import Fleet
+from lpac.sim.sitl.build import require_build
+
+# Of a robot with its vehicle and its part of a ground, with room for whatever else runs.
+_CORES_EACH = 0.33
+# What a late machine broke says nothing, and is flown again.
+_TRIES = 3
+
+
+class RealTimeDrill:
+    """Flies faults with processes on simulated vehicles, or on real PX4s.
+
+    Each flight leaves its logs, and a figure, in a folder of `folder`.
+    """
+
+    def __init__(
+        self, folder: Path, robots: int, bundle: Path, px4_build: Path | None = None
+    ) -> None:
+        """With `px4_build` on real PX4s of that build. Raises ValueError if it is none."""
+        if px4_build is not None:
+            px4_build = require_build(px4_build)
+        self._folder, self._robots, self._bundle = folder, robots, bundle
+        self._px4_build = px4_build
+
+    def outcome(self, fault: Fault, seed: int) -> FlightOutcome:
+        """Fly and judge; again if it broke a promise while this machine was late."""
+        for _ in range(_TRIES):
+            outcome = outcome_of(fault, seed, lambda: self._fly(fault, seed))
+            if outcome.held or outcome.late_s <= LATE_S:
+                break
+        return outcome
+
+    def pool(self, tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+        """All of them, as many at once as this machine carries; outcomes as they come."""
+        at_once = 1
+        # PX4's ports are the same for all fleets.
+        if self._px4_build is None:
+            at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * self._robots))
+        return over_processes(tasks, self.fly_task, max(1, at_once))
+
+    def fly_task(self, task: FlightTask) -> FlightOutcome:
+        """One flight, in whatever process this is."""
+        log.listen(log.show_errors)
+        return self.outcome(FAULTS[task.fault], task.seed)
+
+    def _fly(self, fault: Fault, seed: int) -> FlightTruth:
+        folder = self._folder / f"{fault.name}-{seed}"
+        shutil.rmtree(folder, ignore_errors=True)
+        fleet = Fleet(
+            scenario_of(fault, seed, self._robots), folder, self._bundle,
+            px4_build=self._px4_build, settings=settings_of(fault),
+        )  # fmt: skip
+        if fleet.simulated is not None and has_remote_control(fault):
+            for vehicle in fleet.simulated.vehicles:
+                vehicle.rc_connected = True
+        with (
+            fleet,
+            GroundProgram(fleet.fleet_toml, fleet.name) as ground,
+            process_field(fleet, ground) as field,
+        ):
+            timeline = field.fly(fault, seed)
+        truth = field.truth(timeline)
+        write_figure(fault, truth, folder)
+        return truth

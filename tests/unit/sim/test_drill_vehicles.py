@@ -1,0 +1,77 @@
+"""Which vehicles fly which faults, and what is made of a flight of a machine that was late."""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lpac.sim.description import ERRORS, fence_around
+from lpac.sim.drill.campaign import LATE_S, Campaign, FlightOutcome, FlightTask, outcome_of
+from lpac.sim.drill.faults import FAULTS
+from lpac.sim.drill.field import supports
+from lpac.sim.drill.processes import MAVLINK, PX4
+from lpac.sim.drill.simulated import SUPPORTED
+from lpac.sim.drill.truth import FlightTruth, VehicleTruth
+from lpac.sim.px4.modes import Px4Mode
+from tests.conftest import ROOT, SHIPPED
+
+
+def test_the_table_tells_who_flies_what() -> None:
+    rows = re.findall(
+        r"^\| ([a-z0-9-]+) \| .* \| (yes|) \| (yes|) \|$",
+        (ROOT / "docs" / "drill.md").read_text(),
+        re.MULTILINE,
+    )
+    assert rows == [
+        (fault.name, *("yes" if supports(kind, fault) else "" for kind in (MAVLINK, PX4)))
+        for fault in FAULTS.values()
+    ]
+    assert all(supports(SUPPORTED, fault) for fault in FAULTS.values())
+
+
+def never_down(late_s: float) -> FlightTruth:
+    """A flight that ends in the air."""
+    count = 3
+    vehicle = VehicleTruth(
+        time_s=np.array([0.0, 0.04, 0.08]),
+        position_m=np.full((count, 3), 8.0),
+        velocity_m_s=np.zeros((count, 3)),
+        mode=np.full(count, Px4Mode.OFFBOARD),
+        armed=np.ones(count, np.bool_),
+        landed=np.zeros(count, np.bool_),
+        setpoint_at_s=np.full(count, -math.inf),
+        is_velocity=np.zeros(count, np.bool_),
+    )
+    return FlightTruth(
+        (vehicle,), (), 0.0, 0.0, {}, (), fence_around(32.0, 1, ERRORS), np.zeros((1, 2)), 0.5,
+        late_s,
+    )  # fmt: skip
+
+
+def test_what_breaks_while_the_machine_is_late_is_not_judged() -> None:
+    fault = FAULTS["held"]
+    judged = outcome_of(fault, 0, lambda: never_down(LATE_S))
+    assert not judged.error and "not down in the end" in {each.name for each in judged.broken}
+    late = outcome_of(fault, 0, lambda: never_down(LATE_S + 0.1))
+    assert late.error.startswith("not judged (not down in the end")
+    assert late.error.endswith("this machine was 0.3 s behind real time")
+    assert late.late_s == pytest.approx(LATE_S + 0.1)
+
+
+def test_what_was_not_judged_is_flown_again(tmp_path: Path) -> None:
+    flown: list[str] = []
+
+    def pool(tasks: list[FlightTask]) -> list[FlightOutcome]:
+        flown.extend(task.fault for task in tasks)
+        return [
+            FlightOutcome(task.fault, task.seed, (), "not judged" if task.fault == "held" else "")
+            for task in tasks
+        ]
+
+    faults = [FAULTS["held"], FAULTS["landed"]]
+    for _ in range(2):
+        campaign = Campaign(tmp_path, "mavlink", 2, SHIPPED)
+        assert len(list(campaign.fly(faults, [0], lambda tasks: iter(pool(list(tasks)))))) == 2
+    assert sorted(flown) == ["held", "held", "landed"]
