@@ -1,14 +1,27 @@
 """Flights over a Ray cluster: its nodes have the same installation, and the bundle at its path."""
 
+import socket
 from collections.abc import Iterator, Sequence
 
 import ray
 
 from lpac.sim.drill.campaign import FlightOutcome, FlightTask, Pool, fly_order
 
+_ANSWERS_WITHIN_S = 5.0
+
 
 def over_ray(address: str) -> Pool:
-    """A pool of all cores of the cluster at `address`. Raises ConnectionError if there is none."""
+    """A pool of all cores of the cluster at `address`: HOST:PORT, or what `ray.init` takes.
+
+    Raises ConnectionError if nobody listens there.
+    """
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit():
+        # Ray would try for minutes.
+        try:
+            socket.create_connection((host, int(port)), _ANSWERS_WITHIN_S).close()
+        except OSError as error:
+            raise ConnectionError(f"no Ray cluster at {address}: {error}") from None
 
     def pool(orders: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
         ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
