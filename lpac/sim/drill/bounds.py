@@ -332,6 +332,24 @@ class FallsSilent:
 
 
 @dataclass(frozen=True, slots=True)
+class SentNothing:
+    """No setpoint comes from then on, and until then."""
+
+    from_s: float
+    until_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        """How many came."""
+        begin_s, end_s = flight.fault_s + self.from_s, flight.fault_s + self.until_s
+        sent = 0
+        for vehicle in _of(flight, self.whose):
+            at_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
+            sent += int(((at_s > begin_s) & (at_s < end_s)).sum())
+        return Figure("setpoints after the lapse", sent, 0, "")
+
+
+@dataclass(frozen=True, slots=True)
 class StaysDown:
     """Its motors never start."""
 

@@ -22,6 +22,7 @@ from lpac.sim.drill.bounds import (
     MotorsOff,
     NotFaster,
     NotLandedBefore,
+    SentNothing,
     Stands,
     StaysDown,
     StraightDown,
@@ -143,11 +144,12 @@ _PROGRAMS = (
     ),
     Fault(
         name="program-goes-on", what="a stopped program is continued after 5 s (SIGCONT)",
-        promise="it holds where the vehicle is, until the operator orders start",
+        promise="nothing is sent for 2 s; it holds where the vehicle is, until start is ordered",
         does=(*_once(ProgramStops(5.0)), Do(20.0, OperatorOrders("start"), mark="start")),
         watched_s=35.0,
         bounds=(
-            MissionEnds(0.6, 19.9), Stands(_STANDS_AFTER_S, 19.9), NotLandedBefore(35.0),
+            MissionEnds(0.6, 19.9), SentNothing(0.3, 6.9), Stands(_STANDS_AFTER_S, 19.9),
+            NotLandedBefore(35.0),
             FliesOn(14.0, 0.8, "hit", 4.0, "start"), FliesOn(20.0), LandsAtPad(_AT_PAD_M, "all"),
         ),
     ),
@@ -155,7 +157,9 @@ _PROGRAMS = (
         name="control-hangs", what="the control loop alone hangs, for 3 s",
         promise="the watchdog has PX4 hold after 0.5 s; the robot holds until start is ordered",
         does=_once(LoopHangs("control", 3.0)),
-        bounds=(MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
+        bounds=(
+            MissionEnds(0.6), SentNothing(0.3, 4.9), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0),
+        ),
     ),
     Fault(
         name="left-alone", what="the control loop hangs for 3 s, and nobody answers",
@@ -644,13 +648,13 @@ _PEOPLE = (
         bounds=(),
     ),
     Fault(
-        name="start-outside", what="who holds finds itself beyond the fence; start is ordered",
+        name="start-outside", what="who holds finds itself beyond the fence; resume is ordered",
         promise="start is refused outside: it is flown back first",
         does=(
             *_once(OperatorOrders("hold")), Do(4.0, EstimateJumpsOut(3.0)),
-            Do(8.5, OperatorOrders("start"), mark="start"),
+            Do(8.5, OperatorOrders("resume"), mark="start"),
         ),
-        watched_s=25.0, beyond_fence_m=POSITION_ERROR_M + 25.0,
+        watched_s=25.0,
         bounds=(MissionEnds(0.0, 2.5, after="start"), FliesOn(20.0)),
     ),
 )  # fmt: skip

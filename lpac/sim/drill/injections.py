@@ -128,7 +128,7 @@ class HeightJumps(VehicleInjection):
     up_m: float
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        vehicle.gps_bias_m = vehicle.gps_bias_m - np.array([0.0, 0.0, self.up_m])
+        vehicle.gps_offset_m = vehicle.gps_offset_m - np.array([0.0, 0.0, self.up_m])
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ class EstimateJumpsOut(VehicleInjection):
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
         jump_m = (around.inside_m(robot) + self.beyond_m) * around.outwards(robot)
-        vehicle.gps_bias_m = vehicle.gps_bias_m + np.array([*jump_m, 0.0])
+        vehicle.gps_offset_m = vehicle.gps_offset_m + np.array([*jump_m, 0.0])
 
 
 @dataclass(frozen=True, slots=True)

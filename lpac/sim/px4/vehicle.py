@@ -164,7 +164,8 @@ class Px4Vehicle:
     Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
     deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m` (3,)
     (its fix is off by that much at once, and the estimator must see what to make of it),
-    `gps_drift_m_s` (3,) (both it and the estimate go on drifting so), `compass_jump_rad`,
+    `gps_offset_m` and `gps_drift_m_s` (3,) (what fix and estimate are off besides, and how that
+    goes on; no bound keeps it), `compass_jump_rad`,
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
     and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
     any more), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (the share of its thrust
@@ -215,7 +216,7 @@ class Px4Vehicle:
         self.battery_remaining, self._battery_warning = 1.0, 1
 
         self.gps_lost = self.estimate_frozen = False
-        self.gps_jump_m = self.gps_drift_m_s = np.zeros(3)
+        self.gps_jump_m = self.gps_offset_m = self.gps_drift_m_s = np.zeros(3)
         self.gps_told_m: float | None = None
         self._frozen: tuple[F64, F64] | None = None
         self.dead_sensors: set[SimulatedSensor] = set()
@@ -258,7 +259,8 @@ class Px4Vehicle:
         """(3,), world frame: where the vehicle takes itself to be."""
         if self._frozen is not None:
             return self._frozen[0]
-        return self.position_m + self.gps_bias_m + self._walk_m + self.estimator.error_m
+        errors_m = self.gps_bias_m + self._walk_m + self.gps_offset_m + self.estimator.error_m
+        return self.position_m + errors_m
 
     @property
     def estimated_velocity_m_s(self) -> F64:
@@ -288,7 +290,8 @@ class Px4Vehicle:
         """
         noise_m = np.zeros(3) if self._errors is None else self._errors.fix_m(self.time_s)
         late_m = self.position_m - GPS_LAG_S * self.velocity_m_s
-        fix_m = late_m + self.gps_bias_m + self._walk_m + noise_m + self.gps_jump_m
+        errors_m = self.gps_bias_m + self._walk_m + self.gps_offset_m + self.gps_jump_m
+        fix_m = late_m + errors_m + noise_m
         return self._world.to_global(fix_m)
 
     @property
@@ -500,7 +503,7 @@ class Px4Vehicle:
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
-        self.gps_bias_m = self.gps_bias_m + self.gps_drift_m_s * dt_s
+        self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
         self.air_m_s = self.wind_m_s + self._gust
         if self._errors is not None:
             self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m

@@ -1,0 +1,139 @@
+"""What is broken in the program shows in the drill: each mutation breaks a promise of its fault."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import edge.flight.guidance
+import edge.flight.orders
+import edge.flight.step
+from edge.core import F64, log
+from edge.flight.orders import ORDERS
+from edge.flight.state import Robot
+from edge.flight.transitions import TRANSITIONS, Transition
+from edge.messages.codes import ReasonCode
+from edge.messages.mission import FlightState
+from lpac.ground.station.station import Station
+from lpac.sim.drill.bounds import always, judge
+from lpac.sim.drill.faults import FAULTS
+from lpac.sim.drill.simulated import SimulatedDrill
+from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.robots import SimulatedWatchdog
+from tests.conftest import SHIPPED
+
+ROBOTS = 4
+Mutation = Callable[[pytest.MonkeyPatch], None]
+
+
+def swapped(first: ReasonCode, second: ReasonCode) -> Mutation:
+    """The first rows of these reasons from MISSION or HOLD take each other's places."""
+
+    def mutate(monkeypatch: pytest.MonkeyPatch) -> None:
+        rows = list(TRANSITIONS)
+        i, j = (rows.index(_row(code)) for code in (first, second))
+        rows[i], rows[j] = rows[j], rows[i]
+        monkeypatch.setattr(edge.flight.step, "TRANSITIONS", tuple(rows))
+
+    return mutate
+
+
+def _row(code: ReasonCode) -> Transition:
+    return next(
+        row for row in TRANSITIONS if row.code is code and FlightState.MISSION in row.sources
+    )
+
+
+def without_brake(monkeypatch: pytest.MonkeyPatch) -> None:
+    def as_wanted(position_m: F64, velocity_m_s: F64, wanted_m_s: F64, *_: Any) -> F64:
+        return wanted_m_s
+
+    monkeypatch.setattr(edge.flight.guidance, "brake", as_wanted)
+
+
+def start_ignores_the_fence(monkeypatch: pytest.MonkeyPatch) -> None:
+    start = ORDERS["start"]
+    checks = tuple(check for check in start.checks if check.__name__ != "_not_in_place")
+    assert checks != start.checks
+    rules = {**ORDERS, "start": replace(start, checks=checks)}
+    monkeypatch.setattr(edge.flight.orders, "ORDERS", rules)
+
+
+def sends_at_once_after_a_lapse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(edge.flight.guidance, "is_silent", lambda *_: False)
+
+
+def watchdog_waits_5_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    init = SimulatedWatchdog.__init__
+
+    def slow(self: Any, vehicle: Any, schedule: Any, timeout_s: float, land_s: float) -> None:
+        init(self, vehicle, schedule, 5.0, land_s)
+
+    monkeypatch.setattr(SimulatedWatchdog, "__init__", slow)
+
+
+def landing_points_swapped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the ground and the robots, once they fly."""
+    homewards = edge.flight.guidance._homewards
+
+    def to_another(robot: Robot, inputs: Any, position_m: F64) -> F64:
+        others = {0: 1, 1: 0, 2: 3, 3: 2}
+        points_m = _landing_points_m()
+        return homewards(
+            robot, replace(inputs, lands_beside_m=points_m[others[robot.robot_id]]), position_m
+        )
+
+    monkeypatch.setattr(edge.flight.guidance, "_homewards", to_another)
+
+
+@cache
+def _landing_points_m() -> list[tuple[float, float]]:
+    layout = Layout(FleetScenario(robots=ROBOTS, seed=0), SHIPPED)
+    return [(float(x), float(y)) for x, y in layout.landing_points_m]
+
+
+def ground_tells_nothing_of_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The station tells robots nothing of a hold."""
+    publish = Station.published_state
+
+    def without(self: Station) -> Any:
+        state = publish(self)
+        return state and replace(state, safety_action="none", robot_safety_actions={})
+
+    monkeypatch.setattr(Station, "published_state", without)
+
+
+@pytest.mark.parametrize(
+    ("mutate", "fault"),
+    [
+        (swapped(ReasonCode.CONTROL_SILENT, ReasonCode.LEFT_OFFBOARD), "program-goes-on"),
+        (without_brake, "somebody-over-the-pad"),
+        (start_ignores_the_fence, "start-outside"),
+        (sends_at_once_after_a_lapse, "program-goes-on"),
+        (watchdog_waits_5_s, "program-hangs"),
+        (landing_points_swapped, "none"),
+        (ground_tells_nothing_of_holds, "held"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else getattr(each, "__name__", ""),
+)
+def test_a_mutation_breaks_its_promise(
+    monkeypatch: pytest.MonkeyPatch, mutate: Mutation, fault: str
+) -> None:
+    assert not _broken(fault)
+    mutate(monkeypatch)
+    assert _broken(fault)
+
+
+def _broken(name: str) -> list[str]:
+    before = log.listen(log.show_errors)
+    try:
+        # A fleet of its own, so that a mutation has it from the start.
+        fault = FAULTS[name]
+        truth = SimulatedDrill(ROBOTS, Path(SHIPPED)).fly(fault, 0)
+    finally:
+        log.listen(before)
+    figures = judge((*always(fault.beyond_fence_m), *fault.bounds), truth)
+    return [figure.name for figure in figures if figure.broken]
