@@ -1,0 +1,114 @@
+"""Campaigns of flights: over cores, over a Ray cluster, killed and gone on with."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from ray.cluster_utils import Cluster
+
+from lpac.sim.drill.campaign import Campaign, FlightOutcome, over_cores
+from lpac.sim.drill.cluster import over_ray
+from lpac.sim.drill.faults import FAULTS
+from tests.conftest import SHIPPED
+from tests.process.cli.test_cli import error_line, lpac
+
+# They soon come down.
+LANDED, GONE = FAULTS["landed"], FAULTS["ground-dies"]
+ROBOTS = 2
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], FlightOutcome]:
+    """Two faults with two seeds, over all cores."""
+    campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", ROBOTS, SHIPPED)
+    return {(o.fault, o.seed): o for o in campaign.fly([LANDED, GONE], [0, 1], over_cores)}
+
+
+def test_flights_over_cores_hold_what_is_promised(
+    flown: dict[tuple[str, int], FlightOutcome],
+) -> None:
+    assert flown.keys() == {("landed", 0), ("landed", 1), ("ground-dies", 0), ("ground-dies", 1)}
+    assert all(outcome.held for outcome in flown.values())
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    """Two nodes on this machine."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    node: dict[str, Any] = {"num_cpus": 1, "node_ip_address": "127.0.0.1"}
+    nodes: Any = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+    nodes.add_node(**node)
+    yield nodes
+    nodes.shutdown()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_cluster_of_two_nodes_flies_the_same(
+    tmp_path: Path, cluster: Cluster, flown: dict[tuple[str, int], FlightOutcome]
+) -> None:
+    campaign = Campaign(tmp_path, "simulated", ROBOTS, SHIPPED)
+    again = campaign.fly([LANDED, GONE], [0, 1], over_ray(cluster.address))
+    assert {(outcome.fault, outcome.seed): outcome for outcome in again} == flown
+
+
+def test_a_campaign_that_was_killed_goes_on(tmp_path: Path) -> None:
+    out = tmp_path / "drill"
+    options = ("--fault", "landed", "--fault", "ground-dies", "-n", "2", "--seeds", "2")
+    command = [sys.executable, "-m", "lpac.cli.main", "drill", *options, "--out", str(out)]
+    kept = out / "flights.jsonl"
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, process_group=0) as killed:
+        while len(_lines(kept)) < 2:
+            assert killed.poll() is None
+            time.sleep(0.05)
+        killed.send_signal(signal.SIGKILL)
+    # As if it was killed in the middle of a line.
+    before = _lines(kept)[:2]
+    kept.write_text("\n".join([*before, '{"fault": "lan']))
+    result = lpac("drill", *options, "--out", out, "--json")
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    assert _lines(kept)[:2] == before
+    told = json.loads(result.stdout)
+    assert [(each["fault"], each["flights"], each["broken"]) for each in told["faults"]] == [
+        ("ground-dies", 2, 0), ("landed", 2, 0),
+    ]  # fmt: skip
+    suite = ElementTree.parse(out / "drill.xml").getroot()
+    assert (suite.get("tests"), suite.get("failures")) == ("4", "0")
+    # What another version of the code has flown does not count.
+    first, *others = _lines(kept)
+    kept.write_text("\n".join([first.replace('"code": "', '"code": "x'), *others]) + "\n")
+    assert Campaign(out, "simulated", ROBOTS, SHIPPED).outcomes == {}
+
+
+def _lines(path: Path) -> list[str]:
+    return path.read_text().splitlines() if path.exists() else []
+
+
+def test_a_flight_again_is_that_flight_with_logs_and_figure(
+    tmp_path: Path, flown: dict[tuple[str, int], FlightOutcome]
+) -> None:
+    result = lpac("drill", "--fault", "landed", "--seed", 1, "-n", 2, "--out", tmp_path, "--json")
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    [told] = json.loads(result.stdout)["faults"]
+    first = flown["landed", 1]
+    worst = {figure["name"]: figure["value"] for figure in told["worst"]}
+    assert worst == {figure.name: figure.value for figure in first.figures}
+    folder = tmp_path / "landed-1"
+    assert (folder / "drill.png").exists()
+    assert len(list(folder.glob("robots/*/logs/*.mcap"))) == ROBOTS
+
+
+def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
+    for arguments, text in (
+        (("--fault", "nothing"), "--fault nothing: there is none; `lpac drill --list` has all"),
+        (("--seeds", 0), "--seeds 0: must be at least 1"),
+        (("-n", 1), "--robots 1: must be from 2 to 10"),
+        (("--ray", "127.0.0.1:1"), "127.0.0.1:1"),
+    ):
+        assert text in error_line(lpac("drill", *arguments, "--out", tmp_path))

@@ -1,0 +1,179 @@
+"""Each bound of the drill sees what it is for, in flights that are made up."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge.core.fence import Fence
+from lpac.sim.drill.bounds import (
+    AllDown,
+    Apart,
+    BelowCeiling,
+    Criterion,
+    Down,
+    FallsSilent,
+    Figure,
+    FliesOn,
+    InsideFence,
+    KeepsHeight,
+    Lands,
+    LandsAtPad,
+    MissionEnds,
+    MotorsOff,
+    NotFaster,
+    NotLandedBefore,
+    NoUnorderedStart,
+    PilotIsAlone,
+    SentNothing,
+    Stands,
+    StaysDown,
+    StraightDown,
+    TakesOff,
+)
+from lpac.sim.drill.report import at_most_share
+from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
+from lpac.sim.px4.modes import Px4Mode
+
+FENCE = Fence(((0.0, 0.0), (30.0, 0.0), (30.0, 30.0), (0.0, 30.0)), 1.5, 2.0, 25.0)
+TIMES_S = np.arange(0.0, 60.0, 0.04)
+TAKEOFF_S, FAULT_S, LAND_S, DOWN_S = 5.0, 20.0, 40.0, 50.0
+
+
+def a_vehicle(pad_m: tuple[float, float], height_m: float) -> VehicleTruth:
+    """Up at 5 s, a mission at 1 m/s along x from 20 s to 40 s, down by 50 s."""
+    t = TIMES_S
+    x_m = pad_m[0] + np.clip(t - FAULT_S, 0.0, LAND_S - FAULT_S) * 0.2
+    up = np.clip((t - TAKEOFF_S) / 5.0, 0.0, 1.0) * np.clip((DOWN_S - t) / 10.0, 0.0, 1.0)
+    z_m = height_m * np.where(t < LAND_S, np.clip((t - TAKEOFF_S) / 5.0, 0.0, 1.0), up)
+    position_m = np.stack([x_m, np.full_like(t, pad_m[1]), z_m], axis=1)
+    armed = (t >= TAKEOFF_S) & (t < DOWN_S)
+    mode = np.where(t < LAND_S, Px4Mode.OFFBOARD, Px4Mode.LAND)
+    return VehicleTruth(
+        time_s=t,
+        position_m=position_m,
+        velocity_m_s=np.gradient(position_m, 0.04, axis=0),
+        mode=np.where(armed, mode, Px4Mode.HOLD),
+        armed=armed,
+        landed=z_m <= 0.0,
+        setpoint_at_s=np.where(armed, np.minimum(np.floor(t * 10.0) / 10.0, LAND_S), -math.inf),
+        is_velocity=(t >= 10.0) & (t < LAND_S),
+    )
+
+
+def a_flight(**changes: Any) -> FlightTruth:
+    vehicles = (a_vehicle((5.0, 5.0), 5.0), a_vehicle((15.0, 15.0), 9.5))
+    flight = FlightTruth(
+        vehicles=vehicles, hit=(0,), fault_s=FAULT_S, calm_s=LAND_S, marks={"later": 30.0},
+        orders=(GivenOrder("takeoff", (0, 1), 4.0, 12.0),), fence=FENCE,
+        pads_m=np.array([[5.0, 5.0], [15.0, 15.0]]), drone_m=0.5,
+    )  # fmt: skip
+    return replace(flight, **changes)
+
+
+def changed(flight: FlightTruth, **fields: Any) -> FlightTruth:
+    """The same, but for what the first vehicle did."""
+    first, *others = flight.vehicles
+    return replace(flight, vehicles=(replace(first, **fields), *others))
+
+
+def after(begin_s: float, value: Any, otherwise: Any, end_s: float = math.inf) -> Any:
+    chosen = (begin_s <= TIMES_S) & (end_s > TIMES_S)
+    if np.ndim(otherwise) == 2:
+        chosen = chosen[:, None]
+    return np.where(chosen, value, otherwise)
+
+
+WELL = a_flight()
+FIRST = WELL.vehicles[0]
+FLOWN_M, BESIDE_M = FIRST.position_m, WELL.vehicles[1].position_m
+AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
+STANDS = replace(WELL, vehicles=(AT_REST, WELL.vehicles[1]))
+PILOTED = after(25.0, Px4Mode.POSCTL, FIRST.mode, 30.0)
+SILENT_S = np.minimum(FIRST.setpoint_at_s, FAULT_S)
+
+# A bound, a flight that keeps it, and one that breaks it.
+CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
+    (Apart(), WELL, changed(WELL, position_m=after(30.0, BESIDE_M + 0.2, FLOWN_M, 30.1))),
+    (
+        # The one comes down where the other stands, which has landed.
+        Apart(),
+        WELL,
+        changed(WELL, position_m=after(45.0, BESIDE_M * (1.0, 1.0, 0.0), FLOWN_M)),
+    ),
+    (InsideFence(), WELL, changed(WELL, position_m=after(30.0, (-7.0, 5.0, 5.0), FLOWN_M, 31.0))),
+    (BelowCeiling(), WELL, changed(WELL, position_m=after(30.0, (5.0, 5.0, 30.0), FLOWN_M, 31.0))),
+    (NoUnorderedStart(), WELL, replace(WELL, orders=())),
+    (
+        NoUnorderedStart(),
+        WELL,
+        replace(WELL, orders=(GivenOrder("takeoff", (1,), 4.0, 12.0),)),
+    ),
+    (
+        PilotIsAlone(),
+        changed(WELL, mode=PILOTED, setpoint_at_s=np.minimum(FIRST.setpoint_at_s, 25.9)),
+        changed(WELL, mode=PILOTED),
+    ),
+    (AllDown(), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed))),
+    (AllDown(), WELL, changed(WELL, position_m=after(45.0, (5.0, 5.0, 3.0), FLOWN_M))),
+    (Lands(20.5), WELL, changed(WELL, mode=after(0.0, Px4Mode.OFFBOARD, FIRST.mode, 45.0))),
+    (
+        Lands(10.5, after="later"),
+        WELL,
+        changed(WELL, mode=after(0.0, Px4Mode.HOLD, FIRST.mode, 49.0)),
+    ),
+    (NotLandedBefore(19.0), WELL, changed(WELL, mode=after(30.0, Px4Mode.LAND, FIRST.mode))),
+    (Down(30.5), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed, 55.0))),
+    (Down(30.5), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed))),
+    (Stands(1.0, 10.0), STANDS, changed(WELL, velocity_m_s=after(25.0, 0.9, FLOWN_M * 0.0, 26.0))),
+    (StraightDown(3.0), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
+    (LandsAtPad(4.5), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
+    (
+        FliesOn(15.0, whose="hit"),
+        WELL,
+        changed(WELL, is_velocity=after(25.0, False, FIRST.is_velocity)),
+    ),
+    (MissionEnds(0.2), changed(WELL, is_velocity=TIMES_S < FAULT_S), WELL),
+    (FallsSilent(0.2), changed(WELL, setpoint_at_s=SILENT_S), WELL),
+    (
+        SentNothing(1.0, 3.0),
+        changed(WELL, setpoint_at_s=after(FAULT_S, FAULT_S, FIRST.setpoint_at_s, 24.0)),
+        WELL,
+    ),
+    (StaysDown(), changed(WELL, armed=np.zeros_like(FIRST.armed)), WELL),
+    (TakesOff(), WELL, changed(WELL, armed=np.zeros_like(FIRST.armed))),
+    (MotorsOff(1.0), changed(WELL, armed=FIRST.armed & (TIMES_S < FAULT_S + 0.5)), WELL),
+    (
+        KeepsHeight(1.0, 15.0),
+        WELL,
+        changed(WELL, position_m=after(30.0, FLOWN_M + np.array([0.0, 0.0, 2.0]), FLOWN_M, 32.0)),
+    ),
+    (NotFaster(1.0, 15.0), WELL, changed(WELL, velocity_m_s=after(30.0, 1.5, FLOWN_M * 0.0, 31.0))),
+]
+
+
+@pytest.mark.parametrize(
+    ("bound", "kept", "broken"), CASES, ids=[f"{type(case[0]).__name__}" for case in CASES]
+)
+def test_a_bound_sees_what_it_is_for(
+    bound: Criterion, kept: FlightTruth, broken: FlightTruth
+) -> None:
+    assert not bound.figure(kept).broken, bound.figure(kept)
+    assert bound.figure(broken).broken, bound.figure(broken)
+
+
+def test_what_is_not_known_is_broken() -> None:
+    assert Figure("share", math.nan, 0.5, "", at_least=True).broken
+    assert Figure("speed", math.nan, 0.5, "m/s").broken
+    assert not Figure("apart", math.inf, 0.5, "m", at_least=True).broken
+
+
+def test_how_seldom_it_is_at_least() -> None:
+    # None of 1,000 is "below 0.3 % at 95 % confidence".
+    assert at_most_share(1000, 0) == pytest.approx(1.0 - 0.05 ** (1.0 / 1000), abs=1e-5)
+    assert 0.0029 < at_most_share(1000, 0) < 0.003
+    # As R's binom.test(3, 100, alternative = "less").
+    assert at_most_share(100, 3) == pytest.approx(0.0757, abs=1e-3)
+    assert at_most_share(5, 5) == 1.0
