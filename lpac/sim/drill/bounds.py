@@ -239,7 +239,8 @@ class Stands:
             moving = part.airborne & part.armed & ~part.is_in(*LANDING)
             speeds_m_s = np.hypot(*part.velocity_m_s[moving, :2].T)
             fastest_m_s = max(fastest_m_s, float(speeds_m_s.max(initial=0.0)))
-        return Figure("speed at rest", fastest_m_s, self.speed_m_s, "m/s")
+        limit_m_s = self.speed_m_s + flight.wanders_m_s
+        return Figure("speed at rest", fastest_m_s, limit_m_s, "m/s")
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -62,6 +63,8 @@ class RealTimeDrill:
     def fly_task(self, task: FlightTask) -> FlightOutcome:
         """One flight, in whatever process this is."""
         log.listen(log.show_errors)
+        # Who is told to end ends its programs first.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         return self.outcome(FAULTS[task.fault], task.seed)
 
     def _fly(self, fault: Fault, seed: int) -> FlightTruth:

@@ -81,7 +81,8 @@ class FlightTruth:
 
     `fault_s` is when it began, `calm_s` when the operator began to bring all home. `marks` tell of
     further times by their names. `pads_m` (N, 2) is where they really stood at first. `late_s` is
-    how far the machine that flew it was behind real time; 0 on a simulated clock.
+    how far the machine that flew it was behind real time; 0 on a simulated clock. `wanders_m_s` is
+    how much faster than a simulated one a vehicle at rest may be, after an estimate that wanders.
     """
 
     vehicles: tuple[VehicleTruth, ...]
@@ -94,6 +95,7 @@ class FlightTruth:
     pads_m: F64
     drone_m: float
     late_s: float = 0.0
+    wanders_m_s: float = 0.0
 
     @property
     def others(self) -> tuple[int, ...]:

@@ -113,6 +113,12 @@ class RobotProcess:
         if self._process is not None:
             self._process.send_signal(number)
 
+    def kill_watchdog(self) -> None:
+        """The process that watches it, its only child, ends like kill -9."""
+        for children in Path(f"/proc/{self.pid}/task").glob("*/children"):
+            for child in children.read_text().split():
+                os.kill(int(child), signal.SIGKILL)
+
     def wait(self, timeout_s: float) -> int | None:
         """The exit code once the program has ended, None if it has not within the time."""
         assert self._process is not None

@@ -58,15 +58,16 @@ class Vehicles(Protocol):
 class SimulatedVehicles:
     """`lpac.sim.px4` vehicles, which a thread of this process flies.
 
-    Tests do to `vehicles` what they want to happen to them, while holding `stepped`.
+    Tests do to `vehicles`, and to the `links` to their computers, what they want to happen to them,
+    while holding `stepped`.
     """
 
     def __init__(self, vehicles: Sequence[Px4Vehicle]) -> None:
         self.vehicles = tuple(vehicles)
         ports = free_ports(len(self.vehicles))
-        links = [Px4Link(v, system_id=i + 1) for i, v in enumerate(self.vehicles)]
+        self.links = tuple(Px4Link(v, system_id=i + 1) for i, v in enumerate(self.vehicles))
         self._server = Px4Server(
-            [Instance(link, 0, port) for link, port in zip(links, ports, strict=True)]
+            [Instance(link, 0, port) for link, port in zip(self.links, ports, strict=True)]
         )
         self.autopilots = tuple(
             AutopilotAddress(f"udpin://127.0.0.1:{port}", i + 1) for i, port in enumerate(ports)

@@ -116,7 +116,7 @@ class Px4Link:
 
     Over a wire: give it datagrams (`receive`), take from it those that are due (`due`). Within one
     process the same goes as message objects (`hear`, `say`), which costs a tenth: their numbers
-    must be rounded as MAVLink would.
+    must be rounded as MAVLink would. `is_cut`: the wire is, so that neither end hears the other.
     """
 
     def __init__(
@@ -136,6 +136,7 @@ class Px4Link:
         self._ground_station_at_s = -math.inf
         self._texts: deque[tuple[float, Px4Event]] = deque()
         self._text_id = 0
+        self.is_cut = False
         self._event_sequence = 0xFFF5
         self._told: deque[_EventMessage] = deque(maxlen=EVENTS_KEPT)
         self._gps_told_at_s = -math.inf
@@ -199,6 +200,8 @@ class Px4Link:
 
     def receive(self, datagram: bytes) -> None:
         """Act on what a client sent; anything that is no MAVLink, or not for us, is ignored."""
+        if self.is_cut:
+            return
         for message in self._mavlink.parse_buffer(datagram) or ():
             self.hear(message)
 
@@ -213,6 +216,8 @@ class Px4Link:
         """The datagrams to send now: what there is to say, packed."""
         datagrams = [b""]
         for message in self.say():
+            if self.is_cut:
+                continue
             packet = bytes(message.pack(self._mavlink))
             self._mavlink.seq = (self._mavlink.seq + 1) % 256
             if len(datagrams[-1]) + len(packet) > MAX_DATAGRAM_BYTES:
