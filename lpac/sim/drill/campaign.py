@@ -8,11 +8,13 @@ ended early is flown again.
 import hashlib
 import json
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import cache
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,14 +107,27 @@ def over_processes(
     tasks: Sequence[FlightTask], fly: Callable[[FlightTask], FlightOutcome], at_most: int
 ) -> Iterator[FlightOutcome]:
     """So many processes at most that fly; outcomes as they come."""
+    workers = min(len(tasks), at_most)
     # A fork would inherit threads that do not run there.
-    with ProcessPoolExecutor(min(len(tasks), at_most), get_context("spawn")) as pool:
+    with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
         flights = [pool.submit(fly, task) for task in tasks]
         try:
             for flight in as_completed(flights):
                 yield flight.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """A worker would wait for ever for a campaign that was killed."""
+    parent = parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 class Campaign:

@@ -42,9 +42,9 @@ def test_flights_over_cores_hold_what_is_promised(
 def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
     """Two nodes on this machine."""
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    node: dict[str, Any] = {"num_cpus": 1, "node_ip_address": "127.0.0.1"}
-    nodes: Any = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-    nodes.add_node(**node)
+    head = {"num_cpus": 1, "include_dashboard": False}
+    nodes: Any = Cluster(initialize_head=True, head_node_args=head)
+    nodes.add_node(num_cpus=1)
     yield nodes
     nodes.shutdown()
 
