@@ -1,6 +1,7 @@
 """`lpac drill`: faults in flight, and whether what is promised then holds."""
 
 import json
+import signal
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -167,6 +168,8 @@ def _real_time(
     from lpac.sim.drill.real_time import RealTimeDrill
 
     log.listen(log.show_errors)
+    # Whoever ends this command ends its programs, too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     return RealTimeDrill(out, robots, bundle, px4)
 
 

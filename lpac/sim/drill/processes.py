@@ -12,6 +12,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -346,7 +347,7 @@ class MavlinkField(ProcessField):
 
 
 class Px4Field(ProcessField):
-    """On real PX4s, whose vehicles are PX4's own model; times are `time.monotonic()`."""
+    """On real PX4s, whose vehicles are PX4's own model; times count from its making."""
 
     # Up to 0.63 m/s was seen in PX4's own hold, where a simulated vehicle's bound is 0.5.
     wanders_m_s = 0.2
@@ -354,6 +355,7 @@ class Px4Field(ProcessField):
     def __init__(self, fleet: Fleet, ground: GroundProgram, px4s: RealVehicles) -> None:
         super().__init__(fleet, ground, px4s.stepped)
         self._px4s = px4s
+        self._made_s = time.monotonic()
 
     def lead_s(self, injection: Injection) -> float:
         """A battery that falls at once is told by PX4 through a filter."""
@@ -361,7 +363,7 @@ class Px4Field(ProcessField):
 
     def now_s(self) -> float:
         """This machine's."""
-        return time.monotonic()
+        return time.monotonic() - self._made_s
 
     @property
     def vehicles(self) -> Sequence[RealVehicle]:
@@ -401,10 +403,17 @@ class Px4Field(ProcessField):
         px4s, truths = self.fleet.vehicles, []
         assert isinstance(px4s, Px4Build)
         for robot, _ in enumerate(self.vehicles):
-            truth = px4s.logged_truth(robot)
-            if not truth:
+            logged = px4s.logged_truth(robot)
+            if not logged:
                 raise VehicleError(f"the PX4 of r{robot} has left no log of its flight")
-            truths.append(vehicle_truth(truth, self.layout.to_mission))
+            truth = vehicle_truth(logged, self.layout.to_mission)
+            truths.append(
+                replace(
+                    truth,
+                    time_s=truth.time_s - self._made_s,
+                    setpoint_at_s=truth.setpoint_at_s - self._made_s,
+                )
+            )
         return tuple(truths)
 
 

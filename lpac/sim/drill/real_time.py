@@ -63,9 +63,12 @@ class RealTimeDrill:
     def fly_task(self, task: FlightTask) -> FlightOutcome:
         """One flight, in whatever process this is."""
         log.listen(log.show_errors)
-        # Who is told to end ends its programs first.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        return self.outcome(FAULTS[task.fault], task.seed)
+        try:
+            return self.outcome(FAULTS[task.fault], task.seed)
+        except KeyboardInterrupt:
+            # Its programs have ended. A worker of a pool would go on with the next flight.
+            os._exit(1)
 
     def _fly(self, fault: Fault, seed: int) -> FlightTruth:
         folder = self._folder / f"{fault.name}-{seed}"
