@@ -197,8 +197,10 @@ def brake(
     `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
     did. One that is `min_separation_m` or more above or below brakes nothing, since robots cross in
     their height slots. Towards another one the robot may close half the slack: that one does the
-    same. Away from it, it may always fly. Climbing is not limited. Giving way to a neighbour leads
-    over no edge of `fence`; None where there is none to keep to.
+    same. Away from it, it may always fly, and from one that is too near it has to, by half of what
+    is missing: else each error of an estimate would let them close in, and none part them. Climbing
+    is not limited. Giving way to a neighbour leads over no edge of `fence`; None where there is
+    none to keep to.
 
     A neighbour of which something is not known stops the robot.
     """
@@ -220,15 +222,25 @@ def brake(
         # Squares of far smaller numbers than a separation may vanish: never below 0.
         needed_m = math.sqrt(max(min_separation_m * min_separation_m - up_m * up_m, 0.0))
         speed = float(direction @ velocity_m_s[:2])
+        slack_m = (apart_m - needed_m) / 2.0
         directions.append(direction)
-        caps.append(_speed_towards((apart_m - needed_m) / 2.0, speed, limits))
-    towards = zip(directions, caps, strict=True)
-    if all(float(direction @ wanted_m_s[:2]) <= cap for direction, cap in towards):
+        caps.append(
+            _speed_towards(slack_m, speed, limits)
+            if slack_m >= 0.0
+            else -_speed_towards(-slack_m, -speed, limits)
+        )
+    horizontal = wanted_m_s[:2]
+    if all(float(d @ horizontal) <= cap for d, cap in zip(directions, caps, strict=True)):
         return wanted_m_s
+    for direction, cap in zip(directions, caps, strict=True):
+        if cap < 0.0:
+            horizontal = horizontal - direction * max(float(direction @ horizontal) - cap, 0.0)
+    horizontal = limit_speed(horizontal, limits.max_speed_m_s)
+    caps = [max(cap, 0.0) for cap in caps]
     if fence is not None:
         directions += list(-fence.edges().inward)
         caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
-    horizontal = _limit_towards(wanted_m_s[:2], directions, caps)
+    horizontal = _limit_towards(horizontal, directions, caps)
     return np.array([*horizontal, wanted_m_s[2]])
 
 

@@ -265,7 +265,7 @@ def _show(outcomes: list["FlightOutcome"], again: str) -> None:
     share = 100.0 * at_most_share(len(outcomes), len(broken))
     typer.echo(
         f"{len(broken)} of {len(outcomes)} flights broke a promise: at 95 % confidence at most "
-        f"{share:.2g} % do, in this model"
+        f"{share:.3g} % do, in this model"
     )
     for outcome in broken:
         what = outcome.error or "; ".join(map(shown, outcome.broken))

@@ -70,7 +70,7 @@ from lpac.sim.drill.injections import (
 )
 from lpac.sim.px4.errors import GREATEST_WIND_M_S
 from lpac.sim.px4.modes import Px4Mode
-from lpac.sim.px4.vehicle import SimulatedSensor
+from lpac.sim.px4.vehicle import Airframe, SimulatedSensor
 
 Phase = Literal["ready", "takeoff", "mission", "return"]
 Settings = Mapping[str, Mapping[str, object]]
@@ -80,6 +80,11 @@ EVER = math.inf
 _DESCENT_S = 20.0 / 0.7
 # Without GPS nothing holds a place any more, and the wind has it all the way down.
 ADRIFT_M = POSITION_ERROR_M + GREATEST_WIND_M_S * _DESCENT_S
+# A storm, and the greatest wind besides, carry a vehicle as fast as they blow beyond its airspeed,
+# and until it has stopped: no margin covers that.
+_STORM_M_S, _STORM_S = 16.0, 10.0
+_CARRIED_M_S = _STORM_M_S + GREATEST_WIND_M_S - Airframe().max_airspeed_m_s
+_CARRIED_M = _CARRIED_M_S * (_STORM_S + 2.0)
 # A hold is asked for 0.5 s after the last tick, and PX4 brakes.
 _STANDS_AFTER_S = 2.5
 # From any height of four robots down to the ground, and until the motors stop.
@@ -501,8 +506,8 @@ _ENERGY_AND_AIR = (
     Fault(
         name="storm", what="a storm of 16 m/s carries a robot over the fence, for 10 s",
         promise="it is flown back; 5 m beyond the fence PX4 holds it, and it lands after 60 s",
-        does=(*_once(WindBlows(16.0)), Do(10.0, WindBlows())), watched_s=90.0,
-        beyond_fence_m=POSITION_ERROR_M + 5.0 + 20.0,
+        does=(*_once(WindBlows(_STORM_M_S)), Do(_STORM_S, WindBlows())), watched_s=90.0,
+        beyond_fence_m=POSITION_ERROR_M + 5.0 + _CARRIED_M,
         bounds=(FliesOn(20.0),),
     ),
     Fault(
@@ -618,8 +623,10 @@ _PEOPLE = (
     Fault(
         name="pad-taken-before", what="a robot stands beside another's landing point at first",
         promise="the other one does not take off",
-        phase="ready", does=_once(CarriedToPad(beside_m=2.0)), watched_s=30.0,
-        bounds=(StaysDown("next"),),
+        # It stays there: its own battery is too low for a takeoff.
+        phase="ready", does=_once(CarriedToPad(beside_m=2.0), Drain(0.30)), watched_s=30.0,
+        exact=True,
+        bounds=(StaysDown(), StaysDown("next")),
     ),
     Fault(
         name="pad-taken-in-flight", what="a robot that landed is carried to another's pad",
@@ -641,10 +648,12 @@ _PEOPLE = (
         promise="the one that comes home keeps 1.5 m away, and waits",
         does=(
             *(Do(float(t), PilotFliesOver()) for t in range(80)),
-            Do(45.0, OperatorOrders("return"), "next"), Do(80.5, PilotFlies(0.0, 2.0)),
-            Do(84.0, PilotLands()),
+            Do(45.0, OperatorOrders("return"), "next"),
+            # Up and home: whom the pilot flies into or lands on, nobody else can save.
+            Do(80.5, PilotFlies(0.0, 2.0)),
+            *(Do(84.0 + t, PilotFliesOver(0)) for t in range(20)), Do(104.0, PilotLands()),
         ),
-        watched_s=85.0, exact=True,
+        watched_s=105.0, exact=True,
         bounds=(),
     ),
     Fault(

@@ -140,9 +140,9 @@ class FaultyFleet(ABC):
     # Where vehicles are
 
     def outwards(self, robot: int) -> F64:
-        """(2,): the way to the nearest line of the fence, north and east."""
+        """(2,): the way to what it takes to be the fence's nearest line, north and east."""
         to_mission = self.layout.to_mission
-        place_m = to_mission.local_to_mission(self.vehicles[robot].position_m)[:2]
+        place_m = to_mission.local_to_mission(self.vehicles[robot].estimated_position_m)[:2]
         edges = self.layout.fence.edges()
         out = -edges.inward[int(np.argmin(edges.distances_m(place_m)))]
         turned: F64 = (to_mission.rotation @ np.array([*out, 0.0]))[:2]

@@ -254,10 +254,15 @@ class CarriedToPad(VehicleInjection):
 
 @dataclass(frozen=True, slots=True)
 class PilotFliesOver(VehicleInjection):
-    """A pilot flies it over the next robot's pad, at that robot's height; for one second."""
+    """A pilot flies it over a robot's pad, at that robot's height; for one second.
+
+    `pad` is how many robots on that one is.
+    """
+
+    pad: int = 1
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
-        pad_m, height_m = around.place_m(robot + 1), around.height_m(robot + 1)
+        pad_m, height_m = around.place_m(robot + self.pad), around.height_m(robot + self.pad)
         # Over everybody's heads on the way there.
         if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:
             height_m += _PILOT_ABOVE_M

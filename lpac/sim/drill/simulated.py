@@ -1,5 +1,6 @@
 """Faults on the simulated clock: whole robots and the real ground, in this process."""
 
+import math
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,6 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, assert_never, get_args
 
+import numpy as np
+
+from edge.core import F64
 from lpac.ground.procedure import NothingComesError, Procedure
 from lpac.ground.station.protocol import (
     Request,
@@ -42,7 +46,7 @@ from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.radio import GROUND
 
-# Where a second program's vehicle stands, north of the first.
+# How far a second program's vehicle stands from the first.
 _BESIDE_M = 3.0
 # All that there is.
 SUPPORTED: tuple[type, ...] = get_args(Injection)
@@ -187,8 +191,9 @@ class SimulatedField(FaultyFleet):
                 raise TypeError(f"{injection} is not done to a program")
 
     def _start_second(self, robot: int) -> None:
-        north_m, east_m, _ = self.fleet.vehicles[robot].vehicle.position_m.tolist()
-        vehicle = Px4Vehicle(seed=robot, start_m=(north_m + _BESIDE_M, east_m), origin=WORLD)
+        places_m = np.array([each.vehicle.position_m[:2] for each in self.fleet.vehicles])
+        start_m = _beside_m(places_m, robot)
+        vehicle = Px4Vehicle(seed=robot, start_m=start_m, origin=WORLD)
         direct = DirectVehicle(vehicle, robot + 1, self.fleet.schedule)
         self.fleet.second_program(robot, direct).start()
 
@@ -253,6 +258,17 @@ class SimulatedDrill:
 def _one(wanted: Any) -> Procedure[Any]:
     answer = yield wanted
     return answer
+
+
+def _beside_m(places_m: F64, robot: int) -> tuple[float, float]:
+    """A place beside the robot's, where it is in nobody's way who stands at `places_m` (N, 2)."""
+    angles_rad = np.arange(8) * (math.pi / 4.0)
+    around_m = places_m[robot] + _BESIDE_M * np.column_stack(
+        [np.cos(angles_rad), np.sin(angles_rad)]
+    )
+    to_others_m = np.linalg.norm(around_m[:, None] - np.delete(places_m, robot, axis=0), axis=2)
+    north_m, east_m = around_m[to_others_m.min(axis=1, initial=math.inf).argmax()].tolist()
+    return north_m, east_m
 
 
 def _partition(cut: Cut, robots: int) -> tuple[frozenset[int], ...]:
