@@ -55,7 +55,7 @@ class Agents(Protocol):
         payloads: Sequence[Sequence[F32]],
         degrees: Sequence[int],
     ) -> PolicySteps:
-        """`Agent.step` of n robots, no one twice."""
+        """`Agent.step` of n robots, no one twice; payloads are float32, rounded as on the wire."""
 
     def reset(self, robot: int) -> None:
         """The robot's program starts anew: it forgets all."""

@@ -126,13 +126,15 @@ class BatchedFlights:
 
     def _swarm(self, world: Preparation, first_agent: int) -> Swarm[BatchedRobot]:
         scenario, perception = world.scenario, world.perception
+        local_map = np.empty((perception.local_map_size,) * 2, np.float32)
         return Swarm(
-            boot=partial(self._boot, world, first_agent),
+            boot=partial(self._boot, world, local_map, first_agent),
             vehicles=PointVehicles(
                 world.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
             ),
             medium=world.medium,
             rng=world.clock_rng,
+            clocks=scenario.clocks,
             failures=scenario.failures,
             bias_m=world.bias_m,
         )
@@ -140,6 +142,7 @@ class BatchedFlights:
     def _boot(
         self,
         world: Preparation,
+        local_map: F32,
         first_agent: int,
         robot: int,
         boot_epoch: int,
@@ -159,6 +162,7 @@ class BatchedFlights:
             perception=world.perception,
             odometry=odometry,
             parameters=world.parameters,
+            local_map=local_map,
         )
 
 

@@ -49,8 +49,8 @@ class DeferredStep:
 
     `heeded` are the ticks from which its neighbours' messages are. `rank` is how many others have
     to be computed first, one after another. `velocity` (2,) is None as long as it is not computed,
-    and `payload` (message_size,), as the neighbours receive it, undefined; `largest` is the largest
-    number in that.
+    and `payload` (message_size,), the numbers that the neighbours receive, undefined; `largest` is
+    the largest of these.
     """
 
     robot: "BatchedRobot"
@@ -100,7 +100,7 @@ class DeferredSteps:
             [[other.payload for other in step.heeded] for step in steps],
             [step.degree for step in steps],
         )
-        received = rounded(payloads, steps[0].payload.dtype)
+        received = rounded(payloads, "float16")
         largest = np.abs(received).max(axis=1, initial=0.0)
         if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
             raise PolicyFailedError(
@@ -145,8 +145,12 @@ class BatchedRobot:
         perception: PerceptionParameters,
         odometry: OdometrySource,
         parameters: PacParameters,
+        local_map: F32,
     ) -> None:
-        """`agent` is its number among those of `deferred`, which computes its policy."""
+        """`agent` is its number among those of `deferred`, which computes its policy.
+
+        `local_map` (local_map_size, local_map_size) is room that robots may share.
+        """
         self.agent = agent
         self._robot_id = robot_id
         self._boot_epoch = boot_epoch
@@ -155,6 +159,9 @@ class BatchedRobot:
         self._odometry = odometry
         self._parameters = parameters
         self._seen = SeenMap(importance, perception)
+        self._local_map = local_map
+        # Else the neighbours are those whose messages it takes.
+        self._swap_clears = parameters.max_message_age_s == 0.0
         self._perceived: _Perceived | None = None
         self._action: DeferredStep | None = None
         self._action_s = 0.0
@@ -183,7 +190,10 @@ class BatchedRobot:
         neighbours = self._to_model(perceived.neighbours)
         near = neighbours_in_range(own, neighbours, perception.communication_range)
         return self._deferred.agents.inputs(
-            self.agent, Observation(position, self._seen.local_map(position), neighbours[near])
+            self.agent,
+            Observation(
+                position, self._seen.local_map(position, self._local_map), neighbours[near]
+            ),
         )
 
     def infer(self, now_s: float) -> _Said | None:
@@ -195,7 +205,7 @@ class BatchedRobot:
         if inputs is None:
             return None
         odometry, own = self._own()
-        heard = self.mailbox.neighbours(now_s)
+        heard = self.mailbox.neighbours(now_s) if self._swap_clears else ()
         messages = self.mailbox.swap(now_s)
         near = self._in_range(own, messages)
         degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
@@ -211,7 +221,7 @@ class BatchedRobot:
             heeded,
             degree,
             max((other.rank + 1 for other in before if other.velocity is None), default=0),
-            np.empty(self._deferred.agents.message_size, self._parameters.payload),
+            np.empty(self._deferred.agents.message_size, np.float32),
         )
         self._deferred.add(step)
         self._action, self._action_s = step, now_s
