@@ -46,7 +46,7 @@ class Agents(Protocol):
         """What the policy takes of an observation, by name: new arrays, the same for all robots."""
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
-        """What n robots' policy makes of their inputs."""
+        """What n robots' policy makes of their inputs. The only one that any thread may call."""
 
     def step(
         self,

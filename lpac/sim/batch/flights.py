@@ -6,6 +6,7 @@ vehicles act is that of `lpac.sim.experiment.fly`, and so is what comes out, for
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
@@ -81,8 +82,13 @@ class WorldMoment:
 class BatchedFlights:
     """Flights of one bundle in several worlds, which may differ in everything else."""
 
-    def __init__(self, scenarios: Sequence[Scenario], bundle: Bundle) -> None:
-        """Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline."""
+    def __init__(
+        self, scenarios: Sequence[Scenario], bundle: Bundle, executor: Executor | None = None
+    ) -> None:
+        """An `executor` of one thread puts a second core to use, where robots are many.
+
+        Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline.
+        """
         for scenario in scenarios:
             if scenario.controller != "lpac":
                 raise ValueError(
@@ -93,7 +99,7 @@ class BatchedFlights:
             world.perception for world in self.prepared for _ in range(world.scenario.robots)
         ]
         self._deferred = DeferredSteps(
-            make_agents(bundle, perceptions), bundle.manifest.payload_limit
+            make_agents(bundle, perceptions), bundle.manifest.payload_limit, executor
         )
         firsts = np.cumsum([0, *(scenario.robots for scenario in scenarios)]).tolist()
         self.swarms = tuple(
