@@ -47,7 +47,7 @@ def test_scaling(tmp_path: Path) -> None:
     simulators = {scaling.EXACT, scaling.BATCHED}
     if is_installed():
         simulators.add(scaling.REFERENCE)
-    check_frame(result, "scaling", targets=4 + 2 * (len(simulators) - 2))
+    check_frame(result, "scaling", targets=3 + 2 * (len(simulators) - 2))
     for robots, world_size in ((1, 162), (2, 229)):
         flights = result["figures"][str(robots)]
         assert set(flights) == simulators

@@ -181,11 +181,12 @@ class BatchedRobot:
         self._parameters = parameters
         self._seen = SeenMap(importance, perception)
         self._local_map = local_map
-        # Else the neighbours are those whose messages it takes.
         self._swap_clears = parameters.max_message_age_s == 0.0
         self._perceived: _Perceived | None = None
         self._action: DeferredStep | None = None
         self._action_s = 0.0
+        # The last action that was flown, and its velocity in the mission frame.
+        self._flown: tuple[DeferredStep, F64] | None = None
         self._sequence = 0
         self.largest_payload = 0.0
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
@@ -226,10 +227,13 @@ class BatchedRobot:
         if inputs is None:
             return None
         odometry, own = self._own()
+        # Where the swap takes nothing away, the neighbours are those whose messages it hands out.
         heard = self.mailbox.neighbours(now_s) if self._swap_clears else ()
         messages = self.mailbox.swap(now_s)
         near = self._in_range(own, messages)
-        degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
+        degree = int(near.sum())
+        if heard:
+            degree = max(int(self._in_range(own, heard).sum()), degree)
         heeded = tuple(
             message.step
             for message, is_near in zip(messages, near.tolist(), strict=True)
@@ -265,11 +269,13 @@ class BatchedRobot:
         action = self._action
         if action is None or now_s - self._action_s > self._parameters.max_input_age_s:
             return None
-        assert action.velocity is not None
-        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
-            action.velocity.astype(np.float64)
-        )
-        return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+        if self._flown is None or self._flown[0] is not action:
+            assert action.velocity is not None
+            velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
+                action.velocity.astype(np.float64)
+            )
+            self._flown = action, limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+        return self._flown[1]
 
     def receive(self, message: _Message, now_s: float) -> None:
         """Put a neighbour's message into the mailbox."""
