@@ -15,7 +15,8 @@ from edge.policy.family import Policy
 from edge.robot.pac import Pac, PacParameters
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.medium import Medium
-from lpac.sim.swarm import Swarm
+from lpac.sim.swarm import pac_swarm
+from lpac.sim.ticks import Clocks
 
 NEIGHBOURS = 10
 # So many that robots in the middle have ten neighbours.
@@ -52,7 +53,7 @@ def moment_in_flight(policy: Policy) -> Moment:
     assert perception
     rng = np.random.default_rng(1)
     importance = rasterize(random_features(rng, 10, perception.world_size), perception.world_size)
-    swarm = Swarm(
+    swarm = pac_swarm(
         policy=policy,
         importance=importance,
         positions_m=FIELD_SCALE.position_to_mission_m(
@@ -69,6 +70,7 @@ def moment_in_flight(policy: Policy) -> Moment:
             rng=rng,
         ),
         rng=rng,
+        clocks=Clocks(),
     )
     paths: list[F64] = []
     times_s = np.arange(0.0, _LATEST_S, _SAMPLE_S).tolist()

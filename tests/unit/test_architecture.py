@@ -44,10 +44,12 @@ ALLOWED = {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
         "lpac.fleet.writer", "lpac.fleet.authority",
     },
+    # Nothing of the simulators needs it.
+    "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer",
-        "lpac.fleet.authority",
+        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.fleet", "lpac.fleet.settings",
+        "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
