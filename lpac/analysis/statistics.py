@@ -10,7 +10,7 @@ share: Clopper and Pearson, Biometrika 26 (1934).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -35,32 +35,56 @@ class Interval95(NamedTuple):
     high: float
 
 
-def interquartile_mean(values: F64) -> float:
-    """The mean of the middle half of all values, whatever their shape.
+def mean(values: F64) -> F64:
+    """(...,): of each (..., S, K)."""
+    means: F64 = values.mean(axis=(-2, -1))
+    return means
+
+
+def interquartile_mean(values: F64) -> F64:
+    """(...,): of each (..., S, K) the mean of the middle half of all its values.
 
     Where a quartile is inside a value's share, the value counts in part.
     """
-    ordered = np.sort(values, axis=None)
-    edges = np.clip(np.linspace(0.0, 1.0, len(ordered) + 1), 0.25, 0.75)
-    return float(ordered @ np.diff(edges) / 0.5)
+    ordered = np.sort(values.reshape(*values.shape[:-2], -1), axis=-1)
+    edges = np.clip(np.linspace(0.0, 1.0, ordered.shape[-1] + 1), 0.25, 0.75)
+    means: F64 = ordered @ np.diff(edges) / 0.5
+    return means
 
 
-def mean(values: F64) -> float:
-    """Of all values, whatever their shape."""
-    return float(values.mean())
+def difference_of_means(a: F64, b: F64) -> F64:
+    """(...,): of each (..., S, K) and (..., T, K); below 0 where `a` is better."""
+    return mean(a) - mean(b)
 
 
-def bootstrap(values: F64, statistic: Callable[[F64], float] = mean) -> Interval95:
+def ratio_of_means(a: F64, b: F64) -> F64:
+    """(...,): of each (..., S, K) and (..., T, K); below 1 where `a` is better.
+
+    NaN where all of `b` is 0.
+    """
+    below = mean(b)
+    return mean(a) / np.where(below == 0.0, np.nan, below)
+
+
+def share_below(a: F64, b: F64) -> F64:
+    """(...,): in which share of the K worlds the mean of `a` over its trainings is below `b`'s.
+
+    Of each (..., S, K) and (..., T, K); equal ones count half.
+    """
+    offset = a.mean(axis=-2) - b.mean(axis=-2)
+    shares: F64 = (offset < 0.0).mean(axis=-1) + 0.5 * (offset == 0.0).mean(axis=-1)
+    return shares
+
+
+def bootstrap(values: F64, statistic: Callable[[F64], F64] = mean) -> Interval95:
     """A statistic of (S, K), with the interval over other worlds and other trainings."""
     rng = np.random.default_rng(_SEED)
-    drawn = []
-    for _ in range(_RESAMPLES):
-        worlds = _drawn(rng, values.shape[1])
-        drawn.append(statistic(values[np.ix_(_drawn(rng, len(values)), worlds)]))
-    return _interval(statistic(values), drawn)
+    worlds = _drawn(rng, values.shape[1])
+    drawn = values[_drawn(rng, len(values))[:, :, None], worlds[:, None]]
+    return _interval(statistic(values), statistic(drawn))
 
 
-def paired_bootstrap(a: F64, b: F64, statistic: Callable[[F64, F64], float]) -> Interval95:
+def paired_bootstrap(a: F64, b: F64, statistic: Callable[[F64, F64], F64]) -> Interval95:
     """A statistic of two methods, (S, K) and (T, K), over the same worlds in the same order.
 
     Worlds are drawn for both at once, and trainings for each by itself. Raises ValueError if the
@@ -69,23 +93,9 @@ def paired_bootstrap(a: F64, b: F64, statistic: Callable[[F64, F64], float]) -> 
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"{a.shape[1]} worlds of one and {b.shape[1]} of the other: no pairs")
     rng = np.random.default_rng(_SEED)
-    drawn = []
-    for _ in range(_RESAMPLES):
-        worlds = _drawn(rng, a.shape[1])
-        of_a, of_b = _drawn(rng, len(a)), _drawn(rng, len(b))
-        drawn.append(statistic(a[np.ix_(of_a, worlds)], b[np.ix_(of_b, worlds)]))
-    return _interval(statistic(a, b), drawn)
-
-
-def difference_of_means(a: F64, b: F64) -> float:
-    """Below 0 where `a` is better."""
-    return float(a.mean() - b.mean())
-
-
-def ratio_of_means(a: F64, b: F64) -> float:
-    """Below 1 where `a` is better; NaN if all of `b` is 0."""
-    below = float(b.mean())
-    return float(a.mean()) / below if below else math.nan
+    worlds = _drawn(rng, a.shape[1])[:, None]
+    of_a, of_b = (_drawn(rng, len(values))[:, :, None] for values in (a, b))
+    return _interval(statistic(a, b), statistic(a[of_a, worlds], b[of_b, worlds]))
 
 
 class Verdict(NamedTuple):
@@ -122,12 +132,6 @@ def compare(a: F64, b: F64, *, trained_a: bool = True, trained_b: bool = True) -
             for values, trained in ((a, trained_a), (b, trained_b))
         ),
     )
-
-
-def share_below(a: F64, b: F64) -> float:
-    """In which share of the worlds A's mean over its trainings is below B's; equal ones, half."""
-    offset = a.mean(axis=0) - b.mean(axis=0)
-    return float((offset < 0.0).mean() + 0.5 * (offset == 0.0).mean())
 
 
 def performance_profile(values: F64, thresholds: F64) -> F64:
@@ -168,13 +172,15 @@ def _at_most(failed: int, of: int, share: float) -> float:
 
 
 def _drawn(rng: np.random.Generator, count: int) -> npt.NDArray[np.intp]:
-    """So many of so many, with replacement."""
-    return rng.integers(count, size=count)
+    """(_RESAMPLES, count): so many of so many, with replacement."""
+    return rng.integers(count, size=(_RESAMPLES, count))
 
 
-def _interval(value: float, drawn: Sequence[float]) -> Interval95:
+def _interval(value: F64, drawn: F64) -> Interval95:
     """The percentiles of what was drawn and is a number; NaN if nothing is."""
     beyond = (1.0 - CONFIDENCE) / 2.0
-    known = [one for one in drawn if not math.isnan(one)] or [math.nan]
+    known = drawn[~np.isnan(drawn)]
+    if not len(known):
+        return Interval95(math.nan, math.nan, math.nan)
     low, high = np.quantile(known, (beyond, 1.0 - beyond)).tolist()
-    return Interval95(value, low, high)
+    return Interval95(float(value), low, high)

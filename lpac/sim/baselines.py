@@ -227,8 +227,7 @@ def _unseen_points(seen: Bools, origin: tuple[int, int]) -> F64:
     first = [-start % _FRONTIER_PITCH for start in origin]
     lattice = seen[first[0] :: _FRONTIER_PITCH, first[1] :: _FRONTIER_PITCH]
     cells = np.argwhere(~lattice) * _FRONTIER_PITCH + first + origin
-    points: F64 = cells + 0.5
-    return points
+    return np.asarray(cells + 0.5, np.float64)
 
 
 def make_baseline(

@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, get_context, parent_process
 from typing import Protocol, TypeVar
 
@@ -31,7 +32,10 @@ def over_cores(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator
 def over_processes(
     do: Callable[[Task], Outcome], tasks: Sequence[Task], at_most: int
 ) -> Iterator[Outcome]:
-    """So many processes at most; outcomes as they come."""
+    """So many processes at most; outcomes as they come.
+
+    Raises ChildProcessError if one of them is killed.
+    """
     workers = min(len(tasks), at_most)
     # A fork would inherit threads that do not run there.
     with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
@@ -39,6 +43,8 @@ def over_processes(
         try:
             for done in as_completed(given):
                 yield done.result()
+        except BrokenProcessPool:
+            raise ChildProcessError("a worker process was killed") from None
         except BaseException:
             # What nobody waits for ends now.
             for worker in active_children():

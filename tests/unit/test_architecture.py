@@ -44,10 +44,11 @@ ALLOWED = {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
         "lpac.fleet.writer", "lpac.fleet.authority",
     },
+    "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim"},
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer",
-        "lpac.fleet.authority",
+        "lpac.ground", "lpac.sim", "lpac.evaluate", "lpac.fleet", "lpac.fleet.settings",
+        "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
@@ -55,7 +56,7 @@ ONLY_IN = {
     "onnxruntime": {"edge/policy/lpac/graphs.py"},
     "torch": {"export/"},
     "onnx": {"export/"},
-    "matplotlib": {"lpac/sim/", "lpac/analysis/"},
+    "matplotlib": {"lpac/sim/", "lpac/analysis/", "lpac/evaluate/"},
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
     "mcap": {"edge/drivers/"},
