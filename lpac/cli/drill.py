@@ -2,18 +2,20 @@
 
 import json
 import signal
+from contextlib import closing
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE
-from lpac.cli.printing import BAD, GOOD, print_table, styled
+from lpac.cli.options import DEFAULT_BUNDLE, Ray, pool
+from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
 
 if TYPE_CHECKING:
-    from lpac.sim.drill.campaign import Campaign, FlightOutcome, Pool
+    from lpac.sim.drill.campaign import Campaign, FlightOutcome, Flown
     from lpac.sim.drill.faults import Fault
     from lpac.sim.drill.real_time import RealTimeDrill
 
@@ -55,10 +57,7 @@ def drill(
     ] = None,
     robots: Annotated[int, typer.Option("--robots", "-n", help="Number of robots.")] = 4,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
-    ray: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
-    ] = None,
+    ray: Ray = None,
     listing: Annotated[
         bool, typer.Option("--list", help="Only say which faults there are.")
     ] = False,
@@ -72,7 +71,7 @@ def drill(
     ] = None,
 ) -> None:
     """Do faults to a fleet in flight, and judge by the vehicles' truth what is promised."""
-    from lpac.sim.drill.campaign import Campaign
+    from lpac.sim.drill.campaign import Campaign, fly_order
     from lpac.sim.drill.report import as_json as to_json
     from lpac.sim.drill.report import as_junit
 
@@ -95,8 +94,8 @@ def drill(
     else:
         campaign = Campaign(out, vehicle, robots, bundle)
         numbers = range(seeds) if seed is None else [seed]
-        pool = _pool(ray) if real_time is None else real_time.pool
-        outcomes = _fly(campaign, chosen, list(numbers), pool)
+        flown = partial(pool(ray), fly_order) if real_time is None else real_time.fly_all
+        outcomes = _fly(campaign, chosen, list(numbers), flown)
         result = to_json(outcomes)
         (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")
         (out / "drill.xml").write_bytes(as_junit(outcomes))
@@ -181,37 +180,16 @@ def _again(vehicle: DrillVehicle, px4: Path | None, robots: int) -> str:
     return options if px4 is None else f"{options} --px4 {px4}"
 
 
-def _pool(ray: str | None) -> "Pool":
-    if ray is None:
-        from lpac.sim.drill.campaign import over_cores
-
-        return over_cores
-    try:
-        from lpac.sim.drill.cluster import over_ray
-    except ModuleNotFoundError:
-        raise ValueError("--ray needs Ray: `pip install 'lpac-edge[ray]'`") from None
-    return over_ray(ray)
-
-
 def _fly(
-    campaign: "Campaign", faults: list["Fault"], seeds: list[int], pool: "Pool"
+    campaign: "Campaign", faults: list["Fault"], seeds: list[int], flown: "Flown"
 ) -> list["FlightOutcome"]:
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-
     outcomes = []
-    with Progress(
-        TextColumn("flights"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        TextColumn("{task.description}"), console=Console(stderr=True), transient=True,
-    ) as progress:  # fmt: skip
+    with (
+        progress_of("flights") as progress,
+        closing(campaign.fly(faults, seeds, flown)) as flights,
+    ):
         task, broken = progress.add_task("", total=len(faults) * len(seeds)), 0
-        for outcome in campaign.fly(faults, seeds, pool):
+        for outcome in flights:
             outcomes.append(outcome)
             broken += not outcome.held
             progress.update(
@@ -245,8 +223,9 @@ def _fly_again(
 
 
 def _show(outcomes: list["FlightOutcome"], again: str) -> None:
+    from lpac.analysis.statistics import at_most_share
     from lpac.sim.drill.faults import FAULTS
-    from lpac.sim.drill.report import at_most_share, shown, summaries
+    from lpac.sim.drill.report import shown, summaries
 
     rows = []
     for summary in summaries(outcomes):

@@ -18,6 +18,7 @@ from lpac.cli.apps import CommandList
 _COMMANDS = {
     "demo": "Ten robots over an unknown world for 60 s, beside the baselines; makes a figure.",
     "sim": "Fly a swarm over an unknown world and print how well it covers it.",
+    "evaluate": "Policies and baselines over many worlds: how well they cover, and how surely.",
     "drill": "Do faults to a fleet in flight, and judge by the vehicles' truth what is promised.",
     "hosts": "Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
     "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",
@@ -36,7 +37,7 @@ _COMMANDS = {
 }
 # The extra that has a command's packages; without one they are in every install.
 _EXTRAS = {
-    "sim": ("demo", "sim", "drill", "hosts"),
+    "sim": ("demo", "sim", "evaluate", "drill", "hosts"),
     "ground": ("ground", "mission", "watch", "map", "site", "record", "report"),
     "fleet": ("fleet",),
     "export": ("export",),

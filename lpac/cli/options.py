@@ -11,6 +11,7 @@ from lpac.shipped import shipped
 
 if TYPE_CHECKING:
     from lpac.fleet.settings import FleetConfig, RobotHost
+    from lpac.sim.cores import Pool
 
 Fleet = Annotated[
     Path, typer.Option("--fleet", envvar="LPAC_FLEET", help="The fleet's description, TOML.")
@@ -19,6 +20,10 @@ Robots = Annotated[
     str | None, typer.Option("--robots", help="Only these robots, such as r1,r3; else all.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Ray = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
+]
 DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
 
@@ -29,6 +34,19 @@ def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["Rob
 
     config = load_fleet(path)
     return config, select(config, robots)
+
+
+def pool(ray: str | None) -> "Pool":
+    """All cores of this machine, or of a Ray cluster. Raises ValueError, ConnectionError."""
+    if ray is None:
+        from lpac.sim.cores import over_cores
+
+        return over_cores
+    try:
+        from lpac.sim.cluster import over_ray
+    except ModuleNotFoundError:
+        raise ValueError("--ray needs Ray: `pip install 'lpac-edge[ray]'`") from None
+    return over_ray(ray)
 
 
 def user_at_host() -> str:

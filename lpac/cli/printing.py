@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
     from rich.table import Table
     from rich.text import Text
 
@@ -59,3 +60,20 @@ def new_table(*, narrow: bool, heading: bool = True) -> "Table":
         pad_edge=False,
         padding=(0, 1 if narrow else 2, 0, 0),
     )
+
+
+def progress_of(what: str) -> "Progress":
+    """On stderr: how many are done of how many, the time left, and each task's description."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("{task.description}"), console=Console(stderr=True), transient=True,
+    )  # fmt: skip

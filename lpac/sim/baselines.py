@@ -1,17 +1,20 @@
-"""The baseline controllers: Lloyd's algorithm with three degrees of knowledge.
+"""The baseline controllers: Lloyd's algorithm with several degrees of knowledge.
 
-As in CoverageControl, all robots step at once and know the true positions (the decentralised one:
-those within communication range), whatever happens to messages.
+As in CoverageControl, all robots step at once and know the true positions (decentralised ones:
+those within communication range), whatever happens to messages. None of them is a bound: Lloyd's
+algorithm ends in local minima, the clairvoyant's too.
 """
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Literal, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.coverage import cvt_velocity, local_centroid, voronoi_cells
 from edge.core.frames import ModelScale
 from edge.core.perception import (
@@ -24,7 +27,20 @@ from edge.core.perception import (
 from edge.drivers.world_sensor import WorldSensor
 from lpac.sim.vehicles import PointVehicles
 
-BaselineName = Literal["decentralized-cvt", "centralized-cvt", "clairvoyant-cvt"]
+BaselineName = Literal[
+    "decentralized-cvt",
+    "decentralized-cvt-prior",
+    "shared-cvt",
+    "shared-cvt-prior",
+    "frontier-cvt",
+    "centralized-cvt",
+    "clairvoyant-cvt",
+]
+# What a cell is taken for that has not been seen, by the baselines with a prior. Without one they
+# know no reason to go where nobody was.
+PRIOR = 0.1
+# Frontiers are looked for on a lattice of this pitch, in cells; the sensor sees 64.
+_FRONTIER_PITCH = 8
 
 
 class Baseline(Protocol):
@@ -99,15 +115,142 @@ class DecentralizedCvt:
         return others[near]
 
 
+class SharedMaps:
+    """What robots have seen that tell each other everything, at once, also through others.
+
+    They see and talk at each `sense`; who has seen something, has it for ever.
+    """
+
+    def __init__(self, importance: F32, perception: PerceptionParameters, robots: int) -> None:
+        self._importance = importance
+        self._perception = perception
+        # Of robots that have heard the same it is the same array, which is never written to again.
+        self._seen: list[Bools] = [np.zeros(importance.shape, np.bool_)] * robots
+        self._others: list[npt.NDArray[np.intp]] = []
+
+    def sense(self, positions: F64) -> None:
+        """All look around at `positions` (N, 2), and tell whom they can reach."""
+        size, world_size = self._perception.sensor_size, self._perception.world_size
+        self._others = [np.zeros(0, np.intp)] * len(positions)
+        for group in connected(positions, self._perception.communication_range):
+            known = {id(self._seen[robot]): self._seen[robot] for robot in group}
+            seen = np.logical_or.reduce(list(known.values()))
+            for robot in group:
+                view, _ = part_in_world(window_corner(positions[robot], size), size, world_size)
+                seen[view] = True
+                self._seen[robot] = seen
+                self._others[robot] = group[group != robot]
+
+    def others(self, robot: int) -> npt.NDArray[np.intp]:
+        """Whom the robot can reach now, also through others."""
+        return self._others[robot]
+
+    def around(self, robot: int, position: F64) -> tuple[F32, Bools, tuple[int, int]]:
+        """The part of the robot's local map that is in the world.
+
+        What is there, as far as it knows; what it knows; and the part's first cell.
+        """
+        size = self._perception.local_map_size
+        corner = window_corner(position, size)
+        part, _ = part_in_world(corner, size, self._perception.world_size)
+        seen = self._seen[robot][part]
+        unknown = np.float32(self._perception.unknown_importance)
+        return np.where(seen, self._importance[part], unknown), seen, (part[0].start, part[1].start)
+
+
+class SharedCvt:
+    """Decentralised, but robots share their maps and positions over the communication graph."""
+
+    def __init__(self, importance: F32, perception: PerceptionParameters, robots: int) -> None:
+        self._maps = SharedMaps(importance, perception, robots)
+
+    def goals(self, positions: F64) -> F64:
+        """The centroid of each robot's Voronoi cell in its local map."""
+        self._maps.sense(positions)
+        goals = np.empty_like(positions)
+        for robot, position in enumerate(positions):
+            local, _, origin = self._maps.around(robot, position)
+            others = positions[self._maps.others(robot)]
+            goals[robot] = local_centroid(local, origin, position, others)
+        return goals
+
+
+class FrontierCvt:
+    """First explores, then covers: robots share maps and positions as `SharedCvt`'s do.
+
+    Each goes to what is unseen and nearest in its own Voronoi cell of its local map, and when there
+    is nothing, to the cell's centroid. Frontiers: Yamauchi, "Frontier-based exploration using
+    multiple robots" (Agents 1998); one Voronoi cell a robot, so that no two go to one: Hu et al.,
+    "Voronoi-based multi-robot autonomous exploration in unknown environments via deep reinforcement
+    learning" (IEEE Trans. Vehicular Technology, 2020).
+    """
+
+    def __init__(self, importance: F32, perception: PerceptionParameters, robots: int) -> None:
+        self._maps = SharedMaps(importance, perception, robots)
+
+    def goals(self, positions: F64) -> F64:
+        """The nearest unseen point of each robot's cell, or the cell's centroid."""
+        self._maps.sense(positions)
+        goals = np.empty_like(positions)
+        for robot, position in enumerate(positions):
+            local, seen, origin = self._maps.around(robot, position)
+            others = positions[self._maps.others(robot)]
+            unseen = _unseen_points(seen, origin)
+            distance = np.linalg.norm(unseen - position, axis=1)
+            to_others = np.linalg.norm(unseen[:, None] - others, axis=2).min(axis=1, initial=np.inf)
+            own = distance <= to_others
+            if own.any():
+                goals[robot] = unseen[own][distance[own].argmin()]
+            else:
+                goals[robot] = local_centroid(local, origin, position, others)
+        return goals
+
+
+def connected(positions: F64, communication_range: float) -> list[npt.NDArray[np.intp]]:
+    """The robots (N, 2) that reach each other, directly or through others, each group ascending."""
+    left = np.arange(len(positions))
+    groups = []
+    while len(left):
+        group, new = left[:0], left[:1]
+        left = left[1:]
+        while len(new):
+            group = np.append(group, new)
+            offsets = positions[left][:, None] - positions[new]
+            near = (np.hypot(offsets[..., 0], offsets[..., 1]) < communication_range).any(axis=1)
+            new, left = left[near], left[~near]
+        groups.append(np.sort(group))
+    return groups
+
+
+def _unseen_points(seen: Bools, origin: tuple[int, int]) -> F64:
+    """(n, 2): centres of unseen cells, of those on the lattice, in model units."""
+    # In the middle, since at the world's border half a pitch stays unseen.
+    first = [(_FRONTIER_PITCH // 2 - start) % _FRONTIER_PITCH for start in origin]
+    lattice = seen[first[0] :: _FRONTIER_PITCH, first[1] :: _FRONTIER_PITCH]
+    cells = np.argwhere(~lattice) * _FRONTIER_PITCH + first + origin
+    return np.asarray(cells + 0.5, np.float64)
+
+
 def make_baseline(
     name: BaselineName, importance: F32, perception: PerceptionParameters, robots: int
 ) -> Baseline:
     """The baseline of that name, for a world's raster and the sizes of the robots' perception."""
-    if name == "clairvoyant-cvt":
-        return ClairvoyantCvt(importance)
-    if name == "centralized-cvt":
-        return CentralizedCvt(importance, perception)
-    return DecentralizedCvt(importance, perception, robots)
+    with_prior = replace(perception, unknown_importance=PRIOR)
+    match name:
+        case "clairvoyant-cvt":
+            return ClairvoyantCvt(importance)
+        case "centralized-cvt":
+            return CentralizedCvt(importance, perception)
+        case "decentralized-cvt":
+            return DecentralizedCvt(importance, perception, robots)
+        case "decentralized-cvt-prior":
+            return DecentralizedCvt(importance, with_prior, robots)
+        case "shared-cvt":
+            return SharedCvt(importance, perception, robots)
+        case "shared-cvt-prior":
+            return SharedCvt(importance, with_prior, robots)
+        case "frontier-cvt":
+            return FrontierCvt(importance, perception, robots)
 
 
 class BaselineSwarm:

@@ -46,9 +46,11 @@ ALLOWED = {
     },
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
+    "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.fleet", "lpac.fleet.settings",
+        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.fleet",
+        "lpac.fleet.settings",
         "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip
@@ -57,7 +59,7 @@ ONLY_IN = {
     "onnxruntime": {"edge/policy/lpac/graphs.py"},
     "torch": {"export/"},
     "onnx": {"export/"},
-    "matplotlib": {"lpac/sim/", "lpac/analysis/"},
+    "matplotlib": {"lpac/sim/", "lpac/analysis/", "lpac/evaluate/"},
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
     "mcap": {"edge/drivers/"},

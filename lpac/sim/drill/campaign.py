@@ -5,16 +5,10 @@ below one that says what flew. Another version of the code, or another bundle, b
 ended early is flown again.
 """
 
-import hashlib
-import json
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache
-from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,6 +20,7 @@ from lpac.sim.drill.bounds import Figure, always, judge
 from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.drill.truth import FlightTruth
+from lpac.sim.kept import KeptOutcomes, code_digest
 
 _FLIGHTS = "flights.jsonl"
 # Two ticks of control that a robot left out in a flight, or as much of the vehicles' time.
@@ -65,7 +60,8 @@ class FlightOutcome:
         return not self.error and not self.broken
 
 
-Pool = Callable[[Sequence[FlightTask]], Iterator[FlightOutcome]]
+# Flies them all; outcomes as they come. On the simulated clock, `fly_order` over a `Pool`.
+Flown = Callable[[Sequence[FlightTask]], Generator[FlightOutcome, None, None]]
 
 
 def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> FlightOutcome:
@@ -98,60 +94,23 @@ def _drill(robots: int, bundle: str) -> SimulatedDrill:
     return SimulatedDrill(robots, Path(bundle))
 
 
-def over_cores(tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
-    """A process for each core; outcomes as they come."""
-    return over_processes(tasks, fly_order, len(os.sched_getaffinity(0)))
-
-
-def over_processes(
-    tasks: Sequence[FlightTask], fly: Callable[[FlightTask], FlightOutcome], at_most: int
-) -> Iterator[FlightOutcome]:
-    """So many processes at most that fly; outcomes as they come."""
-    workers = min(len(tasks), at_most)
-    # A fork would inherit threads that do not run there.
-    with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
-        flights = [pool.submit(fly, task) for task in tasks]
-        try:
-            for flight in as_completed(flights):
-                yield flight.result()
-        except BaseException:
-            # Flights that nobody waits for end now.
-            for worker in active_children():
-                worker.terminate()
-            raise
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """A worker would wait for ever for a campaign that was killed."""
-    parent = parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
 class Campaign:
     """The flights of one set-up, whose outcomes are in `folder`."""
 
     def __init__(self, folder: Path, vehicle: str, robots: int, bundle: Path) -> None:
         """Raises BundleError, OSError."""
-        folder.mkdir(parents=True, exist_ok=True)
-        self._path = folder / _FLIGHTS
         self._robots, self._bundle = robots, str(bundle.resolve())
-        self._flown_by = {
+        flown_by = {
             "vehicle": vehicle, "robots": robots, "bundle": load_bundle(bundle).id,
-            "code": code_digest(),
+            "code": code_digest(edge, lpac),
         }  # fmt: skip
-        self.outcomes: dict[tuple[str, int], FlightOutcome] = self._kept()
+        self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
+        outcomes = map(_outcome, self._kept.lines)
+        self.outcomes = {(o.fault, o.seed): o for o in outcomes if not o.error}
 
     def fly(
-        self, faults: Iterable[Fault], seeds: Iterable[int], pool: Pool
-    ) -> Iterator[FlightOutcome]:
+        self, faults: Iterable[Fault], seeds: Iterable[int], flown: Flown
+    ) -> Generator[FlightOutcome, None, None]:
         """Fly what was not flown yet, and give all outcomes asked for: first those that were."""
         faults = list(faults)
         # Flights of a seed, and of the same settings, share their begin.
@@ -160,8 +119,8 @@ class Campaign:
             for seed in seeds
             for fault in sorted(faults, key=lambda fault: (fault.exact, fault.settings))
         ]
-        flown = [key for fault, seed in wanted if (key := (fault.name, seed)) in self.outcomes]
-        yield from (self.outcomes[key] for key in flown)
+        kept = [key for fault, seed in wanted if (key := (fault.name, seed)) in self.outcomes]
+        yield from (self.outcomes[key] for key in kept)
         orders = [
             FlightTask(fault.name, seed, self._robots, self._bundle)
             for fault, seed in wanted
@@ -169,45 +128,13 @@ class Campaign:
         ]
         if not orders:
             return
-        with self._path.open("a") as kept:
-            for outcome in pool(orders):
+        with closing(flown(orders)) as outcomes:
+            for outcome in outcomes:
                 self.outcomes[outcome.fault, outcome.seed] = outcome
-                kept.write(json.dumps(asdict(outcome)) + "\n")
-                kept.flush()
+                self._kept.add(asdict(outcome))
                 yield outcome
 
-    def _kept(self) -> dict[tuple[str, int], FlightOutcome]:
-        if self._path.exists():
-            first, *lines = self._path.read_text().splitlines() or [""]
-            if _parsed(first) == self._flown_by:
-                outcomes = [_outcome(line) for line in lines]
-                return {(o.fault, o.seed): o for o in outcomes if o is not None and not o.error}
-        self._path.write_text(json.dumps(self._flown_by) + "\n")
-        return {}
 
-
-@cache
-def code_digest() -> str:
-    """Of all that flies and judges: the sources of `edge` and `lpac`."""
-    digest = hashlib.sha256()
-    for package in (edge, lpac):
-        root = Path(package.__path__[0])
-        for path in sorted(root.rglob("*.py")):
-            digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()
-
-
-def _parsed(line: str) -> Any:
-    try:
-        return json.loads(line)
-    except ValueError:
-        # Killed while it was written.
-        return None
-
-
-def _outcome(line: str) -> FlightOutcome | None:
-    read: Mapping[str, Any] | None = _parsed(line)
-    if read is None:
-        return None
+def _outcome(read: Mapping[str, Any]) -> FlightOutcome:
     figures = tuple(Figure(*figure) for figure in read["figures"])
     return FlightOutcome(**{**read, "figures": figures})

@@ -3,17 +3,12 @@
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 from edge.core import log
-from lpac.sim.drill.campaign import (
-    LATE_S,
-    FlightOutcome,
-    FlightTask,
-    outcome_of,
-    over_processes,
-)
+from lpac.sim.cores import over_processes
+from lpac.sim.drill.campaign import LATE_S, FlightOutcome, FlightTask, outcome_of
 from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.field import has_remote_control, scenario_of, settings_of
 from lpac.sim.drill.figure import write_figure
@@ -52,13 +47,13 @@ class RealTimeDrill:
                 break
         return outcome
 
-    def pool(self, tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+    def fly_all(self, tasks: Sequence[FlightTask]) -> Generator[FlightOutcome, None, None]:
         """All of them, as many at once as this machine carries; outcomes as they come."""
         at_once = 1
         # PX4's ports are the same for all fleets.
         if self._px4_build is None:
             at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * self._robots))
-        return over_processes(tasks, self.fly_task, max(1, at_once))
+        return over_processes(self.fly_task, tasks, max(1, at_once))
 
     def fly_task(self, task: FlightTask) -> FlightOutcome:
         """One flight, in whatever process this is."""

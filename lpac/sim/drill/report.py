@@ -5,11 +5,10 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
+from lpac.analysis.statistics import at_most_share
 from lpac.sim.drill.bounds import Figure
 from lpac.sim.drill.campaign import FlightOutcome
 from lpac.sim.drill.faults import FAULTS
-
-_CONFIDENCE = 0.95
 
 
 class FaultSummary(NamedTuple):
@@ -41,30 +40,6 @@ def summaries(outcomes: Iterable[FlightOutcome]) -> list[FaultSummary]:
 def _worst(outcomes: Sequence[FlightOutcome]) -> tuple[Figure, ...]:
     columns = zip(*(outcome.figures for outcome in outcomes if outcome.figures), strict=True)
     return tuple(min(column, key=lambda figure: figure.room) for column in columns)
-
-
-def at_most_share(flights: int, broken: int) -> float:
-    """The greatest share of broken flights that is still likely, at 95 % confidence, one-sided.
-
-    Clopper and Pearson's bound; of n flights without any it is 1 - 0.05^(1/n), about 3 / n.
-    """
-    if broken >= flights:
-        return 1.0
-    low, high = broken / flights, 1.0
-    while high - low > 1e-6:
-        share = (low + high) / 2.0
-        if _at_most(broken, flights, share) > 1.0 - _CONFIDENCE:
-            low = share
-        else:
-            high = share
-    return high
-
-
-def _at_most(broken: int, flights: int, share: float) -> float:
-    """How likely it is that no more than so many of the flights are broken."""
-    return math.fsum(
-        math.comb(flights, k) * share**k * (1.0 - share) ** (flights - k) for k in range(broken + 1)
-    )
 
 
 def shown(figure: Figure) -> str:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -13,8 +14,9 @@ from xml.etree import ElementTree
 import pytest
 from ray.cluster_utils import Cluster
 
-from lpac.sim.drill.campaign import Campaign, FlightOutcome, over_cores
-from lpac.sim.drill.cluster import over_ray
+from lpac.sim.cluster import over_ray
+from lpac.sim.cores import over_cores
+from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
 from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
@@ -28,7 +30,10 @@ ROBOTS = 2
 def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], FlightOutcome]:
     """Two faults with two seeds, over all cores."""
     campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", ROBOTS, SHIPPED)
-    return {(o.fault, o.seed): o for o in campaign.fly([LANDED, GONE], [0, 1], over_cores)}
+    return {
+        (o.fault, o.seed): o
+        for o in campaign.fly([LANDED, GONE], [0, 1], partial(over_cores, fly_order))
+    }
 
 
 def test_flights_over_cores_hold_what_is_promised(
@@ -54,7 +59,7 @@ def test_a_cluster_of_two_nodes_flies_the_same(
     tmp_path: Path, cluster: Cluster, flown: dict[tuple[str, int], FlightOutcome]
 ) -> None:
     campaign = Campaign(tmp_path, "simulated", ROBOTS, SHIPPED)
-    again = campaign.fly([LANDED, GONE], [0, 1], over_ray(cluster.address))
+    again = campaign.fly([LANDED, GONE], [0, 1], partial(over_ray(cluster.address), fly_order))
     assert {(outcome.fault, outcome.seed): outcome for outcome in again} == flown
 
 

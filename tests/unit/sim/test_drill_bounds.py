@@ -33,7 +33,6 @@ from lpac.sim.drill.bounds import (
     StraightDown,
     TakesOff,
 )
-from lpac.sim.drill.report import at_most_share
 from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
 from lpac.sim.px4.modes import Px4Mode
 
@@ -168,12 +167,3 @@ def test_what_is_not_known_is_broken() -> None:
     assert Figure("share", math.nan, 0.5, "", at_least=True).broken
     assert Figure("speed", math.nan, 0.5, "m/s").broken
     assert not Figure("apart", math.inf, 0.5, "m", at_least=True).broken
-
-
-def test_how_seldom_it_is_at_least() -> None:
-    # None of 1,000 is "below 0.3 % at 95 % confidence".
-    assert at_most_share(1000, 0) == pytest.approx(1.0 - 0.05 ** (1.0 / 1000), abs=1e-5)
-    assert 0.0029 < at_most_share(1000, 0) < 0.003
-    # As R's binom.test(3, 100, alternative = "less").
-    assert at_most_share(100, 3) == pytest.approx(0.0757, abs=1e-3)
-    assert at_most_share(5, 5) == 1.0

@@ -1,11 +1,11 @@
-"""Flights over a Ray cluster: its nodes have the same installation, and the bundle at its path."""
+"""Tasks over a Ray cluster: its nodes have the same installation, and each file at its path."""
 
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 
 import ray
 
-from lpac.sim.drill.campaign import FlightOutcome, FlightTask, Pool, fly_order
+from lpac.sim.cores import Outcome, Pool, Task
 
 _ANSWERS_WITHIN_S = 5.0
 
@@ -23,15 +23,18 @@ def over_ray(address: str) -> Pool:
         except OSError as error:
             raise ConnectionError(f"no Ray cluster at {address}: {error}") from None
 
-    def pool(orders: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+    def pool(
+        do: Callable[[Task], Outcome], tasks: Sequence[Task]
+    ) -> Generator[Outcome, None, None]:
         ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
         try:
-            # A lost node costs the flights that it was flying: others fly them again.
-            fly = ray.remote(num_cpus=1, max_retries=3)(fly_order)
-            flights = [fly.remote(order) for order in orders]
-            while flights:
-                [flown], flights = ray.wait(flights, num_returns=1)
-                yield ray.get(flown)
+            # A lost node costs the tasks that it was at: others do them again.
+            remote = ray.remote(num_cpus=1, max_retries=3)(do)
+            given = [remote.remote(task) for task in tasks]
+            while given:
+                [done], given = ray.wait(given, num_returns=1)
+                outcome: Outcome = ray.get(done)
+                yield outcome
         finally:
             ray.shutdown()
 

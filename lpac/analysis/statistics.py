@@ -1,0 +1,186 @@
+"""What a set of results says, and how surely. Pure numpy; less is better throughout.
+
+Values of a method are (S, K): of S trainings, which differ in their seed alone, over the same K
+worlds. A method of one training, such as a baseline, is (1, K). Worlds are drawn, and so are
+trainings: an interval is about the method only as far as it has several.
+
+Sources: interquartile mean, stratified bootstrap and performance profiles as Agarwal et al., "Deep
+Reinforcement Learning at the Edge of the Statistical Precipice" (arXiv 2108.13264); the bound of a
+share: Clopper and Pearson, Biometrika 26 (1934).
+"""
+
+import math
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F64
+
+CONFIDENCE = 0.95
+# A claim about a method, and not about these of its trainings, needs so many.
+LEAST_TRAININGS = 3
+# Of fewer not even a difference of one sign in all of them would be telling: 2 * 0.5^5 > 0.05.
+LEAST_WORLDS = 6
+_RESAMPLES = 2000
+_SEED = 0
+
+
+class Interval95(NamedTuple):
+    """A value and the ends of its 95 % interval; `low <= high`."""
+
+    value: float
+    low: float
+    high: float
+
+
+def mean(values: F64) -> F64:
+    """(...,): of each (..., S, K)."""
+    means: F64 = values.mean(axis=(-2, -1))
+    return means
+
+
+def interquartile_mean(values: F64) -> F64:
+    """(...,): of each (..., S, K) the mean of the middle half of all its values.
+
+    Where a quartile is inside a value's share, the value counts in part.
+    """
+    ordered = np.sort(values.reshape(*values.shape[:-2], -1), axis=-1)
+    edges = np.clip(np.linspace(0.0, 1.0, ordered.shape[-1] + 1), 0.25, 0.75)
+    means: F64 = ordered @ np.diff(edges) / 0.5
+    return means
+
+
+def difference_of_means(a: F64, b: F64) -> F64:
+    """(...,): of each (..., S, K) and (..., T, K); below 0 where `a` is better."""
+    return mean(a) - mean(b)
+
+
+def ratio_of_means(a: F64, b: F64) -> F64:
+    """(...,): of each (..., S, K) and (..., T, K); below 1 where `a` is better.
+
+    NaN where all of `b` is 0.
+    """
+    below = mean(b)
+    return mean(a) / np.where(below == 0.0, np.nan, below)
+
+
+def share_below(a: F64, b: F64) -> F64:
+    """(...,): in which share of the K worlds the mean of `a` over its trainings is below `b`'s.
+
+    Of each (..., S, K) and (..., T, K); equal ones count half.
+    """
+    offset = a.mean(axis=-2) - b.mean(axis=-2)
+    shares: F64 = (offset < 0.0).mean(axis=-1) + 0.5 * (offset == 0.0).mean(axis=-1)
+    return shares
+
+
+def bootstrap(values: F64, statistic: Callable[[F64], F64] = mean) -> Interval95:
+    """A statistic of (S, K), with the interval over other worlds and other trainings."""
+    rng = np.random.default_rng(_SEED)
+    worlds = _drawn(rng, values.shape[1])
+    drawn = values[_drawn(rng, len(values))[:, :, None], worlds[:, None]]
+    return _interval(statistic(values), statistic(drawn))
+
+
+def paired_bootstrap(a: F64, b: F64, statistic: Callable[[F64, F64], F64]) -> Interval95:
+    """A statistic of two methods, (S, K) and (T, K), over the same worlds in the same order.
+
+    Worlds are drawn for both at once, and trainings for each by itself. Raises ValueError if the
+    numbers of worlds differ.
+    """
+    if a.shape[1] != b.shape[1]:
+        raise ValueError(f"{a.shape[1]} worlds of one and {b.shape[1]} of the other: no pairs")
+    rng = np.random.default_rng(_SEED)
+    worlds = _drawn(rng, a.shape[1])[:, None]
+    of_a, of_b = (_drawn(rng, len(values))[:, :, None] for values in (a, b))
+    return _interval(statistic(a, b), statistic(a[of_a, worlds], b[of_b, worlds]))
+
+
+class Verdict(NamedTuple):
+    """Whether method A is better than B over the same worlds.
+
+    `difference` and `ratio` are those of the means; `a_below_b` is the share of the worlds where
+    A's mean over its trainings is less, equal ones counting half. `better` is None if the data do
+    not tell: the difference's interval has 0 in it, or there are too few worlds. `of_methods` is
+    whether both have trainings enough for a claim about the methods; baselines need none.
+    """
+
+    better: Literal["a", "b"] | None
+    difference: Interval95
+    ratio: Interval95
+    a_below_b: Interval95
+    of_methods: bool
+
+
+def compare(a: F64, b: F64, *, trained_a: bool = True, trained_b: bool = True) -> Verdict:
+    """Compare (S, K) with (T, K) over the same worlds. Raises ValueError as `paired_bootstrap`."""
+    difference = paired_bootstrap(a, b, difference_of_means)
+    better: Literal["a", "b"] | None = None
+    if a.shape[1] >= LEAST_WORLDS and difference.high < 0.0:
+        better = "a"
+    elif a.shape[1] >= LEAST_WORLDS and difference.low > 0.0:
+        better = "b"
+    return Verdict(
+        better,
+        difference,
+        paired_bootstrap(a, b, ratio_of_means),
+        paired_bootstrap(a, b, share_below),
+        all(
+            not trained or len(values) >= LEAST_TRAININGS
+            for values, trained in ((a, trained_a), (b, trained_b))
+        ),
+    )
+
+
+def performance_profile(values: F64, thresholds: F64) -> F64:
+    """(len(thresholds),): the share of all values that are at most as much; it never falls."""
+    ordered = np.sort(values, axis=None)
+    return np.searchsorted(ordered, thresholds, side="right") / len(ordered)
+
+
+def mean_over_time(time_s: F64, curves: F64) -> F64:
+    """(...,): the area under curves (..., T) at times (T,), ascending, over their duration."""
+    area = ((curves[..., 1:] + curves[..., :-1]) * np.diff(time_s)).sum(axis=-1) / 2.0
+    means: F64 = area / (time_s[-1] - time_s[0])
+    return means
+
+
+def at_most_share(of: int, failed: int) -> float:
+    """The greatest share of failures that is still likely, at 95 % confidence, one-sided.
+
+    Clopper and Pearson's bound; of n without any it is 1 - 0.05^(1/n), about 3 / n.
+    """
+    if failed >= of:
+        return 1.0
+    low, high = failed / of, 1.0
+    while high - low > 1e-6:
+        share = (low + high) / 2.0
+        if _at_most(failed, of, share) > 1.0 - CONFIDENCE:
+            low = share
+        else:
+            high = share
+    return high
+
+
+def _at_most(failed: int, of: int, share: float) -> float:
+    """How likely it is that no more than so many fail."""
+    return math.fsum(
+        math.comb(of, k) * share**k * (1.0 - share) ** (of - k) for k in range(failed + 1)
+    )
+
+
+def _drawn(rng: np.random.Generator, count: int) -> npt.NDArray[np.intp]:
+    """(_RESAMPLES, count): so many of so many, with replacement."""
+    return rng.integers(count, size=(_RESAMPLES, count))
+
+
+def _interval(value: F64, drawn: F64) -> Interval95:
+    """The percentiles of what was drawn and is a number; NaN if nothing is."""
+    beyond = (1.0 - CONFIDENCE) / 2.0
+    known = drawn[~np.isnan(drawn)]
+    if not len(known):
+        return Interval95(math.nan, math.nan, math.nan)
+    low, high = np.quantile(known, (beyond, 1.0 - beyond)).tolist()
+    return Interval95(float(value), low, high)

@@ -1,0 +1,344 @@
+"""`lpac evaluate`: policies and baselines over many worlds, and how surely one is better."""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_BUNDLE, AsJson, Ray, pool
+from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from lpac.evaluate.evaluation import Condition, Evaluation, Method, MethodResult
+    from lpac.evaluate.flights import EvaluationFlight, FlownCost, KeptFlights
+    from lpac.sim.cores import Pool
+    from lpac.sim.experiment import SimulatedFlight
+
+app = new_app()
+
+_OUT = Path("out/evaluate")
+_WORST = 10
+
+
+@app.command()
+def evaluate(
+    *,
+    methods: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[METHOD]...",
+            help="Policy bundles, the shipped one if none is given; several trainings of one "
+            "method joined by commas; or names of baselines.",
+        ),
+    ] = None,
+    world_set: Annotated[
+        str, typer.Option("--set", help="training, validation, or test: look at that one once.")
+    ] = "validation",
+    worlds: Annotated[int, typer.Option("--worlds", "-k", help="The first so many of it.")] = 20,
+    duration: Annotated[float, typer.Option(help="Flight time, s.")] = 60.0,
+    set_ups: Annotated[
+        list[str] | None,
+        typer.Option("--set-up", metavar="NAME", help="field if not given; may be repeated."),
+    ] = None,
+    transfer: Annotated[
+        bool,
+        typer.Option(
+            help="All set-ups: other numbers of robots at equal density, features and ranges."
+        ),
+    ] = False,
+    losses: Annotated[
+        list[float] | None,
+        typer.Option("--loss", help="Also with messages lost with this probability."),
+    ] = None,
+    lost: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROBOTS@S", help="Also with robots lost in flight, such as 2@20: two at 20 s."
+        ),
+    ] = None,
+    baselines: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--baseline", metavar="NAME", help="Only these, and clairvoyant-cvt; else all."
+        ),
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Say whether the first of two methods is better.")
+    ] = False,
+    ray: Ray = None,
+    as_json: AsJson = False,
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for evaluation.json, figures, pictures, and what was flown."),
+    ] = _OUT,
+) -> None:
+    """Policies and baselines over many worlds: how well they cover, and how surely."""
+    from lpac.evaluate.evaluation import as_json as to_json
+    from lpac.evaluate.evaluation import results_of
+    from lpac.evaluate.flights import KeptFlights
+    from lpac.evaluate.report import write_results
+
+    given = methods or [str(DEFAULT_BUNDLE)]
+    if compare and len(given) != 2:
+        raise ValueError(f"--compare needs two methods; {len(given)} given")
+    evaluation = _evaluation(
+        given, world_set, worlds, duration, set_ups, losses or [], lost or [], baselines,
+        transfer=transfer,
+    )  # fmt: skip
+    cores = pool(ray)
+    kept = KeptFlights(out)
+    results = results_of(evaluation, _fly(evaluation, kept, cores))
+    told = to_json(evaluation, results, compared=compare)
+    told["test_set_opened"] = _opened(evaluation)
+    write_results(told, results, out)
+    _write_worst(evaluation, results, cores, out)
+    if as_json:
+        typer.echo(json.dumps(told, indent=2))
+        return
+    _show(told, compared=compare)
+    typer.echo(f"\nsee {out}: evaluation.json, figures, and the worst worlds")
+
+
+def _evaluation(
+    given: Sequence[str],
+    world_set: str,
+    worlds: int,
+    duration_s: float,
+    set_ups: list[str] | None,
+    losses: Sequence[float],
+    lost: Sequence[str],
+    baselines: list[str] | None,
+    *,
+    transfer: bool,
+) -> "Evaluation":
+    from edge.policy.bundle import load_bundle
+    from lpac.evaluate.evaluation import CLAIRVOYANT, Condition, Evaluation, Method
+    from lpac.evaluate.flights import BASELINES, LostRobots, sizes_of, task_of
+    from lpac.evaluate.worlds import SET_UPS, WORLD_SETS
+
+    chosen_sets = [one for one in WORLD_SETS if one == world_set]
+    if not chosen_sets:
+        raise ValueError(f"--set {world_set}: must be one of {', '.join(WORLD_SETS)}")
+    for name in baselines or ():
+        if name not in BASELINES:
+            raise ValueError(f"--baseline {name}: must be one of {', '.join(BASELINES)}")
+    for name in set_ups or ():
+        if name not in SET_UPS:
+            raise ValueError(f"--set-up {name}: must be one of {', '.join(SET_UPS)}")
+    if transfer and set_ups:
+        raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
+    lost_robots = [LostRobots.parse(text) for text in lost]
+    names = _names(given)
+    policies = [_method(text, name) for text, name in zip(given, names, strict=True)]
+    paths = [training.path for method in policies for training in method.trainings]
+    bundles = {path: load_bundle(Path(path)) for path in paths or [str(DEFAULT_BUNDLE)]}
+    tasks = {task_of(bundle): path for path, bundle in bundles.items()}
+    if len(tasks) > 1:
+        different = "; ".join(f"{path}: {task}" for task, path in tasks.items())
+        raise ValueError(f"bundles of different tasks: {different}")
+    sizes_from, first = next(iter(bundles.items()))
+    named = {method.name for method in policies}
+    others = [
+        Method(name=name, flier=name)
+        for name in BASELINES
+        if name not in named and (not baselines or name in (*baselines, CLAIRVOYANT))
+    ]
+    return Evaluation(
+        methods=(*policies, *others),
+        conditions=tuple(
+            condition
+            for name in (SET_UPS if transfer else set_ups or ["field"])
+            for condition in (
+                Condition(name),
+                *(Condition(name, loss=loss) for loss in losses),
+                *(Condition(name, lost=robots) for robots in lost_robots),
+            )
+        ),
+        world_set=chosen_sets[0],
+        worlds=worlds,
+        duration_s=duration_s,
+        sizes_from=sizes_from,
+        sizes=sizes_of(first),
+    )
+
+
+def _names(given: Sequence[str]) -> list[str]:
+    """Short ones: of each path the last parts, as many as tell it from the others."""
+    parts = [[Path(path).resolve().parts for path in text.split(",")] for text in given]
+    for depth in range(1, max(len(part) for text in parts for part in text) + 1):
+        names = [",".join("/".join(part[-depth:]) for part in text) for text in parts]
+        if len(set(names)) == len(set(given)):
+            break
+    return names
+
+
+def _method(text: str, name: str) -> "Method":
+    """A baseline by its name, or bundles by their paths. Raises BundleError."""
+    from edge.policy.bundle import load_bundle
+    from lpac.evaluate.evaluation import Method, TrainedBundle
+    from lpac.evaluate.flights import BASELINES, POLICY
+
+    for baseline in BASELINES:
+        if baseline == text:
+            return Method(name=baseline, flier=baseline)
+    paths = [Path(part) for part in text.split(",")]
+    return Method(
+        name=name,
+        flier=POLICY,
+        trainings=tuple(TrainedBundle(str(p.resolve()), load_bundle(p).id) for p in paths),
+    )
+
+
+def _fly(
+    evaluation: "Evaluation", kept: "KeptFlights", cores: "Pool"
+) -> dict["EvaluationFlight", "FlownCost"]:
+    flights, costs = evaluation.flights(), {}
+    with progress_of("flights") as progress, closing(kept.fly(flights, cores)) as told:
+        task = progress.add_task("", total=len(flights))
+        for flight, flown in told:
+            costs[flight] = flown
+            progress.update(task, advance=1)
+    return costs
+
+
+def _opened(evaluation: "Evaluation") -> dict[str, Any] | None:
+    """Of the test set: by whom, when, and how many worlds of it. None if another was looked at."""
+    if evaluation.world_set != "test":
+        return None
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "bundle_ids": [
+            training.bundle_id for method in evaluation.methods for training in method.trainings
+        ],
+        "worlds": evaluation.worlds,
+    }
+
+
+def _write_worst(
+    evaluation: "Evaluation",
+    results: Mapping["Condition", Sequence["MethodResult"]],
+    cores: "Pool",
+    out: Path,
+) -> None:
+    """Of each policy, under the first condition: its worst worlds, flown again."""
+    from lpac.evaluate.evaluation import CLAIRVOYANT, worst_worlds
+    from lpac.evaluate.flights import fly_group, groups_of
+    from lpac.evaluate.report import write_world
+
+    condition, of_all = next(iter(results.items()))
+    clairvoyant = next(r.method for r in of_all if r.method.name == CLAIRVOYANT)
+    wanted = {
+        (result.method.name, place, world): [
+            next(evaluation.flights_of(method, condition, world))
+            for method in (result.method, clairvoyant)
+        ]
+        for result in of_all
+        if result.method.trained
+        for place, world in enumerate(worst_worlds(result, _WORST), 1)
+    }
+    flights = list(dict.fromkeys(flight for pair in wanted.values() for flight in pair))
+    flown: dict[EvaluationFlight, SimulatedFlight] = {}
+    with progress_of("pictures of the worst worlds") as progress:
+        task = progress.add_task("", total=len(flights))
+        for group in cores(fly_group, groups_of(flights)) if flights else ():
+            flown.update(group)
+            progress.update(task, advance=len(group))
+        for (name, place, world), pair in wanted.items():
+            shown = {str(flight.flier): flown[flight] for flight in pair}
+            write_world(
+                shown, out / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
+            )
+
+
+def _show(told: Mapping[str, Any], *, compared: bool) -> None:
+    policies = [method["name"] for method in told["methods"] if method["bundles"]]
+    for condition in told["conditions"]:
+        typer.echo(
+            f"{condition['name']}: {told['worlds']} worlds of the {told['world_set']} set, "
+            f"{told['duration_s']:g} s; cost at the end over that at the start\n"
+        )
+        of_all = condition["results"]
+        print_table(_COLUMNS, [_row(one) for one in of_all], right=_COLUMNS[1:])
+        of_policies = [one for one in of_all if one["name"] in policies]
+        for one in of_policies:
+            typer.echo(
+                f"\n{one['name']}: {_share(one['fails'])} of the worlds end above "
+                f"{told['fails_above']:g} x clairvoyant; in {_share(one['rises_again'])} costs "
+                "rise again"
+            )
+        if of_policies:
+            typer.echo()
+            rows = [
+                [baseline["name"], *(_against(one, baseline["name"]) for one in of_policies)]
+                for baseline in of_all
+                if baseline not in of_policies
+            ]
+            print_table(("against", *policies), rows)
+        if compared:
+            _show_verdict(condition["compared"], *told["methods"][:2])
+        typer.echo()
+    opened = told["test_set_opened"]
+    if opened is not None:
+        typer.echo(
+            f"the test set was opened, {opened['worlds']} worlds of it: whoever chooses by this "
+            "has none any more"
+        )
+
+
+_COLUMNS = ("", "mean", "95 %", "p90", "worst", "area", "/clair", "p90", "/Lloyd")
+
+
+def _row(result: Mapping[str, Any]) -> list[str]:
+    final, over = result["final"], result["over_clairvoyant"]
+    mean, low, high = final["mean"]
+    return [
+        result["name"],
+        f"{mean:.3f}",
+        f"{low:.3f}-{high:.3f}",
+        f"{final['quantiles']['0.9']:.3f}",
+        f"{final['worst']:.3f}",
+        f"{result['area']['mean'][0]:.3f}",
+        f"{over['ratio_of_means'][0]:.3f}",
+        f"{over['quantiles']['0.9']:.2f}",
+        f"{result['over_best_of_ten']['ratio_of_means'][0]:.3f}",
+    ]
+
+
+def _share(told: Mapping[str, Any]) -> str:
+    """With how much it may be in truth."""
+    share, bound = 100.0 * told["share"], 100.0 * told["at_most_share"]
+    return f"{share:.3g} % (95 %: at most {bound:.3g})"
+
+
+def _against(policy: Mapping[str, Any], baseline: str) -> "Text":
+    """Whether better, and in how many worlds it ends above the baseline."""
+    above, verdict = policy["above"][baseline], policy["against"][baseline]
+    text = {"a": "better", "b": "worse", None: "not told"}[verdict["better"]]
+    style = {"a": GOOD, "b": BAD, None: ""}[verdict["better"]]
+    return styled(f"{text}, above it in {100.0 * above['share']:.3g} %", style)
+
+
+def _show_verdict(verdict: Mapping[str, Any], a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
+    ratio, below = verdict["ratio"], verdict["a_below_b"]
+    if verdict["better"] is None:
+        said = f"the data do not tell whether {a['name']} or {b['name']} is better"
+    else:
+        better, worse = (a, b) if verdict["better"] == "a" else (b, a)
+        said = f"{better['name']} is better than {worse['name']}"
+    typer.echo(
+        f"\n{said}: cost at the end {ratio[0]:.3f} times (95 %: {ratio[1]:.3f} to {ratio[2]:.3f}), "
+        f"lower in {100.0 * below[0]:.3g} % of the worlds ({100.0 * below[1]:.3g} to "
+        f"{100.0 * below[2]:.3g})"
+    )
+    if not verdict["of_methods"]:
+        typer.echo(
+            "that is said of these bundles; of the methods only with three trainings of each, "
+            "joined by commas"
+        )

@@ -1,0 +1,1 @@
+"""How well policies cover, over many worlds, and how surely one is better than another."""

@@ -1,0 +1,149 @@
+"""An evaluation's figures."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullLocator
+
+from lpac.analysis import style
+from lpac.analysis.statistics import paired_bootstrap, performance_profile, ratio_of_means
+from lpac.analysis.style import WIDTH_IN, tidy
+from lpac.evaluate.evaluation import FAILS_ABOVE, Condition, MethodResult
+
+# For more than a figure's curves have: the baselines.
+_LOOKS: tuple[tuple[str, Any], ...] = (
+    *style.CURVES, (style.ORANGE, "-"), (style.GREY, "--"), (style.YELLOW, "-."),
+    (style.FAINT, "-"),
+)  # fmt: skip
+_BAND = (0.1, 0.9)
+_MOST_RIVALS = 4
+
+
+def cost_curves(condition: Condition, results: Sequence[MethodResult]) -> Figure:
+    """Each method's median cost over time; of policies with the band from 10 % to 90 %."""
+    with style.figure(WIDTH_IN, 3.0) as figure:
+        axes = figure.subplots()
+        for result, (colour, dashes) in _looks(results):
+            low, median, high = np.quantile(result.curves, (_BAND[0], 0.5, _BAND[1]), axis=(0, 1))
+            if result.method.trained:
+                axes.fill_between(result.time_s, low, high, color=colour, alpha=0.12, lw=0)
+            axes.plot(
+                result.time_s, median, color=colour, ls=dashes, lw=1.3,
+                label=f"{median[-1]:.2f}  {result.method.name}",
+            )  # fmt: skip
+        axes.set(
+            xlabel="time (s)", ylabel=r"coverage cost $J(t)\,/\,J(0)$", ylim=(0.0, None),
+            xlim=(0.0, results[0].time_s[-1]), title=f"{condition.name}: median over worlds",
+        )  # fmt: skip
+        tidy(axes)
+        handles, labels = axes.get_legend_handles_labels()
+        if any(result.method.trained for result in results):
+            handles.append(Patch(color=style.FAINT, label="policies: 10 % to 90 % of the worlds"))
+            labels.append("policies: 10 % to 90 %")
+        figure.legend(
+            handles, labels, loc="outside right center", title="$J$ at the end / $J(0)$",
+            alignment="left", handlelength=2.8, fontsize=7,
+        )  # fmt: skip
+        return figure
+
+
+def distributions(condition: Condition, results: Sequence[MethodResult]) -> Figure:
+    """Performance profiles: how many worlds end below how much, in two measures."""
+    with style.figure(WIDTH_IN, 3.0) as figure:
+        left, right = figure.subplots(1, 2, sharey=True)
+        for axes, measure, label in (
+            (left, "final", "coverage cost at the end $/\\,J(0)$"),
+            (right, "over_clairvoyant", "coverage cost at the end over clairvoyant's"),
+        ):
+            drawn = [(getattr(result, measure), looks) for result, looks in _looks(results)]
+            highest = 1.02 * max(float(np.quantile(values, 0.98)) for values, _ in drawn)
+            lowest = 0.98 * min(float(values.min()) for values, _ in drawn)
+            thresholds = np.linspace(lowest, highest, 400)
+            for values, (colour, dashes) in drawn:
+                axes.plot(
+                    thresholds, performance_profile(values, thresholds), color=colour, ls=dashes,
+                    lw=1.3, drawstyle="steps-post",
+                )  # fmt: skip
+            axes.set(xlabel=label, xlim=(lowest, highest), ylim=(0.0, 1.02))
+            tidy(axes)
+        right.axvline(FAILS_ABOVE, color=style.FAINT, lw=0.8, zorder=0)
+        left.set_ylabel("share of the worlds below")
+        for result, (colour, dashes) in _looks(results):
+            left.plot([], [], color=colour, ls=dashes, lw=1.3, label=result.method.name)
+        figure.legend(loc="outside lower center", ncols=4, fontsize=7, handlelength=2.8)
+        figure.suptitle(condition.name, fontsize=8)
+        return figure
+
+
+def pairs(condition: Condition, results: Sequence[MethodResult]) -> Figure:
+    """World by world: the policies' cost at the end against that of the best other methods."""
+    policies = [result for result in results if result.method.trained] or [results[0]]
+    others = [result for result in results if not any(result is policy for policy in policies)]
+    rivals = sorted(others, key=lambda result: float(result.final.mean()))[:_MOST_RIVALS]
+    looks = {id(result): colour for result, (colour, _) in _looks(results)}
+    with style.figure(WIDTH_IN, 2.4) as figure:
+        panels = figure.subplots(1, max(len(rivals), 1), sharex=True, sharey=True, squeeze=False)[0]
+        shown = [*policies, *rivals]
+        low = 0.95 * min(float(result.final.min()) for result in shown)
+        high = 1.05 * max(float(result.final.max()) for result in shown)
+        for axes, rival in zip(panels, rivals, strict=False):
+            axes.plot((low, high), (low, high), color=style.FAINT, lw=0.8, zorder=0)
+            for policy in policies:
+                for training in policy.final:
+                    axes.plot(
+                        rival.final.mean(axis=0), training, ls="", marker="o", ms=2.5,
+                        color=looks[id(policy)], alpha=0.7, mew=0,
+                    )  # fmt: skip
+            axes.set(xlabel=rival.method.name, xscale="log", yscale="log")
+            axes.set(xlim=(low, high), ylim=(low, high), aspect="equal")
+            _plain_ticks(axes)
+        panels[0].set_ylabel(" / ".join(policy.method.name for policy in policies), fontsize=7)
+        figure.suptitle(
+            f"{condition.name}: $J$ at the end $/\\,J(0)$, a dot per world; below the line the "
+            "policy is better", fontsize=8,
+        )  # fmt: skip
+        return figure
+
+
+def over_conditions(results: Mapping[Condition, Sequence[MethodResult]]) -> Figure:
+    """The mean cost at the end over clairvoyant's, under each condition, with 95 % intervals."""
+    with style.figure(WIDTH_IN, 3.2) as figure:
+        axes = figure.subplots()
+        methods = next(iter(results.values()))
+        for place, (first, (colour, _)) in enumerate(_looks(methods)):
+            shift = 0.6 * ((place + 0.5) / len(methods) - 0.5)
+            for row, of_all in enumerate(results.values()):
+                [result] = [one for one in of_all if one.method == first.method]
+                value, low, high = paired_bootstrap(
+                    result.final, result.clairvoyant, ratio_of_means
+                )
+                axes.errorbar(
+                    row + shift, value, [[value - low], [high - value]], fmt="o", ms=3,
+                    color=colour, lw=1.0, label=first.method.name if row == 0 else None,
+                )  # fmt: skip
+        axes.axhline(1.0, color=style.FAINT, lw=0.8, zorder=0)
+        axes.set(ylabel="mean cost at the end\nover clairvoyant's", yscale="log")
+        _plain_ticks(axes)
+        axes.set_xticks(
+            range(len(results)), [condition.name for condition in results], rotation=30, ha="right"
+        )
+        tidy(axes)
+        figure.legend(loc="outside upper center", ncols=4, fontsize=7)
+        return figure
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """0.2, not 2 x 10^-1."""
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() == "log":
+            axis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_locator(NullLocator())
+
+
+def _looks(results: Sequence[MethodResult]) -> list[tuple[MethodResult, tuple[str, Any]]]:
+    return [(result, _LOOKS[i % len(_LOOKS)]) for i, result in enumerate(results)]

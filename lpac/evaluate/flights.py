@@ -1,0 +1,220 @@
+"""The flights of an evaluation; this is the one place where they are flown."""
+
+import re
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+import edge
+from edge.policy.bundle import Bundle, BundleError, load_bundle
+from lpac import analysis, evaluate, sim
+from lpac.analysis.coverage import Coverage
+from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
+from lpac.sim.baselines import BaselineName
+from lpac.sim.batch import PolicyFailedError, fly_batch
+from lpac.sim.cores import Pool
+from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly, prepare
+from lpac.sim.failure import Failure
+from lpac.sim.kept import KeptOutcomes, code_digest
+
+BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
+# The best of ten runs of Lloyd's algorithm that knows the world: where robots would end, not a
+# flight. A mark for comparison, and no bound.
+LLOYD: Literal["best-of-ten-lloyd"] = "best-of-ten-lloyd"
+POLICY: Literal["lpac"] = "lpac"
+Flier = Literal["lpac", "best-of-ten-lloyd"] | BaselineName
+
+# Larger batches of the simulator are no faster.
+_ROBOTS_TOGETHER = 80
+_FLIGHTS = "flights.jsonl"
+_LOST = re.compile(r"(\d+)@(\d+\.?\d*)")
+
+
+class LostRobots(NamedTuple):
+    """So many of the robots are gone from that time of the flight on, s; at 0, they never were."""
+
+    robots: int
+    at_s: float
+
+    @classmethod
+    def parse(cls, text: str) -> "LostRobots":
+        """Of "2@20". Raises ValueError."""
+        found = _LOST.fullmatch(text)
+        if found is None:
+            raise ValueError(f"lost robots {text!r}: must be ROBOTS@SECONDS, such as 2@20")
+        return cls(int(found[1]), float(found[2]))
+
+
+NONE_LOST = LostRobots(0, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationFlight:
+    """One flight over one world: all of it follows from this, and from what is in the bundle.
+
+    `bundle` is the path of the one that flies, or gives a baseline the sizes of sensor and local
+    map; `flown_by` is its id, or says these sizes.
+    """
+
+    flier: Flier
+    bundle: str
+    flown_by: str
+    world_set: WorldSet
+    world: int
+    set_up: str
+    duration_s: float
+    loss: float = 0.0
+    lost: LostRobots = NONE_LOST
+
+    @property
+    def key(self) -> str:
+        """What tells it from all other flights, wherever the bundle lies."""
+        return (
+            f"{self.flier} {self.flown_by}: {self.world_set} {self.world} {self.set_up}, "
+            f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
+        )
+
+
+class FlownCost(NamedTuple):
+    """The coverage cost J (C,) in model units at times (C,), s, of the robots that are left."""
+
+    time_s: tuple[float, ...]
+    cost: tuple[float, ...]
+
+
+def task_of(bundle: Bundle) -> str:
+    """What policies must have in common to be compared. Raises BundleError without perception."""
+    perception, training = bundle.manifest.perception, bundle.manifest.training
+    if perception is None:
+        raise BundleError(f"bundle {bundle.manifest.name!r} has no perception: it cannot fly")
+    return (
+        f"sensor {perception.sensor_size}, speed {training.max_speed:g}, "
+        f"features cut at {training.idf_truncation:g}, scaled to {training.idf_norm:g}"
+    )
+
+
+def sizes_of(bundle: Bundle) -> str:
+    """What baselines take from a bundle. Raises BundleError without perception."""
+    task, perception = task_of(bundle), bundle.manifest.perception
+    assert perception is not None
+    unseen = perception.unknown_importance
+    return f"local map {perception.local_map_size}, unseen {unseen:g}, {task}"
+
+
+# Flights that go together: those of one batch of the simulator, or one other.
+FlightGroup = tuple[EvaluationFlight, ...]
+
+
+def groups_of(flights: Iterable[EvaluationFlight]) -> list[FlightGroup]:
+    """The flights in groups that go together, in about their order."""
+    alike: dict[tuple[str, str], list[EvaluationFlight]] = {}
+    groups: list[FlightGroup] = []
+    for flight in flights:
+        if flight.flier != POLICY:
+            groups.append((flight,))
+            continue
+        waiting = alike.setdefault((flight.bundle, flight.set_up), [])
+        waiting.append(flight)
+        if len(waiting) * SET_UPS[flight.set_up].robots >= _ROBOTS_TOGETHER:
+            groups.append(tuple(waiting))
+            waiting.clear()
+    return [*groups, *(tuple(waiting) for waiting in alike.values() if waiting)]
+
+
+def costs_of(group: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
+    """Fly them, in whatever process this is. Raises BundleError, ValueError, OSError."""
+    if group[0].flier == LLOYD:
+        return [(flight, _best_of_ten(flight)) for flight in group]
+    return [
+        (flight, FlownCost(tuple(flown.cost_time_s.tolist()), tuple(flown.cost.tolist())))
+        for flight, flown in fly_group(group)
+    ]
+
+
+def fly_group(group: FlightGroup) -> list[tuple[EvaluationFlight, SimulatedFlight]]:
+    """The flights with all that they were like. Raises BundleError, ValueError, OSError."""
+    bundle, scenarios = _bundle(group[0].bundle), [_scenario(flight) for flight in group]
+    if group[0].flier == POLICY and bundle.id != group[0].flown_by:
+        raise ValueError(f"{group[0].bundle}: is another bundle by now, or on this machine")
+    if group[0].flier != POLICY:
+        flown = [fly(scenario, bundle) for scenario in scenarios]
+    else:
+        try:
+            flown = fly_batch(scenarios, bundle)
+        except PolicyFailedError as error:
+            raise ValueError(f"{group[0].bundle}: {error}") from None
+    return list(zip(group, flown, strict=True))
+
+
+def _scenario(flight: EvaluationFlight) -> Scenario:
+    set_up = SET_UPS[flight.set_up]
+    world = draw_world(flight.world_set, flight.world, set_up)
+    # Starts are drawn alike for all: whoever is lost might be anybody.
+    left = set_up.robots - flight.lost.robots
+    lost_late = flight.lost.at_s > 0.0
+    robots = set_up.robots if lost_late else left
+    starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts[:robots])).tolist()
+    return Scenario(
+        controller="clairvoyant-cvt" if flight.flier == LLOYD else flight.flier,
+        robots=robots,
+        seed=world.seed,
+        duration_s=flight.duration_s,
+        features=world.features,
+        starts_m=tuple((x_m, y_m) for x_m, y_m in starts_m),
+        scale=FIELD_SCALE,
+        loss=flight.loss,
+        world_size=set_up.world_size,
+        communication_range=set_up.communication_range,
+        failures=tuple(Failure(robot, flight.lost.at_s) for robot in range(left, robots)),
+    )
+
+
+def _best_of_ten(flight: EvaluationFlight) -> FlownCost:
+    """From the start to where Lloyd's algorithm ends, as if that took no time."""
+    prepared = prepare(_scenario(flight), _bundle(flight.bundle))
+    coverage = Coverage(prepared.importance, FIELD_SCALE.env_scale)
+    cost = coverage.cost(prepared.starts_m), coverage.lloyd(prepared.starts_m)
+    return FlownCost((0.0, 0.0), cost)
+
+
+@cache
+def _bundle(path: str) -> Bundle:
+    """Loaded once in each process."""
+    return load_bundle(Path(path))
+
+
+class KeptFlights:
+    """What came of flights, in a folder: who asks again for one that was flown there has it."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises OSError."""
+        flown_by = {"code": code_digest(edge, analysis, evaluate, sim)}
+        self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
+        self._costs = {
+            line["flight"]: FlownCost(tuple(line["time_s"]), tuple(line["cost"]))
+            for line in self._kept.lines
+        }
+
+    def fly(
+        self, flights: Sequence[EvaluationFlight], pool: Pool
+    ) -> Generator[tuple[EvaluationFlight, FlownCost], None, None]:
+        """All of them: first what was flown before, and then the others as they come."""
+        missing = []
+        for flight in flights:
+            if flight.key in self._costs:
+                yield flight, self._costs[flight.key]
+            else:
+                missing.append(flight)
+        if not missing:
+            return
+        with closing(pool(costs_of, groups_of(missing))) as groups:
+            for flight, flown in chain.from_iterable(groups):
+                self._costs[flight.key] = flown
+                self._kept.add({"flight": flight.key, "time_s": flown.time_s, "cost": flown.cost})
+                yield flight, flown

@@ -1,0 +1,100 @@
+"""The worlds that policies are trained, chosen and judged on.
+
+World number i of a set has its features, the robots' starts and the draws of their clocks from
+seeds of its own: spawn keys (set, i, what) of one entropy. So no two sets have a world in common,
+and how many worlds are taken of a set changes none of them.
+
+Train on "training", choose by "validation". "test" tells how good what was chosen is: whoever looks
+at it, and then chooses, has no test set any more.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from edge.core.world import GaussianFeature, random_features
+
+WorldSet = Literal["training", "validation", "test"]
+WORLD_SETS: tuple[WorldSet, ...] = get_args(WorldSet)
+
+_ENTROPY = 0x6C706163
+# Never changed, nor used twice: these are the worlds.
+_SET_KEYS: dict[WorldSet, int] = {"training": 0, "validation": 1, "test": 2}
+_FEATURES, _STARTS, _FLIGHT = range(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetUp:
+    """Sizes of a task, in model units; the sensor's and the local map's are the policy's.
+
+    `sigma` are the least and the greatest standard deviation of features.
+    Raises ValueError that names what is impossible.
+    """
+
+    robots: int
+    world_size: int
+    communication_range: float
+    features: int
+    sigma: tuple[float, float] = (40.0, 60.0)
+
+    def __post_init__(self) -> None:
+        for name in ("robots", "world_size", "features"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if not 0.0 < self.sigma[0] <= self.sigma[1] < math.inf:
+            raise ValueError(f"sigma = {self.sigma}: must be above 0, finite, and ascend")
+        if not 0.0 < self.communication_range < math.inf:
+            raise ValueError(
+                f"communication_range = {self.communication_range}: must be positive and finite"
+            )
+
+
+FIELD = SetUp(robots=10, world_size=512, communication_range=256.0, features=10)
+
+
+def at_equal_density(robots: int) -> SetUp:
+    """The field's for another number of robots: world area and features grow with them."""
+    world_size = round(FIELD.world_size * math.sqrt(robots / FIELD.robots))
+    return replace(FIELD, robots=robots, world_size=world_size, features=robots)
+
+
+# By name: the field; other numbers of robots; the paper's training; and the field's otherwise.
+SET_UPS: dict[str, SetUp] = {
+    "field": FIELD,
+    **{f"n{robots}": at_equal_density(robots) for robots in (1, 3, 5, 20, 32, 100, 300, 1000)},
+    "paper": SetUp(robots=32, world_size=1024, communication_range=128.0, features=32),
+    **{f"features-{count}": replace(FIELD, features=count) for count in (3, 5, 20, 40)},
+    "features-half-as-wide": replace(FIELD, sigma=(20.0, 30.0)),
+    "features-twice-as-wide": replace(FIELD, sigma=(80.0, 120.0)),
+    **{f"range-{units}": replace(FIELD, communication_range=units) for units in (64, 128, 512)},
+}
+
+
+class DrawnWorld(NamedTuple):
+    """A world and a flight over it, in model units: `starts` are (x, y) of each robot.
+
+    From `seed` follow what else is random: clocks, losses.
+    """
+
+    features: tuple[GaussianFeature, ...]
+    starts: tuple[tuple[float, float], ...]
+    seed: int
+
+
+def draw_world(world_set: WorldSet, index: int, set_up: SetUp) -> DrawnWorld:
+    """World number `index`, from 0 on, of that set. Raises ValueError if `index` is below 0."""
+    if index < 0:
+        raise ValueError(f"world = {index}: must be at least 0")
+
+    def seeds(what: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence(_ENTROPY, spawn_key=(_SET_KEYS[world_set], index, what))
+
+    features = random_features(
+        np.random.default_rng(seeds(_FEATURES)), set_up.features, set_up.world_size, set_up.sigma
+    )
+    size = (set_up.robots, 2)
+    starts = np.random.default_rng(seeds(_STARTS)).uniform(0.0, set_up.world_size, size)
+    [seed] = seeds(_FLIGHT).generate_state(1, np.uint64).tolist()
+    return DrawnWorld(features, tuple((x, y) for x, y in starts.tolist()), seed)

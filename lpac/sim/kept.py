@@ -1,0 +1,57 @@
+"""Outcomes that are kept on disk while they come, so that what is killed goes on where it was."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+
+class KeptOutcomes:
+    """Lines of JSON in a file, below one that says what they came of.
+
+    What came of anything else, such as of another version of the code, does not count, and is not
+    kept. `lines` are those that count.
+    """
+
+    def __init__(self, path: Path, came_of: Mapping[str, Any]) -> None:
+        """Makes the file, or reads it. Raises OSError."""
+        self._path = path
+        self.lines: list[dict[str, Any]] = []
+        path.parent.mkdir(parents=True, exist_ok=True)
+        text = path.read_text() if path.exists() else ""
+        first, *lines = [*map(_parsed, text.splitlines())] or [None]
+        if first == came_of:
+            self.lines = [line for line in lines if line is not None]
+        if first == came_of and None not in lines:
+            return
+        # Of another version, or killed in the middle of a line, in which the next would go on.
+        new = path.with_name(f"{path.name}.new")
+        new.write_text("".join(json.dumps(line) + "\n" for line in (came_of, *self.lines)))
+        new.replace(path)
+
+    def add(self, line: dict[str, Any]) -> None:
+        """Keep one more. Raises OSError."""
+        with self._path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        self.lines.append(line)
+
+
+@cache
+def code_digest(*packages: ModuleType) -> str:
+    """Of the sources of these packages."""
+    digest = hashlib.sha256()
+    for package in packages:
+        root = Path(package.__path__[0])
+        for path in sorted(root.rglob("*.py")):
+            digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _parsed(line: str) -> Any:
+    try:
+        return json.loads(line)
+    except ValueError:
+        return None
