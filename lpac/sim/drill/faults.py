@@ -38,6 +38,7 @@ from lpac.sim.drill.injections import (
     Drain,
     EstimateDrifts,
     EstimateFreezes,
+    EstimateIsRight,
     EstimateJumpsOut,
     FenceWithout,
     GroundClockSteps,
@@ -662,8 +663,10 @@ _PEOPLE = (
         does=(
             *_once(OperatorOrders("hold")), Do(4.0, EstimateJumpsOut(3.0)),
             Do(8.5, OperatorOrders("resume"), mark="start"),
+            # Who errs by that much comes down anywhere, which no margin covers.
+            Do(20.0, EstimateIsRight()),
         ),
-        watched_s=25.0,
+        watched_s=32.0,
         bounds=(MissionEnds(0.0, 2.5, after="start"), FliesOn(20.0)),
     ),
 )  # fmt: skip

@@ -143,6 +143,14 @@ class EstimateJumpsOut(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
+class EstimateIsRight(VehicleInjection):
+    """What led the estimate astray is over, and it jumps back."""
+
+    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+        vehicle.gps_offset_m = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True)
 class OriginJumps(VehicleInjection):
     """The estimator starts over from another origin: north, east, down."""
 
