@@ -15,7 +15,7 @@ from edge.policy.family import Policy
 from edge.robot.pac import Pac, PacParameters
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.medium import Medium
-from lpac.sim.swarm import Swarm
+from lpac.sim.swarm import pac_swarm
 
 NEIGHBOURS = 10
 # So many that robots in the middle have ten neighbours.
@@ -52,7 +52,7 @@ def moment_in_flight(policy: Policy) -> Moment:
     assert perception
     rng = np.random.default_rng(1)
     importance = rasterize(random_features(rng, 10, perception.world_size), perception.world_size)
-    swarm = Swarm(
+    swarm = pac_swarm(
         policy=policy,
         importance=importance,
         positions_m=FIELD_SCALE.position_to_mission_m(

@@ -65,17 +65,17 @@ class AggregatedMessage:
 
 
 class HopBuffer:
-    """One robot's y_kl for k = 0..K and l = 1..L, updated in place once per policy tick.
+    """Robots' y_kl for k = 0..K and l = 1..L, updated in place once per policy tick.
 
-    Not thread-safe: it belongs to the policy thread.
+    A robot has one for itself alone. Not thread-safe: it belongs to the policy thread.
     """
 
-    def __init__(self, geometry: Geometry) -> None:
+    def __init__(self, geometry: Geometry, robots: int = 1) -> None:
         self._hops = geometry.hops
         inputs = geometry.feature_sizes[:-1]
-        # One block per layer, (1, K + 1, F_{l-1}): what the layer's graph takes, batch of one.
+        # One block per layer, (robots, K + 1, F_{l-1}): what the layer's graph takes, a batch.
         self.layers: tuple[F32, ...] = tuple(
-            np.zeros((1, geometry.hops + 1, size), np.float32) for size in inputs
+            np.zeros((robots, geometry.hops + 1, size), np.float32) for size in inputs
         )
         self._sum = np.zeros(geometry.message_size, np.float32)
         ends = np.cumsum([geometry.hops * size for size in inputs])
@@ -85,7 +85,7 @@ class HopBuffer:
             for end, size in zip(ends.tolist(), inputs, strict=True)
         )
 
-    def diffuse(self, payloads: Sequence[F32], degree: int) -> None:
+    def diffuse(self, payloads: Sequence[F32], degree: int, robot: int = 0) -> None:
         """y_kl = sum over neighbours j of S_ij (y_j)_{k-1,l}, for k = 1..K and all layers at once.
 
         `payloads` are the neighbours' messages, (message_size,) each, and `degree` is d_i: larger
@@ -99,9 +99,9 @@ class HopBuffer:
         else:
             self._sum[:] = 0.0
         for layer, part in zip(self.layers, self._parts, strict=True):
-            layer[0, 1:] = self._sum[part].reshape(self._hops, -1)
+            layer[robot, 1:] = self._sum[part].reshape(self._hops, -1)
 
-    def message(self, degree: int) -> F32:
+    def message(self, degree: int, robot: int = 0) -> F32:
         """A new (message_size,) payload: y_kl for k = 0..K-1, times 1/sqrt(degree); 0 if none."""
         scale = np.float32(1.0 / math.sqrt(degree) if degree else 0.0)
-        return np.concatenate([layer[0, : self._hops].ravel() for layer in self.layers]) * scale
+        return np.concatenate([layer[robot, : self._hops].ravel() for layer in self.layers]) * scale

@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from edge.core import F32
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetTime
 
@@ -88,10 +89,7 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTyp
     payload_type = next((code for code, known in _PAYLOAD_TYPES.items() if known == dtype), None)
     if payload_type is None:
         raise ValueError(f"payload dtype = {dtype}: must be float32 or float16")
-    limit = np.finfo(dtype).max
-    saturated = np.clip(message.payload, -limit, limit)
-    payload = np.where(np.isfinite(message.payload), saturated, message.payload)
-    data = payload.astype(_PAYLOAD_TYPES[payload_type]).tobytes()
+    data = rounded(message.payload, _PAYLOAD_TYPES[payload_type]).tobytes()
     base, time_s, uncertainty_s = message.sent or _NO_TIME
     fields = _FIELDS.pack(
         _MAGIC,
@@ -110,6 +108,13 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTyp
         uncertainty_s,
     )
     return b"".join((fields, _CHECKSUM.pack(zlib.crc32(data, zlib.crc32(fields))), data))
+
+
+def rounded(payload: F32, dtype: npt.DTypeLike) -> F32:
+    """A payload, of any shape, as it comes out at the receivers: see `encode`."""
+    limit = np.finfo(dtype).max
+    saturated = np.clip(payload, -limit, limit)
+    return np.where(np.isfinite(payload), saturated, payload).astype(dtype)
 
 
 def decode(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,8 +18,9 @@ from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
+from lpac.sim.failure import Failure, alive_at
 from lpac.sim.medium import Medium
-from lpac.sim.swarm import Swarm
+from lpac.sim.swarm import ClockedPac, Swarm, pac_swarm
 from lpac.sim.vehicles import PointVehicles
 
 Controller = Literal["lpac"] | BaselineName
@@ -36,8 +37,13 @@ SAMPLES_PER_COST = 5
 class Scenario:
     """A flight to simulate; everything random in it follows from `seed`.
 
-    Without `features` the world has `random_feature_count` Gaussian ones; without `starts_m`,
-    one position in the mission frame per robot, they start anywhere in the world.
+    Without `features` the world has `random_feature_count` Gaussian ones, `random_feature_sigma`
+    (least, greatest) wide, in model units; without `starts_m`, one position in the mission frame
+    per robot, they start anywhere in the world. `world_size` and `communication_range`, in model
+    units, and `max_speed_m_s` are the bundle's where they are None. `position_bias` is, per robot
+    and in model units, by how much its knowledge of its position is wrong; `lag_s` the time
+    constant with which velocities follow what is told; ages are those of `PacParameters`. Baselines
+    know true positions and do not fail.
 
     Raises ValueError that names what is impossible.
     """
@@ -53,14 +59,23 @@ class Scenario:
     loss: float = 0.0
     delay_s: float = 0.0
     max_message_age_s: float = 0.8
+    max_input_age_s: float = 1.0
+    random_feature_sigma: tuple[float, float] = (40.0, 60.0)
+    world_size: int | None = None
+    communication_range: float | None = None
+    max_speed_m_s: float | None = None
+    lag_s: float = 0.0
+    position_bias: tuple[tuple[float, float], ...] | None = None
+    failures: tuple[Failure, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS:
             raise ValueError(f"robots = {self.robots}: must be from 1 to {MAX_ROBOTS}")
         if self.seed < 0:
             raise ValueError(f"seed = {self.seed}: must be at least 0")
-        if self.starts_m is not None and len(self.starts_m) != self.robots:
-            raise ValueError(f"starts_m: {len(self.starts_m)} positions for {self.robots} robots")
+        for name, of_each in (("starts_m", self.starts_m), ("position_bias", self.position_bias)):
+            if of_each is not None and len(of_each) != self.robots:
+                raise ValueError(f"{name}: {len(of_each)} positions for {self.robots} robots")
         if not 0.0 < self.duration_s < np.inf:
             raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
         if self.random_feature_count < 0:
@@ -69,6 +84,24 @@ class Scenario:
             raise ValueError(
                 f"max_message_age_s = {self.max_message_age_s}: must be at least 0 and finite"
             )
+        least, greatest = self.random_feature_sigma
+        if not 0.0 < least <= greatest < np.inf:
+            raise ValueError(
+                f"random_feature_sigma = {self.random_feature_sigma}: must be (least, greatest) "
+                "above 0"
+            )
+        if self.controller != "lpac" and (self.failures or self.position_bias is not None):
+            raise ValueError(
+                f"controller = {self.controller!r}: a baseline knows no failures and no position "
+                "bias"
+            )
+        for failure in self.failures:
+            if not 0 <= failure.robot < self.robots:
+                raise ValueError(
+                    f"failures: robot {failure.robot}: must be from 0 to {self.robots - 1}"
+                )
+            if not alive_at(self.robots, self.failures, failure.from_s).any():
+                raise ValueError(f"failures: at {failure.from_s} s nobody is left")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,6 +172,105 @@ class SimulatedFlight:
         }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Preparation:
+    """What a scenario comes to with a bundle: all that a simulator of it begins with.
+
+    `bundle` has the scenario's own sizes in its manifest. `starts_m` (N, 2) and `bias_m` (N, 2) or
+    None are in the mission frame, `importance` is (world_size, world_size), `times_s` are those of
+    the samples, and what is random in flight is drawn from `clock_rng` and within `medium`.
+    """
+
+    scenario: Scenario
+    bundle: Bundle
+    perception: PerceptionParameters
+    parameters: PacParameters
+    features: tuple[Feature, ...]
+    importance: F32
+    starts_m: F64
+    bias_m: F64 | None
+    times_s: list[float]
+    clock_rng: np.random.Generator
+    medium: Medium
+
+    def flight(
+        self, positions_m: F64, messages: dict[str, int], largest_payload: float
+    ) -> SimulatedFlight:
+        """What came out, with true positions (T, N, 2) at `times_s`."""
+        time_s = np.array(self.times_s)
+        record = _record(self.scenario, self.perception, self.importance, time_s, positions_m)
+        return SimulatedFlight(
+            scenario=self.scenario,
+            bundle_id=self.bundle.id,
+            perception=self.perception,
+            features=self.features,
+            record=record,
+            time_s=time_s,
+            positions_m=positions_m,
+            cost=record.cost,
+            messages=messages,
+            largest_payload=largest_payload,
+        )
+
+
+def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
+    """Draw what is random in `scenario` before the start.
+
+    Raises BundleError for a bundle without perception, ValueError for impossible sizes and link
+    parameters.
+    """
+    manifest, scale = bundle.manifest, scenario.scale
+    perception, training = manifest.perception, manifest.training
+    if perception is None:
+        raise BundleError(f"bundle {manifest.name!r} has no perception: it cannot fly")
+    if scenario.world_size is not None:
+        perception = replace(perception, world_size=scenario.world_size)
+    if scenario.communication_range is not None:
+        perception = replace(perception, communication_range=scenario.communication_range)
+    bundle = replace(bundle, manifest=replace(manifest, perception=perception))
+    seeds = np.random.SeedSequence(scenario.seed).spawn(4)
+    world_rng, start_rng, clock_rng, medium_rng = (np.random.default_rng(seed) for seed in seeds)
+    features = scenario.features
+    if features is None:
+        features = random_features(
+            world_rng,
+            scenario.random_feature_count,
+            perception.world_size,
+            scenario.random_feature_sigma,
+        )
+    max_speed_m_s = scenario.max_speed_m_s
+    if max_speed_m_s is None:
+        max_speed_m_s = training.max_speed * scale.velocity_scale
+    bias_m: F64 | None = None
+    if scenario.position_bias is not None:
+        bias_m = scale.position_to_mission_m(np.array(scenario.position_bias, np.float64))
+    return Preparation(
+        scenario=scenario,
+        bundle=bundle,
+        perception=perception,
+        parameters=PacParameters(
+            scale=scale,
+            max_speed_m_s=max_speed_m_s,
+            max_message_age_s=scenario.max_message_age_s,
+            max_input_age_s=scenario.max_input_age_s,
+        ),
+        features=features,
+        importance=rasterize(
+            features, perception.world_size, training.idf_truncation, training.idf_norm
+        ),
+        starts_m=_starts_m(scenario, perception.world_size, start_rng),
+        bias_m=bias_m,
+        times_s=_sample_times_s(scenario.duration_s),
+        clock_rng=clock_rng,
+        medium=Medium(
+            range_m=perception.communication_range / scale.env_scale,
+            loss=scenario.loss,
+            delay_s=scenario.delay_s,
+            rng=medium_rng,
+        ),
+    )
+
+
 def fly(
     scenario: Scenario, bundle: Bundle, progress: Callable[[float], None] | None = None
 ) -> SimulatedFlight:
@@ -147,64 +279,37 @@ def fly(
     `progress` is called with the simulated time. Raises BundleError for a bundle without
     perception, ValueError for impossible link parameters.
     """
-    perception, training = bundle.manifest.perception, bundle.manifest.training
-    if perception is None:
-        raise BundleError(f"bundle {bundle.manifest.name!r} has no perception: it cannot fly")
-    seeds = np.random.SeedSequence(scenario.seed).spawn(4)
-    world_rng, start_rng, clock_rng, medium_rng = (np.random.default_rng(seed) for seed in seeds)
-    features = scenario.features
-    if features is None:
-        features = random_features(world_rng, scenario.random_feature_count, perception.world_size)
-    importance = rasterize(
-        features, perception.world_size, training.idf_truncation, training.idf_norm
-    )
-    starts_m = _starts_m(scenario, perception.world_size, start_rng)
-    max_speed_m_s = training.max_speed * scenario.scale.velocity_scale
-    swarm: Swarm | BaselineSwarm
+    prepared = prepare(scenario, bundle)
+    perception, parameters = prepared.perception, prepared.parameters
+    swarm: Swarm[ClockedPac] | BaselineSwarm
     if scenario.controller == "lpac":
-        swarm = Swarm(
-            policy=load_policy(bundle),
-            importance=importance,
-            positions_m=starts_m,
-            parameters=PacParameters(
-                scale=scenario.scale,
-                max_speed_m_s=max_speed_m_s,
-                max_message_age_s=scenario.max_message_age_s,
-            ),
-            medium=Medium(
-                range_m=perception.communication_range / scenario.scale.env_scale,
-                loss=scenario.loss,
-                delay_s=scenario.delay_s,
-                rng=medium_rng,
-            ),
-            rng=clock_rng,
+        swarm = pac_swarm(
+            policy=load_policy(prepared.bundle),
+            importance=prepared.importance,
+            positions_m=prepared.starts_m,
+            parameters=parameters,
+            medium=prepared.medium,
+            rng=prepared.clock_rng,
+            failures=scenario.failures,
+            bias_m=prepared.bias_m,
+            lag_s=scenario.lag_s,
         )
     else:
         swarm = BaselineSwarm(
-            make_baseline(scenario.controller, importance, perception, scenario.robots),
-            PointVehicles(starts_m, perception.world_size / scenario.scale.env_scale),
+            make_baseline(scenario.controller, prepared.importance, perception, scenario.robots),
+            PointVehicles(
+                prepared.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
+            ),
             scenario.scale,
-            max_speed_m_s,
+            parameters.max_speed_m_s,
         )
-    times_s = _sample_times_s(scenario.duration_s)
+    times_s = prepared.times_s
     positions = []
     for time_s, positions_m in zip(times_s, swarm.run(times_s), strict=True):
         positions.append(positions_m)
         if progress:
             progress(time_s)
-    record = _record(scenario, perception, importance, np.array(times_s), np.array(positions))
-    return SimulatedFlight(
-        scenario=scenario,
-        bundle_id=bundle.id,
-        perception=perception,
-        features=features,
-        record=record,
-        time_s=np.array(times_s),
-        positions_m=np.array(positions),
-        cost=record.cost,
-        messages=swarm.message_counts(),
-        largest_payload=swarm.largest_payload,
-    )
+    return prepared.flight(np.array(positions), swarm.message_counts(), swarm.largest_payload)
 
 
 def _record(
@@ -214,8 +319,9 @@ def _record(
     time_s: F64,
     positions_m: F64,
 ) -> FlightRecord:
-    """Points are in the air from the first to the last, and say nothing."""
+    """Points are in the air from the first to the last, unless they failed, and say nothing."""
     heights_m = np.zeros(len(time_s))
+    alive = np.array([alive_at(scenario.robots, scenario.failures, t) for t in time_s.tolist()])
     return FlightRecord(
         name=scenario.controller,
         duration_s=scenario.duration_s,
@@ -227,7 +333,7 @@ def _record(
                 name=str(robot),
                 time_s=time_s,
                 position_m=np.column_stack([positions_m[:, robot], heights_m]),
-                flying=np.ones(len(time_s), np.bool_),
+                flying=alive[:, robot],
             )
             for robot in range(scenario.robots)
         ),

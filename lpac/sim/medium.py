@@ -36,11 +36,12 @@ class Medium:
         self.broadcasts += 1
         distances = np.hypot(*(positions_m - positions_m[sender]).T)
         distances[sender] = np.inf
-        for receiver in np.flatnonzero(distances < self._range_m):
-            # Both numbers are drawn for every receiver: another loss or delay alone does not change
-            # the chances of the messages after it.
-            chance, travel = self._rng.random(2)
+        receivers = np.flatnonzero(distances < self._range_m)
+        # Both numbers are drawn for every receiver: another loss or delay alone does not change
+        # the chances of the messages after it.
+        drawn = self._rng.random((len(receivers), 2))
+        for receiver, (chance, travel) in zip(receivers.tolist(), drawn.tolist(), strict=True):
             if chance < self._loss:
                 self.lost += 1
             else:
-                yield int(receiver), self._delay_s * (0.5 + travel)
+                yield receiver, self._delay_s * (0.5 + travel)

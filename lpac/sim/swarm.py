@@ -1,146 +1,245 @@
 """A swarm of robots that share nothing but the medium, in simulated time."""
 
 import heapq
+import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from edge.core import F32, F64
+from edge.core.mailbox import Mailbox
+from edge.core.ports import OdometrySource
+from edge.core.wire import Rejection
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import BundleError
 from edge.policy.family import Policy
-from edge.robot.pac import Pac, PacParameters
+from edge.robot.pac import Pac, PacParameters, PolicyTick
+from lpac.sim.failure import Failure
 from lpac.sim.medium import Medium
+from lpac.sim.ticks import Clocks, ticks
 from lpac.sim.vehicles import PointVehicles, VehicleOdometry
 
 
-@dataclass(frozen=True, slots=True)
-class Clocks:
-    """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods."""
+class Saying(Protocol):
+    """What a robot's policy did."""
 
-    perception_s: float = 0.2
-    policy_s: float = 0.4
-    control_s: float = 0.1
-    jitter: float = 0.05
+    @property
+    def message(self) -> Any:
+        """What its neighbours are sent."""
 
 
-class Swarm:
-    """N robots, each with its own perception, mailbox and clocks; deterministic for a seed."""
+class SwarmRobot(Protocol):
+    """A robot's steps, as those of `Pac`."""
+
+    largest_payload: float
+
+    @property
+    def mailbox(self) -> Mailbox: ...
+    @property
+    def waits(self) -> bool:
+        """Whether `control` needs something that somebody else has still to compute."""
+
+    def perceive(self, now_s: float) -> object: ...
+    def infer(self, now_s: float) -> Saying | None: ...
+    def control(self, now_s: float) -> F64 | None: ...
+    def receive(self, message: Any, now_s: float) -> object: ...
+
+
+_Robot = TypeVar("_Robot", bound=SwarmRobot)
+
+
+class Swarm(Generic[_Robot]):
+    """N robots, each with its own clocks; deterministic for a seed."""
 
     def __init__(
         self,
         *,
-        policy: Policy,
-        importance: F32,
-        positions_m: F64,
-        parameters: PacParameters,
+        boot: Callable[[int, int, OdometrySource], _Robot],
+        vehicles: PointVehicles,
         medium: Medium,
         rng: np.random.Generator,
         clocks: Clocks | None = None,
+        failures: Sequence[Failure] = (),
+        bias_m: F64 | None = None,
     ) -> None:
-        """`positions_m` (N, 2) are the starting positions; `rng` draws the clocks' phases.
+        """`boot` makes a robot of its number, boot epoch and odometry, at each of its starts.
 
-        Raises BundleError if the policy has no perception.
+        `rng` draws the clocks' phases; `bias_m` (N, 2) is by how much the robots' knowledge of
+        their positions is wrong.
         """
-        perception = policy.manifest.perception
-        if perception is None:
-            raise BundleError(f"bundle {policy.manifest.name!r} has no perception to simulate")
-        sensor = WorldSensor(importance, perception.sensor_size)
-        self._vehicles = PointVehicles(
-            positions_m, perception.world_size / parameters.scale.env_scale
-        )
-        self.robots = tuple(
-            Pac(
-                robot_id=robot,
-                boot_epoch=1,
-                policy=policy,
-                sensor=sensor,
-                odometry=VehicleOdometry(self._vehicles, robot),
-                parameters=parameters,
-            )
-            for robot in range(len(positions_m))
-        )
-        self.largest_payload = 0.0
+        self._boot = boot
+        self._vehicles = vehicles
         self._medium = medium
-        self._rng = rng
-        # Events (time, order, what to do); the order makes equal times deterministic.
+        self._bias_m = bias_m
+        robots = len(vehicles.positions_m())
+        self._boots = [0] * robots
+        self.robots = [self._booted(robot) for robot in range(robots)]
+        self._gone: list[_Robot] = []
+        self._failed: set[int] = set()
+        # Events (time, order, what to do) beside the ticks; the order makes equal times
+        # deterministic.
         self._events: list[tuple[float, int, Callable[[], object]]] = []
         self._scheduled = 0
-        self._start_clocks(clocks or Clocks())
+        for failure in failures:
+            self._schedule(failure.from_s, partial(self._fail, failure.robot))
+            if failure.until_s < math.inf:
+                self._schedule(failure.until_s, partial(self._come_back, failure.robot))
+        self._ticks = ticks(robots, clocks or Clocks(), rng)
+        self._next_tick = next(self._ticks)
 
     def run(self, times_s: Iterable[float]) -> Iterator[F64]:
-        """Yields the true positions (N, 2), m, at each of `times_s`, which ascend."""
+        """Yields the true positions (N, 2), m, at each of `times_s`, which ascend.
+
+        For robots that never wait.
+        """
         for until_s in times_s:
-            while self._events[0][0] <= until_s:
+            for _ in self.advance(until_s):
+                raise RuntimeError("a robot waits, and nobody computes what for")
+            yield self.positions_m()
+
+    def advance(self, until_s: float) -> Iterator[None]:
+        """Move on to that time; yields whenever a robot waits, and goes on when it no more does."""
+        while True:
+            tick = self._next_tick
+            # Of equal times the tick is first: what it leads to comes after it.
+            if self._events and self._events[0][0] < tick.time_s:
+                if self._events[0][0] > until_s:
+                    break
                 self._vehicles.now_s, _, do = heapq.heappop(self._events)
                 do()
-            self._vehicles.now_s = until_s
-            yield self._vehicles.positions_m()
+                continue
+            if tick.time_s > until_s:
+                break
+            self._vehicles.now_s = tick.time_s
+            if tick.robot not in self._failed:
+                robot = self.robots[tick.robot]
+                if tick.loop == "perception":
+                    robot.perceive(tick.time_s)
+                elif tick.loop == "policy":
+                    self._infer(tick.robot)
+                else:
+                    while robot.waits:
+                        yield
+                    velocity_m_s = robot.control(tick.time_s)
+                    self._vehicles.fly(
+                        tick.robot, np.zeros(2) if velocity_m_s is None else velocity_m_s
+                    )
+            self._next_tick = next(self._ticks)
+        self._vehicles.now_s = until_s
+
+    def positions_m(self) -> F64:
+        """The true positions (N, 2) now."""
+        return self._vehicles.positions_m()
+
+    @property
+    def largest_payload(self) -> float:
+        """The largest number in a payload that a robot has heeded, by its absolute value."""
+        return max(robot.largest_payload for robot in (*self.robots, *self._gone))
 
     def message_counts(self) -> dict[str, int]:
         """Broadcasts, and what became of them at each receiver in range, in all."""
         counts = Counter({"broadcasts": self._medium.broadcasts, "lost": self._medium.lost})
-        for robot in self.robots:
+        for robot in (*self.robots, *self._gone):
             counts.update(robot.mailbox.counts())
         return dict(counts)
 
-    def _start_clocks(self, clocks: Clocks) -> None:
-        for robot in range(len(self.robots)):
-            for period_s, step in (
-                (clocks.perception_s, self._perceive),
-                (clocks.policy_s, self._infer),
-                (clocks.control_s, self._control),
-            ):
-                phase_s = period_s * self._rng.random()
-                self._tick(robot, step, phase_s, period_s, clocks.jitter)
-
-    def _tick(
-        self,
-        robot: int,
-        step: Callable[[int], None],
-        due_s: float,
-        period_s: float,
-        jitter: float,
-    ) -> None:
-        """Run `step` at about `due_s`, and then every period, on absolute deadlines."""
-
-        def tick() -> None:
-            step(robot)
-            self._tick(robot, step, due_s + period_s, period_s, jitter)
-
-        lateness_s = jitter * period_s * self._rng.uniform(-1.0, 1.0)
-        self._schedule(max(due_s + lateness_s, self._vehicles.now_s), tick)
+    def _booted(self, robot: int) -> _Robot:
+        self._boots[robot] += 1
+        bias_m = None if self._bias_m is None else self._bias_m[robot]
+        odometry = VehicleOdometry(self._vehicles, robot, bias_m)
+        return self._boot(robot, self._boots[robot], odometry)
 
     def _schedule(self, time_s: float, do: Callable[[], object]) -> None:
         self._scheduled += 1
         heapq.heappush(self._events, (time_s, self._scheduled, do))
 
-    def _perceive(self, robot: int) -> None:
-        self.robots[robot].perceive(self._vehicles.now_s)
-
-    def _control(self, robot: int) -> None:
-        velocity_m_s = self.robots[robot].control(self._vehicles.now_s)
-        self._vehicles.fly(robot, np.zeros(2) if velocity_m_s is None else velocity_m_s)
-
     def _infer(self, robot: int) -> None:
         now_s = self._vehicles.now_s
-        self._tell_time(robot)
-        tick = self.robots[robot].infer(now_s)
-        if tick is None:
+        said = self.robots[robot].infer(now_s)
+        if said is None:
             return
-        for payload in tick.payloads:
-            self.largest_payload = max(self.largest_payload, float(np.abs(payload).max()))
         for receiver, travel_s in self._medium.broadcast(robot, self._vehicles.positions_m()):
-            self._schedule(now_s + travel_s, partial(self._deliver, receiver, tick.message))
+            self._schedule(now_s + travel_s, partial(self._deliver, receiver, said.message))
 
-    def _deliver(self, receiver: int, message: bytes) -> None:
-        self._tell_time(receiver)
-        self.robots[receiver].receive(message, self._vehicles.now_s)
+    def _deliver(self, receiver: int, message: Any) -> None:
+        if receiver not in self._failed:
+            self.robots[receiver].receive(message, self._vehicles.now_s)
 
-    def _tell_time(self, robot: int) -> None:
-        """All have one clock."""
-        now_s = self._vehicles.now_s
-        self.robots[robot].clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
+    def _fail(self, robot: int) -> None:
+        self._failed.add(robot)
+        self._vehicles.stop(robot)
+
+    def _come_back(self, robot: int) -> None:
+        self._failed.discard(robot)
+        self._gone.append(self.robots[robot])
+        self.robots[robot] = self._booted(robot)
+
+
+class ClockedPac(Pac):
+    """A robot of a fleet that has one clock."""
+
+    waits = False
+    largest_payload = 0.0
+
+    def infer(self, now_s: float) -> PolicyTick | None:
+        """See `Pac.infer`."""
+        self._tell_time(now_s)
+        tick = super().infer(now_s)
+        for payload in tick.payloads if tick else ():
+            self.largest_payload = max(self.largest_payload, float(np.abs(payload).max()))
+        return tick
+
+    def receive(self, data: bytes, now_s: float, *, sender: int | None = None) -> Rejection | None:
+        """See `Pac.receive`."""
+        self._tell_time(now_s)
+        return super().receive(data, now_s, sender=sender)
+
+    def _tell_time(self, now_s: float) -> None:
+        self.clock.hear(1, now_s, echoed_at_s=now_s, held_s=0.0, now_s=now_s)
+
+
+def pac_swarm(
+    *,
+    policy: Policy,
+    importance: F32,
+    positions_m: F64,
+    parameters: PacParameters,
+    medium: Medium,
+    rng: np.random.Generator,
+    failures: Sequence[Failure] = (),
+    bias_m: F64 | None = None,
+    lag_s: float = 0.0,
+) -> Swarm[ClockedPac]:
+    """Robots that run what a real one runs, over the world of `importance`.
+
+    `positions_m` (N, 2) are the starting positions, `lag_s` is that of `PointVehicles`; the rest is
+    as `Swarm` has it. Raises BundleError if the policy has no perception.
+    """
+    perception = policy.manifest.perception
+    if perception is None:
+        raise BundleError(f"bundle {policy.manifest.name!r} has no perception to simulate")
+    sensor = WorldSensor(importance, perception.sensor_size)
+
+    def boot(robot: int, boot_epoch: int, odometry: OdometrySource) -> ClockedPac:
+        return ClockedPac(
+            robot_id=robot,
+            boot_epoch=boot_epoch,
+            policy=policy,
+            sensor=sensor,
+            odometry=odometry,
+            parameters=parameters,
+        )
+
+    return Swarm(
+        boot=boot,
+        vehicles=PointVehicles(
+            positions_m, perception.world_size / parameters.scale.env_scale, lag_s
+        ),
+        medium=medium,
+        rng=rng,
+        failures=failures,
+        bias_m=bias_m,
+    )

@@ -1,5 +1,7 @@
 """Point vehicles that fly the velocity that they are told, inside the world."""
 
+import math
+
 import numpy as np
 
 from edge.core import F64
@@ -13,24 +15,41 @@ class PointVehicles:
     and go no further out.
     """
 
-    def __init__(self, positions_m: F64, world_size_m: float) -> None:
-        """`positions_m` is (N, 2), at time 0."""
+    def __init__(self, positions_m: F64, world_size_m: float, lag_s: float = 0.0) -> None:
+        """`positions_m` is (N, 2), at time 0.
+
+        `lag_s` is the time constant of the first order with which a vehicle's velocity follows the
+        one that it is told; 0: at once. Raises ValueError if it is not finite and at least 0.
+        """
+        if not 0.0 <= lag_s < math.inf:
+            raise ValueError(f"lag_s = {lag_s}: must be at least 0 and finite")
         self._start_m = positions_m.copy()
         self._since_s = np.zeros(len(positions_m))
         self._velocity_m_s = np.zeros_like(self._start_m)
         self._world_size_m = world_size_m
+        self._lag_s = lag_s
+        # What is left, of the velocity before, of its difference from the one that was told.
+        self._excess_m_s = np.zeros_like(self._start_m)
         # The caller moves the time on, never back.
         self.now_s = 0.0
 
     def positions_m(self) -> F64:
         """Positions (N, 2) now."""
-        moved_m = self._start_m + self._velocity_m_s * (self.now_s - self._since_s)[:, None]
+        elapsed_s = (self.now_s - self._since_s)[:, None]
+        moved_m = self._start_m + self._velocity_m_s * elapsed_s
+        if self._lag_s:
+            fading_s = -self._lag_s * np.expm1(-elapsed_s / self._lag_s)
+            moved_m += self._excess_m_s * fading_s
         return self._held_inside(moved_m, self._start_m)
 
     def position_m(self, robot: int) -> F64:
         """Position (2,) of one vehicle now."""
         start_m = self._start_m[robot]
-        moved_m = start_m + self._velocity_m_s[robot] * (self.now_s - self._since_s[robot])
+        elapsed_s = self.now_s - self._since_s[robot]
+        moved_m = start_m + self._velocity_m_s[robot] * elapsed_s
+        if self._lag_s:
+            fading_s = -self._lag_s * math.expm1(-elapsed_s / self._lag_s)
+            moved_m = moved_m + self._excess_m_s[robot] * fading_s
         return self._held_inside(moved_m, start_m)
 
     def velocity_m_s(self, robot: int) -> F64:
@@ -39,10 +58,20 @@ class PointVehicles:
         return velocity_m_s
 
     def fly(self, robot: int, velocity_m_s: F64) -> None:
-        """From now on the vehicle moves with `velocity_m_s` (2,)."""
+        """From now on the vehicle is told `velocity_m_s` (2,)."""
         self._start_m[robot] = self.position_m(robot)
+        if self._lag_s:
+            elapsed_s = self.now_s - self._since_s[robot]
+            left = math.exp(-elapsed_s / self._lag_s)
+            before_m_s = self._velocity_m_s[robot] + self._excess_m_s[robot] * left
+            self._excess_m_s[robot] = before_m_s - velocity_m_s
         self._since_s[robot] = self.now_s
         self._velocity_m_s[robot] = velocity_m_s
+
+    def stop(self, robot: int) -> None:
+        """The vehicle stands still at once."""
+        self.fly(robot, np.zeros(2))
+        self._excess_m_s[robot] = 0.0
 
     def _held_inside(self, moved_m: F64, start_m: F64) -> F64:
         lowest_m = np.minimum(start_m, 0.0)
@@ -53,12 +82,17 @@ class PointVehicles:
 class VehicleOdometry:
     """Where one vehicle is, as its robot is told (an OdometrySource)."""
 
-    def __init__(self, vehicles: PointVehicles, robot: int) -> None:
+    def __init__(self, vehicles: PointVehicles, robot: int, bias_m: F64 | None = None) -> None:
+        """`bias_m` (2,) is by how much what it is told of its position is wrong, all the time."""
         self._vehicles = vehicles
         self._robot = robot
+        self._bias_m = bias_m
 
     def odometry(self) -> Odometry:
-        """The truth; the vehicles are planar."""
-        x_m, y_m = self._vehicles.position_m(self._robot).tolist()
+        """The truth, but for the bias; the vehicles are planar."""
+        position_m = self._vehicles.position_m(self._robot)
+        if self._bias_m is not None:
+            position_m = position_m + self._bias_m
+        x_m, y_m = position_m.tolist()
         x_m_s, y_m_s = self._vehicles.velocity_m_s(self._robot).tolist()
         return Odometry((x_m, y_m, 0.0), (x_m_s, y_m_s, 0.0))

@@ -44,26 +44,24 @@ class Graphs:
         return by_name[graph].run(batch)
 
     def image_features(self, images: F32) -> F32:
-        """The CNN's features (32,) of one robot's images (1, channels, size, size).
+        """The CNN's features (n, 32) of n robots' images (n, channels, size, size).
 
         Raises BundleError if the bundle was exported without perception.
         """
         if self._cnn is None:
             raise BundleError(f"bundle {self.manifest.name!r} has no perception (no {CNN})")
-        features: F32 = self._cnn.run(images)[0]
-        return features
+        return self._cnn.run(images)
 
     def velocity(self, features: F32, hops: HopBuffer) -> F32:
-        """The action (2,), in model units/s, of a robot with input x_i = `features` (F_0,).
+        """The actions (n, 2), in model units/s, of n robots with inputs x_i = `features` (n, F_0).
 
         `hops` holds y_kl for k = 1..K; this fills in its y_0l, layer by layer (paper, section
         "Decentralized Graph Neural Networks": z_l = sum over k of y_kl H_lk, x_l = ReLU(z_l)).
         """
         for graph, layer in zip(self._layers, hops.layers, strict=True):
-            layer[0, 0] = features
-            features = graph.run(layer)[0]
-        velocity: F32 = self._action.run(features[None])[0]
-        return velocity
+            layer[:, 0] = features
+            features = graph.run(layer)
+        return self._action.run(features)
 
 
 class _Graph:

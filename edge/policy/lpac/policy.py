@@ -53,13 +53,13 @@ class LpacAgent:
         """x_i: the CNN's 32 features of the images, and the 2 of the position."""
         images = self._images.images(*observation)
         position = position_feature(observation.position, self._world_size)
-        features = np.concatenate([self._policy.image_features(images), position])
+        features = np.concatenate([self._policy.image_features(images)[0], position])
         return Perceived(features, {"images": images.copy(), "position_feature": position})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
         """The action of x_i and the neighbours' Y_j, and the robot's own Y_i."""
         self._hops.diffuse(payloads, degree)
-        velocity = self._policy.velocity(features, self._hops)
+        [velocity] = self._policy.velocity(features[None], self._hops)
         return PolicyStep(velocity, self._hops.message(degree))
 
     def reset(self) -> None:

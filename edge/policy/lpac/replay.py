@@ -87,7 +87,7 @@ def _perceive(policy: LpacPolicy, message: Mapping[str, Any]) -> tuple[_Array, _
     images = _checked("images", message["images"], shape)
     position_feature = _checked("position_feature", message["position_feature"], (2,))
     logged = _checked("features", message["features"], policy.geometry.feature_sizes[:1])
-    return logged, np.concatenate([policy.image_features(images), position_feature])
+    return logged, np.concatenate([policy.image_features(images)[0], position_feature])
 
 
 def _infer(
@@ -103,7 +103,7 @@ def _infer(
         raise ValueError(f"degree = {degree}: is less than its {len(payloads)} payloads")
     sent = _decoded(policy, message["message"])
     hops.diffuse(payloads, degree)
-    velocity = policy.velocity(features, hops)
+    [velocity] = policy.velocity(features[None], hops)
     now = dataclasses.replace(sent, payload=hops.message(degree))
     again = _decoded(policy, encode(now, policy.bundle_id, sent.payload.dtype))
     return (logged, velocity), (sent.payload, again.payload)

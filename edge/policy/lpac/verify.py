@@ -65,7 +65,7 @@ def swarm_velocities(
             if payloads:
                 heard = [payloads[j] for j in np.flatnonzero(neighbours[i])]
                 buffers[i].diffuse(heard, degree=len(heard))
-            velocities[exchanged, i] = graphs.velocity(features[i], buffers[i])
+            velocities[exchanged, i] = graphs.velocity(features[i : i + 1], buffers[i])[0]
         payloads = [buffers[i].message(int(neighbours[i].sum())) for i in robots]
     return velocities
 

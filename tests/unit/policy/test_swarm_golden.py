@@ -135,7 +135,7 @@ def test_after_k_l_rounds_the_swarm_is_the_reference_librarys_network(
         images = random.uniform(0, 1, (robots, 4, IMAGE_SIZE, IMAGE_SIZE)).astype(np.float32)
         positions = random.uniform(0.5, 1.5, (robots, 2)).astype(np.float32)
         features = np.concatenate(
-            [[policy.image_features(image[None]) for image in images], positions], axis=1
+            [[policy.image_features(image[None])[0] for image in images], positions], axis=1
         )
         velocities = swarm_velocities(policy, neighbours, features, rounds=hops * layers)
         truth = lpac_velocities(model, images, positions, neighbours)

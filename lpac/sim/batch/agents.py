@@ -1,0 +1,178 @@
+"""Many robots under one policy: what `edge.policy.family.Agent` is, for batches."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from edge.core import F32
+from edge.core.aggregation import HopBuffer
+from edge.core.perception import PerceptionParameters
+from edge.drivers.registry import load_policy
+from edge.policy.bundle import Bundle
+from edge.policy.family import Observation, Perceived
+from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.policy import LpacPolicy, position_feature
+
+# The most robots in one batch of the CNN: beyond it is no faster, and its memory grows.
+_CNN_BATCH = 32
+
+Inputs = Mapping[str, F32]
+
+
+class PolicySteps(NamedTuple):
+    """What n robots do next: see `edge.policy.family.PolicyStep`.
+
+    `velocities` is (n, 2), `payloads` (n, message_size).
+    """
+
+    velocities: F32
+    payloads: F32
+
+
+class Agents(Protocol):
+    """Robots 0..N-1, of one world or of several, under one policy.
+
+    What an agent sees has no effect on what it does later, but by its features: so the simulator
+    asks for the inputs, and the features, of those observations only by which a robot decides.
+    """
+
+    @property
+    def message_size(self) -> int:
+        """The number of floats in a payload."""
+
+    def inputs(self, robot: int, observation: Observation) -> Inputs:
+        """What the policy takes of an observation, by name: new arrays, the same for all robots."""
+
+    def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
+        """What n robots' policy makes of their inputs."""
+
+    def step(
+        self,
+        robots: Sequence[int],
+        features: Sequence[F32],
+        payloads: Sequence[Sequence[F32]],
+        degrees: Sequence[int],
+    ) -> PolicySteps:
+        """`Agent.step` of n robots, no one twice."""
+
+    def reset(self, robot: int) -> None:
+        """The robot's program starts anew: it forgets all."""
+
+
+class LpacAgents:
+    """Robots under a policy of the paper's family; all that they remember is in the messages."""
+
+    def __init__(self, policy: LpacPolicy, perceptions: Sequence[PerceptionParameters]) -> None:
+        """`perceptions` are of each robot: the sizes of its world and of what it perceives."""
+        self._policy = policy
+        self._perceptions = perceptions
+        images = policy.lpac.images
+        assert images is not None  # a policy without perception makes no agents
+        self._images = {
+            perception: PolicyImages(perception, len(images.channels), images.size)
+            for perception in set(perceptions)
+        }
+
+    @property
+    def message_size(self) -> int:
+        """See `Agents`."""
+        return self._policy.message_size
+
+    def inputs(self, robot: int, observation: Observation) -> Inputs:
+        """The images (channels, size, size), and the position feature (2,)."""
+        perception = self._perceptions[robot]
+        [images] = self._images[perception].images(*observation)
+        return {
+            "images": images.copy(),
+            "position_feature": position_feature(observation.position, perception.world_size),
+        }
+
+    def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
+        """n of (F_0,): the CNN's features, and the position's."""
+        images = np.stack([each["images"] for each in inputs])
+        positions = np.stack([each["position_feature"] for each in inputs])
+        seen = [
+            self._policy.image_features(images[start : start + _CNN_BATCH])
+            for start in range(0, len(images), _CNN_BATCH)
+        ]
+        return list(np.concatenate([np.concatenate(seen), positions], axis=1))
+
+    def step(
+        self,
+        robots: Sequence[int],
+        features: Sequence[F32],
+        payloads: Sequence[Sequence[F32]],
+        degrees: Sequence[int],
+    ) -> PolicySteps:
+        """See `Agents`."""
+        hops = HopBuffer(self._policy.geometry, len(robots))
+        for i, (heard, degree) in enumerate(zip(payloads, degrees, strict=True)):
+            hops.diffuse(heard, degree, i)
+        velocities = self._policy.velocity(np.stack(features), hops)
+        said = [hops.message(degree, i) for i, degree in enumerate(degrees)]
+        return PolicySteps(velocities, np.stack(said))
+
+    def reset(self, robot: int) -> None:
+        """There is nothing to forget."""
+
+
+class SingleAgents:
+    """Robots under a policy of any family, one agent each, one after another."""
+
+    def __init__(self, bundle: Bundle, perceptions: Sequence[PerceptionParameters]) -> None:
+        """As `LpacAgents`. Raises BundleError and ConfigError as `load_policy`."""
+        policies = {
+            perception: load_policy(
+                replace(bundle, manifest=replace(bundle.manifest, perception=perception))
+            )
+            for perception in dict.fromkeys(perceptions)
+        }
+        self._policies = [policies[perception] for perception in perceptions]
+        self._agents = [policy.agent() for policy in self._policies]
+
+    @property
+    def message_size(self) -> int:
+        """See `Agents`."""
+        return self._policies[0].message_size
+
+    def inputs(self, robot: int, observation: Observation) -> Inputs:
+        """What the agent says that it computed from, and the features that it computed."""
+        perceived: Perceived = self._agents[robot].observe(observation)
+        return {**perceived.inputs, "features": perceived.features}
+
+    def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
+        """See `Agents`."""
+        return [each["features"] for each in inputs]
+
+    def step(
+        self,
+        robots: Sequence[int],
+        features: Sequence[F32],
+        payloads: Sequence[Sequence[F32]],
+        degrees: Sequence[int],
+    ) -> PolicySteps:
+        """See `Agents`."""
+        steps = [
+            self._agents[robot].step(seen, heard, degree)
+            for robot, seen, heard, degree in zip(robots, features, payloads, degrees, strict=True)
+        ]
+        return PolicySteps(
+            np.stack([step.velocity for step in steps]), np.stack([step.payload for step in steps])
+        )
+
+    def reset(self, robot: int) -> None:
+        """See `Agents`."""
+        self._agents[robot] = self._policies[robot].agent()
+
+
+def make_agents(bundle: Bundle, perceptions: Sequence[PerceptionParameters]) -> Agents:
+    """The fastest agents that there are for the bundle's family, one for each of `perceptions`.
+
+    Raises BundleError and ConfigError as `load_policy`.
+    """
+    policy = load_policy(bundle)
+    if isinstance(policy, LpacPolicy):
+        return LpacAgents(policy, perceptions)
+    return SingleAgents(bundle, perceptions)

@@ -1,0 +1,183 @@
+"""Simulated flights over many worlds at once.
+
+Each world runs on until one of its robots needs a velocity that is not computed yet. When all
+worlds wait, what has gathered is computed in batches. The order in which robots, messages and
+vehicles act is that of `lpac.sim.experiment.fly`, and so is what comes out, for the same seed.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F32, F64, Bools
+from edge.core.ports import OdometrySource
+from edge.policy.bundle import Bundle
+from lpac.sim.batch.agents import make_agents
+from lpac.sim.batch.robot import BatchedRobot, DeferredSteps
+from lpac.sim.experiment import Preparation, Scenario, SimulatedFlight, prepare
+from lpac.sim.failure import alive_at
+from lpac.sim.swarm import Swarm
+from lpac.sim.vehicles import PointVehicles
+
+
+class PolicyInputs(NamedTuple):
+    """What a world's robots decide by: arrays (n, ...) by name, of the n robots of `robots`.
+
+    It is what each perceived last, which was up to a perception period ago. Robots that failed, or
+    have perceived nothing yet, are left out.
+    """
+
+    robots: tuple[int, ...]
+    arrays: Mapping[str, F32]
+
+
+class WorldMoment:
+    """One world of a batch at one time; valid until the batch goes on."""
+
+    def __init__(self, prepared: Preparation, swarm: Swarm[BatchedRobot], time_s: float) -> None:
+        self.prepared = prepared
+        self.time_s = time_s
+        self._swarm = swarm
+        # (N, 2), true positions in the mission frame, m.
+        self.positions_m = swarm.positions_m()
+
+    @property
+    def positions(self) -> F64:
+        """(N, 2): true positions in model units."""
+        return self.prepared.scenario.scale.position_to_model(self.positions_m)
+
+    @property
+    def alive(self) -> Bools:
+        """(N,): who has not failed."""
+        scenario = self.prepared.scenario
+        return alive_at(scenario.robots, scenario.failures, self.time_s)
+
+    @property
+    def adjacency(self) -> Bools:
+        """(N, N): who is truly in communication range of whom, and both alive; not oneself."""
+        x, y = self.positions.T
+        distances = np.hypot(x[:, None] - x, y[:, None] - y)
+        np.fill_diagonal(distances, np.inf)
+        near: Bools = distances < self.prepared.perception.communication_range
+        return near & np.logical_and.outer(self.alive, self.alive)
+
+    def inputs(self) -> PolicyInputs:
+        """See `PolicyInputs`. Nothing that the robots do later depends on it."""
+        alive = self.alive
+        found = {
+            i: inputs
+            for i, robot in enumerate(self._swarm.robots)
+            if alive[i] and (inputs := robot.inputs(self.time_s)) is not None
+        }
+        each = list(found.values())
+        arrays = (
+            {name: np.stack([inputs[name] for inputs in each]) for name in each[0]} if each else {}
+        )
+        return PolicyInputs(tuple(found), arrays)
+
+
+class BatchedFlights:
+    """Flights of one bundle in several worlds, which may differ in everything else."""
+
+    def __init__(self, scenarios: Sequence[Scenario], bundle: Bundle) -> None:
+        """Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline."""
+        for scenario in scenarios:
+            if scenario.controller != "lpac":
+                raise ValueError(
+                    f"controller = {scenario.controller!r}: in batches only the bundle flies"
+                )
+        self.prepared = tuple(prepare(scenario, bundle) for scenario in scenarios)
+        perceptions = [
+            world.perception for world in self.prepared for _ in range(world.scenario.robots)
+        ]
+        self._deferred = DeferredSteps(
+            make_agents(bundle, perceptions), bundle.manifest.payload_limit
+        )
+        firsts = np.cumsum([0, *(scenario.robots for scenario in scenarios)]).tolist()
+        self.swarms = tuple(
+            self._swarm(world, first)
+            for world, first in zip(self.prepared, firsts[:-1], strict=True)
+        )
+
+    def advance(self, until_s: Sequence[float]) -> None:
+        """Move each world on to its time. Raises PolicyFailedError."""
+        running = [
+            swarm.advance(time_s) for swarm, time_s in zip(self.swarms, until_s, strict=True)
+        ]
+        while running:
+            running = [world for world in running if next(world, "arrived") is None]
+            if running:
+                self._deferred.compute()
+
+    def moments(self, times_s: Sequence[float]) -> Iterator[tuple[WorldMoment, ...]]:
+        """All worlds at each of `times_s`, which ascend. Raises PolicyFailedError."""
+        for time_s in times_s:
+            self.advance([time_s] * len(self.swarms))
+            yield tuple(
+                WorldMoment(world, swarm, time_s)
+                for world, swarm in zip(self.prepared, self.swarms, strict=True)
+            )
+
+    def finish(self) -> None:
+        """Compute what no robot has needed yet, so that `largest_payload` is complete."""
+        self._deferred.compute()
+
+    def _swarm(self, world: Preparation, first_agent: int) -> Swarm[BatchedRobot]:
+        scenario, perception = world.scenario, world.perception
+        return Swarm(
+            boot=partial(self._boot, world, first_agent),
+            vehicles=PointVehicles(
+                world.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
+            ),
+            medium=world.medium,
+            rng=world.clock_rng,
+            failures=scenario.failures,
+            bias_m=world.bias_m,
+        )
+
+    def _boot(
+        self,
+        world: Preparation,
+        first_agent: int,
+        robot: int,
+        boot_epoch: int,
+        odometry: OdometrySource,
+    ) -> BatchedRobot:
+        agent = first_agent + robot
+        if boot_epoch > 1:
+            # What its agent has still to decide, it decides as the one that it was.
+            self._deferred.compute()
+            self._deferred.agents.reset(agent)
+        return BatchedRobot(
+            robot_id=robot,
+            boot_epoch=boot_epoch,
+            agent=agent,
+            deferred=self._deferred,
+            importance=world.importance,
+            perception=world.perception,
+            odometry=odometry,
+            parameters=world.parameters,
+        )
+
+
+def fly_batch(scenarios: Sequence[Scenario], bundle: Bundle) -> list[SimulatedFlight]:
+    """Simulate `scenarios`, all with `bundle`: what `lpac.sim.experiment.fly` does one by one.
+
+    Raises BundleError and ConfigError for a bundle that cannot fly, ValueError for impossible
+    scenarios and for baselines, PolicyFailedError for a policy that computes what robots refuse.
+    """
+    flights = BatchedFlights(scenarios, bundle)
+    times_s = [world.times_s for world in flights.prepared]
+    positions_m: list[list[F64]] = [[] for _ in scenarios]
+    for sample in range(max(map(len, times_s), default=0)):
+        flights.advance([times[min(sample, len(times) - 1)] for times in times_s])
+        for swarm, times, flown_m in zip(flights.swarms, times_s, positions_m, strict=True):
+            if sample < len(times):
+                flown_m.append(swarm.positions_m())
+    flights.finish()
+    return [
+        world.flight(np.array(flown_m), swarm.message_counts(), swarm.largest_payload)
+        for world, swarm, flown_m in zip(flights.prepared, flights.swarms, positions_m, strict=True)
+    ]

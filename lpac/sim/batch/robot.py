@@ -1,0 +1,265 @@
+"""One robot's steps, as `edge.robot.pac.Pac` has them, without its policy's computations.
+
+What a tick of the policy takes from the swarm (positions, who is heard) is known at once; what it
+computes, a velocity and a payload, is not needed before the robot's next control tick. So a tick
+leaves a `DeferredStep` to be computed later, together with others' (`DeferredSteps`).
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F32, F64, Bools
+from edge.core.aggregation import AggregatedMessage
+from edge.core.fleet_time import FleetClock, FleetTime
+from edge.core.mailbox import Mailbox, Neighbour
+from edge.core.perception import PerceptionParameters, clamp_to_world, neighbours_in_range
+from edge.core.ports import Odometry, OdometrySource
+from edge.core.wire import rounded
+from edge.flight.safety import limit_speed
+from edge.policy.family import Observation
+from edge.robot.pac import PacParameters
+from lpac.sim.batch.agents import Agents, Inputs
+from lpac.sim.batch.seen import SeenMap
+
+
+def _age_error_s() -> float:
+    """How much older a message may be than it seems, where all have one clock."""
+    clock = FleetClock()
+    clock.hear(1, 0.0, echoed_at_s=0.0, held_s=0.0, now_s=0.0)
+    now = clock.at(0.0)
+    age = clock.age_s(now, 0.0) if now else None
+    assert age is not None
+    return age.most_s
+
+
+_AGE_ERROR_S = _age_error_s()
+
+
+class PolicyFailedError(ArithmeticError):
+    """A policy computed what robots refuse: the exact simulator shows what they do then."""
+
+
+@dataclass(slots=True, eq=False)
+class DeferredStep:
+    """A tick of a robot's policy: what it takes, and what it computes, once it is computed.
+
+    `heeded` are the ticks from which its neighbours' messages are. `rank` is how many others have
+    to be computed first, one after another. `velocity` (2,) is None as long as it is not computed,
+    and `payload` (message_size,), as the neighbours receive it, undefined; `largest` is the largest
+    number in that.
+    """
+
+    robot: "BatchedRobot"
+    inputs: Inputs
+    heeded: "tuple[DeferredStep, ...]"
+    degree: int
+    rank: int
+    payload: F32
+    velocity: F32 | None = None
+    largest: float = 0.0
+
+
+class DeferredSteps:
+    """The steps, of all robots of `agents`, that are not computed yet."""
+
+    def __init__(self, agents: Agents, payload_limit: float | None) -> None:
+        """`payload_limit` is that of the bundle's manifest."""
+        self.agents = agents
+        self._payload_limit = np.inf if payload_limit is None else payload_limit
+        self._steps: list[DeferredStep] = []
+
+    def add(self, step: DeferredStep) -> None:
+        self._steps.append(step)
+
+    def compute(self) -> None:
+        """Compute them all. Raises PolicyFailedError."""
+        steps, self._steps = self._steps, []
+        if not steps:
+            return
+        features = self.agents.features(
+            [step.robot.agent for step in steps],
+            [step.inputs for step in steps],
+        )
+        ranked = defaultdict(list)
+        for i, step in enumerate(steps):
+            ranked[step.rank].append(i)
+        for _, group in sorted(ranked.items()):
+            self._step([steps[i] for i in group], [features[i] for i in group])
+        for step in steps:
+            # What it was computed from would hold on to all that was before.
+            step.inputs, step.heeded = {}, ()
+
+    def _step(self, steps: list[DeferredStep], features: list[F32]) -> None:
+        velocities, payloads = self.agents.step(
+            [step.robot.agent for step in steps],
+            features,
+            [[other.payload for other in step.heeded] for step in steps],
+            [step.degree for step in steps],
+        )
+        received = rounded(payloads, steps[0].payload.dtype)
+        largest = np.abs(received).max(axis=1, initial=0.0)
+        if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
+            raise PolicyFailedError(
+                "a velocity or a payload of the policy is not finite, or beyond the bundle's "
+                "payload_limit: `lpac.sim.experiment.fly` shows what robots do then"
+            )
+        for i, step in enumerate(steps):
+            step.velocity = velocities[i]
+            step.payload[:] = received[i]
+            step.largest = float(largest[i])
+            step.robot.note_payloads(step.heeded)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Message(AggregatedMessage):
+    step: DeferredStep
+
+
+class _Said(NamedTuple):
+    message: _Message
+
+
+class _Perceived(NamedTuple):
+    """When the robot looked, from where (2,), in model units, and whom it knew then."""
+
+    time_s: float
+    own: F64
+    neighbours: tuple[Neighbour, ...]
+
+
+class BatchedRobot:
+    """The steps of one robot; see `Pac`."""
+
+    def __init__(
+        self,
+        *,
+        robot_id: int,
+        boot_epoch: int,
+        agent: int,
+        deferred: DeferredSteps,
+        importance: F32,
+        perception: PerceptionParameters,
+        odometry: OdometrySource,
+        parameters: PacParameters,
+    ) -> None:
+        """`agent` is its number among those of `deferred`, which computes its policy."""
+        self.agent = agent
+        self._robot_id = robot_id
+        self._boot_epoch = boot_epoch
+        self._deferred = deferred
+        self._perception = perception
+        self._odometry = odometry
+        self._parameters = parameters
+        self._seen = SeenMap(importance, perception)
+        self._perceived: _Perceived | None = None
+        self._action: DeferredStep | None = None
+        self._action_s = 0.0
+        self._sequence = 0
+        self.largest_payload = 0.0
+        self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+
+    @property
+    def waits(self) -> bool:
+        """Whether its policy's last step is not computed yet."""
+        return self._action is not None and self._action.velocity is None
+
+    def perceive(self, now_s: float) -> None:
+        """See, and remember who is there."""
+        own = self._own()[1]
+        self._seen.observe(own)
+        self._perceived = _Perceived(now_s, own, self.mailbox.neighbours(now_s))
+
+    def inputs(self, now_s: float) -> Inputs | None:
+        """What its policy takes of what it last perceived; None if that is too old."""
+        perceived = self._perceived
+        if perceived is None or now_s - perceived.time_s > self._parameters.max_input_age_s:
+            return None
+        perception, own = self._perception, perceived.own
+        position = clamp_to_world(own, perception.world_size)
+        neighbours = self._to_model(perceived.neighbours)
+        near = neighbours_in_range(own, neighbours, perception.communication_range)
+        return self._deferred.agents.inputs(
+            self.agent, Observation(position, self._seen.local_map(position), neighbours[near])
+        )
+
+    def infer(self, now_s: float) -> _Said | None:
+        """Leave a step of the policy to be computed, and say the message that it leads to.
+
+        None when there is nothing to send: nothing perceived that is fresh.
+        """
+        inputs = self.inputs(now_s)
+        if inputs is None:
+            return None
+        odometry, own = self._own()
+        heard = self.mailbox.neighbours(now_s)
+        messages = self.mailbox.swap(now_s)
+        near = self._in_range(own, messages)
+        degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
+        heeded = tuple(
+            message.step
+            for message, is_near in zip(messages, near.tolist(), strict=True)
+            if is_near and isinstance(message, _Message)
+        )
+        before = (*heeded, self._action) if self._action else heeded
+        step = DeferredStep(
+            self,
+            inputs,
+            heeded,
+            degree,
+            max((other.rank + 1 for other in before if other.velocity is None), default=0),
+            np.empty(self._deferred.agents.message_size, self._parameters.payload),
+        )
+        self._deferred.add(step)
+        self._action, self._action_s = step, now_s
+        self._sequence += 1
+        message = _Message(
+            robot_id=self._robot_id,
+            boot_epoch=self._boot_epoch,
+            sequence=self._sequence,
+            sent=FleetTime(0, now_s, 0.0),
+            position_m=odometry.position_m,
+            velocity_m_s=odometry.velocity_m_s,
+            frame_id=0,
+            payload=step.payload,
+            step=step,
+        )
+        return _Said(message)
+
+    def control(self, now_s: float) -> F64 | None:
+        """The velocity (2,) in the mission frame, m/s; None when there is no fresh action."""
+        action = self._action
+        if action is None or now_s - self._action_s > self._parameters.max_input_age_s:
+            return None
+        assert action.velocity is not None
+        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
+            action.velocity.astype(np.float64)
+        )
+        return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+
+    def receive(self, message: _Message, now_s: float) -> None:
+        """Put a neighbour's message into the mailbox."""
+        assert message.sent is not None
+        self.mailbox.receive(message, now_s, now_s - message.sent.time_s + _AGE_ERROR_S)
+
+    def note_payloads(self, heeded: tuple[DeferredStep, ...]) -> None:
+        """Those whose payloads its policy took."""
+        self.largest_payload = max((self.largest_payload, *(each.largest for each in heeded)))
+
+    def _own(self) -> tuple[Odometry, F64]:
+        odometry = self._odometry.odometry()
+        assert odometry is not None
+        return odometry, self._to_model([odometry])[0]
+
+    def _in_range(self, own: F64, others: Sequence[Neighbour | AggregatedMessage]) -> Bools:
+        return neighbours_in_range(
+            own, self._to_model(others), self._perception.communication_range
+        )
+
+    def _to_model(self, known: Sequence[Odometry | Neighbour | AggregatedMessage]) -> F64:
+        """Horizontal positions (n, 2) in model units."""
+        horizontal = np.array([each.position_m[:2] for each in known], np.float64).reshape(-1, 2)
+        return self._parameters.scale.position_to_model(horizontal)

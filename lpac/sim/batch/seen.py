@@ -1,0 +1,81 @@
+"""What a robot has seen of a known world: which of its cells, and nothing else."""
+
+import numpy as np
+
+from edge.core import F32, F64, Bools
+from edge.core.perception import PerceptionParameters, part_in_world, window_corner
+
+# The box grows by so many cells beyond what it has to hold, so that it seldom grows.
+_MARGIN = 64
+
+
+class SeenMap:
+    """What one robot remembers of the world that its sensor shows it.
+
+    It is what `edge.core.perception.RobotMemory` is: where the robot has seen, the world's
+    importance, elsewhere what is unknown. The world is all robots' own; what a robot has of its
+    own is one byte for each cell of a box around what it has seen.
+    """
+
+    def __init__(self, importance: F32, parameters: PerceptionParameters) -> None:
+        """`importance` (world_size, world_size) is the world, which is not copied."""
+        self._importance = importance
+        self._parameters = parameters
+        # The box's least and greatest cells, and its cells that were seen.
+        self._low = (0, 0)
+        self._high = (0, 0)
+        self._seen: Bools = np.zeros((0, 0), np.bool_)
+
+    def observe(self, position: F64) -> None:
+        """See what the sensor shows around `position` (2,)."""
+        size, world_size = self._parameters.sensor_size, self._parameters.world_size
+        (x, y), _ = part_in_world(window_corner(position, size), size, world_size)
+        if x.start == x.stop or y.start == y.stop:
+            return
+        (x0, y0), (x1, y1) = self._low, self._high
+        if not (x0 <= x.start and x.stop <= x1 and y0 <= y.start and y.stop <= y1):
+            self._grow(x, y)
+            x0, y0 = self._low
+        self._seen[x.start - x0 : x.stop - x0, y.start - y0 : y.stop - y0] = True
+
+    def local_map(self, position: F64) -> F32:
+        """(local_map_size, local_map_size) around `position` (2,); outside the world 0."""
+        parameters = self._parameters
+        size = parameters.local_map_size
+        out = np.zeros((size, size), np.float32)
+        corner_x, corner_y = corner = window_corner(position, size)
+        (x, y), in_window = part_in_world(corner, size, parameters.world_size)
+        if parameters.unknown_importance:
+            out[in_window] = parameters.unknown_importance
+        (x0, y0), (x1, y1) = self._low, self._high
+        x0, x1 = max(x0, x.start), min(x1, x.stop)
+        y0, y1 = max(y0, y.start), min(y1, y.stop)
+        if x0 >= x1 or y0 >= y1:
+            return out
+        low_x, low_y = self._low
+        np.copyto(
+            out[x0 - corner_x : x1 - corner_x, y0 - corner_y : y1 - corner_y],
+            self._importance[x0:x1, y0:y1],
+            where=self._seen[x0 - low_x : x1 - low_x, y0 - low_y : y1 - low_y],
+        )
+        return out
+
+    def _grow(self, x: slice, y: slice) -> None:
+        """Make the box hold the cells of `x` and `y`, too."""
+        (x0, y0), (x1, y1) = self._low, self._high
+        seen = self._seen
+        if not seen.size:
+            x0, y0, x1, y1 = x.start, y.start, x.start, y.start
+        world_size = self._parameters.world_size
+        low_x, low_y = (
+            old if old <= part.start else max(part.start - _MARGIN, 0)
+            for old, part in ((x0, x), (y0, y))
+        )
+        high_x, high_y = (
+            old if old >= part.stop else min(part.stop + _MARGIN, world_size)
+            for old, part in ((x1, x), (y1, y))
+        )
+        self._seen = np.zeros((high_x - low_x, high_y - low_y), np.bool_)
+        if seen.size:
+            self._seen[x0 - low_x : x1 - low_x, y0 - low_y : y1 - low_y] = seen
+        self._low, self._high = (low_x, low_y), (high_x, high_y)

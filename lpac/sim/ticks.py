@@ -1,0 +1,62 @@
+"""When the loops of a swarm's robots tick."""
+
+import heapq
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+Loop = Literal["perception", "policy", "control"]
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods."""
+
+    perception_s: float = 0.2
+    policy_s: float = 0.4
+    control_s: float = 0.1
+    jitter: float = 0.05
+
+
+class LoopTick(NamedTuple):
+    """A loop of one robot ticks."""
+
+    time_s: float
+    loop: Loop
+    robot: int
+
+
+def ticks(robots: int, clocks: Clocks, rng: np.random.Generator) -> Iterator[LoopTick]:
+    """All ticks of so many robots in the order of time, for ever, on absolute deadlines.
+
+    `rng` draws the phases at once, and the lateness of a robot's next tick when the one before has
+    been handed out: what happens in a flight has no part in it.
+    """
+    # (time, order, due, period, tick); the order makes equal times deterministic.
+    heap: list[tuple[float, int, float, float, Loop, int]] = []
+    order = 0
+    now_s = 0.0
+
+    def upcoming(
+        due_s: float, period_s: float, loop: Loop, robot: int
+    ) -> tuple[float, int, float, float, Loop, int]:
+        nonlocal order
+        order += 1
+        lateness_s = clocks.jitter * period_s * rng.uniform(-1.0, 1.0)
+        return max(due_s + lateness_s, now_s), order, due_s, period_s, loop, robot
+
+    periods_s: tuple[tuple[Loop, float], ...] = (
+        ("perception", clocks.perception_s),
+        ("policy", clocks.policy_s),
+        ("control", clocks.control_s),
+    )
+    for robot in range(robots):
+        for loop, period_s in periods_s:
+            phase_s = period_s * rng.random()
+            heapq.heappush(heap, upcoming(phase_s, period_s, loop, robot))
+    while True:
+        now_s, _, due_s, period_s, loop, robot = heap[0]
+        yield LoopTick(now_s, loop, robot)
+        heapq.heapreplace(heap, upcoming(due_s + period_s, period_s, loop, robot))
