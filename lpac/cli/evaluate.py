@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from lpac.evaluate.evaluation import Condition, Evaluation, Method, MethodResult
     from lpac.evaluate.flights import EvaluationFlight, FlownCost, KeptFlights
     from lpac.sim.cores import Pool
+    from lpac.sim.experiment import SimulatedFlight
 
 app = new_app()
 
@@ -216,7 +217,7 @@ def _write_worst(
 ) -> None:
     """Of each policy, under the first condition: its worst worlds, flown again."""
     from lpac.evaluate.evaluation import CLAIRVOYANT, worst_worlds
-    from lpac.evaluate.flights import fly_again
+    from lpac.evaluate.flights import fly_group, groups_of
     from lpac.evaluate.report import write_world
 
     condition, of_all = next(iter(results.items()))
@@ -231,12 +232,12 @@ def _write_worst(
         for place, world in enumerate(worst_worlds(result, _WORST), 1)
     }
     flights = list(dict.fromkeys(flight for pair in wanted.values() for flight in pair))
-    flown = {}
+    flown: dict[EvaluationFlight, SimulatedFlight] = {}
     with progress_of("pictures of the worst worlds") as progress:
         task = progress.add_task("", total=len(flights))
-        for flight, told in cores(fly_again, flights) if flights else ():
-            flown[flight] = told
-            progress.update(task, advance=1)
+        for group in cores(fly_group, groups_of(flights)) if flights else ():
+            flown.update(group)
+            progress.update(task, advance=len(group))
         for (name, place, world), pair in wanted.items():
             shown = {str(flight.flier): flown[flight] for flight in pair}
             write_world(shown, out / "worst" / name / f"{place:02d}-world-{world}")
@@ -277,7 +278,7 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
         )
 
 
-_COLUMNS = ("", "mean", "95 %", "median", "p90", "worst", "x clair.", "p90", "x Lloyd")
+_COLUMNS = ("", "mean", "95 %", "median", "p90", "worst", "/clair", "p90", "/Lloyd")
 
 
 def _row(result: Mapping[str, Any]) -> list[str]:

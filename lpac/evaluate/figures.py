@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullLocator
 
 from lpac.analysis import style
 from lpac.analysis.statistics import paired_bootstrap, performance_profile, ratio_of_means
@@ -139,9 +140,9 @@ def _plain_ticks(axes: Axes) -> None:
     """0.2, not 2 x 10^-1."""
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
+            axis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
             axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter("{x:g}")
-            axis.set_tick_params(which="both", labelsize=6)
+            axis.set_minor_locator(NullLocator())
 
 
 def _looks(results: Sequence[MethodResult]) -> list[tuple[MethodResult, tuple[str, Any]]]:

@@ -1,23 +1,25 @@
 """The flights of an evaluation; this is the one place where they are flown."""
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 import edge
-from edge.core.world import GaussianFeature, rasterize
 from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac import analysis, evaluate, sim
 from lpac.analysis.coverage import Coverage
-from lpac.evaluate.worlds import SET_UPS, SetUp, WorldSet, draw_world
+from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
 from lpac.sim.baselines import BaselineName
+from lpac.sim.batch import PolicyFailedError, fly_batch
 from lpac.sim.cores import Pool
-from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly
+from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly, prepare
+from lpac.sim.failure import Failure
 from lpac.sim.kept import KeptOutcomes, code_digest
 
 BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
@@ -27,6 +29,8 @@ LLOYD: Literal["best-of-ten-lloyd"] = "best-of-ten-lloyd"
 POLICY: Literal["lpac"] = "lpac"
 Flier = Literal["lpac", "best-of-ten-lloyd"] | BaselineName
 
+# Larger batches of the simulator are no faster.
+_ROBOTS_TOGETHER = 80
 _FLIGHTS = "flights.jsonl"
 _LOST = re.compile(r"(\d+)@(\d+\.?\d*)")
 
@@ -102,68 +106,78 @@ def sizes_of(bundle: Bundle) -> str:
     return f"local map {perception.local_map_size}, unseen {unseen:g}, {task}"
 
 
-def cost_of(flight: EvaluationFlight) -> tuple[EvaluationFlight, FlownCost]:
-    """Fly it, in whatever process this is. Raises BundleError, ValueError, OSError."""
-    if flight.flier == LLOYD:
-        return flight, _best_of_ten(flight)
-    _, flown = fly_again(flight)
-    return flight, FlownCost(tuple(flown.cost_time_s.tolist()), tuple(flown.cost.tolist()))
+# Flights that go together: those of one batch of the simulator, or one other.
+FlightGroup = tuple[EvaluationFlight, ...]
 
 
-def fly_again(flight: EvaluationFlight) -> tuple[EvaluationFlight, SimulatedFlight]:
-    """The flight with all that it was like. Raises BundleError, ValueError, OSError."""
-    assert flight.flier != LLOYD
-    drawn, bundle = _drawn(flight), _bundle(flight.bundle)
-    perception = bundle.manifest.perception
-    assert perception is not None
-    sized = replace(
-        perception,
-        world_size=drawn.set_up.world_size,
-        communication_range=drawn.set_up.communication_range,
-    )
-    return flight, fly(
-        Scenario(
-            controller=flight.flier,
-            robots=len(drawn.starts_m),
-            seed=drawn.seed,
-            duration_s=flight.duration_s,
-            features=drawn.features,
-            starts_m=drawn.starts_m,
-            scale=FIELD_SCALE,
-            loss=flight.loss,
-        ),
-        replace(bundle, manifest=replace(bundle.manifest, perception=sized)),
-    )
+def groups_of(flights: Iterable[EvaluationFlight]) -> list[FlightGroup]:
+    """The flights in groups that go together, in about their order."""
+    alike: dict[tuple[str, str], list[EvaluationFlight]] = {}
+    groups: list[FlightGroup] = []
+    for flight in flights:
+        if flight.flier != POLICY:
+            groups.append((flight,))
+            continue
+        waiting = alike.setdefault((flight.bundle, flight.set_up), [])
+        waiting.append(flight)
+        if len(waiting) * SET_UPS[flight.set_up].robots >= _ROBOTS_TOGETHER:
+            groups.append(tuple(waiting))
+            waiting.clear()
+    return [*groups, *(tuple(waiting) for waiting in alike.values() if waiting)]
 
 
-class _Drawn(NamedTuple):
-    """A flight's world and who begins it where, m in the mission frame."""
+def costs_of(group: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
+    """Fly them, in whatever process this is. Raises BundleError, ValueError, OSError."""
+    if group[0].flier == LLOYD:
+        return [(flight, _best_of_ten(flight)) for flight in group]
+    return [
+        (flight, FlownCost(tuple(flown.cost_time_s.tolist()), tuple(flown.cost.tolist())))
+        for flight, flown in fly_group(group)
+    ]
 
-    set_up: SetUp
-    features: tuple[GaussianFeature, ...]
-    starts_m: tuple[tuple[float, float], ...]
-    seed: int
+
+def fly_group(group: FlightGroup) -> list[tuple[EvaluationFlight, SimulatedFlight]]:
+    """The flights with all that they were like. Raises BundleError, ValueError, OSError."""
+    bundle, scenarios = _bundle(group[0].bundle), [_scenario(flight) for flight in group]
+    if group[0].flier != POLICY:
+        flown = [fly(scenario, bundle) for scenario in scenarios]
+    else:
+        try:
+            flown = fly_batch(scenarios, bundle)
+        except PolicyFailedError as error:
+            raise ValueError(f"{group[0].bundle}: {error}") from None
+    return list(zip(group, flown, strict=True))
 
 
-def _drawn(flight: EvaluationFlight) -> _Drawn:
+def _scenario(flight: EvaluationFlight) -> Scenario:
     set_up = SET_UPS[flight.set_up]
     world = draw_world(flight.world_set, flight.world, set_up)
-    starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
     # Starts are drawn alike for all: whoever is lost might be anybody.
-    never = flight.lost.robots if flight.lost.at_s == 0.0 else 0
-    begin_m = tuple((x_m, y_m) for x_m, y_m in starts_m[: set_up.robots - never])
-    return _Drawn(set_up, world.features, begin_m, world.seed)
+    left = set_up.robots - flight.lost.robots
+    lost_late = flight.lost.at_s > 0.0
+    robots = set_up.robots if lost_late else left
+    starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts[:robots])).tolist()
+    return Scenario(
+        controller="clairvoyant-cvt" if flight.flier == LLOYD else flight.flier,
+        robots=robots,
+        seed=world.seed,
+        duration_s=flight.duration_s,
+        features=world.features,
+        starts_m=tuple((x_m, y_m) for x_m, y_m in starts_m),
+        scale=FIELD_SCALE,
+        loss=flight.loss,
+        world_size=set_up.world_size,
+        communication_range=set_up.communication_range,
+        failures=tuple(Failure(robot, flight.lost.at_s) for robot in range(left, robots)),
+    )
 
 
 def _best_of_ten(flight: EvaluationFlight) -> FlownCost:
     """From the start to where Lloyd's algorithm ends, as if that took no time."""
-    drawn, training = _drawn(flight), _bundle(flight.bundle).manifest.training
-    importance = rasterize(
-        drawn.features, drawn.set_up.world_size, training.idf_truncation, training.idf_norm
-    )
-    coverage = Coverage(importance, FIELD_SCALE.env_scale)
-    starts_m = np.array(drawn.starts_m)
-    return FlownCost((0.0, 0.0), (coverage.cost(starts_m), coverage.lloyd(starts_m)))
+    prepared = prepare(_scenario(flight), _bundle(flight.bundle))
+    coverage = Coverage(prepared.importance, FIELD_SCALE.env_scale)
+    cost = coverage.cost(prepared.starts_m), coverage.lloyd(prepared.starts_m)
+    return FlownCost((0.0, 0.0), cost)
 
 
 @cache
@@ -196,7 +210,7 @@ class KeptFlights:
                 missing.append(flight)
         if not missing:
             return
-        for flight, flown in pool(cost_of, missing):
+        for flight, flown in chain.from_iterable(pool(costs_of, groups_of(missing))):
             self._costs[flight.key] = flown
             self._kept.add({"flight": flight.key, "time_s": flown.time_s, "cost": flown.cost})
             yield flight, flown
