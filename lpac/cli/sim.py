@@ -39,6 +39,10 @@ class Controller(StrEnum):
 
     LPAC = "lpac"
     DECENTRALIZED_CVT = "decentralized-cvt"
+    DECENTRALIZED_CVT_PRIOR = "decentralized-cvt-prior"
+    SHARED_CVT = "shared-cvt"
+    SHARED_CVT_PRIOR = "shared-cvt-prior"
+    FRONTIER_CVT = "frontier-cvt"
     CENTRALIZED_CVT = "centralized-cvt"
     CLAIRVOYANT_CVT = "clairvoyant-cvt"
 

@@ -44,6 +44,7 @@ def over_processes(
             for done in as_completed(given):
                 yield done.result()
         except BrokenProcessPool:
+            pool.shutdown()
             raise ChildProcessError("a worker process was killed") from None
         except BaseException:
             # What nobody waits for ends now.
