@@ -224,7 +224,8 @@ def connected(positions: F64, communication_range: float) -> list[npt.NDArray[np
 
 def _unseen_points(seen: Bools, origin: tuple[int, int]) -> F64:
     """(n, 2): centres of unseen cells, of those on the lattice, in model units."""
-    first = [-start % _FRONTIER_PITCH for start in origin]
+    # In the middle, since at the world's border half a pitch stays unseen.
+    first = [(_FRONTIER_PITCH // 2 - start) % _FRONTIER_PITCH for start in origin]
     lattice = seen[first[0] :: _FRONTIER_PITCH, first[1] :: _FRONTIER_PITCH]
     cells = np.argwhere(~lattice) * _FRONTIER_PITCH + first + origin
     return np.asarray(cells + 0.5, np.float64)

@@ -111,7 +111,7 @@ def test_frontiers_are_unseen_near_and_nobody_elses(track: list[list[tuple[float
     positions = steps[-1]
     seen = seen_by_each(steps, shared=True)
     who = reached(positions)
-    lattice = np.stack(np.meshgrid(*[np.arange(0, SIZE, 8)] * 2, indexing="ij"), axis=-1)
+    lattice = np.stack(np.meshgrid(*[np.arange(4, SIZE, 8)] * 2, indexing="ij"), axis=-1)
     for robot, position in enumerate(positions):
         others = positions[who[robot] & (np.arange(len(positions)) != robot)]
         own = []
