@@ -155,5 +155,5 @@ def test_frontiers_are_explored_to_the_last() -> None:
         seen[view(position[0])] = True
         offset = flown.goals(position) - position
         position = position + offset / max(float(np.linalg.norm(offset)) / 4.0, 1.0)
-    assert seen.mean() > 0.9
+    assert seen[4::8, 4::8].all()
     np.testing.assert_allclose(flown.goals(position), position, atol=0.5)
