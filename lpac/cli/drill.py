@@ -2,6 +2,7 @@
 
 import json
 import signal
+from contextlib import closing
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -183,9 +184,12 @@ def _fly(
     campaign: "Campaign", faults: list["Fault"], seeds: list[int], flown: "Flown"
 ) -> list["FlightOutcome"]:
     outcomes = []
-    with progress_of("flights") as progress:
+    with (
+        progress_of("flights") as progress,
+        closing(campaign.fly(faults, seeds, flown)) as flights,
+    ):
         task, broken = progress.add_task("", total=len(faults) * len(seeds)), 0
-        for outcome in campaign.fly(faults, seeds, flown):
+        for outcome in flights:
             outcomes.append(outcome)
             broken += not outcome.held
             progress.update(

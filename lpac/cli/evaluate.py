@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -134,7 +135,8 @@ def _evaluation(
     if transfer and set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
     lost_robots = [LostRobots.parse(text) for text in lost]
-    policies = [_method(text) for text in given]
+    names = _names(given)
+    policies = [_method(text, name) for text, name in zip(given, names, strict=True)]
     paths = [training.path for method in policies for training in method.trainings]
     bundles = {path: load_bundle(Path(path)) for path in paths or [str(DEFAULT_BUNDLE)]}
     tasks = {task_of(bundle): path for path, bundle in bundles.items()}
@@ -167,18 +169,28 @@ def _evaluation(
     )
 
 
-def _method(text: str) -> "Method":
+def _names(given: Sequence[str]) -> list[str]:
+    """Short ones: of each path the last parts, as many as tell it from the others."""
+    parts = [[Path(path).resolve().parts for path in text.split(",")] for text in given]
+    for depth in range(1, max(len(part) for text in parts for part in text) + 1):
+        names = [",".join("/".join(part[-depth:]) for part in text) for text in parts]
+        if len(set(names)) == len(set(given)):
+            break
+    return names
+
+
+def _method(text: str, name: str) -> "Method":
     """A baseline by its name, or bundles by their paths. Raises BundleError."""
     from edge.policy.bundle import load_bundle
     from lpac.evaluate.evaluation import Method, TrainedBundle
     from lpac.evaluate.flights import BASELINES, POLICY
 
-    for name in BASELINES:
-        if name == text:
-            return Method(name=name, flier=name)
+    for baseline in BASELINES:
+        if baseline == text:
+            return Method(name=baseline, flier=baseline)
     paths = [Path(part) for part in text.split(",")]
     return Method(
-        name=",".join(path.resolve().name for path in paths),
+        name=name,
         flier=POLICY,
         trainings=tuple(TrainedBundle(str(p.resolve()), load_bundle(p).id) for p in paths),
     )
@@ -188,9 +200,9 @@ def _fly(
     evaluation: "Evaluation", kept: "KeptFlights", cores: "Pool"
 ) -> dict["EvaluationFlight", "FlownCost"]:
     flights, costs = evaluation.flights(), {}
-    with progress_of("flights") as progress:
+    with progress_of("flights") as progress, closing(kept.fly(flights, cores)) as told:
         task = progress.add_task("", total=len(flights))
-        for flight, flown in kept.fly(flights, cores):
+        for flight, flown in told:
             costs[flight] = flown
             progress.update(task, advance=1)
     return costs
@@ -240,7 +252,9 @@ def _write_worst(
             progress.update(task, advance=len(group))
         for (name, place, world), pair in wanted.items():
             shown = {str(flight.flier): flown[flight] for flight in pair}
-            write_world(shown, out / "worst" / name / f"{place:02d}-world-{world}")
+            write_world(
+                shown, out / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
+            )
 
 
 def _show(told: Mapping[str, Any], *, compared: bool) -> None:

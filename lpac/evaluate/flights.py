@@ -1,7 +1,8 @@
 """The flights of an evaluation; this is the one place where they are flown."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -200,7 +201,7 @@ class KeptFlights:
 
     def fly(
         self, flights: Sequence[EvaluationFlight], pool: Pool
-    ) -> Iterator[tuple[EvaluationFlight, FlownCost]]:
+    ) -> Generator[tuple[EvaluationFlight, FlownCost], None, None]:
         """All of them: first what was flown before, and then the others as they come."""
         missing = []
         for flight in flights:
@@ -210,7 +211,8 @@ class KeptFlights:
                 missing.append(flight)
         if not missing:
             return
-        for flight, flown in chain.from_iterable(pool(costs_of, groups_of(missing))):
-            self._costs[flight.key] = flown
-            self._kept.add({"flight": flight.key, "time_s": flown.time_s, "cost": flown.cost})
-            yield flight, flown
+        with closing(pool(costs_of, groups_of(missing))) as groups:
+            for flight, flown in chain.from_iterable(groups):
+                self._costs[flight.key] = flown
+                self._kept.add({"flight": flight.key, "time_s": flown.time_s, "cost": flown.cost})
+                yield flight, flown

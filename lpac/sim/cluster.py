@@ -1,7 +1,7 @@
 """Tasks over a Ray cluster: its nodes have the same installation, and each file at its path."""
 
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 
 import ray
 
@@ -23,7 +23,9 @@ def over_ray(address: str) -> Pool:
         except OSError as error:
             raise ConnectionError(f"no Ray cluster at {address}: {error}") from None
 
-    def pool(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+    def pool(
+        do: Callable[[Task], Outcome], tasks: Sequence[Task]
+    ) -> Generator[Outcome, None, None]:
         ray.init(address=address, log_to_driver=False, ignore_reinit_error=True)
         try:
             # A lost node costs the tasks that it was at: others do them again.

@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, get_context, parent_process
@@ -17,21 +17,24 @@ class Pool(Protocol):
     """Does the tasks in processes; outcomes come as they are done, in any order.
 
     What to do is a function that other processes can import; tasks and outcomes can be pickled.
+    Who does not take all outcomes closes the generator: the processes end then.
     """
 
     def __call__(
         self, do: Callable[[Task], Outcome], tasks: Sequence[Task]
-    ) -> Iterator[Outcome]: ...
+    ) -> Generator[Outcome, None, None]: ...
 
 
-def over_cores(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Iterator[Outcome]:
+def over_cores(
+    do: Callable[[Task], Outcome], tasks: Sequence[Task]
+) -> Generator[Outcome, None, None]:
     """A `Pool` of a process for each core."""
     return over_processes(do, tasks, len(os.sched_getaffinity(0)))
 
 
 def over_processes(
     do: Callable[[Task], Outcome], tasks: Sequence[Task], at_most: int
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     """So many processes at most; outcomes as they come.
 
     Raises ChildProcessError if one of them is killed.

@@ -5,7 +5,8 @@ below one that says what flew. Another version of the code, or another bundle, b
 ended early is flown again.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -60,7 +61,7 @@ class FlightOutcome:
 
 
 # Flies them all; outcomes as they come. On the simulated clock, `fly_order` over a `Pool`.
-Flown = Callable[[Sequence[FlightTask]], Iterator[FlightOutcome]]
+Flown = Callable[[Sequence[FlightTask]], Generator[FlightOutcome, None, None]]
 
 
 def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> FlightOutcome:
@@ -109,7 +110,7 @@ class Campaign:
 
     def fly(
         self, faults: Iterable[Fault], seeds: Iterable[int], flown: Flown
-    ) -> Iterator[FlightOutcome]:
+    ) -> Generator[FlightOutcome, None, None]:
         """Fly what was not flown yet, and give all outcomes asked for: first those that were."""
         faults = list(faults)
         # Flights of a seed, and of the same settings, share their begin.
@@ -127,10 +128,11 @@ class Campaign:
         ]
         if not orders:
             return
-        for outcome in flown(orders):
-            self.outcomes[outcome.fault, outcome.seed] = outcome
-            self._kept.add(asdict(outcome))
-            yield outcome
+        with closing(flown(orders)) as outcomes:
+            for outcome in outcomes:
+                self.outcomes[outcome.fault, outcome.seed] = outcome
+                self._kept.add(asdict(outcome))
+                yield outcome
 
 
 def _outcome(read: Mapping[str, Any]) -> FlightOutcome:

@@ -3,7 +3,7 @@
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 from edge.core import log
@@ -47,7 +47,7 @@ class RealTimeDrill:
                 break
         return outcome
 
-    def fly_all(self, tasks: Sequence[FlightTask]) -> Iterator[FlightOutcome]:
+    def fly_all(self, tasks: Sequence[FlightTask]) -> Generator[FlightOutcome, None, None]:
         """All of them, as many at once as this machine carries; outcomes as they come."""
         at_once = 1
         # PX4's ports are the same for all fleets.

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,15 +64,14 @@ def test_what_breaks_while_the_machine_is_late_is_not_judged() -> None:
 def test_what_was_not_judged_is_flown_again(tmp_path: Path) -> None:
     flown: list[str] = []
 
-    def pool(tasks: list[FlightTask]) -> list[FlightOutcome]:
-        flown.extend(task.fault for task in tasks)
-        return [
-            FlightOutcome(task.fault, task.seed, (), "not judged" if task.fault == "held" else "")
-            for task in tasks
-        ]
+    def fly_all(tasks: Sequence[FlightTask]) -> Generator[FlightOutcome, None, None]:
+        for task in tasks:
+            flown.append(task.fault)
+            error = "not judged" if task.fault == "held" else ""
+            yield FlightOutcome(task.fault, task.seed, (), error)
 
     faults = [FAULTS["held"], FAULTS["landed"]]
     for _ in range(2):
         campaign = Campaign(tmp_path, "mavlink", 2, SHIPPED)
-        assert len(list(campaign.fly(faults, [0], lambda tasks: iter(pool(list(tasks)))))) == 2
+        assert len(list(campaign.fly(faults, [0], fly_all))) == 2
     assert sorted(flown) == ["held", "held", "landed"]

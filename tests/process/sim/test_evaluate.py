@@ -1,0 +1,161 @@
+"""`lpac evaluate` as a user types it: over cores, killed and gone on with, on a cluster."""
+
+import json
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ray.cluster_utils import Cluster
+
+from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
+from lpac.sim.cluster import over_ray
+from tests.conftest import SHIPPED
+from tests.process.cli.test_cli import error_line, lpac
+
+PLAIN = ("-k", 2, "--duration", 2, "--baseline", "decentralized-cvt-prior")
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """The shipped policy over two worlds, under three conditions."""
+    out = tmp_path_factory.mktemp("evaluated")
+    result = lpac(
+        "evaluate", *PLAIN, "--loss", 0.3, "--lost", "2@1", "--out", out, "--json"
+    )  # fmt: skip
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    return out, json.loads(result.stdout)
+
+
+def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
+    out, told = evaluated
+    assert json.loads((out / "evaluation.json").read_text()) == told
+    assert told["world_set"] == "validation" and told["test_set_opened"] is None
+    plain, lossy, lost = told["conditions"]
+    assert (lossy["loss"], lost["lost_robots"], lost["lost_at_s"]) == (0.3, 2, 1.0)
+    for condition in told["conditions"]:
+        names = [result["name"] for result in condition["results"]]
+        assert names == [SHIPPED.name, "decentralized-cvt-prior", "clairvoyant-cvt"]
+    policy, prior, clairvoyant = plain["results"]
+    assert 0.0 < clairvoyant["final"]["mean"][0] < policy["final"]["mean"][0] < 1.0
+    assert clairvoyant["over_clairvoyant"]["ratio_of_means"] == [1.0, 1.0, 1.0]
+    assert all(ratio > 1.0 for [ratio] in zip(*policy["by_world"]["over_best_of_ten"], strict=True))
+    # A baseline says nothing that could be lost.
+    assert lossy["results"][1] == prior and lossy["results"][0] != policy
+    assert lost["results"][0]["final"]["mean"][0] > policy["final"]["mean"][0]
+
+
+def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
+    out, _ = evaluated
+    folders = ("field", "field-30-percent-of-messages-lost", "field-2-of-10-robots-lost-at-1-s")
+    names = ("curves", "distributions", "pairs")
+    figures = [out / folder / name for folder in folders for name in names]
+    for figure in (*figures, out / "conditions"):
+        assert figure.with_suffix(".png").stat().st_size > 10_000
+    assert len(list((out / "worst" / SHIPPED.name).glob("*.png"))) == 2
+
+
+def test_killed_it_goes_on(evaluated: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    _, told = evaluated
+    kept = tmp_path / "flights.jsonl"
+    options = [*map(str, PLAIN), "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "lpac.cli.main", "evaluate", *options]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL, process_group=0) as killed:
+        while not kept.exists() or len(kept.read_text().splitlines()) < 4:
+            assert killed.poll() is None
+            time.sleep(0.02)
+        killed.send_signal(signal.SIGKILL)
+    before = kept.read_text().splitlines()[:3]
+    # As if it was killed in the middle of a line.
+    kept.write_text("\n".join([*before, '{"flight": "lpa']))
+    result = lpac("evaluate", *PLAIN, "--out", tmp_path, "--json")
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    assert kept.read_text().splitlines()[:3] == before
+    assert json.loads(result.stdout)["conditions"] == told["conditions"][:1]
+
+
+def test_interrupted_it_is_one_line(tmp_path: Path) -> None:
+    kept = tmp_path / "flights.jsonl"
+    command = [sys.executable, "-m", "lpac.cli.main", "evaluate", "-k", "50"]
+    with subprocess.Popen(
+        [*command, "--out", str(tmp_path)], stderr=subprocess.PIPE, process_group=0, text=True
+    ) as interrupted:
+        while not kept.exists():
+            assert interrupted.poll() is None
+            time.sleep(0.02)
+        interrupted.send_signal(signal.SIGINT)
+        _, said = interrupted.communicate()
+    assert interrupted.returncode == 130 and said.strip() == "lpac: interrupted"
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(
+    evaluated: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    """Files that may not grow stand for it."""
+    options = [*map(str, PLAIN), "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "lpac.cli.main", "evaluate", *options]
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+
+    full = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=limit)
+    assert error_line(full) == "lpac: [Errno 27] File too large"
+    before = (tmp_path / "flights.jsonl").read_text().splitlines()[:-1]
+    assert len(before) > 1
+    result = lpac("evaluate", *PLAIN, "--out", tmp_path, "--json")
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    assert json.loads(result.stdout)["conditions"] == evaluated[1]["conditions"][:1]
+    assert (tmp_path / "flights.jsonl").read_text().splitlines()[: len(before)] == before
+
+
+def test_whether_one_is_better(tmp_path: Path) -> None:
+    """Clairvoyant against what stays where it sees something, over few seconds."""
+    result = lpac(
+        "evaluate", "--compare", "clairvoyant-cvt", "decentralized-cvt", "-k", 6, "--duration", 4,
+        "--baseline", "clairvoyant-cvt", "--out", tmp_path, "--set", "test",
+    )  # fmt: skip
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    assert "clairvoyant-cvt is better than decentralized-cvt: cost at the end 0." in result.stdout
+    assert "the test set was opened, 6 worlds of it" in result.stdout
+    told = json.loads((tmp_path / "evaluation.json").read_text())
+    assert told["test_set_opened"].keys() == {"date", "bundle_ids", "worlds"}
+    assert told["conditions"][0]["compared"]["better"] == "a"
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+    """Two nodes on this machine."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    nodes: Any = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+    )
+    nodes.add_node(num_cpus=1)
+    yield nodes
+    nodes.shutdown()
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_a_cluster_of_two_nodes_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    flights = [
+        EvaluationFlight(
+            flier=flier, bundle=str(SHIPPED), flown_by="the shipped one", world_set="validation",
+            world=0, set_up="field", duration_s=1.0,
+        )
+        for flier in (POLICY, LLOYD)
+    ]  # fmt: skip
+    flown = dict(KeptFlights(tmp_path).fly(flights, over_ray(cluster.address)))
+    assert flown == dict(pair for flight in flights for pair in costs_of((flight,)))
+
+
+def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
+    """Others are in tests/unit/cli."""
+    for arguments, text in (
+        (("--set", "tests"), "--set tests: must be one of training, validation, test"),
+        (("--ray", "127.0.0.1:1"), "no Ray cluster at 127.0.0.1:1"),
+    ):
+        assert text in error_line(lpac("evaluate", *arguments, "--out", tmp_path))

@@ -1,0 +1,41 @@
+"""What cannot be evaluated."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edge.policy.bundle import BundleError
+from lpac.cli.evaluate import evaluate
+from tests.conftest import SHIPPED
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"world_set": "tests"}, "--set tests: must be one of training, validation, test"),
+        ({"baselines": ["cvt"]}, "--baseline cvt: must be one of decentralized-cvt, "),
+        ({"set_ups": ["desert"]}, "--set-up desert: must be one of field, n1, "),
+        ({"set_ups": ["field"], "transfer": True}, "--set-up does nothing beside it"),
+        ({"lost": ["2"]}, "lost robots '2': must be ROBOTS@SECONDS, such as 2@20"),
+        ({"lost": ["2@60"]}, "robots lost at 60 s: must be in flight"),
+        ({"losses": [1.5]}, "loss = 1.5: must be from 0 to 1"),
+        ({"worlds": 0}, "worlds = 0: must be at least 1"),
+        ({"methods": ["frontier-cvt"], "compare": True}, "--compare needs two methods; 1 given"),
+        ({"methods": [str(SHIPPED)] * 2}, "each once"),
+    ],
+)
+def test_options_that_cannot_be(options: dict[str, Any], text: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=text):
+        evaluate(**options, out=tmp_path)
+
+
+def test_bundles_that_cannot_fly(tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="nothing"):
+        evaluate(methods=[str(tmp_path / "nothing")], out=tmp_path)
+    broken = tmp_path / "broken"
+    shutil.copytree(SHIPPED, broken)
+    (broken / "action.onnx").write_bytes(b"")
+    with pytest.raises(BundleError, match=r"action\.onnx"):
+        evaluate(methods=[str(broken)], out=tmp_path)
