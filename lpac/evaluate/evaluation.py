@@ -156,8 +156,8 @@ _BEST_OF_TEN = Method(name=LLOYD, flier=LLOYD)
 class MethodResult:
     """What a method came to under one condition, in S trainings over K worlds.
 
-    `time_s` (C,), and `curves` (S, K, C): the normalised cost then. `over_clairvoyant` and
-    `over_best_of_ten` (S, K) are of the cost at the end.
+    `time_s` (C,), and `curves` (S, K, C): the normalised cost then. `clairvoyant` and `best_of_ten`
+    (1, K) are the normalised costs that it is held against. `lost_at_s` is when robots were lost.
     """
 
     method: Method

@@ -140,6 +140,8 @@ def costs_of(group: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
 def fly_group(group: FlightGroup) -> list[tuple[EvaluationFlight, SimulatedFlight]]:
     """The flights with all that they were like. Raises BundleError, ValueError, OSError."""
     bundle, scenarios = _bundle(group[0].bundle), [_scenario(flight) for flight in group]
+    if group[0].flier == POLICY and bundle.id != group[0].flown_by:
+        raise ValueError(f"{group[0].bundle}: is another bundle by now, or on this machine")
     if group[0].flier != POLICY:
         flown = [fly(scenario, bundle) for scenario in scenarios]
     else:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from ray.cluster_utils import Cluster
 
+from edge.policy.bundle import load_bundle
 from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
 from lpac.sim.cluster import over_ray
 from tests.conftest import SHIPPED
@@ -141,9 +142,10 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_cluster_of_two_nodes_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    bundle_id = load_bundle(SHIPPED).id
     flights = [
         EvaluationFlight(
-            flier=flier, bundle=str(SHIPPED), flown_by="the shipped one", world_set="validation",
+            flier=flier, bundle=str(SHIPPED), flown_by=bundle_id, world_set="validation",
             world=0, set_up="field", duration_s=1.0,
         )
         for flier in (POLICY, LLOYD)

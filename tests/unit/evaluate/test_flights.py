@@ -1,0 +1,93 @@
+"""Flights of an evaluation: those of its worlds, and kept."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge.policy.bundle import Bundle
+from lpac.evaluate.flights import (
+    LLOYD,
+    POLICY,
+    EvaluationFlight,
+    FlownCost,
+    KeptFlights,
+    LostRobots,
+    costs_of,
+    fly_group,
+)
+from lpac.evaluate.worlds import FIELD, draw_world
+from lpac.sim.cores import Outcome, Task
+from tests.conftest import SHIPPED
+
+
+def here(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+    """A pool of this process alone."""
+    for task in tasks:
+        yield do(task)
+
+
+@pytest.fixture(scope="module")
+def flight(shipped_bundle: Bundle) -> EvaluationFlight:
+    return EvaluationFlight(
+        flier=POLICY, bundle=str(SHIPPED), flown_by=shipped_bundle.id, world_set="training",
+        world=3, set_up="field", duration_s=1.0,
+    )  # fmt: skip
+
+
+def test_all_fly_over_the_sets_world(flight: EvaluationFlight) -> None:
+    world = draw_world("training", 3, FIELD)
+    for flier in (POLICY, "clairvoyant-cvt"):
+        [(_, flown)] = fly_group((dataclasses.replace(flight, flier=flier),))
+        assert flown.features == world.features
+        np.testing.assert_allclose(flown.positions_m[0] * 16.0, world.starts)
+        assert flown.scenario.seed == world.seed
+        assert flown.perception.communication_range == FIELD.communication_range
+
+
+def test_a_batch_tells_what_its_flights_tell(flight: EvaluationFlight) -> None:
+    group = (flight, dataclasses.replace(flight, loss=0.5), dataclasses.replace(flight, world=4))
+    assert costs_of(group) == [pair for one in group for pair in costs_of((one,))]
+
+
+def test_who_is_lost_does_not_count(flight: EvaluationFlight) -> None:
+    lost = dataclasses.replace(flight, lost=LostRobots(2, 0.5))
+    never = dataclasses.replace(flight, flier="clairvoyant-cvt", lost=LostRobots(2, 0.0))
+    [(_, whole), (_, of_lost)] = costs_of((flight, lost))
+    [(_, of_eight)] = costs_of((never,))
+    assert of_lost.cost[0] == whole.cost[0] < of_eight.cost[0]
+    assert of_lost.cost[-1] > whole.cost[-1]
+    [(_, flown)] = fly_group((never,))
+    assert flown.positions_m.shape[1] == 8
+
+
+def test_the_best_of_ten_is_no_more_than_clairvoyants(flight: EvaluationFlight) -> None:
+    best = costs_of((dataclasses.replace(flight, flier=LLOYD),))[0][1]
+    clairvoyant = costs_of((dataclasses.replace(flight, flier="clairvoyant-cvt"),))[0][1]
+    assert best.cost[0] == clairvoyant.cost[0] and best.cost[-1] < clairvoyant.cost[-1]
+
+
+def test_another_bundle_is_not_taken_for_it(flight: EvaluationFlight) -> None:
+    with pytest.raises(ValueError, match="is another bundle by now"):
+        costs_of((dataclasses.replace(flight, flown_by="0" * 64),))
+
+
+def test_what_was_flown_is_kept(flight: EvaluationFlight, tmp_path: Path) -> None:
+    first = dict(KeptFlights(tmp_path).fly([flight], here))
+
+    def refuse(do: object, tasks: Sequence[object]) -> Generator[Outcome, None, None]:
+        raise AssertionError(f"{tasks} were flown")
+        yield
+
+    assert dict(KeptFlights(tmp_path).fly([flight], refuse)) == first
+    # What another version of the code has flown does not count.
+    path = tmp_path / "flights.jsonl"
+    came_of, *lines = path.read_text().splitlines()
+    other = json.dumps({**json.loads(came_of), "code": "x"})
+    path.write_text("\n".join([other, *lines]) + "\n")
+    with pytest.raises(AssertionError, match="were flown"):
+        dict(KeptFlights(tmp_path).fly([flight], refuse))
+    assert first[flight] == FlownCost(*first[flight]) and len(first[flight].cost) == 2
