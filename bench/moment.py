@@ -16,6 +16,7 @@ from edge.robot.pac import Pac, PacParameters
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.medium import Medium
 from lpac.sim.swarm import pac_swarm
+from lpac.sim.ticks import Clocks
 
 NEIGHBOURS = 10
 # So many that robots in the middle have ten neighbours.
@@ -69,6 +70,7 @@ def moment_in_flight(policy: Policy) -> Moment:
             rng=rng,
         ),
         rng=rng,
+        clocks=Clocks(),
     )
     paths: list[F64] = []
     times_s = np.arange(0.0, _LATEST_S, _SAMPLE_S).tolist()

@@ -1,46 +1,64 @@
-"""The simulator with more and more robots at constant density."""
+"""The simulators of points with more and more robots at constant density, and the reference's."""
 
 import gc
 import math
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from time import perf_counter, process_time
 from typing import Any
 
-from bench import BUNDLE
+from bench import BUNDLE, CHECKPOINT
 from bench.memory import memory_mb
+from bench.reference_swarm import ReferenceSwarm, is_installed
 from bench.report import Report, Table, Target, progress
+from edge.core import F32, F64
 from edge.core.coverage import coverage_cost
+from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, load_bundle
-from lpac.sim.experiment import SAMPLE_S, Scenario, SimulatedFlight, fly
+from lpac.sim.batch import BatchedFlights
+from lpac.sim.experiment import SAMPLE_S, SAMPLES_PER_COST, Scenario, prepare
+from lpac.sim.experiment import fly as fly_exactly
 
+EXACT, BATCHED, REFERENCE = "exact", "batched", "CoverageControl"
+TWO_THREADS = "batched, 2 threads"
 # Of training: ten robots and ten features in one world.
 _ROBOTS_PER_WORLD = 10
 # (robots, simulated seconds, flights)
-_FLIGHTS = ((10, 30.0, 3), (100, 6.0, 1), (1000, 2.0, 1))
+_FLIGHTS = ((10, 30.0, 3), (100, 6.0, 3), (1000, 2.0, 1))
 # Robots see more of the world the longer they fly, so all are weighed at the same age.
 _MEMORY_AT_S = 2.0
+# The reference takes ten megabytes a robot and more, the larger the world; and beyond it a second
+# thread finds something to do.
+_MOST_REFERENCE_ROBOTS = 100
+
+# Called with the simulated time, from 0 to the flight's end.
+Note = Callable[[float], None]
 
 
 def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
     """Flights in processes of their own, one at a time; `flights` are robots, seconds, repeats."""
-    figures: dict[str, Any] = {}
+    figures: dict[str, dict[str, Any]] = {}
     with ProcessPoolExecutor(
         max_workers=1, max_tasks_per_child=1, mp_context=get_context("spawn")
     ) as processes:
         for robots, duration_s, repeats in flights:
             progress(f"scaling: {robots} robots, {duration_s:g} s, {repeats} times")
-            runs = [
-                processes.submit(_measure_flight, robots, duration_s, seed).result()
-                for seed in range(repeats)
-            ]
-            runs.sort(key=lambda run: float(run["real_time_factor"]))
-            figures[str(robots)] = runs[repeats // 2]
+            runs: dict[str, list[dict[str, float]]] = {name: [] for name in _simulators(robots)}
+            # In turn, so that whatever else the machine does meets all of them.
+            for seed in range(repeats):
+                for name, of_simulator in runs.items():
+                    flight = processes.submit(_measure_flight, name, robots, duration_s, seed)
+                    of_simulator.append(flight.result())
+            figures[str(robots)] = {
+                name: sorted(each, key=lambda run: run["cpu_ms_per_robot_s"])[repeats // 2]
+                for name, each in runs.items()
+            }
     rows = [
         (
             f"{robots}",
+            name,
             f"{run['world_size']}",
             f"{run['duration_s']:g}",
             f"{run['real_time_factor']:.2f}",
@@ -48,29 +66,25 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
             f"{run['memory_mb_per_robot']:.2f}",
             f"{100 * run['cost_evaluation_share']:.0f} %",
         )
-        for robots, run in figures.items()
+        for robots, runs_of in figures.items()
+        for name, run in runs_of.items()
     ]
     columns = (
-        "robots", "world", "simulated, s", "x real time", "CPU ms per robot and s",
+        "robots", "simulator", "world", "simulated, s", "x real time", "CPU ms per robot and s",
         f"MB per robot at {_MEMORY_AT_S:g} s", "cost J's share",
     )  # fmt: skip
-    smallest = figures[str(flights[0][0])]
     return Report(
         "scaling",
         figures,
-        [Table("Simulator at constant density, one core", columns, rows)],
+        [Table("Simulators of points at constant density", columns, rows)],
+        list(_targets(figures)),
         [
-            Target(
-                f"{flights[0][0]} robots: times real time",
-                smallest["real_time_factor"],
-                20.0,
-                at_least=True,
-            )
-        ],
-        [
-            "Field scale; the world's area and its features grow with the robots. Of several "
-            "flights the median. Real time leaves out making the world, but includes the coverage "
-            "cost J once a second; memory includes the world's raster, but not the program."
+            "One core each, but for two threads. Field scale (CoverageControl: its own, in which robots move a quarter as far); the "
+            "world's area and its features grow with the robots. Of several flights the median by "
+            "processor time. Times leave out making the world, but include the coverage cost J "
+            "once a second; memory includes the world's raster, but not the program. "
+            "CoverageControl's simulator with its LPAC in batched torch, which all robots ask at "
+            "once, five times a second."
         ],
     )
 
@@ -84,10 +98,35 @@ def world_for(bundle: Bundle, robots: int) -> Bundle:
     return replace(bundle, manifest=replace(bundle.manifest, perception=larger))
 
 
-def _measure_flight(robots: int, duration_s: float, seed: int) -> dict[str, float]:
-    bundle = world_for(load_bundle(BUNDLE), robots)
+def _simulators(robots: int) -> tuple[str, ...]:
+    if robots > _MOST_REFERENCE_ROBOTS:
+        return EXACT, BATCHED, TWO_THREADS
+    return (EXACT, BATCHED, *([REFERENCE] if is_installed() else []))
+
+
+def _targets(figures: dict[str, dict[str, Any]]) -> Iterator[Target]:
+    smallest = next(iter(figures))
+    for name, limit in ((EXACT, 20.0), (BATCHED, 30.0)):
+        factor = figures[smallest][name]["real_time_factor"]
+        yield Target(f"{smallest} robots, {name}: times real time", factor, limit, at_least=True)
+    for robots, of in figures.items():
+        if TWO_THREADS in of:
+            factor = of[TWO_THREADS]["real_time_factor"]
+            what = f"{robots} robots, {TWO_THREADS}: times real time"
+            yield Target(what, factor, 0.6, at_least=True)
+        if REFERENCE in of:
+            share = of[BATCHED]["cpu_ms_per_robot_s"] / of[REFERENCE]["cpu_ms_per_robot_s"]
+            what = f"{robots} robots, {BATCHED}: processor time over {REFERENCE}'s"
+            yield Target(what, share, 0.6, at_least=False)
+    memory_mb_per_robot = max(of[BATCHED]["memory_mb_per_robot"] for of in figures.values())
+    yield Target(f"{BATCHED}: MB per robot", memory_mb_per_robot, 1.0, at_least=False)
+
+
+def _measure_flight(name: str, robots: int, duration_s: float, seed: int) -> dict[str, float]:
+    bundle = load_bundle(BUNDLE)
+    fly = _FLY[name]
     # What the libraries allocate once is not the robots'.
-    fly(Scenario(robots=1, duration_s=1.0, random_feature_count=1), world_for(bundle, 1))
+    fly(Scenario(robots=2, duration_s=1.0, random_feature_count=1), world_for(bundle, 2), _no_note)
     gc.freeze()  # as `lpac sim` does
     empty_mb = memory_mb()["rss"]
     flying_mb = wall_s = cpu_s = 0.0
@@ -104,22 +143,78 @@ def _measure_flight(robots: int, duration_s: float, seed: int) -> dict[str, floa
     scenario = Scenario(
         robots=robots, seed=seed, duration_s=duration_s, random_feature_count=robots
     )
-    flight = fly(scenario, bundle, note)
+    larger = world_for(bundle, robots)
+    cost_s = fly(scenario, larger, note)
+    assert larger.manifest.perception
     return {
         "robots": robots,
-        "world_size": flight.perception.world_size,
+        "world_size": larger.manifest.perception.world_size,
         "duration_s": duration_s,
-        "real_time_factor": duration_s / wall_s,
-        "cpu_ms_per_robot_s": 1e3 * cpu_s / robots / duration_s,
+        "real_time_factor": duration_s / (wall_s + cost_s),
+        "cpu_ms_per_robot_s": 1e3 * (cpu_s + cost_s) / robots / duration_s,
         "memory_mb_per_robot": (flying_mb - empty_mb) / robots,
-        "cost_evaluation_share": _cost_evaluation_s(flight) / wall_s,
+        "cost_evaluation_share": cost_s / (wall_s + cost_s),
     }
 
 
-def _cost_evaluation_s(flight: SimulatedFlight) -> float:
-    """What evaluating J took in the flight, but for the one at its start."""
+def _no_note(time_s: float) -> None:
+    """Nobody looks."""
+
+
+def _fly_exactly(scenario: Scenario, bundle: Bundle, note: Note) -> float:
+    """Fly; returns what J once a second takes, s, which is not part of the noted time."""
+    flight = fly_exactly(scenario, bundle, note)
+    return _cost_s(scenario, flight.importance, flight.positions_m)
+
+
+def _fly_batched(scenario: Scenario, bundle: Bundle, note: Note) -> float:
+    return _fly_on(None, scenario, bundle, note)
+
+
+def _fly_on_two_threads(scenario: Scenario, bundle: Bundle, note: Note) -> float:
+    with ThreadPoolExecutor(1) as executor:
+        return _fly_on(executor, scenario, bundle, note)
+
+
+def _fly_on(executor: Executor | None, scenario: Scenario, bundle: Bundle, note: Note) -> float:
+    flights = BatchedFlights([scenario], bundle, executor)
+    [prepared] = flights.prepared
+    positions_m = []
+    for [moment] in flights.moments(prepared.times_s):
+        positions_m.append(moment.positions_m)
+        note(moment.time_s)
+    return _cost_s(scenario, prepared.importance, positions_m)
+
+
+def _fly_reference(scenario: Scenario, bundle: Bundle, note: Note) -> float:
+    prepared = prepare(scenario, bundle)
+    swarm = ReferenceSwarm(
+        bundle.manifest,
+        CHECKPOINT,
+        [each for each in prepared.features if isinstance(each, GaussianFeature)],
+        scenario.scale.position_to_model(prepared.starts_m),
+    )
+    note(0.0)
+    steps = round(scenario.duration_s / swarm.time_step_s)
+    for step in range(1, steps + 1):
+        swarm.step()
+        note(scenario.duration_s if step == steps else step * swarm.time_step_s)
     start_s = perf_counter()
-    for time_s in flight.cost_time_s[1:]:
-        positions_m = flight.positions_m[round(time_s / SAMPLE_S)]
-        coverage_cost(flight.importance, flight.scenario.scale.position_to_model(positions_m))
+    for _ in range(round(scenario.duration_s)):
+        swarm.cost()
     return perf_counter() - start_s
+
+
+def _cost_s(scenario: Scenario, importance: F32, positions_m: Sequence[F64] | F64) -> float:
+    start_s = perf_counter()
+    for each_m in positions_m[SAMPLES_PER_COST::SAMPLES_PER_COST]:
+        coverage_cost(importance, scenario.scale.position_to_model(each_m))
+    return perf_counter() - start_s
+
+
+_FLY = {
+    EXACT: _fly_exactly,
+    BATCHED: _fly_batched,
+    TWO_THREADS: _fly_on_two_threads,
+    REFERENCE: _fly_reference,
+}

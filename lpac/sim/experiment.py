@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,9 +18,10 @@ from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
-from lpac.sim.failure import Failure, alive_at
+from lpac.sim.failure import Failure, alive_at, require_possible
 from lpac.sim.medium import Medium
 from lpac.sim.swarm import ClockedPac, Swarm, pac_swarm
+from lpac.sim.ticks import Clocks
 from lpac.sim.vehicles import PointVehicles
 
 Controller = Literal["lpac"] | BaselineName
@@ -67,6 +68,7 @@ class Scenario:
     lag_s: float = 0.0
     position_bias: tuple[tuple[float, float], ...] | None = None
     failures: tuple[Failure, ...] = ()
+    clocks: Clocks = field(default_factory=Clocks)
 
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS:
@@ -95,13 +97,7 @@ class Scenario:
                 f"controller = {self.controller!r}: a baseline knows no failures and no position "
                 "bias"
             )
-        for failure in self.failures:
-            if not 0 <= failure.robot < self.robots:
-                raise ValueError(
-                    f"failures: robot {failure.robot}: must be from 0 to {self.robots - 1}"
-                )
-            if not alive_at(self.robots, self.failures, failure.from_s).any():
-                raise ValueError(f"failures: at {failure.from_s} s nobody is left")
+        require_possible(self.failures, self.robots)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -290,6 +286,7 @@ def fly(
             parameters=parameters,
             medium=prepared.medium,
             rng=prepared.clock_rng,
+            clocks=scenario.clocks,
             failures=scenario.failures,
             bias_m=prepared.bias_m,
             lag_s=scenario.lag_s,

@@ -1,7 +1,7 @@
 """Robots that fail in flight."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,3 +38,18 @@ def alive_at(robots: int, failures: Iterable[Failure], time_s: float) -> Bools:
         if failure.from_s <= time_s < failure.until_s:
             alive[failure.robot] = False
     return alive
+
+
+def require_possible(failures: Sequence[Failure], robots: int) -> None:
+    """Raise ValueError if a robot of no swarm of so many fails, or one twice, or all at once."""
+    for i, failure in enumerate(failures):
+        if not 0 <= failure.robot < robots:
+            raise ValueError(f"failures: robot {failure.robot}: must be from 0 to {robots - 1}")
+        for other in (*failures[:i], *failures[i + 1 :]):
+            if other.robot == failure.robot and other.from_s <= failure.from_s <= other.until_s:
+                raise ValueError(
+                    f"failures: robot {failure.robot} fails at {failure.from_s} s, when it has "
+                    "failed already"
+                )
+        if not alive_at(robots, failures, failure.from_s).any():
+            raise ValueError(f"failures: at {failure.from_s} s nobody is left")

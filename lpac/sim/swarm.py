@@ -61,7 +61,7 @@ class Swarm(Generic[_Robot]):
         vehicles: PointVehicles,
         medium: Medium,
         rng: np.random.Generator,
-        clocks: Clocks | None = None,
+        clocks: Clocks,
         failures: Sequence[Failure] = (),
         bias_m: F64 | None = None,
     ) -> None:
@@ -87,7 +87,7 @@ class Swarm(Generic[_Robot]):
             self._schedule(failure.from_s, partial(self._fail, failure.robot))
             if failure.until_s < math.inf:
                 self._schedule(failure.until_s, partial(self._come_back, failure.robot))
-        self._ticks = ticks(robots, clocks or Clocks(), rng)
+        self._ticks = ticks(robots, clocks, rng)
         self._next_tick = next(self._ticks)
 
     def run(self, times_s: Iterable[float]) -> Iterator[F64]:
@@ -209,6 +209,7 @@ def pac_swarm(
     parameters: PacParameters,
     medium: Medium,
     rng: np.random.Generator,
+    clocks: Clocks,
     failures: Sequence[Failure] = (),
     bias_m: F64 | None = None,
     lag_s: float = 0.0,
@@ -240,6 +241,7 @@ def pac_swarm(
         ),
         medium=medium,
         rng=rng,
+        clocks=clocks,
         failures=failures,
         bias_m=bias_m,
     )

@@ -1,6 +1,7 @@
 """When the loops of a swarm's robots tick."""
 
 import heapq
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -12,12 +13,22 @@ Loop = Literal["perception", "policy", "control"]
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods."""
+    """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods.
+
+    Raises ValueError that names what is impossible.
+    """
 
     perception_s: float = 0.2
     policy_s: float = 0.4
     control_s: float = 0.1
     jitter: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("perception_s", "policy_s", "control_s"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be positive and finite")
+        if not 0.0 <= self.jitter < 0.5:
+            raise ValueError(f"jitter = {self.jitter}: must be at least 0 and below 0.5")
 
 
 class LoopTick(NamedTuple):
@@ -44,7 +55,7 @@ def ticks(robots: int, clocks: Clocks, rng: np.random.Generator) -> Iterator[Loo
     ) -> tuple[float, int, float, float, Loop, int]:
         nonlocal order
         order += 1
-        lateness_s = clocks.jitter * period_s * rng.uniform(-1.0, 1.0)
+        lateness_s = clocks.jitter * period_s * (2.0 * rng.random() - 1.0)
         return max(due_s + lateness_s, now_s), order, due_s, period_s, loop, robot
 
     periods_s: tuple[tuple[Loop, float], ...] = (

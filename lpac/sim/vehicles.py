@@ -23,55 +23,53 @@ class PointVehicles:
         """
         if not 0.0 <= lag_s < math.inf:
             raise ValueError(f"lag_s = {lag_s}: must be at least 0 and finite")
-        self._start_m = positions_m.copy()
-        self._since_s = np.zeros(len(positions_m))
+        # (2, N) each, so that what is computed of all runs along the memory.
+        self._start_m = np.ascontiguousarray(positions_m.T)
         self._velocity_m_s = np.zeros_like(self._start_m)
-        self._world_size_m = world_size_m
-        self._lag_s = lag_s
         # What is left, of the velocity before, of its difference from the one that was told.
         self._excess_m_s = np.zeros_like(self._start_m)
+        self._since_s = np.zeros(len(positions_m))
+        self._world_size_m = world_size_m
+        self._lag_s = lag_s
         # The caller moves the time on, never back.
         self.now_s = 0.0
 
     def positions_m(self) -> F64:
         """Positions (N, 2) now."""
-        elapsed_s = (self.now_s - self._since_s)[:, None]
+        elapsed_s = self.now_s - self._since_s
         moved_m = self._start_m + self._velocity_m_s * elapsed_s
         if self._lag_s:
-            fading_s = -self._lag_s * np.expm1(-elapsed_s / self._lag_s)
-            moved_m += self._excess_m_s * fading_s
-        return self._held_inside(moved_m, self._start_m)
+            moved_m += self._excess_m_s * (-self._lag_s * np.expm1(-elapsed_s / self._lag_s))
+        return self._held_inside(moved_m, self._start_m).T
 
     def position_m(self, robot: int) -> F64:
         """Position (2,) of one vehicle now."""
-        start_m = self._start_m[robot]
+        start_m = self._start_m[:, robot]
         elapsed_s = self.now_s - self._since_s[robot]
-        moved_m = start_m + self._velocity_m_s[robot] * elapsed_s
+        moved_m = start_m + self._velocity_m_s[:, robot] * elapsed_s
         if self._lag_s:
-            fading_s = -self._lag_s * math.expm1(-elapsed_s / self._lag_s)
-            moved_m = moved_m + self._excess_m_s[robot] * fading_s
+            faded_s = -self._lag_s * np.expm1(-elapsed_s / self._lag_s)
+            moved_m += self._excess_m_s[:, robot] * faded_s
         return self._held_inside(moved_m, start_m)
 
     def velocity_m_s(self, robot: int) -> F64:
         """The velocity (2,) that one vehicle was told."""
-        velocity_m_s: F64 = self._velocity_m_s[robot]
-        return velocity_m_s
+        return self._velocity_m_s[:, robot]
 
     def fly(self, robot: int, velocity_m_s: F64) -> None:
         """From now on the vehicle is told `velocity_m_s` (2,)."""
-        self._start_m[robot] = self.position_m(robot)
+        self._start_m[:, robot] = self.position_m(robot)
         if self._lag_s:
-            elapsed_s = self.now_s - self._since_s[robot]
-            left = math.exp(-elapsed_s / self._lag_s)
-            before_m_s = self._velocity_m_s[robot] + self._excess_m_s[robot] * left
-            self._excess_m_s[robot] = before_m_s - velocity_m_s
+            left = math.exp(-(self.now_s - self._since_s[robot]) / self._lag_s)
+            before_m_s = self._velocity_m_s[:, robot] + self._excess_m_s[:, robot] * left
+            self._excess_m_s[:, robot] = before_m_s - velocity_m_s
         self._since_s[robot] = self.now_s
-        self._velocity_m_s[robot] = velocity_m_s
+        self._velocity_m_s[:, robot] = velocity_m_s
 
     def stop(self, robot: int) -> None:
         """The vehicle stands still at once."""
         self.fly(robot, np.zeros(2))
-        self._excess_m_s[robot] = 0.0
+        self._excess_m_s[:, robot] = 0.0
 
     def _held_inside(self, moved_m: F64, start_m: F64) -> F64:
         lowest_m = np.minimum(start_m, 0.0)

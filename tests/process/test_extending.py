@@ -17,6 +17,25 @@ GUIDE = (ROOT / "docs" / "extending.md").read_text()
 FILES = dict(re.findall(r"^`([\w./]+)`:\n\n```\w+\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL))
 [COMMANDS] = re.findall(r"^```sh\n(.*?)^```$", GUIDE, re.MULTILINE | re.DOTALL)
 
+# Both simulators of points, in worlds that differ.
+BATCH = """
+import json
+from pathlib import Path
+from edge.policy.bundle import load_bundle
+from lpac.sim.batch import fly_batch
+from lpac.sim.experiment import Scenario, fly
+from lpac.sim.failure import Failure
+
+bundle = load_bundle(Path("lloyd"))
+scenarios = [
+    Scenario(robots=4, duration_s=6.0, loss=0.3),
+    Scenario(robots=3, duration_s=8.0, failures=(Failure(0, 2.0, until_s=3.0),), lag_s=1.0),
+    Scenario(robots=2, duration_s=4.0, world_size=300, communication_range=200.0),
+]
+flights = zip(fly_batch(scenarios, bundle), scenarios)
+print(json.dumps([(a.positions_m == fly(b, bundle).positions_m).all().item() for a, b in flights]))
+"""
+
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -77,6 +96,13 @@ def test_it_flies(installed: Path, vehicle: str) -> None:
     curve = flight["cost_curve"]["normalized_cost"]
     assert max(curve) - min(curve) > 0.02, curve  # the policy took them somewhere
     assert all(robot["messages"]["accepted"] > 0 for robot in flight["fleet"])
+
+
+@pytest.mark.usefixtures("bundle")
+def test_it_flies_in_batches_as_it_does_alone(installed: Path) -> None:
+    flown = run(installed, "python", "-c", BATCH)
+    assert (flown.returncode, flown.stderr) == (0, "")
+    assert json.loads(flown.stdout) == [True, True, True]
 
 
 @pytest.mark.usefixtures("bundle")

@@ -10,6 +10,7 @@ from rich.console import Console
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
 from bench import closed_loop, policy, position, scaling
+from bench.reference_swarm import is_installed
 from bench.report import Report
 
 
@@ -43,8 +44,14 @@ def test_policy(tmp_path: Path) -> None:
 
 def test_scaling(tmp_path: Path) -> None:
     result = kept(scaling.measure([(1, 0.4, 1), (2, 0.4, 1)]), tmp_path)
-    check_frame(result, "scaling", targets=1)
-    assert [flight["world_size"] for flight in result["figures"].values()] == [162, 229]
+    simulators = {scaling.EXACT, scaling.BATCHED}
+    if is_installed():
+        simulators.add(scaling.REFERENCE)
+    check_frame(result, "scaling", targets=3 + 2 * (len(simulators) - 2))
+    for robots, world_size in ((1, 162), (2, 229)):
+        flights = result["figures"][str(robots)]
+        assert set(flights) == simulators
+        assert {flight["world_size"] for flight in flights.values()} == {world_size}
 
 
 def test_closed_loop(tmp_path: Path) -> None:

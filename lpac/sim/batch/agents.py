@@ -46,7 +46,7 @@ class Agents(Protocol):
         """What the policy takes of an observation, by name: new arrays, the same for all robots."""
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
-        """What n robots' policy makes of their inputs."""
+        """What n robots' policy makes of their inputs. The only one that any thread may call."""
 
     def step(
         self,
@@ -55,7 +55,7 @@ class Agents(Protocol):
         payloads: Sequence[Sequence[F32]],
         degrees: Sequence[int],
     ) -> PolicySteps:
-        """`Agent.step` of n robots, no one twice."""
+        """`Agent.step` of n robots, no one twice; payloads are float32, rounded as on the wire."""
 
     def reset(self, robot: int) -> None:
         """The robot's program starts anew: it forgets all."""

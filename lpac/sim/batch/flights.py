@@ -6,6 +6,7 @@ vehicles act is that of `lpac.sim.experiment.fly`, and so is what comes out, for
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
 
@@ -81,8 +82,13 @@ class WorldMoment:
 class BatchedFlights:
     """Flights of one bundle in several worlds, which may differ in everything else."""
 
-    def __init__(self, scenarios: Sequence[Scenario], bundle: Bundle) -> None:
-        """Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline."""
+    def __init__(
+        self, scenarios: Sequence[Scenario], bundle: Bundle, executor: Executor | None = None
+    ) -> None:
+        """An `executor` of one thread puts a second core to use, where robots are many.
+
+        Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline.
+        """
         for scenario in scenarios:
             if scenario.controller != "lpac":
                 raise ValueError(
@@ -93,7 +99,7 @@ class BatchedFlights:
             world.perception for world in self.prepared for _ in range(world.scenario.robots)
         ]
         self._deferred = DeferredSteps(
-            make_agents(bundle, perceptions), bundle.manifest.payload_limit
+            make_agents(bundle, perceptions), bundle.manifest.payload_limit, executor
         )
         firsts = np.cumsum([0, *(scenario.robots for scenario in scenarios)]).tolist()
         self.swarms = tuple(
@@ -126,13 +132,15 @@ class BatchedFlights:
 
     def _swarm(self, world: Preparation, first_agent: int) -> Swarm[BatchedRobot]:
         scenario, perception = world.scenario, world.perception
+        local_map = np.empty((perception.local_map_size,) * 2, np.float32)
         return Swarm(
-            boot=partial(self._boot, world, first_agent),
+            boot=partial(self._boot, world, local_map, first_agent),
             vehicles=PointVehicles(
                 world.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
             ),
             medium=world.medium,
             rng=world.clock_rng,
+            clocks=scenario.clocks,
             failures=scenario.failures,
             bias_m=world.bias_m,
         )
@@ -140,6 +148,7 @@ class BatchedFlights:
     def _boot(
         self,
         world: Preparation,
+        local_map: F32,
         first_agent: int,
         robot: int,
         boot_epoch: int,
@@ -159,6 +168,7 @@ class BatchedFlights:
             perception=world.perception,
             odometry=odometry,
             parameters=world.parameters,
+            local_map=local_map,
         )
 
 

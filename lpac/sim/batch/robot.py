@@ -7,6 +7,7 @@ leaves a `DeferredStep` to be computed later, together with others' (`DeferredSt
 
 from collections import defaultdict
 from collections.abc import Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -37,6 +38,8 @@ def _age_error_s() -> float:
 
 
 _AGE_ERROR_S = _age_error_s()
+# The number of steps whose features are computed together while the flight goes on.
+_AHEAD = 8
 
 
 class PolicyFailedError(ArithmeticError):
@@ -49,8 +52,8 @@ class DeferredStep:
 
     `heeded` are the ticks from which its neighbours' messages are. `rank` is how many others have
     to be computed first, one after another. `velocity` (2,) is None as long as it is not computed,
-    and `payload` (message_size,), as the neighbours receive it, undefined; `largest` is the largest
-    number in that.
+    and `payload` (message_size,), the numbers that the neighbours receive, undefined; `largest` is
+    the largest of these.
     """
 
     robot: "BatchedRobot"
@@ -66,24 +69,35 @@ class DeferredStep:
 class DeferredSteps:
     """The steps, of all robots of `agents`, that are not computed yet."""
 
-    def __init__(self, agents: Agents, payload_limit: float | None) -> None:
-        """`payload_limit` is that of the bundle's manifest."""
+    def __init__(
+        self, agents: Agents, payload_limit: float | None, executor: Executor | None
+    ) -> None:
+        """`payload_limit` is that of the bundle's manifest.
+
+        An `executor` computes features as soon as some are to be computed; without one, all that
+        there are are computed at once when the first is needed.
+        """
         self.agents = agents
         self._payload_limit = np.inf if payload_limit is None else payload_limit
+        self._executor = executor
         self._steps: list[DeferredStep] = []
+        # Of the first of them: what is being computed, _AHEAD steps each.
+        self._ahead: list[Future[list[F32]]] = []
 
     def add(self, step: DeferredStep) -> None:
+        """Compute it later."""
         self._steps.append(step)
+        if self._executor and len(self._steps) % _AHEAD == 0:
+            self._ahead.append(self._executor.submit(self._features, self._steps[-_AHEAD:]))
 
     def compute(self) -> None:
         """Compute them all. Raises PolicyFailedError."""
         steps, self._steps = self._steps, []
+        ahead, self._ahead = self._ahead, []
         if not steps:
             return
-        features = self.agents.features(
-            [step.robot.agent for step in steps],
-            [step.inputs for step in steps],
-        )
+        last = self._features(steps[len(ahead) * _AHEAD :])
+        features = [*(one for each in ahead for one in each.result()), *last]
         ranked = defaultdict(list)
         for i, step in enumerate(steps):
             ranked[step.rank].append(i)
@@ -93,6 +107,13 @@ class DeferredSteps:
             # What it was computed from would hold on to all that was before.
             step.inputs, step.heeded = {}, ()
 
+    def _features(self, steps: list[DeferredStep]) -> list[F32]:
+        if not steps:
+            return []
+        return self.agents.features(
+            [step.robot.agent for step in steps], [step.inputs for step in steps]
+        )
+
     def _step(self, steps: list[DeferredStep], features: list[F32]) -> None:
         velocities, payloads = self.agents.step(
             [step.robot.agent for step in steps],
@@ -100,7 +121,7 @@ class DeferredSteps:
             [[other.payload for other in step.heeded] for step in steps],
             [step.degree for step in steps],
         )
-        received = rounded(payloads, steps[0].payload.dtype)
+        received = rounded(payloads, "float16")
         largest = np.abs(received).max(axis=1, initial=0.0)
         if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
             raise PolicyFailedError(
@@ -145,8 +166,12 @@ class BatchedRobot:
         perception: PerceptionParameters,
         odometry: OdometrySource,
         parameters: PacParameters,
+        local_map: F32,
     ) -> None:
-        """`agent` is its number among those of `deferred`, which computes its policy."""
+        """`agent` is its number among those of `deferred`, which computes its policy.
+
+        `local_map` (local_map_size, local_map_size) is room that robots may share.
+        """
         self.agent = agent
         self._robot_id = robot_id
         self._boot_epoch = boot_epoch
@@ -155,9 +180,13 @@ class BatchedRobot:
         self._odometry = odometry
         self._parameters = parameters
         self._seen = SeenMap(importance, perception)
+        self._local_map = local_map
+        self._swap_clears = parameters.max_message_age_s == 0.0
         self._perceived: _Perceived | None = None
         self._action: DeferredStep | None = None
         self._action_s = 0.0
+        # The last action that was flown, and its velocity in the mission frame.
+        self._flown: tuple[DeferredStep, F64] | None = None
         self._sequence = 0
         self.largest_payload = 0.0
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
@@ -183,7 +212,10 @@ class BatchedRobot:
         neighbours = self._to_model(perceived.neighbours)
         near = neighbours_in_range(own, neighbours, perception.communication_range)
         return self._deferred.agents.inputs(
-            self.agent, Observation(position, self._seen.local_map(position), neighbours[near])
+            self.agent,
+            Observation(
+                position, self._seen.local_map(position, self._local_map), neighbours[near]
+            ),
         )
 
     def infer(self, now_s: float) -> _Said | None:
@@ -195,10 +227,13 @@ class BatchedRobot:
         if inputs is None:
             return None
         odometry, own = self._own()
-        heard = self.mailbox.neighbours(now_s)
+        # Where the swap takes nothing away, the neighbours are those whose messages it hands out.
+        heard = self.mailbox.neighbours(now_s) if self._swap_clears else ()
         messages = self.mailbox.swap(now_s)
         near = self._in_range(own, messages)
-        degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
+        degree = int(near.sum())
+        if heard:
+            degree = max(int(self._in_range(own, heard).sum()), degree)
         heeded = tuple(
             message.step
             for message, is_near in zip(messages, near.tolist(), strict=True)
@@ -211,7 +246,7 @@ class BatchedRobot:
             heeded,
             degree,
             max((other.rank + 1 for other in before if other.velocity is None), default=0),
-            np.empty(self._deferred.agents.message_size, self._parameters.payload),
+            np.empty(self._deferred.agents.message_size, np.float32),
         )
         self._deferred.add(step)
         self._action, self._action_s = step, now_s
@@ -234,11 +269,13 @@ class BatchedRobot:
         action = self._action
         if action is None or now_s - self._action_s > self._parameters.max_input_age_s:
             return None
-        assert action.velocity is not None
-        velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
-            action.velocity.astype(np.float64)
-        )
-        return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+        if self._flown is None or self._flown[0] is not action:
+            assert action.velocity is not None
+            velocity_m_s = self._parameters.scale.velocity_to_mission_m_s(
+                action.velocity.astype(np.float64)
+            )
+            self._flown = action, limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
+        return self._flown[1]
 
     def receive(self, message: _Message, now_s: float) -> None:
         """Put a neighbour's message into the mailbox."""

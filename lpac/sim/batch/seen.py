@@ -38,11 +38,14 @@ class SeenMap:
             x0, y0 = self._low
         self._seen[x.start - x0 : x.stop - x0, y.start - y0 : y.stop - y0] = True
 
-    def local_map(self, position: F64) -> F32:
-        """(local_map_size, local_map_size) around `position` (2,); outside the world 0."""
+    def local_map(self, position: F64, out: F32) -> F32:
+        """Fill `out` (local_map_size, local_map_size) around `position` (2,) and return it.
+
+        The outside of the world is 0.
+        """
         parameters = self._parameters
         size = parameters.local_map_size
-        out = np.zeros((size, size), np.float32)
+        out[:] = 0.0
         corner_x, corner_y = corner = window_corner(position, size)
         (x, y), in_window = part_in_world(corner, size, parameters.world_size)
         if parameters.unknown_importance:

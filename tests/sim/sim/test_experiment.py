@@ -10,6 +10,7 @@ from edge.core.frames import ModelScale
 from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, BundleError
 from lpac.sim.experiment import Controller, Scenario, SimulatedFlight, fly
+from lpac.sim.failure import Failure
 
 CONTROLLERS: tuple[Controller, ...] = (
     "lpac", "decentralized-cvt", "decentralized-cvt-prior", "shared-cvt", "shared-cvt-prior",
@@ -153,6 +154,20 @@ def test_what_the_swarm_does_depends_on_its_messages(shipped_bundle: Bundle) -> 
         ({"delay_s": -0.1}, "delay_s = -0.1"),
         ({"max_message_age_s": float("nan")}, "max_message_age_s = nan"),
         ({"starts_m": ((0.0, 0.0),)}, "starts_m: 1 positions for 4 robots"),
+        ({"position_bias": ((0.0, 0.0),)}, "position_bias: 1 positions for 4 robots"),
+        ({"random_feature_sigma": (9.0, 3.0)}, "random_feature_sigma = \\(9.0, 3.0\\)"),
+        ({"max_speed_m_s": 0.0}, "max_speed_m_s = 0.0: must be positive"),
+        ({"max_input_age_s": 0.0}, "max_input_age_s = 0.0: must be positive"),
+        ({"lag_s": -1.0}, "lag_s = -1.0"),
+        ({"world_size": 0}, "world_size = 0"),
+        ({"communication_range": -1.0}, "communication_range = -1.0"),
+        ({"failures": (Failure(4, 1.0),)}, "robot 4: must be from 0 to 3"),
+        ({"failures": (Failure(1, 1.0), Failure(1, 2.0, 3.0))}, "robot 1 fails at 2.0 s, when"),
+        ({"failures": tuple(Failure(i, 1.0) for i in range(4))}, "at 1.0 s nobody is left"),
+        (
+            {"failures": (Failure(1, 1.0),), "controller": "clairvoyant-cvt"},
+            "a baseline knows no failures",
+        ),
     ],
 )
 def test_impossible_scenarios_are_named(
@@ -160,6 +175,11 @@ def test_impossible_scenarios_are_named(
 ) -> None:
     with pytest.raises(ValueError, match=text):
         short(shipped_bundle, **change)
+
+
+def test_an_impossible_failure_is_named() -> None:
+    with pytest.raises(ValueError, match="robot 1: from_s = 2\\.0, until_s = 2\\.0: must be"):
+        Failure(1, 2.0, 2.0)
 
 
 @pytest.mark.parametrize("place", [(300.0, 180.0), (180.0, 300.0), (340.0, 256.0)])

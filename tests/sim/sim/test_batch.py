@@ -1,0 +1,242 @@
+"""The batched simulator, held to the exact one, which runs what a robot runs.
+
+Both have one event loop, and the same operations on the same numbers; onnxruntime computes a row of
+a batch as it computes it alone. So flights are equal to the last bit.
+"""
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edge.core.coverage import coverage_cost
+from edge.core.frames import ModelScale
+from edge.core.perception import PerceptionParameters, RobotMemory
+from edge.drivers.world_sensor import WorldSensor
+from edge.policy.bundle import Bundle
+from edge.policy.family import Perceived
+from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
+from lpac.sim.batch.agents import SingleAgents
+from lpac.sim.batch.seen import SeenMap
+from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly
+from lpac.sim.failure import Failure
+from lpac.sim.swarm import ClockedPac
+from lpac.sim.ticks import Clocks
+
+# Ten robots of which some fail, one comes back, with all that may go wrong at once.
+HARD = Scenario(
+    seed=5,
+    duration_s=6.0,
+    loss=0.3,
+    delay_s=0.15,
+    failures=(Failure(2, 2.0), Failure(3, 1.0, until_s=3.5)),
+    position_bias=((3.0, -4.0),) * 10,
+    lag_s=1.0,
+)
+
+
+def assert_same(one: SimulatedFlight, other: SimulatedFlight) -> None:
+    np.testing.assert_array_equal(one.positions_m, other.positions_m)
+    np.testing.assert_array_equal(one.cost, other.cost)
+    assert one.summary() == other.summary()
+    assert one.largest_payload == other.largest_payload
+
+
+def unknown_matters(bundle: Bundle, importance: float = 0.2) -> Bundle:
+    perception = bundle.manifest.perception
+    assert perception is not None
+    perception = dataclasses.replace(perception, unknown_importance=importance)
+    return dataclasses.replace(
+        bundle, manifest=dataclasses.replace(bundle.manifest, perception=perception)
+    )
+
+
+@st.composite
+def scenarios(draw: st.DrawFn) -> Scenario:
+    robots = draw(st.integers(1, 8))
+    failing = draw(st.lists(st.integers(0, robots - 1), max_size=robots - 1, unique=True))
+    duration_s = draw(st.floats(0.3, 3.0))
+    failures = []
+    for robot in failing:
+        from_s = draw(st.floats(0.0, 2.0))
+        lasts_s = draw(st.just(float("inf")) | st.floats(0.1, 2.0))
+        failures.append(Failure(robot, from_s, from_s + lasts_s))
+    offsets = st.floats(-30.0, 30.0)
+    world_size = draw(st.integers(100, 700))
+    return Scenario(
+        robots=robots,
+        seed=draw(st.integers(0, 2**32)),
+        duration_s=duration_s,
+        random_feature_count=draw(st.integers(0, 5)),
+        scale=draw(st.sampled_from([FIELD_SCALE, ModelScale(1.0, 1.0), ModelScale(8.0, 1.0)])),
+        loss=draw(st.sampled_from([0.0, 0.3, 1.0])),
+        delay_s=draw(st.sampled_from([0.0, 0.1, 0.7])),
+        max_message_age_s=draw(st.sampled_from([0.0, 0.5, 0.8, 2.0])),
+        max_input_age_s=draw(st.sampled_from([0.05, 1.0])),
+        random_feature_sigma=(20.0, 80.0),
+        world_size=world_size,
+        communication_range=draw(st.floats(50.0, 400.0)),
+        max_speed_m_s=draw(st.none() | st.floats(0.1, 3.0)),
+        lag_s=draw(st.sampled_from([0.0, 0.05, 1.3])),
+        position_bias=draw(
+            st.none()
+            | st.lists(st.tuples(offsets, offsets), min_size=robots, max_size=robots).map(tuple)
+        ),
+        failures=tuple(failures),
+        clocks=draw(st.sampled_from([Clocks(), Clocks(0.5, 0.1, 0.3, 0.4)])),
+    )
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.lists(scenarios(), min_size=1, max_size=3), st.sampled_from([0.0, 0.3]))
+def test_flights_are_those_of_the_exact_simulator(
+    shipped_bundle: Bundle, flown: list[Scenario], unknown: float
+) -> None:
+    bundle = unknown_matters(shipped_bundle, unknown)
+    for batched, scenario in zip(fly_batch(flown, bundle), flown, strict=True):
+        assert_same(batched, fly(scenario, bundle))
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        Scenario(seed=1, robots=6),
+        Scenario(seed=2, robots=6, loss=0.3),
+        Scenario(seed=3, robots=40, duration_s=5.0, world_size=1024, communication_range=128.0),
+        dataclasses.replace(HARD, duration_s=20.0),
+    ],
+    ids=["60 s", "60 s with loss", "the paper's density", "all at once"],
+)
+def test_long_and_large_flights_too(shipped_bundle: Bundle, scenario: Scenario) -> None:
+    [batched] = fly_batch([scenario], shipped_bundle)
+    assert_same(batched, fly(scenario, shipped_bundle))
+
+
+def test_worlds_of_a_batch_do_not_touch_one_another(shipped_bundle: Bundle) -> None:
+    flown = [HARD, Scenario(robots=3, duration_s=2.0), Scenario(seed=9, duration_s=4.05)]
+    together = fly_batch(flown, shipped_bundle)
+    for scenario, flight in zip(flown, together, strict=True):
+        assert_same(flight, *fly_batch([scenario], shipped_bundle))
+    assert fly_batch([], shipped_bundle) == []
+
+
+def test_agents_one_by_one_fly_the_same(
+    shipped_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What serves families that have no batches of their own."""
+    expected = fly_batch([HARD], shipped_bundle)
+    monkeypatch.setattr("lpac.sim.batch.flights.make_agents", SingleAgents)
+    assert_same(*fly_batch([HARD], shipped_bundle), *expected)
+
+
+def test_a_second_thread_changes_nothing(shipped_bundle: Bundle) -> None:
+    scenario = Scenario(robots=60, duration_s=2.0, world_size=1000, communication_range=128.0)
+    [expected] = fly_batch([scenario], shipped_bundle)
+    with ThreadPoolExecutor(1) as executor:
+        flights = BatchedFlights([scenario], shipped_bundle, executor)
+        [[moment]] = flights.moments([2.0])
+    np.testing.assert_array_equal(moment.positions_m, expected.positions_m[-1])
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), unknown=st.sampled_from([0.0, 0.25]), world_size=st.integers(8, 300))
+def test_what_was_seen_is_what_a_robot_remembers(
+    data: st.DataObject, unknown: float, world_size: int
+) -> None:
+    parameters = PerceptionParameters(world_size, 64, 16, 50.0, unknown)
+    importance = np.random.default_rng(0).random((world_size, world_size), np.float32)
+    coordinates = st.floats(-0.2 * world_size, 1.2 * world_size)
+    path = data.draw(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=12))
+    seen, memory = SeenMap(importance, parameters), RobotMemory(parameters)
+    sensor = WorldSensor(importance, parameters.sensor_size)
+    room = np.empty((64, 64), np.float32)
+    for place in map(np.array, path):
+        seen.observe(place)
+        memory.observe(place, sensor.view(place))
+        np.testing.assert_array_equal(seen.local_map(place, room), memory.local_map(place))
+
+
+def test_inputs_at_a_moment_are_what_robots_perceived(
+    shipped_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And to look at them changes nothing."""
+    latest: dict[int, Perceived] = {}
+    perceive = ClockedPac.perceive
+
+    def noted(pac: ClockedPac, now_s: float) -> Perceived | None:
+        perceived = perceive(pac, now_s)
+        assert perceived is not None
+        latest[pac._robot_id] = perceived
+        return perceived
+
+    monkeypatch.setattr(ClockedPac, "perceive", noted)
+    scenario = dataclasses.replace(HARD, duration_s=1.9)
+    expected = fly(scenario, shipped_bundle)
+    flights = BatchedFlights([scenario], shipped_bundle)
+    for [moment] in flights.moments(expected.time_s.tolist()):
+        inputs = moment.inputs()
+    np.testing.assert_array_equal(moment.positions_m, expected.positions_m[-1])
+    assert inputs.robots == (0, 1, 2, 4, 5, 6, 7, 8, 9)  # 3 has failed
+    assert inputs.arrays["images"].shape == (9, 4, 32, 32)
+    for name, values in inputs.arrays.items():
+        for robot, value in zip(inputs.robots, values, strict=True):
+            logged = latest[robot].inputs[name]
+            np.testing.assert_array_equal(value, logged.reshape(value.shape))
+
+
+def test_a_moment_tells_who_is_there(shipped_bundle: Bundle) -> None:
+    starts_m = ((16.0, 16.0), (20.0, 16.0), (16.0, 26.0), (17.0, 17.0))
+    scenario = Scenario(
+        robots=4, starts_m=starts_m, communication_range=128.0, failures=(Failure(3, 0.0),)
+    )
+    flights = BatchedFlights([scenario] * 2, shipped_bundle)
+    for moment in next(flights.moments([0.0])):
+        assert moment.alive.tolist() == [True, True, True, False]
+        assert np.argwhere(moment.adjacency).tolist() == [[0, 1], [1, 0]]
+        np.testing.assert_array_equal(moment.positions, np.array(starts_m) * 16.0)
+        assert moment.inputs().robots == ()
+
+
+def test_who_failed_stands_still_and_does_not_count(shipped_bundle: Bundle) -> None:
+    failures = (Failure(0, 2.0), Failure(1, 1.0, until_s=3.0))
+    scenario = Scenario(robots=4, duration_s=5.0, failures=failures)
+    [flight] = fly_batch([scenario], shipped_bundle)
+    at_s = flight.time_s
+    paths = flight.positions_m
+    assert np.all(paths[at_s >= 2.0, 0] == paths[-1, 0])
+    out = (at_s >= 1.0) & (at_s <= 3.0)
+    assert np.all(paths[out, 1] == paths[out, 1][0])
+    assert np.any(paths[-1, 1] != paths[out, 1][0])
+    for k, counted in ((0, [0, 1, 2, 3]), (1, [0, 2, 3]), (2, [2, 3]), (3, [1, 2, 3])):
+        [sample] = np.flatnonzero(np.isclose(at_s, k))
+        positions = FIELD_SCALE.position_to_model(paths[sample, counted])
+        assert flight.cost[k] == pytest.approx(coverage_cost(flight.importance, positions))
+
+
+def test_who_comes_back_has_forgotten_what_it_saw(shipped_bundle: Bundle) -> None:
+    """Its image is then that of a robot which knows little more than what its sensor shows."""
+    unknown = 1.5  # more than any cell's importance
+    bundle = unknown_matters(shipped_bundle, unknown)
+    perception = bundle.manifest.perception
+    assert perception is not None
+    starts_m = ((10.0, 10.0), (11.0, 10.0))
+    known = []
+    for failures in ((), (Failure(0, 6.0, until_s=6.5),)):
+        flown = Scenario(robots=2, duration_s=7.0, starts_m=starts_m, failures=failures)
+        for [moment] in BatchedFlights([flown], bundle).moments([6.8]):
+            importance, *_, outside = moment.inputs().arrays["images"][0]
+            share = np.mean(importance + unknown * outside < 0.9 * unknown)
+            known.append(share * perception.local_map_size**2)
+    assert known[1] < 2.0 * perception.sensor_size**2 < known[0]
+
+
+def test_what_it_does_not_fly_is_named(shipped_bundle: Bundle) -> None:
+    with pytest.raises(ValueError, match="controller = 'clairvoyant-cvt': in batches"):
+        fly_batch([Scenario(controller="clairvoyant-cvt")], shipped_bundle)
+    manifest = dataclasses.replace(shipped_bundle.manifest, payload_limit=1e-3)
+    narrow = dataclasses.replace(shipped_bundle, manifest=manifest)
+    with pytest.raises(PolicyFailedError, match="payload_limit"):
+        fly_batch([Scenario(duration_s=2.0)], narrow)
