@@ -22,9 +22,7 @@ from lpac.train.lpac import LpacModule, LpacNetwork, lpac_network
 from tests.conftest import ROOT, SHIPPED
 from tests.unit.export.reference_lpac import reference_lpac
 
-SMALL = LpacNetwork(
-    image_size=12, cnn_channels=(6, 6), features=6, layers=2, hops=2, width=8, mlp_width=5
-)
+SMALL = LpacNetwork(image_size=12, cnn_channels=(6, 6), features=6, layers=2, hops=2, width=8)
 MEAN, DEVIATION = np.array([0.1, -0.2], np.float32), np.array([1.5, 2.5], np.float32)
 
 
