@@ -7,7 +7,7 @@ import pytest
 from edge.core.schema import ConfigError
 from lpac.train.config import config_digest, read_config
 from tests.conftest import ROOT
-from tests.unit.train.small import SMALL, read
+from tests.training import SMALL, read
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from edge.policy.bundle import load_bundle
 from lpac.sim.cores import Outcome, Task
 from lpac.train.progress import RunProgress
 from lpac.train.run import TrainingRun
-from tests.unit.train.small import here, read, said
+from tests.training import here, read, said
 
 
 class StoppedError(Exception):
