@@ -18,7 +18,6 @@ from lpac.sim.cluster import over_ray
 from lpac.train.rollout import ShardTask, fly_shard, plan_round
 from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
-from tests.process.sim.test_evaluate import cluster as cluster
 from tests.training import SMALL, here, read, said
 
 # Shards enough to be killed between.

@@ -151,7 +151,7 @@ def test_the_best_of_lloyd_ends_below_the_clairvoyant(shipped_bundle: Bundle) ->
             for world in BatchedFlights(
                 [f.scenario for f in shard.flights], shipped_bundle
             ).prepared:
-                told = make_expert(replace(DATA, expert=expert), world)  # type: ignore[arg-type]
+                told = make_expert(replace(DATA, expert=expert), world)
                 positions = FIELD_SCALE.position_to_model(world.starts_m)
                 for _ in range(60):
                     positions = positions + 4.0 * told.velocities(positions, np.ones(10, np.bool_))
@@ -173,7 +173,7 @@ def test_the_coarse_raster_is_good_enough(shipped_bundle: Bundle) -> None:
         [world] = BatchedFlights([scenario], shipped_bundle).prepared
         np.testing.assert_array_equal(world.importance, importance)
         ours = make_expert(DATA, world)
-        exact = Expert(lambda p, i=importance: voronoi_cells(i, p).centroid, 5.0, 0.8)  # type: ignore[misc]
+        exact = Expert(lambda p, i=importance: voronoi_cells(i, p).centroid, 5.0, 0.8)
         everybody = np.ones(10, np.bool_)
         positions = rng.uniform(0, 512, (10, 2))
         by_exact = by_ours = positions
