@@ -79,12 +79,12 @@ def measure(flights: Sequence[tuple[int, float, int]] = _FLIGHTS) -> Report:
         [Table("Simulators of points at constant density", columns, rows)],
         list(_targets(figures)),
         [
-            "One core each, but for two threads. Field scale (CoverageControl: its own, in which robots move a quarter as far); the "
-            "world's area and its features grow with the robots. Of several flights the median by "
-            "processor time. Times leave out making the world, but include the coverage cost J "
-            "once a second; memory includes the world's raster, but not the program. "
-            "CoverageControl's simulator with its LPAC in batched torch, which all robots ask at "
-            "once, five times a second."
+            "One core each, but for two threads. Field scale (CoverageControl: its own, in which "
+            "robots move a quarter as far); the world's area and its features grow with the "
+            "robots. Of several flights the median by processor time. Times leave out making the "
+            "world, but include the coverage cost J once a second; memory includes the world's "
+            "raster, but not the program. CoverageControl's simulator with its LPAC in batched "
+            "torch, which all robots ask at once, five times a second."
         ],
     )
 

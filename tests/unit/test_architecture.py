@@ -44,11 +44,15 @@ ALLOWED = {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
         "lpac.fleet.writer", "lpac.fleet.authority",
     },
-    "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim"},
-    "lpac.train": {*_EDGE, "export", "lpac.analysis", "lpac.sim", "lpac.evaluate"},
+    # Nothing of the simulators needs it.
+    "lpac.sim.batch": {*_EDGE, "lpac.sim"},
+    "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
+    "lpac.train": {
+        *_EDGE, "export", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.evaluate",
+    },
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.evaluate", "lpac.train", "lpac.fleet",
+        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train", "lpac.fleet",
         "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip

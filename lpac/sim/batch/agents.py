@@ -15,8 +15,8 @@ from edge.policy.family import Observation, Perceived
 from edge.policy.lpac.images import PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 
-# The most robots in one batch of the CNN: beyond it is no faster, and its memory grows.
-_CNN_BATCH = 32
+# The most robots in one batch of the CNN: more are no faster, and take more memory.
+_CNN_BATCH = 8
 
 Inputs = Mapping[str, F32]
 

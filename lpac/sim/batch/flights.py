@@ -27,7 +27,7 @@ class PolicyInputs(NamedTuple):
     """What a world's robots decide by: arrays (n, ...) by name, of the n robots of `robots`.
 
     It is what each perceived last, which was up to a perception period ago. Robots that failed, or
-    have perceived nothing yet, are left out.
+    have perceived nothing for longer than `max_input_age_s`, are left out.
     """
 
     robots: tuple[int, ...]
