@@ -137,7 +137,7 @@ def _text(card: ModelCard) -> str:
 
 A policy of the family `{config.network.get("family", "lpac")}`, bundle `{card.bundle_id}`.
 Licence: {config.export.licence}. `{name}.pt` is the checkpoint, `{name}/` the bundle,
-`config.toml` what both were made of (sha256 of its content `{card.digest}`).
+`config.toml` what both were made of (digest `{card.digest}`).
 
 ## Data
 

@@ -26,8 +26,6 @@ from lpac.train.fit import Fit
 from lpac.train.progress import RunProgress, Work
 from lpac.train.rollout import PlannedShard, ShardTask, fly_shard, plan_round
 from lpac.train.select import (
-    BASELINES,
-    CLAIRVOYANT,
     Candidate,
     ClosedLoopCost,
     JudgedCandidate,
@@ -190,10 +188,7 @@ class TrainingRun:
         self._work.show("export", best.candidate.round)
         folder = self._of(best.candidate)
         judged = load_bundle(folder / _BUNDLE)
-        baselines = {
-            each: self._selection.baseline(each, folder / _BUNDLE, judged, pool)
-            for each in (*BASELINES, CLAIRVOYANT)
-        }
+        baselines = self._selection.baselines(folder / _BUNDLE, judged, pool)
         checkpoint = (folder / _CHECKPOINT).read_bytes()
         limit = _PAYLOAD_MARGIN * self._largest_payload(judged, pool)
         bundle = self._bundle(best.candidate, checkpoint, limit if limit > 0.0 else None)

@@ -121,7 +121,7 @@ class Selection:
         if any(judged.candidate == candidate for judged in self.judged):
             return
         begun_s = time.monotonic()
-        costs = self.fly(flights_of(self._select, POLICY, path, bundle.id), pool, tell)
+        costs = self._fly(flights_of(self._select, POLICY, path, bundle.id), pool, tell)
         self._kept.add(
             {
                 "candidate": list(candidate),
@@ -131,14 +131,20 @@ class Selection:
             }
         )
 
-    def baseline(
-        self, name: BaselineName, path: Path, bundle: Bundle, pool: Pool
-    ) -> ClosedLoopCost:
-        """A baseline over the same worlds, with the bundle's sizes."""
-        flights = flights_of(self._select, name, path, sizes_of(bundle))
-        return ClosedLoopCost.of(self.fly(flights, pool, lambda _: None))
+    def baselines(
+        self, path: Path, bundle: Bundle, pool: Pool
+    ) -> dict[BaselineName, ClosedLoopCost]:
+        """Over the same worlds, with the bundle's sizes."""
+        names = (*BASELINES, CLAIRVOYANT)
+        flights = [
+            flight
+            for name in names
+            for flight in flights_of(self._select, name, path, sizes_of(bundle))
+        ]
+        costs = self._fly(flights, pool, lambda _: None).reshape(len(names), -1)
+        return {name: ClosedLoopCost.of(of) for name, of in zip(names, costs, strict=True)}
 
-    def fly(self, flights: list[EvaluationFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
+    def _fly(self, flights: list[EvaluationFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
         """The cost of each at the end, over that at the start."""
         flown: dict[EvaluationFlight, float] = {}
         with closing(self._flights.fly(flights, pool)) as outcomes:
