@@ -175,7 +175,8 @@ class _Cnn(nn.Module):
         self.linear_1 = nn.Linear(inputs * side**2, network.features)
 
     def forward(self, images: Tensor) -> Tensor:
-        values = images
+        # A CPU is a fifth faster so.
+        values = images.contiguous(memory_format=torch.channels_last)
         for i in range(self._convolutions):
             values = self.get_submodule(f"conv{i}")(values)
             values = self.get_submodule(f"batch_norm{i}")(values)
