@@ -151,7 +151,17 @@ def read_checkpoint(path: Path) -> Checkpoint:
     a missing, unknown or misshapen tensor, one that is not of finite floating point numbers, and
     whatever is not an LPAC network at all.
     """
-    source = _read_folder(path) if path.is_dir() else _read_state_dict(path)
+    return _checkpoint(
+        _read_folder(path) if path.is_dir() else _state_dict(path, _read_bytes(path))
+    )
+
+
+def parse_checkpoint(content: bytes, name: str) -> Checkpoint:
+    """As `read_checkpoint`, of a file's content; errors say `name`. Raises CheckpointError."""
+    return _checkpoint(_state_dict(Path(name), content))
+
+
+def _checkpoint(source: _Source) -> Checkpoint:
     layers = max(_count(source, r"gnn_backbone\.graph_conv_(\d+)\..*"), 1)
     taps = _count_taps(source)
     convolutions = max(_count(source, r"cnn_backbone\.conv(\d+)\..*"), 1) if source.has_cnn else 0
@@ -205,8 +215,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
     return Checkpoint(Geometry(taps - 1, features), cnn, gnn, action, source.sha256)
 
 
-def _read_state_dict(path: Path) -> _Source:
-    content = _read_bytes(path)
+def _state_dict(path: Path, content: bytes) -> _Source:
     state = _load(content, path)
     if not isinstance(state, dict):
         raise CheckpointError(

@@ -1,6 +1,7 @@
 """From a checkpoint and its parameters to a bundle."""
 
 import hashlib
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,10 +12,10 @@ from edge.policy.family import TOLERANCE
 from edge.policy.lpac.images import MAP_CHANNELS
 from edge.policy.lpac.manifest import GOLDEN, Images, LpacManifest
 from edge.policy.lpac.policy import LpacPolicy
-from export.checkpoint import CheckpointError, read_checkpoint
+from export.checkpoint import Checkpoint, CheckpointError, read_checkpoint
 from export.golden import golden_vectors
 from export.graphs import OPSET, build_graphs
-from export.parameters import read_parameters
+from export.parameters import PolicyParameters, read_parameters
 
 
 def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -> Bundle:
@@ -28,6 +29,27 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     """
     network = read_checkpoint(checkpoint)
     trained = read_parameters(parameters)
+    # Hashes are sha256.
+    provenance = {
+        "checkpoint": checkpoint.name,
+        "checkpoint_sha256": network.sha256,
+        "parameters": parameters.name,
+        "parameters_sha256": hashlib.sha256(parameters.read_bytes()).hexdigest(),
+    }
+    try:
+        return bundle_of(network, trained, name or checkpoint.stem, provenance)
+    except CheckpointError as error:
+        raise CheckpointError(f"{checkpoint}: {error}") from None
+
+
+def bundle_of(
+    network: Checkpoint, trained: PolicyParameters, name: str, provenance: Mapping[str, str]
+) -> Bundle:
+    """The bundle of a network in memory; it has passed `verify` on this machine.
+
+    `provenance` says where the network came from; the exporter adds itself. Raises CheckpointError,
+    one line.
+    """
     files = {GOLDEN: golden_vectors(network), **build_graphs(network)}
     images = None
     if network.cnn:
@@ -38,16 +60,12 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
         )
     manifest = Manifest(
         schema=SCHEMA_VERSION,
-        name=name or checkpoint.stem,
+        name=name,
         perception=trained.perception if images else None,
         training=trained.training,
         payload_limit=trained.messages.payload_limit,
-        # Hashes are sha256.
         provenance={
-            "checkpoint": checkpoint.name,
-            "checkpoint_sha256": network.sha256,
-            "parameters": parameters.name,
-            "parameters_sha256": hashlib.sha256(parameters.read_bytes()).hexdigest(),
+            **provenance,
             "exporter": f"lpac-edge {version('lpac-edge')}",
             "torch": torch.__version__,
         },
@@ -58,7 +76,7 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
     for check in LpacPolicy(bundle).verify():
         if not check.passed:
             raise CheckpointError(
-                f"{checkpoint}: {check.name}: float32 rounding alone gives a relative error of "
+                f"{check.name}: float32 rounding alone gives a relative error of "
                 f"{check.relative_error:.1e}, allowed is {TOLERANCE:g}"
             )
     return bundle

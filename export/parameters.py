@@ -11,7 +11,7 @@ from edge.policy.bundle import Training
 
 
 @dataclass(frozen=True, slots=True)
-class _Messages:
+class PolicyMessages:
     """What robots take of each other: see `Manifest.payload_limit`."""
 
     payload_limit: float | None = None
@@ -23,7 +23,7 @@ class PolicyParameters:
 
     perception: PerceptionParameters
     training: Training
-    messages: _Messages = field(default_factory=_Messages)
+    messages: PolicyMessages = field(default_factory=PolicyMessages)
 
 
 def read_parameters(path: Path) -> PolicyParameters:

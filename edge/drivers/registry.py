@@ -7,7 +7,8 @@ A package adds a type by an entry point, named as the type, of the group of its 
 
 The groups are `lpac_edge.policies` (`edge.policy.family.PolicyFamily`), `lpac_edge.sensors`
 (`edge.core.ports.SensorDriver`), `lpac_edge.vehicles` (`edge.core.ports.VehicleDriver`) and
-`lpac_edge.links` (`edge.messages.topics.LinkDriver`).
+`lpac_edge.links` (`edge.messages.topics.LinkDriver`); on a workstation that trains also
+`lpac_edge.learnable` (`lpac.train.family.LearnableFamily`).
 """
 
 from collections.abc import Mapping
@@ -31,6 +32,7 @@ from edge.policy.family import Policy, PolicyFamily, VerifiedPolicy, verified
 
 _POLICIES, _SENSORS = "lpac_edge.policies", "lpac_edge.sensors"
 _VEHICLES, _LINKS = "lpac_edge.vehicles", "lpac_edge.links"
+_LEARNABLE = "lpac_edge.learnable"
 # What every installation has, and no package can replace.
 _BUILT_IN = {
     (entry.group, entry.name): entry
@@ -39,6 +41,7 @@ _BUILT_IN = {
         EntryPoint("world", "edge.drivers.world_sensor:world_sensor", _SENSORS),
         EntryPoint("px4", "edge.drivers.px4.driver:px4_vehicle", _VEHICLES),
         EntryPoint("zenoh", "edge.drivers.zenoh_link:zenoh_link", _LINKS),
+        EntryPoint("lpac", "lpac.train.lpac:lpac_network", _LEARNABLE),
     )
 }
 
@@ -55,6 +58,11 @@ def load_verified_policy(path: Path) -> VerifiedPolicy:
     if bundle.manifest.perception is None:
         raise BundleError(f"{path}: the bundle has no perception: it cannot fly")
     return verified(load_policy(bundle))
+
+
+def load_learnable(family: str) -> Any:
+    """The `LearnableFamily` of that name. Raises ConfigError for an unknown one."""
+    return _load(_LEARNABLE, family, "network: family")
 
 
 def open_sensor(

@@ -73,13 +73,9 @@ class Coverage:
         ends in a local minimum: other starts may come to less. It takes 0.5 s for 10 robots, 2 s
         for 30.
         """
-        sides = math.ceil(math.sqrt(_CELLS_PER_ROBOT * len(positions_m)))
-        coarse, cells = _shrink(self.importance, max(_COARSE_CELLS, sides))
-        cells_per_m = self.cells_per_m / cells
-        best = self.cost(positions_m)
-        for start in (positions_m * cells_per_m, *_random_starts(coarse, len(positions_m))):
-            best = min(best, self.cost(_lloyd(coarse, start) / cells_per_m))
-        return best
+        positions = positions_m * self.cells_per_m
+        ends = lloyd_ends(self.importance, positions, 1 + _RANDOM_STARTS)
+        return min(self.cost(each / self.cells_per_m) for each in (positions, *ends))
 
     def cells_m(self, positions_m: F64) -> list[list[tuple[float, float]]]:
         """Each robot's Voronoi cell within the world: its corners in order, m.
@@ -95,6 +91,23 @@ class Coverage:
         shrunk, _ = _shrink(self.importance, size)
         highest = max(float(shrunk.max()), 1e-9)
         return np.asarray(np.rint(shrunk * (255.0 / highest)), np.uint8)
+
+
+def coarse(importance: F32, robots: int) -> tuple[F32, float]:
+    """The importance in fewer cells, enough for so many robots; and how many old ones each has."""
+    sides = math.ceil(math.sqrt(_CELLS_PER_ROBOT * robots))
+    return _shrink(importance, max(_COARSE_CELLS, sides))
+
+
+def lloyd_ends(importance: F32, positions: F64, runs: int) -> list[F64]:
+    """Where `runs` of Lloyd's algorithm end, each (N, 2), in model units.
+
+    It knows the world. The first starts from `positions` (N, 2), the others at random, at the same
+    places each time; without any importance there is only the first.
+    """
+    shrunk, cells = coarse(importance, len(positions))
+    starts = (positions / cells, *_random_starts(shrunk, len(positions), runs - 1))
+    return [_lloyd(shrunk, start) * cells for start in starts]
 
 
 class Whereabouts:
@@ -160,13 +173,13 @@ def _shrink(importance: F32, most: int) -> tuple[F32, float]:
     return np.asarray(shares @ importance @ shares.T, np.float32), count / most
 
 
-def _random_starts(importance: F32, robots: int) -> list[F64]:
-    """Positions (robots, 2), in cells, drawn from the importance."""
+def _random_starts(importance: F32, robots: int, count: int) -> list[F64]:
+    """So many of positions (robots, 2), in cells, drawn from the importance."""
     weights = importance.ravel().astype(np.float64)
     if weights.sum() == 0.0:
         return []
     rng = np.random.default_rng(_SEED)
-    drawn = rng.choice(len(weights), (_RANDOM_STARTS, robots), p=weights / weights.sum())
+    drawn = rng.choice(len(weights), (count, robots), p=weights / weights.sum())
     cells = np.stack(np.unravel_index(drawn, importance.shape), axis=-1)
     # Within the cell, since of robots at one point only one would own anything.
     return list(cells + rng.random(cells.shape))

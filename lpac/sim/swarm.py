@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.mailbox import Mailbox
 from edge.core.ports import OdometrySource
 from edge.core.wire import Rejection
@@ -133,6 +133,13 @@ class Swarm(Generic[_Robot]):
     def positions_m(self) -> F64:
         """The true positions (N, 2) now."""
         return self._vehicles.positions_m()
+
+    @property
+    def alive(self) -> Bools:
+        """(N,): who has not failed now."""
+        alive = np.ones(len(self.robots), np.bool_)
+        alive[list(self._failed)] = False
+        return alive
 
     @property
     def largest_payload(self) -> float:

@@ -47,19 +47,21 @@ ALLOWED = {
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
+    "lpac.train": {
+        *_EDGE, "export", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.evaluate",
+    },
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.fleet",
-        "lpac.fleet.settings",
-        "lpac.fleet.writer", "lpac.fleet.authority",
+        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train", "lpac.fleet",
+        "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
 ONLY_IN = {
     "onnxruntime": {"edge/policy/lpac/graphs.py"},
-    "torch": {"export/"},
+    "torch": {"export/", "lpac/train/"},
     "onnx": {"export/"},
-    "matplotlib": {"lpac/sim/", "lpac/analysis/", "lpac/evaluate/"},
+    "matplotlib": {"lpac/sim/", "lpac/analysis/", "lpac/evaluate/", "lpac/train/"},
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
     "mcap": {"edge/drivers/"},

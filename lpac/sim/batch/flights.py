@@ -5,7 +5,7 @@ worlds wait, what has gathered is computed in batches. The order in which robots
 vehicles act is that of `lpac.sim.experiment.fly`, and so is what comes out, for the same seed.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F32, F64, Bools
+from edge.core.perception import PerceptionParameters
 from edge.core.ports import OdometrySource
 from edge.policy.bundle import Bundle
-from lpac.sim.batch.agents import make_agents
+from lpac.sim.batch.agents import Agents, make_agents
 from lpac.sim.batch.robot import BatchedRobot, DeferredSteps
 from lpac.sim.experiment import Preparation, Scenario, SimulatedFlight, prepare
-from lpac.sim.failure import alive_at
 from lpac.sim.swarm import Swarm
 from lpac.sim.vehicles import PointVehicles
 
@@ -52,8 +52,7 @@ class WorldMoment:
     @property
     def alive(self) -> Bools:
         """(N,): who has not failed."""
-        scenario = self.prepared.scenario
-        return alive_at(scenario.robots, scenario.failures, self.time_s)
+        return self._swarm.alive
 
     @property
     def adjacency(self) -> Bools:
@@ -83,9 +82,15 @@ class BatchedFlights:
     """Flights of one bundle in several worlds, which may differ in everything else."""
 
     def __init__(
-        self, scenarios: Sequence[Scenario], bundle: Bundle, executor: Executor | None = None
+        self,
+        scenarios: Sequence[Scenario],
+        bundle: Bundle,
+        executor: Executor | None = None,
+        agents: Callable[[Bundle, Sequence[PerceptionParameters]], Agents] = make_agents,
     ) -> None:
         """An `executor` of one thread puts a second core to use, where robots are many.
+
+        `agents` makes who decides, for all robots of all worlds in their order.
 
         Raises BundleError and ConfigError as `load_policy`; ValueError, also for a baseline.
         """
@@ -99,7 +104,7 @@ class BatchedFlights:
             world.perception for world in self.prepared for _ in range(world.scenario.robots)
         ]
         self._deferred = DeferredSteps(
-            make_agents(bundle, perceptions), bundle.manifest.payload_limit, executor
+            agents(bundle, perceptions), bundle.manifest.payload_limit, executor
         )
         firsts = np.cumsum([0, *(scenario.robots for scenario in scenarios)]).tolist()
         self.swarms = tuple(

@@ -5,10 +5,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -41,17 +39,6 @@ def test_flights_over_cores_hold_what_is_promised(
 ) -> None:
     assert flown.keys() == {("landed", 0), ("landed", 1), ("ground-dies", 0), ("ground-dies", 1)}
     assert all(outcome.held for outcome in flown.values())
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
-    """Two nodes on this machine."""
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    head = {"num_cpus": 1, "include_dashboard": False}
-    nodes: Any = Cluster(initialize_head=True, head_node_args=head)
-    nodes.add_node(num_cpus=1)
-    yield nodes
-    nodes.shutdown()
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")

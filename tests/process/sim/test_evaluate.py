@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -126,18 +125,6 @@ def test_whether_one_is_better(tmp_path: Path) -> None:
     told = json.loads((tmp_path / "evaluation.json").read_text())
     assert told["test_set_opened"].keys() == {"date", "bundle_ids", "worlds"}
     assert told["conditions"][0]["compared"]["better"] == "a"
-
-
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
-    """Two nodes on this machine."""
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    nodes: Any = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
-    )
-    nodes.add_node(num_cpus=1)
-    yield nodes
-    nodes.shutdown()
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")

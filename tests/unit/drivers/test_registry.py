@@ -7,6 +7,7 @@ import pytest
 from edge.core.ports import VehicleSetting
 from edge.core.schema import ConfigError
 from edge.drivers.registry import (
+    load_learnable,
     load_policy,
     load_verified_policy,
     open_link,
@@ -31,7 +32,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     metadata = tmp_path / "added_here-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: added-here\nVersion: 1.0\n")
-    groups = ("sensors", "vehicles", "links", "policies")
+    groups = ("sensors", "vehicles", "links", "policies", "learnable")
     (metadata / "entry_points.txt").write_text(
         "".join(
             f"[lpac_edge.{group}]\nadded = added_here:opened\nbroken = added_here:missing\n"
@@ -51,6 +52,7 @@ def test_a_package_adds_types(shipped_bundle: Bundle) -> None:
     with open_sensor("added", {"mast_m": 2.0}, shipped_bundle.manifest) as setting:
         assert setting.options == {"mast_m": 2.0}  # type: ignore[attr-defined]
         assert setting.perception.sensor_size == 64  # type: ignore[attr-defined]
+    assert load_learnable("added")(VEHICLE).__enter__() == VEHICLE
 
 
 @pytest.mark.usefixtures("package")

@@ -1,6 +1,8 @@
 """The reference implementation of the network, for tests only: CoverageControl's LPAC (GPL)."""
 
+import gc
 import sys
+import warnings
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.machinery import PathFinder
@@ -11,6 +13,12 @@ import pytest
 import torch
 
 _PACKAGE = "tests_reference_lpac"
+
+# Loaded before any test runs: it tries a socket, and leaves it to the garbage collector.
+with warnings.catch_warnings(action="ignore", category=ResourceWarning):
+    if PathFinder.find_spec("torch_geometric") is not None:
+        import_module("torch_geometric")
+    gc.collect()
 
 
 def reference_lpac(state: Mapping[str, torch.Tensor], image_size: int) -> torch.nn.Module:

@@ -1,0 +1,1 @@
+"""From a configuration to a policy: generate, fit, DAgger rounds, select, export."""

@@ -1,0 +1,242 @@
+"""The paper's family as one that is trained: CNN, aggregated graph neural network, MLP.
+
+The state dict has the tensors that CoverageControl's LPAC module has, by their names: it loads
+there if all convolutions have as many channels as the CNN puts out features, and the four maps.
+"""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from edge.core import F32
+from edge.core.schema import from_mapping
+from edge.policy.bundle import Bundle
+from edge.policy.lpac.images import MAP_CHANNELS
+from export.checkpoint import (
+    ACTION_SIZE,
+    BATCH_NORM_EPS,
+    LEAKY_RELU_SLOPE,
+    POSITION_SIZE,
+    parse_checkpoint,
+)
+from export.exporter import bundle_of
+from export.parameters import PolicyParameters
+from lpac.train.family import Inputs, StateDict
+
+# What changes its sign, or its place, where the world is mirrored.
+_NEIGHBOURS = ("neighbours_x", "neighbours_y")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LpacNetwork:
+    """Sizes of the network: see `Learnable`.
+
+    `channels` are the images that the CNN sees, `image_size` wide; `cnn_channels` those of each
+    convolution, `kernel` wide. Then `layers` (L) of `hops` (K), `width` wide, and an MLP of
+    `mlp_layers` layers `mlp_width` wide.
+
+    Raises ValueError that names what is impossible.
+    """
+
+    channels: tuple[str, ...] = MAP_CHANNELS[4]
+    image_size: int = 32
+    cnn_channels: tuple[int, ...] = (32, 32, 32)
+    kernel: int = 3
+    features: int = 32
+    layers: int = 2
+    hops: int = 3
+    width: int = 256
+    mlp_width: int = 32
+    mlp_layers: int = 2
+
+    def __post_init__(self) -> None:
+        if self.channels not in MAP_CHANNELS.values():
+            allowed = " or ".join(", ".join(names) for names in MAP_CHANNELS.values())
+            raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
+        if not self.cnn_channels or min(self.cnn_channels) < 1:
+            raise ValueError(f"cnn_channels = {self.cnn_channels}: must be one or more, above 0")
+        for name in ("image_size", "kernel", "features", "layers", "hops", "width", "mlp_width"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.mlp_layers < 2:
+            raise ValueError(f"mlp_layers = {self.mlp_layers}: must be at least 2")
+        if self._side < 1:
+            raise ValueError(
+                f"image_size = {self.image_size}: must be above {self.image_size - self._side}, "
+                "what the convolutions take off"
+            )
+
+    @property
+    def _side(self) -> int:
+        """Of the images that the last convolution puts out."""
+        return self.image_size - len(self.cnn_channels) * (self.kernel - 1)
+
+    def module(self, actions_mean: F32, actions_std: F32) -> "LpacModule":
+        """See `Learnable`."""
+        return LpacModule(self, self._side, actions_mean, actions_std)
+
+    def symmetric(self, inputs: Inputs, velocities: F32, turned: int) -> tuple[Inputs, F32]:
+        """See `Learnable`; bit 0 mirrors x, bit 1 mirrors y, bit 2 swaps the two."""
+        images, position = inputs["images"], inputs["position_feature"]
+        plane = {name: self.channels.index(name) for name in _NEIGHBOURS if name in self.channels}
+        for axis in range(2):
+            if turned & 1 << axis:
+                images = np.flip(images, 2 + axis).copy()
+                # Features are symmetric about 1.
+                position, velocities = position.copy(), velocities.copy()
+                position[:, axis] = 2.0 - position[:, axis]
+                velocities[:, axis] *= -1.0
+                if plane:
+                    images[:, plane[_NEIGHBOURS[axis]]] *= -1.0
+        if turned & 4:
+            images = images.swapaxes(2, 3)
+            order = list(range(len(self.channels)))
+            if plane:
+                x, y = (plane[name] for name in _NEIGHBOURS)
+                order[x], order[y] = y, x
+            images = images[:, order]
+            position, velocities = position[:, ::-1], velocities[:, ::-1]
+        turned_inputs = {
+            "images": np.ascontiguousarray(images),
+            "position_feature": np.ascontiguousarray(position),
+        }
+        return turned_inputs, np.ascontiguousarray(velocities)
+
+    def checkpoint(self, state: StateDict) -> bytes:
+        """See `Learnable`; what `torch.load` reads."""
+        buffer = io.BytesIO()
+        torch.save({name: tensor.detach().cpu() for name, tensor in state.items()}, buffer)
+        return buffer.getvalue()
+
+    def bundle(
+        self,
+        checkpoint: bytes,
+        parameters: PolicyParameters,
+        name: str,
+        provenance: Mapping[str, str],
+    ) -> Bundle:
+        """See `Learnable`."""
+        network = parse_checkpoint(checkpoint, name)
+        return bundle_of(
+            network, parameters, name, {"checkpoint_sha256": network.sha256, **provenance}
+        )
+
+
+def lpac_network(network: Mapping[str, object], where: str) -> LpacNetwork:
+    """See `LearnableFamily`."""
+    return from_mapping(LpacNetwork, network, where)
+
+
+class LpacModule(nn.Module):
+    """See `TrainableModule`; what `export.network.centralised` computes, for training."""
+
+    actions_mean: Tensor
+    actions_std: Tensor
+
+    def __init__(
+        self, network: LpacNetwork, side: int, actions_mean: F32, actions_std: F32
+    ) -> None:
+        super().__init__()
+        self.register_buffer("actions_mean", torch.from_numpy(actions_mean.copy()))
+        self.register_buffer("actions_std", torch.from_numpy(actions_std.copy()))
+        self.cnn_backbone = _Cnn(network, side)
+        self.gnn_backbone = _Gnn(network)
+        self.gnn_mlp = _Mlp(network)
+        self.output_linear = nn.Linear(network.mlp_width, ACTION_SIZE)
+
+    def forward(self, inputs: Mapping[str, Tensor], shift: Tensor, present: Tensor) -> Tensor:
+        """See `TrainableModule`."""
+        features = torch.cat(
+            [self.cnn_backbone(inputs["images"]), inputs["position_feature"]], dim=1
+        )
+        swarms = features.new_zeros(*present.shape, features.shape[1])
+        swarms[present] = features
+        values = self.gnn_backbone(swarms, shift)[present]
+        actions: Tensor = self.output_linear(self.gnn_mlp(values)).float()
+        return actions * self.actions_std + self.actions_mean
+
+
+class _Cnn(nn.Module):
+    def __init__(self, network: LpacNetwork, side: int) -> None:
+        super().__init__()
+        self._convolutions = len(network.cnn_channels)
+        inputs = len(network.channels)
+        for i, outputs in enumerate(network.cnn_channels):
+            self.add_module(f"conv{i}", nn.Conv2d(inputs, outputs, network.kernel))
+            self.add_module(f"batch_norm{i}", nn.BatchNorm2d(outputs, eps=BATCH_NORM_EPS))
+            inputs = outputs
+        self.linear_1 = nn.Linear(inputs * side**2, network.features)
+
+    def forward(self, images: Tensor) -> Tensor:
+        # A CPU is a fifth faster so.
+        values = images.contiguous(memory_format=torch.channels_last)
+        for i in range(self._convolutions):
+            values = self.get_submodule(f"conv{i}")(values)
+            values = self.get_submodule(f"batch_norm{i}")(values)
+            values = functional.leaky_relu(values, LEAKY_RELU_SLOPE)
+        return functional.leaky_relu(self.linear_1(values.flatten(1)), LEAKY_RELU_SLOPE)
+
+
+class _Gnn(nn.Module):
+    def __init__(self, network: LpacNetwork) -> None:
+        super().__init__()
+        inputs = network.features + POSITION_SIZE
+        self._layers = network.layers
+        for i in range(network.layers):
+            self.add_module(f"graph_conv_{i}", _GraphLayer(network.hops, inputs, network.width))
+            inputs = network.width
+
+    def forward(self, swarms: Tensor, shift: Tensor) -> Tensor:
+        for i in range(self._layers):
+            swarms = self.get_submodule(f"graph_conv_{i}")(swarms, shift)
+        return swarms
+
+
+class _GraphLayer(nn.Module):
+    """z_l of K hops, and ReLU."""
+
+    def __init__(self, hops: int, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.lins = nn.ModuleList(nn.Linear(inputs, outputs, bias=False) for _ in range(hops + 1))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def forward(self, swarms: Tensor, shift: Tensor) -> Tensor:
+        hop, values = swarms, self.bias
+        for k, tap in enumerate(self.lins):
+            if k:
+                hop = shift @ hop
+            values = values + tap(hop)
+        return values.relu()
+
+
+class _Norm(nn.Module):
+    """The state dict calls it so."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.module = nn.BatchNorm1d(size, eps=BATCH_NORM_EPS)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return cast(Tensor, self.module(values))
+
+
+class _Mlp(nn.Module):
+    """Linear layers, with batch norm and ReLU between them."""
+
+    def __init__(self, network: LpacNetwork) -> None:
+        super().__init__()
+        sizes = [network.width, *[network.mlp_width] * network.mlp_layers]
+        self.lins = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(sizes))
+        self.norms = nn.ModuleList(_Norm(network.mlp_width) for _ in range(network.mlp_layers - 1))
+
+    def forward(self, values: Tensor) -> Tensor:
+        for linear, norm in zip(self.lins, self.norms, strict=False):
+            values = norm(linear(values)).relu()
+        return cast(Tensor, self.lins[-1](values))

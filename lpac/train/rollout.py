@@ -1,0 +1,304 @@
+"""Flights that make data: what robots perceive in the batched simulator, and what the expert says.
+
+Which flights, and all that is random in them, follows from the configuration, the round and the
+flight's number. Processes fly them, a shard at a time: this module loads no torch.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from edge.core import F32, F64, Bools
+from edge.core.perception import PerceptionParameters
+from edge.policy.bundle import Bundle
+from edge.policy.family import Observation
+from lpac.evaluate.worlds import SetUp, draw_world
+from lpac.sim.batch import BatchedFlights, PolicyFailedError, WorldMoment
+from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
+from lpac.sim.experiment import Scenario
+from lpac.sim.failure import Failure
+from lpac.train.config import DaggerConfig, DataConfig, Disturbances
+from lpac.train.expert import Expert, make_expert
+
+# Of one shard: larger batches of the simulator are no faster, and a kill costs one.
+_ROBOTS_TOGETHER = 40
+# Each training seed has worlds of its own, of the training set's.
+_WORLDS_PER_SEED = 1_000_000
+# By then all robots have perceived.
+_FIRST_STATE_S = 0.5
+
+
+class PlannedFlight(NamedTuple):
+    """A flight, and whether the expert flies it, or the policy."""
+
+    scenario: Scenario
+    by_expert: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedShard:
+    """Flights whose states are kept together, those at `times_s`."""
+
+    name: str
+    flights: tuple[PlannedFlight, ...]
+    times_s: tuple[float, ...]
+    data: DataConfig
+
+
+class ShardTask(NamedTuple):
+    """A shard to fly; the bundle says what is perceived, and flies if the expert does not."""
+
+    shard: PlannedShard
+    bundle: Bundle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class States:
+    """S states of swarms, in all of R robots; those that had failed are left out.
+
+    `inputs` (R, ...) by name, images as float16; `velocities` (R, 2) are the expert's, in model
+    units/s; `robots` (S,) says how many robots each state has, and `adjacency` (sum of their
+    squares,) who is in range of whom, row by row. `largest_payload` is that of the flights.
+    """
+
+    inputs: dict[str, npt.NDArray[np.floating]]
+    velocities: F32
+    robots: npt.NDArray[np.int32]
+    adjacency: Bools
+    largest_payload: float
+
+
+def plan_round(
+    data: DataConfig, dagger: DaggerConfig, seed: int, round_: int
+) -> list[PlannedShard]:
+    """The shards of a round; the expert alone flies round 0."""
+    flights = data.flights if round_ == 0 else dagger.flights
+    first = 0 if round_ == 0 else data.flights + (round_ - 1) * dagger.flights
+    duration_s = data.duration_s if round_ == 0 else dagger.duration_s
+    experts = flights if round_ == 0 else round(dagger.expert_flights * flights)
+    shards: list[list[PlannedFlight]] = [[]]
+    for number in range(flights):
+        scenario = _draw_flight(data, duration_s, seed, first + number)
+        robots = sum(flight.scenario.robots for flight in shards[-1])
+        if shards[-1] and robots + scenario.robots > _ROBOTS_TOGETHER:
+            shards.append([])
+        shards[-1].append(PlannedFlight(scenario, number < experts))
+    return [
+        PlannedShard(
+            name=f"{round_:02d}-{number:04d}",
+            flights=tuple(shard),
+            times_s=_draw_times_s(data.states, duration_s, [seed, round_, number]),
+            data=data,
+        )
+        for number, shard in enumerate(shards)
+    ]
+
+
+def _draw_times_s(states: int, duration_s: float, seed: list[int]) -> tuple[float, ...]:
+    """One in each of so many parts of the flight, all as long."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed))
+    edges = np.linspace(_FIRST_STATE_S, duration_s, states + 1)
+    return tuple(rng.uniform(edges[:-1], edges[1:]).tolist())
+
+
+def _draw_flight(data: DataConfig, duration_s: float, seed: int, number: int) -> Scenario:
+    rng = np.random.default_rng(np.random.SeedSequence([seed, number]))
+    weights = np.array([worlds.weight for worlds in data.worlds])
+    worlds = data.worlds[int(rng.choice(len(weights), p=weights / weights.sum()))]
+    least, most = worlds.sigma
+    set_up = SetUp(
+        robots=_integer(rng, worlds.robots),
+        world_size=_integer(rng, worlds.world_size),
+        communication_range=_uniform(rng, worlds.communication_range),
+        features=_integer(rng, worlds.features),
+        sigma=(least, most),
+    )
+    world = draw_world("training", seed * _WORLDS_PER_SEED + number, set_up)
+    starts_m = data.scale.position_to_mission_m(np.array(world.starts)).tolist()
+    wrong = data.disturbances
+    bias = rng.normal(0.0, _uniform(rng, wrong.position_bias), (set_up.robots, 2)).tolist()
+    return Scenario(
+        robots=set_up.robots,
+        seed=world.seed,
+        duration_s=duration_s,
+        features=world.features,
+        starts_m=tuple((x_m, y_m) for x_m, y_m in starts_m),
+        scale=data.scale,
+        clocks=data.clocks,
+        world_size=set_up.world_size,
+        communication_range=set_up.communication_range,
+        loss=_uniform(rng, wrong.loss),
+        delay_s=_uniform(rng, wrong.delay_s),
+        lag_s=_uniform(rng, wrong.lag_s),
+        position_bias=tuple((x, y) for x, y in bias),
+        failures=tuple(_draw_failures(wrong, set_up.robots, duration_s, rng)),
+    )
+
+
+def _integer(rng: np.random.Generator, least_most: Sequence[int]) -> int:
+    least, most = least_most
+    return int(rng.integers(least, most, endpoint=True))
+
+
+def _uniform(rng: np.random.Generator, least_most: Sequence[float]) -> float:
+    least, most = least_most
+    return float(rng.uniform(least, most))
+
+
+def _draw_failures(
+    wrong: Disturbances, robots: int, duration_s: float, rng: np.random.Generator
+) -> Iterator[Failure]:
+    lost = min(_integer(rng, wrong.lost_robots), robots - 1)
+    for robot in rng.permutation(robots)[:lost].tolist():
+        from_s, until_s = sorted(rng.uniform(0.0, duration_s, 2).tolist())
+        comes_back = rng.random() < wrong.come_back
+        yield Failure(robot, from_s, until_s) if comes_back else Failure(robot, from_s)
+
+
+class FlownShard(NamedTuple):
+    """A shard's states, and the CPU time that they took."""
+
+    name: str
+    states: States
+    cpu_s: float
+
+
+def fly_shard(task: ShardTask) -> FlownShard:
+    """Fly it, in whatever process this is. Raises BundleError, ValueError."""
+    shard, bundle = task
+    begun_s = time.process_time()
+    deciding = _Deciding([flight.by_expert for flight in shard.flights])
+    scenarios = [flight.scenario for flight in shard.flights]
+    flights = BatchedFlights(scenarios, bundle, agents=deciding.of)
+    experts = [make_expert(shard.data, world) for world in flights.prepared]
+    deciding.watch(flights, experts)
+    kept = _Kept()
+    try:
+        for moments in flights.moments(shard.times_s):
+            for moment, expert in zip(moments, experts, strict=True):
+                kept.add(moment, expert)
+        flights.finish()
+    except PolicyFailedError as error:
+        raise ValueError(f"shard {shard.name}: {error}") from None
+    states = kept.states(max(swarm.largest_payload for swarm in flights.swarms))
+    return FlownShard(shard.name, states, time.process_time() - begun_s)
+
+
+class _Deciding:
+    """See `Agents`: in some of the worlds the expert decides instead of the policy, and is mute."""
+
+    def __init__(self, by_expert: Sequence[bool]) -> None:
+        self._by_expert = by_expert
+        self._world_of: list[int] = []
+        self._robot_of: list[int] = []
+
+    def of(self, bundle: Bundle, perceptions: Sequence[PerceptionParameters]) -> Agents:
+        """This, for a bundle whose policy decides in the other worlds."""
+        self._policy = make_agents(bundle, perceptions)
+        return self
+
+    def watch(self, flights: BatchedFlights, experts: Sequence[Expert]) -> None:
+        """What the experts know; before anybody decides."""
+        self._flights = flights
+        self._experts = experts
+        for world, prepared in enumerate(flights.prepared):
+            self._world_of += [world] * prepared.scenario.robots
+            self._robot_of += range(prepared.scenario.robots)
+
+    @property
+    def message_size(self) -> int:
+        return self._policy.message_size
+
+    def inputs(self, robot: int, observation: Observation) -> Inputs:
+        return self._policy.inputs(robot, observation)
+
+    def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
+        deciding = self._by_policy(robots)
+        found = [np.zeros(0, np.float32)] * len(robots)
+        if deciding:
+            computed = self._policy.features(
+                [robots[i] for i in deciding], [inputs[i] for i in deciding]
+            )
+            for i, features in zip(deciding, computed, strict=True):
+                found[i] = features
+        return found
+
+    def step(
+        self,
+        robots: Sequence[int],
+        features: Sequence[F32],
+        payloads: Sequence[Sequence[F32]],
+        degrees: Sequence[int],
+    ) -> PolicySteps:
+        velocities = np.zeros((len(robots), 2), np.float32)
+        said = np.zeros((len(robots), self.message_size), np.float32)
+        deciding = self._by_policy(robots)
+        if deciding:
+            steps = self._policy.step(
+                [robots[i] for i in deciding],
+                [features[i] for i in deciding],
+                [payloads[i] for i in deciding],
+                [degrees[i] for i in deciding],
+            )
+            velocities[deciding], said[deciding] = steps
+        told: dict[int, F64] = {}
+        for i, agent in enumerate(robots):
+            world = self._world_of[agent]
+            if self._by_expert[world]:
+                if world not in told:
+                    told[world] = self._told(world)
+                velocities[i] = told[world][self._robot_of[agent]]
+        return PolicySteps(velocities, said)
+
+    def reset(self, robot: int) -> None:
+        self._policy.reset(robot)
+
+    def _by_policy(self, robots: Sequence[int]) -> list[int]:
+        return [i for i, agent in enumerate(robots) if not self._by_expert[self._world_of[agent]]]
+
+    def _told(self, world: int) -> F64:
+        """By the expert, where the world's robots are now."""
+        swarm, scenario = self._flights.swarms[world], self._flights.prepared[world].scenario
+        return self._experts[world].velocities(
+            scenario.scale.position_to_model(swarm.positions_m()), swarm.alive
+        )
+
+
+class _Kept:
+    """States as they come."""
+
+    def __init__(self) -> None:
+        self._inputs: list[Inputs] = []
+        self._velocities: list[F64] = []
+        self._robots: list[int] = []
+        self._adjacency: list[Bools] = []
+
+    def add(self, moment: WorldMoment, expert: Expert) -> None:
+        robots, arrays = moment.inputs()
+        if not robots:
+            return
+        left = list(robots)
+        self._inputs.append(arrays)
+        self._velocities.append(expert.velocities(moment.positions, moment.alive)[left])
+        self._robots.append(len(left))
+        self._adjacency.append(moment.adjacency[np.ix_(left, left)].ravel())
+
+    def states(self, largest_payload: float) -> States:
+        names = self._inputs[0] if self._inputs else {}
+        return States(
+            inputs={name: _stored([each[name] for each in self._inputs]) for name in names},
+            velocities=np.concatenate(self._velocities).astype(np.float32),
+            robots=np.array(self._robots, np.int32),
+            adjacency=np.concatenate(self._adjacency),
+            largest_payload=largest_payload,
+        )
+
+
+def _stored(arrays: Sequence[F32]) -> npt.NDArray[np.floating]:
+    """(R, ...): images, of more than one dimension, in half the space."""
+    rows = np.concatenate(arrays)
+    return rows.astype(np.float16) if rows.ndim > 2 else rows

@@ -1,0 +1,266 @@
+"""A training from its configuration to a policy, in a folder that it can go on in.
+
+For each round: generate (the expert flies, then the policy), fit, and now and then select; at the
+end export. What is done is on disk, and is not done again.
+"""
+
+import platform
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from edge.core.schema import ConfigError
+from edge.policy.bundle import Bundle, load_bundle, write_bundle
+from export.parameters import PolicyMessages
+from lpac.sim.cores import Pool
+from lpac.train.card import ModelCard, write_card
+from lpac.train.config import ReadConfig, config_digest
+from lpac.train.data import Shards
+from lpac.train.files import write_atomically
+from lpac.train.fit import Fit
+from lpac.train.progress import RunProgress, Work
+from lpac.train.rollout import PlannedShard, ShardTask, fly_shard, plan_round
+from lpac.train.select import (
+    Candidate,
+    ClosedLoopCost,
+    JudgedCandidate,
+    Selection,
+    candidates_of,
+)
+
+_CONFIG, _CHECKPOINT, _BUNDLE = "config.toml", "checkpoint.pt", "bundle"
+# The payload limit is so many times the largest number in a payload of this many flights.
+_PAYLOAD_MARGIN = 10.0
+_PAYLOAD_FLIGHTS = 16
+
+
+class TrainingRun:
+    """One folder's training."""
+
+    def __init__(self, read: ReadConfig, folder: Path, tell: Callable[[RunProgress], None]) -> None:
+        """Begins, or goes on. Raises ConfigError if it was begun otherwise; ValueError, OSError."""
+        self._config, self._network, self._folder = read.config, read.network, folder
+        self._digest = read.digest
+        begun = folder / _CONFIG
+        if begun.exists() and config_digest(begun.read_text("utf-8")) != read.digest:
+            raise ConfigError(
+                f"{folder}: was begun with another configuration ({begun}); only dagger.rounds may "
+                "change: choose another export.name, or --out"
+            )
+        write_atomically(begun, read.text.encode())
+        config = self._config
+        self._shards = Shards(folder / "data", read.digest)
+        self._fit = Fit(read.network, config.fit, config.dagger, config.seed, folder / "fit.pt")
+        self._selection = Selection(folder, read.digest, config.select)
+        self._plans = [
+            plan_round(config.data, config.dagger, config.seed, round_)
+            for round_ in range(config.dagger.rounds + 1)
+        ]
+        self._work = self._planned(tell)
+
+    def run(self, pool: Pool) -> dict[str, Any]:
+        """Train; gives what came out, for JSON. Raises ValueError, OSError."""
+        for round_ in range(self._config.dagger.rounds + 1):
+            self._generate(round_, pool)
+            self._train(round_, pool)
+        return self._export(pool)
+
+    def _planned(self, tell: Callable[[RunProgress], None]) -> Work:
+        """Robots times seconds to fly, robots times epochs to fit, and flights to select by."""
+        config, robots, fit = self._config, 0, 0
+        judged = len(config.select.set_ups) * config.select.worlds
+        flights = 0
+        for round_, shards in enumerate(self._plans):
+            robots += sum(map(_robots, shards)) * config.data.states
+            fit += robots * self._fit.epochs(round_)
+            flights += len(self._candidates(round_)) * judged
+        flown = sum(map(_robot_seconds, (shard for plan in self._plans for shard in plan)))
+        work = Work({"generate": flown, "fit": fit, "select": flights}, tell)
+        work.skip("select", judged * len(self._selection.judged))
+        return work
+
+    def _candidates(self, round_: int) -> list[Candidate]:
+        return candidates_of(round_, self._fit.epochs(round_), self._config.select.every_epochs)
+
+    def _generate(self, round_: int, pool: Pool) -> None:
+        there, work = self._shards.facts, self._work
+        missing = {shard.name: shard for shard in self._plans[round_] if shard.name not in there}
+        for shard in self._plans[round_]:
+            if shard.name in there:
+                work.skip("generate", _robot_seconds(shard))
+        if not missing:
+            return
+        bundle = self._flying(round_)
+        tasks = [ShardTask(shard, bundle) for shard in missing.values()]
+        work.begin()
+        work.show("generate", round_)
+        with closing(pool(fly_shard, tasks)) as outcomes:
+            for name, states, cpu_s in outcomes:
+                shard = missing[name]
+                facts = {
+                    "seed": self._config.seed,
+                    "flights": len(shard.flights),
+                    "by_expert": sum(flight.by_expert for flight in shard.flights),
+                    "bundle_id": bundle.id if round_ else None,
+                    "cpu_s": round(cpu_s, 3),
+                    "versions": _versions(),
+                }
+                self._shards.add(name, states, facts)
+                work.add("generate", round_, _robot_seconds(shard))
+
+    def _flying(self, round_: int) -> Bundle:
+        """Who flies in a round: at first nobody does, but all perceive as this bundle says."""
+        if round_:
+            return load_bundle(self._of(self._candidates(round_ - 1)[-1]) / _BUNDLE)
+        checkpoint = self._network.checkpoint(self._fit.untrained())
+        return self._network.bundle(
+            checkpoint, self._config.parameters, self._config.export.name, {"training": "none"}
+        )
+
+    def _train(self, round_: int, pool: Pool) -> None:
+        work, candidates = self._work, self._candidates(round_)
+        data = None
+        of_all = self._fit.epochs(round_)
+        robots = sum(map(_robots, (s for plan in self._plans[: round_ + 1] for s in plan)))
+        units = float(robots * self._config.data.states * of_all)
+        done = self._fit.done(round_) / of_all
+        work.skip("fit", units * done)
+        for candidate in candidates:
+            if self._fit.done(round_) < candidate.epoch:
+                data = data or self._shards.load(round_)
+                work.begin()
+
+                def tell(share: float, loss: float) -> None:
+                    nonlocal done
+                    work.loss = loss
+                    work.add("fit", round_, units * (share - done))
+                    done = share
+
+                self._fit.run(data, round_, candidate.epoch, tell)
+            folder = self._of(candidate)
+            if not (folder / _BUNDLE).exists():
+                self._write_candidate(candidate)
+            self._judge(candidate, pool)
+
+    def _write_candidate(self, candidate: Candidate) -> None:
+        """The bundle is last: a candidate that has one is complete."""
+        checkpoint = self._network.checkpoint(self._fit.weights)
+        folder = self._of(candidate)
+        write_atomically(folder / _CHECKPOINT, checkpoint)
+        write_bundle(self._bundle(candidate, checkpoint, None), folder / _BUNDLE)
+
+    def _bundle(
+        self, candidate: Candidate, checkpoint: bytes, payload_limit: float | None
+    ) -> Bundle:
+        provenance = {
+            "training": f"lpac train, configuration {self._digest}, seed {self._config.seed}",
+            "candidate": f"round {candidate.round}, epoch {candidate.epoch}",
+        }
+        parameters = replace(self._config.parameters, messages=PolicyMessages(payload_limit))
+        return self._network.bundle(checkpoint, parameters, self._config.export.name, provenance)
+
+    def _judge(self, candidate: Candidate, pool: Pool) -> None:
+        work, path, flown = self._work, self._of(candidate) / _BUNDLE, 0
+        bundle = load_bundle(path)
+        work.begin()
+
+        def tell(flights: int) -> None:
+            nonlocal flown
+            work.add("select", candidate.round, flights - flown)
+            flown = flights
+
+        self._selection.judge(candidate, path, bundle, pool, tell)
+        best = self._selection.best
+        work.cost = best.cost.mean if best else None
+
+    def _of(self, candidate: Candidate) -> Path:
+        return self._folder / "candidates" / candidate.name
+
+    def _export(self, pool: Pool) -> dict[str, Any]:
+        config, name = self._config, self._config.export.name
+        best = self._selection.best
+        assert best is not None
+        self._work.show("export", best.candidate.round)
+        folder = self._of(best.candidate)
+        judged = load_bundle(folder / _BUNDLE)
+        baselines = self._selection.baselines(folder / _BUNDLE, judged, pool)
+        checkpoint = (folder / _CHECKPOINT).read_bytes()
+        limit = _PAYLOAD_MARGIN * self._largest_payload(judged, pool)
+        bundle = self._bundle(best.candidate, checkpoint, limit if limit > 0.0 else None)
+        write_atomically(self._folder / f"{name}.pt", checkpoint)
+        write_bundle(bundle, self._folder / name)
+        card = ModelCard(
+            config=config,
+            digest=self._digest,
+            bundle_id=bundle.id,
+            best=best,
+            judged=self._selection.judged,
+            losses=self._fit.losses,
+            baselines=baselines,
+            shards=self._shards.facts,
+            fit_hours=self._fit.seconds / 3600.0,
+            select_hours=self._selection.seconds / 3600.0,
+            device=self._fit.device,
+            versions=_versions(),
+        )
+        write_card(card, self._folder, judged, folder / _BUNDLE)
+        return {
+            "folder": str(self._folder),
+            "bundle": str(self._folder / name),
+            "bundle_id": bundle.id,
+            "checkpoint": str(self._folder / f"{name}.pt"),
+            "selected": _judged_json(best),
+            "candidates": [_judged_json(each) for each in self._selection.judged],
+            "baselines": {each: _cost_json(cost) for each, cost in baselines.items()},
+            "below_decentralized_cvt": best.cost.mean < baselines["decentralized-cvt"].mean,
+            "states": sum(facts["states"] for facts in self._shards.facts.values()),
+            "hours": {
+                "generate_cpu": card.generate_hours,
+                "fit": card.fit_hours,
+                "select": card.select_hours,
+            },
+        }
+
+    def _largest_payload(self, bundle: Bundle, pool: Pool) -> float:
+        """The largest number in a payload of the first flights of the data, flown by the policy."""
+        flights = [flight for shard in self._plans[0] for flight in shard.flights]
+        shards = [
+            replace(
+                self._plans[0][0],
+                flights=(flight._replace(by_expert=False),),
+                times_s=(self._config.data.duration_s,),
+            )
+            for flight in flights[:_PAYLOAD_FLIGHTS]
+        ]
+        with closing(pool(fly_shard, [ShardTask(shard, bundle) for shard in shards])) as outcomes:
+            return max(states.largest_payload for _, states, _ in outcomes)
+
+
+def _robots(shard: PlannedShard) -> int:
+    return sum(flight.scenario.robots for flight in shard.flights)
+
+
+def _robot_seconds(shard: PlannedShard) -> float:
+    return sum(flight.scenario.robots * flight.scenario.duration_s for flight in shard.flights)
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "lpac-edge": version("lpac-edge"),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "torch": version("torch"),
+    }
+
+
+def _judged_json(judged: JudgedCandidate) -> dict[str, Any]:
+    return {**judged.candidate._asdict(), **_cost_json(judged.cost)}
+
+
+def _cost_json(cost: ClosedLoopCost) -> dict[str, float]:
+    return {"mean": cost.mean, "p90": cost.p90, "worst": cost.worst}

@@ -1,0 +1,154 @@
+"""Which weights are best: by the cost that they fly to over validation worlds, and nothing else."""
+
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.policy.bundle import Bundle
+from lpac.evaluate.flights import POLICY, EvaluationFlight, Flier, KeptFlights, sizes_of
+from lpac.sim.baselines import BaselineName
+from lpac.sim.cores import Pool
+from lpac.sim.kept import KeptOutcomes
+from lpac.train.config import SelectConfig
+
+# What a policy is held against in the model card.
+BASELINES: tuple[BaselineName, ...] = ("decentralized-cvt", "decentralized-cvt-prior")
+CLAIRVOYANT: BaselineName = "clairvoyant-cvt"
+
+
+class Candidate(NamedTuple):
+    """The weights after so many epochs of a round."""
+
+    round: int
+    epoch: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.round:02d}-{self.epoch:04d}"
+
+
+class ClosedLoopCost(NamedTuple):
+    """Over the worlds: cost at the end over that at the start."""
+
+    mean: float
+    p90: float
+    worst: float
+    worst_flight: int
+
+    @classmethod
+    def of(cls, costs: F64) -> "ClosedLoopCost":
+        """Of (flights,)."""
+        return cls(
+            float(costs.mean()), float(np.quantile(costs, 0.9)), float(costs.max()),
+            int(costs.argmax()),
+        )  # fmt: skip
+
+
+class JudgedCandidate(NamedTuple):
+    """A candidate, and how it flew."""
+
+    candidate: Candidate
+    cost: ClosedLoopCost
+
+
+def candidates_of(round_: int, epochs: int, every: int) -> list[Candidate]:
+    """Those of a round: after every so many epochs, and after the last."""
+    return [Candidate(round_, epoch) for epoch in sorted({*range(every, epochs, every), epochs})]
+
+
+def flights_of(
+    select: SelectConfig, flier: Flier, bundle: Path, flown_by: str
+) -> list[EvaluationFlight]:
+    """The flights by which one is judged: over validation worlds. Baselines lose no messages."""
+    return [
+        EvaluationFlight(
+            flier=flier,
+            bundle=str(bundle.resolve()),
+            flown_by=flown_by,
+            world_set="validation",
+            world=world,
+            set_up=set_up,
+            duration_s=select.duration_s,
+            loss=select.loss if flier == POLICY else 0.0,
+        )
+        for set_up in select.set_ups
+        for world in range(select.worlds)
+    ]
+
+
+class Selection:
+    """The candidates of a run that were judged; kept in a folder."""
+
+    def __init__(self, folder: Path, config: str, select: SelectConfig) -> None:
+        """`config` is the digest of the run's. Raises OSError."""
+        self._select = select
+        self._flights = KeptFlights(folder)
+        self._kept = KeptOutcomes(folder / "candidates.jsonl", {"config": config})
+
+    @property
+    def judged(self) -> list[JudgedCandidate]:
+        """In the order of training."""
+        return sorted(
+            JudgedCandidate(Candidate(*line["candidate"]), ClosedLoopCost(*line["cost"]))
+            for line in self._kept.lines
+        )
+
+    @property
+    def best(self) -> JudgedCandidate | None:
+        """That of the least mean cost, the earlier of two."""
+        return min(self.judged, key=lambda judged: judged.cost.mean, default=None)
+
+    @property
+    def seconds(self) -> float:
+        """What judging took."""
+        return float(sum(line["seconds"] for line in self._kept.lines))
+
+    def judge(
+        self,
+        candidate: Candidate,
+        path: Path,
+        bundle: Bundle,
+        pool: Pool,
+        tell: Callable[[int], None],
+    ) -> None:
+        """Fly it, unless it was; `tell` is called with the number of flights that are done."""
+        if any(judged.candidate == candidate for judged in self.judged):
+            return
+        begun_s = time.monotonic()
+        costs = self._fly(flights_of(self._select, POLICY, path, bundle.id), pool, tell)
+        self._kept.add(
+            {
+                "candidate": list(candidate),
+                "bundle_id": bundle.id,
+                "cost": list(ClosedLoopCost.of(costs)),
+                "seconds": round(time.monotonic() - begun_s, 3),
+            }
+        )
+
+    def baselines(
+        self, path: Path, bundle: Bundle, pool: Pool
+    ) -> dict[BaselineName, ClosedLoopCost]:
+        """Over the same worlds, with the bundle's sizes."""
+        names = (*BASELINES, CLAIRVOYANT)
+        flights = [
+            flight
+            for name in names
+            for flight in flights_of(self._select, name, path, sizes_of(bundle))
+        ]
+        costs = self._fly(flights, pool, lambda _: None).reshape(len(names), -1)
+        return {name: ClosedLoopCost.of(of) for name, of in zip(names, costs, strict=True)}
+
+    def _fly(self, flights: list[EvaluationFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
+        """The cost of each at the end, over that at the start."""
+        flown: dict[EvaluationFlight, float] = {}
+        with closing(self._flights.fly(flights, pool)) as outcomes:
+            for flight, told in outcomes:
+                flown[flight] = told.cost[-1] / told.cost[0]
+                tell(len(flown))
+        return np.array([flown[flight] for flight in flights])
