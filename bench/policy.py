@@ -104,7 +104,7 @@ class EdgeRobot:
         self._hops = HopBuffer(policy.geometry)
         images = policy.lpac.images
         assert images
-        self._images = PolicyImages(policy.manifest.perception, len(images.channels), images.size)
+        self._images = PolicyImages(policy.manifest.perception, images.channels, images.size)
         self._agent = policy.agent()
         self.images = self._make_images().copy()
         self.features = self._agent.observe(self._observation()).features

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import torch
 
 from edge.policy.bundle import SCHEMA_VERSION, Bundle, Manifest, make_bundle
 from edge.policy.family import TOLERANCE
-from edge.policy.lpac.images import MAP_CHANNELS
+from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 from edge.policy.lpac.manifest import GOLDEN, Images, LpacManifest
 from edge.policy.lpac.policy import LpacPolicy
 from export.checkpoint import Checkpoint, CheckpointError, read_checkpoint
@@ -47,21 +48,23 @@ def bundle_of(
 ) -> Bundle:
     """The bundle of a network in memory; it has passed `verify` on this machine.
 
-    `provenance` says where the network came from; the exporter adds itself. Raises CheckpointError,
-    one line.
+    `provenance` says where the network came from; the exporter adds itself. Whether what is unseen
+    is NaN in the local map follows from the network's images, whatever `trained` says. Raises
+    CheckpointError, one line.
     """
     files = {GOLDEN: golden_vectors(network), **build_graphs(network)}
-    images = None
+    images = perception = None
     if network.cnn:
         images = Images(
             MAP_CHANNELS[network.cnn.channels],
             network.cnn.image_size,
             len(network.cnn.linear.bias),
         )
+        perception = replace(trained.perception, unseen_as_nan=EXPLORED in images.channels)
     manifest = Manifest(
         schema=SCHEMA_VERSION,
         name=name,
-        perception=trained.perception if images else None,
+        perception=perception,
         training=trained.training,
         payload_limit=trained.messages.payload_limit,
         provenance={

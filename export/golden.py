@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from edge.core import F32, F64
-from edge.policy.lpac.images import MAP_CHANNELS, neighbour_maps
+from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS, NEIGHBOURS, neighbour_maps
 from edge.policy.lpac.manifest import ACTION, CNN, gnn_graph
 from export import network
 from export.checkpoint import (
@@ -121,10 +121,11 @@ def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
         seen = np.hypot(x - 0.5, y - 0.5) < random.uniform(0.3, 0.6)
         maps = {
             "importance": np.clip(importance, 0, 1) * seen,
+            EXPLORED: seen.astype(np.float64),
             "obstacles": np.maximum(x > random.uniform(0.6, 1), y < random.uniform(0, 0.4)),
         }
         offsets = random.uniform(-0.9, 0.9, (random.integers(1, 6), 2))
-        maps["neighbours_x"], maps["neighbours_y"] = neighbour_maps(offsets, 1.0, size)
+        maps |= zip(NEIGHBOURS, neighbour_maps(offsets, 1.0, size), strict=True)
         image[:] = [maps[channel] for channel in MAP_CHANNELS[cnn.channels]]
     return images
 

@@ -106,5 +106,13 @@ def shipped_bundle() -> Bundle:
 
 
 @pytest.fixture(scope="session")
+def exploring_bundle() -> Bundle:
+    """One whose small CNN sees what was explored; its weights are random."""
+    states = pytest.importorskip("tests.unit.export.states", reason="torch makes the bundle")
+    bundle: Bundle = states.random_bundle(channels=5)
+    return bundle
+
+
+@pytest.fixture(scope="session")
 def shipped_policy(shipped_bundle: Bundle) -> LpacPolicy:
     return LpacPolicy(shipped_bundle)

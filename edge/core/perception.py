@@ -31,6 +31,8 @@ class PerceptionParameters:
     communication_range: float
     # Importance of what has not been seen yet.
     unknown_importance: float = 0.0
+    # The local map is NaN there instead, for policies that tell what is unseen from what is not.
+    unseen_as_nan: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.world_size <= MAX_WORLD_SIZE:
@@ -47,6 +49,11 @@ class PerceptionParameters:
             raise ValueError(
                 f"unknown_importance = {self.unknown_importance}: must be at least 0 and finite"
             )
+
+    @property
+    def unseen(self) -> float:
+        """What the local map has in the world's cells that were not seen."""
+        return math.nan if self.unseen_as_nan else self.unknown_importance
 
 
 def window_corner(position: F64, size: int) -> tuple[int, int]:
@@ -85,9 +92,10 @@ class RobotMap:
     So its cost is that of the area seen, however large the world is.
     """
 
-    def __init__(self, world_size: int, unknown_importance: float = 0.0) -> None:
+    def __init__(self, world_size: int, unseen: float = 0.0) -> None:
+        """`unseen` is the value of cells that were not seen; it may be NaN."""
         self._world_size = world_size
-        self._unknown = np.float32(unknown_importance)
+        self._unseen = np.float32(unseen)
         self._tiles: dict[tuple[int, int], F32] = {}
 
     def insert(self, view: F32, corner: tuple[int, int]) -> None:
@@ -96,7 +104,7 @@ class RobotMap:
         for key, tile_part, view_part in self._overlaps(corner, size):
             tile = self._tiles.get(key)
             if tile is None:
-                tile = np.full((TILE_SIZE, TILE_SIZE), self._unknown, np.float32)
+                tile = np.full((TILE_SIZE, TILE_SIZE), self._unseen, np.float32)
                 self._tiles[key] = tile
             tile[tile_part] = view[view_part]
 
@@ -108,8 +116,8 @@ class RobotMap:
             tile = self._tiles.get(key)
             if tile is not None:
                 out[out_part] = tile[tile_part]
-            elif self._unknown:
-                out[out_part] = self._unknown
+            elif self._unseen:
+                out[out_part] = self._unseen
         return out
 
     def _overlaps(
@@ -148,7 +156,7 @@ class RobotMemory:
 
     def __init__(self, parameters: PerceptionParameters) -> None:
         self._world_size = parameters.world_size
-        self._map = RobotMap(parameters.world_size, parameters.unknown_importance)
+        self._map = RobotMap(parameters.world_size, parameters.unseen)
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
         # For people: which cells of the coarse raster over the world it has seen.
         self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
@@ -171,6 +179,6 @@ class RobotMemory:
     def local_map(self, position: F64) -> F32:
         """(local_map_size, local_map_size) around `position`, valid until the next call.
 
-        The outside of the world is 0.
+        `PerceptionParameters.unseen` where nothing was seen; the outside of the world is 0.
         """
         return self._map.window(window_corner(position, self._local.shape[0]), self._local)

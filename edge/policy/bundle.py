@@ -106,6 +106,8 @@ def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
         del mapping["family"]
     if manifest.payload_limit is None:
         del mapping["payload_limit"]
+    if manifest.perception and not manifest.perception.unseen_as_nan:
+        del mapping["perception"]["unseen_as_nan"]
     text = json.dumps(mapping, indent=2, sort_keys=True) + "\n"
     bundle_id = _sha256(text.encode())
     sealed = {**files, MANIFEST: text.encode(), BUNDLE_ID: f"{bundle_id}\n".encode()}

@@ -18,7 +18,7 @@ from torch.nn import functional
 from edge.core import F32
 from edge.core.schema import from_mapping
 from edge.policy.bundle import Bundle
-from edge.policy.lpac.images import MAP_CHANNELS
+from edge.policy.lpac.images import MAP_CHANNELS, NEIGHBOURS
 from export.checkpoint import (
     ACTION_SIZE,
     BATCH_NORM_EPS,
@@ -30,17 +30,14 @@ from export.exporter import bundle_of
 from export.parameters import PolicyParameters
 from lpac.train.family import Inputs, StateDict
 
-# What changes its sign, or its place, where the world is mirrored.
-_NEIGHBOURS = ("neighbours_x", "neighbours_y")
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LpacNetwork:
     """Sizes of the network: see `Learnable`.
 
-    `channels` are the images that the CNN sees, `image_size` wide; `cnn_channels` those of each
-    convolution, `kernel` wide. Then `layers` (L) of `hops` (K), `width` wide, and an MLP of
-    `mlp_layers` layers `mlp_width` wide.
+    `channels` are the images that the CNN sees, one of `MAP_CHANNELS`, `image_size` wide;
+    `cnn_channels` those of each convolution, `kernel` wide. Then `layers` (L) of `hops` (K),
+    `width` wide, and an MLP of `mlp_layers` layers `mlp_width` wide.
 
     Raises ValueError that names what is impossible.
     """
@@ -85,7 +82,8 @@ class LpacNetwork:
     def symmetric(self, inputs: Inputs, velocities: F32, turned: int) -> tuple[Inputs, F32]:
         """See `Learnable`; bit 0 mirrors x, bit 1 mirrors y, bit 2 swaps the two."""
         images, position = inputs["images"], inputs["position_feature"]
-        plane = {name: self.channels.index(name) for name in _NEIGHBOURS if name in self.channels}
+        # What changes its sign, or its place, where the world is mirrored.
+        plane = {name: self.channels.index(name) for name in NEIGHBOURS if name in self.channels}
         for axis in range(2):
             if turned & 1 << axis:
                 images = np.flip(images, 2 + axis).copy()
@@ -94,12 +92,12 @@ class LpacNetwork:
                 position[:, axis] = 2.0 - position[:, axis]
                 velocities[:, axis] *= -1.0
                 if plane:
-                    images[:, plane[_NEIGHBOURS[axis]]] *= -1.0
+                    images[:, plane[NEIGHBOURS[axis]]] *= -1.0
         if turned & 4:
             images = images.swapaxes(2, 3)
             order = list(range(len(self.channels)))
             if plane:
-                x, y = (plane[name] for name in _NEIGHBOURS)
+                x, y = (plane[name] for name in NEIGHBOURS)
                 order[x], order[y] = y, x
             images = images[:, order]
             position, velocities = position[:, ::-1], velocities[:, ::-1]

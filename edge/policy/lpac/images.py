@@ -1,9 +1,13 @@
 """The images that the policy takes, of what a robot has seen.
 
 LPAC paper (arXiv 2401.04855), section "Perception Module": four square images around the robot:
-importance, the neighbours' relative x and y, and obstacles (the outside of the world). All are
-indexed [x, y]; one cell of a map is one model unit; positions are in model units.
+importance, the neighbours' relative x and y, and obstacles (the outside of the world). A fifth,
+which the paper's policies do not have, tells what is unseen from what is worthless: 1 where the
+robot has seen, 0 where it has not, and outside the world. All are indexed [x, y]; one cell of a map
+is one model unit; positions are in model units.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,10 +19,13 @@ from edge.core.perception import (
     window_corner,
 )
 
-# The images by number of channels, in the order in which CoverageControl stacks them.
-MAP_CHANNELS = {
+NEIGHBOURS = ("neighbours_x", "neighbours_y")
+EXPLORED = "explored"
+# The images by number of channels, two and four in the order in which CoverageControl stacks them.
+MAP_CHANNELS: dict[int, tuple[str, ...]] = {
     2: ("importance", "obstacles"),
-    4: ("importance", "neighbours_x", "neighbours_y", "obstacles"),
+    4: ("importance", *NEIGHBOURS, "obstacles"),
+    5: ("importance", *NEIGHBOURS, EXPLORED, "obstacles"),
 }
 
 
@@ -78,10 +85,17 @@ def neighbour_maps(offsets: F64, communication_range: float, image_size: int) ->
 class PolicyImages:
     """Makes one robot's images. Not thread-safe: it belongs to the perception thread."""
 
-    def __init__(self, parameters: PerceptionParameters, channels: int, image_size: int) -> None:
+    def __init__(
+        self, parameters: PerceptionParameters, channels: Sequence[str], image_size: int
+    ) -> None:
+        """`channels` are of `MAP_CHANNELS`; for EXPLORED, `parameters` have `unseen_as_nan`."""
         self._parameters = parameters
         self._resize = Resize(parameters.local_map_size, image_size)
-        self._images = np.empty((1, channels, image_size, image_size), np.float32)
+        self._images = np.empty((1, len(channels), image_size, image_size), np.float32)
+        self._image = dict(zip(channels, self._images[0], strict=True))
+        if EXPLORED in channels:
+            # What of the local map is resized: what was seen, and then what is known there.
+            self._part = np.empty((parameters.local_map_size,) * 2, np.float32)
 
     def images(self, position: F64, local_map: F32, neighbours: F64) -> F32:
         """The policy's images, (1, channels, image_size, image_size), valid until the next call.
@@ -90,14 +104,24 @@ class PolicyImages:
         `neighbours` (n, 2) are the positions of the robots in range. Those outside the world are
         taken to the nearest point of it, where training kept the robots.
         """
-        parameters = self._parameters
-        self._resize.image(local_map, out=self._images[0, 0])
+        parameters, image = self._parameters, self._image
         corner = window_corner(position, parameters.local_map_size)
         _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)
-        self._images[0, -1] = 1.0 - np.outer(*map(self._resize.interval, inside))
-        if self._images.shape[1] == len(MAP_CHANNELS[4]):
+        if EXPLORED in image:
+            unseen = np.isnan(local_map)
+            self._part[:] = 0.0
+            self._part[inside] = ~unseen[inside]
+            self._resize.image(self._part, out=image[EXPLORED])
+            self._part[:] = local_map
+            self._part[unseen] = parameters.unknown_importance
+            local_map = self._part
+        self._resize.image(local_map, out=image["importance"])
+        image["obstacles"][:] = 1.0 - np.outer(*map(self._resize.interval, inside))
+        if NEIGHBOURS[0] in image:
             others = clamp_to_world(neighbours, parameters.world_size)
-            self._images[0, 1:3] = neighbour_maps(
+            maps = neighbour_maps(
                 others - position, parameters.communication_range, self._images.shape[-1]
             )
+            for name, values in zip(NEIGHBOURS, maps, strict=True):
+                image[name][:] = values
         return self._images

@@ -6,7 +6,7 @@ from typing import Literal
 from edge.core.aggregation import Geometry
 from edge.core.schema import ConfigError, from_mapping
 from edge.policy.bundle import LPAC, BundleError, Manifest
-from edge.policy.lpac.images import MAP_CHANNELS
+from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 
 GOLDEN = "golden.npz"
 CNN = "cnn.onnx"
@@ -63,6 +63,13 @@ class LpacManifest:
             raise BundleError(str(error)) from None
         if (lpac.images is None) != (manifest.perception is None):
             raise BundleError(f"{where}: images and perception: both or neither")
+        if lpac.images and manifest.perception:
+            explores = EXPLORED in lpac.images.channels
+            if manifest.perception.unseen_as_nan != explores:
+                raise BundleError(
+                    f"{where}: perception.unseen_as_nan = {manifest.perception.unseen_as_nan}: "
+                    f"must be {explores}, by images.channels"
+                )
         expected = {*lpac.graphs, GOLDEN}
         if set(manifest.files) != expected:
             raise BundleError(

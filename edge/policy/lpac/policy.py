@@ -46,7 +46,7 @@ class LpacAgent:
             )
         self._policy = policy
         self._world_size = manifest.perception.world_size
-        self._images = PolicyImages(manifest.perception, len(images.channels), images.size)
+        self._images = PolicyImages(manifest.perception, images.channels, images.size)
         self._hops = HopBuffer(policy.geometry)
 
     def observe(self, observation: Observation) -> Perceived:

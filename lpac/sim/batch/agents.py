@@ -71,7 +71,7 @@ class LpacAgents:
         images = policy.lpac.images
         assert images is not None  # a policy without perception makes no agents
         self._images = {
-            perception: PolicyImages(perception, len(images.channels), images.size)
+            perception: PolicyImages(perception, images.channels, images.size)
             for perception in set(perceptions)
         }
 

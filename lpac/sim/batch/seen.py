@@ -13,8 +13,8 @@ class SeenMap:
     """What one robot remembers of the world that its sensor shows it.
 
     It is what `edge.core.perception.RobotMemory` is: where the robot has seen, the world's
-    importance, elsewhere what is unknown. The world is all robots' own; what a robot has of its
-    own is one byte for each cell of a box around what it has seen.
+    importance, elsewhere what stands for the unseen. The world is all robots' own; what a robot
+    has of its own is one byte for each cell of a box around what it has seen.
     """
 
     def __init__(self, importance: F32, parameters: PerceptionParameters) -> None:
@@ -41,15 +41,15 @@ class SeenMap:
     def local_map(self, position: F64, out: F32) -> F32:
         """Fill `out` (local_map_size, local_map_size) around `position` (2,) and return it.
 
-        The outside of the world is 0.
+        `PerceptionParameters.unseen` where nothing was seen; the outside of the world is 0.
         """
         parameters = self._parameters
         size = parameters.local_map_size
         out[:] = 0.0
         corner_x, corner_y = corner = window_corner(position, size)
         (x, y), in_window = part_in_world(corner, size, parameters.world_size)
-        if parameters.unknown_importance:
-            out[in_window] = parameters.unknown_importance
+        if parameters.unseen:
+            out[in_window] = parameters.unseen
         (x0, y0), (x1, y1) = self._low, self._high
         x0, x1 = max(x0, x.start), min(x1, x.stop)
         y0, y1 = max(y0, y.start), min(y1, y.stop)

@@ -100,6 +100,16 @@ def test_flights_are_those_of_the_exact_simulator(
         assert_same(batched, fly(scenario, bundle))
 
 
+@pytest.mark.parametrize("unknown", [0.0, 0.3])
+def test_robots_that_see_what_they_explored_fly_the_same(
+    exploring_bundle: Bundle, unknown: float
+) -> None:
+    bundle = unknown_matters(exploring_bundle, unknown)
+    flown = [HARD, Scenario(robots=3, duration_s=5.0, world_size=200)]
+    for batched, scenario in zip(fly_batch(flown, bundle), flown, strict=True):
+        assert_same(batched, fly(scenario, bundle))
+
+
 @pytest.mark.parametrize(
     "scenario",
     [
@@ -124,12 +134,14 @@ def test_worlds_of_a_batch_do_not_touch_one_another(shipped_bundle: Bundle) -> N
 
 
 def test_agents_one_by_one_fly_the_same(
-    shipped_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+    shipped_bundle: Bundle, exploring_bundle: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What serves families that have no batches of their own."""
-    expected = fly_batch([HARD], shipped_bundle)
+    bundles = shipped_bundle, exploring_bundle
+    expected = [fly_batch([HARD], bundle) for bundle in bundles]
     monkeypatch.setattr("lpac.sim.batch.flights.make_agents", SingleAgents)
-    assert_same(*fly_batch([HARD], shipped_bundle), *expected)
+    for bundle, flights in zip(bundles, expected, strict=True):
+        assert_same(*fly_batch([HARD], bundle), *flights)
 
 
 def test_a_second_thread_changes_nothing(shipped_bundle: Bundle) -> None:
@@ -142,11 +154,16 @@ def test_a_second_thread_changes_nothing(shipped_bundle: Bundle) -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(data=st.data(), unknown=st.sampled_from([0.0, 0.25]), world_size=st.integers(8, 300))
+@given(
+    data=st.data(),
+    unknown=st.sampled_from([0.0, 0.25]),
+    unseen_as_nan=st.booleans(),
+    world_size=st.integers(8, 300),
+)
 def test_what_was_seen_is_what_a_robot_remembers(
-    data: st.DataObject, unknown: float, world_size: int
+    data: st.DataObject, unknown: float, unseen_as_nan: bool, world_size: int
 ) -> None:
-    parameters = PerceptionParameters(world_size, 64, 16, 50.0, unknown)
+    parameters = PerceptionParameters(world_size, 64, 16, 50.0, unknown, unseen_as_nan)
     importance = np.random.default_rng(0).random((world_size, world_size), np.float32)
     coordinates = st.floats(-0.2 * world_size, 1.2 * world_size)
     path = data.draw(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=12))

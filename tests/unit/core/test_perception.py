@@ -18,7 +18,7 @@ from edge.core.perception import (
     part_in_world,
     window_corner,
 )
-from edge.policy.lpac.images import PolicyImages, Resize, neighbour_maps
+from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages, Resize, neighbour_maps
 
 PARAMETERS = PerceptionParameters(
     world_size=512, local_map_size=256, sensor_size=64, communication_range=256.0
@@ -29,7 +29,7 @@ corners = st.tuples(st.integers(-150, 400), st.integers(-150, 400))
 @settings(deadline=None, max_examples=50)
 @given(
     world_size=st.sampled_from([1, 100, TILE_SIZE, TILE_SIZE + 1, 300]),
-    unknown=st.sampled_from([0.0, 0.5]),
+    unknown=st.sampled_from([0.0, 0.5, np.nan]),
     views=st.lists(corners, max_size=6),
     window=corners,
 )
@@ -68,7 +68,9 @@ def test_resize_is_torchs_antialiased_bilinear_one(size: int, new_size: int) -> 
 def images_at(position: tuple[float, float], neighbours: list[tuple[float, float]]) -> F32:
     own, memory = np.array(position), RobotMemory(PARAMETERS)
     others = np.array(neighbours, np.float64).reshape(-1, 2)
-    images: F32 = PolicyImages(PARAMETERS, 4, 32).images(own, memory.local_map(own), others)[0]
+    images: F32 = PolicyImages(PARAMETERS, MAP_CHANNELS[4], 32).images(
+        own, memory.local_map(own), others
+    )[0]
     return images
 
 
@@ -79,9 +81,9 @@ def test_images_keep_x_and_y_and_left_and_right_apart() -> None:
     view[60, 8] = 1.0  # 28 to the right (+x) and 24 behind (-y)
     memory.observe(position, view)
     neighbour = np.array([300.0, 250.0])
-    importance, neighbours_x, neighbours_y, obstacles = PolicyImages(PARAMETERS, 4, 32).images(
-        position, memory.local_map(position), neighbour[None]
-    )[0]
+    importance, neighbours_x, neighbours_y, obstacles = PolicyImages(
+        PARAMETERS, MAP_CHANNELS[4], 32
+    ).images(position, memory.local_map(position), neighbour[None])[0]
     # 128 + 28 and 128 - 24 cells into a local map of 256, eight of them to one of the image.
     assert np.unravel_index(importance.argmax(), importance.shape) == (19, 13)
     cell = (22, 12)  # rint(100 / 16 + 15.5), rint(-50 / 16 + 15.5)
@@ -100,9 +102,57 @@ def test_obstacles_are_on_the_side_of_the_border() -> None:
 
 def test_two_channels_leave_the_neighbours_out() -> None:
     own, unseen = np.array([0.0, 256.0]), np.zeros((256, 256), np.float32)
-    images = PolicyImages(PARAMETERS, 2, 32).images(own, unseen, np.array([[10.0, 256.0]]))
+    images = PolicyImages(PARAMETERS, MAP_CHANNELS[2], 32).images(
+        own, unseen, np.array([[10.0, 256.0]])
+    )
     assert images.shape == (1, 2, 32, 32)
     np.testing.assert_array_equal(images[0, 1], images_at((0.0, 256.0), [])[3])
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    data=st.data(),
+    world_size=st.integers(8, 300),
+    sensor_size=st.sampled_from([2, 10, 32]),
+    unknown=st.sampled_from([0.0, 0.25]),
+)
+def test_explored_is_one_where_the_sensor_has_been(
+    data: st.DataObject, world_size: int, sensor_size: int, unknown: float
+) -> None:
+    """Cell by cell, and the other images are those of a robot that does not tell."""
+    other = PerceptionParameters(world_size, 64, sensor_size, 50.0, unknown)
+    parameters = dataclasses.replace(other, unseen_as_nan=True)
+    memory, other_memory = RobotMemory(parameters), RobotMemory(other)
+    policy_images = PolicyImages(parameters, MAP_CHANNELS[5], 16)
+    other_images = PolicyImages(other, MAP_CHANNELS[4], 16)
+    seen: set[tuple[int, int]] = set()
+    coordinates = st.floats(-0.2 * world_size, 1.2 * world_size)
+    path = data.draw(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=6))
+    rng = np.random.default_rng(0)
+    for place in map(np.array, path):
+        # Some of what is seen is worth nothing.
+        view = rng.integers(0, 2, (sensor_size, sensor_size)).astype(np.float32)
+        low_x, low_y = window_corner(place, sensor_size)
+        seen |= {(low_x + i, low_y + j) for i in range(sensor_size) for j in range(sensor_size)}
+        memory.observe(place, view)
+        other_memory.observe(place, view)
+        position, neighbours = np.clip(place, 0.0, world_size), rng.uniform(0, world_size, (3, 2))
+
+        images = policy_images.images(position, memory.local_map(position), neighbours)[0]
+        image = dict(zip(MAP_CHANNELS[5], images, strict=True))
+        explored = np.zeros((64, 64), np.float32)
+        corner_x, corner_y = window_corner(position, 64)
+        for x, y in seen:
+            in_x, in_y = x - corner_x, y - corner_y
+            if min(x, y, in_x, in_y) >= 0 and max(x, y) < world_size and max(in_x, in_y) < 64:
+                explored[in_x, in_y] = 1.0
+        expected = np.empty((16, 16), np.float32)
+        Resize(64, 16).image(explored, out=expected)
+        np.testing.assert_array_equal(image["explored"], expected)
+
+        without = other_images.images(position, other_memory.local_map(position), neighbours)[0]
+        for name, values in zip(MAP_CHANNELS[4], without, strict=True):
+            np.testing.assert_array_equal(image[name], values)
 
 
 @given(st.lists(st.tuples(*[st.floats(-255.9, 255.9)] * 2), max_size=12))

@@ -7,7 +7,7 @@ from edge.core import F32, F64
 from edge.core.perception import PerceptionParameters, RobotMemory, neighbours_in_range
 from edge.core.world import random_features
 from edge.drivers.world_sensor import WorldSensor
-from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
 from tests.unit.core.reference import point_vector, reference_environment
 
 PARAMETERS = PerceptionParameters(
@@ -51,7 +51,10 @@ def test_images_are_the_librarys(seed: int) -> None:
     environment = reference_environment(features, walk[0])
     # The library's own raster: ours is compared with it elsewhere.
     sensor = WorldSensor(environment.GetWorldMap().astype(np.float32), PARAMETERS.sensor_size)
-    robots = [(RobotMemory(PARAMETERS), PolicyImages(PARAMETERS, 4, 32)) for _ in range(ROBOTS)]
+    robots = [
+        (RobotMemory(PARAMETERS), PolicyImages(PARAMETERS, MAP_CHANNELS[4], 32))
+        for _ in range(ROBOTS)
+    ]
     seen = 0.0
     for positions in walk:
         environment.SetGlobalRobotPositions(point_vector(positions))

@@ -1,10 +1,18 @@
 """Random LPAC state dicts of any geometry, with batch norms that have seen data."""
 
+import io
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from edge.policy.bundle import Bundle
+from export.checkpoint import parse_checkpoint
+from export.exporter import bundle_of
+from export.parameters import read_parameters
+
+ROOT = Path(__file__).parents[3]
 State = dict[str, torch.Tensor]
 
 
@@ -63,3 +71,11 @@ def random_state(
     weight("output_linear.weight", 2, 32)
     bias("output_linear.bias", 2)
     return state
+
+
+def random_bundle(**sizes: int) -> Bundle:
+    """The bundle of such a state, with the shipped policy's perception."""
+    content = io.BytesIO()
+    torch.save(random_state(**sizes), content)
+    parameters = read_parameters(ROOT / "policies" / "lpac_l2_k3_n10_512.toml")
+    return bundle_of(parse_checkpoint(content.getvalue(), "random"), parameters, "random", {})

@@ -73,6 +73,24 @@ def test_command_writes_a_bundle_that_verifies(tmp_path: Path) -> None:
         assert "L = 2, K = 1, features 10 -> 16 -> 16" in result.output
 
 
+def test_a_checkpoint_of_five_images_sees_what_was_explored(tmp_path: Path) -> None:
+    torch.save(random_state(channels=5), tmp_path / "model.pt")
+    result = run(
+        *(tmp_path / "model.pt", "--params", POLICIES / f"{NAME}.toml"),
+        *("-o", tmp_path / "bundle"),
+    )
+    assert result.exit_code == 0, result.output
+    bundle = load_bundle(tmp_path / "bundle")
+    images = LpacManifest.of(bundle.manifest).images
+    assert images is not None and images.channels == (
+        "importance", "neighbours_x", "neighbours_y", "explored", "obstacles",
+    )  # fmt: skip
+    assert bundle.manifest.perception == PerceptionParameters(
+        512, 256, 64, 256.0, unseen_as_nan=True
+    )
+    assert all(check.passed for check in LpacPolicy(bundle).verify())
+
+
 @pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
 def test_authors_taps_give_a_bundle_without_perception(tmp_path: Path) -> None:
     result = run(*(AUTHORS_TAPS, "--params", POLICIES / f"{NAME}.toml", "-o", tmp_path / "bundle"))

@@ -47,12 +47,14 @@ def scaled_weights(content: bytes, taps: int) -> Iterator[tuple[str, bytes]]:
             tensor.raw_data = original
 
 
-@pytest.mark.parametrize("kind", ["shipped", "authors", "random"])
+@pytest.mark.parametrize("kind", ["shipped", "authors", "random", "explored"])
 def test_every_tensor_of_a_graph_shows(kind: str, tmp_path: Path) -> None:
     if kind == "authors" and not AUTHORS_TAPS.is_dir():
         pytest.skip("the authors' taps are not in this checkout")
     if kind == "random":
         checkpoint = random_checkpoint(tmp_path, layers=5, hops=3)
+    elif kind == "explored":
+        checkpoint = random_checkpoint(tmp_path, channels=5)
     else:
         checkpoint = read_checkpoint(POLICY if kind == "shipped" else AUTHORS_TAPS)
     golden = golden_of(checkpoint)

@@ -31,7 +31,7 @@ GEOMETRIES = [
 ]
 CNNS = [
     (channels, image_size, kernel, convolutions)
-    for channels in (2, 4)
+    for channels in (2, 4, 5)
     for image_size in (16, 32)
     for kernel in (3, 5)
     for convolutions in (2, 3)

@@ -50,6 +50,28 @@ def test_directory_and_archive_hold_the_same_bundle(shipped_bundle: Bundle, arch
     assert load_bundle(folder) == shipped_bundle
 
 
+def test_what_older_versions_do_not_know_is_not_in_bundles_that_do_not_need_it(
+    shipped_bundle: Bundle, exploring_bundle: Bundle
+) -> None:
+    again = make_bundle(shipped_bundle.manifest, with_files(shipped_bundle))
+    assert again == shipped_bundle
+    perception = json.loads(exploring_bundle.files[MANIFEST])["perception"]
+    assert perception.pop("unseen_as_nan") is True
+    assert perception == json.loads(shipped_bundle.files[MANIFEST])["perception"]
+
+
+@pytest.mark.parametrize("channels", ["four", "five"])
+def test_images_and_the_local_map_must_agree(
+    channels: str, shipped_bundle: Bundle, exploring_bundle: Bundle
+) -> None:
+    manifest = (exploring_bundle if channels == "five" else shipped_bundle).manifest
+    assert manifest.perception is not None
+    told = channels == "four"
+    perception = dataclasses.replace(manifest.perception, unseen_as_nan=told)
+    with pytest.raises(BundleError, match=f"unseen_as_nan = {told}: must be {not told}"):
+        LpacManifest.of(dataclasses.replace(manifest, perception=perception))
+
+
 def test_the_shipped_bundle_computes_what_torch_computed(shipped_bundle: Bundle) -> None:
     checks = list(LpacPolicy(shipped_bundle).verify())
     assert [check.name for check in checks] == [*GRAPHS, "swarm"]

@@ -11,6 +11,7 @@ from edge.core import F64
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.policy.bundle import Bundle, BundleError
+from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import ReplayError, replay
 from edge.robot.pac import Pac, PacParameters, PayloadType
@@ -76,6 +77,18 @@ def test_the_same_machine_computes_the_same(
     for comparison in replay(shipped_policy, flown):
         assert (comparison.ticks, comparison.differing) == (6, 0)
         assert comparison.largest_difference == 0.0
+
+
+def test_what_was_explored_is_logged_with_the_other_images(exploring_bundle: Bundle) -> None:
+    policy = LpacPolicy(exploring_bundle)
+    flown = fly(policy)
+    for comparison in replay(policy, flown):
+        assert (comparison.ticks, comparison.differing) == (6, 0)
+    [images] = flown[0][2]["images"]
+    image = dict(zip(MAP_CHANNELS[5], images, strict=True))
+    # It has looked once, around itself, far from the border: 64 of the local map's 256 cells.
+    assert image[EXPLORED].sum() * 16**2 == pytest.approx(64**2, rel=1e-5)
+    assert image[EXPLORED][8, 8] == pytest.approx(1.0) and image[EXPLORED][0, 0] == 0.0
 
 
 def test_ticks_stand_for_themselves(shipped_policy: LpacPolicy) -> None:

@@ -12,7 +12,7 @@ from edge.core.aggregation import Geometry
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.policy.bundle import Bundle
-from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 from edge.policy.lpac.verify import swarm_velocities
 from edge.robot.pac import Pac, PacParameters
@@ -259,7 +259,7 @@ def test_robots_that_talk_by_wire_become_the_reference_network(shipped_policy: L
     assert perception
     images = np.concatenate(
         [
-            PolicyImages(perception, 4, 32).images(
+            PolicyImages(perception, MAP_CHANNELS[4], 32).images(
                 place, robot._memory.local_map(place), places_m[near] * 16.0
             )
             for robot, place, near in zip(robots, places_m * 16.0, neighbours, strict=True)

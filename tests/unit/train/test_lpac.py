@@ -1,6 +1,7 @@
 """The network that is trained is the one that flies."""
 
 import io
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from edge.core import F32, Bools
 from edge.core.schema import ConfigError
-from edge.policy.lpac.images import PolicyImages
+from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
 from edge.policy.lpac.manifest import LpacManifest
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 from export import network
@@ -71,6 +72,7 @@ def velocities(
             channels=("importance", "obstacles"), image_size=9, cnn_channels=(4, 7, 3), features=5,
             layers=3, hops=1, width=6, mlp_width=4, mlp_layers=3,
         ),
+        replace(SMALL, channels=MAP_CHANNELS[5]),
     ],
 )  # fmt: skip
 def test_it_computes_what_the_checkpoints_network_does(sizes: LpacNetwork) -> None:
@@ -129,14 +131,18 @@ def test_who_is_not_heard_is_still_a_neighbour() -> None:
     np.testing.assert_allclose(whole, expected, rtol=1e-6)
 
 
-@given(turned=st.integers(0, 7), seed=st.integers(0, 99))
-def test_symmetries_are_those_of_the_images(turned: int, seed: int) -> None:
+@given(turned=st.integers(0, 7), channels=st.sampled_from([4, 5]), seed=st.integers(0, 99))
+def test_symmetries_are_those_of_the_images(turned: int, channels: int, seed: int) -> None:
     """What a robot perceives in a mirrored world is the mirrored image of what it perceived."""
     parameters = read_parameters(SHIPPED.with_suffix(".toml")).perception
     size, rng = parameters.world_size, np.random.default_rng(seed)
     position, others = rng.integers(0, size, 2) * 1.0, rng.uniform(0, size, (3, 2))
     goal = rng.normal(size=2)
     around = rng.random((parameters.local_map_size,) * 2, np.float32)
+    sizes = LpacNetwork(channels=MAP_CHANNELS[channels])
+    if channels == 5:
+        parameters = replace(parameters, unseen_as_nan=True)
+        around[np.cumsum(around, axis=0) > 20.0] = np.nan
 
     def turn(points: "np.ndarray[Any, Any]", about: float) -> "np.ndarray[Any, Any]":
         points = points.copy()
@@ -151,14 +157,16 @@ def test_symmetries_are_those_of_the_images(turned: int, seed: int) -> None:
     flipped = flipped.T if turned & 4 else flipped
 
     def perceived(at: Any, local: Any, near: Any) -> dict[str, F32]:
-        images = PolicyImages(parameters, 4, 32).images(at, np.ascontiguousarray(local), near)
+        images = PolicyImages(parameters, sizes.channels, 32).images(
+            at, np.ascontiguousarray(local), near
+        )
         return {
             "images": images.copy(),
             "position_feature": position_feature(at, parameters.world_size)[None],
         }
 
     before, velocity = perceived(position, around, others), goal.astype(np.float32)[None]
-    inputs, velocity = LpacNetwork().symmetric(before, velocity, turned)
+    inputs, velocity = sizes.symmetric(before, velocity, turned)
     expected = perceived(turn(position, size / 2), flipped, turn(others, size / 2))
     np.testing.assert_allclose(velocity[0], turn(goal, 0.0), rtol=1e-6)
     np.testing.assert_allclose(inputs["position_feature"], expected["position_feature"], rtol=1e-6)

@@ -6,12 +6,15 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from edge.core.schema import ConfigError
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import load_bundle
+from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
+from edge.policy.lpac.manifest import LpacManifest
 from lpac.sim.cores import Outcome, Task
 from lpac.train.progress import RunProgress
 from lpac.train.run import TrainingRun
@@ -71,6 +74,19 @@ def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
         assert text in card
     for figure in ("losses", "costs", "first-world", "worst-world"):
         assert (folder / "figures" / f"{figure}.png").stat().st_size > 5_000
+
+
+def test_a_network_that_sees_what_was_explored_is_trained_alike(tmp_path: Path) -> None:
+    channels = MAP_CHANNELS[5]
+    config = read(tmp_path, ("[network]\n", f"[network]\nchannels = {list(channels)}\n"))
+    TrainingRun(config, tmp_path / "run", quiet).run(here)
+    bundle = load_bundle(tmp_path / "run" / "small")
+    images = LpacManifest.of(bundle.manifest).images
+    assert images is not None and images.channels == channels
+    assert all(check.passed for check in load_policy(bundle).verify())
+    data = [np.load(shard)["input/images"] for shard in (tmp_path / "run" / "data").glob("*.npz")]
+    explored = np.concatenate(data)[:, channels.index(EXPLORED)]
+    assert explored.min() == 0.0 and explored.max() == 1.0
 
 
 def test_stopped_anywhere_it_goes_on_and_comes_to_the_same(
