@@ -113,7 +113,7 @@ class PolicyImages:
             self._part[inside] = ~unseen[inside]
             self._resize.image(self._part, out=image[EXPLORED])
             self._part[:] = local_map
-            self._part[unseen] = parameters.unknown_importance
+            np.copyto(self._part, parameters.unknown_importance, where=unseen)
             local_map = self._part
         self._resize.image(local_map, out=image["importance"])
         image["obstacles"][:] = 1.0 - np.outer(*map(self._resize.interval, inside))

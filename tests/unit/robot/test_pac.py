@@ -1,6 +1,7 @@
 """One robot's steps: what they do, and what they do when something is missing."""
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +15,8 @@ from edge.core.fleet_time import FleetTime
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
 from edge.core.wire import Rejection, decode, encode
-from edge.policy.bundle import Bundle, BundleError
+from edge.policy.bundle import Bundle, BundleError, Manifest
+from edge.policy.family import GoldenCheck, Observation, Perceived, Policy, PolicyStep
 from edge.policy.lpac.policy import LpacPolicy
 from edge.robot.pac import Pac, PacParameters
 
@@ -38,7 +40,7 @@ class World:
 
 
 def make_robot(
-    policy: LpacPolicy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
+    policy: Policy, world: World, robot_id: int = 1, parameters: PacParameters = PARAMETERS
 ) -> Pac:
     robot = Pac(
         robot_id=robot_id, boot_epoch=1, policy=policy, sensor=world, odometry=world,
@@ -287,6 +289,58 @@ def test_a_bundle_without_perception_drives_no_robot(shipped_bundle: Bundle) -> 
     blind.manifest = dataclasses.replace(blind.manifest, perception=None)
     with pytest.raises(BundleError, match="has no perception"):
         make_robot(blind, World())
+
+
+@dataclass
+class Watching:
+    """A policy of another family, and its agent, which keeps the maps that it is shown."""
+
+    manifest: Manifest
+    bundle_id: bytes = bytes(32)
+    message_size: int = 0
+    local_maps: list[F32] = field(default_factory=list)
+
+    def agent(self) -> "Watching":
+        return self
+
+    def verify(self) -> Iterator[GoldenCheck]:
+        return iter(())
+
+    def observe(self, observation: Observation) -> Perceived:
+        _, local_map, _ = observation
+        self.local_maps.append(local_map.copy())
+        return Perceived(np.zeros(2, np.float32), {})
+
+    def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
+        return PolicyStep(features, np.zeros(0, np.float32))
+
+    def reset(self) -> None:
+        pass
+
+
+def test_a_policy_is_shown_what_is_unseen_if_its_manifest_asks(shipped_bundle: Bundle) -> None:
+    manifest = dataclasses.replace(shipped_bundle.manifest, family="watching", parameters={})
+    assert manifest.perception is not None
+    asks = dataclasses.replace(manifest.perception, unseen_as_nan=True)
+    shown = []
+    for policy in (
+        Watching(manifest),
+        Watching(dataclasses.replace(manifest, perception=asks)),
+    ):
+        robot = make_robot(policy, World(position=(0.0, 16.0, 3.0)))  # at x = 0, y = 256
+        robot.perceive(0.0)
+        robot.forget()
+        robot.perceive(0.1)
+        first, again = policy.local_maps
+        np.testing.assert_array_equal(first, again)
+        shown.append(first)
+    plain, marked = shown
+    seen = np.zeros((256, 256), np.bool_)
+    seen[96:160, 96:160] = True
+    np.testing.assert_array_equal(plain[128:], np.where(seen, np.float32(0.5), 0.0)[128:])
+    np.testing.assert_array_equal(np.isnan(marked), ~seen & (np.arange(256) >= 128)[:, None])
+    np.testing.assert_array_equal(np.nan_to_num(marked), plain)
+    assert not plain[:128].any()  # outside the world
 
 
 def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> None:
