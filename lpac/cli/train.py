@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 app = new_app()
 
 _OUT = Path("out/train")
-_LOCK_CHARACTERS = 80
+# The name of a lock has some hundred bytes.
+_LOCK_BYTES = 80
 
 
 @app.command()
@@ -43,7 +44,7 @@ def train(
     cores = pool(ray)
     folder = out or _OUT / read.config.export.name
     with (
-        ProcessLock(f"the training in {str(folder.resolve())[-_LOCK_CHARACTERS:]}"),
+        ProcessLock(f"the training in {_last_part(folder)}"),
         _progress() as tell,
     ):
         told = TrainingRun(read, folder, tell).run(cores)
@@ -51,6 +52,10 @@ def train(
         typer.echo(json.dumps(told, indent=2))
     else:
         _show(told)
+
+
+def _last_part(folder: Path) -> str:
+    return bytes(folder.resolve())[-_LOCK_BYTES:].decode(errors="ignore")
 
 
 @contextmanager
