@@ -92,7 +92,7 @@ class PolicyImages:
         self._parameters = parameters
         self._resize = Resize(parameters.local_map_size, image_size)
         self._images = np.empty((1, len(channels), image_size, image_size), np.float32)
-        self._image = dict(zip(channels, self._images[0], strict=True))
+        self._channels = tuple(channels)
         if EXPLORED in channels:
             # What of the local map is resized: what was seen, and then what is known there.
             self._part = np.empty((parameters.local_map_size,) * 2, np.float32)
@@ -104,7 +104,9 @@ class PolicyImages:
         `neighbours` (n, 2) are the positions of the robots in range. Those outside the world are
         taken to the nearest point of it, where training kept the robots.
         """
-        parameters, image = self._parameters, self._image
+        parameters = self._parameters
+        # Views for this call alone: kept, a copy of a robot would be torn from its own images.
+        image = dict(zip(self._channels, self._images[0], strict=True))
         corner = window_corner(position, parameters.local_map_size)
         _, inside = part_in_world(corner, parameters.local_map_size, parameters.world_size)
         if EXPLORED in image:

@@ -1,5 +1,6 @@
 """The robot's memory and its images: against plain dense arrays, torch, and by hand."""
 
+import copy
 import dataclasses
 from typing import Any
 
@@ -214,3 +215,22 @@ def test_a_coarse_cell_counts_as_seen_when_its_centre_was(world_size: int) -> No
         seen |= np.outer(in_x, in_y)
         np.testing.assert_array_equal(memory.explored, seen)
     assert seen.any()
+
+
+@pytest.mark.parametrize("channels", [2, 4, 5])
+def test_a_copied_robot_looks_at_images_of_its_own(channels: int) -> None:
+    parameters = PerceptionParameters(
+        world_size=64, local_map_size=32, sensor_size=16, communication_range=20.0,
+        unseen_as_nan=channels == 5,
+    )  # fmt: skip
+    images = PolicyImages(parameters, MAP_CHANNELS[channels], 8)
+    looks = [
+        (np.array([30.0, 30.0]), np.zeros((32, 32), np.float32), np.zeros((0, 2))),
+        (np.array([5.0, 40.0]), np.ones((32, 32), np.float32), np.array([[9.0, 42.0]])),
+    ]
+    first = images.images(*looks[0]).copy()
+    copied = copy.deepcopy(images)
+    second = copied.images(*looks[1]).copy()
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(images.images(*looks[0]), first)
+    np.testing.assert_array_equal(images.images(*looks[1]), second)
