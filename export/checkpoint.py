@@ -161,6 +161,13 @@ def parse_checkpoint(content: bytes, name: str) -> Checkpoint:
     return _checkpoint(_state_dict(Path(name), content))
 
 
+def checkpoint_tensors(content: bytes, name: str) -> dict[str, torch.Tensor]:
+    """The tensors of a state dict's file by their names, checked. Raises CheckpointError."""
+    source = _state_dict(Path(name), content)
+    _checkpoint(source)
+    return dict(source.tensors)
+
+
 def _checkpoint(source: _Source) -> Checkpoint:
     layers = max(_count(source, r"gnn_backbone\.graph_conv_(\d+)\..*"), 1)
     taps = _count_taps(source)

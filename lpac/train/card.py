@@ -133,6 +133,8 @@ def _text(card: ModelCard) -> str:
         f"{_least_most(worlds.communication_range)}"
         for worlds in data.worlds
     )
+    begun = config.fit.begin_with
+    begins = f"It begins with the weights of `{begun}`." if begun else "Its weights were drawn."
     return f"""# {name}
 
 A policy of the family `{config.network.get("family", "lpac")}`, bundle `{card.bundle_id}`.
@@ -148,9 +150,9 @@ the policy in {dagger.rounds} DAgger rounds. Worlds: {trained}. Flown at
 
 ## Training
 
-{len(card.losses)} epochs in all, on {card.device}; the loss came to {card.losses[-1].loss:.3f} of
-the actions' variance. Hours: {card.generate_hours:.2f} of CPU to make the data,
-{card.fit_hours:.2f} to fit, {card.select_hours:.2f} to select. Versions:
+{begins} {len(card.losses)} epochs in all, on {card.device}; the loss came to
+{card.losses[-1].loss:.3f} of the actions' variance. Hours: {card.generate_hours:.2f} of CPU to make
+the data, {card.fit_hours:.2f} to fit, {card.select_hours:.2f} to select. Versions:
 {", ".join(f"{each} {number}" for each, number in card.versions.items())}.
 
 ![losses](figures/losses.png)

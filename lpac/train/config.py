@@ -17,7 +17,7 @@ from export.parameters import PolicyParameters
 from lpac.evaluate.worlds import SET_UPS
 from lpac.sim.experiment import FIELD_SCALE, MAX_ROBOTS
 from lpac.sim.ticks import Clocks
-from lpac.train.family import Learnable, learnable
+from lpac.train.family import Learnable, StateDict, learnable
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
@@ -126,6 +126,8 @@ class DataConfig:
 class FitConfig:
     """Imitation of the expert: `epochs` over the first data, in batches of about `batch_robots`.
 
+    `begin_with` is a checkpoint that is trained on, its path from the configuration's folder; if
+    there is none, weights are drawn.
     The learning rate falls to nothing along a cosine, in each round again. `lost_messages` is the
     share of the graph's edges that is left out at random; with `symmetries` each state is mirrored
     and turned at random. `bf16` computes in it where the machine does.
@@ -138,6 +140,7 @@ class FitConfig:
     lost_messages: float = 0.0
     symmetries: bool = True
     bf16: bool = True
+    begin_with: str | None = None
 
     def __post_init__(self) -> None:
         _at_least(1, epochs=self.epochs)
@@ -236,11 +239,15 @@ class TrainingConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadConfig:
-    """A configuration, the network that it describes, and the file's text."""
+    """A configuration, the network that it describes, and the file's text.
+
+    `initial` are the weights that training begins with, None for such as are drawn.
+    """
 
     config: TrainingConfig
     network: Learnable
     text: str
+    initial: StateDict | None
 
     @property
     def digest(self) -> str:
@@ -260,7 +267,20 @@ def read_config(path: Path) -> ReadConfig:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
     config = from_mapping(TrainingConfig, document, str(path))
-    return ReadConfig(config, learnable(config.network, f"{path}: network"), text)
+    network = learnable(config.network, f"{path}: network")
+    return ReadConfig(config, network, text, _initial(config, network, path))
+
+
+def _initial(config: TrainingConfig, network: Learnable, path: Path) -> StateDict | None:
+    if config.fit.begin_with is None:
+        return None
+    checkpoint, where = path.parent / config.fit.begin_with, f"{path}: fit.begin_with"
+    try:
+        return network.initial(checkpoint.read_bytes(), str(checkpoint))
+    except OSError as error:
+        raise ConfigError(f"{where} = {str(checkpoint)!r}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
 
 
 def config_digest(text: str) -> str:

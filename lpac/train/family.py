@@ -47,6 +47,12 @@ class Learnable(Protocol):
         outputs of mean 0 and deviation 1.
         """
 
+    def initial(self, checkpoint: bytes, name: str) -> StateDict:
+        """A module's state dict with the weights of a checkpoint, to train on from them.
+
+        Raises ValueError that begins with `name`, if that is of another network.
+        """
+
     def symmetric(self, inputs: Inputs, velocities: F32, turned: int) -> tuple[Inputs, F32]:
         """All that in a world that is mirrored or turned: `turned` is 0 (as it is) to 7."""
 

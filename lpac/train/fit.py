@@ -47,14 +47,24 @@ class Fit:
     """The weights, and how far they are; kept in a file."""
 
     def __init__(
-        self, network: Learnable, fit: FitConfig, dagger: DaggerConfig, seed: int, path: Path
+        self,
+        network: Learnable,
+        fit: FitConfig,
+        dagger: DaggerConfig,
+        seed: int,
+        path: Path,
+        initial: StateDict | None = None,
     ) -> None:
-        """Goes on with the file at `path`, if there is one. Raises OSError, ValueError."""
+        """Goes on with the file at `path`, if there is one; else from `initial`, or as drawn.
+
+        Raises OSError, ValueError.
+        """
         self._network = network
         self._config = fit
         self._dagger = dagger
         self._seed = seed
         self._path = path
+        self._initial = initial
         self._device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self._bf16 = fit.bf16 and _computes_bf16(self._device)
         self._at = _Position()
@@ -81,7 +91,7 @@ class Fit:
         return at.epoch if at.round == round_ else self.epochs(round_) if at.round > round_ else 0
 
     def untrained(self) -> StateDict:
-        """Weights as they are drawn, for a bundle whose inputs are needed, and not its actions."""
+        """As training begins with them, for a bundle whose inputs are needed, not its actions."""
         zero, one = np.zeros(2, np.float32), np.ones(2, np.float32)
         return self._drawn(zero, one).state_dict()
 
@@ -182,7 +192,10 @@ class Fit:
     def _drawn(self, mean: F32, deviation: F32) -> torch.nn.Module:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
-            return self._network.module(mean, deviation)
+            module = self._network.module(mean, deviation)
+        if self._initial is not None:
+            module.load_state_dict(self._initial)
+        return module
 
     def _restored(self, data: Dataset) -> tuple[torch.nn.Module, torch.optim.Optimizer]:
         """The module and its optimiser, as they were kept, or new."""

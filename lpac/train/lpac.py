@@ -24,11 +24,16 @@ from export.checkpoint import (
     BATCH_NORM_EPS,
     LEAKY_RELU_SLOPE,
     POSITION_SIZE,
+    checkpoint_tensors,
     parse_checkpoint,
 )
 from export.exporter import bundle_of
 from export.parameters import PolicyParameters
 from lpac.train.family import Inputs, StateDict
+
+_FIRST_CONVOLUTION = "cnn_backbone.conv0.weight"
+# A count that nothing is computed from, which not every checkpoint has.
+_BATCHES = "num_batches_tracked"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,6 +83,28 @@ class LpacNetwork:
     def module(self, actions_mean: F32, actions_std: F32) -> "LpacModule":
         """See `Learnable`."""
         return LpacModule(self, self._side, actions_mean, actions_std)
+
+    def initial(self, checkpoint: bytes, name: str) -> StateDict:
+        """See `Learnable`; images that the checkpoint's CNN does not see have weights of 0."""
+        zero, one = np.zeros(ACTION_SIZE, np.float32), np.ones(ACTION_SIZE, np.float32)
+        state = self.module(zero, one).state_dict()
+        tensors = checkpoint_tensors(checkpoint, name)
+        seen = tensors[_FIRST_CONVOLUTION]
+        channels = MAP_CHANNELS.get(seen.shape[1], ())
+        if set(channels) <= set(self.channels):
+            places = [self.channels.index(channel) for channel in channels]
+            widened = seen.new_zeros(seen.shape[0], len(self.channels), *seen.shape[2:])
+            widened[:, places] = seen
+            tensors[_FIRST_CONVOLUTION] = widened
+        for tensor, expected in state.items():
+            if tensor not in tensors and tensor.endswith(_BATCHES):
+                continue
+            found = tuple(tensors[tensor].shape) if tensor in tensors else "nothing"
+            if found != tuple(expected.shape):
+                raise ValueError(f"{name}: {tensor}: found {found}, expected {(*expected.shape,)}")
+        if unknown := tensors.keys() - state.keys():
+            raise ValueError(f"{name}: {min(unknown)}: the network has no such tensor")
+        return {**state, **tensors}
 
     def symmetric(self, inputs: Inputs, velocities: F32, turned: int) -> tuple[Inputs, F32]:
         """See `Learnable`; bit 0 mirrors x, bit 1 mirrors y, bit 2 swaps the two."""

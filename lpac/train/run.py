@@ -55,7 +55,9 @@ class TrainingRun:
         write_atomically(begun, read.text.encode())
         config = self._config
         self._shards = Shards(folder / "data", read.digest)
-        self._fit = Fit(read.network, config.fit, config.dagger, config.seed, folder / "fit.pt")
+        self._fit = Fit(
+            read.network, config.fit, config.dagger, config.seed, folder / "fit.pt", read.initial
+        )
         self._selection = Selection(folder, read.digest, config.select)
         self._plans = [
             plan_round(config.data, config.dagger, config.seed, round_)

@@ -28,6 +28,8 @@ from tests.training import SMALL, read
         ("come_back = 0.5", "come_back = 2.0", "come_back = 2.0: must be from 0 to 1"),
         ("epochs = 2", "epochs = 0", "fit: epochs = 0: must be at least 1"),
         ("epochs = 2", "epochs = 2\nlearning_rate = 0.0", "learning_rate = 0.0: must be above 0"),
+        ("epochs = 2", "epochs = 2\nbegin_with = 'no.pt'", r"fit.begin_with = '.*no.pt': No such"),
+        ("epochs = 2", "epochs = 2\nbegin_with = 'small.toml'", "begin_with: .* no torch file"),
         ("rounds = 1", "rounds = -1", "dagger: rounds = -1: must be at least 0"),
         ('"n3"', '"n4"', "select: set_ups = 'n4': allowed are field, n1, n3, "),
         ('["n3"]', "[]", "select: set_ups = .*: must be one or more"),

@@ -7,6 +7,7 @@ import pytest
 
 from lpac.train.config import DaggerConfig, FitConfig
 from lpac.train.data import Dataset
+from lpac.train.family import StateDict
 from lpac.train.fit import Fit
 from lpac.train.lpac import LpacNetwork
 
@@ -31,9 +32,9 @@ def states(count: int, robots: int = 3) -> Dataset:
     )
 
 
-def fit(path: Path, epochs: int) -> Fit:
+def fit(path: Path, epochs: int, initial: StateDict | None = None) -> Fit:
     config = FitConfig(epochs=epochs, batch_robots=30, learning_rate=1e-2, bf16=False)
-    return Fit(NETWORK, config, DaggerConfig(), 0, path)
+    return Fit(NETWORK, config, DaggerConfig(), 0, path, initial)
 
 
 def test_it_learns(tmp_path: Path) -> None:
@@ -43,6 +44,15 @@ def test_it_learns(tmp_path: Path) -> None:
     assert len(losses) == 8 and losses[-1] < 0.1 and losses[0] > 2.0 * losses[-1]
     again = fit(tmp_path / "fit.pt", 8)
     assert again.losses == of.losses and again.done(0) == 8 and again.done(1) == 0
+
+
+def test_it_begins_with_what_was_learnt_before(tmp_path: Path) -> None:
+    before = fit(tmp_path / "before.pt", 8)
+    before.run(states(200), 0, 8, lambda share, loss: None)
+    of = fit(tmp_path / "fit.pt", 8, before.weights)
+    assert all(of.untrained()[name].equal(tensor) for name, tensor in before.weights.items())
+    of.run(states(200), 0, 1, lambda share, loss: None)
+    assert of.losses[0].loss < 0.5 * before.losses[0].loss
 
 
 def test_a_loss_that_is_not_finite_is_one_line(tmp_path: Path) -> None:

@@ -207,3 +207,44 @@ def test_networks_that_cannot_be(network_table: dict[str, object], text: str) ->
     if "family" not in network_table:
         with pytest.raises(ConfigError, match=text):
             lpac_network(network_table, "here")
+
+
+@pytest.mark.parametrize("batches", [True, False])
+def test_a_checkpoint_without_the_explored_image_is_gone_on_with(batches: bool) -> None:
+    """Whatever that image shows, at first the wider network does what the narrower one does."""
+    module = drawn(SMALL)
+    state = {
+        name: tensor
+        for name, tensor in module.state_dict().items()
+        if batches or not name.endswith("num_batches_tracked")
+    }
+    sizes = replace(SMALL, channels=MAP_CHANNELS[5])
+    wider = sizes.module(MEAN + 1.0, DEVIATION)
+    wider.load_state_dict(sizes.initial(SMALL.checkpoint(state), "narrow.pt"))
+    inputs, adjacency = swarm(sizes, 7)
+    places = [sizes.channels.index(channel) for channel in SMALL.channels]
+    narrow = {**inputs, "images": inputs["images"][:, places]}
+    present = np.ones((1, 7), np.bool_)
+    torch.testing.assert_close(
+        velocities(wider.eval(), inputs, adjacency[None], present),
+        velocities(module, narrow, adjacency[None], present),
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"width": 9}, r"other.pt: gnn_backbone.graph_conv_0.bias: found \(9,\), expected \(8,\)"),
+        ({"layers": 1}, r"other.pt: gnn_backbone.graph_conv_1.bias: found nothing, expected"),
+        ({"layers": 3}, r"other.pt: gnn_backbone.graph_conv_2.*: the network has no such tensor"),
+        (
+            {"channels": MAP_CHANNELS[5]},
+            r"other.pt: cnn_backbone.conv0.weight: found \(6, 5, 3, 3\)",
+        ),
+    ],
+)
+def test_another_networks_checkpoint_is_not(changes: dict[str, Any], text: str) -> None:
+    other = replace(SMALL, **changes)
+    checkpoint = other.checkpoint(drawn(other).state_dict())
+    with pytest.raises(ValueError, match=text):
+        SMALL.initial(checkpoint, "other.pt")
