@@ -42,8 +42,8 @@ def over_processes(
     workers = min(len(tasks), at_most)
     # A fork would inherit threads that do not run there.
     with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
-        given = [pool.submit(do, task) for task in tasks]
         try:
+            given = [pool.submit(do, task) for task in tasks]
             for done in as_completed(given):
                 yield done.result()
         except BrokenProcessPool:
