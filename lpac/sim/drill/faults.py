@@ -30,6 +30,7 @@ from lpac.sim.drill.bounds import (
 )
 from lpac.sim.drill.injections import (
     AutopilotSilent,
+    BatteryIs,
     CarriedToPad,
     ClockSteps,
     CompassJumps,
@@ -538,7 +539,7 @@ _ENERGY_AND_AIR = (
     Fault(
         name="battery-low-before", what="a robot's battery is at 30 % before takeoff",
         promise="it does not take off",
-        phase="ready", does=_once(Drain(0.30)),
+        phase="ready", does=_once(BatteryIs(0.30)),
         bounds=(StaysDown(), TakesOff("others")),
     ),
 )  # fmt: skip
@@ -625,7 +626,7 @@ _PEOPLE = (
         name="pad-taken-before", what="a robot stands beside another's landing point at first",
         promise="the other one does not take off",
         # It stays there: its own battery is too low for a takeoff.
-        phase="ready", does=_once(CarriedToPad(beside_m=2.0), Drain(0.30)), watched_s=30.0,
+        phase="ready", does=_once(CarriedToPad(beside_m=2.0), BatteryIs(0.30)), watched_s=30.0,
         exact=True,
         bounds=(StaysDown(), StaysDown("next")),
     ),

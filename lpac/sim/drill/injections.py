@@ -59,13 +59,18 @@ class LoseGps(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
-class Drain(VehicleInjection):
-    """Its battery falls to this share."""
+class BatteryIs(VehicleInjection):
+    """Its battery has this share left from now on."""
 
     remaining: float
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
         vehicle.battery_remaining = self.remaining
+
+
+@dataclass(frozen=True, slots=True)
+class Drain(BatteryIs):
+    """It falls to it in flight: PX4's own simulator keeps the battery full while disarmed."""
 
 
 @dataclass(frozen=True, slots=True)
