@@ -7,7 +7,8 @@ import numpy as np
 
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
-from edge.core.perception import RobotMap, RobotMemory, neighbours_in_range, window_corner
+from edge.core.memory import RobotMap, RobotMemory
+from edge.core.perception import neighbours_in_range, window_corner
 from edge.core.world import random_features, rasterize
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Manifest

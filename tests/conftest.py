@@ -1,5 +1,6 @@
 """What all tests share: their tiers, and the shipped policy."""
 
+import dataclasses
 import signal
 import sys
 from collections.abc import Iterator
@@ -8,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from edge.policy.bundle import Bundle, load_bundle
+from edge.policy.bundle import Bundle, load_bundle, make_bundle
 from edge.policy.lpac.policy import LpacPolicy
 
 ROOT = Path(__file__).parents[1]
@@ -111,6 +112,16 @@ def exploring_bundle() -> Bundle:
     states = pytest.importorskip("tests.unit.export.states", reason="torch makes the bundle")
     bundle: Bundle = states.random_bundle(channels=5)
     return bundle
+
+
+@pytest.fixture(scope="session")
+def sharing_bundle(exploring_bundle: Bundle) -> Bundle:
+    """One whose robots tell each other what they have seen."""
+    manifest = exploring_bundle.manifest
+    assert manifest.perception is not None
+    perception = dataclasses.replace(manifest.perception, shared_map_cell=8)
+    files = {name: exploring_bundle.files[name] for name in manifest.files}
+    return make_bundle(dataclasses.replace(manifest, perception=perception), files)
 
 
 @pytest.fixture(scope="session")

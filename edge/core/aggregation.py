@@ -12,6 +12,7 @@ import numpy as np
 
 from edge.core import F32
 from edge.core.fleet_time import FleetTime
+from edge.core.shared_map import SharedMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,8 @@ class AggregatedMessage:
     `position_m` and `velocity_m_s` are in the mission frame that `frame_id` stands for
     (`MissionFrame.frame_id`); `sent` is when, None as long as the sender does not know the time.
     `boot_epoch` grows with every start of the sender, `sequence` with every message of one start.
+    `shared` is what it knows around it, if robots share maps, and `trial` the mission that it knows
+    it of: what was seen in another one is not to be known.
     """
 
     robot_id: int
@@ -62,6 +65,8 @@ class AggregatedMessage:
     velocity_m_s: tuple[float, float, float]
     frame_id: int
     payload: F32
+    trial: int = 0
+    shared: SharedMap | None = None
 
 
 class HopBuffer:

@@ -11,6 +11,7 @@ from threading import Lock
 from typing import NamedTuple
 
 from edge.core.aggregation import AggregatedMessage
+from edge.core.shared_map import SharedMap
 from edge.core.wire import Rejection
 
 # After a cut, TCP delivers data that is up to 2 s old; nothing is in transit longer than this.
@@ -18,12 +19,17 @@ _LONGEST_TRANSIT_S = 5.0
 
 
 class Neighbour(NamedTuple):
-    """Another robot: its position and velocity in the mission frame, as they were `age_s` ago."""
+    """Another robot: its position and velocity in the mission frame, as they were `age_s` ago.
+
+    And what it told of its surroundings in the mission `trial`, if robots share maps.
+    """
 
     robot_id: int
     position_m: tuple[float, float, float]
     velocity_m_s: tuple[float, float, float]
     age_s: float
+    trial: int = 0
+    shared: SharedMap | None = None
 
 
 class _Received(NamedTuple):
@@ -108,6 +114,8 @@ class Mailbox:
                 entry.message.position_m,
                 entry.message.velocity_m_s,
                 max(now_s - entry.born_s, 0.0),
+                entry.message.trial,
+                entry.message.shared,
             )
             for robot_id, entry in received
             if self._is_fresh(entry.born_s, now_s)

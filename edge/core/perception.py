@@ -1,20 +1,15 @@
-"""From sensor views to what a robot remembers of the world.
+"""What a robot perceives, in which sizes, and where that is in the world.
 
 All maps are indexed [x, y]; one cell is one model unit; positions are in model units.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from edge.core import F32, F64, Bools
+from edge.core import F64, Bools
 
-# What a robot has explored is told in this many cells along each side of the world.
-EXPLORED_CELLS = 64
-TILE_SIZE = 128
 MAX_WORLD_SIZE = 2**15  # whose raster takes 4 GiB
 
 
@@ -33,6 +28,8 @@ class PerceptionParameters:
     unknown_importance: float = 0.0
     # The local map is NaN there instead, for policies that tell what is unseen from what is not.
     unseen_as_nan: bool = False
+    # Robots tell each other what they have seen, in cells of this size; 0: they do not.
+    shared_map_cell: int = 0
 
     def __post_init__(self) -> None:
         if not 0 < self.world_size <= MAX_WORLD_SIZE:
@@ -49,6 +46,20 @@ class PerceptionParameters:
             raise ValueError(
                 f"unknown_importance = {self.unknown_importance}: must be at least 0 and finite"
             )
+        cell = self.shared_map_cell
+        if cell and not (cell > 0 and self.unseen_as_nan):
+            raise ValueError(
+                f"shared_map_cell = {cell}: must be 0, or above 0 with unseen_as_nan = true"
+            )
+        if cell and self.local_map_size % cell:
+            raise ValueError(
+                f"shared_map_cell = {cell}: must divide local_map_size = {self.local_map_size}"
+            )
+
+    @property
+    def shared_map_side(self) -> int:
+        """How many cells a shared map has along each side; 0 if maps are not shared."""
+        return self.local_map_size // self.shared_map_cell if self.shared_map_cell else 0
 
     @property
     def unseen(self) -> float:
@@ -76,109 +87,22 @@ def part_in_world(
     As a part of the world's raster and as a part of the window; empty, at the border, for a
     window outside the world.
     """
-    low_x, high_x, low_y, high_y = (
-        min(max(cell, 0), world_size) for start in corner for cell in (start, start + size)
+    (in_world_x, in_window_x), (in_world_y, in_window_y) = (
+        overlap(start, size, world_size) for start in corner
     )
-    x, y = corner
-    return (
-        (slice(low_x, high_x), slice(low_y, high_y)),
-        (slice(low_x - x, high_x - x), slice(low_y - y, high_y - y)),
-    )
+    return (in_world_x, in_world_y), (in_window_x, in_window_y)
 
 
-class RobotMap:
-    """What one robot has seen, in tiles that are made when first seen.
+def overlap(start: int, size: int, world_size: int) -> tuple[slice, slice]:
+    """What `size` cells from `start` on share with 0 .. world_size: as part of that, and of them.
 
-    So its cost is that of the area seen, however large the world is.
+    Empty, at the border, if they share nothing.
     """
-
-    def __init__(self, world_size: int, unseen: float = 0.0) -> None:
-        """`unseen` is the value of cells that were not seen; it may be NaN."""
-        self._world_size = world_size
-        self._unseen = np.float32(unseen)
-        self._tiles: dict[tuple[int, int], F32] = {}
-
-    def insert(self, view: F32, corner: tuple[int, int]) -> None:
-        """Write the square `view`, whose lowest cell is `corner`; what is off the world is not."""
-        size = view.shape[0]
-        for key, tile_part, view_part in self._overlaps(corner, size):
-            tile = self._tiles.get(key)
-            if tile is None:
-                tile = np.full((TILE_SIZE, TILE_SIZE), self._unseen, np.float32)
-                self._tiles[key] = tile
-            tile[tile_part] = view[view_part]
-
-    def window(self, corner: tuple[int, int], out: F32) -> F32:
-        """Fill the square `out` from `corner` on and return it; the outside of the world is 0."""
-        size = out.shape[0]
-        out[:] = 0.0
-        for key, tile_part, out_part in self._overlaps(corner, size):
-            tile = self._tiles.get(key)
-            if tile is not None:
-                out[out_part] = tile[tile_part]
-            elif self._unseen:
-                out[out_part] = self._unseen
-        return out
-
-    def _overlaps(
-        self, corner: tuple[int, int], size: int
-    ) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
-        """Tile, part of the tile and part of the window, for all tiles that share cells."""
-        spans_y = list(self._spans(corner[1], size))
-        for tile_x, in_tile_x, in_window_x in self._spans(corner[0], size):
-            for tile_y, in_tile_y, in_window_y in spans_y:
-                yield (tile_x, tile_y), (in_tile_x, in_tile_y), (in_window_x, in_window_y)
-
-    def _spans(self, start: int, size: int) -> Iterator[tuple[int, slice, slice]]:
-        """The same along one axis, from `start` on and inside the world."""
-        low, end = max(start, 0), min(start + size, self._world_size)
-        while low < end:
-            tile = low // TILE_SIZE
-            origin = tile * TILE_SIZE
-            high = min(end, origin + TILE_SIZE)
-            yield tile, slice(low - origin, high - origin), slice(low - start, high - start)
-            low = high
+    low, high = (min(max(cell, 0), world_size) for cell in (start, start + size))
+    return slice(low, high), slice(low - start, high - start)
 
 
-def neighbours_in_range(
-    position: F64, others: F64, communication_range: float
-) -> npt.NDArray[np.bool_]:
+def neighbours_in_range(position: F64, others: F64, communication_range: float) -> Bools:
     """Which of `others` (n, 2) are closer to `position` (2,) than the range: (n,) bool."""
-    near: npt.NDArray[np.bool_] = np.hypot(*(others - position).T) < communication_range
+    near: Bools = np.hypot(*(others - position).T) < communication_range
     return near
-
-
-class RobotMemory:
-    """What one robot has seen of the world.
-
-    Not thread-safe: it belongs to the perception thread.
-    """
-
-    def __init__(self, parameters: PerceptionParameters) -> None:
-        self._world_size = parameters.world_size
-        self._map = RobotMap(parameters.world_size, parameters.unseen)
-        self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
-        # For people: which cells of the coarse raster over the world it has seen.
-        self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
-
-    def observe(self, position: F64, view: F32) -> None:
-        """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
-
-        Those cells of `explored` count as seen whose centre was.
-        """
-        size = view.shape[0]
-        corner = window_corner(position, size)
-        self._map.insert(view, corner)
-        scale = EXPLORED_CELLS / self._world_size
-        x, y = (
-            slice(max(math.ceil(low * scale - 0.5), 0), max(math.ceil(high * scale - 0.5), 0))
-            for low, high in ((start, start + size) for start in corner)
-        )
-        self.explored[x, y] = True
-
-    def local_map(self, position: F64) -> F32:
-        """(local_map_size, local_map_size) around `position`, valid until the next call.
-
-        `PerceptionParameters.unseen` where nothing was seen; the outside of the world is 0.
-        """
-        return self._map.window(window_corner(position, self._local.shape[0]), self._local)

@@ -1,6 +1,6 @@
 """AggregatedMessage <-> the bytes that travel between robots.
 
-Little-endian, a header of 104 bytes and then the payload:
+Little-endian, a header of 104 bytes, then the payload, and then the map, if robots share maps:
 
 | offset | type | field | unit |
 | --- | --- | --- | --- |
@@ -21,6 +21,15 @@ Little-endian, a header of 104 bytes and then the payload:
 | 100 | uint32 | CRC-32 (zlib) of all other bytes, payload included | |
 | 104 | float32 or float16 | payload | |
 
+The map begins behind the payload; its type is the payload's, plus 128:
+
+| offset | type | field | unit |
+| --- | --- | --- | --- |
+| 0 | uint32 | the mission that it was seen in: CRC-32 of the trial's name | |
+| 4 | 2 x int32 | x, y of its first cell | cells |
+| 12 | uint32 | n, its side | cells |
+| 16 | n x n bytes | the cells, as `edge.core.shared_map` reads them, [x, y] | |
+
 Magic and version stay where they are in every version.
 """
 
@@ -36,12 +45,15 @@ import numpy.typing as npt
 from edge.core import F32
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetTime
+from edge.core.shared_map import SharedMap
 
 _MAGIC = b"LPAC-MSG"
 _VERSION = 3
 _VERSION_AT = len(_MAGIC)
 _FIELDS = struct.Struct("<8sBBHI16sQ4d3f3If")
 _CHECKSUM = struct.Struct("<I")
+_MAP = struct.Struct("<I2iI")
+_WITH_MAP = 0x80
 # A multiple of 8, so that the payload is aligned wherever the message is.
 _HEADER_SIZE = _FIELDS.size + _CHECKSUM.size
 _BUNDLE_ID_SIZE = 16
@@ -90,6 +102,10 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_dtype: npt.DTyp
     if payload_type is None:
         raise ValueError(f"payload dtype = {dtype}: must be float32 or float16")
     data = rounded(message.payload, _PAYLOAD_TYPES[payload_type]).tobytes()
+    if message.shared is not None:
+        payload_type |= _WITH_MAP
+        (x, y), codes = message.shared
+        data += _MAP.pack(message.trial, x, y, len(codes)) + codes.tobytes()
     base, time_s, uncertainty_s = message.sent or _NO_TIME
     fields = _FIELDS.pack(
         _MAGIC,
@@ -125,14 +141,15 @@ def decode(
     own_robot_id: int,
     message_size: int,
     payload_limit: float | None = None,
+    shared_side: int = 0,
 ) -> AggregatedMessage | Rejection:
     """The message in `data`, or why it is refused; raises nothing, whatever the bytes.
 
     `bundle_id` is the 32 bytes of the own manifest's SHA-256, `frame_id` that of the own mission
     frame (None takes messages of any), `message_size` the number of floats that the own network
-    takes, `payload_limit` the largest that one of them can be (None: any that is finite). The
-    payload is a read-only view of `data`, float32 or float16, not a copy: `data` must not change
-    afterwards.
+    takes, `payload_limit` the largest that one of them can be (None: any that is finite),
+    `shared_side` the side of the map that it takes, in cells (0: none). Payload and map are
+    read-only views of `data`, not copies: `data` must not change afterwards.
     """
     view = memoryview(data).toreadonly()
     # Nothing behind the version can be read in a layout that is not this one.
@@ -164,10 +181,17 @@ def decode(
         uncertainty_s,
     ) = _FIELDS.unpack_from(view)
     # First whether these are the bytes that were sent; only then does what they say mean anything.
-    dtype = _PAYLOAD_TYPES.get(payload_type)
+    dtype = _PAYLOAD_TYPES.get(payload_type & ~_WITH_MAP)
     if dtype is None:
         return Rejection.PAYLOAD_TYPE
-    sent_size = _HEADER_SIZE + payload_length * dtype.itemsize
+    map_at = _HEADER_SIZE + payload_length * dtype.itemsize
+    trial = x = y = side = 0
+    sent_size = map_at
+    if payload_type & _WITH_MAP:
+        if len(view) < map_at + _MAP.size:
+            return Rejection.TRUNCATED
+        trial, x, y, side = _MAP.unpack_from(view, map_at)
+        sent_size += _MAP.size + side * side
     if len(view) != sent_size:
         return Rejection.TRUNCATED if len(view) < sent_size else Rejection.TOO_LONG
     (checksum,) = _CHECKSUM.unpack_from(view, _FIELDS.size)
@@ -177,7 +201,7 @@ def decode(
         return Rejection.OTHER_BUNDLE
     if robot_id == own_robot_id:
         return Rejection.OWN
-    if payload_length != message_size:
+    if (payload_length, side) != (message_size, shared_side):
         return Rejection.PAYLOAD_LENGTH
     if frame_id is not None and sender_frame_id != frame_id:
         return Rejection.OTHER_FRAME
@@ -189,9 +213,15 @@ def decode(
         (x_m, y_m, z_m),
         (vx_m_s, vy_m_s, vz_m_s),
         sender_frame_id,
-        np.frombuffer(view, dtype, offset=_HEADER_SIZE),
+        np.frombuffer(view, dtype, payload_length, _HEADER_SIZE),
+        trial,
+        _shared_map((x, y), side, view[map_at + _MAP.size :]) if side else None,
     )
     return _out_of_range(message, (time_s, uncertainty_s), payload_limit) or message
+
+
+def _shared_map(corner: tuple[int, int], side: int, cells: memoryview) -> SharedMap:
+    return SharedMap(corner, np.frombuffer(cells, np.uint8).reshape(side, side))
 
 
 def _out_of_range(

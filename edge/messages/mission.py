@@ -21,7 +21,7 @@ from msgspec import Meta
 from edge.core import Bools
 from edge.core.fence import Fence
 from edge.core.frames import MissionFrame
-from edge.core.perception import EXPLORED_CELLS
+from edge.core.memory import EXPLORED_CELLS
 from edge.core.position import PositionCause, PositionQuality
 from edge.messages.bounds import (
     MOST_ROBOTS,

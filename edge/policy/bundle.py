@@ -108,6 +108,8 @@ def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
         del mapping["payload_limit"]
     if manifest.perception and not manifest.perception.unseen_as_nan:
         del mapping["perception"]["unseen_as_nan"]
+    if manifest.perception and not manifest.perception.shared_map_cell:
+        del mapping["perception"]["shared_map_cell"]
     text = json.dumps(mapping, indent=2, sort_keys=True) + "\n"
     bundle_id = _sha256(text.encode())
     sealed = {**files, MANIFEST: text.encode(), BUNDLE_ID: f"{bundle_id}\n".encode()}

@@ -158,7 +158,7 @@ class FlightControl:
         self._has_flown |= decision.flight.state in (FlightState.ARMING, *AIRBORNE)
         self._navigation.datum_m = decision.flight.datum_m
         if decision.new_trial:
-            self._pac.forget()
+            self._pac.forget(decision.flight.trial)
         for action in decision.actions:
             self._vehicle.command(action)
         dt_s = 0.0 if self._last_tick_s is None else now_s - self._last_tick_s

@@ -6,9 +6,10 @@ simulated time; both run this code.
 """
 
 import math
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,10 @@ from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetClock
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
-from edge.core.perception import RobotMemory, clamp_to_world, neighbours_in_range
+from edge.core.memory import RobotMemory
+from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource, Sensor
+from edge.core.shared_map import SharedMap
 from edge.core.wire import MAX_ROBOT_ID, Rejection, decode, encode
 from edge.flight.safety import limit_speed
 from edge.policy.bundle import BundleError
@@ -58,6 +61,13 @@ class _Timed:
 
     value: F32
     time_s: float
+
+
+class _Told(NamedTuple):
+    """What the neighbours may know, and of which mission."""
+
+    trial: int
+    shared: SharedMap | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,6 +122,9 @@ class Pac:
         # Set by whoever wants it, done by the thread that the memory, or the agent, belongs to.
         self._forget_map = False
         self._reset_agent = False
+        # Which mission it is in, so that maps of another one are not taken.
+        self._trial = 0
+        self._told = _Told(0, None)
         self._sequence = 0
         self._features: _Timed | None = None
         self._action: _Timed | None = None
@@ -122,11 +135,12 @@ class Pac:
         self.frame_id = 0
         self.sensor = sensor
 
-    def forget(self) -> None:
-        """Start anew: no explored map and no messages. From any thread.
+    def forget(self, trial: str = "") -> None:
+        """Start anew, with the mission `trial`: no explored map and no messages. From any thread.
 
         The last action is left to the next tick of the policy, so that the robot need not stop.
         """
+        self._trial = zlib.crc32(trial.encode())
         self._forget_map = True
         self._reset_agent = True
         self._features = None
@@ -144,6 +158,7 @@ class Pac:
             own_robot_id=self._robot_id,
             message_size=self._policy.message_size,
             payload_limit=self._policy.manifest.payload_limit,
+            shared_side=self._perception.shared_map_side,
         )
         if not isinstance(message, Rejection) and sender not in (None, message.robot_id):
             message = Rejection.OTHER_SENDER
@@ -161,6 +176,7 @@ class Pac:
         if self._forget_map:
             self._forget_map = False
             self._memory = RobotMemory(self._perception)
+            self._told = _Told(self._trial, None)
         odometry = self._finite_odometry()
         if odometry is None:
             return None
@@ -169,16 +185,19 @@ class Pac:
         if view is None or not self._is_valid(view):
             return None
         self._memory.observe(own, view)
-        heard = self._to_model([n.position_m for n in self.mailbox.neighbours(now_s)])
+        neighbours = self.mailbox.neighbours(now_s)
+        heard = self._to_model([neighbour.position_m for neighbour in neighbours])
+        near = neighbours_in_range(own, heard, self._perception.communication_range)
+        trial = self._told.trial
+        for neighbour, is_near in zip(neighbours, near, strict=True):
+            if is_near and neighbour.shared is not None and neighbour.trial == trial:
+                self._memory.hear(neighbour.shared)
+        self._told = _Told(trial, self._memory.tell(own))
         # Outside the world the policy is told the nearest point of it, where training kept the
         # robots: it never sees an input that it could not have been trained on.
         position = clamp_to_world(own, self._perception.world_size)
         perceived = self._agent.observe(
-            Observation(
-                position,
-                self._memory.local_map(position),
-                heard[neighbours_in_range(own, heard, self._perception.communication_range)],
-            )
+            Observation(position, self._memory.local_map(position), heard[near])
         )
         self._features = _Timed(perceived.features, now_s)
         return perceived
@@ -212,6 +231,7 @@ class Pac:
             return None
         self._action = _Timed(velocity, now_s)
         self._sequence += 1
+        told = self._told
         message = AggregatedMessage(
             robot_id=self._robot_id,
             boot_epoch=self._boot_epoch,
@@ -221,6 +241,8 @@ class Pac:
             velocity_m_s=odometry.velocity_m_s,
             frame_id=self.frame_id,
             payload=payload,
+            trial=told.trial,
+            shared=told.shared,
         )
         return PolicyTick(
             features=features.value,

@@ -17,9 +17,9 @@ import numpy.typing as npt
 from edge.core import F32, F64, Bools
 from edge.core.coverage import cvt_velocity, local_centroid, voronoi_cells
 from edge.core.frames import ModelScale
+from edge.core.memory import RobotMap
 from edge.core.perception import (
     PerceptionParameters,
-    RobotMap,
     neighbours_in_range,
     part_in_world,
     window_corner,

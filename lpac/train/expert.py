@@ -1,5 +1,11 @@
-"""Who is imitated: experts that know the whole world, and where all robots truly are."""
+"""Who is imitated: experts that know where all robots truly are.
 
+Most know the whole world, too. What such a one does where a robot has seen nothing cannot be
+learned, only its mean: to stay about where one is. "frontier-cvt" knows what all robots together
+have seen, which is what robots that share maps come to know: it goes and looks.
+"""
+
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -8,6 +14,7 @@ import numpy.typing as npt
 from edge.core import F32, F64, Bools
 from edge.core.coverage import cvt_velocity, voronoi_cells
 from lpac.analysis.coverage import coarse, lloyd_ends
+from lpac.sim.baselines import FrontierCvt
 from lpac.sim.experiment import Preparation
 from lpac.train.config import DataConfig
 
@@ -45,12 +52,20 @@ def make_expert(config: DataConfig, world: Preparation) -> Expert:
     scale, training = world.scenario.scale, world.bundle.manifest.training
     # What a velocity of 1 comes to in flight, in model units/s: so it arrives within a time step.
     flown = scale.env_scale * scale.velocity_scale
-    goals: Goals = (
-        _Centroids(world.importance)
-        if config.expert == "clairvoyant-cvt"
-        else _LloydEnds(world.importance, config.lloyd_runs)
-    )
-    return Expert(goals, training.max_speed, training.time_step * flown)
+    return Expert(_goals(config, world), training.max_speed, training.time_step * flown)
+
+
+def _goals(config: DataConfig, world: Preparation) -> Goals:
+    match config.expert:
+        case "clairvoyant-cvt":
+            return _Centroids(world.importance)
+        case "best-of-lloyd":
+            return _LloydEnds(world.importance, config.lloyd_runs)
+        case "frontier-cvt":
+            all_hear_all = replace(
+                world.perception, communication_range=2.0 * world.perception.world_size
+            )
+            return FrontierCvt(world.importance, all_hear_all, world.scenario.robots).goals
 
 
 class _Centroids:

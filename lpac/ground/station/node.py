@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from edge.core.perception import EXPLORED_CELLS
+from edge.core.memory import EXPLORED_CELLS
 from edge.core.ports import Clock
 from edge.identity.card import Role
 from edge.identity.guard import Guard, Speaker

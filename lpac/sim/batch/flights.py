@@ -16,8 +16,10 @@ from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters
 from edge.core.ports import OdometrySource
 from edge.policy.bundle import Bundle
+from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, make_agents
 from lpac.sim.batch.robot import BatchedRobot, DeferredSteps
+from lpac.sim.batch.seen import ShownWorld
 from lpac.sim.experiment import Preparation, Scenario, SimulatedFlight, prepare
 from lpac.sim.swarm import Swarm
 from lpac.sim.vehicles import PointVehicles
@@ -137,9 +139,10 @@ class BatchedFlights:
 
     def _swarm(self, world: Preparation, first_agent: int) -> Swarm[BatchedRobot]:
         scenario, perception = world.scenario, world.perception
+        shown = ShownWorld(world.importance, perception)
         local_map = np.empty((perception.local_map_size,) * 2, np.float32)
         return Swarm(
-            boot=partial(self._boot, world, local_map, first_agent),
+            boot=partial(self._boot, world.parameters, shown, local_map, first_agent),
             vehicles=PointVehicles(
                 world.starts_m, perception.world_size / scenario.scale.env_scale, scenario.lag_s
             ),
@@ -152,7 +155,8 @@ class BatchedFlights:
 
     def _boot(
         self,
-        world: Preparation,
+        parameters: PacParameters,
+        world: ShownWorld,
         local_map: F32,
         first_agent: int,
         robot: int,
@@ -169,10 +173,9 @@ class BatchedFlights:
             boot_epoch=boot_epoch,
             agent=agent,
             deferred=self._deferred,
-            importance=world.importance,
-            perception=world.perception,
+            world=world,
             odometry=odometry,
-            parameters=world.parameters,
+            parameters=parameters,
             local_map=local_map,
         )
 

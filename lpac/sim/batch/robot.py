@@ -17,14 +17,15 @@ from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetClock, FleetTime
 from edge.core.mailbox import Mailbox, Neighbour
-from edge.core.perception import PerceptionParameters, clamp_to_world, neighbours_in_range
+from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource
+from edge.core.shared_map import SharedMap
 from edge.core.wire import rounded
 from edge.flight.safety import limit_speed
 from edge.policy.family import Observation
 from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, Inputs
-from lpac.sim.batch.seen import SeenMap
+from lpac.sim.batch.seen import SeenMap, ShownWorld
 
 
 def _age_error_s() -> float:
@@ -135,7 +136,7 @@ class DeferredSteps:
             step.robot.note_payloads(step.heeded)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Message(AggregatedMessage):
     step: DeferredStep
 
@@ -145,11 +146,12 @@ class _Said(NamedTuple):
 
 
 class _Perceived(NamedTuple):
-    """When the robot looked, from where (2,), in model units, and whom it knew then."""
+    """When the robot looked, from where (2,), where those in range were (n, 2), what it tells."""
 
     time_s: float
     own: F64
-    neighbours: tuple[Neighbour, ...]
+    neighbours: F64
+    shared: SharedMap | None
 
 
 class BatchedRobot:
@@ -162,8 +164,7 @@ class BatchedRobot:
         boot_epoch: int,
         agent: int,
         deferred: DeferredSteps,
-        importance: F32,
-        perception: PerceptionParameters,
+        world: ShownWorld,
         odometry: OdometrySource,
         parameters: PacParameters,
         local_map: F32,
@@ -176,10 +177,10 @@ class BatchedRobot:
         self._robot_id = robot_id
         self._boot_epoch = boot_epoch
         self._deferred = deferred
-        self._perception = perception
+        self._perception = world.parameters
         self._odometry = odometry
         self._parameters = parameters
-        self._seen = SeenMap(importance, perception)
+        self._seen = SeenMap(world)
         self._local_map = local_map
         self._swap_clears = parameters.max_message_age_s == 0.0
         self._perceived: _Perceived | None = None
@@ -200,21 +201,23 @@ class BatchedRobot:
         """See, and remember who is there."""
         own = self._own()[1]
         self._seen.observe(own)
-        self._perceived = _Perceived(now_s, own, self.mailbox.neighbours(now_s))
+        heard = self.mailbox.neighbours(now_s)
+        near = self._in_range(own, heard)
+        for neighbour, is_near in zip(heard, near, strict=True):
+            if is_near and neighbour.shared is not None:
+                self._seen.hear(neighbour.shared)
+        self._perceived = _Perceived(now_s, own, self._to_model(heard)[near], self._seen.tell(own))
 
     def inputs(self, now_s: float) -> Inputs | None:
         """What its policy takes of what it last perceived; None if that is too old."""
         perceived = self._perceived
         if perceived is None or now_s - perceived.time_s > self._parameters.max_input_age_s:
             return None
-        perception, own = self._perception, perceived.own
-        position = clamp_to_world(own, perception.world_size)
-        neighbours = self._to_model(perceived.neighbours)
-        near = neighbours_in_range(own, neighbours, perception.communication_range)
+        position = clamp_to_world(perceived.own, self._perception.world_size)
         return self._deferred.agents.inputs(
             self.agent,
             Observation(
-                position, self._seen.local_map(position, self._local_map), neighbours[near]
+                position, self._seen.local_map(position, self._local_map), perceived.neighbours
             ),
         )
 
@@ -224,7 +227,7 @@ class BatchedRobot:
         None when there is nothing to send: nothing perceived that is fresh.
         """
         inputs = self.inputs(now_s)
-        if inputs is None:
+        if inputs is None or self._perceived is None:
             return None
         odometry, own = self._own()
         # Where the swap takes nothing away, the neighbours are those whose messages it hands out.
@@ -260,6 +263,7 @@ class BatchedRobot:
             velocity_m_s=odometry.velocity_m_s,
             frame_id=0,
             payload=step.payload,
+            shared=self._perceived.shared,
             step=step,
         )
         return _Said(message)

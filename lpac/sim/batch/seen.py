@@ -4,23 +4,39 @@ import numpy as np
 
 from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters, part_in_world, window_corner
+from edge.core.shared_map import Codes, SharedCells, SharedMap, cell_means, codes_of
 
 # The box grows by so many cells beyond what it has to hold, so that it seldom grows.
 _MARGIN = 64
 
 
-class SeenMap:
-    """What one robot remembers of the world that its sensor shows it.
-
-    It is what `edge.core.perception.RobotMemory` is: where the robot has seen, the world's
-    importance, elsewhere what stands for the unseen. The world is all robots' own; what a robot
-    has of its own is one byte for each cell of a box around what it has seen.
-    """
+class ShownWorld:
+    """What sensors show of a world, and what robots that share maps tell of it."""
 
     def __init__(self, importance: F32, parameters: PerceptionParameters) -> None:
         """`importance` (world_size, world_size) is the world, which is not copied."""
-        self._importance = importance
-        self._parameters = parameters
+        self.importance = importance
+        self.parameters = parameters
+        cell = parameters.shared_map_cell
+        # Of all cells that maps are shared in.
+        self.codes: Codes = np.zeros((0, 0), np.uint8)
+        if cell:
+            beyond = -parameters.world_size % cell
+            self.codes = codes_of(cell_means(np.pad(importance, (0, beyond)), cell))
+
+
+class SeenMap:
+    """What one robot remembers of the world that its sensor shows it, and of what others tell.
+
+    It is what `edge.core.memory.RobotMemory` is: where the robot has seen, the world's importance,
+    elsewhere what stands for the unseen. The world is all robots' own; what a robot has of its own
+    is one byte for each cell of a box around what it has seen, and one for each shared cell.
+    """
+
+    def __init__(self, world: ShownWorld) -> None:
+        self._world = world
+        self._parameters = parameters = world.parameters
+        self._cells = SharedCells(parameters) if parameters.shared_map_cell else None
         # The box's least and greatest cells, and its cells that were seen.
         self._low = (0, 0)
         self._high = (0, 0)
@@ -29,7 +45,10 @@ class SeenMap:
     def observe(self, position: F64) -> None:
         """See what the sensor shows around `position` (2,)."""
         size, world_size = self._parameters.sensor_size, self._parameters.world_size
-        (x, y), _ = part_in_world(window_corner(position, size), size, world_size)
+        corner = window_corner(position, size)
+        if self._cells:
+            self._cells.see_world(self._world.codes, corner, size)
+        (x, y), _ = part_in_world(corner, size, world_size)
         if x.start == x.stop or y.start == y.stop:
             return
         (x0, y0), (x1, y1) = self._low, self._high
@@ -38,17 +57,29 @@ class SeenMap:
             x0, y0 = self._low
         self._seen[x.start - x0 : x.stop - x0, y.start - y0 : y.stop - y0] = True
 
+    def hear(self, told: SharedMap) -> None:
+        """Remember what another robot knows; nothing, if maps are not shared."""
+        if self._cells:
+            self._cells.hear(told)
+
+    def tell(self, position: F64) -> SharedMap | None:
+        """What others may know of the surroundings of `position`; None if maps are not shared."""
+        return self._cells.tell(position) if self._cells else None
+
     def local_map(self, position: F64, out: F32) -> F32:
         """Fill `out` (local_map_size, local_map_size) around `position` (2,) and return it.
 
-        `PerceptionParameters.unseen` where nothing was seen; the outside of the world is 0.
+        `PerceptionParameters.unseen` where nothing was seen, nor told by others; the outside of the
+        world is 0.
         """
         parameters = self._parameters
         size = parameters.local_map_size
         out[:] = 0.0
         corner_x, corner_y = corner = window_corner(position, size)
         (x, y), in_window = part_in_world(corner, size, parameters.world_size)
-        if parameters.unseen:
+        if self._cells:
+            out[in_window] = self._cells.importance(corner, size)[in_window]
+        elif parameters.unseen:
             out[in_window] = parameters.unseen
         (x0, y0), (x1, y1) = self._low, self._high
         x0, x1 = max(x0, x.start), min(x1, x.stop)
@@ -58,7 +89,7 @@ class SeenMap:
         low_x, low_y = self._low
         np.copyto(
             out[x0 - corner_x : x1 - corner_x, y0 - corner_y : y1 - corner_y],
-            self._importance[x0:x1, y0:y1],
+            self._world.importance[x0:x1, y0:y1],
             where=self._seen[x0 - low_x : x1 - low_x, y0 - low_y : y1 - low_y],
         )
         return out

@@ -14,13 +14,15 @@ from hypothesis import strategies as st
 
 from edge.core.coverage import coverage_cost
 from edge.core.frames import ModelScale
-from edge.core.perception import PerceptionParameters, RobotMemory
+from edge.core.memory import RobotMemory
+from edge.core.perception import PerceptionParameters
+from edge.core.shared_map import SharedMap
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Bundle
 from edge.policy.family import Perceived
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
 from lpac.sim.batch.agents import SingleAgents
-from lpac.sim.batch.seen import SeenMap
+from lpac.sim.batch.seen import SeenMap, ShownWorld
 from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly
 from lpac.sim.failure import Failure
 from lpac.sim.swarm import ClockedPac
@@ -101,10 +103,11 @@ def test_flights_are_those_of_the_exact_simulator(
 
 
 @pytest.mark.parametrize("unknown", [0.0, 0.3])
+@pytest.mark.parametrize("name", ["exploring_bundle", "sharing_bundle"])
 def test_robots_that_see_what_they_explored_fly_the_same(
-    exploring_bundle: Bundle, unknown: float
+    request: pytest.FixtureRequest, name: str, unknown: float
 ) -> None:
-    bundle = unknown_matters(exploring_bundle, unknown)
+    bundle = unknown_matters(request.getfixturevalue(name), unknown)
     flown = [HARD, Scenario(robots=3, duration_s=5.0, world_size=200)]
     for batched, scenario in zip(fly_batch(flown, bundle), flown, strict=True):
         assert_same(batched, fly(scenario, bundle))
@@ -153,27 +156,39 @@ def test_a_second_thread_changes_nothing(shipped_bundle: Bundle) -> None:
     np.testing.assert_array_equal(moment.positions_m, expected.positions_m[-1])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     data=st.data(),
     unknown=st.sampled_from([0.0, 0.25]),
-    unseen_as_nan=st.booleans(),
+    tells=st.sampled_from([(False, 0), (True, 0), (True, 4), (True, 16)]),
     world_size=st.integers(8, 300),
 )
 def test_what_was_seen_is_what_a_robot_remembers(
-    data: st.DataObject, unknown: float, unseen_as_nan: bool, world_size: int
+    data: st.DataObject, unknown: float, tells: tuple[bool, int], world_size: int
 ) -> None:
-    parameters = PerceptionParameters(world_size, 64, 16, 50.0, unknown, unseen_as_nan)
+    """Of two robots, too, that tell each other."""
+    parameters = PerceptionParameters(world_size, 64, 16, 50.0, unknown, *tells)
     importance = np.random.default_rng(0).random((world_size, world_size), np.float32)
     coordinates = st.floats(-0.2 * world_size, 1.2 * world_size)
     path = data.draw(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=12))
-    seen, memory = SeenMap(importance, parameters), RobotMemory(parameters)
+    shown = ShownWorld(importance, parameters)
     sensor = WorldSensor(importance, parameters.sensor_size)
+    robots = [(SeenMap(shown), RobotMemory(parameters)) for _ in range(2)]
     room = np.empty((64, 64), np.float32)
+    told: SharedMap | None = None
     for place in map(np.array, path):
-        seen.observe(place)
-        memory.observe(place, sensor.view(place))
-        np.testing.assert_array_equal(seen.local_map(place, room), memory.local_map(place))
+        for (seen, memory), at in zip(robots, (place, world_size - place), strict=True):
+            seen.observe(at)
+            memory.observe(at, sensor.view(at))
+            if told is not None:
+                seen.hear(told)
+                memory.hear(told)
+            np.testing.assert_array_equal(seen.local_map(at, room), memory.local_map(at))
+            told, also = seen.tell(at), memory.tell(at)
+            assert (told is None) == (also is None) == (not tells[1])
+            if told and also:
+                assert told.corner == also.corner
+                np.testing.assert_array_equal(told.codes, also.codes)
 
 
 def test_inputs_at_a_moment_are_what_robots_perceived(

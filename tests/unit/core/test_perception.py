@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edge.core import F32
+from edge.core.memory import TILE_SIZE, RobotMap, RobotMemory
 from edge.core.perception import (
-    TILE_SIZE,
     PerceptionParameters,
-    RobotMap,
-    RobotMemory,
     neighbours_in_range,
     part_in_world,
     window_corner,

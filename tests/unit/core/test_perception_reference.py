@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from edge.core import F32, F64
-from edge.core.perception import PerceptionParameters, RobotMemory, neighbours_in_range
+from edge.core.memory import RobotMemory
+from edge.core.perception import PerceptionParameters, neighbours_in_range
 from edge.core.world import random_features
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages

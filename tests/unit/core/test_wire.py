@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as hnp
 from edge.core import F32
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetTime
+from edge.core.shared_map import Codes, SharedMap
 from edge.core.wire import Rejection, decode, encode
 
 BUNDLE_ID = hashlib.sha256(b"manifest").digest()
@@ -69,6 +70,7 @@ def receive(
     bundle_id: bytes = BUNDLE_ID,
     own_robot_id: int = OWN_ID,
     payload_limit: float | None = None,
+    shared_side: int = 0,
 ) -> AggregatedMessage | Rejection:
     return decode(
         data,
@@ -77,6 +79,7 @@ def receive(
         own_robot_id=own_robot_id,
         message_size=message_size,
         payload_limit=payload_limit,
+        shared_side=shared_side,
     )
 
 
@@ -94,7 +97,8 @@ def seal(data: bytes) -> bytes:
 
 def without_payload(message: AggregatedMessage) -> tuple[object, ...]:
     fields = dataclasses.fields(message)
-    return tuple(getattr(message, field.name) for field in fields if field.name != "payload")
+    arrays = "payload", "shared"
+    return tuple(getattr(message, field.name) for field in fields if field.name not in arrays)
 
 
 @settings(deadline=None)
@@ -116,6 +120,36 @@ def test_float16_arrives_rounded_and_never_infinite(message: AggregatedMessage) 
     # Half a unit in the last of 11 bits, or half the smallest subnormal.
     allowed = np.maximum(np.abs(saturated) * 2.0**-11, 2.0**-25)
     assert (np.abs(received.payload.astype(np.float64) - saturated) <= allowed).all()
+
+
+INT32 = st.integers(-(2**31), 2**31 - 1)
+
+
+@TYPES
+@settings(deadline=None)
+@given(
+    trial=st.integers(0, 2**32 - 1),
+    corner=st.tuples(INT32, INT32),
+    codes=hnp.arrays(np.uint8, st.integers(1, 9).map(lambda side: (side, side))),
+)
+def test_a_map_arrives_behind_the_payload(
+    payload_dtype: type, trial: int, corner: tuple[int, int], codes: Codes
+) -> None:
+    sent = dataclasses.replace(MESSAGE, trial=trial, shared=SharedMap(corner, codes))
+    data, side = encode(sent, BUNDLE_ID, payload_dtype), len(codes)
+    received = receive(data, shared_side=side)
+    assert isinstance(received, AggregatedMessage) and received.shared is not None
+    assert (received.trial, received.shared.corner) == (trial, corner)
+    np.testing.assert_array_equal(received.shared.codes, codes)
+    np.testing.assert_array_equal(received.payload, MESSAGE.payload)
+    # Who takes no map, or another one, and a map that was cut or is too long.
+    assert receive(data) is Rejection.PAYLOAD_LENGTH
+    assert receive(data, shared_side=side + 1) is Rejection.PAYLOAD_LENGTH
+    without = encode(MESSAGE, BUNDLE_ID, payload_dtype)
+    assert receive(without, shared_side=side) is Rejection.PAYLOAD_LENGTH
+    assert receive(data[:-1], shared_side=side) is Rejection.TRUNCATED
+    assert receive(data[: len(without) + 3], shared_side=side) is Rejection.TRUNCATED
+    assert receive(data + b"\0", shared_side=side) is Rejection.TOO_LONG
 
 
 @settings(deadline=None)
@@ -207,6 +241,20 @@ def test_the_layout_is_a_contract() -> None:
     float16 = head.format(payload_type="02") + "4fb75a3f" + "0000003c00c140560030"
     assert encode(MESSAGE, BUNDLE_ID, np.float32).hex() == float32
     assert encode(MESSAGE, BUNDLE_ID, np.float16).hex() == float16
+    mapped = dataclasses.replace(
+        MESSAGE, trial=0x0A0B0C0D, shared=SharedMap((5, -2), np.array([[1, 2], [3, 4]], np.uint8))
+    )
+    assert (
+        encode(mapped, BUNDLE_ID, np.float16)
+        .hex()
+        .endswith(
+            "0000003c00c140560030"
+            "0d0c0b0a"  # trial
+            "05000000feffffff"  # first cell
+            "02000000"  # side
+            "01020304"
+        )
+    )
     assert accepted(bytes.fromhex(float32), 5).sequence == 258
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.core.perception import EXPLORED_CELLS
+from edge.core.memory import EXPLORED_CELLS
 from edge.core.world import MOST_FEATURES, format_world, random_features
 from edge.messages.codec import MessageError
 from edge.messages.codes import RefusalCode

@@ -1,0 +1,125 @@
+"""What one robot remembers of the world, from what its sensor shows and what others tell.
+
+All maps are indexed [x, y]; one cell is one model unit; positions are in model units.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from edge.core import F32, F64, Bools
+from edge.core.perception import PerceptionParameters, window_corner
+from edge.core.shared_map import SharedCells, SharedMap
+
+# What a robot has explored is told in this many cells along each side of the world.
+EXPLORED_CELLS = 64
+TILE_SIZE = 128
+
+
+class RobotMap:
+    """What one robot has seen, in tiles that are made when first seen.
+
+    So its cost is that of the area seen, however large the world is.
+    """
+
+    def __init__(self, world_size: int, unseen: float = 0.0) -> None:
+        """`unseen` is the value of cells that were not seen; it may be NaN."""
+        self._world_size = world_size
+        self._unseen = np.float32(unseen)
+        self._tiles: dict[tuple[int, int], F32] = {}
+
+    def insert(self, view: F32, corner: tuple[int, int]) -> None:
+        """Write the square `view`, whose lowest cell is `corner`; what is off the world is not."""
+        size = view.shape[0]
+        for key, tile_part, view_part in self._overlaps(corner, size):
+            tile = self._tiles.get(key)
+            if tile is None:
+                tile = np.full((TILE_SIZE, TILE_SIZE), self._unseen, np.float32)
+                self._tiles[key] = tile
+            tile[tile_part] = view[view_part]
+
+    def window(self, corner: tuple[int, int], out: F32) -> F32:
+        """Fill the square `out` from `corner` on and return it; the outside of the world is 0."""
+        size = out.shape[0]
+        out[:] = 0.0
+        for key, tile_part, out_part in self._overlaps(corner, size):
+            tile = self._tiles.get(key)
+            if tile is not None:
+                out[out_part] = tile[tile_part]
+            elif self._unseen:
+                out[out_part] = self._unseen
+        return out
+
+    def _overlaps(
+        self, corner: tuple[int, int], size: int
+    ) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
+        """Tile, part of the tile and part of the window, for all tiles that share cells."""
+        spans_y = list(self._spans(corner[1], size))
+        for tile_x, in_tile_x, in_window_x in self._spans(corner[0], size):
+            for tile_y, in_tile_y, in_window_y in spans_y:
+                yield (tile_x, tile_y), (in_tile_x, in_tile_y), (in_window_x, in_window_y)
+
+    def _spans(self, start: int, size: int) -> Iterator[tuple[int, slice, slice]]:
+        """The same along one axis, from `start` on and inside the world."""
+        low, end = max(start, 0), min(start + size, self._world_size)
+        while low < end:
+            tile = low // TILE_SIZE
+            origin = tile * TILE_SIZE
+            high = min(end, origin + TILE_SIZE)
+            yield tile, slice(low - origin, high - origin), slice(low - start, high - start)
+            low = high
+
+
+class RobotMemory:
+    """What one robot has seen of the world.
+
+    Not thread-safe: it belongs to the perception thread.
+    """
+
+    def __init__(self, parameters: PerceptionParameters) -> None:
+        self._world_size = parameters.world_size
+        self._map = RobotMap(parameters.world_size, parameters.unseen)
+        self._cells = SharedCells(parameters) if parameters.shared_map_cell else None
+        self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
+        # For people: which cells of the coarse raster over the world it has seen.
+        self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
+
+    def observe(self, position: F64, view: F32) -> None:
+        """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
+
+        Those cells of `explored` count as seen whose centre was.
+        """
+        size = view.shape[0]
+        corner = window_corner(position, size)
+        self._map.insert(view, corner)
+        if self._cells:
+            self._cells.see(view, corner)
+        scale = EXPLORED_CELLS / self._world_size
+        x, y = (
+            slice(max(math.ceil(low * scale - 0.5), 0), max(math.ceil(high * scale - 0.5), 0))
+            for low, high in ((start, start + size) for start in corner)
+        )
+        self.explored[x, y] = True
+
+    def hear(self, told: SharedMap) -> None:
+        """Remember what another robot knows; nothing, if maps are not shared."""
+        if self._cells:
+            self._cells.hear(told)
+
+    def tell(self, position: F64) -> SharedMap | None:
+        """What others may know of the surroundings of `position`; None if maps are not shared."""
+        return self._cells.tell(position) if self._cells else None
+
+    def local_map(self, position: F64) -> F32:
+        """(local_map_size, local_map_size) around `position`, valid until the next call.
+
+        `PerceptionParameters.unseen` where nothing was seen, nor told by others; the outside of the
+        world is 0.
+        """
+        corner = window_corner(position, self._local.shape[0])
+        self._map.window(corner, self._local)
+        if self._cells:
+            told = self._cells.importance(corner, self._local.shape[0])
+            np.copyto(self._local, told, where=np.isnan(self._local))
+        return self._local
