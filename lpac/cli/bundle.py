@@ -46,6 +46,9 @@ def info(path: BundlePath, as_json: AsJson = False) -> None:
             rows.append(("images", f"{', '.join(images.channels)}: {images.size} x {images.size}"))
     else:
         rows += [(key, json.dumps(value)) for key, value in sorted(manifest.parameters.items())]
+    if perception and perception.shared_map_cell:
+        side, cell = perception.shared_map_side, perception.shared_map_cell
+        rows.append(("shared map", f"{side} x {side} cells of {cell}: {side * side:,} B more"))
     if perception:
         rows.append(
             (

@@ -117,12 +117,14 @@ def _checked(name: str, value: object, shape: tuple[int, ...]) -> _Array:
 
 
 def _decoded(policy: LpacPolicy, data: bytes) -> AggregatedMessage:
+    perception = policy.manifest.perception
     message = decode(
         data,
         bundle_id=policy.bundle_id,
         frame_id=None,
         own_robot_id=_NOBODY,
         message_size=policy.geometry.message_size,
+        shared_side=perception.shared_map_side if perception else 0,
     )
     if isinstance(message, Rejection):
         raise ValueError(f"message: would be refused: {message}")

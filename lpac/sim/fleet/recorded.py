@@ -99,6 +99,7 @@ def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps
     if not logs:
         raise RecordingError(f"{folder}: has no flight log of robot {robot_id}")
     steps: dict[int, PolicyStep] = {}
+    perception = policy.manifest.perception
     for log in logs:
         if bytes.fromhex(read_metadata(log).bundle_id) != policy.bundle_id:
             raise RecordingError(f"{log}: was flown with another policy")
@@ -109,6 +110,7 @@ def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps
                 frame_id=None,
                 own_robot_id=-1,
                 message_size=policy.message_size,
+                shared_side=perception.shared_map_side if perception else 0,
             )
             if isinstance(sent, Rejection):
                 raise RecordingError(f"{log}: at {unix_time_s:.3f} s: a message is {sent}")

@@ -364,3 +364,27 @@ def test_messages_of_another_mission_frame_are_not_listened_to(shipped_policy: L
     robot.frame_id = 8
     assert robot.receive(message(shipped_policy), 0.0) is Rejection.OTHER_FRAME
     assert robot.receive(message(shipped_policy, frame_id=8), 0.0) is None
+
+
+def test_what_others_have_seen_is_heard_within_one_mission(sharing_bundle: Bundle) -> None:
+    """Whoever begins the next one later still tells of the last, and is not heard."""
+    policy = LpacPolicy(sharing_bundle)
+    here, there = World(position=(16.0, 16.0, 3.0)), World(position=(12.0, 16.0, 3.0))
+    robot, other = make_robot(policy, here, 1), make_robot(policy, there, 2)
+
+    def explored(now_s: float) -> float:
+        """How much the robot knows of, in model units squared, after the other one has spoken."""
+        other.perceive(now_s)
+        tick = other.infer(now_s)
+        assert tick is not None
+        assert robot.receive(tick.message, now_s) is None
+        perceived = robot.perceive(now_s)
+        assert perceived is not None
+        return float(perceived.inputs["images"][0, 3].mean()) * 256**2
+
+    both, alone = 2 * 64**2, 64**2
+    assert explored(0.0) == pytest.approx(both, rel=0.01)
+    robot.forget("second")
+    assert explored(0.4) == pytest.approx(alone, rel=0.01)
+    other.forget("second")
+    assert explored(0.8) == pytest.approx(both, rel=0.01)
