@@ -21,7 +21,7 @@ from lpac.train.family import Learnable, StateDict, learnable
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
-ExpertName = Literal["clairvoyant-cvt", "best-of-lloyd", "frontier-cvt"]
+ExpertName = Literal["clairvoyant-cvt", "best-of-lloyd", "exploring-cvt"]
 
 
 def _at_least(least: float, **values: float) -> None:

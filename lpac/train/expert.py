@@ -1,11 +1,11 @@
 """Who is imitated: experts that know where all robots truly are.
 
 Most know the whole world, too. What such a one does where a robot has seen nothing cannot be
-learned, only its mean: to stay about where one is. "frontier-cvt" knows what all robots together
+learned, only its mean: to stay about where one is. "exploring-cvt" knows what all robots together
 have seen, which is what robots that share maps come to know: it goes and looks.
 """
 
-from dataclasses import replace
+import math
 from typing import Protocol
 
 import numpy as np
@@ -13,16 +13,27 @@ import numpy.typing as npt
 
 from edge.core import F32, F64, Bools
 from edge.core.coverage import cvt_velocity, voronoi_cells
+from edge.core.perception import PerceptionParameters, window_corner
 from lpac.analysis.coverage import coarse, lloyd_ends
-from lpac.sim.baselines import FrontierCvt
 from lpac.sim.experiment import Preparation
 from lpac.train.config import DataConfig
+
+# How often an expert looks around, s.
+LOOK_PERIOD_S = 0.5
+# Of the expert that explores, in model units: its lattice; how much further what is unseen may be
+# to count e times less; how far its goal is where all that is unseen is in one direction.
+_PITCH = 8
+_DECAY = 32.0
+_STEP = 12.0
 
 
 class Goals(Protocol):
     """Where robots at `positions` (n, 2), all that are left, should go: (n, 2), model units."""
 
     def __call__(self, positions: F64) -> F64: ...
+
+    def look(self, positions: F64) -> None:
+        """Take notice of what the robots there see."""
 
 
 class Expert:
@@ -36,6 +47,10 @@ class Expert:
         self._goals = goals
         self._max_speed = max_speed
         self._reach = reach
+
+    def look(self, positions: F64, alive: Bools) -> None:
+        """Take notice of what the robots at `positions` (N, 2) see that are left."""
+        self._goals.look(positions[alive])
 
     def velocities(self, positions: F64, alive: Bools) -> F64:
         """(N, 2) at true positions (N, 2); 0 of those who are not left."""
@@ -61,14 +76,18 @@ def _goals(config: DataConfig, world: Preparation) -> Goals:
             return _Centroids(world.importance)
         case "best-of-lloyd":
             return _LloydEnds(world.importance, config.lloyd_runs)
-        case "frontier-cvt":
-            all_hear_all = replace(
-                world.perception, communication_range=2.0 * world.perception.world_size
-            )
-            return FrontierCvt(world.importance, all_hear_all, world.scenario.robots).goals
+        case "exploring-cvt":
+            return _Exploring(world.importance, world.perception)
 
 
-class _Centroids:
+class _Clairvoyant:
+    """Has seen everything."""
+
+    def look(self, positions: F64) -> None:
+        """There is nothing new."""
+
+
+class _Centroids(_Clairvoyant):
     """ClairvoyantCVT's, on a coarser raster.
 
     Of ten robots in 512 x 512 it takes a third of the time; a test holds the centroids to the fine
@@ -87,7 +106,7 @@ class _Centroids:
         return voronoi_cells(importance, positions / cells).centroid * cells
 
 
-class _LloydEnds:
+class _LloydEnds(_Clairvoyant):
     """The best ends of several runs of Lloyd's algorithm, shared out among the robots."""
 
     def __init__(self, importance: F32, runs: int) -> None:
@@ -106,6 +125,57 @@ class _LloydEnds:
         goals = self._best[robots]
         squares = ((positions[:, None] - goals) ** 2).sum(axis=2)
         return goals[assignment(squares)]
+
+
+class _Exploring:
+    """Explores its own Voronoi cell of its local map and covers it, the more the less is unseen.
+
+    What `lpac.sim.baselines.FrontierCvt` does, but without its jumps from one goal to another: the
+    mean of what is done on both sides of a jump is to stay, and that is what would be learned.
+    """
+
+    def __init__(self, importance: F32, perception: PerceptionParameters) -> None:
+        half, world_size = _PITCH // 2, perception.world_size
+        self._sensor_size = perception.sensor_size
+        self._half_window = perception.local_map_size / 2.0
+        centres = np.arange(half, world_size, _PITCH)
+        self._importance = importance[np.ix_(centres, centres)].astype(np.float64)
+        self._lattice = np.stack(np.meshgrid(centres, centres, indexing="ij"), axis=-1) + 0.5
+        self._seen = np.zeros((len(centres),) * 2, np.bool_)
+
+    def look(self, positions: F64) -> None:
+        for position in positions:
+            corner = window_corner(position, self._sensor_size)
+            x, y = (
+                slice(
+                    max(math.ceil((low - _PITCH // 2) / _PITCH), 0),
+                    max(math.ceil((low + self._sensor_size - _PITCH // 2) / _PITCH), 0),
+                )
+                for low in corner
+            )
+            self._seen[x, y] = True
+
+    def __call__(self, positions: F64) -> F64:
+        self.look(positions)
+        points = self._lattice.reshape(-1, 2)
+        squares = ((points[:, None] - positions) ** 2).sum(axis=2)
+        nearest = squares.argmin(axis=1)
+        seen, importance = self._seen.ravel(), self._importance.ravel()
+        goals = positions.copy()
+        for robot, position in enumerate(positions):
+            offsets = points - position
+            own = (nearest == robot) & (np.abs(offsets) < self._half_window).all(axis=1)
+            unseen, known = offsets[own & ~seen], offsets[own & seen]
+            weights = importance[own & seen]
+            distance = np.linalg.norm(unseen, axis=1)
+            pull = np.exp(-distance / _DECAY)
+            away = pull / np.maximum(distance, 1.0)
+            to_explore = _STEP * (away @ unseen) / max(pull.sum(), 1e-12)
+            to_cover = weights @ known / max(weights.sum(), 1e-12)
+            to_cover *= min(1.0, _STEP / max(float(np.linalg.norm(to_cover)), 1e-12))
+            exploring = pull.sum() / (pull.sum() + 1.0)
+            goals[robot] += exploring * to_explore + (1.0 - exploring) * to_cover
+        return goals
 
 
 def assignment(cost: F64) -> npt.NDArray[np.intp]:

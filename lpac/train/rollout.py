@@ -22,7 +22,7 @@ from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
 from lpac.sim.experiment import Scenario
 from lpac.sim.failure import Failure
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances
-from lpac.train.expert import Expert, make_expert
+from lpac.train.expert import LOOK_PERIOD_S, Expert, make_expert
 
 # Of one shard: larger batches of the simulator are no faster, and a kill costs one.
 _ROBOTS_TOGETHER = 40
@@ -176,11 +176,15 @@ def fly_shard(task: ShardTask) -> FlownShard:
     flights = BatchedFlights(scenarios, bundle, agents=deciding.of)
     experts = [make_expert(shard.data, world) for world in flights.prepared]
     deciding.watch(flights, experts)
+    looks_s = np.arange(0.0, max(shard.times_s), LOOK_PERIOD_S).tolist()
+    times_s = sorted({*shard.times_s, *looks_s})
     kept = _Kept()
     try:
-        for moments in flights.moments(shard.times_s):
+        for moments in flights.moments(times_s):
             for moment, expert in zip(moments, experts, strict=True):
-                kept.add(moment, expert)
+                expert.look(moment.positions, moment.alive)
+                if moment.time_s in shard.times_s:
+                    kept.add(moment, expert)
         flights.finish()
     except PolicyFailedError as error:
         raise ValueError(f"shard {shard.name}: {error}") from None

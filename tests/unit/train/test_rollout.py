@@ -3,19 +3,21 @@
 from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.core import F32, F64
 from edge.core.coverage import coverage_cost, voronoi_cells
 from edge.core.world import random_features, rasterize
 from edge.policy.bundle import Bundle
 from lpac.evaluate.worlds import FIELD, draw_world
 from lpac.sim.batch import BatchedFlights, fly_batch
 from lpac.sim.experiment import FIELD_SCALE
-from lpac.train.config import DaggerConfig, DataConfig, Disturbances, WorldRanges
+from lpac.train.config import DaggerConfig, DataConfig, Disturbances, ExpertName, WorldRanges
 from lpac.train.data import Dataset, Shards
 from lpac.train.expert import Expert, assignment, make_expert
 from lpac.train.rollout import PlannedShard, ShardTask, States, fly_shard, plan_round
@@ -128,7 +130,7 @@ def test_who_decides_changes_nothing_else(shard: PlannedShard, shipped_bundle: B
     assert kept.largest_payload == max(each.largest_payload for each in flown)
 
 
-@pytest.mark.parametrize("expert", ["clairvoyant-cvt", "best-of-lloyd"])
+@pytest.mark.parametrize("expert", ["clairvoyant-cvt", "best-of-lloyd", "exploring-cvt"])
 def test_experts_leave_out_who_is_lost(
     expert: str, shard: PlannedShard, shipped_bundle: Bundle
 ) -> None:
@@ -160,6 +162,41 @@ def test_the_best_of_lloyd_ends_below_the_clairvoyant(shipped_bundle: Bundle) ->
     assert ends["best-of-lloyd"] < ends["clairvoyant-cvt"]
 
 
+class FineCentroids(NamedTuple):
+    """ClairvoyantCVT's."""
+
+    importance: F32
+
+    def __call__(self, positions: F64) -> F64:
+        return voronoi_cells(self.importance, positions).centroid
+
+    def look(self, positions: F64) -> None:
+        pass
+
+
+def test_who_explores_ends_about_as_well_as_who_knows(shipped_bundle: Bundle) -> None:
+    """And without jumps: who stands a little further is told nearly the same."""
+    everybody = np.ones(10, np.bool_)
+    ends: dict[ExpertName, float] = {}
+    largest = 0.0
+    for expert in ("clairvoyant-cvt", "exploring-cvt"):
+        costs = []
+        [shard] = plan_round(replace(DATA, flights=4), DAGGER, 0, 0)
+        for world in BatchedFlights([f.scenario for f in shard.flights], shipped_bundle).prepared:
+            told = make_expert(replace(DATA, expert=expert), world)
+            positions = FIELD_SCALE.position_to_model(world.starts_m)
+            for _ in range(150):
+                velocities = told.velocities(positions, everybody)
+                beside = told.velocities(positions + 0.01, everybody)
+                if expert == "exploring-cvt":
+                    largest = max(largest, float(np.abs(beside - velocities).max()))
+                positions = positions + 1.6 * velocities
+            costs.append(coverage_cost(world.importance, positions))
+        ends[expert] = sum(costs)
+    assert ends["exploring-cvt"] < 1.1 * ends["clairvoyant-cvt"]
+    assert largest < 1.0
+
+
 def test_the_coarse_raster_is_good_enough(shipped_bundle: Bundle) -> None:
     """See `lpac.train.expert._Centroids`."""
     errors, fine, coarse = [], 0.0, 0.0
@@ -173,7 +210,7 @@ def test_the_coarse_raster_is_good_enough(shipped_bundle: Bundle) -> None:
         [world] = BatchedFlights([scenario], shipped_bundle).prepared
         np.testing.assert_array_equal(world.importance, importance)
         ours = make_expert(DATA, world)
-        exact = Expert(lambda p, i=importance: voronoi_cells(i, p).centroid, 5.0, 0.8)
+        exact = Expert(FineCentroids(importance), 5.0, 0.8)
         everybody = np.ones(10, np.bool_)
         positions = rng.uniform(0, 512, (10, 2))
         by_exact = by_ours = positions
