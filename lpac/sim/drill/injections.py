@@ -70,7 +70,7 @@ class BatteryIs(VehicleInjection):
 
 @dataclass(frozen=True, slots=True)
 class Drain(BatteryIs):
-    """It falls to it in flight: PX4's own simulator keeps the battery full while disarmed."""
+    """It falls to it in flight: PX4's own simulator drains only a battery of an armed vehicle."""
 
 
 @dataclass(frozen=True, slots=True)

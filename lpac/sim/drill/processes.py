@@ -26,6 +26,7 @@ from lpac.sim.drill.field import FaultyFleet
 from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
     AutopilotSilent,
+    BatteryIs,
     Do,
     Drain,
     FenceWithout,
@@ -61,7 +62,7 @@ _PROGRAMS = (
 # program that is as in the field hangs on demand.
 MAVLINK: tuple[type, ...] = (VehicleInjection, AutopilotSilent, *_PROGRAMS)
 # What a ground station can do to a real one, and PX4's own simulator to its vehicle.
-PX4: tuple[type, ...] = (LoseGps, Drain, OriginJumps, ModeIs, *_PROGRAMS)
+PX4: tuple[type, ...] = (LoseGps, BatteryIs, OriginJumps, ModeIs, *_PROGRAMS)
 
 # How long a command may take, each robot.
 _PATIENCE_S = 60.0
@@ -391,6 +392,8 @@ class Px4Field(ProcessField):
                 vehicle.lose_gps(lost=lost)
             case Drain(remaining):
                 vehicle.drain(remaining)
+            case BatteryIs(remaining):
+                vehicle.change_battery(remaining)
             case OriginJumps(by_m):
                 vehicle.jump_estimator_origin(*by_m)
             case ModeIs(mode):

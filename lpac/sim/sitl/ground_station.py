@@ -29,6 +29,10 @@ _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 # PX4's own default.
 _SATELLITES = 10
+# BAT1_SOURCE: what MAVLink tells, instead of PX4's own simulator. And cells as the simulator's.
+_EXTERNAL_BATTERY = 1
+_CELLS, _EMPTY_CELL_V, _FULL_CELL_V = 4, 3.6, 4.05
+_UNKNOWN_UINT16, _UNKNOWN_INT16 = 0xFFFF, 0x7FFF
 # Of vehicle_status in PX4's log.
 NAVIGATION_LAND = 18
 # Not in pymavlink's dialect: custom_mode comes first. PX4 has it since v1.15.
@@ -69,6 +73,10 @@ class RealVehicle:
         self._udp.setblocking(False)
         self._mav: Any = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         self._mav.robust_parsing = True
+        self._battery: float | None = None
+        self._battery_mav: Any = mavlink.MAVLink(
+            None, srcSystem=self._system, srcComponent=mavlink.MAV_COMP_ID_BATTERY
+        )
 
     @property
     def landed(self) -> bool:
@@ -93,9 +101,21 @@ class RealVehicle:
         self.set_parameter("SIM_GPS_USED", satellites, mavlink.MAV_PARAM_TYPE_INT32)
 
     def drain(self, remaining: float) -> None:
-        """The battery falls to this share within a second."""
+        """The battery of an armed vehicle falls to this share within a second.
+
+        PX4's simulator has a battery of 100 % whenever it is disarmed.
+        """
         self.set_parameter("SIM_BAT_MIN_PCT", 100.0 * remaining, mavlink.MAV_PARAM_TYPE_REAL32)
         self.set_parameter("SIM_BAT_DRAIN", 1.0, mavlink.MAV_PARAM_TYPE_REAL32)
+
+    def change_battery(self, remaining: float) -> None:
+        """A disarmed vehicle's battery has this share from now on.
+
+        It is another one, which tells PX4 itself: not for flights, since PX4 takes one that does
+        not tell how long it lasts to last for no time, and returns.
+        """
+        self.set_parameter("BAT1_SOURCE", _EXTERNAL_BATTERY, mavlink.MAV_PARAM_TYPE_INT32)
+        self._battery = remaining
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
         """A ground station moves the estimator's origin."""
@@ -115,13 +135,24 @@ class RealVehicle:
             raw = float(np.array([int(value)], np.int32).view(np.float32)[0])
         self._send(mavlink.MAVLink_param_set_message(self._system, 1, name.encode(), raw, kind))
 
+    def _tell_of_battery(self, remaining: float) -> None:
+        cell_v = _EMPTY_CELL_V + remaining * (_FULL_CELL_V - _EMPTY_CELL_V)
+        self._send(
+            mavlink.MAVLink_battery_status_message(
+                0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, _UNKNOWN_INT16,
+                [round(cell_v * 1e3)] * _CELLS + [_UNKNOWN_UINT16] * (10 - _CELLS), -1, -1, -1,
+                round(100.0 * remaining),
+            ),
+            self._battery_mav,
+        )  # fmt: skip
+
     def _command(self, command: int, *parameters: float) -> None:
         filled = [*parameters, *[0.0] * (7 - len(parameters))]
         self._send(mavlink.MAVLink_command_long_message(self._system, 1, command, 0, *filled))
 
-    def _send(self, message: Any) -> None:
+    def _send(self, message: Any, mav: Any = None) -> None:
         with suppress(ConnectionError):  # PX4 does not listen yet, or any more.
-            self._udp.send(message.pack(self._mav))
+            self._udp.send(message.pack(mav or self._mav))
 
     # What it does
 
@@ -135,6 +166,8 @@ class RealVehicle:
                     mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
                 )
             )
+            if self._battery is not None:
+                self._tell_of_battery(self._battery)
             if not self.truth:
                 for message, rate_hz in _RATES_HZ.items():
                     self._command(
