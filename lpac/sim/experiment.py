@@ -14,7 +14,7 @@ from edge.core.wire import MAX_ROBOT_ID
 from edge.core.world import Feature, random_features, rasterize
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle, BundleError
-from edge.robot.pac import PacParameters
+from edge.robot.pac import PacParameters, PayloadType
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
@@ -43,8 +43,8 @@ class Scenario:
     per robot, they start anywhere in the world. `world_size` and `communication_range`, in model
     units, and `max_speed_m_s` are the bundle's where they are None. `position_bias` is, per robot
     and in model units, by how much its knowledge of its position is wrong; `lag_s` the time
-    constant with which velocities follow what is told; ages are those of `PacParameters`. Baselines
-    know true positions and do not fail.
+    constant with which velocities follow what is told; ages and `payload` are those of
+    `PacParameters`. Baselines know true positions and do not fail.
 
     Raises ValueError that names what is impossible.
     """
@@ -61,6 +61,7 @@ class Scenario:
     delay_s: float = 0.0
     max_message_age_s: float = 0.8
     max_input_age_s: float = 1.0
+    payload: PayloadType = "float16"
     random_feature_sigma: tuple[float, float] = (40.0, 60.0)
     world_size: int | None = None
     communication_range: float | None = None
@@ -249,6 +250,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
             max_speed_m_s=max_speed_m_s,
             max_message_age_s=scenario.max_message_age_s,
             max_input_age_s=scenario.max_input_age_s,
+            payload=scenario.payload,
         ),
         features=features,
         importance=rasterize(

@@ -23,7 +23,7 @@ from edge.core.shared_map import SharedMap
 from edge.core.wire import rounded
 from edge.flight.safety import limit_speed
 from edge.policy.family import Observation
-from edge.robot.pac import PacParameters
+from edge.robot.pac import PacParameters, PayloadType
 from lpac.sim.batch.agents import Agents, Inputs
 from lpac.sim.batch.seen import SeenMap, ShownWorld
 
@@ -122,7 +122,9 @@ class DeferredSteps:
             [[other.payload for other in step.heeded] for step in steps],
             [step.degree for step in steps],
         )
-        received = rounded(payloads, "float16")
+        # float32 arrives as it is.
+        halves = [step.robot.payload == "float16" for step in steps]
+        received = np.where(np.array(halves)[:, None], rounded(payloads, "float16"), payloads)
         largest = np.abs(received).max(axis=1, initial=0.0)
         if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
             raise PolicyFailedError(
@@ -196,6 +198,11 @@ class BatchedRobot:
     def waits(self) -> bool:
         """Whether its policy's last step is not computed yet."""
         return self._action is not None and self._action.velocity is None
+
+    @property
+    def payload(self) -> PayloadType:
+        """How its messages' payloads are encoded."""
+        return self._parameters.payload
 
     def perceive(self, now_s: float) -> None:
         """See, and remember who is there."""

@@ -78,6 +78,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         delay_s=draw(st.sampled_from([0.0, 0.1, 0.7])),
         max_message_age_s=draw(st.sampled_from([0.0, 0.5, 0.8, 2.0])),
         max_input_age_s=draw(st.sampled_from([0.05, 1.0])),
+        payload=draw(st.sampled_from(["float16", "float32"])),
         random_feature_sigma=(20.0, 80.0),
         world_size=world_size,
         communication_range=draw(st.floats(50.0, 400.0)),
@@ -118,14 +119,23 @@ def test_robots_that_see_what_they_explored_fly_the_same(
     [
         Scenario(seed=1, robots=6),
         Scenario(seed=2, robots=6, loss=0.3),
+        Scenario(seed=2, robots=6, payload="float32"),
         Scenario(seed=3, robots=40, duration_s=5.0, world_size=1024, communication_range=128.0),
         dataclasses.replace(HARD, duration_s=20.0),
     ],
-    ids=["60 s", "60 s with loss", "the paper's density", "all at once"],
+    ids=["60 s", "60 s with loss", "60 s with float32", "the paper's density", "all at once"],
 )
 def test_long_and_large_flights_too(shipped_bundle: Bundle, scenario: Scenario) -> None:
     [batched] = fly_batch([scenario], shipped_bundle)
     assert_same(batched, fly(scenario, shipped_bundle))
+
+
+def test_payloads_arrive_as_they_are_encoded(shipped_bundle: Bundle) -> None:
+    halves, whole = Scenario(duration_s=5.0), Scenario(duration_s=5.0, payload="float32")
+    flown = fly_batch([halves, whole], shipped_bundle)
+    assert not np.array_equal(flown[0].positions_m, flown[1].positions_m)
+    assert np.float32(np.float16(flown[0].largest_payload)) == flown[0].largest_payload
+    assert np.float32(np.float16(flown[1].largest_payload)) != flown[1].largest_payload
 
 
 def test_worlds_of_a_batch_do_not_touch_one_another(shipped_bundle: Bundle) -> None:
