@@ -84,17 +84,23 @@ def bootstrap(values: F64, statistic: Callable[[F64], F64] = mean) -> Interval95
     return _interval(statistic(values), statistic(drawn))
 
 
-def paired_bootstrap(a: F64, b: F64, statistic: Callable[[F64, F64], F64]) -> Interval95:
+def paired_bootstrap(
+    a: F64, b: F64, statistic: Callable[[F64, F64], F64], *, same_trainings: bool = False
+) -> Interval95:
     """A statistic of two methods, (S, K) and (T, K), over the same worlds in the same order.
 
-    Worlds are drawn for both at once, and trainings for each by itself. Raises ValueError if the
-    numbers of worlds differ.
+    Worlds are drawn for both at once. Trainings are drawn for each by itself; or for both at once,
+    if they are the same, in the same order, and only fly otherwise. Raises ValueError if what is
+    drawn for both differs in number.
     """
     if a.shape[1] != b.shape[1]:
         raise ValueError(f"{a.shape[1]} worlds of one and {b.shape[1]} of the other: no pairs")
+    if same_trainings and len(a) != len(b):
+        raise ValueError(f"{len(a)} trainings of one and {len(b)} of the other: not the same")
     rng = np.random.default_rng(_SEED)
     worlds = _drawn(rng, a.shape[1])[:, None]
-    of_a, of_b = (_drawn(rng, len(values))[:, :, None] for values in (a, b))
+    of_a = _drawn(rng, len(a))[:, :, None]
+    of_b = of_a if same_trainings else _drawn(rng, len(b))[:, :, None]
     return _interval(statistic(a, b), statistic(a[of_a, worlds], b[of_b, worlds]))
 
 
@@ -114,9 +120,20 @@ class Verdict(NamedTuple):
     of_methods: bool
 
 
-def compare(a: F64, b: F64, *, trained_a: bool = True, trained_b: bool = True) -> Verdict:
-    """Compare (S, K) with (T, K) over the same worlds. Raises ValueError as `paired_bootstrap`."""
-    difference = paired_bootstrap(a, b, difference_of_means)
+def compare(
+    a: F64,
+    b: F64,
+    *,
+    trained_a: bool = True,
+    trained_b: bool = True,
+    same_trainings: bool = False,
+) -> Verdict:
+    """Compare (S, K) with (T, K) over the same worlds; see `paired_bootstrap`, also for errors."""
+
+    def told(statistic: Callable[[F64, F64], F64]) -> Interval95:
+        return paired_bootstrap(a, b, statistic, same_trainings=same_trainings)
+
+    difference = told(difference_of_means)
     better: Literal["a", "b"] | None = None
     if a.shape[1] >= LEAST_WORLDS and difference.high < 0.0:
         better = "a"
@@ -125,8 +142,8 @@ def compare(a: F64, b: F64, *, trained_a: bool = True, trained_b: bool = True) -
     return Verdict(
         better,
         difference,
-        paired_bootstrap(a, b, ratio_of_means),
-        paired_bootstrap(a, b, share_below),
+        told(ratio_of_means),
+        told(share_below),
         all(
             not trained or len(values) >= LEAST_TRAININGS
             for values, trained in ((a, trained_a), (b, trained_b))

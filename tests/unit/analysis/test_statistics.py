@@ -114,6 +114,22 @@ def test_one_good_training_of_several_proves_nothing() -> None:
     assert told.better is None and told.of_methods
 
 
+def test_the_same_trainings_are_pairs_too() -> None:
+    """They differ by more than what each comes to if it flies otherwise."""
+    worlds = np.random.default_rng(0).uniform(0.1, 0.9, (1, 30))
+    b = worlds + np.array([[-0.1], [0.02], [0.05]])
+    a = b - 0.01
+    assert compare(a, b).better is None
+    told = compare(a, b, same_trainings=True)
+    assert told.better == "a" and told.of_methods
+    assert told.difference.low == pytest.approx(told.difference.high)
+    # All trainings but one are worse for it.
+    a = b + np.array([[-0.1], [0.02], [0.05]])
+    assert compare(a, b, same_trainings=True).better is None
+    with pytest.raises(ValueError, match="3 trainings of one and 1 of the other: not the same"):
+        compare(a, b[:1], same_trainings=True)
+
+
 def test_few_worlds_prove_nothing() -> None:
     a = np.full((1, 5), 0.2)
     assert compare(a, a + 0.1).better is None
