@@ -3,7 +3,7 @@
 import re
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 import edge
 from edge.policy.bundle import Bundle, BundleError, load_bundle
+from edge.robot.pac import PayloadType
 from lpac import analysis, evaluate, sim
 from lpac.analysis.coverage import Coverage
 from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
@@ -22,6 +23,7 @@ from lpac.sim.cores import Pool
 from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly, prepare
 from lpac.sim.failure import Failure
 from lpac.sim.kept import KeptOutcomes, code_digest
+from lpac.sim.ticks import Clocks
 
 BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
 # The best of ten runs of Lloyd's algorithm that knows the world: where robots would end, not a
@@ -59,7 +61,7 @@ class EvaluationFlight:
     """One flight over one world: all of it follows from this, and from what is in the bundle.
 
     `bundle` is the path of the one that flies, or gives a baseline the sizes of sensor and local
-    map; `flown_by` is its id, or says these sizes.
+    map; `flown_by` is its id, or says these sizes. The rest is as `Scenario` has it.
     """
 
     flier: Flier
@@ -71,6 +73,10 @@ class EvaluationFlight:
     duration_s: float
     loss: float = 0.0
     lost: LostRobots = NONE_LOST
+    delay_s: float = 0.0
+    max_message_age_s: float = 0.8
+    payload: PayloadType = "float16"
+    clocks: Clocks = field(default_factory=Clocks)
 
     @property
     def key(self) -> str:
@@ -78,6 +84,8 @@ class EvaluationFlight:
         return (
             f"{self.flier} {self.flown_by}: {self.world_set} {self.world} {self.set_up}, "
             f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
+            f", delay {self.delay_s:g} s, ages to {self.max_message_age_s:g} s, {self.payload}, "
+            f"{self.clocks}"
         )
 
 
@@ -169,6 +177,10 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         starts_m=tuple((x_m, y_m) for x_m, y_m in starts_m),
         scale=FIELD_SCALE,
         loss=flight.loss,
+        delay_s=flight.delay_s,
+        max_message_age_s=flight.max_message_age_s,
+        payload=flight.payload,
+        clocks=flight.clocks,
         world_size=set_up.world_size,
         communication_range=set_up.communication_range,
         failures=tuple(Failure(robot, flight.lost.at_s) for robot in range(left, robots)),

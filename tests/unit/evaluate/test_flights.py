@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from lpac.evaluate.flights import (
 )
 from lpac.evaluate.worlds import FIELD, draw_world
 from lpac.sim.cores import Outcome, Task
+from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED
 
 
@@ -49,7 +51,12 @@ def test_all_fly_over_the_sets_world(flight: EvaluationFlight) -> None:
 
 
 def test_a_batch_tells_what_its_flights_tell(flight: EvaluationFlight) -> None:
-    group = (flight, dataclasses.replace(flight, loss=0.5), dataclasses.replace(flight, world=4))
+    changes: list[dict[str, Any]] = [
+        {}, {"loss": 0.5}, {"world": 4}, {"delay_s": 0.3}, {"max_message_age_s": 0.1},
+        {"payload": "float32"}, {"clocks": Clocks(perception_s=0.1, policy_s=0.2)},
+    ]  # fmt: skip
+    group = tuple(dataclasses.replace(flight, **change) for change in changes)
+    assert len({one.key for one in group}) == len({costs for _, costs in costs_of(group)}) == 7
     assert costs_of(group) == [pair for one in group for pair in costs_of((one,))]
 
 
