@@ -42,7 +42,8 @@ class LpacNetwork:
 
     `channels` are the images that the CNN sees, one of `MAP_CHANNELS`, `image_size` wide;
     `cnn_channels` those of each convolution, `kernel` wide. Then `layers` (L) of `hops` (K),
-    `width` wide, and an MLP of `mlp_layers` layers `mlp_width` wide.
+    `width` wide, and an MLP of `mlp_layers` layers `mlp_width` wide. With 0 hops robots see where
+    neighbours are, but heed nothing of what they say: the checkpoint has one hop, of weight 0.
 
     Raises ValueError that names what is impossible.
     """
@@ -64,9 +65,11 @@ class LpacNetwork:
             raise ValueError(f"channels = {', '.join(self.channels)}: allowed are {allowed}")
         if not self.cnn_channels or min(self.cnn_channels) < 1:
             raise ValueError(f"cnn_channels = {self.cnn_channels}: must be one or more, above 0")
-        for name in ("image_size", "kernel", "features", "layers", "hops", "width", "mlp_width"):
+        for name in ("image_size", "kernel", "features", "layers", "width", "mlp_width"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be at least 1")
+        if self.hops < 0:
+            raise ValueError(f"hops = {self.hops}: must be at least 0")
         if self.mlp_layers < 2:
             raise ValueError(f"mlp_layers = {self.mlp_layers}: must be at least 2")
         if self._side < 1:
@@ -86,6 +89,8 @@ class LpacNetwork:
 
     def initial(self, checkpoint: bytes, name: str) -> StateDict:
         """See `Learnable`; images that the checkpoint's CNN does not see have weights of 0."""
+        if not self.hops:
+            raise ValueError(f"{name}: weights of hops are of no use to a network of hops = 0")
         zero, one = np.zeros(ACTION_SIZE, np.float32), np.ones(ACTION_SIZE, np.float32)
         state = self.module(zero, one).state_dict()
         tensors = checkpoint_tensors(checkpoint, name)
@@ -229,7 +234,12 @@ class _GraphLayer(nn.Module):
 
     def __init__(self, hops: int, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.lins = nn.ModuleList(nn.Linear(inputs, outputs, bias=False) for _ in range(hops + 1))
+        self.lins = nn.ModuleList(
+            nn.Linear(inputs, outputs, bias=False) for _ in range(max(hops, 1) + 1)
+        )
+        if not hops:  # what flies has one at least
+            for unheeded in self.lins[1].parameters():
+                nn.init.zeros_(unheeded.requires_grad_(False))
         self.bias = nn.Parameter(torch.zeros(outputs))
 
     def forward(self, swarms: Tensor, shift: Tensor) -> Tensor:

@@ -190,6 +190,30 @@ def test_it_can_go_on_with_the_shipped_policys_weights() -> None:
     LpacNetwork().module(MEAN, DEVIATION).load_state_dict(state)
 
 
+def test_without_hops_nobody_heeds_what_is_said() -> None:
+    """Trained or not; and what flies is a network of one hop."""
+    sizes = replace(SMALL, hops=0)
+    module = drawn(sizes)
+    optimiser = torch.optim.AdamW(module.parameters(), lr=0.1)
+    inputs, adjacency = swarm(sizes, 7)
+    present = np.ones((1, 7), np.bool_)
+    shift = torch.from_numpy(shift_operator(adjacency[None], np.ones_like(adjacency)[None]))
+    tensors = {name: torch.from_numpy(rows) for name, rows in inputs.items()}
+    module(tensors, shift, torch.from_numpy(present)).square().sum().backward()
+    optimiser.step()
+    content = sizes.checkpoint(module.state_dict())
+    assert parse_checkpoint(content, "trained").geometry.hops == 1
+    alone = np.zeros_like(adjacency[None])
+    torch.testing.assert_close(
+        velocities(module, inputs, adjacency[None], present),
+        velocities(module, inputs, alone, present),
+    )
+    bundle = sizes.bundle(content, read_parameters(SHIPPED.with_suffix(".toml")), "small", {})
+    assert all(check.passed for check in LpacPolicy(bundle).verify())
+    with pytest.raises(ValueError, match=r"small\.pt: weights of hops are of no use"):
+        sizes.initial(content, "small.pt")
+
+
 @pytest.mark.parametrize(
     ("network_table", "text"),
     [
@@ -197,7 +221,8 @@ def test_it_can_go_on_with_the_shipped_policys_weights() -> None:
         ({"depth": 3}, "here: unknown key 'depth'; known are channels, "),
         ({"channels": ["importance"]}, "here: channels = importance: allowed are "),
         ({"cnn_channels": []}, r"here: cnn_channels = \(\): must be one or more, above 0"),
-        ({"hops": 0}, "here: hops = 0: must be at least 1"),
+        ({"hops": -1}, "here: hops = -1: must be at least 0"),
+        ({"layers": 0}, "here: layers = 0: must be at least 1"),
         ({"image_size": 6}, "here: image_size = 6: must be above 6, what the convolutions"),
     ],
 )
