@@ -24,6 +24,14 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 ExpertName = Literal["clairvoyant-cvt", "best-of-lloyd", "exploring-cvt"]
 
 
+def require_name(name: str) -> None:
+    """Of something that has files. Raises ValueError."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"name = {name!r}: must be letters, digits and _ . -, the first of the two"
+        )
+
+
 def _at_least(least: float, **values: float) -> None:
     for name, value in values.items():
         if not least <= value < math.inf:
@@ -208,10 +216,7 @@ class ExportConfig:
     licence: str = "MIT"
 
     def __post_init__(self) -> None:
-        if not _NAME.fullmatch(self.name):
-            raise ValueError(
-                f"name = {self.name!r}: must be letters, digits and _ . -, the first of the two"
-            )
+        require_name(self.name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,26 +260,38 @@ class ReadConfig:
         return config_digest(self.text)
 
 
-def read_config(path: Path) -> ReadConfig:
-    """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
+def read_toml(path: Path) -> str:
+    """The text of a file that is TOML. Raises ConfigError that names the file, and the line."""
     try:
         text = path.read_text("utf-8")
-        document = tomllib.loads(text)
+        tomllib.loads(text)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not UTF-8 text, expected TOML") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
-    config = from_mapping(TrainingConfig, document, str(path))
-    network = learnable(config.network, f"{path}: network")
-    return ReadConfig(config, network, text, _initial(config, network, path))
+    return text
 
 
-def _initial(config: TrainingConfig, network: Learnable, path: Path) -> StateDict | None:
+def read_config(path: Path) -> ReadConfig:
+    """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
+    return config_of(read_toml(path), str(path), path.parent)
+
+
+def config_of(text: str, where: str, folder: Path) -> ReadConfig:
+    """Of TOML, whose paths are from that folder. Raises ConfigError that begins with `where`."""
+    config = from_mapping(TrainingConfig, tomllib.loads(text), where)
+    network = learnable(config.network, f"{where}: network")
+    return ReadConfig(config, network, text, _initial(config, network, where, folder))
+
+
+def _initial(
+    config: TrainingConfig, network: Learnable, where: str, folder: Path
+) -> StateDict | None:
     if config.fit.begin_with is None:
         return None
-    checkpoint, where = path.parent / config.fit.begin_with, f"{path}: fit.begin_with"
+    checkpoint, where = folder / config.fit.begin_with, f"{where}: fit.begin_with"
     try:
         return network.initial(checkpoint.read_bytes(), str(checkpoint))
     except OSError as error:

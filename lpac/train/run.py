@@ -39,6 +39,16 @@ _PAYLOAD_MARGIN = 10.0
 _PAYLOAD_FLIGHTS = 16
 
 
+def require_same_run(read: ReadConfig, folder: Path) -> None:
+    """That whatever was begun in the folder can go on so. Raises ConfigError, OSError."""
+    begun = folder / _CONFIG
+    if begun.exists() and config_digest(begun.read_text("utf-8")) != read.digest:
+        raise ConfigError(
+            f"{folder}: was begun with another configuration ({begun}); only dagger.rounds may "
+            "change: choose another name, or --out"
+        )
+
+
 class TrainingRun:
     """One folder's training."""
 
@@ -46,13 +56,8 @@ class TrainingRun:
         """Begins, or goes on. Raises ConfigError if it was begun otherwise; ValueError, OSError."""
         self._config, self._network, self._folder = read.config, read.network, folder
         self._digest = read.digest
-        begun = folder / _CONFIG
-        if begun.exists() and config_digest(begun.read_text("utf-8")) != read.digest:
-            raise ConfigError(
-                f"{folder}: was begun with another configuration ({begun}); only dagger.rounds may "
-                "change: choose another export.name, or --out"
-            )
-        write_atomically(begun, read.text.encode())
+        require_same_run(read, folder)
+        write_atomically(folder / _CONFIG, read.text.encode())
         config = self._config
         self._shards = Shards(folder / "data", read.digest)
         self._fit = Fit(
