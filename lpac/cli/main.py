@@ -20,6 +20,7 @@ _COMMANDS = {
     "sim": "Fly a swarm over an unknown world and print how well it covers it.",
     "evaluate": "Policies and baselines over many worlds: how well they cover, and how surely.",
     "train": "Train a policy, or go on with it where it was stopped; chosen by how it flies.",
+    "ablate": "Train a method without each of its parts, and say what each of them is worth.",
     "drill": "Do faults to a fleet in flight, and judge by the vehicles' truth what is promised.",
     "hosts": "Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
     "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",
@@ -42,7 +43,7 @@ _EXTRAS = {
     "ground": ("ground", "mission", "watch", "map", "site", "record", "report"),
     "fleet": ("fleet",),
     "export": ("export",),
-    "train": ("train",),
+    "train": ("train", "ablate"),
 }
 _INTERRUPTED = 130
 

@@ -10,6 +10,7 @@ import typer
 from lpac.shipped import shipped
 
 if TYPE_CHECKING:
+    from edge.drivers.process_lock import ProcessLock
     from lpac.fleet.settings import FleetConfig, RobotHost
     from lpac.sim.cores import Pool
 
@@ -26,6 +27,8 @@ Ray = Annotated[
 ]
 DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
+# The name of a lock has some hundred bytes.
+_LOCK_BYTES = 80
 
 
 def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
@@ -47,6 +50,14 @@ def pool(ray: str | None) -> "Pool":
     except ModuleNotFoundError:
         raise ValueError("--ray needs Ray: `pip install 'lpac-edge[ray]'`") from None
     return over_ray(ray)
+
+
+def folder_lock(what: str, folder: Path) -> "ProcessLock":
+    """To be held by who works in the folder."""
+    from edge.drivers.process_lock import ProcessLock
+
+    last_part = bytes(folder.resolve())[-_LOCK_BYTES:].decode(errors="ignore")
+    return ProcessLock(f"{what} in {last_part}")
 
 
 def user_at_host() -> str:

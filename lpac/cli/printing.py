@@ -1,6 +1,7 @@
 """Tables, notes and colours, as all commands print them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -77,3 +78,31 @@ def progress_of(what: str) -> "Progress":
         TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         TextColumn("{task.description}"), console=Console(stderr=True), transient=True,
     )  # fmt: skip
+
+
+@contextmanager
+def progress_of_run() -> Iterator[Callable[[float, str, Sequence[str]], None]]:
+    """One bar for a run of hours, on stderr: the share that is done, what is done now, numbers."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    with Progress(
+        TextColumn("{task.fields[stage]:<20}"), BarColumn(), TaskProgressColumn(),
+        TextColumn("{task.fields[numbers]}"), console=Console(stderr=True), transient=True,
+    ) as progress:  # fmt: skip
+        task = progress.add_task("", total=1.0, stage="", numbers="")
+
+        def show(done: float, stage: str, numbers: Sequence[str]) -> None:
+            progress.update(task, completed=done, stage=stage, numbers="  ".join(numbers))
+
+        yield show
+
+
+def time_left(left_s: float | None) -> list[str]:
+    """What is said of it: nothing if nobody knows."""
+    if left_s is None:
+        return []
+    minutes = round(left_s / 60.0)
+    return [
+        f"{minutes // 60}:{minutes % 60:02d} h left" if minutes >= 60 else f"{minutes} min left"
+    ]

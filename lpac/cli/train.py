@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import AsJson, Ray, pool
-from lpac.cli.printing import print_table
+from lpac.cli.options import AsJson, Ray, folder_lock, pool
+from lpac.cli.printing import print_table, progress_of_run, time_left
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 app = new_app()
 
 _OUT = Path("out/train")
-# The name of a lock has some hundred bytes.
-_LOCK_BYTES = 80
 
 
 @app.command()
@@ -36,17 +34,13 @@ def train(
     as_json: AsJson = False,
 ) -> None:
     """Train a policy, or go on with it where it was stopped; chosen by how it flies."""
-    from edge.drivers.process_lock import ProcessLock
     from lpac.train.config import read_config
     from lpac.train.run import TrainingRun
 
     read = read_config(config)
     cores = pool(ray)
     folder = out or _OUT / read.config.export.name
-    with (
-        ProcessLock(f"the training in {_last_part(folder)}"),
-        _progress() as tell,
-    ):
+    with folder_lock("the training", folder), _progress() as tell:
         told = TrainingRun(read, folder, tell).run(cores)
     if as_json:
         typer.echo(json.dumps(told, indent=2))
@@ -54,39 +48,21 @@ def train(
         _show(told)
 
 
-def _last_part(folder: Path) -> str:
-    return bytes(folder.resolve())[-_LOCK_BYTES:].decode(errors="ignore")
-
-
 @contextmanager
 def _progress() -> "Iterator[Callable[[RunProgress], None]]":
-    """One bar for the whole run, on stderr."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
-
-    with Progress(
-        TextColumn("{task.fields[stage]:<20}"), BarColumn(), TaskProgressColumn(),
-        TextColumn("{task.fields[numbers]}"), console=Console(stderr=True), transient=True,
-    ) as progress:  # fmt: skip
-        task = progress.add_task("", total=1.0, stage="", numbers="")
+    with progress_of_run() as show:
 
         def tell(now: "RunProgress") -> None:
-            numbers = [
-                f"loss {now.loss:.3f}" if now.loss is not None else "",
-                f"closed-loop cost {now.cost:.3f}" if now.cost is not None else "",
-                f"{_duration(now.left_s)} left" if now.left_s is not None else "",
-            ]
-            progress.update(
-                task, completed=now.done, stage=f"round {now.round}: {now.stage}",
-                numbers="  ".join(filter(None, numbers)),
-            )  # fmt: skip
+            numbers = [*numbers_of_training(now), *time_left(now.left_s)]
+            show(now.done, f"round {now.round}: {now.stage}", numbers)
 
         yield tell
 
 
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60.0)
-    return f"{minutes // 60}:{minutes % 60:02d} h" if minutes >= 60 else f"{minutes} min"
+def numbers_of_training(now: "RunProgress") -> list[str]:
+    """What is known of them."""
+    loss = [] if now.loss is None else [f"loss {now.loss:.3f}"]
+    return loss if now.cost is None else [*loss, f"closed-loop cost {now.cost:.3f}"]
 
 
 def _show(told: dict[str, Any]) -> None:

@@ -50,10 +50,13 @@ ALLOWED = {
     "lpac.train": {
         *_EDGE, "export", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.evaluate",
     },
+    "lpac.ablate": {
+        *_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate", "lpac.train",
+    },
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train", "lpac.fleet",
-        "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
+        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train", "lpac.ablate",
+        "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
@@ -61,7 +64,13 @@ ONLY_IN = {
     "onnxruntime": {"edge/policy/lpac/graphs.py"},
     "torch": {"export/", "lpac/train/"},
     "onnx": {"export/"},
-    "matplotlib": {"lpac/sim/", "lpac/analysis/", "lpac/evaluate/", "lpac/train/"},
+    "matplotlib": {
+        "lpac/sim/",
+        "lpac/analysis/",
+        "lpac/evaluate/",
+        "lpac/train/",
+        "lpac/ablate/",
+    },
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
     "mcap": {"edge/drivers/"},

@@ -62,8 +62,9 @@ def test_only_the_number_of_rounds_may_change(tmp_path: Path) -> None:
     assert digest != read(tmp_path, ("states = 3", "states = 4")).digest
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.toml")), ids=lambda p: p.name)
-def test_the_examples_can_be_trained(path: Path) -> None:
+@pytest.mark.parametrize("name", ["field", "general", "quick"])
+def test_the_examples_can_be_trained(name: str) -> None:
+    path = ROOT / "examples" / f"{name}.toml"
     read = read_config(path)
     assert read.config.export.name == path.stem
     assert read.config.parameters.training.env_scale == read.config.data.scale.env_scale

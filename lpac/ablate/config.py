@@ -1,0 +1,243 @@
+"""What `lpac ablate` is told: a TOML file, as frozen dataclasses; and the trainings that it means.
+
+Compute is equal: every variant has as many flights, states, epochs, rounds and candidates as the
+base. What goes without DAgger has them too: with `dagger.expert_flights` of 1 the expert flies in
+the rounds instead of the policy.
+"""
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Literal
+
+from edge.core.schema import ConfigError, from_mapping
+from edge.robot.pac import PayloadType
+from lpac.evaluate.worlds import SET_UPS
+from lpac.sim.ticks import Clocks
+from lpac.train.config import ReadConfig, TrainingConfig, config_of, read_toml, require_name
+
+BASE = "base"
+# Keys of a training that no variant changes: how much is computed, and what the task is.
+_EQUAL = (
+    "data.flights", "data.states", "data.duration_s", "fit.epochs", "dagger.rounds",
+    "dagger.flights", "dagger.duration_s", "dagger.epochs", "select.worlds", "select.set_ups",
+    "select.duration_s", "select.every_epochs", "perception.sensor_size",
+    "training.max_speed", "training.idf_truncation", "training.idf_norm",
+)  # fmt: skip
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownAs:
+    """How the flights are that are judged: see `lpac.sim.experiment.Scenario`."""
+
+    loss: float = 0.0
+    delay_s: float = 0.0
+    max_message_age_s: float = 0.8
+    payload: PayloadType = "float16"
+    clocks: Clocks = field(default_factory=Clocks)
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.loss <= 1.0:
+            raise ValueError(f"loss = {self.loss}: must be from 0 to 1")
+        for name in ("delay_s", "max_message_age_s"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} = {getattr(self, name)}: must be at least 0 and finite")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """What is otherwise than in the base: `why` is a sentence that says it to people.
+
+    `train` is merged into the base's configuration, `fly` into its `FlownAs`. One that only flies
+    otherwise has the base's policies.
+    """
+
+    name: str
+    why: str
+    train: dict[str, object] = field(default_factory=dict)
+    fly: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require_name(self.name)
+        if self.name == BASE:
+            raise ValueError(f"name = {BASE!r}: is what the variants are held against")
+        if not self.why.strip() or "\n" in self.why.strip():
+            raise ValueError(f"why = {self.why!r}: must be a sentence, on one line")
+        if not self.train and not self.fly:
+            raise ValueError("train, fly: one of them must say what is otherwise")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AblationConfig:
+    """The file. `base` is the path of a training's configuration, from the file's folder.
+
+    `train` is merged into that, and `fly` says how flights are, for the base and all variants. All
+    are trained with each of `seeds`, and judged over `worlds` worlds in `set_up`.
+    """
+
+    base: str
+    variants: tuple[Variant, ...]
+    seeds: tuple[int, ...] = (0, 1, 2)
+    worlds: int = 40
+    world_set: Literal["validation", "test"] = "validation"
+    set_up: str = "field"
+    duration_s: float = 60.0
+    train: dict[str, object] = field(default_factory=dict)
+    fly: dict[str, object] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        names = [variant.name for variant in self.variants]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"variants: name = {name!r}: must be one variant's alone")
+        if not self.variants:
+            raise ValueError("variants = []: must be one or more")
+        if not self.seeds or len(set(self.seeds)) < len(self.seeds) or min(self.seeds) < 0:
+            raise ValueError(
+                f"seeds = {list(self.seeds)}: must be one or more, at least 0, each once"
+            )
+        if self.worlds < 1:
+            raise ValueError(f"worlds = {self.worlds}: must be at least 1")
+        if self.set_up not in SET_UPS:
+            raise ValueError(f"set_up = {self.set_up!r}: allowed are {', '.join(SET_UPS)}")
+        if not 1.0 <= self.duration_s <= 3600.0:
+            raise ValueError(f"duration_s = {self.duration_s}: must be from 1 to 3600")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedTraining:
+    """A training of the base or of a variant; `name` is that of its folder and of its policy."""
+
+    name: str
+    seed: int
+    read: ReadConfig
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedVariant:
+    """The base or a variant; `trained` is False of one that flies the base's trainings."""
+
+    name: str
+    why: str
+    trainings: tuple[PlannedTraining, ...]
+    flown_as: FlownAs
+    trained: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ablation:
+    """What the file means; the base is the first of `variants`."""
+
+    config: AblationConfig
+    variants: tuple[PlannedVariant, ...]
+
+    @property
+    def trainings(self) -> list[PlannedTraining]:
+        """Each once."""
+        return [each for variant in self.variants if variant.trained for each in variant.trainings]
+
+    @property
+    def worlds(self) -> range:
+        """Numbers of those that are flown over: none that weights are chosen by."""
+        select = self.variants[0].trainings[0].read.config.select
+        first = select.worlds if self.config.world_set == "validation" else 0
+        return range(first, first + self.config.worlds)
+
+
+def read_ablation(path: Path) -> Ablation:
+    """Raises ConfigError that names the file, the line or key, the value and what is allowed."""
+    config = from_mapping(AblationConfig, tomllib.loads(read_toml(path)), str(path))
+    _require_no_names(config.train, str(path))
+    base_path = path.parent / config.base
+    document = _merged(tomllib.loads(read_toml(base_path)), config.train)
+    where = f"{path}: {BASE}"
+    base = PlannedVariant(
+        BASE,
+        f"All parts: {base_path.name}.",
+        _trainings(BASE, config.seeds, document, where, base_path.parent),
+        from_mapping(FlownAs, config.fly, f"{where}: fly"),
+        trained=True,
+    )
+    variants = [base]
+    for variant in config.variants:
+        name, where, trainings = variant.name, f"{path}: {variant.name}", base.trainings
+        if variant.train:
+            _require_no_names(variant.train, where)
+            merged = _merged(document, variant.train)
+            trainings = _trainings(name, config.seeds, merged, where, base_path.parent)
+            _require_equal_compute(trainings[0].read.config, base.trainings[0].read.config, where)
+        fly = from_mapping(FlownAs, _merged(config.fly, variant.fly), f"{where}: fly")
+        variants.append(
+            PlannedVariant(name, variant.why, trainings, fly, trained=bool(variant.train))
+        )
+    return Ablation(config, tuple(variants))
+
+
+def _trainings(
+    variant: str, seeds: Sequence[int], document: Mapping[str, Any], where: str, folder: Path
+) -> tuple[PlannedTraining, ...]:
+    trainings = []
+    for seed in seeds:
+        name = f"{variant}-{seed}"
+        own = _merged(document, {"seed": seed, "export": {"name": name}})
+        trainings.append(PlannedTraining(name, seed, config_of(_as_toml(own), where, folder)))
+    return tuple(trainings)
+
+
+def _require_no_names(train: Mapping[str, object], where: str) -> None:
+    for key in ("seed", "export"):
+        if key in train:
+            raise ConfigError(f"{where}: train.{key}: is not to be set: it follows from `seeds`")
+
+
+def _require_equal_compute(config: TrainingConfig, base: TrainingConfig, where: str) -> None:
+    for key in _EQUAL:
+        value, allowed = attrgetter(key)(config), attrgetter(key)(base)
+        if value != allowed:
+            hint = "; without DAgger is dagger.expert_flights = 1" if "dagger" in key else ""
+            raise ConfigError(
+                f"{where}: train.{key} = {value}: must be the base's, {allowed}, or what is "
+                f"compared would not be as much work{hint}"
+            )
+
+
+def _merged(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables key by key; whatever else there is replaces what was."""
+    merged = dict(document)
+    for key, value in changes.items():
+        old = merged.get(key)
+        tables = isinstance(old, Mapping) and isinstance(value, Mapping)
+        merged[key] = _merged(merged[key], value) if tables else value
+    return merged
+
+
+def _as_toml(document: Mapping[str, Any]) -> str:
+    """The text of a document: each of its tables has its heading, and a line for each key."""
+    tables = {key: value for key, value in document.items() if isinstance(value, Mapping)}
+    lines = [_line(key, value) for key, value in document.items() if key not in tables]
+    for name, table in tables.items():
+        lines += ["", f"[{_key(name)}]", *(_line(key, value) for key, value in table.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _line(key: str, value: object) -> str:
+    return f"{_key(key)} = {_value(value)}"
+
+
+def _key(key: str) -> str:
+    return key if _BARE_KEY.fullmatch(key) else _value(key)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(_line(key, each) for key, each in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    # Of text and bool JSON is TOML; of numbers and dates Python is.
+    return json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)

@@ -1,0 +1,118 @@
+"""An ablation as files: ablation.json, a figure, and README.md with the table."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from lpac.ablate.config import Ablation
+from lpac.ablate.results import VariantResult, as_json, is_claim
+from lpac.analysis import style
+from lpac.analysis.statistics import LEAST_TRAININGS
+from lpac.analysis.style import WIDTH_IN, tidy
+from lpac.train.files import write_atomically
+
+_COLOURS = {"better": style.GREEN, "worse": style.VERMILLION, "not told apart": style.GREY}
+
+
+def write_report(ablation: Ablation, results: Sequence[VariantResult], folder: Path) -> None:
+    """All of it. Raises OSError."""
+    told = json.dumps(as_json(ablation, results), indent=2) + "\n"
+    write_atomically(folder / "ablation.json", told.encode())
+    style.save(_differences(results), folder / "differences")
+    write_atomically(folder / "README.md", _text(ablation, results).encode())
+
+
+def no_claim(ablation: Ablation) -> str | None:
+    """What has to be said if trainings are too few."""
+    if is_claim(ablation):
+        return None
+    seeds = len(ablation.config.seeds)
+    return (
+        f"{seeds} training seed{'s' if seeds > 1 else ''}: this says something of these policies, "
+        f"and is no claim about the method, which needs {LEAST_TRAININGS}"
+    )
+
+
+def _differences(results: Sequence[VariantResult]) -> Figure:
+    """How much each variant's mean cost is above the base's, with its interval."""
+    base, *variants = results
+    with style.figure(WIDTH_IN, 1.0 + 0.24 * len(variants)) as figure:
+        axes = figure.subplots()
+        axes.axvline(0.0, color=style.INK, lw=0.8, zorder=0)
+        for row, result in enumerate(variants):
+            assert result.against_base is not None and result.verdict is not None
+            value, low, high = result.against_base.difference
+            colour = _COLOURS[result.verdict]
+            by_seed = result.final.mean(axis=1) - base.final.mean(
+                axis=None if result.variant.trained else 1
+            )
+            axes.plot(
+                by_seed, [row] * len(by_seed), ls="", marker="|", ms=7, color=style.FAINT, zorder=1
+            )
+            axes.plot((low, high), (row, row), color=colour, lw=1.2)
+            axes.plot(value, row, ls="", marker="o", ms=4, color=colour)
+        for verdict, colour in _COLOURS.items():
+            axes.plot([], [], ls="", marker="o", ms=4, color=colour, label=verdict)
+        axes.plot([], [], ls="", marker="|", ms=7, color=style.FAINT, label="one seed")
+        axes.set_yticks(range(len(variants)), [result.variant.name for result in variants])
+        axes.set(
+            xlabel="mean cost at the end / at the start, above the base's; 95 % intervals",
+            ylim=(len(variants) - 0.5, -0.5),
+        )
+        tidy(axes)
+        figure.legend(loc="outside upper center", ncols=4, fontsize=7)
+        return figure
+
+
+def _text(ablation: Ablation, results: Sequence[VariantResult]) -> str:
+    config, worlds = ablation.config, ablation.worlds
+    chosen = (
+        "of the validation set that no weights were chosen by"
+        if config.world_set == "validation"
+        else "of the test set, which is opened now: whoever chooses by this has none any more"
+    )
+    claim, flown_as = no_claim(ablation), results[0].variant.flown_as
+    return f"""# What each part is worth
+
+Each variant is the base but for what its line says. Those that are trained are trained as the base
+is, with the seeds {", ".join(map(str, config.seeds))}, in as many flights, states, epochs, rounds
+and candidates; the others fly the base's policies. All fly over the {len(worlds)} worlds
+{worlds.start} to {worlds.stop - 1} {chosen} ({config.set_up},
+{config.duration_s:g} s), the base with {100.0 * flown_as.loss:g} % of messages lost, a delay of
+{flown_as.delay_s:g} s, and payloads in {flown_as.payload}.
+{f"{chr(10)}**{claim[0].upper()}{claim[1:]}.**{chr(10)}" if claim else ""}
+| variant | | trained | mean | over seeds | difference to base | 95 % | |
+| --- | --- | --- | --- | --- | --- | --- | --- |
+{chr(10).join(_row(result) for result in results)}
+
+Cost at the end over that at the start; less is better. "Over seeds" is the standard deviation of
+the trainings' means. The intervals are of a bootstrap in which worlds are drawn in pairs, and
+trainings too: those of a variant and of the base each by themselves, unless they are the same. Of
+few trainings the intervals are rather too narrow; and each is by itself: of twenty, one is expected
+to miss.
+
+![differences to the base](differences.png)
+
+`ablation.json` has all numbers, and each folder beside it a training with its model card.
+"""
+
+
+def _row(result: VariantResult) -> str:
+    variant = result.variant
+    cells = [variant.name, variant.why, "yes" if variant.trained else "no", *numbers_of(result)]
+    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
+
+
+def numbers_of(result: VariantResult) -> tuple[str, str, str, str, str]:
+    """Mean, deviation over seeds, difference to the base, its interval, and the verdict."""
+    mean, _, _ = result.mean
+    deviation = "" if result.deviation is None else f"{result.deviation:.3f}"
+    if result.against_base is None:
+        return f"{mean:.3f}", deviation, "", "", ""
+    difference, low, high = result.against_base.difference
+    return (
+        f"{mean:.3f}", deviation, f"{difference:+.3f}", f"{low:+.3f} to {high:+.3f}",
+        result.verdict or "",
+    )  # fmt: skip
