@@ -77,8 +77,8 @@ def _text(ablation: Ablation, results: Sequence[VariantResult]) -> str:
     return f"""# What each part is worth
 
 Each variant is the base but for what its line says. Those that are trained are trained as the base
-is, with the seeds {", ".join(map(str, config.seeds))}, in as many flights, states, epochs, rounds
-and candidates; the others fly the base's policies. All fly over the {len(worlds)} worlds
+is (seeds: {", ".join(map(str, config.seeds))}), in as many flights, states, epochs, rounds and
+candidates; the others fly the base's policies. All fly over the {len(worlds)} worlds
 {worlds.start} to {worlds.stop - 1} {chosen} ({config.set_up},
 {config.duration_s:g} s), the base with {100.0 * flown_as.loss:g} % of messages lost, a delay of
 {flown_as.delay_s:g} s, and payloads in {flown_as.payload}.

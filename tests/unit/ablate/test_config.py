@@ -123,9 +123,9 @@ def test_the_example_leaves_out_each_part() -> None:
     ablation = read_ablation(ROOT / "examples" / "ablation.toml")
     assert [variant.name for variant in ablation.variants if variant.trained] == [
         "base", "no-messages", "no-features", "one-hop", "three-hops", "one-layer",
-        "no-explored-map", "no-dagger", "no-loss-and-delay",
+        "no-explored-map", "shared-map", "no-dagger", "no-loss-and-delay",
     ]  # fmt: skip
     assert [variant.name for variant in ablation.variants if not variant.trained] == [
         "float32", "half-rates", "double-rates",
     ]  # fmt: skip
-    assert len(ablation.trainings) == 27 and len(ablation.worlds) == 40
+    assert len(ablation.trainings) == 30 and len(ablation.worlds) == 40
