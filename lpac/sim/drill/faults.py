@@ -668,7 +668,8 @@ _PEOPLE = (
             Do(20.0, EstimateIsRight()),
         ),
         watched_s=32.0,
-        bounds=(MissionEnds(0.0, 2.5, after="start"), FliesOn(20.0)),
+        # Later it may be back inside, and fly on.
+        bounds=(MissionEnds(0.0, 1.8, after="start"), FliesOn(20.0)),
     ),
 )  # fmt: skip
 
