@@ -79,8 +79,10 @@ class RobotMemory:
 
     def __init__(self, parameters: PerceptionParameters) -> None:
         self._world_size = parameters.world_size
-        self._map = RobotMap(parameters.world_size, parameters.unseen)
+        self._unseen = parameters.unseen
         self._cells = SharedCells(parameters) if parameters.shared_map_cell else None
+        # What others tell goes where there is nothing.
+        self._map = RobotMap(parameters.world_size, math.nan if self._cells else self._unseen)
         self._local = np.empty((parameters.local_map_size,) * 2, np.float32)
         # For people: which cells of the coarse raster over the world it has seen.
         self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
@@ -122,4 +124,5 @@ class RobotMemory:
         if self._cells:
             told = self._cells.importance(corner, self._local.shape[0])
             np.copyto(self._local, told, where=np.isnan(self._local))
+            np.copyto(self._local, self._unseen, where=np.isnan(self._local))
         return self._local

@@ -47,13 +47,10 @@ class PerceptionParameters:
                 f"unknown_importance = {self.unknown_importance}: must be at least 0 and finite"
             )
         cell = self.shared_map_cell
-        if cell and not (cell > 0 and self.unseen_as_nan):
+        if cell < 0 or (cell and self.local_map_size % cell):
             raise ValueError(
-                f"shared_map_cell = {cell}: must be 0, or above 0 with unseen_as_nan = true"
-            )
-        if cell and self.local_map_size % cell:
-            raise ValueError(
-                f"shared_map_cell = {cell}: must divide local_map_size = {self.local_map_size}"
+                f"shared_map_cell = {cell}: must be 0, or divide "
+                f"local_map_size = {self.local_map_size}"
             )
 
     @property

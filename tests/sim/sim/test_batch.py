@@ -170,7 +170,7 @@ def test_a_second_thread_changes_nothing(shipped_bundle: Bundle) -> None:
 @given(
     data=st.data(),
     unknown=st.sampled_from([0.0, 0.25]),
-    tells=st.sampled_from([(False, 0), (True, 0), (True, 4), (True, 16)]),
+    tells=st.sampled_from([(False, 0), (True, 0), (False, 8), (True, 4), (True, 16)]),
     world_size=st.integers(8, 300),
 )
 def test_what_was_seen_is_what_a_robot_remembers(
