@@ -23,9 +23,11 @@ Codes = npt.NDArray[np.uint8]
 _SHIFT = 7
 _MOST_CODE = 0xF8
 # Of each byte, (256,): NaN of 0, and of those that stand for nothing.
-_IMPORTANCE = ((np.arange(256, dtype=np.uint16) - 1) << _SHIFT).view(np.float16).astype(np.float32)
+_IMPORTANCE = np.full(256, np.nan, np.float32)
+_IMPORTANCE[1 : _MOST_CODE + 1] = (np.arange(_MOST_CODE, dtype=np.uint16) << _SHIFT).view(
+    np.float16
+)
 _LARGEST = _IMPORTANCE[_MOST_CODE]
-_IMPORTANCE[[0, *range(_MOST_CODE + 1, 256)]] = np.nan
 
 
 class SharedMap(NamedTuple):
