@@ -43,9 +43,11 @@ MOST_FLIGHTS = 3
 STARTING_S = 2.0
 # Snapshots at the end of the mission, of which the cost is taken.
 LAST = int(3.0 / SNAPSHOT_PERIOD_S)
-# In this world the swarm's end hangs little on the phases of its clocks, which are chance in
-# programs: the two flights ended within 0.5 m and 0.1 % of the first cost. A metre of that robot
-# on which the cost hangs most is 4 % of it.
+# The phases of the robots' clocks are chance in programs, and the swarm's end hangs on them: on the
+# simulated clock, which draws them, costs at the end were 0.46 to 0.52 of the first one, places up
+# to 1.5 m apart. A flight of programs must be one of these, within a metre of that robot on which
+# the cost hangs most: 4 % of it.
+DRAWS = 6
 COST_TOLERANCE = 0.03
 START_TOLERANCE_M, END_TOLERANCE_M = 0.5, 1.2
 # Where a robot takes its pad to be, and what its landing leaves.
@@ -144,8 +146,12 @@ def places_m(snapshot: FleetSnapshot) -> F64:
     return np.array([r.status.position_m for r in snapshot.robots if r.status])
 
 
-def on_the_simulated_clock(folder: Path) -> SeenFlight:
+def on_the_simulated_clock(folder: Path, draw: int) -> SeenFlight:
+    """Each start of a robot's program draws the phases of its clocks."""
     fleet = SimulatedFleet(SCENARIO, folder, SHIPPED)
+    for robot in fleet.robots * draw:
+        robot.stop()
+        robot.start()
     seen = SeenFlight(fleet.layout, fleet.ground.setup)
     fleet.schedule.every(SNAPSHOT_PERIOD_S, lambda: seen.snapshots.append(fleet.ground.snapshot))
     flight = ScriptedFlight(fleet.ground, folder / "fleet.toml", SCENARIO.duration_s)
@@ -193,9 +199,9 @@ def watching(fleet: str, see: Callable[[FleetSnapshot], None]) -> Iterator[None]
 
 
 @pytest.fixture(scope="module")
-def flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[SeenFlight, SeenFlight]:
+def flights(tmp_path_factory: pytest.TempPathFactory) -> "Flights":
     folder = tmp_path_factory.mktemp("same")
-    simulated = on_the_simulated_clock(folder / "simulated")
+    simulated = [on_the_simulated_clock(folder / f"simulated-{i}", i) for i in range(DRAWS)]
     for attempt in range(MOST_FLIGHTS):
         programs = as_programs(folder / f"programs-{attempt}")
         if not programs.held_up():
@@ -203,49 +209,56 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> tuple[SeenFlight, SeenF
     raise AssertionError("this machine is too busy for three robots")
 
 
-Flights = tuple[SeenFlight, SeenFlight]
+Flights = tuple[list[SeenFlight], SeenFlight]
 
 
 def test_each_robot_is_seen_in_the_same_states(flights: Flights) -> None:
     simulated, programs = flights
     for robot in range(SCENARIO.robots):
-        assert programs.states(robot) == simulated.states(robot), robot
-        assert simulated.states(robot)[-1] is _S.LANDED
+        for each in simulated:
+            assert programs.states(robot) == each.states(robot), robot
+        assert programs.states(robot)[-1] is _S.LANDED
 
 
 def test_each_command_has_the_same_results(flights: Flights) -> None:
     simulated, programs = flights
-    assert programs.results() == simulated.results()
-    assert {name for name, _ in simulated.results()} >= {"takeoff", "start", "return"}
-    assert {code for _, its in simulated.results() for code in its.values()} == {"done"}
+    assert all(programs.results() == each.results() for each in simulated)
+    assert {name for name, _ in programs.results()} >= {"takeoff", "start", "return"}
+    assert {code for _, its in programs.results() for code in its.values()} == {"done"}
 
 
 def test_nothing_alarms(flights: Flights) -> None:
-    for seen in flights:
+    simulated, programs = flights
+    for seen in (*simulated, programs):
         assert seen.alarms() == set()
 
 
 def test_they_cover_alike(flights: Flights) -> None:
-    first, last = zip(*(seen.costs() for seen in flights), strict=True)
+    simulated, programs = flights
+    firsts, lasts = zip(*(seen.costs() for seen in simulated), strict=True)
+    first, last = programs.costs()
     # They stand on the same pads, and hold there, but for gusts and their receivers' noise.
-    assert first[1] == pytest.approx(first[0], rel=0.02)
-    assert last[1] == pytest.approx(last[0], abs=COST_TOLERANCE * first[0])
-    assert max(last) < 0.6 * min(first)
+    assert firsts == pytest.approx([first] * DRAWS, rel=0.02)
+    tolerance = COST_TOLERANCE * first
+    assert min(lasts) - tolerance < last < max(lasts) + tolerance
+    assert max(last, *lasts) < 0.6 * first
 
 
 def test_they_fly_alike(flights: Flights) -> None:
-    simulated, programs = (seen.mission() for seen in flights)
-    lasted_s = [told[-1].unix_time_s - told[0].unix_time_s for told in (simulated, programs)]
-    assert lasted_s[1] == pytest.approx(lasted_s[0], abs=1.0)
+    simulated, programs = [seen.mission() for seen in flights[0]], flights[1].mission()
+    lasted_s = [told[-1].unix_time_s - told[0].unix_time_s for told in (*simulated, programs)]
+    assert lasted_s == pytest.approx([lasted_s[-1]] * (DRAWS + 1), abs=1.0)
     for i, tolerance_m in ((0, START_TOLERANCE_M), (-1, END_TOLERANCE_M)):
-        off_m = np.linalg.norm(places_m(simulated[i]) - places_m(programs[i]), axis=1)
-        assert off_m.max() < tolerance_m, off_m
+        here_m = places_m(programs[i])
+        off_m = [np.linalg.norm(places_m(each[i]) - here_m, axis=1).max() for each in simulated]
+        assert min(off_m) < tolerance_m, off_m
 
 
 def test_they_come_as_near_to_each_other_and_land_on_their_pads(flights: Flights) -> None:
-    nearest_m = [nearest(seen) for seen in flights]
-    assert nearest_m[1] == pytest.approx(nearest_m[0], abs=END_TOLERANCE_M)
-    for seen in flights:
+    simulated, programs = flights
+    nearest_m = [nearest(seen) for seen in simulated]
+    assert min(nearest_m) - 0.5 < nearest(programs) < max(nearest_m) + 0.5
+    for seen in (*simulated, programs):
         for robot, pad_m in enumerate(seen.layout.landing_points_m):
             _, status = seen.statuses(robot)[-1]
             assert status.position_m is not None
