@@ -18,7 +18,14 @@ import torch
 from torch import Tensor
 
 from edge.core import F32, F64
-from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS, NEIGHBOURS, neighbour_maps
+from edge.policy.lpac.images import (
+    EXPLORED,
+    MAP_CHANNELS,
+    NEIGHBOURS,
+    OWN_CELL,
+    neighbour_maps,
+    own_cell,
+)
 from edge.policy.lpac.manifest import ACTION, CNN, gnn_graph
 from export import network
 from export.checkpoint import (
@@ -126,6 +133,7 @@ def _flight_images(cnn: Cnn, count: int, random: np.random.Generator) -> F64:
         }
         offsets = random.uniform(-0.9, 0.9, (random.integers(1, 6), 2))
         maps |= zip(NEIGHBOURS, neighbour_maps(offsets, 1.0, size), strict=True)
+        maps[OWN_CELL] = own_cell(offsets, 1.0, size)
         image[:] = [maps[channel] for channel in MAP_CHANNELS[cnn.channels]]
     return images
 

@@ -115,12 +115,14 @@ def exploring_bundle() -> Bundle:
 
 
 @pytest.fixture(scope="session")
-def sharing_bundle(exploring_bundle: Bundle) -> Bundle:
-    """One whose robots tell each other what they have seen."""
-    manifest = exploring_bundle.manifest
+def sharing_bundle() -> Bundle:
+    """One whose robots tell each other what they have seen, and whose CNN sees all images."""
+    states = pytest.importorskip("tests.unit.export.states", reason="torch makes the bundle")
+    bundle: Bundle = states.random_bundle(channels=6)
+    manifest = bundle.manifest
     assert manifest.perception is not None
     perception = dataclasses.replace(manifest.perception, shared_map_cell=8)
-    files = {name: exploring_bundle.files[name] for name in manifest.files}
+    files = {name: bundle.files[name] for name in manifest.files}
     return make_bundle(dataclasses.replace(manifest, perception=perception), files)
 
 

@@ -24,7 +24,8 @@ LOOK_PERIOD_S = 0.5
 # to count e times less; how far its goal is where all that is unseen is in one direction.
 _PITCH = 8
 _DECAY = 32.0
-_STEP = 12.0
+_STEP = 24.0
+_W0 = 1.0
 
 
 class Goals(Protocol):
@@ -173,7 +174,7 @@ class _Exploring:
             to_explore = _STEP * (away @ unseen) / max(pull.sum(), 1e-12)
             to_cover = weights @ known / max(weights.sum(), 1e-12)
             to_cover *= min(1.0, _STEP / max(float(np.linalg.norm(to_cover)), 1e-12))
-            exploring = pull.sum() / (pull.sum() + 1.0)
+            exploring = pull.sum() / (pull.sum() + _W0)
             goals[robot] += exploring * to_explore + (1.0 - exploring) * to_cover
         return goals
 

@@ -1,17 +1,18 @@
 """The images that the policy takes, of what a robot has seen.
 
 LPAC paper (arXiv 2401.04855), section "Perception Module": four square images around the robot:
-importance, the neighbours' relative x and y, and obstacles (the outside of the world). A fifth,
-which the paper's policies do not have, tells what is unseen from what is worthless: 1 where the
-robot has seen, 0 where it has not, and outside the world. All are indexed [x, y]; one cell of a map
-is one model unit; positions are in model units.
+importance, the neighbours' relative x and y, and obstacles (the outside of the world). Two more,
+which the paper's policies do not have: "explored" tells what is unseen from what is worthless, 1
+where the robot has seen or was told, and 0 elsewhere, also outside the world; "own_cell" is 1 in
+the robot's Voronoi cell among the neighbours, 0 elsewhere. All are indexed [x, y]; one cell of a
+map is one model unit; positions are in model units.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.perception import (
     PerceptionParameters,
     clamp_to_world,
@@ -21,11 +22,13 @@ from edge.core.perception import (
 
 NEIGHBOURS = ("neighbours_x", "neighbours_y")
 EXPLORED = "explored"
+OWN_CELL = "own_cell"
 # The images by number of channels, two and four in the order in which CoverageControl stacks them.
 MAP_CHANNELS: dict[int, tuple[str, ...]] = {
     2: ("importance", "obstacles"),
     4: ("importance", *NEIGHBOURS, "obstacles"),
     5: ("importance", *NEIGHBOURS, EXPLORED, "obstacles"),
+    6: ("importance", *NEIGHBOURS, EXPLORED, OWN_CELL, "obstacles"),
 }
 
 
@@ -82,6 +85,22 @@ def neighbour_maps(offsets: F64, communication_range: float, image_size: int) ->
     return maps
 
 
+def own_cell(offsets: F64, local_map_size: float, image_size: int) -> Bools:
+    """Which places of an image are nearest to the robot: (image_size, image_size).
+
+    `offsets` (n, 2) are the neighbours' positions relative to the robot, in model units; the image
+    spans `local_map_size` around it. Nearer to it than to one of them is a half plane.
+    """
+    places = (np.arange(image_size) + 0.5 - image_size / 2.0) * (local_map_size / image_size)
+    along_x, along_y = (
+        offsets[:, 0, None, None] * places[:, None],
+        offsets[:, 1, None, None] * places,
+    )
+    half_squares = (offsets**2).sum(axis=1)[:, None, None] / 2.0
+    own: Bools = (along_x + along_y <= half_squares).all(axis=0)
+    return own
+
+
 class PolicyImages:
     """Makes one robot's images. Not thread-safe: it belongs to the perception thread."""
 
@@ -119,11 +138,12 @@ class PolicyImages:
             local_map = self._part
         self._resize.image(local_map, out=image["importance"])
         image["obstacles"][:] = 1.0 - np.outer(*map(self._resize.interval, inside))
+        size = self._images.shape[-1]
+        offsets = clamp_to_world(neighbours, parameters.world_size) - position
         if NEIGHBOURS[0] in image:
-            others = clamp_to_world(neighbours, parameters.world_size)
-            maps = neighbour_maps(
-                others - position, parameters.communication_range, self._images.shape[-1]
-            )
+            maps = neighbour_maps(offsets, parameters.communication_range, size)
             for name, values in zip(NEIGHBOURS, maps, strict=True):
                 image[name][:] = values
+        if OWN_CELL in image:
+            image[OWN_CELL][:] = own_cell(offsets, parameters.local_map_size, size)
         return self._images

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from edge.core.perception import (
     part_in_world,
     window_corner,
 )
-from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages, Resize, neighbour_maps
+from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages, Resize, neighbour_maps, own_cell
 
 PARAMETERS = PerceptionParameters(
     world_size=512, local_map_size=256, sensor_size=64, communication_range=256.0
@@ -164,6 +165,20 @@ def test_neighbour_maps_hold_every_neighbour(offsets: list[tuple[float, float]])
     )
 
 
+@settings(deadline=None)
+@given(st.lists(st.tuples(*[st.floats(-255.9, 255.9)] * 2), max_size=9), st.sampled_from([8, 32]))
+def test_the_own_cell_is_what_is_nearer_to_oneself_than_to_anybody(
+    offsets: list[tuple[float, float]], size: int
+) -> None:
+    array = np.array(offsets, np.float64).reshape(-1, 2)
+    cells = own_cell(array, 256.0, size)
+    places = (np.arange(size) + 0.5) * 256.0 / size - 128.0
+    for x, y in itertools.product(range(size), repeat=2):
+        place = np.array([places[x], places[y]])
+        room = np.linalg.norm(array - place, axis=1).min(initial=np.inf) - np.linalg.norm(place)
+        assert cells[x, y] == (room >= 0.0) or abs(room) < 1e-9
+
+
 def test_range_is_open_and_two_robots_at_one_point_are_neighbours() -> None:
     own = np.array([10.0, 10.0])
     others = own + np.array([[0.0, 0.0], [256.0, 0.0], [0.0, -255.999]])
@@ -215,11 +230,11 @@ def test_a_coarse_cell_counts_as_seen_when_its_centre_was(world_size: int) -> No
     assert seen.any()
 
 
-@pytest.mark.parametrize("channels", [2, 4, 5])
+@pytest.mark.parametrize("channels", [2, 4, 5, 6])
 def test_a_copied_robot_looks_at_images_of_its_own(channels: int) -> None:
     parameters = PerceptionParameters(
         world_size=64, local_map_size=32, sensor_size=16, communication_range=20.0,
-        unseen_as_nan=channels == 5,
+        unseen_as_nan=channels >= 5,
     )  # fmt: skip
     images = PolicyImages(parameters, MAP_CHANNELS[channels], 8)
     looks = [

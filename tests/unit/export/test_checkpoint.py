@@ -195,7 +195,7 @@ def renamed(name: str, new_name: str) -> Callable[[State], State]:
         ),
         (
             changed("cnn_backbone.conv0.weight", lambda weight: weight[:, :3]),
-            "cnn_backbone.conv0.weight: found 3 map channels, expected 2 or 4 or 5",
+            "cnn_backbone.conv0.weight: found 3 map channels, expected 2 or 4 or 5 or 6",
         ),
         (
             changed("cnn_backbone.linear_1.weight", lambda weight: weight[:, 8:]),
