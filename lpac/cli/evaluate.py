@@ -63,6 +63,19 @@ def evaluate(
             metavar="ROBOTS@S", help="Also with robots lost in flight, such as 2@20: two at 20 s."
         ),
     ] = None,
+    lags: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--lag", help="Also with robots that follow with this time constant, s; baselines too."
+        ),
+    ] = None,
+    position_errors: Annotated[
+        list[float] | None,
+        typer.Option(
+            "--position-error",
+            help="Also with robots that are wrong about where they are: standard deviation, m.",
+        ),
+    ] = None,
     baselines: Annotated[
         list[str] | None,
         typer.Option(
@@ -82,16 +95,22 @@ def evaluate(
     """Policies and baselines over many worlds: how well they cover, and how surely."""
     from lpac.evaluate.evaluation import as_json as to_json
     from lpac.evaluate.evaluation import results_of
-    from lpac.evaluate.flights import KeptFlights
+    from lpac.evaluate.flights import KeptFlights, LostRobots
     from lpac.evaluate.report import write_results
 
     given = methods or [str(DEFAULT_BUNDLE)]
     if compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
+    lost_robots = [LostRobots.parse(text) for text in lost or []]
+    changes: list[dict[str, Any]] = [
+        *({"loss": loss} for loss in losses or []),
+        *({"lost": robots} for robots in lost_robots),
+        *({"lag_s": lag_s} for lag_s in lags or []),
+        *({"position_error_m": error_m} for error_m in position_errors or []),
+    ]
     evaluation = _evaluation(
-        given, world_set, worlds, duration, set_ups, losses or [], lost or [], baselines,
-        transfer=transfer,
-    )  # fmt: skip
+        given, world_set, worlds, duration, set_ups, changes, baselines, transfer=transfer
+    )
     cores = pool(ray)
     kept = KeptFlights(out)
     results = results_of(evaluation, _fly(evaluation, kept, cores))
@@ -112,15 +131,14 @@ def _evaluation(
     worlds: int,
     duration_s: float,
     set_ups: list[str] | None,
-    losses: Sequence[float],
-    lost: Sequence[str],
+    changes: Sequence[Mapping[str, Any]],
     baselines: list[str] | None,
     *,
     transfer: bool,
 ) -> "Evaluation":
     from edge.policy.bundle import load_bundle
     from lpac.evaluate.evaluation import CLAIRVOYANT, Condition, Evaluation, Method
-    from lpac.evaluate.flights import BASELINES, LostRobots, sizes_of, task_of
+    from lpac.evaluate.flights import BASELINES, sizes_of, task_of
     from lpac.evaluate.worlds import SET_UPS, WORLD_SETS
 
     chosen_sets = [one for one in WORLD_SETS if one == world_set]
@@ -134,7 +152,6 @@ def _evaluation(
             raise ValueError(f"--set-up {name}: must be one of {', '.join(SET_UPS)}")
     if transfer and set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
-    lost_robots = [LostRobots.parse(text) for text in lost]
     names = _names(given)
     policies = [_method(text, name) for text, name in zip(given, names, strict=True)]
     paths = [training.path for method in policies for training in method.trainings]
@@ -155,11 +172,7 @@ def _evaluation(
         conditions=tuple(
             condition
             for name in (SET_UPS if transfer else set_ups or ["field"])
-            for condition in (
-                Condition(name),
-                *(Condition(name, loss=loss) for loss in losses),
-                *(Condition(name, lost=robots) for robots in lost_robots),
-            )
+            for condition in (Condition(name), *(Condition(name, **change) for change in changes))
         ),
         world_set=chosen_sets[0],
         worlds=worlds,

@@ -74,6 +74,8 @@ class Condition(NamedTuple):
     set_up: str
     loss: float = 0.0
     lost: LostRobots = NONE_LOST
+    lag_s: float = 0.0
+    position_error_m: float = 0.0
 
     @property
     def name(self) -> str:
@@ -84,6 +86,10 @@ class Condition(NamedTuple):
         if self.lost.robots:
             robots = SET_UPS[self.set_up].robots
             words.append(f"{self.lost.robots} of {robots} robots lost at {self.lost.at_s:g} s")
+        if self.lag_s:
+            words.append(f"lag {self.lag_s:g} s")
+        if self.position_error_m:
+            words.append(f"positions off by {self.position_error_m:g} m")
         return ", ".join(words)
 
 
@@ -108,13 +114,19 @@ class Evaluation:
             raise ValueError(f"worlds = {self.worlds}: must be at least 1")
         if not 0.0 < self.duration_s < math.inf:
             raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
-        for set_up, loss, lost in self.conditions:
+        for condition in self.conditions:
+            loss, lost = condition.loss, condition.lost
             if not 0.0 <= loss <= 1.0:
                 raise ValueError(f"loss = {loss}: must be from 0 to 1")
+            for name in ("lag_s", "position_error_m"):
+                if not 0.0 <= getattr(condition, name) < math.inf:
+                    raise ValueError(
+                        f"{name} = {getattr(condition, name)}: must be at least 0 and finite"
+                    )
             if lost.robots and not 0.0 < lost.at_s < self.duration_s:
                 raise ValueError(f"robots lost at {lost.at_s:g} s: must be in flight")
-            if lost.robots >= SET_UPS[set_up].robots:
-                raise ValueError(f"{lost.robots} robots lost: {set_up} has no more")
+            if lost.robots >= SET_UPS[condition.set_up].robots:
+                raise ValueError(f"{lost.robots} robots lost: {condition.set_up} has no more")
         names = [method.name for method in self.methods]
         if len(set(names)) < len(names):
             raise ValueError(f"methods {', '.join(names)}: each once")
@@ -133,7 +145,8 @@ class Evaluation:
     def flights_of(
         self, method: Method, condition: Condition, world: int
     ) -> Iterator[EvaluationFlight]:
-        """One of each training; of a baseline one, which loses no messages, and no robots late."""
+        """One of each training; of a baseline one, which knows where robots are, loses no messages,
+        and no robots late."""
         lost = LostRobots(condition.lost.robots, 0.0)
         for path, bundle_id in method.trainings or [TrainedBundle(self.sizes_from, self.sizes)]:
             yield EvaluationFlight(
@@ -146,6 +159,8 @@ class Evaluation:
                 duration_s=self.duration_s,
                 loss=condition.loss if method.trained else 0.0,
                 lost=condition.lost if method.trained else lost,
+                lag_s=condition.lag_s,
+                position_error_m=condition.position_error_m if method.trained else 0.0,
             )
 
 
@@ -252,6 +267,8 @@ def as_json(
                 "loss": condition.loss,
                 "lost_robots": condition.lost.robots,
                 "lost_at_s": condition.lost.at_s,
+                "lag_s": condition.lag_s,
+                "position_error_m": condition.position_error_m,
                 "results": [_result_json(result, of_all) for result in of_all],
                 "compared": _verdict_json(verdict_of(of_all[0], of_all[1])) if compared else None,
             }

@@ -61,7 +61,9 @@ class EvaluationFlight:
     """One flight over one world: all of it follows from this, and from what is in the bundle.
 
     `bundle` is the path of the one that flies, or gives a baseline the sizes of sensor and local
-    map; `flown_by` is its id, or says these sizes. The rest is as `Scenario` has it.
+    map; `flown_by` is its id, or says these sizes. `position_error_m` is the standard deviation,
+    along each axis, of each robot's error in knowing its position. The rest is as `Scenario` has
+    it.
     """
 
     flier: Flier
@@ -77,6 +79,8 @@ class EvaluationFlight:
     max_message_age_s: float = 0.8
     payload: PayloadType = "float16"
     clocks: Clocks = field(default_factory=Clocks)
+    lag_s: float = 0.0
+    position_error_m: float = 0.0
 
     @property
     def key(self) -> str:
@@ -85,7 +89,7 @@ class EvaluationFlight:
             f"{self.flier} {self.flown_by}: {self.world_set} {self.world} {self.set_up}, "
             f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
             f", delay {self.delay_s:g} s, ages to {self.max_message_age_s:g} s, {self.payload}, "
-            f"{self.clocks}"
+            f"{self.clocks}, lag {self.lag_s:g} s, positions to {self.position_error_m:g} m"
         )
 
 
@@ -168,6 +172,8 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     lost_late = flight.lost.at_s > 0.0
     robots = set_up.robots if lost_late else left
     starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts[:robots])).tolist()
+    error = flight.position_error_m * FIELD_SCALE.env_scale
+    errors = np.random.default_rng(world.seed).normal(0.0, error, (robots, 2)).tolist()
     return Scenario(
         controller="clairvoyant-cvt" if flight.flier == LLOYD else flight.flier,
         robots=robots,
@@ -183,6 +189,8 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         clocks=flight.clocks,
         world_size=set_up.world_size,
         communication_range=set_up.communication_range,
+        lag_s=flight.lag_s,
+        position_bias=tuple((x, y) for x, y in errors) if error else None,
         failures=tuple(Failure(robot, flight.lost.at_s) for robot in range(left, robots)),
     )
 

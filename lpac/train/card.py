@@ -121,11 +121,12 @@ def _text(card: ModelCard) -> str:
     flown = sum(facts["flights"] for facts in card.shards.values())
     states = sum(facts["states"] for facts in card.shards.values())
     robots = sum(facts["robots"] for facts in card.shards.values())
-    expert = (
-        "ClairvoyantCVT"
-        if data.expert == "clairvoyant-cvt"
-        else f"the best of {data.lloyd_runs} runs of Lloyd's algorithm"
-    )
+    expert = {
+        "clairvoyant-cvt": "ClairvoyantCVT, which knows the whole world",
+        "best-of-lloyd": f"the best of {data.lloyd_runs} runs of Lloyd's algorithm on the whole "
+        "world",
+        "exploring-cvt": "ExploringCVT, which knows what all robots together have seen",
+    }[data.expert]
     rows = [f"| **{name}** | {_row(best.cost)} |"]
     rows += [f"| {each} | {_row(cost)} |" for each, cost in card.baselines.items()]
     trained = ", ".join(
@@ -144,8 +145,8 @@ Licence: {config.export.licence}. `{name}.pt` is the checkpoint, `{name}/` the b
 ## Data
 
 {states} states of swarms, {robots} of robots, from {flown} flights over worlds of the training set,
-seed {config.seed}; the expert is {expert}, which knows the whole world. In round 0 it flew, then
-the policy in {dagger.rounds} DAgger rounds. Worlds: {trained}. Flown at
+seed {config.seed}; the expert is {expert}. In round 0 it flew, then the policy
+in {dagger.rounds} DAgger rounds. Worlds: {trained}. Flown at
 {data.scale.env_scale * data.scale.velocity_scale:g} times the policy's velocities.
 
 ## Training

@@ -110,7 +110,9 @@ class DataConfig:
     """The flights of the first data, which the expert flies; of every flight `states` are kept.
 
     The expert soon is where it wants to be: short flights show most of it. `lloyd_runs` are those
-    of the expert "best-of-lloyd".
+    of the expert "best-of-lloyd". Velocities that are imitated may be `overshoot` times max_speed,
+    which nobody flies faster than: so the mean of what an expert does where it cannot be foretold,
+    less than each of it, is still fast.
     """
 
     flights: int
@@ -118,6 +120,7 @@ class DataConfig:
     duration_s: float = 20.0
     expert: ExpertName = "clairvoyant-cvt"
     lloyd_runs: int = 10
+    overshoot: float = 1.0
     scale: ModelScale = FIELD_SCALE
     clocks: Clocks = field(default_factory=Clocks)
     worlds: tuple[WorldRanges, ...] = (WorldRanges(),)
@@ -125,6 +128,7 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         _at_least(1, flights=self.flights, states=self.states, lloyd_runs=self.lloyd_runs)
+        _at_least(1, overshoot=self.overshoot)
         _duration(self.duration_s)
         if not sum(worlds.weight for worlds in self.worlds) > 0.0:
             raise ValueError("worlds: the weights must not all be 0")

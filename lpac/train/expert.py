@@ -21,11 +21,12 @@ from lpac.train.config import DataConfig
 # How often an expert looks around, s.
 LOOK_PERIOD_S = 0.5
 # Of the expert that explores, in model units: its lattice; how much further what is unseen may be
-# to count e times less; how far its goal is where all that is unseen is in one direction.
+# to count e times less; how far its goal is where all that is unseen is in one direction. In eight
+# training worlds of the field it ended at 0.259 of the first cost (clairvoyant 0.263), and was at
+# 0.38 after 20 s; with a decay of 32 at 0.56. With 12 it left what is far unseen: 0.39.
 _PITCH = 8
-_DECAY = 32.0
+_DECAY = 20.0
 _STEP = 24.0
-_W0 = 1.0
 
 
 class Goals(Protocol):
@@ -68,7 +69,8 @@ def make_expert(config: DataConfig, world: Preparation) -> Expert:
     scale, training = world.scenario.scale, world.bundle.manifest.training
     # What a velocity of 1 comes to in flight, in model units/s: so it arrives within a time step.
     flown = scale.env_scale * scale.velocity_scale
-    return Expert(_goals(config, world), training.max_speed, training.time_step * flown)
+    limit = training.max_speed * config.overshoot
+    return Expert(_goals(config, world), limit, training.time_step * flown)
 
 
 def _goals(config: DataConfig, world: Preparation) -> Goals:
@@ -174,7 +176,7 @@ class _Exploring:
             to_explore = _STEP * (away @ unseen) / max(pull.sum(), 1e-12)
             to_cover = weights @ known / max(weights.sum(), 1e-12)
             to_cover *= min(1.0, _STEP / max(float(np.linalg.norm(to_cover)), 1e-12))
-            exploring = pull.sum() / (pull.sum() + _W0)
+            exploring = pull.sum() / (pull.sum() + 1.0)
             goals[robot] += exploring * to_explore + (1.0 - exploring) * to_cover
         return goals
 

@@ -1,6 +1,7 @@
 """What an evaluation flies, and the numbers that it tells of it."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -149,6 +150,11 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
         ({"worlds": 0}, "worlds = 0: must be at least 1"),
         ({"duration_s": float("inf")}, "duration = inf: must be positive and finite"),
         ({"conditions": (Condition("field", loss=1.5),)}, "loss = 1.5: must be from 0 to 1"),
+        ({"conditions": (Condition("field", lag_s=-1.0),)}, "lag_s = -1.0: must be at least 0"),
+        (
+            {"conditions": (Condition("field", position_error_m=math.nan),)},
+            "position_error_m = nan: must be at least 0 and finite",
+        ),
         ({"conditions": (Condition("field", lost=LostRobots(2, 40.0)),)}, "must be in flight"),
         ({"conditions": (Condition("n1", lost=LostRobots(1, 20.0)),)}, "n1 has no more"),
         ({"methods": (ONE, ONE, CLAIRVOYANT)}, "methods one, one, clairvoyant-cvt: each once"),

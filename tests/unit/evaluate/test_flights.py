@@ -54,9 +54,10 @@ def test_a_batch_tells_what_its_flights_tell(flight: EvaluationFlight) -> None:
     changes: list[dict[str, Any]] = [
         {}, {"loss": 0.5}, {"world": 4}, {"delay_s": 0.3}, {"max_message_age_s": 0.1},
         {"payload": "float32"}, {"clocks": Clocks(perception_s=0.1, policy_s=0.2)},
+        {"lag_s": 0.6}, {"position_error_m": 1.5},
     ]  # fmt: skip
     group = tuple(dataclasses.replace(flight, **change) for change in changes)
-    assert len({one.key for one in group}) == len({costs for _, costs in costs_of(group)}) == 7
+    assert len({one.key for one in group}) == len({costs for _, costs in costs_of(group)}) == 9
     assert costs_of(group) == [pair for one in group for pair in costs_of((one,))]
 
 
