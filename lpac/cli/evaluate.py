@@ -76,6 +76,13 @@ def evaluate(
             help="Also with robots that are wrong about where they are: standard deviation, m.",
         ),
     ] = None,
+    whole: Annotated[
+        bool,
+        typer.Option(
+            help="Also as the field is flown: whole robots on simulated vehicles, and points from "
+            "the same pads."
+        ),
+    ] = False,
     baselines: Annotated[
         list[str] | None,
         typer.Option(
@@ -107,6 +114,7 @@ def evaluate(
         *({"lost": robots} for robots in lost_robots),
         *({"lag_s": lag_s} for lag_s in lags or []),
         *({"position_error_m": error_m} for error_m in position_errors or []),
+        *({"robot": robot} for robot in ("point-from-pad", "whole") if whole),
     ]
     evaluation = _evaluation(
         given, world_set, worlds, duration, set_ups, changes, baselines, transfer=transfer
@@ -150,6 +158,8 @@ def _evaluation(
     for name in set_ups or ():
         if name not in SET_UPS:
             raise ValueError(f"--set-up {name}: must be one of {', '.join(SET_UPS)}")
+    if transfer and any("robot" in change for change in changes):
+        raise ValueError("--whole flies over the field alone: not with --transfer")
     if transfer and set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
     names = _names(given)

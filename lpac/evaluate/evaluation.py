@@ -38,6 +38,7 @@ from lpac.evaluate.flights import (
     Flier,
     FlownCost,
     LostRobots,
+    RobotModel,
 )
 from lpac.evaluate.worlds import SET_UPS, WorldSet
 from lpac.sim.baselines import BaselineName
@@ -76,6 +77,7 @@ class Condition(NamedTuple):
     lost: LostRobots = NONE_LOST
     lag_s: float = 0.0
     position_error_m: float = 0.0
+    robot: RobotModel = "point"
 
     @property
     def name(self) -> str:
@@ -90,6 +92,10 @@ class Condition(NamedTuple):
             words.append(f"lag {self.lag_s:g} s")
         if self.position_error_m:
             words.append(f"positions off by {self.position_error_m:g} m")
+        if self.robot != "point":
+            words.append("from pads")
+        if self.robot == "whole":
+            words.append("whole robots")
         return ", ".join(words)
 
 
@@ -123,6 +129,8 @@ class Evaluation:
                     raise ValueError(
                         f"{name} = {getattr(condition, name)}: must be at least 0 and finite"
                     )
+            if condition.robot != "point" and condition.set_up != "field":
+                raise ValueError(f"{condition.set_up}: whole robots fly over the field alone")
             if lost.robots and not 0.0 < lost.at_s < self.duration_s:
                 raise ValueError(f"robots lost at {lost.at_s:g} s: must be in flight")
             if lost.robots >= SET_UPS[condition.set_up].robots:
@@ -161,9 +169,13 @@ class Evaluation:
                 lost=condition.lost if method.trained else lost,
                 lag_s=condition.lag_s,
                 position_error_m=condition.position_error_m if method.trained else 0.0,
+                robot=condition.robot if method.trained else _AS_POINT[condition.robot],
             )
 
 
+_AS_POINT: dict[RobotModel, RobotModel] = {
+    "point": "point", "point-from-pad": "point-from-pad", "whole": "point-from-pad",
+}  # fmt: skip
 _BEST_OF_TEN = Method(name=LLOYD, flier=LLOYD)
 
 
@@ -269,6 +281,7 @@ def as_json(
                 "lost_at_s": condition.lost.at_s,
                 "lag_s": condition.lag_s,
                 "position_error_m": condition.position_error_m,
+                "robot": condition.robot,
                 "results": [_result_json(result, of_all) for result in of_all],
                 "compared": _verdict_json(verdict_of(of_all[0], of_all[1])) if compared else None,
             }

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -20,8 +21,17 @@ from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
 from lpac.sim.baselines import BaselineName
 from lpac.sim.batch import PolicyFailedError, fly_batch
 from lpac.sim.cores import Pool
-from lpac.sim.experiment import FIELD_SCALE, Scenario, SimulatedFlight, fly, prepare
+from lpac.sim.experiment import (
+    FIELD_SCALE,
+    Scenario,
+    SimulatedFlight,
+    cost_times_s,
+    fly,
+    prepare,
+)
 from lpac.sim.failure import Failure
+from lpac.sim.fleet.clocked import fly_simulated
+from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.kept import KeptOutcomes, code_digest
 from lpac.sim.ticks import Clocks
 
@@ -31,6 +41,9 @@ BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
 LLOYD: Literal["best-of-ten-lloyd"] = "best-of-ten-lloyd"
 POLICY: Literal["lpac"] = "lpac"
 Flier = Literal["lpac", "best-of-ten-lloyd"] | BaselineName
+# A point that follows its velocity; the same that begins where whole robots stand; and the whole
+# robot: its program's loops and separation, on a simulated vehicle that errs, in wind.
+RobotModel = Literal["point", "point-from-pad", "whole"]
 
 # Larger batches of the simulator are no faster.
 _ROBOTS_TOGETHER = 80
@@ -62,8 +75,8 @@ class EvaluationFlight:
 
     `bundle` is the path of the one that flies, or gives a baseline the sizes of sensor and local
     map; `flown_by` is its id, or says these sizes. `position_error_m` is the standard deviation,
-    along each axis, of each robot's error in knowing its position. The rest is as `Scenario` has
-    it.
+    along each axis, of each robot's error in knowing its position. Baselines have no whole robots.
+    The rest is as `Scenario` has it.
     """
 
     flier: Flier
@@ -81,6 +94,7 @@ class EvaluationFlight:
     clocks: Clocks = field(default_factory=Clocks)
     lag_s: float = 0.0
     position_error_m: float = 0.0
+    robot: RobotModel = "point"
 
     @property
     def key(self) -> str:
@@ -90,6 +104,7 @@ class EvaluationFlight:
             f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
             f", delay {self.delay_s:g} s, ages to {self.max_message_age_s:g} s, {self.payload}, "
             f"{self.clocks}, lag {self.lag_s:g} s, positions to {self.position_error_m:g} m"
+            f", {self.robot}"
         )
 
 
@@ -128,7 +143,7 @@ def groups_of(flights: Iterable[EvaluationFlight]) -> list[FlightGroup]:
     alike: dict[tuple[str, str], list[EvaluationFlight]] = {}
     groups: list[FlightGroup] = []
     for flight in flights:
-        if flight.flier != POLICY:
+        if flight.flier != POLICY or flight.robot == "whole":
             groups.append((flight,))
             continue
         waiting = alike.setdefault((flight.bundle, flight.set_up), [])
@@ -143,6 +158,8 @@ def costs_of(group: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
     """Fly them, in whatever process this is. Raises BundleError, ValueError, OSError."""
     if group[0].flier == LLOYD:
         return [(flight, _best_of_ten(flight)) for flight in group]
+    if group[0].robot == "whole":
+        return [(flight, _whole(flight)) for flight in group]
     return [
         (flight, FlownCost(tuple(flown.cost_time_s.tolist()), tuple(flown.cost.tolist())))
         for flight, flown in fly_group(group)
@@ -150,10 +167,11 @@ def costs_of(group: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
 
 
 def fly_group(group: FlightGroup) -> list[tuple[EvaluationFlight, SimulatedFlight]]:
-    """The flights with all that they were like. Raises BundleError, ValueError, OSError."""
-    bundle, scenarios = _bundle(group[0].bundle), [_scenario(flight) for flight in group]
-    if group[0].flier == POLICY and bundle.id != group[0].flown_by:
-        raise ValueError(f"{group[0].bundle}: is another bundle by now, or on this machine")
+    """The flights of points, with all that they were like.
+
+    Raises BundleError, ValueError, OSError.
+    """
+    bundle, scenarios = _bundle(group[0]), [_scenario(flight) for flight in group]
     if group[0].flier != POLICY:
         flown = [fly(scenario, bundle) for scenario in scenarios]
     else:
@@ -171,7 +189,9 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     left = set_up.robots - flight.lost.robots
     lost_late = flight.lost.at_s > 0.0
     robots = set_up.robots if lost_late else left
-    starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts[:robots])).tolist()
+    starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
+    if flight.robot != "point":
+        starts_m = Layout(_fleet(flight), Path(flight.bundle)).pads_m.tolist()
     error = flight.position_error_m * FIELD_SCALE.env_scale
     errors = np.random.default_rng(world.seed).normal(0.0, error, (robots, 2)).tolist()
     return Scenario(
@@ -180,7 +200,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         seed=world.seed,
         duration_s=flight.duration_s,
         features=world.features,
-        starts_m=tuple((x_m, y_m) for x_m, y_m in starts_m),
+        starts_m=tuple((x_m, y_m) for x_m, y_m in starts_m[:robots]),
         scale=FIELD_SCALE,
         loss=flight.loss,
         delay_s=flight.delay_s,
@@ -197,15 +217,48 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
 
 def _best_of_ten(flight: EvaluationFlight) -> FlownCost:
     """From the start to where Lloyd's algorithm ends, as if that took no time."""
-    prepared = prepare(_scenario(flight), _bundle(flight.bundle))
+    prepared = prepare(_scenario(flight), _bundle(flight))
     coverage = Coverage(prepared.importance, FIELD_SCALE.env_scale)
     cost = coverage.cost(prepared.starts_m), coverage.lloyd(prepared.starts_m)
     return FlownCost((0.0, 0.0), cost)
 
 
+def _fleet(flight: EvaluationFlight) -> FleetScenario:
+    """Whole robots over the flight's world; where they stand follows from its seed."""
+    set_up = SET_UPS[flight.set_up]
+    world = draw_world(flight.world_set, flight.world, set_up)
+    return FleetScenario(
+        robots=set_up.robots,
+        seed=world.seed,
+        duration_s=flight.duration_s,
+        features=world.features,
+    )
+
+
+def _whole(flight: EvaluationFlight) -> FlownCost:
+    """Of the places where the vehicles truly are, from the start of the mission on."""
+    _bundle(flight)
+    with TemporaryDirectory() as folder:
+        flown = fly_simulated(_fleet(flight), Path(folder), Path(flight.bundle))
+    record = flown.record
+    if flown.problem is not None or not len(record.curve_time_s):
+        raise ValueError(f"{flight.key}: {flown.problem or 'nobody flew'}")
+    time_s = cost_times_s(flight.duration_s)
+    cost = np.interp(time_s, record.curve_time_s, record.true_cost)
+    return FlownCost(tuple(time_s.tolist()), tuple(cost.tolist()))
+
+
+def _bundle(flight: EvaluationFlight) -> Bundle:
+    """The flight's; raises ValueError if it is not that one."""
+    bundle = _loaded(flight.bundle)
+    if flight.flier == POLICY and bundle.id != flight.flown_by:
+        raise ValueError(f"{flight.bundle}: is another bundle by now, or on this machine")
+    return bundle
+
+
 @cache
-def _bundle(path: str) -> Bundle:
-    """Loaded once in each process."""
+def _loaded(path: str) -> Bundle:
+    """Once in each process."""
     return load_bundle(Path(path))
 
 

@@ -338,8 +338,14 @@ def _record(
         ),
         coverage=Coverage(importance, scenario.scale.env_scale),
         sensor_size=perception.sensor_size,
-        cost_time_s=np.array([*time_s[:-1:SAMPLES_PER_COST], time_s[-1]]),
+        cost_time_s=cost_times_s(scenario.duration_s),
     )
+
+
+def cost_times_s(duration_s: float) -> F64:
+    """(C,): when the cost of a flight is taken; each second, and at its end."""
+    time_s = _sample_times_s(duration_s)
+    return np.array([*time_s[:-1:SAMPLES_PER_COST], time_s[-1]])
 
 
 def _sample_times_s(duration_s: float) -> list[float]:

@@ -72,6 +72,18 @@ def test_who_is_lost_does_not_count(flight: EvaluationFlight) -> None:
     assert flown.positions_m.shape[1] == 8
 
 
+def test_whole_robots_begin_where_points_from_pads_do(flight: EvaluationFlight) -> None:
+    point = dataclasses.replace(flight, robot="point-from-pad")
+    [(_, of_point)] = costs_of((point,))
+    [(_, of_whole)] = costs_of((dataclasses.replace(flight, robot="whole"),))
+    assert of_whole.time_s == of_point.time_s == (0.0, 1.0)
+    # They hold above their pads, in wind.
+    assert of_whole.cost[0] == pytest.approx(of_point.cost[0], rel=0.05)
+    assert of_whole.cost != of_point.cost
+    [(_, flown)] = fly_group((point,))
+    assert flown.features == draw_world("training", 3, FIELD).features
+
+
 def test_the_best_of_ten_is_no_more_than_clairvoyants(flight: EvaluationFlight) -> None:
     best = costs_of((dataclasses.replace(flight, flier=LLOYD),))[0][1]
     clairvoyant = costs_of((dataclasses.replace(flight, flier="clairvoyant-cvt"),))[0][1]
