@@ -153,8 +153,7 @@ class Evaluation:
     def flights_of(
         self, method: Method, condition: Condition, world: int
     ) -> Iterator[EvaluationFlight]:
-        """One of each training; of a baseline one, which knows where robots are, loses no messages,
-        and no robots late."""
+        """One of each training; of a baseline one, which loses no messages, and no robots late."""
         lost = LostRobots(condition.lost.robots, 0.0)
         for path, bundle_id in method.trainings or [TrainedBundle(self.sizes_from, self.sizes)]:
             yield EvaluationFlight(
@@ -168,7 +167,7 @@ class Evaluation:
                 loss=condition.loss if method.trained else 0.0,
                 lost=condition.lost if method.trained else lost,
                 lag_s=condition.lag_s,
-                position_error_m=condition.position_error_m if method.trained else 0.0,
+                position_error_m=condition.position_error_m,
                 robot=condition.robot if method.trained else _AS_POINT[condition.robot],
             )
 

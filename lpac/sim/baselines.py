@@ -1,7 +1,8 @@
 """The baseline controllers: Lloyd's algorithm with several degrees of knowledge.
 
 As in CoverageControl, all robots step at once and know the true positions (decentralised ones:
-those within communication range), whatever happens to messages. None of them is a bound: Lloyd's
+those within communication range), whatever happens to messages; where robots are wrong about where
+they are, these are. None of them is a bound: Lloyd's
 algorithm ends in local minima, the clairvoyant's too.
 """
 
@@ -20,6 +21,7 @@ from edge.core.frames import ModelScale
 from edge.core.memory import RobotMap
 from edge.core.perception import (
     PerceptionParameters,
+    clamp_to_world,
     neighbours_in_range,
     part_in_world,
     window_corner,
@@ -265,11 +267,19 @@ class BaselineSwarm:
         vehicles: PointVehicles,
         scale: ModelScale,
         max_speed_m_s: float,
+        bias_m: F64 | None,
+        world_size: int,
     ) -> None:
+        """With `bias_m` (N, 2) robots are wrong by that about where they are, and see that place.
+
+        `world_size` is in model units.
+        """
         self._baseline = baseline
         self._vehicles = vehicles
         self._scale = scale
         self._max_speed_m_s = max_speed_m_s
+        self._bias_m = bias_m
+        self._world_size = world_size
 
     def run(self, times_s: Sequence[float]) -> Iterator[F64]:
         """Yields the positions (N, 2), m, at each of `times_s`, which ascend."""
@@ -277,7 +287,10 @@ class BaselineSwarm:
             self._vehicles.now_s = now_s
             positions_m = self._vehicles.positions_m()
             yield positions_m
-            goals = self._baseline.goals(self._scale.position_to_model(positions_m))
+            if self._bias_m is not None:
+                positions_m = positions_m + self._bias_m
+            positions = clamp_to_world(self._scale.position_to_model(positions_m), self._world_size)
+            goals = self._baseline.goals(positions)
             goals_m = self._scale.position_to_mission_m(goals)
             velocities_m_s = cvt_velocity(positions_m, goals_m, self._max_speed_m_s, next_s - now_s)
             for robot, velocity_m_s in enumerate(velocities_m_s):

@@ -93,11 +93,8 @@ class Scenario:
                 f"random_feature_sigma = {self.random_feature_sigma}: must be (least, greatest) "
                 "above 0"
             )
-        if self.controller != "lpac" and (self.failures or self.position_bias is not None):
-            raise ValueError(
-                f"controller = {self.controller!r}: a baseline knows no failures and no position "
-                "bias"
-            )
+        if self.controller != "lpac" and self.failures:
+            raise ValueError(f"controller = {self.controller!r}: a baseline knows no failures")
         require_possible(self.failures, self.robots)
 
 
@@ -301,6 +298,8 @@ def fly(
             ),
             scenario.scale,
             parameters.max_speed_m_s,
+            prepared.bias_m,
+            perception.world_size,
         )
     times_s = prepared.times_s
     positions = []

@@ -197,6 +197,17 @@ def test_robots_go_to_the_important_side(
     assert to_place < min(to_others)
 
 
+def test_a_baseline_that_is_wrong_about_its_place_ends_beside_its_goal(
+    shipped_bundle: Bundle,
+) -> None:
+    feature = GaussianFeature(mean=(256.0, 256.0), sigma=(40.0, 40.0))
+    [[x_m, y_m]] = short(
+        shipped_bundle, robots=1, starts_m=((14.0, 18.0),), features=(feature,),
+        controller="clairvoyant-cvt", position_bias=((16.0, -24.0),),
+    ).positions_m[-1]  # fmt: skip
+    assert (x_m, y_m) == pytest.approx((15.0, 17.5), abs=0.1)
+
+
 def test_a_bundle_without_perception_cannot_fly(shipped_bundle: Bundle) -> None:
     manifest = dataclasses.replace(shipped_bundle.manifest, perception=None)
     blind = dataclasses.replace(shipped_bundle, manifest=manifest)
