@@ -20,7 +20,13 @@ from lpac.sim.experiment import FIELD_SCALE
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances, ExpertName, WorldRanges
 from lpac.train.data import Dataset, Shards
 from lpac.train.expert import Expert, assignment, make_expert
-from lpac.train.rollout import PlannedShard, ShardTask, States, fly_shard, plan_round
+from lpac.train.rollout import (
+    PlannedShard,
+    ShardTask,
+    States,
+    fly_shard,
+    plan_round,
+)
 
 DATA = DataConfig(flights=2, states=4, duration_s=6.0, disturbances=Disturbances(loss=(0.2, 0.5)))
 DAGGER = DaggerConfig(rounds=1, flights=4, duration_s=6.0, expert_flights=0.5)
@@ -143,6 +149,21 @@ def test_experts_leave_out_who_is_lost(
     np.testing.assert_allclose(
         velocities[alive], told.velocities(positions[alive], np.ones(9, np.bool_))
     )
+
+
+def test_what_overshoots_is_flown_no_faster(shard: PlannedShard, shipped_bundle: Bundle) -> None:
+    ends = {}
+    for overshoot in (1.0, 3.0):
+        task = replace(
+            shard, flights=shard.flights[:1], times_s=(2.0,),
+            data=replace(DATA, overshoot=overshoot),
+        )  # fmt: skip
+        told = fly_shard(ShardTask(task, shipped_bundle)).states.velocities
+        ends[overshoot] = np.linalg.norm(told, axis=1)
+    assert ends[1.0].max() == pytest.approx(5.0) and 5.0 < ends[3.0].max() <= 15.0 + 1e-5
+    # Both have flown the same until then: what is slower than max_speed is told alike.
+    slow = ends[1.0] < 5.0 - 1e-5
+    np.testing.assert_allclose(ends[3.0][slow], ends[1.0][slow])
 
 
 def test_the_best_of_lloyd_ends_below_the_clairvoyant(shipped_bundle: Bundle) -> None:
