@@ -26,7 +26,7 @@ Ray = Annotated[
     typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
 ]
 DEFAULT_FLEET = Path("fleet.toml")
-DEFAULT_BUNDLE = shipped("policies/lpac_l2_k3_n10_512")
+DEFAULT_BUNDLE = shipped("policies/field/field")
 # The name of a lock has some hundred bytes.
 _LOCK_BYTES = 80
 

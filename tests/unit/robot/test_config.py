@@ -58,7 +58,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     config = load_config(EXAMPLE)
-    assert Path(config.policy.bundle).samefile(ROOT / "policies" / "lpac_l2_k3_n10_512")
+    assert Path(config.policy.bundle).samefile(ROOT / "policies" / "field" / "field")
     assert config.policy.world == str(EXAMPLE.parent / "world.env")
     assert config.log.folder == str(EXAMPLE.parent / "logs")
     (tmp_path / "robot.toml").write_text(
