@@ -309,6 +309,18 @@ def _near_neighbour(f: _Flight) -> None:
         f.run(3.0)
 
 
+def _comes_down_above(f: _Flight) -> None:
+    """Somebody's ground station lands robot 1 through the height of robot 0, near by."""
+    f.fly()
+    other = f.fleet.vehicles[1].vehicle
+    place_m = f.vehicle.estimated_position_m + np.array([3.0, 1.0, 0.0])
+    x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
+    other.position_m = np.array([x_m, y_m, other.position_m[2]])
+    f.begin()
+    other.set_mode(Px4Mode.LAND)
+    f.run(10.0)
+
+
 def _landing_point_taken(f: _Flight) -> None:
     """Robot 1 has come down where robot 0 lands."""
     f.fly()
@@ -525,6 +537,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
         _remote_control_lost, {"failsafe": {"rc": "pilot", "rc_lost": "land"}},
     ),
     "near_neighbour": (_near_neighbour, {}),
+    "comes_down_above": (_comes_down_above, {}),
     "landing_point_taken": (_landing_point_taken, {}),
     "offboard_refused": (_offboard_refused, {}),
     "arming_refused": (_arming_refused, {}),

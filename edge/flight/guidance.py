@@ -107,7 +107,7 @@ def guide(
         velocity_m_s,
         inside_m_s,
         inputs.neighbours,
-        robot.parameters.min_separation_m,
+        robot.separation,
         limits,
         robot.fence,
     )

@@ -28,6 +28,8 @@ _SLACK_TIME_S = 0.5
 _RECOVERY_SHARE = 0.5
 _ROUNDING_M_S = 1e-9
 _HEIGHT_GAIN_PER_S = 1.0
+# Slower than any landing (PX4's last metres: 0.7 m/s), faster than a gust moves who holds a height.
+_PASSING_M_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +55,19 @@ class MotionLimits:
                 raise ValueError(f"{name} = {value}: must be finite and above 0")
         if not 0.0 <= self.lag_s < math.inf:
             raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
+
+
+class Separation(NamedTuple):
+    """How far to stay from other robots, m.
+
+    `level_m`: from each, by 3-D distance as estimated. `passing_m`: in the plane, from one that
+    climbs or comes down through the robot's height, since it keeps to its place and looks for
+    nobody. `height_error_m`: by how much two heights differ in truth that are estimated to be one.
+    """
+
+    level_m: float
+    passing_m: float
+    height_error_m: float
 
 
 class Closest(NamedTuple):
@@ -188,19 +203,20 @@ def brake(
     velocity_m_s: F64,
     wanted_m_s: F64,
     neighbours: Sequence[Neighbour],
-    min_separation_m: float,
+    separation: Separation,
     limits: MotionLimits,
     fence: Fence | None,
 ) -> F64:
-    """What may be flown of `wanted_m_s`, so that the robot stays `min_separation_m` from others.
+    """What may be flown of `wanted_m_s`, so that the robot stays as far from others as it must.
 
     `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
-    did. One that is `min_separation_m` or more above or below brakes nothing, since robots cross in
-    their height slots. Towards another one the robot may close half the slack: that one does the
-    same. Away from it, it may always fly, and from one that is too near it has to, by half of what
-    is missing: else each error of an estimate would let them close in, and none part them. Climbing
-    is not limited. Giving way to a neighbour leads over no edge of `fence`; None where there is
-    none to keep to.
+    did. One that is `level_m` or more above or below brakes nothing, since robots cross in their
+    height slots, unless it climbs or comes down and passes before the robot could be out of its
+    way. Towards another one the robot may close half the slack: that one does the same; but one
+    that passes does not, so all of it is the robot's. Away from it, it may always fly, and from one
+    that is too near it has to, by half of what is missing, or by all: else each error of an
+    estimate would let them close in, and none part them. Climbing is not limited. Giving way to a
+    neighbour leads over no edge of `fence`; None where there is none to keep to.
 
     A neighbour of which something is not known stops the robot.
     """
@@ -213,16 +229,20 @@ def brake(
     for neighbour in neighbours:
         offset_m = np.array(_extrapolated(neighbour)) - position_m
         up_m = float(offset_m[2])
-        if abs(up_m) >= min_separation_m:
+        passes = _passes(up_m, neighbour.velocity_m_s[2], separation, limits)
+        if abs(up_m) >= separation.level_m and not passes:
             continue
         apart_m = math.hypot(offset_m[0], offset_m[1])
         if apart_m == 0.0:
             return np.zeros(3)  # Every way may be the wrong one.
         direction = offset_m[:2] / apart_m
-        # Squares of far smaller numbers than a separation may vanish: never below 0.
-        needed_m = math.sqrt(max(min_separation_m * min_separation_m - up_m * up_m, 0.0))
         speed = float(direction @ velocity_m_s[:2])
-        slack_m = (apart_m - needed_m) / 2.0
+        if passes:
+            slack_m = apart_m - separation.passing_m
+        else:
+            # Squares of far smaller numbers than a separation may vanish: never below 0.
+            needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
+            slack_m = (apart_m - needed_m) / 2.0
         directions.append(direction)
         caps.append(
             _speed_towards(slack_m, speed, limits)
@@ -242,6 +262,16 @@ def brake(
         caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
     horizontal = _limit_towards(horizontal, directions, caps)
     return np.array([*horizontal, wanted_m_s[2]])
+
+
+def _passes(up_m: float, climb_m_s: float, separation: Separation, limits: MotionLimits) -> bool:
+    """Whether who is `up_m` higher is at the robot's height before that has left its way."""
+    if abs(climb_m_s) < _PASSING_M_S:
+        return False
+    to_leave_s = limits.lag_s + separation.passing_m / limits.max_speed_m_s
+    lowest_m, highest_m = sorted((up_m, up_m + climb_m_s * to_leave_s))
+    near_m = separation.level_m + separation.height_error_m
+    return lowest_m < near_m and highest_m > -near_m
 
 
 def _extrapolated(neighbour: Neighbour) -> list[float]:

@@ -18,9 +18,9 @@ from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
-from edge.flight.margins import ErrorBudget
+from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
-from edge.flight.safety import Closest, MotionLimits
+from edge.flight.safety import Closest, MotionLimits, Separation
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
     MAX_SLOT,
@@ -223,6 +223,13 @@ class Robot:
     def place(self) -> Place:
         """Its place in the flight."""
         return Place(self.parameters.slot, self.parameters.landing_point_m)
+
+    @property
+    def separation(self) -> Separation:
+        """How far it stays from the others in flight; they err as it does."""
+        position_m, level_m = self.errors.position_m, self.parameters.min_separation_m
+        passing = places_apart(position_m, position_m).or_at_least(level_m, "min_separation_m")
+        return Separation(level_m, passing.least_m, self.errors.height_apart_m)
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place that the ground gives it, or else its own."""

@@ -14,7 +14,7 @@ import pytest
 
 from edge.core.changes import changed, changes, same
 from edge.drivers.flight_log import read
-from edge.flight import guidance, orders, state, step
+from edge.flight import guidance, orders, safety, state, step
 from edge.flight.record import FlightTick, TickError, TickReader, TickWriter
 from edge.flight.replay import FlightReplay, differing
 from edge.flight.transitions import TRANSITIONS, Transition
@@ -105,6 +105,10 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
     "no brake before a neighbour": (
         lambda patch: patch.setattr(guidance, "brake", lambda *given: given[2]),
         ("near_neighbour",),
+    ),
+    "no way for who comes down": (
+        lambda patch: patch.setattr(safety, "_PASSING_M_S", math.inf),
+        ("comes_down_above",),
     ),
     "no fence": (
         lambda patch: patch.setattr(

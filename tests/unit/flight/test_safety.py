@@ -15,6 +15,7 @@ from edge.core.schema import ConfigError, from_mapping
 from edge.flight.safety import (
     Closest,
     MotionLimits,
+    Separation,
     approach_speed,
     brake,
     clear_height_m,
@@ -31,6 +32,7 @@ FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)
 LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
 CONTROL_S, STEP_S = 0.1, 0.02
 AT_REST = np.zeros(3)
+LEVEL_2, LEVEL_3 = Separation(2.0, 8.0, 2.0), Separation(3.0, 8.0, 2.0)
 
 
 def number(low: float, high: float) -> st.SearchStrategy[float]:
@@ -313,21 +315,21 @@ def neighbour(robot_id: int, *position_m: float, **at: object) -> Neighbour:
 
 def test_the_way_towards_a_neighbour_is_slowed_and_no_other() -> None:
     wanted = np.array([2.0, 1.0, 0.5])
-    command = brake(AT_REST, AT_REST, wanted, [neighbour(7, 3.0, 0.0, 0.0)], 3.0, LIMITS, None)
+    command = brake(AT_REST, AT_REST, wanted, [neighbour(7, 3.0, 0.0, 0.0)], LEVEL_3, LIMITS, None)
     np.testing.assert_allclose(command, [0.0, 1.0, 0.5], atol=1e-9)
-    away = brake(AT_REST, AT_REST, -wanted, [neighbour(7, 1.0, 0.0, 0.0)], 3.0, LIMITS, None)
+    away = brake(AT_REST, AT_REST, -wanted, [neighbour(7, 1.0, 0.0, 0.0)], LEVEL_3, LIMITS, None)
     np.testing.assert_array_equal(away, -wanted)
 
 
 def test_robots_cross_in_their_height_slots() -> None:
     wanted = np.array([2.0, 0.0, 0.0])
     above = neighbour(2, 0.5, 0.0, 2.0)
-    command = brake(AT_REST, AT_REST, wanted, [above], 2.0, LIMITS, None)
+    command = brake(AT_REST, AT_REST, wanted, [above], LEVEL_2, LIMITS, None)
     np.testing.assert_array_equal(command, wanted)
     # Nearer in height, it needs as much horizontally as is missing: 1.32 m of a sphere.
-    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.33, 0.0, 1.5)], 2.0, LIMITS, None)
+    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.33, 0.0, 1.5)], LEVEL_2, LIMITS, None)
     assert 0.0 <= command[0] < 0.01
-    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.3, 0.0, 1.5)], 2.0, LIMITS, None)
+    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.3, 0.0, 1.5)], LEVEL_2, LIMITS, None)
     assert -0.02 < command[0] < 0.0
 
 
@@ -337,7 +339,7 @@ def test_who_waits_for_a_neighbour_does_not_creep_up_to_it_as_estimates_wander(
     apart_m: float, bearing_rad: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    min_separation_m, wander_m, tick_s = 1.5, 0.2, 0.1
+    separation, wander_m, tick_s = Separation(1.5, 8.0, 2.0), 0.2, 0.1
     position_m = apart_m * np.array([math.cos(bearing_rad), math.sin(bearing_rad), 0.0])
     velocity_m_s, errors_m = np.zeros(3), np.zeros((2, 3))
     distances_m = []
@@ -347,13 +349,68 @@ def test_who_waits_for_a_neighbour_does_not_creep_up_to_it_as_estimates_wander(
         errors_m[:, :2] += wander_m * math.sqrt(2.0 * tick_s / 5.0) * rng.normal(size=(2, 2))
         seen_m = position_m + errors_m[0]
         other = neighbour(2, *errors_m[1].tolist())
-        command = brake(seen_m, velocity_m_s, -seen_m, [other], min_separation_m, LIMITS, None)
+        command = brake(seen_m, velocity_m_s, -seen_m, [other], separation, LIMITS, None)
         velocity_m_s = velocity_m_s + (command - velocity_m_s) * tick_s / 0.5
         position_m = position_m + velocity_m_s * tick_s
         distances_m.append(math.hypot(*position_m[:2]))
     # Once they have parted, only the errors of the moment count: it stays, and stays near.
-    assert min(distances_m[300:]) > min_separation_m - 5.0 * wander_m
-    assert np.mean(distances_m[300:]) == pytest.approx(min_separation_m, abs=2.0 * wander_m)
+    assert min(distances_m[300:]) > separation.level_m - 5.0 * wander_m
+    assert np.mean(distances_m[300:]) == pytest.approx(separation.level_m, abs=2.0 * wander_m)
+
+
+def test_the_way_under_who_comes_down_is_left_in_time_and_kept_free() -> None:
+    """From right under it, at the speeds of the field, with a vehicle that follows late."""
+    limits = MotionLimits(1.25, 1.0, 2.0, 1.3)
+    separation = Separation(1.5, 8.0, 2.0)
+    vehicle = Vehicle(np.array([0.4, 0.3, 5.0]), limits.lag_s, limits.max_acceleration_m_s2)
+    height_m, apart_m = 14.0, {}
+    while height_m > 0.0:
+        above = neighbour(2, 0.0, 0.0, height_m, velocity_m_s=(0.0, 0.0, -1.5))
+        # The policy wants to be right there.
+        wanted = limit_speed(-vehicle.position_m[:2], limits.max_speed_m_s)
+        command = brake(
+            vehicle.position_m,
+            vehicle.velocity_m_s,
+            np.append(wanted, 0.0),
+            [above],
+            separation,
+            limits,
+            None,
+        )
+        vehicle.fly(command, AT_REST)
+        height_m -= 1.5 * CONTROL_S
+        apart_m[height_m] = math.hypot(*vehicle.position_m[:2])
+    assert min(m for h, m in apart_m.items() if abs(h - 5.0) < 2.0) > 3.5
+    # Once it is well below, its place is anybody's.
+    wanted = np.array([-1.0, 0.0, 0.0])
+    at_m = np.array([5.0, 0.0, 5.0])
+    below = neighbour(2, 0.0, 0.0, 1.4, velocity_m_s=(0.0, 0.0, -0.7))
+    np.testing.assert_array_equal(
+        brake(at_m, AT_REST, wanted, [below], separation, limits, None), wanted
+    )
+
+
+@pytest.mark.parametrize(
+    ("up_m", "climb_m_s", "passes"),
+    [
+        (9.0, -1.5, True),
+        (9.0, -0.2, False),
+        (9.0, 1.0, False),
+        (40.0, -1.5, False),
+        (-4.5, 1.0, True),
+        (-4.5, -1.0, False),
+        (-3.0, -1.0, True),  # In truth it may still be at this height.
+    ],
+)
+def test_who_climbs_or_comes_down_through_ones_height_is_given_its_way(
+    up_m: float, climb_m_s: float, passes: bool
+) -> None:
+    limits = MotionLimits(1.25, 1.0, 2.0, 1.3)
+    wanted = np.array([1.0, 0.0, 0.0])
+    other = neighbour(2, 6.0, 0.0, up_m, velocity_m_s=(0.0, 0.0, climb_m_s))
+    command = brake(AT_REST, AT_REST, wanted, [other], Separation(1.5, 8.0, 2.0), limits, None)
+    assert (command[0] < -0.5) == passes
+    assert command[0] in {1.0} or passes
 
 
 def test_the_nearest_neighbour_is_where_it_has_flown_to_since() -> None:
@@ -368,7 +425,8 @@ def test_the_nearest_neighbour_is_where_it_has_flown_to_since() -> None:
 def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
     data: st.DataObject,
 ) -> None:
-    limits, separation_m = data.draw(motion_limits), data.draw(number(1.0, 4.0))
+    limits, level_m = data.draw(motion_limits), data.draw(number(1.0, 4.0))
+    separation = Separation(level_m, 8.0, 2.0)
     fence = Fence(((-16.0, -12.0), (16.0, -12.0), (0.0, 24.0)), 1.0, 3.0, 25.0)
     corners = ((-11.0, -10.0), (11.0, -10.0), (0.0, 16.0), (0.0, 0.0))
     starts = data.draw(st.permutations(corners))[: data.draw(st.integers(2, 4))]
@@ -393,12 +451,12 @@ def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
             )
             others = [other for other in heard if other.robot_id != own]
             closest = nearest(position_m.tolist(), others)
-            command = brake(position_m, velocity_m_s, inside, others, separation_m, limits, fence)
+            command = brake(position_m, velocity_m_s, inside, others, separation, limits, fence)
             vehicle.fly(command, AT_REST)
             assert not recovering
             assert fence.distance_m(*vehicle.position_m[:2]) > 0.5 * fence.buffer_m
             assert closest is not None
-            assert closest.distance_m > 0.9 * separation_m
+            assert closest.distance_m > 0.9 * level_m
 
 
 def test_giving_way_to_a_neighbour_leads_over_no_edge() -> None:
@@ -406,9 +464,9 @@ def test_giving_way_to_a_neighbour_leads_over_no_edge() -> None:
     at_the_buffer = np.array([2.0, 16.0, 10.0])
     ahead = neighbour(3, 3.0, 17.5, 10.0)
     wanted = np.array([0.0, 1.0, 0.0])
-    free = brake(at_the_buffer, AT_REST, wanted, [ahead], 2.0, LIMITS, None)
+    free = brake(at_the_buffer, AT_REST, wanted, [ahead], LEVEL_2, LIMITS, None)
     assert free[0] < -0.1
-    command = brake(at_the_buffer, AT_REST, wanted, [ahead], 2.0, LIMITS, FENCE)
+    command = brake(at_the_buffer, AT_REST, wanted, [ahead], LEVEL_2, LIMITS, FENCE)
     assert command[0] > -1e-6
     assert command @ (1.0, 1.5, 0.0) < 1e-6
 
@@ -449,7 +507,7 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
         neighbour(1, *AT_REST, age_s=d),
         neighbour(1, *a, velocity_m_s=tuple(b), age_s=0.1),
     ):
-        command = brake(a, b, c, [other], 2.0, LIMITS, FENCE)
+        command = brake(a, b, c, [other], LEVEL_2, LIMITS, FENCE)
         closest = nearest((0.0, 0.0, 0.0), [other])
         assert np.isfinite(command).all()
         assert usable or not command.any()
@@ -465,7 +523,7 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
 def test_an_unknown_neighbour_stops_the_robot_and_hides_no_other() -> None:
     lost = neighbour(1, math.nan, 0.0, 0.0)
     others = [lost, neighbour(2, 9.0, 0.0, 0.0)]
-    command = brake(AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), others, 2.0, LIMITS, None)
+    command = brake(AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), others, LEVEL_2, LIMITS, None)
     assert not command.any()
     assert nearest((0.0, 0.0, 0.0), others) == Closest(2, 9.0)
 
