@@ -122,10 +122,11 @@ def test_what_cannot_be(tmp_path: Path, old: str, new: str, text: str) -> None:
 def test_the_example_leaves_out_each_part() -> None:
     ablation = read_ablation(ROOT / "examples" / "ablation.toml")
     assert [variant.name for variant in ablation.variants if variant.trained] == [
-        "base", "no-messages", "no-features", "one-hop", "three-hops", "one-layer",
-        "no-explored-map", "shared-map", "no-dagger", "no-loss-and-delay",
+        "base", "no-messages", "no-features", "one-hop", "two-hops", "one-layer",
+        "no-explored-map", "no-own-cell", "no-shared-map", "no-overshoot", "no-dagger",
+        "no-loss-and-delay",
     ]  # fmt: skip
     assert [variant.name for variant in ablation.variants if not variant.trained] == [
         "float32", "half-rates", "double-rates",
     ]  # fmt: skip
-    assert len(ablation.trainings) == 30 and len(ablation.worlds) == 40
+    assert len(ablation.trainings) == 36 and len(ablation.worlds) == 40
