@@ -88,6 +88,10 @@ class FaultyFleet(ABC):
     def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
         """What the vehicles did."""
 
+    def highest_m(self) -> float:
+        """The height of the robot that flies highest."""
+        return max(map(self.height_m, range(len(self.robots_by_name))))
+
     def lead_s(self, injection: Injection) -> float:
         """How much earlier it has to happen to be felt in time."""
         return 0.0

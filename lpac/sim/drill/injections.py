@@ -35,6 +35,10 @@ class Surroundings(Protocol):
         """The height that a robot flies at."""
         ...
 
+    def highest_m(self) -> float:
+        """The height of the robot that flies highest."""
+        ...
+
     def place_m(self, robot: int) -> F64:
         """(2,): the pad that a robot stood on at first, where it really is."""
         ...
@@ -278,7 +282,7 @@ class PilotFliesOver(VehicleInjection):
         pad_m, height_m = around.place_m(robot + self.pad), around.height_m(robot + self.pad)
         # Over everybody's heads on the way there.
         if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:
-            height_m += _PILOT_ABOVE_M
+            height_m = around.highest_m() + _PILOT_ABOVE_M
         target_m = np.array([*pad_m, -height_m])
         wanted_m_s = _PILOT_GAIN_PER_S * (target_m - vehicle.position_m)
         fastest = max(1.0, float(np.linalg.norm(wanted_m_s)) / _PILOT_M_S)
