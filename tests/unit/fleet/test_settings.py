@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 
 from edge.core.schema import ConfigError
 from edge.robot.config import RobotConfig, load_config
+from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.fleet.release import drop_ins
 from lpac.fleet.settings import FleetConfig, Places, RobotHost, load_fleet, select
 from lpac.fleet.writer import add_robot, assign, robot_toml, write_fleet, write_robot
-from tests.conftest import ROOT, SHIPPED
+from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"
 # A value that is commented out, at the start of its line, and the head of such a table.
@@ -94,7 +95,7 @@ def test_the_example_is_complete_and_shows_the_defaults(tmp_path: Path) -> None:
 
 def test_the_example_says_who_is_where() -> None:
     config = load_fleet(EXAMPLE)
-    assert config.bundle.samefile(SHIPPED)
+    assert config.bundle.samefile(DEFAULT_BUNDLE)
     assert config.world == EXAMPLE.parent / "world.env"
     assert config.robots["r1"] == RobotHost(
         name="r1", host="192.168.8.11", user="root", port=None, address="192.168.8.11", robot_id=1,
