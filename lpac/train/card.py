@@ -153,7 +153,8 @@ in {dagger.rounds} DAgger rounds. Worlds: {trained}. Flown at
 
 {begins} {len(card.losses)} epochs in all, on {card.device}; the loss came to
 {card.losses[-1].loss:.3f} of the variance of round 0's actions. Hours:
-{card.generate_hours:.2f} of CPU to make the data, {card.fit_hours:.2f} to fit, {card.select_hours:.2f} to select. Versions:
+{card.generate_hours:.2f} of CPU to make the data, {card.fit_hours:.2f} to fit,
+{card.select_hours:.2f} to select. Versions:
 {", ".join(f"{each} {number}" for each, number in card.versions.items())}.
 
 ![losses](figures/losses.png)
