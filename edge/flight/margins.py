@@ -108,6 +108,20 @@ class ErrorBudget:
         )
 
     @property
+    def passing_m(self) -> float:
+        """In the plane between two vehicles as estimated, so that in truth they do not touch.
+
+        Estimates tell where wind and control carry them, but for their own errors.
+        """
+        return 2.0 * self.gps_m + self.drone_m
+
+    @property
+    def passing_height_m(self) -> float:
+        """The same in height, each above its own pad."""
+        estimates_m = self.height_apart_m + self.takeoffs_height_m
+        return estimates_m + self.pads_height_m + self.drone_m
+
+    @property
     def height_m(self) -> float:
         """How far one vehicle's height above its own pad may be from what it is told."""
         return self.height_common_m + self.height_apart_m / 2.0 + self.height_control_m

@@ -58,16 +58,16 @@ class MotionLimits:
 
 
 class Separation(NamedTuple):
-    """How far to stay from other robots, m.
+    """How far to stay from other robots, as estimated, m.
 
-    `level_m`: from each, by 3-D distance as estimated. `passing_m`: in the plane, from one that
-    climbs or comes down through the robot's height, since it keeps to its place and looks for
-    nobody. `height_error_m`: by how much two heights differ in truth that are estimated to be one.
+    `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
+    down through the robot's height, since it keeps to its place and looks for nobody; it has not
+    passed before it is `passing_height_m` away in height.
     """
 
     level_m: float
     passing_m: float
-    height_error_m: float
+    passing_height_m: float
 
 
 class Closest(NamedTuple):
@@ -212,11 +212,12 @@ def brake(
     `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
     did. One that is `level_m` or more above or below brakes nothing, since robots cross in their
     height slots, unless it climbs or comes down and passes before the robot could be out of its
-    way. Towards another one the robot may close half the slack: that one does the same; but one
-    that passes does not, so all of it is the robot's. Away from it, it may always fly, and from one
-    that is too near it has to, by half of what is missing, or by all: else each error of an
-    estimate would let them close in, and none part them. Climbing is not limited. Giving way to a
-    neighbour leads over no edge of `fence`; None where there is none to keep to.
+    way. Towards another one the robot may close half the slack: that one does the same. Away from
+    it, it may always fly, and from one that is too near it has to, by half of what is missing: else
+    each error of an estimate would let them close in, and none part them. Who passes does nothing
+    of the kind: the robot leaves all of its way, and by where the vehicle comes to rest, so that it
+    does not turn round under it. Climbing is not limited. Giving way to a neighbour leads over no
+    edge of `fence`; None where there is none to keep to.
 
     A neighbour of which something is not known stops the robot.
     """
@@ -224,44 +225,55 @@ def brake(
         return np.zeros(3)
     if not all(map(_is_known, neighbours)):
         return np.zeros(3)
-    directions: list[F64] = []
-    caps: list[float] = []
+    ways: list[_Way] = []
     for neighbour in neighbours:
         offset_m = np.array(_extrapolated(neighbour)) - position_m
         up_m = float(offset_m[2])
         passes = _passes(up_m, neighbour.velocity_m_s[2], separation, limits)
         if abs(up_m) >= separation.level_m and not passes:
             continue
+        if passes:
+            offset_m[:2] -= velocity_m_s[:2] * limits.lag_s
         apart_m = math.hypot(offset_m[0], offset_m[1])
         if apart_m == 0.0:
             return np.zeros(3)  # Every way may be the wrong one.
         direction = offset_m[:2] / apart_m
-        speed = float(direction @ velocity_m_s[:2])
         if passes:
-            slack_m = apart_m - separation.passing_m
+            cap = _speed_to(apart_m - separation.passing_m, 0.0, limits)
+            at_most = _speed_to(max(apart_m - separation.level_m, 0.0), 0.0, limits)
         else:
             # Squares of far smaller numbers than a separation may vanish: never below 0.
             needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
-            slack_m = (apart_m - needed_m) / 2.0
-        directions.append(direction)
-        caps.append(
-            _speed_towards(slack_m, speed, limits)
-            if slack_m >= 0.0
-            else -_speed_towards(-slack_m, -speed, limits)
-        )
+            cap = _speed_to((apart_m - needed_m) / 2.0, float(direction @ velocity_m_s[:2]), limits)
+            at_most = 0.0
+        ways.append(_Way(direction, cap, at_most if cap < 0.0 else cap))
     horizontal = wanted_m_s[:2]
-    if all(float(d @ horizontal) <= cap for d, cap in zip(directions, caps, strict=True)):
+    if all(float(way.direction @ horizontal) <= way.cap for way in ways):
         return wanted_m_s
-    for direction, cap in zip(directions, caps, strict=True):
-        if cap < 0.0:
-            horizontal = horizontal - direction * max(float(direction @ horizontal) - cap, 0.0)
+    # Whom it has to leave most has the last word.
+    for way in sorted(ways, key=lambda way: -way.cap):
+        if way.cap < 0.0:
+            excess = max(float(way.direction @ horizontal) - way.cap, 0.0)
+            horizontal = horizontal - way.direction * excess
     horizontal = limit_speed(horizontal, limits.max_speed_m_s)
-    caps = [max(cap, 0.0) for cap in caps]
+    directions = [way.direction for way in ways]
+    caps = [way.at_most for way in ways]
     if fence is not None:
         directions += list(-fence.edges().inward)
         caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
     horizontal = _limit_towards(horizontal, directions, caps)
     return np.array([*horizontal, wanted_m_s[2]])
+
+
+class _Way(NamedTuple):
+    """The way to a neighbour, (2,), and how fast to be told to fly it, m/s: away if below 0.
+
+    `at_most`, 0 or more, if others have to be left more than this one.
+    """
+
+    direction: F64
+    cap: float
+    at_most: float
 
 
 def _passes(up_m: float, climb_m_s: float, separation: Separation, limits: MotionLimits) -> bool:
@@ -270,8 +282,15 @@ def _passes(up_m: float, climb_m_s: float, separation: Separation, limits: Motio
         return False
     to_leave_s = limits.lag_s + separation.passing_m / limits.max_speed_m_s
     lowest_m, highest_m = sorted((up_m, up_m + climb_m_s * to_leave_s))
-    near_m = separation.level_m + separation.height_error_m
+    near_m = separation.passing_height_m
     return lowest_m < near_m and highest_m > -near_m
+
+
+def _speed_to(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
+    """How fast to be told to fly towards a line, back if it is passed, already doing `speed_m_s`."""
+    if slack_m >= 0.0:
+        return _speed_towards(slack_m, speed_m_s, limits)
+    return -_speed_towards(-slack_m, -speed_m_s, limits)
 
 
 def _extrapolated(neighbour: Neighbour) -> list[float]:

@@ -18,7 +18,7 @@ from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
-from edge.flight.margins import ErrorBudget, places_apart
+from edge.flight.margins import ErrorBudget
 from edge.flight.reach import Reach
 from edge.flight.safety import Closest, MotionLimits, Separation
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
@@ -226,10 +226,9 @@ class Robot:
 
     @property
     def separation(self) -> Separation:
-        """How far it stays from the others in flight; they err as it does."""
-        position_m, level_m = self.errors.position_m, self.parameters.min_separation_m
-        passing = places_apart(position_m, position_m).or_at_least(level_m, "min_separation_m")
-        return Separation(level_m, passing.least_m, self.errors.height_apart_m)
+        """How far it stays from the others in flight, whose estimates err as its own does."""
+        level_m, errors = self.parameters.min_separation_m, self.errors
+        return Separation(level_m, max(errors.passing_m, level_m), errors.passing_height_m)
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place that the ground gives it, or else its own."""

@@ -30,9 +30,11 @@ from edge.flight.safety import (
 SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)
 LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
+FIELD_LIMITS = MotionLimits(1.25, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
+FIELD_SEPARATION = Separation(level_m=1.5, passing_m=6.5, passing_height_m=3.5)
 CONTROL_S, STEP_S = 0.1, 0.02
 AT_REST = np.zeros(3)
-LEVEL_2, LEVEL_3 = Separation(2.0, 8.0, 2.0), Separation(3.0, 8.0, 2.0)
+LEVEL_2, LEVEL_3 = Separation(2.0, 6.5, 3.5), Separation(3.0, 6.5, 3.5)
 
 
 def number(low: float, high: float) -> st.SearchStrategy[float]:
@@ -339,7 +341,7 @@ def test_who_waits_for_a_neighbour_does_not_creep_up_to_it_as_estimates_wander(
     apart_m: float, bearing_rad: float, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    separation, wander_m, tick_s = Separation(1.5, 8.0, 2.0), 0.2, 0.1
+    separation, wander_m, tick_s = FIELD_SEPARATION, 0.2, 0.1
     position_m = apart_m * np.array([math.cos(bearing_rad), math.sin(bearing_rad), 0.0])
     velocity_m_s, errors_m = np.zeros(3), np.zeros((2, 3))
     distances_m = []
@@ -358,36 +360,39 @@ def test_who_waits_for_a_neighbour_does_not_creep_up_to_it_as_estimates_wander(
     assert np.mean(distances_m[300:]) == pytest.approx(separation.level_m, abs=2.0 * wander_m)
 
 
-def test_the_way_under_who_comes_down_is_left_in_time_and_kept_free() -> None:
-    """From right under it, at the speeds of the field, with a vehicle that follows late."""
-    limits = MotionLimits(1.25, 1.0, 2.0, 1.3)
-    separation = Separation(1.5, 8.0, 2.0)
-    vehicle = Vehicle(np.array([0.4, 0.3, 5.0]), limits.lag_s, limits.max_acceleration_m_s2)
-    height_m, apart_m = 14.0, {}
-    while height_m > 0.0:
+@pytest.mark.parametrize("speed_m_s", [-1.25, 0.0, 1.25])
+@pytest.mark.parametrize("start_m", [0.3, 0.5, 0.75, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize(("above_m", "least_m"), [(4.5, 1.5), (9.0, 4.0)])
+def test_the_way_under_who_comes_down_is_left_in_time(
+    speed_m_s: float, start_m: float, above_m: float, least_m: float
+) -> None:
+    """At the field's speeds, by a vehicle that follows late, and may be on its way under it."""
+    vehicle = Vehicle(
+        np.array([start_m, 0.05, 5.0]), FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2
+    )
+    vehicle.velocity_m_s = np.array([speed_m_s, 0.0, 0.0])
+    height_m, distances_m = 5.0 + above_m, []
+    while height_m > 5.0 - FIELD_SEPARATION.passing_height_m:
         above = neighbour(2, 0.0, 0.0, height_m, velocity_m_s=(0.0, 0.0, -1.5))
         # The policy wants to be right there.
-        wanted = limit_speed(-vehicle.position_m[:2], limits.max_speed_m_s)
-        command = brake(
-            vehicle.position_m,
-            vehicle.velocity_m_s,
-            np.append(wanted, 0.0),
-            [above],
-            separation,
-            limits,
-            None,
-        )
-        vehicle.fly(command, AT_REST)
+        wanted = limit_speed(-vehicle.position_m[:2], FIELD_LIMITS.max_speed_m_s)
+        vehicle.fly(passing(vehicle, np.append(wanted, 0.0), above), AT_REST)
         height_m -= 1.5 * CONTROL_S
-        apart_m[height_m] = math.hypot(*vehicle.position_m[:2])
-    assert min(m for h, m in apart_m.items() if abs(h - 5.0) < 2.0) > 3.5
-    # Once it is well below, its place is anybody's.
-    wanted = np.array([-1.0, 0.0, 0.0])
-    at_m = np.array([5.0, 0.0, 5.0])
-    below = neighbour(2, 0.0, 0.0, 1.4, velocity_m_s=(0.0, 0.0, -0.7))
-    np.testing.assert_array_equal(
-        brake(at_m, AT_REST, wanted, [below], separation, limits, None), wanted
-    )
+        distances_m.append(math.dist(vehicle.position_m, (0.0, 0.0, height_m)))
+    assert min(distances_m) > least_m
+
+
+def passing(vehicle: Vehicle, wanted_m_s: F64, *others: Neighbour) -> F64:
+    at_m, velocity_m_s = vehicle.position_m, vehicle.velocity_m_s
+    return brake(at_m, velocity_m_s, wanted_m_s, others, FIELD_SEPARATION, FIELD_LIMITS, None)
+
+
+def test_of_two_that_come_down_the_nearer_one_is_left() -> None:
+    down = {"velocity_m_s": (0.0, 0.0, -1.5)}
+    near, far = neighbour(1, -1.0, 0.0, 3.0, **down), neighbour(2, 6.4, 0.0, 3.0, **down)
+    for others in ((near, far), (far, near)):
+        still = Vehicle(AT_REST, FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2)
+        assert passing(still, AT_REST, *others)[0] > 1.0
 
 
 @pytest.mark.parametrize(
@@ -405,10 +410,9 @@ def test_the_way_under_who_comes_down_is_left_in_time_and_kept_free() -> None:
 def test_who_climbs_or_comes_down_through_ones_height_is_given_its_way(
     up_m: float, climb_m_s: float, passes: bool
 ) -> None:
-    limits = MotionLimits(1.25, 1.0, 2.0, 1.3)
-    wanted = np.array([1.0, 0.0, 0.0])
-    other = neighbour(2, 6.0, 0.0, up_m, velocity_m_s=(0.0, 0.0, climb_m_s))
-    command = brake(AT_REST, AT_REST, wanted, [other], Separation(1.5, 8.0, 2.0), limits, None)
+    still = Vehicle(AT_REST, FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2)
+    other = neighbour(2, 4.0, 0.0, up_m, velocity_m_s=(0.0, 0.0, climb_m_s))
+    command = passing(still, np.array([1.0, 0.0, 0.0]), other)
     assert (command[0] < -0.5) == passes
     assert command[0] in {1.0} or passes
 
@@ -426,7 +430,7 @@ def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
     data: st.DataObject,
 ) -> None:
     limits, level_m = data.draw(motion_limits), data.draw(number(1.0, 4.0))
-    separation = Separation(level_m, 8.0, 2.0)
+    separation = Separation(level_m, 6.5, 3.5)
     fence = Fence(((-16.0, -12.0), (16.0, -12.0), (0.0, 24.0)), 1.0, 3.0, 25.0)
     corners = ((-11.0, -10.0), (11.0, -10.0), (0.0, 16.0), (0.0, 0.0))
     starts = data.draw(st.permutations(corners))[: data.draw(st.integers(2, 4))]
