@@ -287,7 +287,7 @@ def _passes(up_m: float, climb_m_s: float, separation: Separation, limits: Motio
 
 
 def _speed_to(slack_m: float, speed_m_s: float, limits: MotionLimits) -> float:
-    """How fast to be told to fly towards a line, back if it is passed, already doing `speed_m_s`."""
+    """How fast to be told to fly to a line, and back if it is passed, already doing `speed_m_s`."""
     if slack_m >= 0.0:
         return _speed_towards(slack_m, speed_m_s, limits)
     return -_speed_towards(-slack_m, -speed_m_s, limits)
