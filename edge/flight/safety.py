@@ -57,7 +57,7 @@ class MotionLimits:
             raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
 
 
-class Separation(NamedTuple):
+class SeparationLimits(NamedTuple):
     """How far to stay from other robots, as estimated, m.
 
     `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
@@ -203,7 +203,7 @@ def brake(
     velocity_m_s: F64,
     wanted_m_s: F64,
     neighbours: Sequence[Neighbour],
-    separation: Separation,
+    separation: SeparationLimits,
     limits: MotionLimits,
     fence: Fence | None,
 ) -> F64:
@@ -276,7 +276,9 @@ class _Way(NamedTuple):
     at_most: float
 
 
-def _passes(up_m: float, climb_m_s: float, separation: Separation, limits: MotionLimits) -> bool:
+def _passes(
+    up_m: float, climb_m_s: float, separation: SeparationLimits, limits: MotionLimits
+) -> bool:
     """Whether who is `up_m` higher is at the robot's height before that has left its way."""
     if abs(climb_m_s) < _PASSING_M_S:
         return False

@@ -20,7 +20,7 @@ from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
 from edge.flight.margins import ErrorBudget
 from edge.flight.reach import Reach
-from edge.flight.safety import Closest, MotionLimits, Separation
+from edge.flight.safety import Closest, MotionLimits, SeparationLimits
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
     MAX_SLOT,
@@ -225,10 +225,10 @@ class Robot:
         return Place(self.parameters.slot, self.parameters.landing_point_m)
 
     @property
-    def separation(self) -> Separation:
+    def separation(self) -> SeparationLimits:
         """How far it stays from the others in flight, whose estimates err as its own does."""
         level_m, errors = self.parameters.min_separation_m, self.errors
-        return Separation(level_m, max(errors.passing_m, level_m), errors.passing_height_m)
+        return SeparationLimits(level_m, max(errors.passing_m, level_m), errors.passing_height_m)
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place that the ground gives it, or else its own."""

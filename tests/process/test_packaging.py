@@ -7,7 +7,8 @@ import tomllib
 import zipfile
 from pathlib import Path
 
-from tests.conftest import ROOT, SHIPPED
+from lpac.cli.options import DEFAULT_BUNDLE
+from tests.conftest import ROOT
 
 
 def test_the_wheel_holds_everything_below_three_names(tmp_path: Path) -> None:
@@ -22,7 +23,7 @@ def test_the_wheel_holds_everything_below_three_names(tmp_path: Path) -> None:
             assert str(path.relative_to(ROOT)) in names
     shipped = {name.removeprefix("lpac/_shipped/") for name in names if "/_shipped/" in name}
     assert shipped == {
-        *(str(path.relative_to(ROOT)) for path in SHIPPED.iterdir()),
+        *(str(path.relative_to(ROOT)) for path in DEFAULT_BUNDLE.iterdir()),
         *(f"systemd/{path.name}" for path in (ROOT / "systemd").iterdir()),
     }
 

@@ -12,11 +12,11 @@ from xml.etree import ElementTree
 import pytest
 from ray.cluster_utils import Cluster
 
+from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.sim.cluster import over_ray
 from lpac.sim.cores import over_cores
 from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
-from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
 
 # They soon come down.
@@ -27,7 +27,7 @@ ROBOTS = 2
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], FlightOutcome]:
     """Two faults with two seeds, over all cores."""
-    campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", ROBOTS, SHIPPED)
+    campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", ROBOTS, DEFAULT_BUNDLE)
     return {
         (o.fault, o.seed): o
         for o in campaign.fly([LANDED, GONE], [0, 1], partial(over_cores, fly_order))
@@ -45,7 +45,7 @@ def test_flights_over_cores_hold_what_is_promised(
 def test_a_cluster_of_two_nodes_flies_the_same(
     tmp_path: Path, cluster: Cluster, flown: dict[tuple[str, int], FlightOutcome]
 ) -> None:
-    campaign = Campaign(tmp_path, "simulated", ROBOTS, SHIPPED)
+    campaign = Campaign(tmp_path, "simulated", ROBOTS, DEFAULT_BUNDLE)
     again = campaign.fly([LANDED, GONE], [0, 1], partial(over_ray(cluster.address), fly_order))
     assert {(outcome.fault, outcome.seed): outcome for outcome in again} == flown
 
@@ -75,7 +75,7 @@ def test_a_campaign_that_was_killed_goes_on(tmp_path: Path) -> None:
     # What another version of the code has flown does not count.
     first, *others = _lines(kept)
     kept.write_text("\n".join([first.replace('"code": "', '"code": "x'), *others]) + "\n")
-    assert Campaign(out, "simulated", ROBOTS, SHIPPED).outcomes == {}
+    assert Campaign(out, "simulated", ROBOTS, DEFAULT_BUNDLE).outcomes == {}
 
 
 def _lines(path: Path) -> list[str]:

@@ -13,9 +13,9 @@ import pytest
 from ray.cluster_utils import Cluster
 
 from edge.policy.bundle import load_bundle
+from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
 from lpac.sim.cluster import over_ray
-from tests.conftest import SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
 
 PLAIN = ("-k", 2, "--duration", 2, "--baseline", "decentralized-cvt-prior")
@@ -40,7 +40,7 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     assert (lossy["loss"], lost["lost_robots"], lost["lost_at_s"]) == (0.3, 2, 1.0)
     for condition in told["conditions"]:
         names = [result["name"] for result in condition["results"]]
-        assert names == [SHIPPED.name, "decentralized-cvt-prior", "clairvoyant-cvt"]
+        assert names == [DEFAULT_BUNDLE.name, "decentralized-cvt-prior", "clairvoyant-cvt"]
     policy, prior, clairvoyant = plain["results"]
     assert 0.0 < clairvoyant["final"]["mean"][0] < policy["final"]["mean"][0] < 1.0
     assert clairvoyant["over_clairvoyant"]["ratio_of_means"] == [1.0, 1.0, 1.0]
@@ -57,7 +57,7 @@ def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     figures = [out / folder / name for folder in folders for name in names]
     for figure in (*figures, out / "conditions"):
         assert figure.with_suffix(".png").stat().st_size > 10_000
-    assert len(list((out / "worst" / SHIPPED.name).glob("*.png"))) == 2
+    assert len(list((out / "worst" / DEFAULT_BUNDLE.name).glob("*.png"))) == 2
 
 
 def test_killed_it_goes_on(evaluated: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
@@ -129,10 +129,10 @@ def test_whether_one_is_better(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
 def test_a_cluster_of_two_nodes_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
-    bundle_id = load_bundle(SHIPPED).id
+    bundle_id = load_bundle(DEFAULT_BUNDLE).id
     flights = [
         EvaluationFlight(
-            flier=flier, bundle=str(SHIPPED), flown_by=bundle_id, world_set="validation",
+            flier=flier, bundle=str(DEFAULT_BUNDLE), flown_by=bundle_id, world_set="validation",
             world=0, set_up="field", duration_s=1.0,
         )
         for flier in (POLICY, LLOYD)

@@ -15,7 +15,7 @@ from edge.core.schema import ConfigError, from_mapping
 from edge.flight.safety import (
     Closest,
     MotionLimits,
-    Separation,
+    SeparationLimits,
     approach_speed,
     brake,
     clear_height_m,
@@ -31,10 +31,10 @@ SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)
 LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
 FIELD_LIMITS = MotionLimits(1.25, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
-FIELD_SEPARATION = Separation(level_m=1.5, passing_m=6.5, passing_height_m=3.5)
+FIELD_SEPARATION = SeparationLimits(level_m=1.5, passing_m=6.5, passing_height_m=3.5)
 CONTROL_S, STEP_S = 0.1, 0.02
 AT_REST = np.zeros(3)
-LEVEL_2, LEVEL_3 = Separation(2.0, 6.5, 3.5), Separation(3.0, 6.5, 3.5)
+LEVEL_2, LEVEL_3 = SeparationLimits(2.0, 6.5, 3.5), SeparationLimits(3.0, 6.5, 3.5)
 
 
 def number(low: float, high: float) -> st.SearchStrategy[float]:
@@ -430,7 +430,7 @@ def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
     data: st.DataObject,
 ) -> None:
     limits, level_m = data.draw(motion_limits), data.draw(number(1.0, 4.0))
-    separation = Separation(level_m, 6.5, 3.5)
+    separation = SeparationLimits(level_m, 6.5, 3.5)
     fence = Fence(((-16.0, -12.0), (16.0, -12.0), (0.0, 24.0)), 1.0, 3.0, 25.0)
     corners = ((-11.0, -10.0), (11.0, -10.0), (0.0, 16.0), (0.0, 0.0))
     starts = data.draw(st.permutations(corners))[: data.draw(st.integers(2, 4))]
