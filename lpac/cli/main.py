@@ -67,6 +67,9 @@ class _Lpac(CommandList):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
+            # `python -m` dies of the signal, whatever is caught, if it came while a string was
+            # executed, as named tuples do when they are imported. The next string forgets that.
+            exec("")
             typer.echo("lpac: interrupted", err=True)
             raise typer.Exit(_INTERRUPTED) from None
         except ModuleNotFoundError as error:

@@ -3,10 +3,11 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import active_children, get_context, parent_process
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context, parent_process, resource_tracker
 from typing import Protocol, TypeVar
 
 Task = TypeVar("Task")
@@ -41,25 +42,53 @@ def over_processes(
     """
     workers = min(len(tasks), at_most)
     # A fork would inherit threads that do not run there.
-    with ProcessPoolExecutor(workers, get_context("spawn"), _end_with_parent) as pool:
-        try:
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _obey_parent)
+    try:
+        with _without_interrupts():
             given = [pool.submit(do, task) for task in tasks]
-            for done in as_completed(given):
-                yield done.result()
-        except BrokenProcessPool:
-            pool.shutdown()
-            raise ChildProcessError("a worker process was killed") from None
-        except BaseException:
-            # What nobody waits for ends now.
-            for worker in active_children():
-                worker.terminate()
-            raise
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        for done in as_completed(given):
+            yield done.result()
+    except BrokenProcessPool:
+        raise ChildProcessError("a worker process was killed") from None
+    except BaseException:
+        # What nobody waits for ends now.
+        for worker in active_children():
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
-def _end_with_parent() -> None:
-    """A worker would wait for ever for a parent that was killed."""
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Ctrl-C comes at the end, and to no process that begins here.
+
+    A worker that is interrupted, or loses its parent, while it begins prints a traceback.
+    """
+    # It unblocks the signal when it begins.
+    resource_tracker.ensure_running()
+    in_main = threading.current_thread() is threading.main_thread()
+    came: list[int] = []
+    # Another thread may take the signal that this one blocks; Python's handler would still run.
+    before = (
+        signal.signal(signal.SIGINT, lambda number, _: came.append(number)) if in_main else None
+    )
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        if in_main:
+            signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
+
+
+def _obey_parent() -> None:
+    """A worker ends when its parent says so, and with it; Ctrl-C is the parent's."""
+    # Not "ignored", which the programs that a worker starts would inherit.
+    signal.signal(signal.SIGINT, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = parent_process()
     assert parent is not None
 

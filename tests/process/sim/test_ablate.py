@@ -1,6 +1,7 @@
 """`lpac ablate` as a user types it. What comes of one is in tests/unit/ablate."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -46,7 +47,7 @@ def test_what_ends_it_is_one_line(tmp_path: Path) -> None:
             time.sleep(0.02)
         second = error_line(lpac("ablate", path, "--out", out))
         assert f"is in use by process {process.pid} on this machine" in second
-        process.send_signal(signal.SIGINT)
+        os.killpg(process.pid, signal.SIGINT)
         _, told = process.communicate()
     assert process.returncode == 130 and told.strip() == "lpac: interrupted"
 

@@ -1,6 +1,7 @@
 """`lpac evaluate` as a user types it: over cores, killed and gone on with, on a cluster."""
 
 import json
+import os
 import resource
 import signal
 import subprocess
@@ -88,7 +89,8 @@ def test_interrupted_it_is_one_line(tmp_path: Path) -> None:
         while not kept.exists():
             assert interrupted.poll() is None
             time.sleep(0.02)
-        interrupted.send_signal(signal.SIGINT)
+        # As a terminal does: its workers have it too.
+        os.killpg(interrupted.pid, signal.SIGINT)
         _, said = interrupted.communicate()
     assert interrupted.returncode == 130 and said.strip() == "lpac: interrupted"
 

@@ -75,7 +75,7 @@ def test_what_ends_it_is_one_line_and_loses_nothing(config: Path, tmp_path: Path
         os.killpg(process.pid, signal.SIGSTOP)
         second = lpac("train", config, "--out", out)
         assert f"is in use by process {process.pid} on this machine" in error_line(second)
-        process.send_signal(signal.SIGINT)
+        os.killpg(process.pid, signal.SIGINT)
         os.killpg(process.pid, signal.SIGCONT)
         _, told = process.communicate()
     assert process.returncode == 130 and told.strip() == "lpac: interrupted"
