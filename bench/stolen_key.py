@@ -163,7 +163,7 @@ class Thief:
                 position_m=place_m,
                 payload=self._payload if lies else message.payload,
             )
-            data += encode(said, self._policy.bundle_id, np.float16)
+            data += encode(said, self._policy.bundle_id, "float16")
         self._link.publish(MESSAGE, data)
 
 

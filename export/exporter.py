@@ -67,6 +67,7 @@ def bundle_of(
         perception=perception,
         training=trained.training,
         payload_limit=trained.messages.payload_limit,
+        payload_types=trained.messages.payload_types,
         provenance={
             **provenance,
             "exporter": f"lpac-edge {version('lpac-edge')}",

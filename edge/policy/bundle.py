@@ -17,6 +17,7 @@ from pathlib import Path
 
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
+from edge.core.wire import FLOAT_PAYLOADS, PayloadType
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
@@ -63,7 +64,8 @@ class Manifest:
     `perception` is None in one that no robot can fly. `provenance` says where the bundle came from,
     in names and hashes that its maker chose. `parameters` are the keys that only the family
     understands, as JSON has them. Robots take no payload with a number beyond `payload_limit`;
-    None: any that is finite.
+    None: any that is finite. `payload_types` are those that the policy was judged with, in closed
+    loop: robots send no other.
     """
 
     schema: int
@@ -74,6 +76,7 @@ class Manifest:
     files: dict[str, str]
     family: str = LPAC
     payload_limit: float | None = None
+    payload_types: tuple[PayloadType, ...] = FLOAT_PAYLOADS
     parameters: dict[str, object] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -106,6 +109,8 @@ def make_bundle(manifest: Manifest, files: Mapping[str, bytes]) -> Bundle:
         del mapping["family"]
     if manifest.payload_limit is None:
         del mapping["payload_limit"]
+    if manifest.payload_types == FLOAT_PAYLOADS:
+        del mapping["payload_types"]
     if manifest.perception and not manifest.perception.unseen_as_nan:
         del mapping["perception"]["unseen_as_nan"]
     if manifest.perception and not manifest.perception.shared_map_cell:

@@ -15,7 +15,7 @@ from edge.core.fence import Fence
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.wire import MAX_ROBOT_ID
+from edge.core.wire import MAX_ROBOT_ID, PayloadType
 from edge.flight.energy import EnergyParameters
 from edge.flight.failsafe import required
 from edge.flight.margins import ErrorBudget, Margin
@@ -24,7 +24,7 @@ from edge.flight.reach import Reach
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightParameters, RemoteControlLost, Robot
 from edge.messages.topics import is_loopback
-from edge.robot.pac import PacParameters, PayloadType
+from edge.robot.pac import PacParameters
 
 # What fleet.toml has too. Each raises ValueError, one line that says what is allowed.
 

@@ -9,7 +9,7 @@ import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,13 +23,12 @@ from edge.core.memory import RobotMemory
 from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource, Sensor
 from edge.core.shared_map import SharedMap
-from edge.core.wire import MAX_ROBOT_ID, Rejection, decode, encode
+from edge.core.wire import MAX_ROBOT_ID, PAYLOAD_TYPES, PayloadType, Rejection, decode, encode
 from edge.flight.safety import limit_speed
 from edge.policy.bundle import BundleError
 from edge.policy.family import Observation, Perceived, Policy
 
 Position = tuple[float, float, float]  # in the mission frame, m
-PayloadType = Literal["float16", "float32"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +50,10 @@ class PacParameters:
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"{name} = {value}: must be positive and finite")
-        if self.payload not in get_args(PayloadType):
-            raise ValueError(f"payload = {self.payload!r}: must be 'float16' or 'float32'")
+        if self.payload not in PAYLOAD_TYPES:
+            raise ValueError(
+                f"payload = {self.payload!r}: must be one of {', '.join(PAYLOAD_TYPES)}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -61,6 +61,12 @@ _M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 2**19
 def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, SensorOver, str]:
     """Policy, sensor and world, before anything that moves. Raises ValueError or OSError."""
     policy = load_verified_policy(Path(config.policy.bundle))
+    judged = policy.policy.manifest.payload_types
+    if config.policy.payload not in judged:
+        raise ConfigError(
+            f"policy: payload = {config.policy.payload!r}: {config.policy.bundle} was judged with "
+            f"{', '.join(judged)} alone (`lpac evaluate --payload`)"
+        )
     sensor = config.sensor
     sensor_over = parts.enter_context(
         open_sensor(sensor.type, sensor.options, policy.policy.manifest)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from edge.core.schema import ConfigError, from_mapping
-from edge.robot.pac import PayloadType
+from edge.core.wire import PayloadType
 from lpac.evaluate.worlds import SET_UPS
 from lpac.sim.ticks import Clocks
 from lpac.train.config import ReadConfig, TrainingConfig, config_of, read_toml, require_name

@@ -16,6 +16,7 @@ from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
 if TYPE_CHECKING:
     from rich.text import Text
 
+    from edge.core.wire import PayloadType
     from lpac.evaluate.evaluation import Condition, Evaluation, Method, MethodResult
     from lpac.evaluate.flights import EvaluationFlight, FlownCost, KeptFlights
     from lpac.sim.cores import Pool
@@ -76,6 +77,15 @@ def evaluate(
             help="Also with robots that are wrong about where they are: standard deviation, m.",
         ),
     ] = None,
+    payloads: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--payload",
+            metavar="TYPE",
+            help="Also with messages that carry float32 or int8 instead of float16, and with each "
+            "--loss so.",
+        ),
+    ] = None,
     whole: Annotated[
         bool,
         typer.Option(
@@ -109,11 +119,17 @@ def evaluate(
     if compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
     lost_robots = [LostRobots.parse(text) for text in lost or []]
-    changes: list[dict[str, Any]] = [
-        *({"loss": loss} for loss in losses or []),
+    lossy: list[dict[str, Any]] = [{"loss": loss} for loss in losses or []]
+    changes = [
+        *lossy,
         *({"lost": robots} for robots in lost_robots),
         *({"lag_s": lag_s} for lag_s in lags or []),
         *({"position_error_m": error_m} for error_m in position_errors or []),
+        *(
+            {"payload": payload, **loss}
+            for payload in _payload_types(payloads or [])
+            for loss in ({}, *lossy)
+        ),
         *({"robot": robot} for robot in ("point-from-pad", "whole") if whole),
     ]
     evaluation = _evaluation(
@@ -131,6 +147,15 @@ def evaluate(
         return
     _show(told, compared=compare)
     typer.echo(f"\nsee {out}: evaluation.json, figures, and the worst worlds")
+
+
+def _payload_types(given: Sequence[str]) -> list["PayloadType"]:
+    from edge.core.wire import PAYLOAD_TYPES
+
+    for name in given:
+        if name not in PAYLOAD_TYPES:
+            raise ValueError(f"--payload {name}: must be one of {', '.join(PAYLOAD_TYPES)}")
+    return [known for known in PAYLOAD_TYPES if known in given]
 
 
 def _evaluation(

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from edge.core import F64, Bools
+from edge.core.wire import PayloadType
 from lpac.analysis.statistics import (
     Verdict,
     at_most_share,
@@ -78,6 +79,7 @@ class Condition(NamedTuple):
     lag_s: float = 0.0
     position_error_m: float = 0.0
     robot: RobotModel = "point"
+    payload: PayloadType = "float16"
 
     @property
     def name(self) -> str:
@@ -92,6 +94,8 @@ class Condition(NamedTuple):
             words.append(f"lag {self.lag_s:g} s")
         if self.position_error_m:
             words.append(f"positions off by {self.position_error_m:g} m")
+        if self.payload != "float16":
+            words.append(f"payloads in {self.payload}")
         if self.robot != "point":
             words.append("from pads")
         if self.robot == "whole":
@@ -169,6 +173,7 @@ class Evaluation:
                 lag_s=condition.lag_s,
                 position_error_m=condition.position_error_m,
                 robot=condition.robot if method.trained else _AS_POINT[condition.robot],
+                payload=condition.payload if method.trained else "float16",
             )
 
 
@@ -276,6 +281,7 @@ def as_json(
                 "name": condition.name,
                 "set_up": condition.set_up,
                 "loss": condition.loss,
+                "payload": condition.payload,
                 "lost_robots": condition.lost.robots,
                 "lost_at_s": condition.lost.at_s,
                 "lag_s": condition.lag_s,

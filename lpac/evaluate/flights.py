@@ -13,8 +13,8 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 import edge
+from edge.core.wire import PayloadType
 from edge.policy.bundle import Bundle, BundleError, load_bundle
-from edge.robot.pac import PayloadType
 from lpac import analysis, evaluate, sim
 from lpac.analysis.coverage import Coverage
 from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world

@@ -10,11 +10,11 @@ import numpy as np
 from edge.core import F32, F64
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
-from edge.core.wire import MAX_ROBOT_ID
+from edge.core.wire import MAX_ROBOT_ID, PayloadType
 from edge.core.world import Feature, random_features, rasterize
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle, BundleError
-from edge.robot.pac import PacParameters, PayloadType
+from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline

@@ -31,6 +31,7 @@ class ModelCard:
     judged: Sequence[JudgedCandidate]
     losses: Sequence[EpochLoss]
     baselines: Mapping[BaselineName, ClosedLoopCost]
+    int8: ClosedLoopCost
     shards: Mapping[str, Mapping[str, Any]]
     fit_hours: float
     select_hours: float
@@ -128,6 +129,7 @@ def _text(card: ModelCard) -> str:
         "exploring-cvt": "ExploringCVT, which knows what all robots together have seen",
     }[data.expert]
     rows = [f"| **{name}** | {_row(best.cost)} |"]
+    rows += [f"| {name}, with int8 payloads | {_row(card.int8)} |"]
     rows += [f"| {each} | {_row(cost)} |" for each, cost in card.baselines.items()]
     trained = ", ".join(
         f"{_least_most(worlds.robots)} robots in {_least_most(worlds.world_size)} units, range "

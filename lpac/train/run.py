@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from edge.core.schema import ConfigError
+from edge.core.wire import FLOAT_PAYLOADS, PAYLOAD_TYPES
 from edge.policy.bundle import Bundle, load_bundle, write_bundle
 from export.parameters import PolicyMessages
 from lpac.sim.cores import Pool
@@ -37,6 +38,8 @@ _CONFIG, _CHECKPOINT, _BUNDLE = "config.toml", "checkpoint.pt", "bundle"
 # The payload limit is so many times the largest number in a payload of this many flights.
 _PAYLOAD_MARGIN = 10.0
 _PAYLOAD_FLIGHTS = 16
+# With int8 payloads robots may fly if that costs no more than this.
+_MOST_WORSE = 1.01
 
 
 def require_same_run(read: ReadConfig, folder: Path) -> None:
@@ -159,16 +162,14 @@ class TrainingRun:
         checkpoint = self._network.checkpoint(self._fit.weights)
         folder = self._of(candidate)
         write_atomically(folder / _CHECKPOINT, checkpoint)
-        write_bundle(self._bundle(candidate, checkpoint, None), folder / _BUNDLE)
+        write_bundle(self._bundle(candidate, checkpoint, PolicyMessages()), folder / _BUNDLE)
 
-    def _bundle(
-        self, candidate: Candidate, checkpoint: bytes, payload_limit: float | None
-    ) -> Bundle:
+    def _bundle(self, candidate: Candidate, checkpoint: bytes, messages: PolicyMessages) -> Bundle:
         provenance = {
             "training": f"lpac train, configuration {self._digest}, seed {self._config.seed}",
             "candidate": f"round {candidate.round}, epoch {candidate.epoch}",
         }
-        parameters = replace(self._config.parameters, messages=PolicyMessages(payload_limit))
+        parameters = replace(self._config.parameters, messages=messages)
         return self._network.bundle(checkpoint, parameters, self._config.export.name, provenance)
 
     def _judge(self, candidate: Candidate, pool: Pool) -> None:
@@ -198,7 +199,12 @@ class TrainingRun:
         baselines = self._selection.baselines(folder / _BUNDLE, judged, pool)
         checkpoint = (folder / _CHECKPOINT).read_bytes()
         limit = _PAYLOAD_MARGIN * self._largest_payload(judged, pool)
-        bundle = self._bundle(best.candidate, checkpoint, limit if limit > 0.0 else None)
+        int8 = self._selection.with_payload("int8", folder / _BUNDLE, judged, pool)
+        worse = int8.mean > _MOST_WORSE * best.cost.mean
+        messages = PolicyMessages(
+            limit if limit > 0.0 else None, FLOAT_PAYLOADS if worse else PAYLOAD_TYPES
+        )
+        bundle = self._bundle(best.candidate, checkpoint, messages)
         write_atomically(self._folder / f"{name}.pt", checkpoint)
         write_bundle(bundle, self._folder / name)
         card = ModelCard(
@@ -209,6 +215,7 @@ class TrainingRun:
             judged=self._selection.judged,
             losses=self._fit.losses,
             baselines=baselines,
+            int8=int8,
             shards=self._shards.facts,
             fit_hours=self._fit.seconds / 3600.0,
             select_hours=self._selection.seconds / 3600.0,

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
+from edge.core.wire import PayloadType
 from edge.policy.bundle import Bundle
 from lpac.evaluate.flights import POLICY, EvaluationFlight, Flier, KeptFlights, sizes_of
 from lpac.sim.baselines import BaselineName
@@ -63,7 +64,11 @@ def candidates_of(round_: int, epochs: int, every: int) -> list[Candidate]:
 
 
 def flights_of(
-    select: SelectConfig, flier: Flier, bundle: Path, flown_by: str
+    select: SelectConfig,
+    flier: Flier,
+    bundle: Path,
+    flown_by: str,
+    payload: PayloadType = "float16",
 ) -> list[EvaluationFlight]:
     """The flights by which one is judged: over validation worlds. Baselines lose no messages."""
     return [
@@ -76,6 +81,7 @@ def flights_of(
             set_up=set_up,
             duration_s=select.duration_s,
             loss=select.loss if flier == POLICY else 0.0,
+            payload=payload,
         )
         for set_up in select.set_ups
         for world in range(select.worlds)
@@ -143,6 +149,13 @@ class Selection:
         ]
         costs = self._fly(flights, pool, lambda _: None).reshape(len(names), -1)
         return {name: ClosedLoopCost.of(of) for name, of in zip(names, costs, strict=True)}
+
+    def with_payload(
+        self, payload: PayloadType, path: Path, bundle: Bundle, pool: Pool
+    ) -> ClosedLoopCost:
+        """The same flights, with messages that are encoded so."""
+        flights = flights_of(self._select, POLICY, path, bundle.id, payload)
+        return ClosedLoopCost.of(self._fly(flights, pool, lambda _: None))
 
     def _fly(self, flights: list[EvaluationFlight], pool: Pool, tell: Callable[[int], None]) -> F64:
         """The cost of each at the end, over that at the start."""

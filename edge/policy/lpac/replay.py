@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core.aggregation import AggregatedMessage, HopBuffer
-from edge.core.wire import Rejection, decode, encode
+from edge.core.wire import Rejection, decode, encode, payload_type_of
 from edge.policy.bundle import BundleError
 from edge.policy.lpac.policy import LpacPolicy
 
@@ -54,7 +54,7 @@ def replay(
     `messages` are (topic, Unix time in s, message), of which `perception` (features and inputs of a
     `Perceived`) and `policy` (the fields of a `PolicyTick`) count. Every tick stands for itself, so
     that gaps do no harm. Of the message it is the payload that is compared, as it was sent: in
-    float16 if that was its type.
+    float16 or int8 if that was its type.
 
     Raises ReplayError that names the tick if one is not of this policy, and BundleError if no robot
     can fly it.
@@ -105,7 +105,7 @@ def _infer(
     hops.diffuse(payloads, degree)
     [velocity] = policy.velocity(features[None], hops)
     now = dataclasses.replace(sent, payload=hops.message(degree))
-    again = _decoded(policy, encode(now, policy.bundle_id, sent.payload.dtype))
+    again = _decoded(policy, encode(now, policy.bundle_id, payload_type_of(message["message"])))
     return (logged, velocity), (sent.payload, again.payload)
 
 

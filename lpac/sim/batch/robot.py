@@ -20,10 +20,10 @@ from edge.core.mailbox import Mailbox, Neighbour
 from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource
 from edge.core.shared_map import SharedMap
-from edge.core.wire import rounded
+from edge.core.wire import PayloadType, rounded
 from edge.flight.safety import limit_speed
 from edge.policy.family import Observation
-from edge.robot.pac import PacParameters, PayloadType
+from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, Inputs
 from lpac.sim.batch.seen import SeenMap, ShownWorld
 
@@ -122,9 +122,10 @@ class DeferredSteps:
             [[other.payload for other in step.heeded] for step in steps],
             [step.degree for step in steps],
         )
-        # float32 arrives as it is.
-        halves = [step.robot.payload == "float16" for step in steps]
-        received = np.where(np.array(halves)[:, None], rounded(payloads, "float16"), payloads)
+        received = np.empty_like(payloads)
+        types = np.array([step.robot.payload for step in steps])
+        for payload_type in set(types.tolist()):
+            received[types == payload_type] = rounded(payloads[types == payload_type], payload_type)
         largest = np.abs(received).max(axis=1, initial=0.0)
         if not (np.isfinite(velocities).all() and (largest <= self._payload_limit).all()):
             raise PolicyFailedError(

@@ -110,6 +110,7 @@ def test_check_refuses_two_vehicles_on_one_link(tmp_path: Path) -> None:
     ("changes", "error"),
     [
         ({"policy": {"bundle": "nothing"}}, "nothing"),
+        ({"policy": {"payload": "int8"}}, "was judged with float32, float16 alone"),
         ({"policy": {"world": "nothing.env"}}, "nothing.env"),
         ({"policy": {"world": "broken.env"}}, "broken.env: record 1 (CircularBND)"),
         ({"flight": {"slot": 99}}, "slot = 99 flies at 450.5 m"),

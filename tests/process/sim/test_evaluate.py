@@ -24,10 +24,11 @@ PLAIN = ("-k", 2, "--duration", 2, "--baseline", "decentralized-cvt-prior")
 
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """The shipped policy over two worlds, under three conditions."""
+    """The shipped policy over two worlds, under five conditions."""
     out = tmp_path_factory.mktemp("evaluated")
     result = lpac(
-        "evaluate", *PLAIN, "--loss", 0.3, "--lost", "2@1", "--out", out, "--json"
+        "evaluate", *PLAIN, "--loss", 0.3, "--lost", "2@1", "--payload", "int8", "--out", out,
+        "--json"
     )  # fmt: skip
     assert result.returncode == 0, (result.stdout, result.stderr)
     return out, json.loads(result.stdout)
@@ -37,7 +38,7 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     out, told = evaluated
     assert json.loads((out / "evaluation.json").read_text()) == told
     assert told["world_set"] == "validation" and told["test_set_opened"] is None
-    plain, lossy, lost = told["conditions"]
+    plain, lossy, lost, int8, int8_lossy = told["conditions"]
     assert (lossy["loss"], lost["lost_robots"], lost["lost_at_s"]) == (0.3, 2, 1.0)
     for condition in told["conditions"]:
         names = [result["name"] for result in condition["results"]]
@@ -46,6 +47,10 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     assert 0.0 < clairvoyant["final"]["mean"][0] < policy["final"]["mean"][0] < 1.0
     assert clairvoyant["over_clairvoyant"]["ratio_of_means"] == [1.0, 1.0, 1.0]
     assert all(ratio > 1.0 for [ratio] in zip(*policy["by_world"]["over_best_of_ten"], strict=True))
+    payloads = [(condition["payload"], condition["loss"]) for condition in (int8, int8_lossy)]
+    assert payloads == [("int8", 0.0), ("int8", 0.3)]
+    coarse = int8["results"][0]["final"]["mean"][0]
+    assert 0.0 < abs(coarse - policy["final"]["mean"][0]) < 0.05 and int8["results"][1] == prior
     # A baseline says nothing that could be lost.
     assert lossy["results"][1] == prior and lossy["results"][0] != policy
     assert lost["results"][0]["final"]["mean"][0] > policy["final"]["mean"][0]
@@ -146,6 +151,7 @@ def test_a_cluster_of_two_nodes_flies_the_same(cluster: Cluster, tmp_path: Path)
 def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
     """Others are in tests/unit/cli."""
     for arguments, text in (
+        (("--payload", "int4"), "--payload int4: must be one of float32, float16, int8"),
         (("--set", "tests"), "--set tests: must be one of training, validation, test"),
         (("--ray", "127.0.0.1:1"), "no Ray cluster at 127.0.0.1:1"),
     ):

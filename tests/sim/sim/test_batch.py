@@ -17,6 +17,7 @@ from edge.core.frames import ModelScale
 from edge.core.memory import RobotMemory
 from edge.core.perception import PerceptionParameters
 from edge.core.shared_map import SharedMap
+from edge.core.wire import PAYLOAD_TYPES
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Bundle
 from edge.policy.family import Perceived
@@ -78,7 +79,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         delay_s=draw(st.sampled_from([0.0, 0.1, 0.7])),
         max_message_age_s=draw(st.sampled_from([0.0, 0.5, 0.8, 2.0])),
         max_input_age_s=draw(st.sampled_from([0.05, 1.0])),
-        payload=draw(st.sampled_from(["float16", "float32"])),
+        payload=draw(st.sampled_from(PAYLOAD_TYPES)),
         random_feature_sigma=(20.0, 80.0),
         world_size=world_size,
         communication_range=draw(st.floats(50.0, 400.0)),

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import numpy_helper
 
+from edge.core.wire import FLOAT_PAYLOADS, PAYLOAD_TYPES
 from edge.policy.bundle import (
     BUNDLE_ID,
     MANIFEST,
@@ -192,6 +193,7 @@ def resealed(bundle: Bundle, folder: Path, change: dict[str, object]) -> Path:
         ({"images": None}, "images and perception: both or neither"),
         ({"training": {"max_speed": -5.0, "time_step": 0.2}}, "max_speed = -5.0: must be positive"),
         ({"files": {}}, "action.onnx does not belong to the bundle"),
+        ({"payload_types": ["int4"]}, "payload_types[0] = 'int4': allowed are 'float32'"),
         ({"opset": 20.5}, "opset = 20.5: expected int"),
         ({"family": "other"}, "is of the family 'other', not 'lpac'"),
     ],
@@ -252,6 +254,16 @@ def test_writing_never_destroys_something_else(shipped_bundle: Bundle, tmp_path:
             write_bundle(shipped_bundle, path)
     assert (home / "thesis.tex").read_text() == "years of work"
     assert (tmp_path / "photos.zip").read_bytes() == b"PK"
+
+
+def test_how_payloads_may_be_encoded_is_written_where_it_is_not_as_ever(
+    shipped_bundle: Bundle,
+) -> None:
+    assert shipped_bundle.manifest.payload_types == FLOAT_PAYLOADS
+    assert b"payload_types" not in shipped_bundle.files["manifest.json"]
+    more = dataclasses.replace(shipped_bundle.manifest, payload_types=PAYLOAD_TYPES)
+    sealed = make_bundle(more, with_files(shipped_bundle))
+    assert sealed.manifest.payload_types == PAYLOAD_TYPES
 
 
 def test_a_bundle_without_perception_says_so(shipped_bundle: Bundle) -> None:

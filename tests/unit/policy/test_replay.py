@@ -10,11 +10,12 @@ import pytest
 from edge.core import F64
 from edge.core.frames import ModelScale
 from edge.core.ports import Odometry
+from edge.core.wire import PAYLOAD_TYPES, PayloadType
 from edge.policy.bundle import Bundle, BundleError
 from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import ReplayError, replay
-from edge.robot.pac import Pac, PacParameters, PayloadType
+from edge.robot.pac import Pac, PacParameters
 
 Messages = list[tuple[str, float, dict[str, Any]]]
 
@@ -68,7 +69,7 @@ def fly(policy: LpacPolicy, payload: PayloadType = "float16", ticks: int = 6) ->
     return messages
 
 
-@pytest.mark.parametrize("payload", ["float16", "float32"])
+@pytest.mark.parametrize("payload", PAYLOAD_TYPES)
 def test_the_same_machine_computes_the_same(
     shipped_policy: LpacPolicy, payload: PayloadType
 ) -> None:
@@ -146,7 +147,7 @@ def test_a_logged_nan_is_a_difference(shipped_policy: LpacPolicy) -> None:
         ("perception", lambda m: m.update(features=None), "features: is NoneType; .* needs"),
         ("policy", lambda m: m.update(degree=1), "degree = 1: is less than its 2 payloads"),
         ("policy", lambda m: m.update(payloads=[np.zeros(3)]), r"payloads: is \(3,\)"),
-        ("policy", lambda m: m.update(message=m["message"][:-1]), "refused: truncated"),
+        ("policy", lambda m: m.update(message=m["message"][:-1]), "refused: checksum"),
         ("policy", lambda m: m.update(message=b""), "refused: truncated"),
     ],
 )

@@ -117,7 +117,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
         ("# [rates]", "[rates]\npolicy_hz = inf", ["rates: policy_hz = inf", "0.1 to 100"]),
         ("# [log]", "[log]\nmax_total_mb = 5", ["log: max_total_mb = 5", "50 or more"]),
         ("# [log]", "[[log]]", ["log", "expected a table"]),
-        ("# payload", 'payload = "int8" #', ["policy: payload = 'int8'", "'float16', 'float32'"]),
+        ("# payload", 'payload = "int4" #', ["policy: payload = 'int4'", "'float16', 'int8'"]),
         ("# env_scale = 16.0", "env_scale = 0.0", ["policy: env_scale = 0.0"]),
         ("# max_message_age_s = 0.8", "max_message_age_s = -1.0", ["max_message_age_s = -1.0"]),
         ("# max_input_age_s = 1.0", "max_input_age_s = 0.0", ["max_input_age_s = 0.0"]),

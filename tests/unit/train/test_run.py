@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from edge.core.schema import ConfigError
+from edge.core.wire import FLOAT_PAYLOADS
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import load_bundle
 from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
@@ -47,6 +48,7 @@ def test_what_comes_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
     assert bundle.id == told["bundle_id"]
     assert all(check.passed for check in load_policy(bundle).verify())
     assert bundle.manifest.payload_limit is not None and bundle.manifest.payload_limit > 0.0
+    assert set(FLOAT_PAYLOADS) <= set(bundle.manifest.payload_types)
     assert told["states"] == 12  # 2 + 2 flights, 3 of each
     assert [(one["round"], one["epoch"]) for one in told["candidates"]] == [(0, 1), (0, 2), (1, 1)]
     assert told["selected"] == min(told["candidates"], key=lambda one: one["mean"])
@@ -63,8 +65,8 @@ def test_its_candidates_flew_over_validation_worlds_only(
         json.loads(line)["flight"]
         for line in (trained[0] / "flights.jsonl").read_text().splitlines()[1:]
     ]
-    # Three candidates and three baselines over two worlds.
-    assert len(flown) == 12 and all(": validation " in flight for flight in flown)
+    # Three candidates, the best of them with int8 payloads, and three baselines, over two worlds.
+    assert len(flown) == 14 and all(": validation " in flight for flight in flown)
 
 
 def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
