@@ -13,7 +13,8 @@ connected and yet deaf to each other.
 With TLS both sides show a certificate of the fleet's authority, and what a peer says is taken by
 its certificate's common name: `robot-<id>` below its own key, `operator` below the ground's,
 `observer` there a state only. Names of hosts are not looked at, since robots have none. A router
-passes on what others say, so that behind one only the signatures of the messages tell who they are.
+passes on what others say: it looks at who says what instead, so that behind it only the signatures
+of the messages tell who they are.
 """
 
 import atexit
@@ -24,7 +25,8 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from threading import Lock, Thread
+from functools import partial
+from threading import Event, Lock, Thread
 from typing import Literal, Self
 
 import zenoh
@@ -55,6 +57,9 @@ _MOST_TOKENS = 1000
 # As many as PX4's system ids, of which every vehicle has one of its own.
 MAX_CERTIFIED_ID = 255
 _CLOSE_TIMEOUT_S = 1.0
+# A client looks for its router so often, and waits so long for an answer.
+_ENTER_AGAIN_S = 0.3
+_ENTER_TIMEOUT_S = 1.0
 _CLOSE_AT_EXIT_S = 1.5
 
 # zenoh closes TCP sockets with a linger time of 10 s, which holds the closing thread for as long if
@@ -66,7 +71,7 @@ _RUNTIME = "(net: (handover: rx), rx: (worker_threads: 16))"
 _ADVICE = {
     "Address already in use": "another program has this port; does this robot's already run?",
     "Cannot assign requested address": "this machine has no such address",
-    "Unable to connect": "no router answers there; start it, or set mode = 'peer'",
+    "Unable to connect": "no router answers there; start it (`lpac fleet router`)",
 }
 
 
@@ -111,8 +116,8 @@ class ZenohLink:
         """Open the session.
 
         `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all of them
-        `tls/<host>:<port>`; without `listen` a peer takes a free port. A peer opens even if nobody
-        answers, and connects later; a client needs its router. `scouting` finds others by
+        `tls/<host>:<port>`; without `listen` a peer takes a free port. It opens even if nobody
+        answers, a client even without its router, and connects later. `scouting` finds others by
         multicast.
 
         `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
@@ -120,23 +125,31 @@ class ZenohLink:
         among it, nor what is larger than its topic's limit. A callback must only store: a slow one
         holds up the link.
 
-        Raises LinkError if a setting is wrong, a port is taken or a client finds no router.
+        Raises LinkError if a setting is wrong, or a port is taken.
         """
         _check(fleet, robot_id, mode, listen, connect, scouting, tls)
+        own: Sender = "ground" if robot_id is None else "robot"
         self._prefix = f"lpac/{fleet}/"
-        self._own_prefix = self._prefix + ("ground/" if robot_id is None else f"robot/{robot_id}/")
+        self._own_prefix = self._prefix + (f"{own}/" if robot_id is None else f"{own}/{robot_id}/")
         self._robot_id = robot_id
         self._lock = Lock()
         self._tokens: set[tuple[int, str]] = set()
         self._failures: Counter[str] = Counter()
         self._admission = Admission()
         self._session_id = _session_id(robot_id)
-        self._session = _open(self._config(mode, listen, connect, scouting, tls))
-        try:
-            self._publishers = self._declare(subscriptions or {})
-        except BaseException:
-            self.close()
-            raise
+        self._own_topics = [topic for topic in TOPICS if topic.sender == own]
+        self._closed = Event()
+        self._entering: Thread | None = None
+        self._session: zenoh.Session | None = None
+        self._publishers: dict[Topic, zenoh.Publisher] = {}
+        config = _config(self._prefix, self._session_id, mode, listen, connect, scouting, tls)
+        enter = partial(self._enter, config, subscriptions or {})
+        if mode == "client":
+            # zenoh opens no client without its router, which may come, or come back, in flight.
+            self._entering = Thread(target=self._enter_in_time, args=(enter,), daemon=True)
+            self._entering.start()
+        else:
+            enter()
 
     def __enter__(self) -> Self:
         return self
@@ -147,10 +160,16 @@ class ZenohLink:
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send on a topic of robots, or of the ground, as this session is one or the other.
 
-        Dropped when the link is congested or closed. Raises KeyError for a topic of the others.
+        Dropped when the link is congested, closed, or without its router. Raises KeyError for a
+        topic of the others.
         """
+        if topic not in self._own_topics:
+            raise KeyError(topic.name)
+        publisher = self._publishers.get(topic)
+        if publisher is None:
+            return
         try:
-            self._publishers[topic].put(data)
+            publisher.put(data)
         except zenoh.ZError as error:
             self._failed(f"publish {topic.name}", error)
 
@@ -173,8 +192,11 @@ class ZenohLink:
 
     def peers(self) -> int:
         """The number of zenoh peers and routers connected to this session."""
+        session = self._session
+        if session is None:
+            return 0
         try:
-            return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
+            return len(session.info.peers_zid()) + len(session.info.routers_zid())
         except zenoh.ZError:  # closed
             return 0
 
@@ -189,6 +211,7 @@ class ZenohLink:
 
     def close(self) -> None:
         """Leave the radio, within a second or so; again is no error."""
+        self._closed.set()
         # A connection whose other end is out of reach holds it, too.
         closing = Thread(target=self._close_session, daemon=True)
         closing.start()
@@ -198,105 +221,45 @@ class ZenohLink:
             atexit.register(closing.join, _CLOSE_AT_EXIT_S)
 
     def _close_session(self) -> None:
+        if self._entering is not None:
+            self._entering.join()
+        if self._session is None:
+            return
         try:
             self._session.close()  # type: ignore[no-untyped-call]
         except zenoh.ZError as error:
             self._failed("close", error)
 
-    def _config(
-        self,
-        mode: str,
-        listen: Sequence[str],
-        connect: Sequence[str],
-        scouting: bool,
-        tls: TlsFiles | None,
-    ) -> zenoh.Config:
-        # Of two robots that find each other by scouting or gossip, the one of the greater id
-        # connects: the same side as the configured endpoints make it.
-        once = {"autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
-        retry = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
-        if mode == "peer":
-            # Who calls nobody elsewhere need not be called from there.
-            host = "127.0.0.1" if connect and all(map(is_loopback, connect)) else "0.0.0.0"
-            listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
-        config = zenoh.Config()
-        for key, value in {
-            **({} if tls is None else self._tls(mode, tls)),
-            "id": self._session_id,
-            "mode": mode,
-            "listen/endpoints": list(listen),
-            "connect/endpoints": list(connect),
-            "connect/retry": retry,
-            "scouting/delay": 0,
-            "scouting/multicast": {"enabled": scouting, **once},
-            "scouting/gossip": once,
-            # How soon a lost neighbour is noticed, ms; and how many signs of life that is. Whoever
-            # speaks more often, as robots do in flight, sends none besides: with a sign each
-            # quarter of a second, ten robots' took a quarter of a channel's time.
-            "transport/link/tx/lease": 1500,
-            "transport/link/tx/keep_alive": 3,
-            "transport/link/tx/queue/size/background": _PATIENT_BATCHES,
-            # An attempt that a lost packet holds up is given up soon, and made again.
-            "transport/unicast/open_timeout": 2000,
-            "transport/unicast/accept_timeout": 2000,
-            # What is larger is never held in memory, and what is larger than its topic allows not
-            # handed on.
-            "transport/link/rx/max_message_size": _MOST_BYTES,
-            "low_pass_filter": [
-                {
-                    "flows": ["ingress"],
-                    "messages": ["put"],
-                    "key_exprs": [self._prefix + topic.pattern],
-                    "size_limit": topic.limit_bytes,
-                }
-                for topic in TOPICS
-            ],
-            # A state of its own for each connection, and before anything reaches this program.
-            "downsampling": [
-                {
-                    "flows": ["ingress"],
-                    "messages": ["put"],
-                    "rules": [
-                        {"key_expr": self._prefix + topic.pattern, "freq": topic.most_of_one_hz}
-                        for topic in TOPICS
-                        if topic.most_of_one_hz is not None
-                    ],
-                }
-            ],
-            # 200 MB among ten robots, for no gain.
-            "transport/shared_memory/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
-        return config
+    def _enter(self, config: zenoh.Config, subscriptions: Mapping[Topic, ReceiveCallback]) -> None:
+        """Raises LinkError."""
+        session = _open(config)
+        try:
+            self._publishers = self._declare(session, subscriptions)
+        except BaseException:
+            session.close()  # type: ignore[no-untyped-call]
+            raise
+        self._session = session
 
-    def _tls(self, mode: str, tls: TlsFiles) -> dict[str, object]:
-        """Only members get in, and say only what is theirs."""
-        settings: dict[str, object] = {
-            "transport/link/protocols": ["tls"],
-            "transport/link/tls": {
-                "root_ca_certificate": tls.authority,
-                "enable_mtls": True,
-                "verify_name_on_connect": False,
-                "listen_private_key": tls.key,
-                "listen_certificate": tls.certificate,
-                "connect_private_key": tls.key,
-                "connect_certificate": tls.certificate,
-            },
-        }
-        if mode == "peer":
-            settings["access_control"] = _access_control(self._prefix)
-        return settings
+    def _enter_in_time(self, enter: Callable[[], None]) -> None:
+        """Once the router answers, or never."""
+        while not self._closed.is_set():
+            try:
+                enter()
+                break
+            except (LinkError, zenoh.ZError) as error:
+                self._failed("enter", error)
+            self._closed.wait(_ENTER_AGAIN_S)
 
     def _declare(
-        self, subscriptions: Mapping[Topic, ReceiveCallback]
+        self, session: zenoh.Session, subscriptions: Mapping[Topic, ReceiveCallback]
     ) -> dict[Topic, zenoh.Publisher]:
         for topic, callback in subscriptions.items():
-            self._session.declare_subscriber(
+            session.declare_subscriber(
                 self._prefix + topic.pattern,
                 zenoh.handlers.Callback(self._guarded(topic, callback), indirect=False),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
-        liveliness = self._session.liveliness()
+        liveliness = session.liveliness()
         liveliness.declare_subscriber(
             self._prefix + "robot/*/alive/*",
             zenoh.handlers.Callback(self._on_token, indirect=False),
@@ -305,9 +268,8 @@ class ZenohLink:
         if self._robot_id is not None:
             # Kept, since a token that nothing refers to is withdrawn.
             self._token = liveliness.declare_token(f"{self._own_prefix}alive/{self._session_id}")
-        own: Sender = "ground" if self._robot_id is None else "robot"
         return {
-            topic: self._session.declare_publisher(
+            topic: session.declare_publisher(
                 self._own_prefix + topic.name,
                 # The newest counts, at once: nothing queues up.
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -319,8 +281,7 @@ class ZenohLink:
                 ),
                 reliability=zenoh.Reliability.RELIABLE,
             )
-            for topic in TOPICS
-            if topic.sender == own
+            for topic in self._own_topics
         }
 
     def _guarded(self, topic: Topic, callback: ReceiveCallback) -> Callable[[zenoh.Sample], None]:
@@ -359,6 +320,124 @@ class ZenohLink:
         """The robot ids that other sessions claim."""
         with self._lock:
             return frozenset(id_ for id_, session in self._tokens if session != self._session_id)
+
+
+class ZenohRouter:
+    """What clients meet at: it passes on what they say, and says nothing itself.
+
+    Close it, or use it as a context manager.
+    """
+
+    def __init__(self, *, fleet: str, listen: Sequence[str], tls: TlsFiles | None = None) -> None:
+        """`listen` are endpoints, as `ZenohLink` has them; with `tls` members alone are let in.
+
+        Raises LinkError if a setting is wrong, or a port is taken.
+        """
+        _check(fleet, None, "router", listen, (), False, tls)
+        config = _config(f"lpac/{fleet}/", _session_id(None), "router", listen, (), False, tls)
+        self._session = _open(config)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """All clients are alone then, and look for it; again is no error."""
+        if not self._session.is_closed():
+            self._session.close()  # type: ignore[no-untyped-call]
+
+
+def _config(
+    prefix: str,
+    session_id: str,
+    mode: Literal["peer", "client", "router"],
+    listen: Sequence[str],
+    connect: Sequence[str],
+    scouting: bool,
+    tls: TlsFiles | None,
+) -> zenoh.Config:
+    # Of two robots that find each other by scouting or gossip, the one of the greater id
+    # connects: the same side as the configured endpoints make it.
+    once = {"autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
+    retry = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
+    if mode == "peer":
+        # Who calls nobody elsewhere need not be called from there.
+        host = "127.0.0.1" if connect and all(map(is_loopback, connect)) else "0.0.0.0"
+        listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
+    config = zenoh.Config()
+    for key, value in {
+        **({} if tls is None else _tls(prefix, mode, tls)),
+        "id": session_id,
+        "mode": mode,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "connect/retry": retry,
+        **({"connect/timeout_ms": round(1000 * _ENTER_TIMEOUT_S)} if mode == "client" else {}),
+        "scouting/delay": 0,
+        "scouting/multicast": {"enabled": scouting, **once},
+        "scouting/gossip": once,
+        # How soon a lost neighbour is noticed, ms; and how many signs of life that is. Whoever
+        # speaks more often, as robots do in flight, sends none besides: with a sign each
+        # quarter of a second, ten robots' took a quarter of a channel's time.
+        "transport/link/tx/lease": 1500,
+        "transport/link/tx/keep_alive": 3,
+        "transport/link/tx/queue/size/background": _PATIENT_BATCHES,
+        # An attempt that a lost packet holds up is given up soon, and made again.
+        "transport/unicast/open_timeout": 2000,
+        "transport/unicast/accept_timeout": 2000,
+        # What is larger is never held in memory, and what is larger than its topic allows not
+        # handed on.
+        "transport/link/rx/max_message_size": _MOST_BYTES,
+        "low_pass_filter": [
+            {
+                "flows": ["ingress"],
+                "messages": ["put"],
+                "key_exprs": [prefix + topic.pattern],
+                "size_limit": topic.limit_bytes,
+            }
+            for topic in TOPICS
+        ],
+        # A state of its own for each connection, and before anything reaches this program. All that
+        # a client hears is of one connection: there the router has looked.
+        "downsampling": []
+        if mode == "client"
+        else [
+            {
+                "flows": ["ingress"],
+                "messages": ["put"],
+                "rules": [
+                    {"key_expr": prefix + topic.pattern, "freq": topic.most_of_one_hz}
+                    for topic in TOPICS
+                    if topic.most_of_one_hz is not None
+                ],
+            }
+        ],
+        # 200 MB among ten robots, for no gain.
+        "transport/shared_memory/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _tls(prefix: str, mode: str, tls: TlsFiles) -> dict[str, object]:
+    """Only members get in, and say only what is theirs."""
+    settings: dict[str, object] = {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": tls.authority,
+            "enable_mtls": True,
+            "verify_name_on_connect": False,
+            "listen_private_key": tls.key,
+            "listen_certificate": tls.certificate,
+            "connect_private_key": tls.key,
+            "connect_certificate": tls.certificate,
+        },
+    }
+    if mode != "client":
+        settings["access_control"] = _access_control(prefix)
+    return settings
 
 
 def _access_control(prefix: str) -> dict[str, object]:

@@ -125,7 +125,7 @@ class LinkConfig:
     @property
     def leaves_machine(self) -> bool:
         """Whether somebody on another computer may be heard."""
-        if self.type != "zenoh" or self.scouting or not self.listen:
+        if self.type != "zenoh" or self.scouting or not (self.listen or self.mode == "client"):
             return True
         return not all(map(is_loopback, (*self.listen, *self.connect)))
 

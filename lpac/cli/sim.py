@@ -47,6 +47,13 @@ class Controller(StrEnum):
     CLAIRVOYANT_CVT = "clairvoyant-cvt"
 
 
+class RadioTransport(StrEnum):
+    """[radio] of fleet.toml."""
+
+    MESH = "mesh"
+    ROUTER = "router"
+
+
 class Scale(StrEnum):
     """How large the model's world is in the air."""
 
@@ -127,6 +134,12 @@ def sim(
             "it: what they say is signed, and nobody else is heard."
         ),
     ] = False,
+    transport: Annotated[
+        RadioTransport,
+        typer.Option(
+            help="mavlink, px4: whether robots say what they say to each other, or to a router."
+        ),
+    ] = RadioTransport.MESH,
     script: Annotated[
         bool,
         typer.Option(help="mavlink, px4: take off, cover and land; else wait for `lpac ground`."),
@@ -163,6 +176,7 @@ def sim(
             errors=errors,
             sensor=sensor,
             secure=secure,
+            transport=transport.value,
         )
 
         if vehicle is VehicleKind.SIMULATED:
@@ -225,6 +239,7 @@ _ONLY_FOR = {
     "sensor": (VehicleKind.SIMULATED, VehicleKind.MAVLINK, VehicleKind.PX4),
     "recorded": (VehicleKind.SIMULATED,),
     "px4": (VehicleKind.PX4,),
+    "transport": (VehicleKind.MAVLINK, VehicleKind.PX4),
     "script": (VehicleKind.MAVLINK, VehicleKind.PX4),
 }
 

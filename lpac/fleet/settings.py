@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.margins import Margin, places_apart
@@ -28,6 +28,9 @@ from edge.robot.config import (
 )
 
 DEFAULT_DIRECTORY = "/opt/lpac"
+
+Transport = Literal["mesh", "router"]
+
 # Where fleets' keys are if the file does not say: not beside it, where repositories are.
 _KEYS = "~/.local/share/lpac/keys"
 _MAX_CPU = 1023
@@ -47,7 +50,7 @@ _ELSEWHERE = {
     "policy.world": "it is `world` at the top of the file",
     "autopilot.system_id": "it is `system_id` in [robots.NAME]",
     "identity": "it follows from `keys` at the top of the file",
-    "link": "it follows from `address` and `zenoh_port` in [robots.NAME]",
+    "link": "it follows from [radio], and `address` and `zenoh_port` in [robots.NAME]",
     "flight.slot": "it is `height` in [[slots]]",
     "flight.landing_point_m": "it is `landing_point_m` in [[slots]]",
     "log.folder": "robots log to /var/lib/lpac/logs",
@@ -67,6 +70,30 @@ class SshConfig:
     def __post_init__(self) -> None:
         if not 1.0 <= self.connect_timeout_s <= 300.0:
             raise ValueError(f"connect_timeout_s = {self.connect_timeout_s}: must be from 1 to 300")
+
+
+@dataclass(frozen=True, slots=True)
+class RadioConfig:
+    """How what robots say gets to the others.
+
+    "mesh": each is connected to each, and says it to them one by one. "router": all are connected
+    to a router, at `router` (IPv4 address and port), which `lpac fleet router` is.
+    """
+
+    transport: Transport = "mesh"
+    router: str = ""
+
+    def __post_init__(self) -> None:
+        if self.router and not _is_endpoint(self.router):
+            raise ValueError(
+                f"router = {self.router!r}: must be an IPv4 address and a port, such as "
+                "'192.168.8.2:7447'"
+            )
+        if (self.transport == "router") != bool(self.router):
+            raise ValueError(
+                f"transport = {self.transport!r}: router = {self.router!r}: must be where the "
+                "router is, and is for this transport alone"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,10 +187,26 @@ class FleetConfig:
     shared: Mapping[str, Any]
     keys: Path | None
     insecure: bool
+    radio: RadioConfig = field(default_factory=RadioConfig)
 
     def endpoint(self, robot: RobotHost) -> str:
         """Where zenoh reaches the robot."""
         return f"{self.scheme}/{robot.address}:{robot.zenoh_port}"
+
+    @property
+    def router(self) -> str | None:
+        """The router's endpoint, where the fleet has one."""
+        return f"{self.scheme}/{self.radio.router}" if self.radio.router else None
+
+    @property
+    def everybody(self) -> tuple[str, ...]:
+        """The endpoints by which zenoh reaches all robots: the router's, or those of each."""
+        return (self.router,) if self.router else tuple(map(self.endpoint, self.robots.values()))
+
+    @property
+    def mode(self) -> Literal["peer", "client"]:
+        """What zenoh's sessions are: clients of a router, or peers."""
+        return "client" if self.router else "peer"
 
     @property
     def scheme(self) -> str:
@@ -283,6 +326,7 @@ class _FleetTable:
     keys: str = ""
     insecure: bool = False
     ssh: SshConfig = field(default_factory=SshConfig)
+    radio: RadioConfig = field(default_factory=RadioConfig)
     robot: dict = field(default_factory=dict)  # type: ignore[type-arg]
     robots: dict = field(default_factory=dict)  # type: ignore[type-arg]
     slots: tuple[Slot, ...] = ()
@@ -360,6 +404,7 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
         shared=table.robot,
         keys=None,
         insecure=table.insecure,
+        radio=table.radio,
     )
     needs_keys = not table.insecure and not _is_all_here(config)
     if table.keys or needs_keys:
@@ -372,9 +417,8 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
 
 def _is_all_here(config: FleetConfig) -> bool:
     """Whether it is a fleet that this computer simulates."""
-    return bool(config.robots) and all(
-        map(is_loopback, map(config.endpoint, config.robots.values()))
-    )
+    endpoints = [*map(config.endpoint, config.robots.values()), *config.everybody]
+    return bool(config.robots) and all(map(is_loopback, endpoints))
 
 
 def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
@@ -406,6 +450,11 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
         cpus=_cpus(table.cpus),
         overrides=table.robot,
     )
+
+
+def _is_endpoint(text: str) -> bool:
+    address, _, port = text.rpartition(":")
+    return _is_ipv4(address) and port.isdecimal() and 1 <= int(port) <= 65535
 
 
 def _is_ipv4(text: str) -> bool:
@@ -484,17 +533,21 @@ def _robot_mapping(
     earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
     # A fleet that is all on this computer needs no keys, and nobody else reaches it.
     listen = places.listen if config.keys or config.insecure else "127.0.0.1"
+    link: dict[str, Any] = {
+        "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
+        "connect": [
+            config.endpoint(other) for other in sorted(earlier, key=lambda other: other.robot_id)
+        ],
+    }
+    if config.router is not None:
+        link = {"mode": "client", "connect": [config.router]}
     own = {
         "fleet": config.fleet,
         "robot_id": robot.robot_id,
         "policy": {"bundle": places.bundle, "world": places.world},
         "autopilot": {"url": robot.mavlink_url, "system_id": robot.system_id},
         "link": {
-            "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
-            "connect": [
-                config.endpoint(other)
-                for other in sorted(earlier, key=lambda other: other.robot_id)
-            ],
+            **link,
             **({"insecure": True} if config.insecure else {}),
         },
         "flight": {"slot": slot.height, "landing_point_m": list(slot.landing_point_m)},

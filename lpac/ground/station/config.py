@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from edge.core.schema import ConfigError
 from edge.core.world import parse_world
@@ -17,13 +18,15 @@ from lpac.fleet.settings import FleetConfig, load_fleet
 
 @dataclass(frozen=True, slots=True)
 class GroundConfig:
-    """`setup` is what its clients are told; `connect` are all robots' endpoints, for zenoh.
+    """`setup` is what its clients are told, `connect` the endpoints by which zenoh reaches all
+    robots, `mode` what it is there.
 
     `identity` is this station's in its fleet, None where nobody has one.
     """
 
     setup: FleetSetup
     connect: tuple[str, ...]
+    mode: Literal["peer", "client"]
     identity: Identity | None = None
 
 
@@ -35,7 +38,7 @@ def load_ground(
     In a fleet with keys its name is that of its card, and `operator` None or just that.
     """
     config = load_fleet(path)
-    identity = _identity(config, operator)
+    identity = load_own_identity(config, operator)
     name = operator or default_name() if identity is None else identity.card.name
     seated = next((slot.robot for slot in config.slots if slot.robot), None)
     if seated is None:
@@ -74,12 +77,17 @@ def load_ground(
             ground_lost_land_s=robot.flight.ground_lost_land_s,
             insecure=config.insecure,
         ),
-        connect=tuple(map(config.endpoint, config.robots.values())),
+        connect=config.everybody,
+        mode=config.mode,
         identity=identity,
     )
 
 
-def _identity(config: FleetConfig, operator: str | None) -> Identity | None:
+def load_own_identity(config: FleetConfig, operator: str | None) -> Identity | None:
+    """Of this computer, None in a fleet without keys. Raises ConfigError, OSError.
+
+    `operator`: the name that it must have, where one is given.
+    """
     if config.keys is None:
         return None
     identity = load_identity(config.keys, fleet=config.fleet, unix_s=time.time())

@@ -13,7 +13,7 @@ from edge.core.world import Feature, format_world, random_features
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.messages.mission import Origin
 from edge.policy.bundle import BundleError, load_bundle
-from lpac.fleet.settings import Places
+from lpac.fleet.settings import Places, Transport
 from lpac.fleet.writer import assign, write_fleet, write_robot
 from lpac.sim.description import ERRORS, fence_around, robot_table
 from lpac.sim.experiment import FIELD_SCALE
@@ -46,8 +46,8 @@ class FleetScenario:
     simulated vehicles' estimates are off by noise alone, and the air stands still. `budget` is what
     the robots take their errors for: how far apart they stand and fly. `sensor` is the `type` in
     robot.toml's [sensor]. With `secure` robots and ground are members of a fleet, with keys that
-    are made for it. They stand at `pads_m`, (x, y) of the mission frame, or else where there is
-    room.
+    are made for it. `transport` is that of fleet.toml's [radio]. They stand at `pads_m`, (x, y) of
+    the mission frame, or else where there is room.
 
     Raises ValueError that names what is impossible.
     """
@@ -61,6 +61,7 @@ class FleetScenario:
     budget: ErrorBudget = ERRORS
     sensor: str = "world"
     secure: bool = False
+    transport: Transport = "mesh"
     pads_m: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
@@ -131,13 +132,14 @@ class Layout:
         settings: Mapping[str, Mapping[str, object]] | None = None,
         spares: int = 0,
         keys: bool = False,
+        router: str | None = None,
     ) -> None:
         """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
 
         `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
         `settings` are further keys of robot.toml's tables, for all robots. The last `spares` lose
         their slots in fleet.toml, once their robot.toml is written. `keys`: a secure fleet has them
-        in `folder`, where `write_keys` puts them.
+        in `folder`, where `write_keys` puts them. `router` is its address and port, if it has one.
         """
         assert self.features is not None
         folder.mkdir(parents=True, exist_ok=True)
@@ -152,6 +154,7 @@ class Layout:
             {
                 "fleet": fleet,
                 **({"keys": "keys"} if self.scenario.secure and keys else {}),
+                **({"radio": {"transport": "router", "router": router}} if router else {}),
                 "image": "none",
                 "bundle": str(self.bundle_path),
                 "world": "world.env",

@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import socket
 import subprocess
 import time
 from collections import deque
@@ -30,6 +31,7 @@ STOP_WITHIN_S = 3.0
 DOUBTFUL_S = 1.5
 OVERLOADED_S = 5.0
 _WHILE_S = 20.0
+_LOOK_AGAIN_S = 0.05
 
 
 class SimulatedFleetError(ValueError):
@@ -150,6 +152,45 @@ class RobotProcess:
         return f"exit code {code}: {last}"
 
 
+class RouterProcess:
+    """`lpac fleet router`: a context, in which it runs; what it prints is in router.log."""
+
+    def __init__(self, fleet_toml: Path, port: int) -> None:
+        self._fleet_toml = fleet_toml
+        self._port = port
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        with (self._fleet_toml.parent / "router.log").open("ab") as output:
+            self._process = subprocess.Popen(
+                python_program("lpac.cli.main", "fleet", "router",
+                               "--fleet", str(self._fleet_toml)),
+                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                process_group=0,
+            )  # fmt: skip
+        # Robots would wait for it, and say so.
+        while self._process.poll() is None:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self._port)) == 0:
+                    break
+            time.sleep(_LOOK_AGAIN_S)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        assert self._process is not None
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
 def process_usage(pid: int) -> Usage:
     """What a process of this machine took so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -166,9 +207,10 @@ class Fleet:
 
     `layout` is what it is, `robots[i]` is robot i's process, `heard` what they say. `simulated` are
     the vehicles themselves, for whoever wants to do something to them; None where they are real
-    PX4. `endpoints` are the robots' zenoh addresses, `name` the fleet's. `carried` is how many
-    robots this machine was found to carry; who finds it out says so. `fleet_toml` describes the
-    fleet to `lpac ground`, as if its robots were in the field.
+    PX4. `endpoints` are the robots' zenoh addresses, `router` the program that they meet at where
+    they are its clients, `name` the fleet's. `carried` is how many robots this machine was found to
+    carry; who finds it out says so. `fleet_toml` describes the fleet to `lpac ground`, as if its
+    robots were in the field.
     """
 
     def __init__(
@@ -199,9 +241,11 @@ class Fleet:
         else:
             starts_m = [self.layout.to_world_m(pad_m) for pad_m in self.layout.pads_m]
             self.vehicles = Px4Build(px4_build, starts_m, WORLD, self.folder / "px4")
-        ports = free_ports(scenario.robots)
+        *ports, router_port = free_ports(scenario.robots + 1)
         scheme = "tls" if scenario.secure else "tcp"
         self.endpoints = tuple(f"{scheme}/127.0.0.1:{port}" for port in ports)
+        router = f"127.0.0.1:{router_port}" if scenario.transport == "router" else None
+        self.router = None if router is None else RouterProcess(self.fleet_toml, router_port)
         self.name = f"sim-{ports[0]}"
         self.robots = tuple(
             RobotProcess(robot, self.folder / "robots" / str(robot))
@@ -212,7 +256,8 @@ class Fleet:
         keys = write_keys(self.folder, self.name, scenario.robots) if scenario.secure else None
         self.heard = FleetListener(
             fleet=self.name,
-            connect=self.endpoints,
+            connect=self.endpoints if router is None else (f"{scheme}/{router}",),
+            mode="peer" if router is None else "client",
             identity=keys,
             say=self.say_unless_behind,
         )
@@ -234,12 +279,15 @@ class Fleet:
             },
             settings=settings,
             keys=True,
+            router=router,
         )
 
     def __enter__(self) -> Self:
         """Start everything. Raises OSError or LinkError if a port is taken."""
         with ExitStack() as stack:
             stack.enter_context(self.vehicles)
+            if self.router is not None:
+                stack.enter_context(self.router)
             stack.enter_context(self.heard)
             stack.callback(self._stop_robots)
             for robot in self.robots:

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -17,7 +18,7 @@ from typing import Any, Self
 import pytest
 import zenoh
 
-from edge.drivers.zenoh_link import LinkError, ZenohLink
+from edge.drivers.zenoh_link import LinkError, ZenohLink, ZenohRouter
 from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
 from lpac.sim.ports import free_ports
 from tests.conftest import ROOT
@@ -209,34 +210,36 @@ def test_the_ground_speaks_to_all_robots_and_is_none() -> None:
 
 
 def test_clients_meet_at_the_router_and_find_it_again() -> None:
-    at = endpoint()
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", json.dumps([at]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    heard = Inbox()
-    router = zenoh.open(config)
-    try:
-        with (
-            ZenohLink(fleet="test", robot_id=1, mode="client", connect=[at]) as first,
-            ZenohLink(
-                fleet="test",
-                robot_id=2,
-                mode="client",
-                connect=[at],
-                subscriptions={MESSAGE: heard},
-            ) as second,
-        ):
-            eventually_hears(first, MESSAGE, b"before", "robot/1/message", heard)
-            eventually(lambda: first.present() == {2} and second.present() == {1})
-            eventually(lambda: first.peers() == 1)
-            router.close()  # type: ignore[no-untyped-call]
+    at, heard, states = endpoint(), Inbox(), Inbox()
+    with (
+        # It comes after them, and goes.
+        ZenohLink(
+            fleet="test", robot_id=1, mode="client", connect=[at], subscriptions={STATE: states}
+        ) as first,
+        ZenohLink(
+            fleet="test", robot_id=2, mode="client", connect=[at], subscriptions={MESSAGE: heard}
+        ) as second,
+        ZenohLink(fleet="test", mode="client", connect=[at]) as ground,
+    ):
+        first.publish(MESSAGE, b"to nobody")
+        with pytest.raises(KeyError):
+            first.publish(STATE, b"not mine")
+        assert first.peers() == 0 and first.present() == frozenset()
+        for what in (b"before", b"after"):
+            with ZenohRouter(fleet="test", listen=[at]):
+                eventually_hears(first, MESSAGE, what, "robot/1/message", heard)
+                eventually_hears(ground, STATE, what, "ground/state", states)
+                eventually(lambda: first.present() == {2} and second.present() == {1})
+                eventually(lambda: ground.present() == {1, 2} and first.peers() == 1)
             eventually(lambda: not first.present() and not second.present())
-            router = zenoh.open(config)
-            eventually(lambda: first.present() == {2} and second.present() == {1})
-            eventually_hears(first, MESSAGE, b"after", "robot/1/message", heard)
-    finally:
-        router.close()  # type: ignore[no-untyped-call]
+
+
+def test_a_client_ends_though_its_router_never_came() -> None:
+    before = threading.active_count()
+    with ZenohLink(fleet="test", robot_id=1, mode="client", connect=[endpoint()]) as link:
+        eventually(lambda: link.failures() > 0)
+        assert threading.active_count() > before
+    eventually(lambda: threading.active_count() == before)
 
 
 def test_scouting_finds_the_others() -> None:
@@ -396,10 +399,11 @@ def test_what_cannot_be_opened_is_said_in_one_line() -> None:
         assert taken in error(listen=[taken])
         assert "another program has this port" in error(listen=[taken])
     assert "no such address" in error(listen=["tcp/192.0.2.77:7447"])
-    free = endpoint()
-    nobody = error(mode="client", connect=[free])
-    assert free in nobody
-    assert "no router answers" in nobody
+    with (
+        pytest.raises(LinkError, match="another program has this port"),
+        ZenohLink(fleet="test", listen=[taken]),
+    ):
+        ZenohRouter(fleet="test", listen=[taken])
 
 
 def test_grounds_hear_each_other_and_a_robot_gets_their_world_whole() -> None:

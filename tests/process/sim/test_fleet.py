@@ -24,6 +24,7 @@ from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.robot.config import load_config
 from lpac.fleet.settings import load_fleet
+from lpac.ground.station.config import load_ground
 from lpac.sim.description import ERRORS
 from lpac.sim.experiment import Scenario
 from lpac.sim.experiment import fly as fly_in_process
@@ -174,6 +175,26 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
         # A stopped process is woken up to end.
         fleet.robots[0].send_signal(signal.SIGSTOP)
     assert [robot.wait(0.0) for robot in fleet.robots] == [0, 0]
+
+
+@pytest.mark.real_time
+def test_a_fleet_meets_at_its_router_and_finds_it_again(tmp_path: Path) -> None:
+    scenario = FleetScenario(robots=2, secure=True, transport="router")
+    with Fleet(scenario, tmp_path, SHIPPED) as fleet:
+        config = load_ground(fleet.fleet_toml, None)
+        assert config.mode == "client" and len(config.connect) == 1
+        for robot in fleet.robots:
+            link = load_config(robot.folder / "robot.toml").link
+            assert (link.mode, link.listen, link.connect) == ("client", (), config.connect)
+        assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
+        before = {robot: its.boot_nonce for robot, its in fleet.heard.statuses().items()}
+        assert fleet.router is not None
+        fleet.router.__exit__(None, None, None)
+        assert fleet.heard.wait_for(lambda statuses: not statuses, 60.0)
+        fleet.router.__enter__()
+        assert fleet.heard.wait_for(
+            lambda statuses: {r: its.boot_nonce for r, its in statuses.items()} == before, 60.0
+        )
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from lpac.fleet.doctor import (
 )
 from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
 from lpac.fleet.operations import Outcome
-from lpac.fleet.settings import FleetConfig, RobotHost, SshConfig, load_fleet
+from lpac.fleet.settings import FleetConfig, RadioConfig, RobotHost, SshConfig, load_fleet
 from lpac.fleet.up import decide, packs
 from lpac.fleet.writer import robot_toml
 from tests.conftest import ROOT
@@ -185,6 +185,16 @@ def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str) -> Non
     checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
     assert checks["clock"].verdict == verdict
     assert checks["clock"].fix == ("" if verdict == "ok" else "lpac fleet up")
+
+
+def test_who_does_not_reach_the_router_is_told_to_start_it(config: FleetConfig) -> None:
+    routed = dataclasses.replace(config, radio=RadioConfig("router", "192.168.8.2:7447"))
+    for peers, verdict, fix in ((1, "ok", ""), (0, "warning", "lpac fleet router")):
+        fleet = {name: well(routed, name) for name in ("r1", "r2", "r3")}
+        fleet["r1"].facts["service"]["status"]["peers"] = peers
+        checks = {check.name: check for check in judge(routed, routed.robots["r1"], fleet)}
+        assert (checks["program"].verdict, checks["program"].fix) == (verdict, fix)
+    assert "router at 192.168.8.2:7447" in checks["program"].found
 
 
 def container(**about: object) -> list[dict[str, object]]:

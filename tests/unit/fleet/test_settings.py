@@ -159,6 +159,33 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert str(tmp_path) not in robot_toml(config, "r3")
 
 
+def test_with_a_router_all_are_its_clients(tmp_path: Path) -> None:
+    config = load_fleet(fleet_file(tmp_path, with_router("192.168.8.2:7447")))
+    for name in ("r1", "r3"):
+        link = rendered(config, name, tmp_path).link
+        assert (link.mode, link.listen, link.connect) == (
+            "client", (), ("tls/192.168.8.2:7447",),
+        )  # fmt: skip
+    assert (config.mode, config.everybody) == ("client", ("tls/192.168.8.2:7447",))
+    mesh = load_fleet(fleet_file(tmp_path, example()))
+    assert (mesh.mode, mesh.router) == ("peer", None)
+    assert mesh.everybody[0] == "tls/192.168.8.11:7447" and len(mesh.everybody) == 4
+
+
+def with_router(place: str) -> str:
+    return example("# [radio]", f'[radio]\ntransport = "router"\nrouter = "{place}"\n')
+
+
+def test_robots_of_this_computer_need_keys_if_their_router_is_elsewhere(tmp_path: Path) -> None:
+    here = re.sub(r"192\.168\.8\.(\d+)", r"127.0.0.\1", with_router("127.0.0.1:7447"))
+    here = re.sub(r'host = "127\.0\.0\.(\d+)"', r'host = "127.0.0.\1"', here)
+    config = load_fleet(fleet_file(tmp_path, here))
+    assert config.keys is None
+    assert rendered(config, "r1", tmp_path).link.connect == ("tcp/127.0.0.1:7447",)
+    elsewhere = here.replace('router = "127.0.0.1:7447"', 'router = "192.168.8.2:7447"')
+    assert load_fleet(fleet_file(tmp_path, elsewhere)).keys is not None
+
+
 def test_a_spare_and_a_stranger_get_none() -> None:
     config = load_fleet(EXAMPLE)
     with pytest.raises(ConfigError, match=r"robots\.r11: is a spare"):
@@ -258,6 +285,13 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
     [
         ('fleet = "demo"', "", ["fleet is missing"]),
         ('fleet = "demo"', 'fleet = "a b"', ["fleet = 'a b'", "letters"]),
+        ("# [radio]", '[radio]\ntransport = "air"\n#', ["radio: transport = 'air'", "'mesh'"]),
+        ("# [radio]", '[radio]\ntransport = "router"\n#', ["radio: transport = 'router'", "where"]),
+        ("# [radio]", '[radio]\nrouter = "10.0.0.1:1"\n#', ["radio: transport = 'mesh'", "alone"]),
+        (
+            "# [radio]", '[radio]\ntransport = "router"\nrouter = "laptop:7447"\n#',
+            ["radio: router = 'laptop:7447'", "192.168.8.2:7447"],
+        ),
         ('"../out/image/arm64"', '""', ["image = ''", "path"]),
         ("# directory = ", "folder = ", ["unknown key 'folder'", "directory", "robots"]),
         ('"/opt/lpac"', '"/a"\ndirectory = "lpac"', ["directory = 'lpac'", "absolute"]),

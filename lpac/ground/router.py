@@ -1,0 +1,28 @@
+"""The router of a fleet whose robots are its clients: a process that outlives `lpac ground`."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from edge.core.schema import ConfigError
+from edge.drivers.zenoh_link import ZenohRouter
+from lpac.fleet.settings import load_fleet
+from lpac.ground.station.config import load_own_identity
+
+
+def serve_router(path: Path, stop: threading.Event, on_listening: Callable[[str], None]) -> None:
+    """Pass on what members say until `stop` is set; `on_listening` is told the endpoint.
+
+    `path` is the fleet's description. Raises ConfigError, LinkError or OSError, in one line.
+    """
+    config = load_fleet(path)
+    if config.router is None:
+        raise ConfigError(
+            f"{path}: radio: transport = 'mesh' has no router: set transport = \"router\" and "
+            'router = "ADDRESS:PORT", and deploy'
+        )
+    identity = load_own_identity(config, None)
+    tls = None if identity is None else identity.tls
+    with ZenohRouter(fleet=config.fleet, listen=(config.router,), tls=tls):
+        on_listening(config.router)
+        stop.wait()
