@@ -44,6 +44,7 @@ ALLOWED = {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
         "lpac.fleet.writer", "lpac.fleet.authority",
     },
+    "lpac.radio": {"edge.core", "edge.messages"},
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
@@ -85,7 +86,9 @@ ONLY_IN = {
 }
 # No clock, thread, file or socket: all of it is called by somebody who has them. What several
 # threads call has a lock; a bundle and a configuration are read from their paths.
-PURE = ("edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.robot")
+PURE = (
+    "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.robot", "lpac.radio",
+)  # fmt: skip
 BUT = {
     "edge/core/mailbox.py": {"threading"},
     "edge/robot/inbox.py": {"threading"},

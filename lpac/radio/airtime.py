@@ -1,0 +1,545 @@
+"""How much of a Wi-Fi channel's time a fleet's messages take, and what becomes of them.
+
+A model, not a measurement; docs/scaling.md has its figures, and what emulated Wi-Fi said to it. All
+stations hear each other, on one channel, and around one access point:
+
+- `mesh`: each robot has a TLS connection to each other station. A message crosses the air twice for
+  each receiver, station -> access point -> station, and so does TCP's acknowledgement.
+- `router`: a message goes up to a zenoh router once, and down once for each receiver. A router that
+  is itself a station (`Wifi.ground_wired` false) passes all of it on over the air again.
+- `multicast`: what several robots hear goes up once, acknowledged and at the data rate as all that
+  a station sends, and down once for all, at the multicast rate and without acknowledgement. What
+  the ground alone hears goes there by TLS.
+
+Per transmission: DIFS, backoff, preamble, data, SIFS and acknowledgement. What goes to one station
+goes as one A-MPDU; and for a robot that sends, all that it has to say goes to the access point,
+whoever it is for. How many slots are idle and how many transmissions collide for each that succeeds
+follows Bianchi, "Performance Analysis of the IEEE 802.11 Distributed Coordination Function" (IEEE
+JSAC 18(3), 2000), with as many contenders as wait in a queue of such a load.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Literal, NamedTuple, get_args
+
+from edge.core.wire import PayloadType
+from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATE, STATUS
+
+Transport = Literal["mesh", "router", "multicast"]
+TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
+
+# The OFDM PHY at 5 GHz (IEEE 802.11-2020, 17.4.4), us.
+_SLOT_US, _SIFS_US, _DIFS_US = 9.0, 16.0, 34.0
+# Of 802.11n and later in mixed mode; and of the old rates, in which groups are addressed.
+_PREAMBLE_US, _OLD_PREAMBLE_US = 40.0, 20.0
+# A compressed block acknowledgement: the old preamble, and 32 bytes at 24 Mbit/s.
+_ACK_US = 32.0
+_LEAST_WINDOW, _DOUBLINGS = 16, 6
+# Attempts at a frame before a station gives up.
+_ATTEMPTS = 8
+# Half of what the standard lets into one A-MPDU, 64 frames and 5.484 ms: a queue is seldom full.
+_MOST_FRAMES, _LONGEST_US = 32.0, 2500.0
+# QoS header 26, LLC and SNAP 8, CCMP 16, checksum 4; delimiters of an A-MPDU are left out.
+_MAC_BYTES = 54
+_IP_BYTES, _UDP_BYTES, _MTU_BYTES = 20, 8, 1500
+# With timestamps, as Linux has them.
+_TCP_IP_BYTES = 52
+# Counted on a connection of two zenoh 1.x sessions, with declared keys.
+_ZENOH_BYTES = 27
+# TLS 1.3: a record's header 5, its type 1, its authentication tag 16.
+_TLS_BYTES = 22
+# TCP acknowledges every second full segment, and within 40 ms what is left; 2.5 messages a second
+# are too few for an acknowledgement to wait for one that goes its way.
+_SEGMENTS_PER_ACK = 2.0
+
+# What is said, in its envelope (`edge.identity.envelope`): bytes, means of simulated flights of the
+# field policy. A message with its beacon, of ten robots; of 30 in one world it is a tenth more.
+MESSAGE_BYTES: Mapping[PayloadType, float] = MappingProxyType(
+    {"float32": 2670.0, "float16": 1880.0, "int8": 1300.0}
+)
+EXPLORED_BYTES, CARD_BYTES, GROUND_CARD_BYTES = 597.0, 228.0, 238.0
+
+
+def status_bytes(robots: float) -> float:
+    """Of the RobotStatus of one that hears all of so many: it names each of them twice."""
+    return 2720.0 + 21.0 * robots
+
+
+def state_bytes(robots: float) -> float:
+    """Of a GroundState for so many: it has an echo for each whose status is 0.3 s old at most."""
+    return 495.0 + 42.0 * robots
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wifi:
+    """One channel and its access point.
+
+    `data_rate_mbit_s` is what stations and access point send frames to one receiver at,
+    `multicast_rate_mbit_s` what the access point sends to a group at. `frame_loss` is the
+    probability that one transmission of one frame is lost for reasons other than collisions.
+    `queue_s` is how long something waits in queues that are full. `ground_wired`: ground and router
+    are at the access point's wire; else they are one more station.
+
+    Raises ValueError that names an impossible value.
+    """
+
+    data_rate_mbit_s: float
+    multicast_rate_mbit_s: float = 6.0
+    frame_loss: float = 0.05
+    queue_s: float = 0.3
+    ground_wired: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("data_rate_mbit_s", "multicast_rate_mbit_s"):
+            _require_positive(name, getattr(self, name))
+        if not 0.0 <= self.frame_loss < 1.0:
+            raise ValueError(f"frame_loss = {self.frame_loss}: must be at least 0 and below 1")
+        _require_not_negative("queue_s", self.queue_s)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Traffic:
+    """What a fleet says in flight; sizes are those of sealed messages, before any framing.
+
+    `message_bytes` and `message_hz` are of what a robot tells its neighbours, `status_hz` of what
+    it tells the ground. `neighbours` is how many robots' messages and cards a robot is sent on
+    average, by who sends on to those in range alone; None: all others'. `guests` are robots of
+    other cells whose messages and cards come by wire and are sent to this cell's robots too.
+    Orders, worlds and revocations are left out: they are sent at moments.
+
+    Raises ValueError that names an impossible value.
+    """
+
+    robots: int
+    message_bytes: float = MESSAGE_BYTES["float16"]
+    message_hz: float = MESSAGE.rate_hz
+    status_hz: float = STATUS.rate_hz
+    neighbours: float | None = None
+    guests: int = 0
+
+    def __post_init__(self) -> None:
+        if self.robots < 1:
+            raise ValueError(f"robots = {self.robots}: must be at least 1")
+        _require_positive("message_bytes", self.message_bytes)
+        for name in ("message_hz", "status_hz", "guests"):
+            _require_not_negative(name, getattr(self, name))
+        if self.neighbours is not None:
+            _require_not_negative("neighbours", self.neighbours)
+
+
+@dataclass(frozen=True, slots=True)
+class Airtime:
+    """How much of the channel's time is asked for: above 1 in `total` it does not get it.
+
+    `shares` are by topic, `message_s` is what one robot's message to all its receivers takes,
+    acknowledgements included, `contenders` how many stations want to send at once, on average, and
+    `collision` the probability that a transmission collides.
+    """
+
+    shares: Mapping[str, float]
+    message_s: float
+    contenders: float
+    collision: float
+
+    @property
+    def total(self) -> float:
+        """Of all topics."""
+        return math.fsum(self.shares.values())
+
+
+class LinkQuality(NamedTuple):
+    """From one robot to another: the probability that a message is lost, and the mean delay, s."""
+
+    loss: float
+    delay_s: float
+
+
+def airtime(transport: Transport, wifi: Wifi, traffic: Traffic) -> Airtime:
+    """What the fleet's traffic takes of the channel's time.
+
+    Raises ValueError for another transport, and for a mesh with guests: it ends at its channel.
+    """
+    _require_possible(transport, traffic)
+    return _airtime(transport, wifi, traffic, traffic.robots)
+
+
+def carries(
+    transport: Transport,
+    wifi: Wifi,
+    traffic: Traffic,
+    *,
+    most: float = 0.6,
+    most_robots: int = 10_000,
+) -> int:
+    """For how many robots the total is `most` or less, instead of `traffic.robots`; 0 if for none.
+
+    No more than `most_robots` are tried. Raises what `airtime` does, and ValueError for a share
+    that is not above 0 and finite.
+    """
+    _require_possible(transport, traffic)
+    _require_positive("most", most)
+    few, many = 0, most_robots + 1
+    while many - few > 1:
+        robots = (few + many) // 2
+        if _airtime(transport, wifi, traffic, robots).total <= most:
+            few = robots
+        else:
+            many = robots
+    return few
+
+
+def guests_around(robots: int, *, of: int, per_m2: float, range_m: float) -> int:
+    """How many robots of others stand within `range_m` of a square cell of so many.
+
+    Of a fleet of `of` robots, `per_m2` a square metre. Raises ValueError that names an impossible
+    value.
+    """
+    if not 1 <= robots <= of:
+        raise ValueError(f"robots = {robots}: must be from 1 to {of}, the fleet's")
+    _require_positive("per_m2", per_m2)
+    _require_not_negative("range_m", range_m)
+    side_m = math.sqrt(robots / per_m2)
+    around = per_m2 * (4.0 * side_m * range_m + math.pi * range_m**2)
+    return min(of - robots, round(around))
+
+
+def cells(
+    transport: Transport,
+    wifi: Wifi,
+    traffic: Traffic,
+    *,
+    per_m2: float,
+    range_m: float,
+    most: float = 0.6,
+) -> int | None:
+    """Into how few equal square cells, each with a channel of its own, a fleet must be parted.
+
+    So that none takes more than `most` of its channel's time: 1 if it need not be; None if even one
+    robot takes more. A cell is sent what `guests_around` it say, and `traffic.guests` is not looked
+    at. Raises what `airtime`, `carries` and `guests_around` do.
+    """
+    _require_positive("most", most)
+    if airtime(transport, wifi, replace(traffic, guests=0)).total <= most:
+        return 1
+    for number in range(2, traffic.robots + 1):
+        robots = math.ceil(traffic.robots / number)
+        guests = guests_around(robots, of=traffic.robots, per_m2=per_m2, range_m=range_m)
+        if airtime(transport, wifi, replace(traffic, robots=robots, guests=guests)).total <= most:
+            return number
+    return None
+
+
+def link_quality(
+    transport: Transport, wifi: Wifi, traffic: Traffic, *, in_range: float = 1.0
+) -> LinkQuality:
+    """What a robot's message to a robot in range suffers: `lpac.sim.medium.Medium` takes the two.
+
+    `in_range` is the share of the other robots that a robot's radio reaches: so many share the
+    channel with it and hear it, and of all others it notices nothing.
+
+    A message waits as in a queue of random arrivals and equal jobs (Pollaczek and Khinchine), a job
+    being one message to all its receivers. What waits for one receiver is sent together, which
+    takes less time: so a channel that `airtime` finds full may still carry all, late. If it does
+    not, messages wait `Wifi.queue_s`, and of what is too much for the channel each has the same
+    chance to be dropped. In multicast nothing is sent together, and each of a message's frames is
+    lost for good by noise or by a collision; elsewhere it is repeated, and takes time only.
+
+    Raises what `airtime` does, and ValueError for an impossible share.
+    """
+    _require_possible(transport, traffic)
+    if not 0.0 <= in_range <= 1.0:
+        raise ValueError(f"in_range = {in_range}: must be from 0 to 1")
+    robots = 1.0 + in_range * (traffic.robots - 1)
+    wait_s, load = _queue(transport, wifi, traffic, robots)
+    delivery = min(1.0, 1.0 / load.total)
+    if transport == "multicast":
+        frames = _datagrams(traffic.message_bytes).number
+        delivery *= ((1.0 - wifi.frame_loss) * (1.0 - load.collision)) ** frames
+    # The copies come one after another, a group's all at once.
+    sending_s = load.message_s * (1.0 if transport == "multicast" else 0.5)
+    return LinkQuality(1.0 - delivery, wait_s + min(sending_s, wifi.queue_s))
+
+
+def _queue(
+    transport: Transport, wifi: Wifi, traffic: Traffic, robots: float
+) -> tuple[float, Airtime]:
+    """How long messages wait, s, and what they take when those that wait are sent together."""
+    # How often a message for one station comes to its queue; a group's do not wait for each other.
+    comes_hz = 0.0
+    if transport != "multicast":
+        messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]
+        comes_hz = math.fsum(f.senders * f.rate_hz * f.robots for f in messages) / robots
+
+    def load_after(wait_s: float) -> Airtime:
+        return _airtime(transport, wifi, traffic, robots, 1.0 + comes_hz * wait_s)
+
+    # The longer they wait, the more of them go together, and the less they have to wait.
+    low_s, high_s = 0.0, wifi.queue_s
+    for _ in range(30):
+        wait_s = (low_s + high_s) / 2.0
+        load = load_after(wait_s)
+        if load.message_s * _waiting(load.total) > wait_s:
+            low_s = wait_s
+        else:
+            high_s = wait_s
+    return high_s, load_after(high_s)
+
+
+def _require_possible(transport: Transport, traffic: Traffic) -> None:
+    if transport not in TRANSPORTS:
+        raise ValueError(f"transport = {transport!r}: must be one of {', '.join(TRANSPORTS)}")
+    if transport == "mesh" and traffic.guests:
+        raise ValueError(f"guests = {traffic.guests}: must be 0 in a mesh, which has one channel")
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"{name} = {value}: must be above 0 and finite")
+
+
+def _require_not_negative(name: str, value: float) -> None:
+    if not 0.0 <= value < math.inf:
+        raise ValueError(f"{name} = {value}: must be at least 0 and finite")
+
+
+def _waiting(load: float) -> float:
+    """How many jobs' time somebody waits who comes at random, in a queue M/D/1."""
+    return load / (2.0 * (1.0 - load)) if load < 1.0 else math.inf
+
+
+class _Packets(NamedTuple):
+    """How many IP packets, and the mean of their bytes."""
+
+    number: float
+    mean_bytes: float
+
+
+_TCP_ACK = _Packets(1.0, _TCP_IP_BYTES)
+
+
+def _segments(payload_bytes: float) -> _Packets:
+    """What a message becomes over TLS and TCP."""
+    total_bytes = payload_bytes + _ZENOH_BYTES + _TLS_BYTES
+    count = math.ceil(total_bytes / (_MTU_BYTES - _TCP_IP_BYTES))
+    return _Packets(count, total_bytes / count + _TCP_IP_BYTES)
+
+
+def _datagrams(payload_bytes: float) -> _Packets:
+    """What a message becomes over UDP: a datagram, in IP fragments if it is too large for one."""
+    total_bytes = payload_bytes + _ZENOH_BYTES + _UDP_BYTES
+    count = math.ceil(total_bytes / (_MTU_BYTES - _IP_BYTES))
+    return _Packets(count, total_bytes / count + _IP_BYTES)
+
+
+class _Contention(NamedTuple):
+    """For each transmission that succeeds: idle slots, and collisions; and how likely one is."""
+
+    idle_slots: float
+    collisions: float
+    collision: float
+
+
+@lru_cache(maxsize=4096)
+def _contention(contenders: float) -> _Contention:
+    """Bianchi's model of stations that always have something to send, 1 of them or more."""
+    low, high = 0.0, 1.0
+    # The probability of a collision that makes stations send as often as it takes to cause it.
+    for _ in range(50):
+        collision = (low + high) / 2.0
+        sending = _sending(collision)
+        if 1.0 - (1.0 - sending) ** (contenders - 1.0) > collision:
+            low = collision
+        else:
+            high = collision
+    collision = low
+    sending = _sending(collision)
+    busy = 1.0 - (1.0 - sending) ** contenders
+    alone = contenders * sending * (1.0 - sending) ** (contenders - 1.0)
+    return _Contention((1.0 - busy) / alone, busy / alone - 1.0, collision)
+
+
+def _sending(collision: float) -> float:
+    """The probability that a station sends in a slot: Bianchi's equation 7, without its pole."""
+    doubled = math.fsum((2.0 * collision) ** stage for stage in range(_DOUBLINGS))
+    return 2.0 / (1.0 + _LEAST_WINDOW + collision * _LEAST_WINDOW * doubled)
+
+
+class _Use(NamedTuple):
+    """Of the channel's time, us or shares of it: what stations send, and the access point."""
+
+    up: float = 0.0
+    down: float = 0.0
+
+    @property
+    def total(self) -> float:
+        return self.up + self.down
+
+    def plus(self, other: "_Use") -> "_Use":
+        return _Use(self.up + other.up, self.down + other.down)
+
+    def times(self, factor: float) -> "_Use":
+        return _Use(factor * self.up, factor * self.down)
+
+
+class _Channel:
+    """How long transmissions take on a channel that `contenders` want at once.
+
+    Where a receiver's messages wait, `together` of them go as one A-MPDU.
+    """
+
+    def __init__(self, wifi: Wifi, contenders: float = 1.0, together: float = 1.0) -> None:
+        self._wifi = wifi
+        self._contention = _contention(contenders)
+        self._together = together
+
+    @property
+    def collision(self) -> float:
+        """How likely a transmission collides."""
+        return self._contention.collision
+
+    def one_sender(self, packets: _Packets, copies: float) -> _Use:
+        """Copies from one station to the access point, which is the next receiver of them all."""
+        return _Use(up=self._to_one(packets, copies) if copies else 0.0)
+
+    def to_stations(self, packets: _Packets, copies: float) -> _Use:
+        """Copies from the access point, each to another station."""
+        return _Use(down=copies * self._to_one(packets, self._together) / self._together)
+
+    def from_stations(self, packets: _Packets, copies: float) -> _Use:
+        """Copies to the access point, each from another station."""
+        return _Use(up=copies * self._to_one(packets, self._together) / self._together)
+
+    def to_group(self, packets: _Packets) -> _Use:
+        """From the access point: frame by frame, and nobody acknowledges."""
+        data_us = _data_us(packets.mean_bytes, self._wifi.multicast_rate_mbit_s)
+        return _Use(down=packets.number * self._won(_OLD_PREAMBLE_US + data_us))
+
+    def _to_one(self, packets: _Packets, copies: float) -> float:
+        """With acknowledgement, and with what is repeated; us."""
+        count = copies * packets.number
+        frame_us = _data_us(packets.mean_bytes, self._wifi.data_rate_mbit_s)
+        turns = max(1.0, count / _MOST_FRAMES, count * frame_us / _LONGEST_US)
+        frames, loss = count / turns, self._wifi.frame_loss
+        each = (1.0 - loss**_ATTEMPTS) / (1.0 - loss)
+        # A turn is repeated until its last frame is through, with only what is missing; unless
+        # more waits, with which that goes.
+        rounds = math.fsum(1.0 - (1.0 - loss**n) ** frames for n in range(_ATTEMPTS))
+        rounds = each + (rounds - each) / self._together
+        data_us = frames * each * frame_us / rounds
+        return turns * rounds * self._won(_PREAMBLE_US + data_us + _SIFS_US + _ACK_US)
+
+    def _won(self, exchange_us: float) -> float:
+        """One exchange, with what it takes to get its turn. A collision lasts as long as it."""
+        idle_slots, collisions, _ = self._contention
+        return idle_slots * _SLOT_US + (1.0 + collisions) * (_DIFS_US + exchange_us)
+
+
+def _data_us(packet_bytes: float, rate_mbit_s: float) -> float:
+    return 8.0 * (packet_bytes + _MAC_BYTES) / rate_mbit_s
+
+
+class _Flow(NamedTuple):
+    """What `senders` say on a topic, each so often, to so many robots, and to the ground or not."""
+
+    topic: str
+    source: Literal["robot", "ground", "wire"]
+    senders: float
+    rate_hz: float
+    payload_bytes: float
+    robots: float
+    to_ground: bool = False
+
+
+# Of robots to robots.
+_MESSAGES = ("message", "guests' message")
+
+
+def _flows(traffic: Traffic, robots: float) -> tuple[_Flow, ...]:
+    others, guests = robots - 1.0, float(traffic.guests)
+    # Of those whose words a robot could hear, the share whose words it is sent.
+    share = 1.0
+    if traffic.neighbours is not None and others + guests > 0.0:
+        share = min(1.0, traffic.neighbours / (others + guests))
+    heard = share * (others + guests)
+    size, hz = traffic.message_bytes, traffic.message_hz
+    return (
+        _Flow("message", "robot", robots, hz, size, share * others),
+        _Flow("status", "robot", robots, traffic.status_hz, status_bytes(1.0 + heard), 0.0, True),
+        _Flow("explored", "robot", robots, EXPLORED.rate_hz, EXPLORED_BYTES, 0.0, True),
+        _Flow("card", "robot", robots, CARD.rate_hz, CARD_BYTES, share * others, True),
+        _Flow("state", "ground", 1.0, STATE.rate_hz, state_bytes(robots), robots),
+        _Flow("ground card", "ground", 1.0, GROUND_CARD.rate_hz, GROUND_CARD_BYTES, robots),
+        _Flow("guests' message", "wire", guests, hz, size, share * robots),
+        _Flow("guests' card", "wire", guests, CARD.rate_hz, CARD_BYTES, share * robots),
+    )
+
+
+def _airtime(
+    transport: Transport, wifi: Wifi, traffic: Traffic, robots: float, together: float = 1.0
+) -> Airtime:
+    flows = _flows(traffic, robots)
+    stations = robots + (1.0 if wifi.ground_wired else 2.0)
+    alone = _Channel(wifi, 1.0, together)
+    contenders = _contenders([_share(transport, wifi, alone, flow) for flow in flows], stations)
+    channel = _Channel(wifi, contenders, together)
+    shares = {flow.topic: _share(transport, wifi, channel, flow).total for flow in flows}
+    message_s = 1e-6 * _message_us(transport, wifi, channel, flows[0]).total
+    return Airtime(MappingProxyType(shares), message_s, contenders, channel.collision)
+
+
+def _contenders(shares: Sequence[_Use], stations: float) -> float:
+    """How many want to send when somebody does, by what the flows would take if only one did.
+
+    While the channel is busy, all that waits at the access point is one contender. A station that
+    waits does so for the rest of a transmission, half of one on average, and then has to win
+    against those that wait, the access point among them. By Little's law so many wait as come
+    meanwhile.
+    """
+    up, total = math.fsum(use.up for use in shares), math.fsum(use.total for use in shares)
+    if up >= 1.0:
+        return stations
+    return min(stations, 1.0 + 1.5 * min(total, 1.0) * up / (1.0 - up))
+
+
+def _share(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
+    rate_hz = flow.senders * flow.rate_hz
+    return _message_us(transport, wifi, channel, flow).times(1e-6 * rate_hz)
+
+
+def _message_us(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
+    """What one message of a flow takes, to all that hear it."""
+    if transport == "multicast" and flow.robots:
+        return _multicast_us(wifi, channel, flow)
+    from_air = flow.source == "robot" or (flow.source == "ground" and not wifi.ground_wired)
+    ground_on_air = flow.to_ground and not wifi.ground_wired
+    on_air = flow.robots + (1.0 if ground_on_air else 0.0)
+    on_wire = 1.0 if flow.to_ground and wifi.ground_wired else 0.0
+    segments = _segments(flow.payload_bytes)
+    if not (transport == "router" and flow.source == "robot" and flow.robots):
+        up = on_air + on_wire if from_air else 0.0
+        return _connections_us(channel, segments, up=up, down=on_air)
+    if wifi.ground_wired:
+        return _connections_us(channel, segments, up=1.0, down=flow.robots)
+    # To the router, which hears it for the ground too, and from there as any station sends.
+    to_router = _connections_us(channel, segments, up=1.0, down=1.0)
+    return to_router.plus(_connections_us(channel, segments, up=flow.robots, down=flow.robots))
+
+
+def _connections_us(channel: _Channel, segments: _Packets, *, up: float, down: float) -> _Use:
+    """One sender's copies, `up` to the access point and `down` from there; acks the other way."""
+    acks = max(1.0, segments.number / _SEGMENTS_PER_ACK)
+    return (
+        channel.one_sender(segments, up)
+        .plus(channel.to_stations(segments, down))
+        .plus(channel.from_stations(_TCP_ACK, acks * down))
+        .plus(channel.to_stations(_TCP_ACK, acks * up))
+    )
+
+
+def _multicast_us(wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
+    datagrams = _datagrams(flow.payload_bytes)
+    on_wire = flow.source == "wire" or (flow.source == "ground" and wifi.ground_wired)
+    return channel.one_sender(datagrams, 0.0 if on_wire else 1.0).plus(channel.to_group(datagrams))

@@ -1,0 +1,395 @@
+"""Airtime: what a fleet's messages take of a channel, and what becomes of them."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from edge.core.memory import EXPLORED_CELLS
+from edge.identity.envelope import OVERHEAD_BYTES
+from edge.messages.bounds import MOST_ROBOTS
+from edge.messages.codec import encode
+from edge.messages.mission import Echo, GroundState
+from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATE, STATUS
+from lpac.radio.airtime import (
+    CARD_BYTES,
+    EXPLORED_BYTES,
+    GROUND_CARD_BYTES,
+    MESSAGE_BYTES,
+    TRANSPORTS,
+    Traffic,
+    Transport,
+    Wifi,
+    airtime,
+    carries,
+    cells,
+    guests_around,
+    link_quality,
+    state_bytes,
+    status_bytes,
+)
+from tests.unit.ground import snapshots
+
+WIFI = Wifi(data_rate_mbit_s=220.0)
+LOSSLESS = replace(WIFI, frame_loss=0.0)
+TEN = Traffic(robots=10)
+EACH = pytest.mark.parametrize("transport", TRANSPORTS)
+INT8 = MESSAGE_BYTES["int8"]
+# The example's field.
+PLACE: dict[str, float] = {"per_m2": 10 / 32**2, "range_m": 16.0}
+
+wifis = st.builds(
+    Wifi,
+    data_rate_mbit_s=st.floats(6.0, 1200.0),
+    multicast_rate_mbit_s=st.floats(1.0, 54.0),
+    frame_loss=st.floats(0.0, 0.5),
+    queue_s=st.floats(0.0, 1.0),
+    ground_wired=st.booleans(),
+)
+traffics = st.builds(
+    Traffic,
+    robots=st.integers(1, 1000),
+    message_bytes=st.floats(100.0, 20_000.0),
+    message_hz=st.floats(0.0, 20.0),
+    status_hz=st.floats(0.0, 4.0),
+    neighbours=st.none() | st.floats(0.0, 100.0),
+)
+transports = st.sampled_from(TRANSPORTS)
+
+
+def total(transport: Transport, wifi: Wifi = WIFI, traffic: Traffic = TEN) -> float:
+    return airtime(transport, wifi, traffic).total
+
+
+# One message, by hand. Next to nobody else wants the channel, so that a station waits for 7.5 of
+# the slots 0 to 15.
+DIFS_US, BACKOFF_US, SIFS_US, ACK_US = 34.0, 7.5 * 9.0, 16.0, 32.0
+PREAMBLE_US, OLD_PREAMBLE_US, MAC_BYTES = 40.0, 20.0, 54
+
+
+def unicast_us(packet_bytes: float, rate_mbit_s: float) -> float:
+    data_us = 8.0 * (packet_bytes + MAC_BYTES) / rate_mbit_s
+    return DIFS_US + BACKOFF_US + PREAMBLE_US + data_us + SIFS_US + ACK_US
+
+
+def group_us(packet_bytes: float, rate_mbit_s: float) -> float:
+    return DIFS_US + BACKOFF_US + OLD_PREAMBLE_US + 8.0 * (packet_bytes + MAC_BYTES) / rate_mbit_s
+
+
+def test_one_datagram_goes_up_once_and_down_once() -> None:
+    packet_bytes = 1000 + 27 + 8 + 20  # zenoh, UDP, IP
+    expected_us = unicast_us(packet_bytes, 220.0) + group_us(packet_bytes, 6.0)
+    found = airtime("multicast", LOSSLESS, Traffic(robots=2, message_bytes=1000.0))
+    assert 1e6 * found.message_s == pytest.approx(expected_us, rel=2e-3)
+
+
+def test_one_segment_of_a_mesh_of_two_goes_up_and_down_and_so_does_its_acknowledgement() -> None:
+    packet_bytes = 1000 + 27 + 22 + 52  # zenoh, TLS, TCP and IP
+    expected_us = 2.0 * unicast_us(packet_bytes, 220.0) + 2.0 * unicast_us(52, 220.0)
+    found = airtime("mesh", LOSSLESS, Traffic(robots=2, message_bytes=1000.0))
+    assert 1e6 * found.message_s == pytest.approx(expected_us, rel=2e-3)
+
+
+def test_a_router_on_a_wire_is_told_once_and_acknowledges_it() -> None:
+    packet_bytes = 1000 + 27 + 22 + 52
+    up_us = unicast_us(packet_bytes, 220.0) + unicast_us(52, 220.0)
+    found = airtime("router", LOSSLESS, Traffic(robots=4, message_bytes=1000.0))
+    # Up once, and down three times.
+    assert 1e6 * found.message_s == pytest.approx(4.0 * up_us, rel=5e-3)
+
+
+def test_a_message_too_large_for_a_datagram_takes_two_turns_of_a_group() -> None:
+    small, large = (
+        airtime("multicast", LOSSLESS, Traffic(robots=2, message_bytes=size))
+        for size in (1440.0, 1446.0)
+    )
+    assert large.message_s - small.message_s == pytest.approx(1e-6 * group_us(20, 6.0), rel=0.1)
+
+
+# Where it stands: shares of the field policy's fleet
+
+
+@pytest.mark.parametrize(
+    ("transport", "robots", "wifi", "size", "share"),
+    [
+        ("mesh", 10, WIFI, MESSAGE_BYTES["float16"], 0.18),
+        ("multicast", 10, WIFI, MESSAGE_BYTES["float16"], 0.08),
+        ("multicast", 100, replace(WIFI, multicast_rate_mbit_s=24.0), INT8, 0.21),
+    ],
+)
+def test_shares_of_the_channel_that_messages_take(
+    transport: Transport, robots: int, wifi: Wifi, size: float, share: float
+) -> None:
+    found = airtime(transport, wifi, Traffic(robots=robots, message_bytes=size))
+    assert found.shares["message"] == pytest.approx(share, abs=0.01)
+
+
+@EACH
+def test_the_total_is_that_of_all_topics(transport: Transport) -> None:
+    found = airtime(transport, WIFI, TEN)
+    assert found.total == pytest.approx(sum(found.shares.values()))
+    assert found.shares["message"] == max(found.shares.values())
+
+
+def test_a_mesh_grows_with_the_square_and_multicast_with_the_number() -> None:
+    for transport, power in (("mesh", 2.0), ("multicast", 1.0)):
+        few, many = (
+            airtime(transport, WIFI, Traffic(robots=n)).shares["message"]  # type: ignore[arg-type]
+            for n in (5, 10)
+        )
+        assert math.log2(many / few) == pytest.approx(power, abs=0.25)
+
+
+def test_multicast_pays_from_a_few_robots_on() -> None:
+    """At a low rate it takes as long as several unicasts; it does not take more with receivers."""
+    slow = replace(WIFI, multicast_rate_mbit_s=6.0)
+    two, ten = Traffic(robots=2), Traffic(robots=10)
+    assert total("multicast", slow, two) > total("mesh", slow, two)
+    assert total("multicast", slow, ten) < total("router", slow, ten) < total("mesh", slow, ten)
+
+
+def test_a_router_in_the_wifi_costs_as_much_as_a_mesh() -> None:
+    on_air = replace(WIFI, ground_wired=False)
+    assert total("router", on_air) == pytest.approx(total("mesh", on_air), rel=0.15)
+    assert total("router", WIFI) < 0.8 * total("router", on_air)
+
+
+def test_sending_on_to_neighbours_alone_takes_what_they_are() -> None:
+    hundred = Traffic(robots=100)
+    near = airtime("router", WIFI, replace(hundred, neighbours=8.0))
+    all_ = airtime("router", WIFI, hundred)
+    assert near.shares["message"] < all_.shares["message"] / 8
+    assert near.shares["card"] < all_.shares["card"] / 4
+
+
+def test_more_neighbours_than_there_are_is_all() -> None:
+    assert total("router", WIFI, replace(TEN, neighbours=50.0)) == total("router")
+
+
+def test_guests_are_sent_down_only() -> None:
+    guests = airtime("multicast", LOSSLESS, replace(TEN, guests=10))
+    assert 0.0 < guests.shares["guests' message"] < guests.shares["message"]
+
+
+# Properties
+
+
+@given(transports, wifis, traffics, st.integers(1, 50))
+def test_more_robots_take_more(
+    transport: Transport, wifi: Wifi, traffic: Traffic, more: int
+) -> None:
+    larger = replace(traffic, robots=traffic.robots + more)
+    assert total(transport, wifi, larger) >= total(transport, wifi, traffic)
+
+
+@given(transports, wifis, traffics, st.floats(1.05, 4.0))
+def test_a_faster_channel_takes_less(
+    transport: Transport, wifi: Wifi, traffic: Traffic, faster: float
+) -> None:
+    for name in ("data_rate_mbit_s", "multicast_rate_mbit_s"):
+        changed = replace(wifi, **{name: faster * getattr(wifi, name)})
+        assert total(transport, changed, traffic) <= total(transport, wifi, traffic) * (1 + 1e-9)
+
+
+@given(transports, wifis, traffics, st.floats(0.0, 1.0))
+def test_loss_and_delay_are_bounded(
+    transport: Transport, wifi: Wifi, traffic: Traffic, in_range: float
+) -> None:
+    loss, delay_s = link_quality(transport, wifi, traffic, in_range=in_range)
+    assert 0.0 <= loss <= 1.0
+    # In a queue, and on its way.
+    assert 0.0 <= delay_s <= 2.0 * wifi.queue_s + 1e-9
+
+
+@given(transports, wifis, traffics, st.floats(0.05, 5.0))
+def test_carries_is_the_last_that_fits(
+    transport: Transport, wifi: Wifi, traffic: Traffic, most: float
+) -> None:
+    robots = carries(transport, wifi, traffic, most=most, most_robots=500)
+    assert 0 <= robots <= 500
+    if robots:
+        assert total(transport, wifi, replace(traffic, robots=robots)) <= most
+    if robots < 500:
+        assert total(transport, wifi, replace(traffic, robots=robots + 1)) > most
+
+
+# What becomes of messages
+
+
+@EACH
+def test_where_there_is_time_for_all_nothing_is_lost_but_by_noise(transport: Transport) -> None:
+    quality = link_quality(transport, LOSSLESS, TEN)
+    assert quality.loss == pytest.approx(0.0, abs=0.01)
+    assert 0.0 < quality.delay_s < 0.02
+
+
+def test_multicast_loses_what_has_two_frames_twice_as_often() -> None:
+    one, two = (
+        link_quality("multicast", WIFI, replace(TEN, message_bytes=size)).loss
+        for size in (INT8, 2.0 * INT8)
+    )
+    assert one == pytest.approx(0.05, abs=0.01)
+    assert two == pytest.approx(2.0 * one, rel=0.1)
+
+
+@EACH
+def test_beyond_the_channel_messages_wait_and_are_lost(transport: Transport) -> None:
+    quality = link_quality(transport, WIFI, Traffic(robots=1000))
+    assert quality.loss > 0.95
+    assert quality.delay_s >= WIFI.queue_s
+
+
+def test_a_full_channel_still_carries_what_is_sent_together() -> None:
+    thirty = Traffic(robots=30)
+    assert total("mesh", WIFI, thirty) > 1.0
+    quality = link_quality("mesh", WIFI, thirty)
+    assert quality.loss == 0.0
+    assert quality.delay_s > 5.0 * link_quality("mesh", WIFI, TEN).delay_s
+
+
+@EACH
+def test_who_is_out_of_range_takes_nothing_and_hears_nothing(transport: Transport) -> None:
+    hundred = Traffic(robots=100)
+    near = link_quality(transport, WIFI, hundred, in_range=9 / 99)
+    assert near == pytest.approx(link_quality(transport, WIFI, TEN))
+    assert near.loss <= link_quality(transport, WIFI, hundred).loss
+
+
+# Cells
+
+
+def test_a_small_fleet_needs_no_cells_and_a_large_one_more_the_larger_it_is() -> None:
+    parted = [
+        cells("multicast", WIFI, Traffic(robots=n, message_bytes=INT8), **PLACE)
+        for n in (10, 100, 300, 1000)
+    ]
+    assert parted[0] == 1
+    assert parted == sorted(parted, key=lambda number: number or math.inf)
+    assert len(set(parted)) == 4
+
+
+def test_a_cell_with_its_guests_fits_and_one_larger_does_not() -> None:
+    traffic = Traffic(robots=300, message_bytes=INT8)
+    number = cells("multicast", WIFI, traffic, **PLACE)
+    assert number is not None
+    for parts, fits in ((number, True), (number - 1, False)):
+        robots = math.ceil(300 / parts)
+        guests = guests_around(robots, of=300, **PLACE)
+        cell = replace(traffic, robots=robots, guests=guests)
+        assert (total("multicast", WIFI, cell) <= 0.6) is fits
+
+
+def test_where_one_robot_is_too_many_no_cells_help() -> None:
+    slow = Wifi(data_rate_mbit_s=0.01)
+    assert cells("router", slow, TEN, **PLACE) is None
+    assert carries("router", slow, TEN) == 0
+
+
+def test_guests_stand_around_a_cell() -> None:
+    # One robot a square metre, 100 in 10 x 10 m: four strips of 10 m^2, and the corners' circle.
+    assert guests_around(100, of=1000, per_m2=1.0, range_m=1.0) == round(40 + math.pi)
+    assert guests_around(100, of=110, per_m2=1.0, range_m=1.0) == 10
+    assert guests_around(100, of=100, per_m2=1.0, range_m=1.0) == 0
+
+
+# What is impossible
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("data_rate_mbit_s", 0.0, "above 0"),
+        ("data_rate_mbit_s", math.inf, "finite"),
+        ("multicast_rate_mbit_s", -6.0, "above 0"),
+        ("multicast_rate_mbit_s", math.nan, "above 0"),
+        ("frame_loss", 1.0, "below 1"),
+        ("frame_loss", -0.1, "at least 0"),
+        ("queue_s", -1.0, "at least 0"),
+    ],
+)
+def test_an_impossible_channel_is_named(name: str, value: Any, allowed: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} = {value}: must be .*{allowed}"):
+        replace(WIFI, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "allowed"),
+    [
+        ("robots", 0, "at least 1"),
+        ("message_bytes", 0.0, "above 0"),
+        ("message_hz", math.inf, "finite"),
+        ("status_hz", -2.0, "at least 0"),
+        ("neighbours", math.nan, "at least 0"),
+        ("guests", -1, "at least 0"),
+    ],
+)
+def test_impossible_traffic_is_named(name: str, value: Any, allowed: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} = {value}: must be .*{allowed}"):
+        replace(TEN, **{name: value})
+
+
+def test_impossible_questions_are_named() -> None:
+    unknown: Any = "pigeon"
+    with pytest.raises(ValueError, match=r"^transport = 'pigeon': must be one of mesh, router"):
+        airtime(unknown, WIFI, TEN)
+    with pytest.raises(ValueError, match=r"^guests = 3: must be 0 in a mesh"):
+        airtime("mesh", WIFI, replace(TEN, guests=3))
+    with pytest.raises(ValueError, match=r"^most = 0\.0: must be above 0"):
+        carries("mesh", WIFI, TEN, most=0.0)
+    with pytest.raises(ValueError, match=r"^in_range = 1\.5: must be from 0 to 1"):
+        link_quality("mesh", WIFI, TEN, in_range=1.5)
+    with pytest.raises(ValueError, match=r"^robots = 11: must be from 1 to 10"):
+        guests_around(11, of=10, **PLACE)
+
+
+# The sizes are those of real messages
+
+
+def sealed(message: object) -> int:
+    return len(encode(message)) + OVERHEAD_BYTES
+
+
+def heard(robots: int) -> int:
+    """A status of one that hears so many."""
+    ids = [str(robot) for robot in range(robots)]
+    ages_s, messages = dict.fromkeys(ids, 0.123), dict.fromkeys(ids, 1234)
+    return sealed(snapshots.status(0, neighbour_ages_s=ages_s, neighbour_messages=messages))
+
+
+def told(robots: int) -> int:
+    """A state with an echo of so many."""
+    echo = Echo(2**47, 123.4567, 0.1234)
+    echoes = {str(robot): echo for robot in range(robots)}
+    return sealed(GroundState(sequence=4, operator="alice", echoes=echoes))
+
+
+def test_a_status_grows_with_each_that_is_heard() -> None:
+    # 21 bytes while ids have one digit.
+    assert (heard(90) - heard(20)) / 70 == pytest.approx(
+        (status_bytes(90) - status_bytes(20)) / 70, rel=0.2
+    )
+
+
+def test_a_state_has_an_echo_of_each() -> None:
+    grows = (told(90) - told(20)) / 70
+    # Statuses come twice a second: six of ten are that young.
+    assert (state_bytes(90) - state_bytes(20)) / 70 == pytest.approx(0.6 * grows, rel=0.05)
+
+
+def test_what_is_explored_has_one_size() -> None:
+    assert EXPLORED_BYTES == EXPLORED_CELLS**2 // 8 + OVERHEAD_BYTES
+
+
+def test_all_sizes_are_within_their_topics_limits() -> None:
+    for topic, size in (
+        (MESSAGE, max(MESSAGE_BYTES.values())),
+        (STATUS, status_bytes(MOST_ROBOTS)),
+        (STATE, state_bytes(MOST_ROBOTS)),
+        (EXPLORED, EXPLORED_BYTES),
+        (CARD, CARD_BYTES),
+        (GROUND_CARD, GROUND_CARD_BYTES),
+    ):
+        assert size <= topic.limit_bytes
