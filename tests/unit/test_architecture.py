@@ -45,6 +45,7 @@ ALLOWED = {
         "lpac.fleet.writer", "lpac.fleet.authority",
     },
     "lpac.radio": {"edge.core", "edge.messages"},
+    "lpac.radio.figures": {"edge.core", "edge.messages", "lpac.analysis", "lpac.radio"},
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
@@ -71,6 +72,7 @@ ONLY_IN = {
         "lpac/evaluate/",
         "lpac/train/",
         "lpac/ablate/",
+        "lpac/radio/figures.py",
     },
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},

@@ -31,6 +31,7 @@ from lpac.radio.airtime import (
     state_bytes,
     status_bytes,
 )
+from tests.conftest import ROOT
 from tests.unit.ground import snapshots
 
 WIFI = Wifi(data_rate_mbit_s=220.0)
@@ -393,3 +394,12 @@ def test_all_sizes_are_within_their_topics_limits() -> None:
         (GROUND_CARD, GROUND_CARD_BYTES),
     ):
         assert size <= topic.limit_bytes
+
+
+def test_the_docs_tables_are_the_models() -> None:
+    pytest.importorskip("matplotlib")
+    from lpac.radio.figures import tables  # noqa: PLC0415
+
+    text = (ROOT / "docs" / "scaling.md").read_text()
+    for name, table in tables().items():
+        assert table in text, f"{name}: python -m lpac.radio.figures prints it anew"
