@@ -344,7 +344,7 @@ def test_a_neighbours_messages_come_corrupt_old_and_from_another_bundle(rig: Fau
         assert not isinstance(message, Rejection)
         wrong = {
             Rejection.MAGIC: bytes(len(genuine)),
-            Rejection.TRUNCATED: genuine[:-1],
+            Rejection.TRUNCATED: genuine[: BEACON_BYTES + 50],
             Rejection.CHECKSUM: genuine[:-1] + bytes([genuine[-1] ^ 1]),
             Rejection.OTHER_BUNDLE: genuine[:BEACON_BYTES]
             + wire.encode(message, bytes(32), "float16"),
