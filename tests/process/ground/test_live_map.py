@@ -362,10 +362,14 @@ def test_a_flight_by_clicks(few: FlownFleet) -> None:
             assert box["x"] + box["width"] <= width and box["y"] + box["height"] <= height
         seen.act("enable")
         seen.wait_for_states(dict.fromkeys(("r0", "r1", "r2"), "preflight"))
-        # Takeoff asks first; who will not is named, in text.
+        # Takeoff asks first; who will not is named, in text; and it follows what robots say.
         seen.act("takeoff")
         page.wait_for_selector("#ask >> text=Take off 2 of 3")
-        assert HOSTILE in page.inner_text("#ask")
+        few.says[0] = lambda said: replace(said, ready=False)
+        page.wait_for_selector("#ask >> text=Take off 1 of 3")
+        del few.says[0]
+        page.wait_for_selector("#ask >> text=Take off 2 of 3")
+        page.wait_for_selector(f"#ask >> text={HOSTILE}")
         page.click("#ask-no")
         assert page.is_hidden("#ask")
         assert seen.state_of("r0") == "preflight"

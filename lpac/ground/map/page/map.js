@@ -82,6 +82,7 @@ const take = {
     snapshotAt = performance.now();
     map.setSnapshot(message);
     showHead();
+    showAsked();
     showAlarms(message.alarms, pick);
     showFleet(message.robots, map.alarmed, selected, pick);
     const robot = message.robots.find(({ name }) => name === selected);
@@ -140,36 +141,56 @@ function hold() {
 let asked = null;
 
 function ask(action, robots = []) {
+  asked = { action, robots };
+  showAsked();
+  setText($("#ask-yes"), TITLES[action]);
+  $("#ask").hidden = false;
+  $("#ask-no").focus();
+}
+
+// With every snapshot: who says yes gets what he reads, also when a robot became ready meanwhile.
+function showAsked() {
+  if (!asked) return;
+  const { title, lines } = question(asked);
+  setText($("#ask-title"), title);
+  const shown = [...$("#ask-text").children].map(({ textContent }) => textContent);
+  if (lines.join("\n") === shown.join("\n")) return;
+  $("#ask-text").replaceChildren(...lines.map((line) => make("p", "", line)));
+}
+
+function question({ action, robots }) {
   const all = snapshot?.robots ?? [];
   const names = new Set(robots.length ? robots : (setup?.slots ?? []).map(({ robot }) => robot));
   const addressed = all.filter(({ name }) => names.has(name));
-  const lines = [];
   const list = (some) => some.map(({ name }) => name).join(", ");
   if (action === "takeoff") {
     const ready = addressed.filter(({ ready: is, state, fresh }) => is && fresh && state === "preflight");
     const others = addressed.filter((robot) => !ready.includes(robot));
-    setText($("#ask-title"), `Take off ${ready.length} of ${addressed.length} robots?`);
-    lines.push(ready.length ? `Ready: ${list(ready)}.` : "None is ready.");
     const why = (robot) => {
       if (!robot.fresh) return "not heard";
       return robot.state === "preflight" ? (robot.failed_checks[0] ?? "checking") : robot.state;
     };
-    for (const [reason, some] of groups(others, why)) lines.push(`Not ready: ${list(some)}: ${reason}`);
-    lines.push("Motors start, one robot after another.");
-  } else if (action === "command") {
-    setText($("#ask-title"), `Take the command from ${snapshot?.commander}?`);
-    lines.push("Their commands that still run end, but for a kill. From then on they only observe, and hold.");
-  } else {
-    const flying = addressed.filter(({ in_air: is }) => is);
-    const what = robots.length ? robots.join(", ") : `all ${flying.length} robots in the air`;
-    setText($("#ask-title"), `Land ${what}, where ${flying.length === 1 ? "it is" : "they are"}?`);
-    lines.push("Straight down, not at the landing points: that is Return.");
+    return {
+      title: `Take off ${ready.length} of ${addressed.length} robots?`,
+      lines: [
+        ready.length ? `Ready: ${list(ready)}.` : "None is ready.",
+        ...[...groups(others, why)].map(([reason, some]) => `Not ready: ${list(some)}: ${reason}`),
+        "Motors start, one robot after another.",
+      ],
+    };
   }
-  $("#ask-text").replaceChildren(...lines.map((line) => make("p", "", line)));
-  setText($("#ask-yes"), TITLES[action]);
-  asked = { action, robots };
-  $("#ask").hidden = false;
-  $("#ask-no").focus();
+  if (action === "command") {
+    return {
+      title: `Take the command from ${snapshot?.commander}?`,
+      lines: ["Their commands that still run end, but for a kill. From then on they only observe, and hold."],
+    };
+  }
+  const flying = addressed.filter(({ in_air: is }) => is);
+  const what = robots.length ? robots.join(", ") : `all ${flying.length} robots in the air`;
+  return {
+    title: `Land ${what}, where ${flying.length === 1 ? "it is" : "they are"}?`,
+    lines: ["Straight down, not at the landing points: that is Return."],
+  };
 }
 
 function groups(items, keyOf) {
