@@ -203,6 +203,12 @@ def _from_steps(steps: npt.NDArray[np.float16], counts: npt.NDArray[np.int8]) ->
         return each * counts.astype(np.float32)
 
 
+def most_bytes(message_size: int, payload_type: PayloadType, shared_side: int = 0) -> int:
+    """What a message takes whose numbers cannot be compressed; see `decode` for the two sizes."""
+    map_bytes = _MAP.size + shared_side * shared_side if shared_side else 0
+    return _HEADER_SIZE + _payload_size(message_size, payload_type) + map_bytes
+
+
 def decode(
     data: bytes | memoryview,
     *,
@@ -289,10 +295,13 @@ class _Header(NamedTuple):
     @property
     def payload_size(self) -> int:
         """In bytes."""
-        payload_type = self.payload_type
-        if payload_type == "int8" or payload_type is None:
-            return _blocks(self.payload_length) * _STEP.itemsize + self.payload_length
-        return self.payload_length * _FLOATS[payload_type].itemsize
+        return _payload_size(self.payload_length, self.payload_type or "int8")
+
+
+def _payload_size(length: int, payload_type: PayloadType) -> int:
+    if payload_type == "int8":
+        return _blocks(length) * _STEP.itemsize + length
+    return length * _FLOATS[payload_type].itemsize
 
 
 def _header_of(view: memoryview) -> _Header | Rejection:

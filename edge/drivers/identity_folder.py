@@ -7,12 +7,14 @@
 | `certificate.pem`, `authority.pem` | for TLS: of the same key, and of the authority |
 | `revoked` | the newest list of revoked keys that was heard |
 | `start` | the number of this start of the program, greater than those before |
+| `group-keys` | of a robot: the fleet's keys of its multicast group, in hexadecimal digits, a line
+each, the newest first; for nobody else to read |
 """
 
 import base64
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +22,7 @@ import msgspec
 
 from edge.core.schema import ConfigError
 from edge.identity.card import Card, CardError, verified
+from edge.identity.group import GroupKey
 from edge.identity.guard import Membership, SignedGuard
 from edge.identity.signature import SEED_BYTES, Signer
 from edge.messages.topics import TlsFiles
@@ -30,6 +33,7 @@ _MOST_BYTES = 2**16
 _REVOKED, _START = "revoked", "start"
 AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM = "authority.pem", "certificate.pem", "key.pem"
 IDENTITY_JSON = "identity.json"
+GROUP_KEYS = "group-keys"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +45,7 @@ class Identity:
     card: Card
     tls: TlsFiles
     revocations: bytes
+    group_keys: tuple[bytes, ...]
 
     def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
         """What the program speaks and hears through; `clock_s` is its monotonic clock."""
@@ -90,6 +95,7 @@ def _load(folder: Path, fleet: str, start: int) -> Identity:
         revocations = _revocations_in(folder)
         # Before anything counts on it.
         SignedGuard(membership, lambda: 0.0, revocations)
+        group_keys = _group_keys(folder / GROUP_KEYS)
     except FileNotFoundError as error:
         raise ConfigError(
             f"{folder}: {Path(error.filename).name} is missing: enroll it first (`lpac fleet "
@@ -100,7 +106,7 @@ def _load(folder: Path, fleet: str, start: int) -> Identity:
     if card.fleet != fleet or written.fleet != fleet:
         raise ConfigError(f"{folder}: is of fleet {card.fleet!r}, not of {fleet!r}")
     paths = (str(folder / name) for name in (AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM))
-    return Identity(folder, membership, card, TlsFiles(*paths), revocations)
+    return Identity(folder, membership, card, TlsFiles(*paths), revocations, group_keys)
 
 
 def load_card(folder: Path, authority: bytes) -> Card:
@@ -157,9 +163,30 @@ def identity_json(fleet: str, authority: bytes, card_data: bytes) -> bytes:
     return msgspec.json.encode(_Written(fleet, authority.hex(), card_data.hex()))
 
 
-def _seed(path: Path) -> bytes:
+def group_keys_text(keys: Sequence[bytes]) -> bytes:
+    """The file of a robot's keys of the group, the newest first."""
+    return "".join(f"{key.hex()}\n" for key in keys).encode()
+
+
+def _group_keys(path: Path) -> tuple[bytes, ...]:
+    """None of them, if there is no file. Raises ValueError."""
+    try:
+        _require_private(path)
+        keys = tuple(map(bytes.fromhex, _bytes_of(path).decode("ascii", "replace").split()))
+    except FileNotFoundError:
+        return ()
+    for key in keys:
+        GroupKey.of(key)
+    return keys
+
+
+def _require_private(path: Path) -> None:
     if path.stat().st_mode & 0o077:
         raise ValueError(f"{path.name} is readable for others: chmod 600 {path}")
+
+
+def _seed(path: Path) -> bytes:
+    _require_private(path)
     match = re.search(
         r"-----BEGIN PRIVATE KEY-----([A-Za-z0-9+/=\s]+)-----END PRIVATE KEY-----",
         _bytes_of(path).decode("ascii", "replace"),

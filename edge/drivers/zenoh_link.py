@@ -32,14 +32,12 @@ from typing import Literal, Self
 import zenoh
 
 from edge.core import log
-from edge.core.schema import no_options
 from edge.core.wire import MAX_ROBOT_ID
 from edge.messages.admission import Admission
 from edge.messages.topics import (
     GROUND_CARD,
     STATE,
     TOPICS,
-    LinkSetting,
     ReceiveCallback,
     Sender,
     TlsFiles,
@@ -77,21 +75,6 @@ _ADVICE = {
 
 class LinkError(OSError):
     """The link cannot be opened; the text says which endpoint or setting, and what to do."""
-
-
-def zenoh_link(setting: LinkSetting) -> "ZenohLink":
-    """The type "zenoh" of robot.toml's [link]; it has no options. Raises LinkError, ConfigError."""
-    no_options("link", setting.options)
-    return ZenohLink(
-        fleet=setting.fleet,
-        robot_id=setting.robot_id,
-        mode=setting.mode,
-        listen=setting.listen,
-        connect=setting.connect,
-        scouting=setting.scouting,
-        subscriptions=setting.subscriptions,
-        tls=setting.tls,
-    )
 
 
 class ZenohLink:

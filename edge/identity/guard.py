@@ -290,12 +290,13 @@ class SignedGuard:
 
     # What comes in
 
-    def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> None:
+    def _receive(self, topic: Topic, hear: Hear, key: str, data: bytes) -> bool:
         found = self._opened(topic, key, data)
         if isinstance(found, RefusedMessage):
             self._refuse(found, key)
-        else:
-            hear(key, found[0], found[1])
+            return False
+        hear(key, found[0], found[1])
+        return True
 
     def _opened(
         self, topic: Topic, key: str, data: bytes

@@ -1,7 +1,6 @@
 """Ed25519 (RFC 8032), which every card and every message is signed with.
 
-The only place that knows the library. Keys are their bytes: 32 of a secret key's seed, 32 of a
-public key, 64 of a signature.
+Keys are their bytes: 32 of a secret key's seed, 32 of a public key, 64 of a signature.
 """
 
 import hashlib

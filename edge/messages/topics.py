@@ -75,8 +75,9 @@ class Link(Protocol):
         """How many messages it did not look at: too many at once, or too large."""
 
 
-# Of the key below `lpac/<fleet>/` and the data; from any thread, and it only stores.
-ReceiveCallback = Callable[[str, bytes], None]
+# Of the key below `lpac/<fleet>/` and the data; from any thread, and it only stores. False: it was
+# nobody's word.
+ReceiveCallback = Callable[[str, bytes], bool | None]
 
 
 class TlsFiles(NamedTuple):
@@ -92,11 +93,27 @@ def is_loopback(endpoint: str) -> bool:
     return re.match(r"\w+/(127\.|localhost:|\[::1\])", endpoint) is not None
 
 
+class Group(NamedTuple):
+    """A multicast group in which robots tell each other what they say.
+
+    `interface` is the robot's own IPv4 address, by whose network it is reached. `keys` are the
+    fleet's, 32 bytes each: it speaks with the first, and hears all. Without `is_secret` they are no
+    secret.
+    """
+
+    address: str
+    port: int
+    interface: str
+    keys: tuple[bytes, ...]
+    is_secret: bool
+
+
 class LinkSetting(NamedTuple):
     """What robot.toml says of the radio: see `edge.robot.config.LinkConfig`.
 
     With `robot_id` None it only listens. `subscriptions` maps topics to callbacks. With `tls` only
-    members of the fleet are let in; without, whoever reaches it.
+    members of the fleet are let in; without, whoever reaches it. With `group` robots tell each
+    other there what they have to say.
     """
 
     fleet: str
@@ -108,6 +125,7 @@ class LinkSetting(NamedTuple):
     options: Mapping[str, object]
     subscriptions: Mapping[Topic, ReceiveCallback]
     tls: TlsFiles | None
+    group: Group | None = None
 
 
 class LinkDriver(Protocol):

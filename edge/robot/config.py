@@ -58,6 +58,24 @@ def require_url(key: str, url: str) -> None:
         raise ValueError(f"{key} = {url!r}: its port must be from 1 to 65535")
 
 
+def is_ipv4(text: str) -> bool:
+    """Whether it is an IPv4 address."""
+    numbers = text.split(".")
+    return len(numbers) == 4 and all(n.isdecimal() and int(n) <= 255 for n in numbers)
+
+
+def require_group(key: str, group: str) -> tuple[str, int]:
+    """The address and the port of a multicast group."""
+    address, _, port = group.rpartition(":")
+    is_group = is_ipv4(address) and 224 <= int(address.partition(".")[0]) <= 239
+    if not (is_group and port.isdecimal() and 1 <= int(port) <= 65535):
+        raise ValueError(
+            f"{key} = {group!r}: must be an IPv4 multicast address and a port, such as "
+            "'239.255.76.80:7450'"
+        )
+    return address, int(port)
+
+
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
     """What looks at the ground: a `type` of `edge.drivers.registry`, and what that takes."""
@@ -97,13 +115,17 @@ class LinkConfig:
     A "client" talks through a router, which `connect` or scouting names; a "peer" needs none.
     Members of a fleet ([identity]) meet by TLS: tls/192.168.8.10:7447. Without an identity whoever
     reaches the radio can fly the robot: beyond this machine that must be said, by `insecure`.
-    `type` is one of `edge.drivers.registry`; `options` is what another type takes besides.
+    With `group` robots tell each other what they have to say by multicast, to that IPv4 address and
+    port, in the network of their own address `interface`. `type` is one of `edge.drivers.registry`;
+    `options` is what another type takes besides.
     """
 
     mode: Literal["peer", "client"] = "peer"
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     scouting: bool = False
+    group: str = ""
+    interface: str = ""
     insecure: bool = False
     type: str = "zenoh"
     options: dict[str, object] = field(default_factory=dict, hash=False)
@@ -121,11 +143,20 @@ class LinkConfig:
                     raise ValueError(
                         f"{name} = {endpoint!r}: must be tls/ADDRESS:PORT, or tcp/ADDRESS:PORT"
                     )
+        if self.group:
+            require_group("group", self.group)
+        if bool(self.group) != bool(self.interface) or not is_ipv4(self.interface or "0.0.0.0"):
+            raise ValueError(
+                f"interface = {self.interface!r}: must be the robot's own IPv4 address, with group "
+                "alone"
+            )
 
     @property
     def leaves_machine(self) -> bool:
         """Whether somebody on another computer may be heard."""
         if self.type != "zenoh" or self.scouting or not (self.listen or self.mode == "client"):
+            return True
+        if self.group and not self.interface.startswith("127."):
             return True
         return not all(map(is_loopback, (*self.listen, *self.connect)))
 

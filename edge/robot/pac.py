@@ -23,8 +23,18 @@ from edge.core.memory import RobotMemory
 from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Odometry, OdometrySource, Sensor
 from edge.core.shared_map import SharedMap
-from edge.core.wire import MAX_ROBOT_ID, PAYLOAD_TYPES, PayloadType, Rejection, decode, encode
+from edge.core.wire import (
+    MAX_ROBOT_ID,
+    PAYLOAD_TYPES,
+    PayloadType,
+    Rejection,
+    decode,
+    encode,
+    most_bytes,
+)
 from edge.flight.safety import limit_speed
+from edge.identity.envelope import OVERHEAD_BYTES
+from edge.messages.beacon import BEACON_BYTES
 from edge.policy.bundle import BundleError
 from edge.policy.family import Observation, Perceived, Policy
 
@@ -54,6 +64,18 @@ class PacParameters:
             raise ValueError(
                 f"payload = {self.payload!r}: must be one of {', '.join(PAYLOAD_TYPES)}"
             )
+
+
+def message_bytes(policy: Policy, payload: PayloadType) -> tuple[int, int]:
+    """What a robot's message takes, beacon and envelope included, if its numbers do not compress.
+
+    Without its map, and with one that does not compress either: most maps do.
+    """
+    perception = policy.manifest.perception
+    side = perception.shared_map_side if perception else 0
+    least, most = (most_bytes(policy.message_size, payload, cells) for cells in (0, side))
+    around = OVERHEAD_BYTES + BEACON_BYTES
+    return around + least, around + most
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,20 +26,27 @@ from edge.core.schema import ConfigError
 from edge.core.vehicle import Action, Setpoint
 from edge.drivers.clock import SystemClock
 from edge.drivers.flight_log import FlightLog
-from edge.drivers.identity_folder import Identity, listening_identity, load_identity
+from edge.drivers.identity_folder import (
+    GROUP_KEYS,
+    Identity,
+    listening_identity,
+    load_identity,
+)
 from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
 from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
+from edge.identity.group import MOST_BYTES, MOST_FRAGMENTS, frames, key_of_open_fleet
 from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import LoopStatus
-from edge.messages.topics import Link, LinkSetting
+from edge.messages.topics import Group, Link, LinkSetting
 from edge.policy.family import VerifiedPolicy
-from edge.robot.config import RobotConfig
+from edge.robot.config import RobotConfig, require_group
 from edge.robot.log import open_log
 from edge.robot.loops import Loop
 from edge.robot.node import Ports, RobotNode
+from edge.robot.pac import message_bytes
 
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
@@ -66,6 +73,13 @@ def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, Sensor
         raise ConfigError(
             f"policy: payload = {config.policy.payload!r}: {config.policy.bundle} was judged with "
             f"{', '.join(judged)} alone (`lpac evaluate --payload`)"
+        )
+    least_bytes, _ = message_bytes(policy.policy, config.policy.payload)
+    if config.link.group and frames(least_bytes) > MOST_FRAGMENTS:
+        raise ConfigError(
+            f"link: group = {config.link.group!r}: a message of {config.policy.bundle} in "
+            f"{config.policy.payload} has {least_bytes} bytes, and a group takes {MOST_BYTES}: "
+            "take another payload, or another transport"
         )
     sensor = config.sensor
     sensor_over = parts.enter_context(
@@ -174,9 +188,23 @@ def _open_link(
     link = config.link
     setting = LinkSetting(
         config.fleet, robot_id, link.mode, link.listen, link.connect, link.scouting, link.options,
-        node.subscriptions, None if identity is None else identity.tls,
+        node.subscriptions, None if identity is None else identity.tls, _group(config, identity),
     )  # fmt: skip
     return open_link(link.type, setting)
+
+
+def _group(config: RobotConfig, identity: Identity | None) -> Group | None:
+    """Raises ConfigError for a member that was given no key of the group."""
+    if not config.link.group:
+        return None
+    address, port = require_group("group", config.link.group)
+    keys = (key_of_open_fleet(config.fleet),) if identity is None else identity.group_keys
+    if not keys:
+        raise ConfigError(
+            f"{config.identity.folder}: {GROUP_KEYS} is missing, which multicast needs: run `lpac "
+            "fleet up`"
+        )
+    return Group(address, port, config.link.interface, keys, is_secret=identity is not None)
 
 
 class _Program:

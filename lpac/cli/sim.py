@@ -52,6 +52,7 @@ class RadioTransport(StrEnum):
 
     MESH = "mesh"
     ROUTER = "router"
+    MULTICAST = "multicast"
 
 
 class Scale(StrEnum):
@@ -137,7 +138,8 @@ def sim(
     transport: Annotated[
         RadioTransport,
         typer.Option(
-            help="mavlink, px4: whether robots say what they say to each other, or to a router."
+            help="mavlink, px4: whether robots say what they say to each other, to a router, or "
+            "to all at once."
         ),
     ] = RadioTransport.MESH,
     script: Annotated[

@@ -8,6 +8,7 @@ was issued. Cards are what robots decide by; certificates of the same keys let t
 import datetime
 import fcntl
 import os
+import secrets
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,19 +29,24 @@ from edge.core.schema import ConfigError
 from edge.drivers.identity_folder import (
     AUTHORITY_PEM,
     CERTIFICATE_PEM,
+    GROUP_KEYS,
     IDENTITY_JSON,
     KEY_PEM,
+    group_keys_text,
     identity_json,
     load_card,
 )
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID
 from edge.identity.card import MOST_REVOKED, Card, Revocations, Role, signed
+from edge.identity.group import KEY_BYTES
 from edge.identity.signature import Signer, fingerprint
 from edge.robot.config import require_name
 
 _SECRET = "authority.key"
 _MEMBERS = "members.json"
 _REVOKED = "revoked"
+# The newest, and the one that robots have that were not given it yet.
+_MOST_KEYS = 2
 _VALID_S = 2.0 * 365.0 * 86400.0
 # Flight depends on no wall clock: a certificate lets its holder in whatever the time is.
 _ALWAYS = (datetime.datetime(1970, 1, 1), datetime.datetime(9999, 12, 31, 23, 59, 59))
@@ -74,10 +80,16 @@ class _Ledger(msgspec.Struct):
     revocations: int = 0
     releases: int = 0
     members: list[Member] = []
+    # Hexadecimal digits, the newest first; somebody who has the first is a member no more, if so.
+    group_keys: list[str] = []
+    group_key_leaked: bool = False
 
 
 class Issued(NamedTuple):
-    """What a member is handed; the files of its folder by name. None of it is secret."""
+    """What a member is handed; the files of its folder by name.
+
+    A robot's keys of the group are secret: the way there must be.
+    """
 
     member: Member
     files: dict[str, bytes]
@@ -138,7 +150,7 @@ class Authority:
         return Issued(member, self.files(member))
 
     def files(self, member: Member) -> dict[str, bytes]:
-        """What the member has of the authority: the files of its folder by name, none secret."""
+        """What the member has of the authority: the files of its folder by name."""
         common_name = member.role.value
         if member.robot_id is not None:
             common_name = f"robot-{member.robot_id}"
@@ -150,7 +162,24 @@ class Authority:
                 "authority", self.fleet, self._key.public_key(), self._key, is_authority=True
             ),
             _REVOKED: self.revocations,
+            **({GROUP_KEYS: self.group_keys()} if member.role is Role.ROBOT else {}),
         }
+
+    def group_keys(self) -> bytes:
+        """What robots have of the multicast group's keys: the file of that name."""
+        return group_keys_text(list(map(bytes.fromhex, self._read().group_keys)))
+
+    def renew_group_key(self) -> bool:
+        """Make a new key of the group if somebody who has the last is a member no more.
+
+        Whether there is one. Robots hear each other by the one before, too, until all have it.
+        """
+        with self._changed() as ledger:
+            leaked = ledger.group_key_leaked or not ledger.group_keys
+            if leaked:
+                ledger.group_keys = [secrets.token_hex(KEY_BYTES), *ledger.group_keys][:_MOST_KEYS]
+                ledger.group_key_leaked = False
+        return leaked
 
     def identity_json(self, member: Member) -> bytes:
         """The member's file of that name, with its card."""
@@ -217,6 +246,7 @@ class Authority:
                 "new authority"
             )
         ledger.revocations += 1
+        ledger.group_key_leaked = True
         data = signed(Revocations(ledger.revocations, fingerprints), self._signer)
         write_file(self.folder / _REVOKED, data, 0o644)
 
@@ -248,7 +278,7 @@ def create_authority(folder: Path, fleet: str) -> Authority:
         raise AuthorityError(f"{folder}: has an authority already")
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     key = Ed25519PrivateKey.generate()
-    ledger = _Ledger(fleet, revocations=1)
+    ledger = _Ledger(fleet, revocations=1, group_keys=[secrets.token_hex(KEY_BYTES)])
     write_file(folder / _MEMBERS, msgspec.json.encode(ledger), 0o600)
     write_file(folder / _REVOKED, signed(Revocations(1), Signer(key.private_bytes_raw())), 0o644)
     write_file(folder / _SECRET, _pem(key), 0o600)
@@ -260,7 +290,7 @@ def write_member(folder: Path, issued: Issued, key: Ed25519PrivateKey) -> None:
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     write_file(folder / KEY_PEM, _pem(key), 0o600)
     for name, data in issued.files.items():
-        write_file(folder / name, data, 0o644)
+        write_file(folder / name, data, 0o600)
 
 
 def new_member(

@@ -1,6 +1,7 @@
 """Who belongs to the fleet: cards for robots, whose keys stay on them, and for ground stations."""
 
 import base64
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -71,10 +72,42 @@ async def renew_card(config: FleetConfig, robot: RobotHost, report: Report) -> N
         made = await session.call("identity_key", fresh=True)
         await _write_card(session, authority, robot, made["public_key"], fresh=True)
         if found["service"]["active"] == "active":
-            await session.call(
-                "restart", directory=config.directory, mavlink_port=robot.mavlink_port,
-                in_flight=False,
-            )  # fmt: skip
+            await _restart(session, config, robot)
+
+
+def has_group_keys(config: FleetConfig) -> bool:
+    """Whether robots need keys of a multicast group, and this computer is where they are made."""
+    if config.radio.transport != "multicast" or config.keys is None:
+        return False
+    try:
+        open_authority(config)
+    except AuthorityError:
+        return False
+    return True
+
+
+async def give_group_keys(session: Session, config: FleetConfig, robot: RobotHost) -> bool:
+    """See that the robot has the keys of the fleet's group; the session has its lock.
+
+    Whether it had others. A program that runs is started again, to speak with the new one.
+    Raises FleetError if it flies, AuthorityError or OSError.
+    """
+    keys = open_authority(config).group_keys()
+    found = await session.call("identity_key", fresh=False)
+    if found["group_keys"] == hashlib.sha256(keys).hexdigest():
+        return False
+    await session.call(
+        "set_group_keys", text=base64.b64encode(keys).decode(), mavlink_port=robot.mavlink_port
+    )
+    if (await session.call("service"))["active"] == "active":
+        await _restart(session, config, robot)
+    return True
+
+
+async def _restart(session: Session, config: FleetConfig, robot: RobotHost) -> None:
+    await session.call(
+        "restart", directory=config.directory, mavlink_port=robot.mavlink_port, in_flight=False
+    )
 
 
 async def _write_card(

@@ -5,7 +5,6 @@ A robot without a slot is a spare. Relative paths are meant from the file's own 
 user's. Every mistake is one line that names the file, the key, the robot and what is allowed.
 """
 
-import ipaddress
 import itertools
 import math
 import re
@@ -21,6 +20,8 @@ from edge.messages.topics import is_loopback
 from edge.robot.config import (
     AutopilotConfig,
     RobotConfig,
+    is_ipv4,
+    require_group,
     require_name,
     require_robot_id,
     require_system_id,
@@ -29,7 +30,7 @@ from edge.robot.config import (
 
 DEFAULT_DIRECTORY = "/opt/lpac"
 
-Transport = Literal["mesh", "router"]
+Transport = Literal["mesh", "router", "multicast"]
 
 # Where fleets' keys are if the file does not say: not beside it, where repositories are.
 _KEYS = "~/.local/share/lpac/keys"
@@ -77,11 +78,14 @@ class RadioConfig:
     """How what robots say gets to the others.
 
     "mesh": each is connected to each, and says it to them one by one. "router": all are connected
-    to a router, at `router` (IPv4 address and port), which `lpac fleet router` is.
+    to a router, at `router` (IPv4 address and port), which `lpac fleet router` is. "multicast":
+    robots tell each other all at once, in `group` (multicast address and port), and the ground by
+    way of the router.
     """
 
     transport: Transport = "mesh"
     router: str = ""
+    group: str = "239.255.76.80:7450"
 
     def __post_init__(self) -> None:
         if self.router and not _is_endpoint(self.router):
@@ -89,11 +93,10 @@ class RadioConfig:
                 f"router = {self.router!r}: must be an IPv4 address and a port, such as "
                 "'192.168.8.2:7447'"
             )
-        if (self.transport == "router") != bool(self.router):
-            raise ValueError(
-                f"transport = {self.transport!r}: router = {self.router!r}: must be where the "
-                "router is, and is for this transport alone"
-            )
+        if (self.transport == "mesh") == bool(self.router):
+            must = "must be left out" if self.router else "must be where the router is"
+            raise ValueError(f"transport = {self.transport!r}: router = {self.router!r}: {must}")
+        require_group("group", self.group)
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,9 +304,9 @@ class _RobotTable:
             raise ValueError(
                 f"system_id is missing: robot_id = {self.robot_id} is not from 1 to 255"
             )
-        if self.address is not None and not _is_ipv4(self.address):
+        if self.address is not None and not is_ipv4(self.address):
             raise ValueError(f"address = {self.address!r}: must be an IPv4 address")
-        if self.address is None and not _is_ipv4(self.host):
+        if self.address is None and not is_ipv4(self.host):
             raise ValueError(
                 f"address is missing: host = {self.host!r} is no IPv4 address, by which the other "
                 "robots could reach it"
@@ -454,15 +457,7 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
 
 def _is_endpoint(text: str) -> bool:
     address, _, port = text.rpartition(":")
-    return _is_ipv4(address) and port.isdecimal() and 1 <= int(port) <= 65535
-
-
-def _is_ipv4(text: str) -> bool:
-    try:
-        ipaddress.IPv4Address(text)
-    except ValueError:
-        return False
-    return True
+    return is_ipv4(address) and port.isdecimal() and 1 <= int(port) <= 65535
 
 
 def _cpus(text: str) -> tuple[int, ...]:
@@ -541,6 +536,8 @@ def _robot_mapping(
     }
     if config.router is not None:
         link = {"mode": "client", "connect": [config.router]}
+    if config.radio.transport == "multicast":
+        link |= {"group": config.radio.group, "interface": robot.address}
     own = {
         "fleet": config.fleet,
         "robot_id": robot.robot_id,

@@ -6,7 +6,13 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from edge.core.wire import PayloadType
+from edge.drivers.registry import load_policy
 from edge.flight.energy import trials
+from edge.identity.group import frames
+from edge.policy.bundle import load_bundle
+from edge.robot.pac import message_bytes
+from lpac.fleet.cards import give_group_keys, has_group_keys
 from lpac.fleet.doctor import (
     GOOD_CLOCK_OFFSET_S,
     Diagnosis,
@@ -21,6 +27,8 @@ from lpac.fleet.session import RemoteError, Session, UnreachableError
 from lpac.fleet.settings import FleetConfig, RobotHost
 
 _ASK_AGAIN_S = 1.0
+# Of what goes to a group by Wi-Fi, where the receiver is neither near nor far.
+_LOST = 0.05
 
 
 class Arrival(NamedTuple):
@@ -48,6 +56,36 @@ class Pack(NamedTuple):
     share: float | None
     endurance_s: float | None
     trials: int | None
+
+
+class GroupCost(NamedTuple):
+    """What a robot's message takes in a multicast group: datagrams, all of which must come.
+
+    `datagrams` are from so many, with a map that is almost nothing, to so many, with one that does
+    not compress; `lost` is the share of messages, each of it, that are lost if one datagram of
+    twenty is. More than `MOST_FRAGMENTS` are not sent.
+    """
+
+    payload: PayloadType
+    datagrams: tuple[int, int]
+    lost: tuple[float, float]
+
+
+def group_costs(config: FleetConfig) -> list[GroupCost]:
+    """For each payload that robots of the fleet speak in; none unless they speak in a group.
+
+    Raises BundleError, ConfigError or OSError for a policy that cannot be loaded.
+    """
+    if config.radio.transport != "multicast":
+        return []
+    policy = load_policy(load_bundle(config.bundle))
+    flying = [slot.robot for slot in config.slots if slot.robot is not None]
+    costs = []
+    for payload in dict.fromkeys(config.robot_config(name).policy.payload for name in flying):
+        least, most = map(frames, message_bytes(policy, payload))
+        lost = 1.0 - (1.0 - _LOST) ** least, 1.0 - (1.0 - _LOST) ** most
+        costs.append(GroupCost(payload, (least, most), lost))
+    return costs
 
 
 async def bring_up(
@@ -103,6 +141,12 @@ async def _bring_up(
         port = robot.mavlink_port
         if await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
             done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
+    if locked and has_group_keys(config):
+        try:
+            if await give_group_keys(session, config, robot):
+                done.append("it was given a new key of the group")
+        except RemoteError as error:
+            problems.append(str(error))
     service = await session.call("service")
     flies = config.slot_of(robot.name) is not None
     idle = flies and locked and service["enabled"] and service["active"] != "active"

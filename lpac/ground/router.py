@@ -18,8 +18,8 @@ def serve_router(path: Path, stop: threading.Event, on_listening: Callable[[str]
     config = load_fleet(path)
     if config.router is None:
         raise ConfigError(
-            f"{path}: radio: transport = 'mesh' has no router: set transport = \"router\" and "
-            'router = "ADDRESS:PORT", and deploy'
+            f"{path}: radio: transport = 'mesh' has no router: set transport = \"router\" or "
+            '"multicast" and router = "ADDRESS:PORT", and deploy'
         )
     identity = load_own_identity(config, None)
     tls = None if identity is None else identity.tls

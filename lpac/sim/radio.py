@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 
 from edge.core import F64
-from edge.messages.topics import Topic
+from edge.messages.topics import ReceiveCallback, Topic
 from lpac.sim.schedule import Schedule
 
-Subscriptions = Mapping[Topic, Callable[[str, bytes], None]]
+Subscriptions = Mapping[Topic, ReceiveCallback]
 # The first ground; further ones are -2, -3, ...
 GROUND = -1
 

@@ -83,7 +83,7 @@ ONLY_IN = {
     "textual": {"lpac/ground/terminal/"},
     "aiohttp": {"lpac/ground/map/"},
     "tomlkit": {"lpac/fleet/writer.py"},
-    "nacl": {"edge/identity/signature.py"},
+    "nacl": {"edge/identity/signature.py", "edge/identity/group.py"},
     "cryptography": {"lpac/fleet/authority.py", "lpac/fleet/web_certificate.py"},
 }
 # No clock, thread, file or socket: all of it is called by somebody who has them. What several

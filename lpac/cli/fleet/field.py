@@ -105,6 +105,22 @@ def _print_free_ground(config: "FleetConfig") -> None:
         typer.echo(f"\nkeep free: the fence and {margin.least_m:g} m around it ({margin.why})")
 
 
+def _print_group(config: "FleetConfig") -> None:
+    """What multicast costs."""
+    from lpac.fleet.up import group_costs
+
+    for cost in group_costs(config):
+        (least, most), (seldom, often) = cost.datagrams, cost.lost
+        several = most > 1
+        numbers = f"{least} to {most}" if least < most else str(most)
+        lost = f"{seldom:.0%} to {often:.0%}" if least < most else f"{often:.0%}"
+        typer.echo(
+            f"multicast: a message in {cost.payload} takes {numbers} "
+            f"datagram{'s' if several else ''}{', all or nothing' if several else ''}: where 1 of "
+            f"20 is lost, {lost} of messages are"
+        )
+
+
 def _described(diagnoses: "Sequence[Diagnosis]") -> dict[str, Any]:
     return {
         each.robot: {
@@ -138,6 +154,7 @@ def up(
 
     Without --robots for all that have a slot. Nothing takes off.
     """
+    from lpac.fleet.cards import has_group_keys, open_authority
     from lpac.fleet.up import board, bring_up, decide, packs
 
     config, chosen = open_fleet(fleet, robots)
@@ -146,6 +163,9 @@ def up(
         if not chosen:
             raise ValueError(f"{config.path}: slots: no robot sits in one")
     until_s = time.monotonic() + timeout
+    # Who is not given a new key is not understood by who was.
+    if robots is None and has_group_keys(config) and open_authority(config).renew_group_key():
+        typer.echo("the group has a new key, since a key of the fleet was revoked")
 
     async def arrive(robot: "RobotHost", report: "Report") -> "Arrival":
         return await bring_up(config, robot, until_s, report)
@@ -167,6 +187,7 @@ def up(
         _print_board(diagnoses)
         _print_findings(diagnoses)
         _print_free_ground(config)
+        _print_group(config)
         _print_decisions(decisions, batteries)
         if config.insecure:
             typer.secho("insecure: whoever is on the network can fly this fleet", fg="yellow")

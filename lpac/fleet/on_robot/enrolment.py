@@ -2,6 +2,7 @@
 
 import base64
 import binascii
+import hashlib
 import json
 import os
 import shutil
@@ -15,7 +16,7 @@ _IDENTITY = "/etc/lpac/robot.json"
 # As `edge.drivers.identity_folder` reads it; the program sees it below /var/lib/lpac.
 _MEMBERSHIP = "/var/lib/private/lpac/identity"
 _KEY, _NEXT_KEY, _CARD = "key.pem", "next-key.pem", "identity.json"
-_AUTHORITY = "authority.pem"
+_AUTHORITY, _GROUP_KEYS = "authority.pem", "group-keys"
 # Bridges PX4 to DDS: through it a predecessor's program commands the vehicle.
 _DDS_AGENT = "voxl-microdds-agent"
 # What else of ModalAI's may send setpoints.
@@ -50,8 +51,9 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
     """The public key of this robot, whose secret key is made here and never leaves.
 
     With `fresh` it is another one than before, which counts once `set_card` brings its card.
-    Returns the `public_key` in hexadecimal digits, and the text of the `card` that is there, None
-    unless the robot knows by whom releases are signed, too.
+    Returns the `public_key` in hexadecimal digits, the text of the `card` that is there, None
+    unless the robot knows by whom releases are signed, too, and the SHA-256 of the `group_keys`
+    that are, in hexadecimal digits.
     """
     _make_identity()
     key = os.path.join(_MEMBERSHIP, _NEXT_KEY if fresh else _KEY)
@@ -67,7 +69,8 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
         with open(os.path.join(_MEMBERSHIP, _CARD)) as file:
             card = file.read()
     # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
-    return {"public_key": binascii.hexlify(der[-32:]).decode(), "card": card}
+    public_key = binascii.hexlify(der[-32:]).decode()
+    return {"public_key": public_key, "card": card, "group_keys": _group_keys_sha256()}
 
 
 @call
@@ -84,9 +87,28 @@ def set_card(files: Dict[str, str], fresh: bool, mavlink_port: int) -> Dict[str,
     for name, text in sorted(files.items()):
         if os.path.basename(name) != name:
             raise Refused("%r is no file's name" % name)
-        write_whole(os.path.join(_MEMBERSHIP, name), base64.b64decode(text))
+        write_whole(os.path.join(_MEMBERSHIP, name), base64.b64decode(text), 0o600)
     _own_identity()
     signatures.trust_authority(base64.b64decode(files[_AUTHORITY]))
+    return {}
+
+
+def _group_keys_sha256() -> Optional[str]:
+    try:
+        with open(os.path.join(_MEMBERSHIP, _GROUP_KEYS), "rb") as file:
+            return hashlib.sha256(file.read()).hexdigest()
+    except FileNotFoundError:
+        return None
+
+
+@call
+def set_group_keys(text: str, mavlink_port: int) -> Dict[str, Any]:
+    """Write the fleet's keys of its multicast group, in base64, which the program starts with."""
+    releases.require_lock()
+    service.refuse_in_flight(mavlink_port, "a new key of the group")
+    _make_identity()
+    write_whole(os.path.join(_MEMBERSHIP, _GROUP_KEYS), base64.b64decode(text), 0o600)
+    _own_identity()
     return {}
 
 

@@ -132,14 +132,14 @@ class Layout:
         settings: Mapping[str, Mapping[str, object]] | None = None,
         spares: int = 0,
         keys: bool = False,
-        router: str | None = None,
+        radio: Mapping[str, str] | None = None,
     ) -> None:
         """fleet.toml, world.env, and robots/<i>/robot.toml in `folder`.
 
         `robots` has what fleet.toml says of each robot besides its ids, by name, in their order.
         `settings` are further keys of robot.toml's tables, for all robots. The last `spares` lose
         their slots in fleet.toml, once their robot.toml is written. `keys`: a secure fleet has them
-        in `folder`, where `write_keys` puts them. `router` is its address and port, if it has one.
+        in `folder`, where `write_keys` puts them. `radio` is fleet.toml's table of that name.
         """
         assert self.features is not None
         folder.mkdir(parents=True, exist_ok=True)
@@ -154,7 +154,7 @@ class Layout:
             {
                 "fleet": fleet,
                 **({"keys": "keys"} if self.scenario.secure and keys else {}),
-                **({"radio": {"transport": "router", "router": router}} if router else {}),
+                **({"radio": radio} if radio else {}),
                 "image": "none",
                 "bundle": str(self.bundle_path),
                 "world": "world.env",

@@ -244,8 +244,12 @@ class Fleet:
         *ports, router_port = free_ports(scenario.robots + 1)
         scheme = "tls" if scenario.secure else "tcp"
         self.endpoints = tuple(f"{scheme}/127.0.0.1:{port}" for port in ports)
-        router = f"127.0.0.1:{router_port}" if scenario.transport == "router" else None
+        router = None if scenario.transport == "mesh" else f"127.0.0.1:{router_port}"
         self.router = None if router is None else RouterProcess(self.fleet_toml, router_port)
+        radio = {} if router is None else {"transport": scenario.transport, "router": router}
+        if scenario.transport == "multicast":
+            # Of its own: another fleet's datagrams would be looked at, too.
+            radio["group"] = f"239.255.76.80:{router_port}"
         self.name = f"sim-{ports[0]}"
         self.robots = tuple(
             RobotProcess(robot, self.folder / "robots" / str(robot))
@@ -279,7 +283,7 @@ class Fleet:
             },
             settings=settings,
             keys=True,
-            router=router,
+            radio=radio,
         )
 
     def __enter__(self) -> Self:

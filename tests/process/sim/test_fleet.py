@@ -8,6 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 
 from edge.core.world import parse_world
-from edge.drivers.flight_log import read_metadata
+from edge.drivers.flight_log import read, read_metadata
 from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.robot.config import load_config
@@ -195,6 +196,25 @@ def test_a_fleet_meets_at_its_router_and_finds_it_again(tmp_path: Path) -> None:
         assert fleet.heard.wait_for(
             lambda statuses: {r: its.boot_nonce for r, its in statuses.items()} == before, 60.0
         )
+
+
+@pytest.mark.real_time
+def test_with_multicast_robots_hear_each_other_without_the_router(tmp_path: Path) -> None:
+    scenario = FleetScenario(robots=2, secure=True, transport="multicast")
+    with Fleet(scenario, tmp_path, SHIPPED) as fleet:
+        assert fleet.router is not None
+        for robot in fleet.robots:
+            assert load_config(robot.folder / "robot.toml").link.interface == "127.0.0.1"
+        assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0, 1}, 60.0)
+        fleet.router.__exit__(None, None, None)
+        gone_unix_s = time.time()
+        assert fleet.heard.wait_for(lambda statuses: not statuses, 60.0)
+        gone_s = time.time() - gone_unix_s
+    for robot in fleet.robots:
+        (log,) = robot.logs()
+        heard = [at_s for _, at_s, _ in read(log, "received") if at_s > gone_unix_s]
+        # Something may be late on a busy machine, but not most of it.
+        assert len(heard) > 0.5 * 2.5 * gone_s
 
 
 @contextmanager

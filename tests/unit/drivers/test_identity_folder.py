@@ -6,9 +6,15 @@ from pathlib import Path
 import pytest
 
 from edge.core.schema import ConfigError
-from edge.drivers.identity_folder import load_identity
+from edge.drivers.identity_folder import GROUP_KEYS, load_identity
 from edge.identity.card import Revocations, Role, verified
-from lpac.fleet.authority import Authority, AuthorityError, create_authority, new_member
+from lpac.fleet.authority import (
+    Authority,
+    AuthorityError,
+    create_authority,
+    new_member,
+    write_file,
+)
 
 
 @pytest.fixture
@@ -38,6 +44,33 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
     (folder / "revoked").write_bytes(authority.revocations)
     identity.exchange_revocations(guard)
     assert guard.revocations == authority.revocations
+
+
+def test_robots_share_a_key_that_is_renewed_when_one_is_a_member_no_more(
+    authority: Authority, tmp_path: Path
+) -> None:
+    def keys(robot_id: int) -> tuple[bytes, ...]:
+        folder = tmp_path / f"r{robot_id}"
+        write_file(folder / GROUP_KEYS, authority.group_keys(), 0o600)
+        return load_identity(folder, fleet="demo", unix_s=2e9).group_keys
+
+    for robot_id in (1, 2):
+        new_member(authority, tmp_path / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id)
+    # The ground is not in the group.
+    new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
+    assert not (tmp_path / "ann" / GROUP_KEYS).exists()
+    (first,) = keys(1)
+    assert keys(2) == (first,) and len(first) == 32
+    assert not authority.renew_group_key()
+    authority.revoke("r2")
+    # Not before all robots are given it.
+    assert keys(1) == (first,)
+    assert authority.renew_group_key() and not authority.renew_group_key()
+    second, former = keys(1)
+    assert former == first != second
+    authority.revoke("r2")
+    assert authority.renew_group_key()
+    assert keys(1)[1:] == (second,)
 
 
 def test_secrets_are_for_nobody_else(authority: Authority, tmp_path: Path) -> None:

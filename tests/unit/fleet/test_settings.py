@@ -172,6 +172,16 @@ def test_with_a_router_all_are_its_clients(tmp_path: Path) -> None:
     assert mesh.everybody[0] == "tls/192.168.8.11:7447" and len(mesh.everybody) == 4
 
 
+def test_with_multicast_robots_are_in_a_group_too(tmp_path: Path) -> None:
+    text = with_router("192.168.8.2:7447").replace('"router"', '"multicast"')
+    config = load_fleet(fleet_file(tmp_path, text))
+    assert (config.mode, config.everybody) == ("client", ("tls/192.168.8.2:7447",))
+    link = rendered(config, "r3", tmp_path).link
+    assert (link.mode, link.connect) == ("client", ("tls/192.168.8.2:7447",))
+    assert (link.group, link.interface) == ("239.255.76.80:7450", "192.168.8.13")
+    assert link.leaves_machine
+
+
 def with_router(place: str) -> str:
     return example("# [radio]", f'[radio]\ntransport = "router"\nrouter = "{place}"\n')
 
@@ -287,7 +297,11 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('fleet = "demo"', 'fleet = "a b"', ["fleet = 'a b'", "letters"]),
         ("# [radio]", '[radio]\ntransport = "air"\n#', ["radio: transport = 'air'", "'mesh'"]),
         ("# [radio]", '[radio]\ntransport = "router"\n#', ["radio: transport = 'router'", "where"]),
-        ("# [radio]", '[radio]\nrouter = "10.0.0.1:1"\n#', ["radio: transport = 'mesh'", "alone"]),
+        ("# [radio]", '[radio]\nrouter = "10.0.0.1:1"\n#', ["transport = 'mesh'", "left out"]),
+        (
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
+            'group = "10.0.0.2:7450"\n#', ["radio: group = '10.0.0.2:7450'", "239.255.76.80:7450"],
+        ),
         (
             "# [radio]", '[radio]\ntransport = "router"\nrouter = "laptop:7447"\n#',
             ["radio: router = 'laptop:7447'", "192.168.8.2:7447"],

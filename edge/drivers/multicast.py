@@ -1,0 +1,207 @@
+"""What robots tell each other, once for all: datagrams to a multicast group.
+
+On Wi-Fi the access point sends such a frame once, at its slow basic rate and without an
+acknowledgement: some are lost, which the policy takes, and ten times as many robots fit into a
+channel. Everything else goes over zenoh, by way of the fleet's router.
+"""
+
+import itertools
+import math
+import socket
+import time
+from collections import Counter, deque
+from collections.abc import Mapping
+from contextlib import suppress
+from threading import Event, Lock, Thread
+from typing import Self
+
+from edge.core import log
+from edge.drivers.zenoh_link import ZenohLink
+from edge.identity.group import (
+    TOPICS_OF_GROUP,
+    Assembly,
+    GroupKey,
+    MessageNumber,
+    datagrams,
+    number_in,
+    open_datagram,
+)
+from edge.messages.admission import Admission
+from edge.messages.topics import CARD, Group, ReceiveCallback, Topic
+
+# Of a hundred robots' messages those of a second.
+_BUFFER_BYTES = 2**19
+# How soon it looks whether it is to end; and tries again to join, where there is no network yet.
+_WAKES_S, _JOINS_AGAIN_S = 0.25, 0.5
+_FORGETS_AFTER_S = 5.0
+# An interface that went, or an access point that forgot who listens, takes a membership away.
+_REJOINS_AFTER_S = 5.0
+_CLOSE_TIMEOUT_S = 1.0
+# Own messages that may still come back.
+_OWN = 16
+
+
+class MulticastLink:
+    """A robot's radio: a group for what robots tell each other, and zenoh for the rest.
+
+    Every method may be called from any thread. Close it, or use it as a context manager.
+    """
+
+    def __init__(
+        self,
+        group: Group,
+        *,
+        robot_id: int | None,
+        subscriptions: Mapping[Topic, ReceiveCallback],
+        zenoh: ZenohLink,
+    ) -> None:
+        """Join the group, and stay in it; without a network it joins once there is one.
+
+        `subscriptions` are as `ZenohLink` has them: those to the group's topics count here. `zenoh`
+        is closed with it. What this link says does not come back; with `robot_id` None it only
+        listens.
+        """
+        self._group = group
+        self._robot_id = robot_id
+        self._zenoh = zenoh
+        self._callbacks = {t: c for t, c in subscriptions.items() if t in TOPICS_OF_GROUP}
+        self._keys = tuple(map(GroupKey.of, group.keys))
+        self._start = int(time.time() * 1e3)
+        self._counts = itertools.count()
+        self._own: deque[MessageNumber] = deque(maxlen=_OWN)
+        self._assembly = Assembly(math.inf if group.is_secret else _FORGETS_AFTER_S)
+        self._admission = Admission()
+        self._lock = Lock()
+        self._problems: Counter[str] = Counter()
+        self._strangers = 0
+        self._sender = _sending()
+        self._closed = Event()
+        self._hearing = Thread(target=self._hear, name="multicast", daemon=True)
+        self._hearing.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def publish(self, topic: Topic, data: bytes) -> None:
+        """Send to whoever listens; it may be lost. Raises KeyError for a topic of the ground's."""
+        if topic not in TOPICS_OF_GROUP or self._robot_id is None:
+            self._zenoh.publish(topic, data)
+            return
+        number = number_in(data) or MessageNumber(self._start, next(self._counts))
+        with self._lock:
+            self._own.append(number)
+        try:
+            self._sender.setsockopt(
+                socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
+            )
+            for datagram in datagrams(
+                data, topic=topic, sender=self._robot_id, number=number, key=self._keys[0]
+            ):
+                self._sender.sendto(datagram, (self._group.address, self._group.port))
+        except (OSError, ValueError) as error:  # No network, a full queue, or too large a message.
+            self._failed(f"publish {topic.name}", error)
+        if topic == CARD:
+            self._zenoh.publish(topic, data)  # The ground is not in the group.
+
+    def is_claimed(self, robot_id: int) -> bool:
+        """Whether another session says that it is that robot."""
+        return self._zenoh.is_claimed(robot_id)
+
+    def peers(self) -> int:
+        """How many it is connected to by zenoh: the router, or none."""
+        return self._zenoh.peers()
+
+    def refused(self) -> int:
+        """How many messages it did not look at: too many at once, too large, or of strangers."""
+        return self._zenoh.refused() + self._admission.refused + self._strangers
+
+    def close(self) -> None:
+        """Leave the radio, within a second or so; again is no error."""
+        self._closed.set()
+        self._hearing.join(_CLOSE_TIMEOUT_S)
+        self._sender.close()
+        self._zenoh.close()
+
+    # Hearing
+
+    def _hear(self) -> None:
+        while not self._closed.is_set():
+            try:
+                with _joined(self._group) as receiver:
+                    self._hear_from(receiver)
+            except Exception as error:  # No network yet; whatever it is, the next try may hear.
+                self._failed("hear the group", error)
+                self._closed.wait(_JOINS_AGAIN_S)
+
+    def _hear_from(self, receiver: socket.socket) -> None:
+        """Until all have been silent for so long that it may be this membership that is lost."""
+        heard_at_s = time.monotonic()
+        while not self._closed.is_set() and time.monotonic() - heard_at_s < _REJOINS_AFTER_S:
+            with suppress(TimeoutError):
+                self._take(receiver.recv(2048))
+                heard_at_s = time.monotonic()
+
+    def _take(self, data: bytes) -> None:
+        fragment = open_datagram(data, self._keys)
+        if fragment is None:
+            self._strangers += 1
+            return
+        if fragment.sender == self._robot_id and self._is_own(fragment.number):
+            return
+        now_s = time.monotonic()
+        message = self._assembly.add(fragment, now_s)
+        callback = self._callbacks.get(fragment.topic)
+        if message is None or callback is None:
+            return
+        key = f"robot/{fragment.sender}/{fragment.topic.name}"
+        if not self._admission.admits(fragment.topic, key, len(message), now_s):
+            return
+        try:
+            is_theirs = callback(key, message)
+        except Exception as error:
+            self._failed(f"callback {fragment.topic.name}", error)
+            return
+        # Outside the envelope a member may claim another's number to be whatever it likes.
+        is_number = not self._group.is_secret or number_in(message) == fragment.number
+        if is_theirs is not False and is_number:
+            self._assembly.heard(fragment, now_s)
+
+    def _is_own(self, number: MessageNumber) -> bool:
+        with self._lock:
+            return number in self._own
+
+    def _failed(self, what: str, error: Exception) -> None:
+        with self._lock:
+            self._problems[what] += 1
+            first = self._problems[what] == 1
+        if first:
+            log.error("link failure", error, what=what)
+
+
+def _sending() -> socket.socket:
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sender.setblocking(False)
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+    # A simulated fleet's other robots are on this computer.
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+    return sender
+
+
+def _joined(group: Group) -> socket.socket:
+    """Raises OSError where there is no such network now."""
+    receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        # To the group's own address, so that nothing else comes in.
+        receiver.bind((group.address, group.port))
+        membership = socket.inet_aton(group.address) + socket.inet_aton(group.interface)
+        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        receiver.settimeout(_WAKES_S)
+    except OSError:
+        receiver.close()
+        raise
+    return receiver

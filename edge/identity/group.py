@@ -1,0 +1,212 @@
+"""What goes to all robots at once: one datagram, or up to three, sealed with the fleet's group key.
+
+Who is not a member reads none of it, and nothing of his is listened to. Who said it is for the
+envelope inside to tell (`edge.identity.envelope`): any member has the key.
+
+A datagram, little-endian:
+
+| offset | type | field |
+| --- | --- | --- |
+| 0 | 2 bytes | magic, `LG` |
+| 2 | uint8 | version of this layout, 1 |
+| 3 | 4 bytes | the key, by its fingerprint |
+| 7 | 24 bytes | nonce, random |
+| 31 | 16 bytes | Poly1305 authentication tag |
+| 47 | | a fragment, encrypted by XSalsa20 |
+
+A fragment:
+
+| offset | type | field |
+| --- | --- | --- |
+| 0 | uint8 | topic, by its number in `TOPICS_OF_GROUP` |
+| 1 | uint16 | the sender's robot id |
+| 3 | uint48 | number of the message: that of its envelope, the start of the program, |
+| 9 | uint32 | and its sequence; or of its own, if it has no envelope |
+| 13 | uint8 | which fragment of the message, from 0 |
+| 14 | uint8 | how many it has |
+| 15 | | its part of the message |
+"""
+
+import hashlib
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from nacl.bindings import (
+    crypto_secretbox,
+    crypto_secretbox_KEYBYTES,
+    crypto_secretbox_NONCEBYTES,
+    crypto_secretbox_open,
+    randombytes,
+)
+from nacl.exceptions import CryptoError
+
+from edge.identity.envelope import read_envelope
+from edge.messages.topics import CARD, MESSAGE, Topic
+
+KEY_BYTES: int = crypto_secretbox_KEYBYTES
+MOST_FRAGMENTS = 3
+# What fits into one frame of 1500 bytes, behind the headers of IPv4 and UDP.
+DATAGRAM_BYTES = 1472
+# What robots tell each other; everything else is for the ground, or by it.
+TOPICS_OF_GROUP = (MESSAGE, CARD)
+
+_MAGIC, _VERSION = b"LG", 1
+_FINGERPRINT_BYTES, _TAG_BYTES = 4, 16
+_HEAD = struct.Struct(f"<2sB{_FINGERPRINT_BYTES}s{crypto_secretbox_NONCEBYTES}s")
+_FRAGMENT = struct.Struct("<BH6sIBB")
+PART_BYTES = DATAGRAM_BYTES - _HEAD.size - _TAG_BYTES - _FRAGMENT.size
+MOST_BYTES = MOST_FRAGMENTS * PART_BYTES
+# A sender's fragments come one after another; a fourth message in pieces means that one is lost.
+_MOST_PARTIAL = 3
+_MOST_SENDERS = 300
+
+
+class GroupKey(NamedTuple):
+    """A key that all robots of a fleet have, and what it is called."""
+
+    secret: bytes
+    fingerprint: bytes
+
+    @classmethod
+    def of(cls, secret: bytes) -> "GroupKey":
+        """Raises ValueError if it is not 32 bytes."""
+        if len(secret) != KEY_BYTES:
+            raise ValueError(f"a group key has {len(secret)} bytes: must be {KEY_BYTES}")
+        return cls(secret, hashlib.sha256(b"lpac group\0" + secret).digest()[:_FINGERPRINT_BYTES])
+
+
+def key_of_open_fleet(fleet: str) -> bytes:
+    """What a fleet without keys takes for one: it keeps fleets apart, and nothing secret."""
+    return hashlib.sha256(f"lpac open fleet {fleet}".encode()).digest()
+
+
+class MessageNumber(NamedTuple):
+    """Of a sender's two messages the one with the greater number is newer."""
+
+    start: int
+    sequence: int
+
+
+_NOTHING = MessageNumber(-1, -1)
+
+
+def number_in(message: bytes) -> MessageNumber | None:
+    """What the envelope says; None if the message has none."""
+    envelope = read_envelope(message)
+    return None if envelope is None else MessageNumber(envelope.start, envelope.sequence)
+
+
+class Fragment(NamedTuple):
+    """A part of a message, as a member sent it."""
+
+    topic: Topic
+    sender: int
+    number: MessageNumber
+    place: int
+    of: int
+    part: bytes
+
+
+def frames(message_bytes: int) -> int:
+    """How many datagrams a message of so many bytes takes; more than three are not sent."""
+    return max(1, math.ceil(message_bytes / PART_BYTES))
+
+
+def datagrams(
+    message: bytes, *, topic: Topic, sender: int, number: MessageNumber, key: GroupKey
+) -> list[bytes]:
+    """The message in datagrams. Raises ValueError for one that takes more than three."""
+    count = frames(len(message))
+    if count > MOST_FRAGMENTS:
+        raise ValueError(f"a message of {len(message)} bytes: a group takes {MOST_BYTES} at most")
+    start = number.start.to_bytes(6, "little")
+    sealed = []
+    for place in range(count):
+        part = message[place * PART_BYTES : (place + 1) * PART_BYTES]
+        topic_number = TOPICS_OF_GROUP.index(topic)
+        fragment = _FRAGMENT.pack(topic_number, sender, start, number.sequence, place, count) + part
+        nonce = randombytes(crypto_secretbox_NONCEBYTES)
+        head = _HEAD.pack(_MAGIC, _VERSION, key.fingerprint, nonce)
+        sealed.append(head + crypto_secretbox(fragment, nonce, key.secret))
+    return sealed
+
+
+def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
+    """The fragment in a datagram; None if no member sent it, or in another way. Raises nothing."""
+    if not _HEAD.size + _TAG_BYTES + _FRAGMENT.size <= len(data) <= DATAGRAM_BYTES:
+        return None
+    magic, version, fingerprint, nonce = _HEAD.unpack_from(data)
+    secret = next((key.secret for key in keys if key.fingerprint == fingerprint), None)
+    if magic != _MAGIC or version != _VERSION or secret is None:
+        return None
+    try:
+        opened: bytes = crypto_secretbox_open(data[_HEAD.size :], nonce, secret)
+    except CryptoError:
+        return None
+    topic, sender, start, sequence, place, of = _FRAGMENT.unpack_from(opened)
+    if topic >= len(TOPICS_OF_GROUP) or not place < of <= MOST_FRAGMENTS:
+        return None
+    number = MessageNumber(int.from_bytes(start, "little"), sequence)
+    part = opened[_FRAGMENT.size :]
+    return Fragment(TOPICS_OF_GROUP[topic], sender, number, place, of, part)
+
+
+@dataclass(slots=True)
+class _Sender:
+    """What came of one sender's messages on one topic."""
+
+    newest: MessageNumber = _NOTHING
+    newest_at_s: float = -math.inf
+    partial: dict[MessageNumber, dict[int, bytes]] = field(default_factory=dict)
+
+
+class Assembly:
+    """Makes messages of fragments: all of them, or nothing. One thread at a time.
+
+    What is not newer than what `heard` was told of is old, and dropped unseen: whatever a stranger
+    recorded and says again, and what came twice. Another member may claim any number: it counts
+    once the message is known to be its sender's.
+
+    `forget_after_s`: who was silent for longer may have started again with a clock that is behind.
+    Members' starts are numbered so that they never are (math.inf).
+    """
+
+    def __init__(self, forget_after_s: float = math.inf) -> None:
+        self._forget_after_s = forget_after_s
+        self._senders: dict[tuple[Topic, int], _Sender] = {}
+        self.old = 0
+
+    def add(self, fragment: Fragment, now_s: float) -> bytes | None:
+        """The message that the fragment completes, if it does. `now_s` is a monotonic clock's."""
+        sender = self._sender(fragment)
+        if sender is None:
+            return None
+        silent = now_s - sender.newest_at_s > self._forget_after_s
+        if fragment.number <= sender.newest and not silent:
+            self.old += 1
+            return None
+        parts = sender.partial.setdefault(fragment.number, {})
+        parts[fragment.place] = fragment.part
+        if len(parts) == fragment.of:
+            del sender.partial[fragment.number]
+            return b"".join(part for _, part in sorted(parts.items()))
+        if len(sender.partial) > _MOST_PARTIAL:
+            # The one that began first: its rest is lost.
+            del sender.partial[next(iter(sender.partial))]
+        return None
+
+    def heard(self, fragment: Fragment, now_s: float) -> None:
+        """The message that this fragment completed was its sender's, and so is its number."""
+        sender = self._sender(fragment)
+        if sender is not None:
+            sender.newest, sender.newest_at_s = fragment.number, now_s
+            sender.partial = {n: p for n, p in sender.partial.items() if n > fragment.number}
+
+    def _sender(self, fragment: Fragment) -> _Sender | None:
+        who = fragment.topic, fragment.sender
+        if who not in self._senders and len(self._senders) >= _MOST_SENDERS:
+            return None
+        return self._senders.setdefault(who, _Sender())

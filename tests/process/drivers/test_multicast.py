@@ -1,0 +1,200 @@
+"""The group of robots: real sockets, members and strangers."""
+
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from threading import Event, Thread
+from typing import Self
+
+import pytest
+
+from edge.drivers.radio import zenoh_radio
+from edge.drivers.zenoh_link import ZenohLink, ZenohRouter
+from edge.identity.card import Card, Role, signed
+from edge.identity.group import PART_BYTES, GroupKey, MessageNumber, datagrams
+from edge.identity.guard import Membership, SignedGuard, Speaker
+from edge.identity.signature import Signer
+from edge.messages.topics import CARD, MESSAGE, STATUS, Group, Link, LinkSetting
+from lpac.sim.ports import free_ports
+from tests.process.drivers.test_zenoh_link import Inbox, endpoint, eventually
+
+KEY, FORMER = b"k" * 32, b"f" * 32
+AUTHORITY = Signer(b"a" * 32)
+
+
+@pytest.fixture
+def group() -> Group:
+    (port,) = free_ports(1)
+    return Group("239.255.76.80", port, "127.0.0.1", (KEY, FORMER), is_secret=True)
+
+
+class Robot:
+    """A member of the fleet in the group: what it hears of the others' messages, by their ids."""
+
+    def __init__(self, group: Group, robot_id: int, at: str | None = None) -> None:
+        self.heard: dict[str, bytes] = {}
+        signer = Signer(robot_id.to_bytes(32, "little"))
+        name = f"r{robot_id}"
+        card = Card("test", Role.ROBOT, name, signer.public_key, 1, 2e9, robot_id)
+        membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start=1)
+        self.guard = SignedGuard(membership, time.monotonic)
+        self.radio = zenoh_radio(
+            LinkSetting(
+                "test", robot_id, "client", (), (at or endpoint(),), False, {},
+                self.guard.subscriptions({MESSAGE: self._hear}), None, group,
+            )
+        )  # fmt: skip
+        self.link: Link = self.guard.over(self.radio)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.radio.close()
+
+    def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
+        self.heard[speaker.name] = data
+
+
+def eventually_hear(sender: Robot, data: bytes, *receivers: Robot) -> None:
+    name = sender.guard.card.name
+
+    def heard() -> bool:
+        sender.link.publish(MESSAGE, data)
+        return all(receiver.heard.get(name) == data for receiver in receivers)
+
+    eventually(heard)
+
+
+def stranger() -> socket.socket:
+    """Somebody on the network."""
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
+    return sender
+
+
+@contextmanager
+def recording(group: Group) -> Iterator[list[bytes]]:
+    """What a stranger hears of the group."""
+    recorded: list[bytes] = []
+    done = Event()
+
+    def listen(receiver: socket.socket) -> None:
+        while not done.is_set():
+            with suppress(TimeoutError):
+                recorded.append(receiver.recv(2048))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        receiver.bind((group.address, group.port))
+        membership = socket.inet_aton(group.address) + socket.inet_aton(group.interface)
+        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        receiver.settimeout(0.1)
+        thread = Thread(target=listen, args=(receiver,))
+        thread.start()
+        try:
+            yield recorded
+        finally:
+            done.set()
+            thread.join()
+
+
+def test_robots_hear_each_other_without_router_or_ground(group: Group) -> None:
+    with Robot(group, 1) as first, Robot(group, 2) as second, Robot(group, 3) as third:
+        for size in (0, 100, PART_BYTES, 3000):
+            eventually_hear(first, b"1" * size, second, third)
+            eventually_hear(third, b"3" * size, first, second)
+        assert "r1" not in first.heard
+        assert first.radio.peers() == 0
+
+
+def test_everything_else_goes_by_the_router(group: Group) -> None:
+    at, said = endpoint(), Inbox()
+    with (
+        ZenohRouter(fleet="test", listen=[at]),
+        Robot(group, 1, at) as first,
+        Robot(group, 2, at) as second,
+        ZenohLink(
+            fleet="test", mode="client", connect=[at],
+            subscriptions=dict.fromkeys((MESSAGE, STATUS, CARD), said),
+        ) as ground,
+    ):  # fmt: skip
+
+        def both() -> bool:
+            first.link.publish(MESSAGE, b"to robots")
+            first.link.publish(STATUS, b"to the ground")
+            return {"robot/1/status", "robot/1/card"} <= said.newest.keys() and "r1" in second.heard
+
+        eventually(both)
+        eventually(lambda: ground.present() == {1, 2} and first.radio.peers() == 1)
+        # It would cross the air once more for each robot.
+        assert "robot/1/message" not in said.newest
+
+
+def test_strangers_are_not_heard_whatever_they_say(group: Group) -> None:
+    place = group.address, group.port
+    with (
+        Robot(group, 1) as first,
+        Robot(group, 2) as second,
+        stranger() as someone,
+        recording(group) as recorded,
+    ):
+        eventually_hear(first, b"before", second)
+        eventually(lambda: recorded)
+        forged = datagrams(
+            b"I am r1", topic=MESSAGE, sender=1, number=MessageNumber(9, 9),
+            key=GroupKey.of(b"x" * 32),
+        )  # fmt: skip
+        heard = dict(second.heard)
+        refused = second.radio.refused()
+        before = list(recorded)
+        for data in (b"", b"LG", b"LG" * 700, *forged):
+            someone.sendto(data, place)
+        # More often than a robot may speak: and then it speaks.
+        for _ in range(300):
+            for data in before:
+                someone.sendto(data, place)
+        eventually(lambda: second.radio.refused() >= refused + 3)
+        assert second.heard == heard
+        eventually_hear(first, b"after", second)
+        assert b"after" not in b"".join(recorded)
+
+
+def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None:
+    place = group.address, group.port
+    with (
+        Robot(group, 1) as first,
+        Robot(group, 2) as second,
+        Robot(group, 3) as third,
+        stranger() as stolen,
+    ):
+        eventually_hear(first, b"before", second)
+        eventually_hear(third, b"a member", second)
+        greatest = MessageNumber(2**48 - 1, 2**32 - 1)
+        # What r3 says as r1, and what r1 said under a number that nothing of r1's reaches.
+        mine = third.guard.seal(MESSAGE, b"I am r1")
+        genuine = first.guard.seal(MESSAGE, b"genuine")
+        for message in (b"I am r1", mine, genuine):
+            (datagram,) = datagrams(
+                message, topic=MESSAGE, sender=1, number=greatest, key=GroupKey.of(KEY)
+            )
+            stolen.sendto(datagram, place)
+        eventually(lambda: second.heard["r1"] == b"genuine")
+        eventually_hear(first, b"after", second)
+        assert "not_allowed" in second.guard.refused()
+
+
+def test_who_has_the_former_key_is_heard_and_hears_nothing_new(group: Group) -> None:
+    late = group._replace(keys=(FORMER,))
+    with Robot(group, 1) as first, Robot(group, 2) as second, Robot(late, 3) as third:
+        eventually_hear(third, b"still here", first, second)
+        eventually_hear(first, b"with the new key", second)
+        assert not third.heard and third.radio.refused() > 0
+
+
+def test_without_a_network_it_opens_and_waits_for_one(group: Group) -> None:
+    nowhere = group._replace(interface="192.0.2.77")
+    with Robot(nowhere, 1) as first:
+        first.link.publish(MESSAGE, b"to nobody")
+        first.link.publish(MESSAGE, b"x" * 100_000)  # More than a group takes.
