@@ -11,6 +11,9 @@ from typing import Any
 
 import pytest
 
+from edge.identity.card import Role
+from lpac.fleet.authority import new_member
+from lpac.fleet.cards import open_authority
 from lpac.fleet.deploy import deploy
 from lpac.fleet.doctor import (
     DoctorCheck,
@@ -228,6 +231,33 @@ def test_up_starts_what_was_switched_off_and_says_go(
     host.run("systemctl disable --now lpac-robot")
     assert asyncio.run(bring_up(config, robot, time.monotonic(), unwatched)) == ((), ())
     assert host.run("systemctl is-active lpac-robot || true") == "inactive\n"
+
+
+def test_up_gives_robots_the_key_of_their_group(enrolled: SimulatedHosts, tmp_path: Path) -> None:
+    host = enrolled[1]
+    text = enrolled.fleet_toml.read_text()
+    radio = f'[radio]\ntransport = "multicast"\nrouter = "{host.address}:7447"\n\n[robot]'
+    enrolled.fleet_toml.write_text(text.replace("[robot]", radio, 1))
+    try:
+        config = load_fleet(enrolled.fleet_toml)
+        robot = config.robots[host.name]
+        authority = open_authority(config)
+        # Somebody who had the last one is a member no more.
+        new_member(authority, tmp_path / "r9", Role.ROBOT, "r9", 9)
+        authority.revoke("r9")
+        shown = lpac_fleet(enrolled.fleet_toml, "up", "--timeout", "3")
+        assert "the group has a new key" in shown.stdout
+        assert "multicast: a message in float16 takes 2" in shown.stdout
+        kept = host.root / "var/lib/private/lpac/identity/group-keys"
+        assert kept.read_bytes() == authority.group_keys()
+        assert kept.stat().st_mode & 0o077 == 0
+        assert asyncio.run(bring_up(config, robot, time.monotonic(), unwatched)) == ((), ())
+        kept.unlink()
+        arrival = asyncio.run(bring_up(config, robot, time.monotonic(), unwatched))
+        assert arrival == (("it was given a new key of the group",), ())
+        assert kept.read_bytes() == authority.group_keys()
+    finally:
+        enrolled.fleet_toml.write_text(text)
 
 
 def test_the_password_that_every_voxl_comes_with_is_found(enrolled: SimulatedHosts) -> None:
