@@ -97,7 +97,7 @@ class Condition(NamedTuple):
         if self.payload != "float16":
             words.append(f"payloads in {self.payload}")
         if self.robot != "point":
-            words.append("from pads")
+            words.append("from pads, with receivers' errors")
         if self.robot == "whole":
             words.append("whole robots")
         return ", ".join(words)

@@ -41,8 +41,9 @@ BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
 LLOYD: Literal["best-of-ten-lloyd"] = "best-of-ten-lloyd"
 POLICY: Literal["lpac"] = "lpac"
 Flier = Literal["lpac", "best-of-ten-lloyd"] | BaselineName
-# A point that follows its velocity; the same that begins where whole robots stand; and the whole
-# robot: its program's loops and separation, on a simulated vehicle that errs, in wind.
+# A point that follows its velocity; the same that begins where whole robots stand, wrong about its
+# place as their receivers are; and the whole robot: its program's loops and separation, on a
+# simulated vehicle, in wind.
 RobotModel = Literal["point", "point-from-pad", "whole"]
 
 # Larger batches of the simulator are no faster.
@@ -190,10 +191,14 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     lost_late = flight.lost.at_s > 0.0
     robots = set_up.robots if lost_late else left
     starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
+    draw = np.random.default_rng(world.seed)
+    errors_m = draw.normal(0.0, flight.position_error_m, (set_up.robots, 2))
     if flight.robot != "point":
-        starts_m = Layout(_fleet(flight), Path(flight.bundle)).pads_m.tolist()
-    error = flight.position_error_m * FIELD_SCALE.env_scale
-    errors = np.random.default_rng(world.seed).normal(0.0, error, (robots, 2)).tolist()
+        layout = Layout(_fleet(flight), Path(flight.bundle))
+        starts_m = layout.pads_m.tolist()
+        # What a vehicle takes its pad to be is off by its receiver's bias.
+        errors_m = errors_m + layout.landing_points_m - layout.pads_m
+    errors = (errors_m[:robots] * FIELD_SCALE.env_scale).tolist()
     return Scenario(
         controller="clairvoyant-cvt" if flight.flier == LLOYD else flight.flier,
         robots=robots,
@@ -210,7 +215,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         world_size=set_up.world_size,
         communication_range=set_up.communication_range,
         lag_s=flight.lag_s,
-        position_bias=tuple((x, y) for x, y in errors) if error else None,
+        position_bias=tuple((x, y) for x, y in errors) if np.any(errors_m) else None,
         failures=tuple(Failure(robot, flight.lost.at_s) for robot in range(left, robots)),
     )
 
