@@ -321,10 +321,13 @@ class SignedGuard:
     def _is_news(self, key: str, envelope: Envelope) -> bool:
         said, whose = (envelope.start, envelope.sequence), (envelope.fingerprint, key)
         with self._lock:
-            if said <= self._heard.get(whose, (-1, -1)):
+            before = self._heard.get(whose, (-1, -1))
+            if said <= before:
                 self._keep_behind(whose, said)
                 return False
             self._heard[whose] = said
+            if envelope.start > before[0]:
+                self._show_soon = True  # A program that just began knows nobody's card.
         return True
 
     def _keep_behind(self, whose: tuple[bytes, str], said: tuple[int, int]) -> None:

@@ -106,6 +106,16 @@ def two(one: Member) -> Member:
     return member
 
 
+def test_a_program_that_began_again_is_shown_the_cards_soon(one: Member, two: Member) -> None:
+    one.say(MESSAGE, b"")
+    one.now_s = 1.0
+    one.hear(two, two.say(MESSAGE, b"still the same"))
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
+    again = robot(2, start=2)
+    one.hear(again, again.say(MESSAGE, b"begun again")[1:])
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
+
+
 def test_a_member_shows_its_card_and_is_heard_as_itself(one: Member) -> None:
     two = robot(2)
     (topic, card), (_, message) = sent = two.say(MESSAGE, b"hello")
