@@ -87,7 +87,7 @@ ONLY_IN = {
     "cryptography": {"lpac/fleet/authority.py", "lpac/fleet/web_certificate.py"},
 }
 # No clock, thread, file or socket: all of it is called by somebody who has them. What several
-# threads call has a lock; a bundle and a configuration are read from their paths.
+# threads call has a lock; bundles, configurations and records are read from their paths.
 PURE = (
     "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.robot", "lpac.radio",
 )  # fmt: skip
@@ -97,6 +97,7 @@ BUT = {
     "edge/identity/guard.py": {"threading"},
     "edge/robot/node.py": {"pathlib"},
     "edge/robot/config.py": {"pathlib"},
+    "lpac/radio/records.py": {"pathlib"},
     # Wait for a vehicle, and measure; neither is part of a robot that flies.
     "edge/robot/setup.py": {"time"},
     "edge/robot/benchmark.py": {"time"},
