@@ -272,11 +272,12 @@ def _queue(
     transport: Transport, wifi: Wifi, traffic: Traffic, robots: float
 ) -> tuple[float, Airtime]:
     """How long messages wait, s, and what they take when those that wait are sent together."""
-    # How often a message for one station comes to its queue; a group's do not wait for each other.
-    comes_hz = 0.0
-    if transport != "multicast":
-        messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]
-        comes_hz = math.fsum(f.senders * f.rate_hz * f.robots for f in messages) / robots
+    if transport == "multicast":
+        load = _airtime(transport, wifi, traffic, robots)
+        return min(load.message_s * _waiting(load.total), wifi.queue_s), load
+    # How often a message for one station comes to its queue.
+    messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]
+    comes_hz = math.fsum(f.senders * f.rate_hz * f.robots for f in messages) / robots
 
     def load_after(wait_s: float) -> Airtime:
         return _airtime(transport, wifi, traffic, robots, 1.0 + comes_hz * wait_s)
