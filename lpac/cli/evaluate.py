@@ -161,7 +161,8 @@ def evaluate(
     results = results_of(evaluation, _fly(evaluation, kept, cores))
     told = to_json(evaluation, results, compared=compare)
     told["test_set_opened"] = _opened(evaluation)
-    told["wifi_from"] = {name: source._asdict() for name, source in found.sources.items()}
+    sources = {name: source._asdict() for name, source in found.sources.items()}
+    told["wifi_from"] = sources if transports else None
     write_results(told, results, out)
     _write_worst(evaluation, results, cores, out)
     if as_json:

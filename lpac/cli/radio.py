@@ -68,4 +68,5 @@ def _text(source: "Source") -> str:
         "busy": "from how busy the channel was",
         "delivered": "from what multicast delivered",
     }[source.kind.value]
-    return f"{said}, {source.records} records" if source.records else said
+    count = f"{source.records} record{'' if source.records == 1 else 's'}"
+    return f"{said}, {count}" if source.records else said

@@ -47,8 +47,7 @@ class Scenario:
     and in model units, by how much its knowledge of its position is wrong; `lag_s` the time
     constant with which velocities follow what is told; ages and `payload` are those of
     `PacParameters`. With a `radio` its model says what is lost and late in a team of `robots`, and
-    `loss` and `delay_s` are 0. Baselines know true positions, do not fail,
-    and need no radio.
+    `loss` and `delay_s` are 0. Baselines know true positions, do not fail, and need no radio.
 
     Raises ValueError that names what is impossible.
     """

@@ -79,7 +79,7 @@ def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
     result = lpac("evaluate", *options)
     assert result.returncode == 0, result.stderr
     assert "field, multicast by the model: 1 worlds" in result.stdout
-    assert "data_rate_mbit_s = 100  # from the radios' rates, 1 records" in result.stdout
+    assert "data_rate_mbit_s = 100  # from the radios' rates, 1 record\n" in result.stdout
     told = json.loads((tmp_path / "evaluation.json").read_text())
     ideal, modelled = told["conditions"]
     assert ideal["radio_model"] is None
