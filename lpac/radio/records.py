@@ -1,7 +1,4 @@
-"""What a field said of its radio: JSON lines, one for each ordered pair and measurement.
-
-`lpac fleet radio --record` writes them.
-"""
+"""What a field said of its radio: JSON lines, one for each ordered pair and measurement."""
 
 import json
 import math
