@@ -12,6 +12,7 @@ import typer
 from lpac.cli.apps import new_app
 from lpac.cli.options import DEFAULT_BUNDLE, AsJson, Ray, pool
 from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
+from lpac.cli.radio import WifiFile, calibration, link_line, transport_named, wifi_lines
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -58,6 +59,16 @@ def evaluate(
         list[float] | None,
         typer.Option("--loss", help="Also with messages lost with this probability."),
     ] = None,
+    transports: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--transport",
+            metavar="NAME",
+            help="Also with the radio that such a team would have, by a model of one Wi-Fi "
+            "channel: mesh, router or multicast.",
+        ),
+    ] = None,
+    wifi: WifiFile = None,
     lost: Annotated[
         list[str] | None,
         typer.Option(
@@ -83,7 +94,7 @@ def evaluate(
             "--payload",
             metavar="TYPE",
             help="Also with messages that carry float32 or int8 instead of float16, and with each "
-            "--loss so.",
+            "--loss or --transport so.",
         ),
     ] = None,
     whole: Annotated[
@@ -114,12 +125,22 @@ def evaluate(
     from lpac.evaluate.evaluation import results_of
     from lpac.evaluate.flights import KeptFlights, LostRobots
     from lpac.evaluate.report import write_results
+    from lpac.radio.modelled import ModelledRadio
 
     given = methods or [str(DEFAULT_BUNDLE)]
     if compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
+    if losses and transports:
+        raise ValueError("--loss and --transport: the model itself says what is lost")
     lost_robots = [LostRobots.parse(text) for text in lost or []]
-    lossy: list[dict[str, Any]] = [{"loss": loss} for loss in losses or []]
+    found = calibration(wifi, transport=bool(transports))
+    lossy: list[dict[str, Any]] = [
+        *({"loss": loss} for loss in losses or []),
+        *(
+            {"radio": ModelledRadio(transport_named(name), found.wifi)}
+            for name in dict.fromkeys(transports or [])
+        ),
+    ]
     changes = [
         *lossy,
         *({"lost": robots} for robots in lost_robots),
@@ -140,12 +161,16 @@ def evaluate(
     results = results_of(evaluation, _fly(evaluation, kept, cores))
     told = to_json(evaluation, results, compared=compare)
     told["test_set_opened"] = _opened(evaluation)
+    sources = {name: source._asdict() for name, source in found.sources.items()}
+    told["wifi_from"] = sources if transports else None
     write_results(told, results, out)
     _write_worst(evaluation, results, cores, out)
     if as_json:
         typer.echo(json.dumps(told, indent=2))
         return
     _show(told, compared=compare)
+    if transports:
+        typer.echo("\n".join(["the model takes the Wi-Fi for:", *wifi_lines(found)]))
     typer.echo(f"\nsee {out}: evaluation.json, figures, and the worst worlds")
 
 
@@ -312,6 +337,9 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
             f"{condition['name']}: {told['worlds']} worlds of the {told['world_set']} set, "
             f"{told['duration_s']:g} s; cost at the end over that at the start\n"
         )
+        radio = condition["radio_model"]
+        if radio is not None:
+            typer.echo(f"{link_line(radio['loss'], radio['delay_s'])}\n")
         of_all = condition["results"]
         print_table(_COLUMNS, [_row(one) for one in of_all], right=_COLUMNS[1:])
         of_policies = [one for one in of_all if one["name"] in policies]

@@ -17,6 +17,7 @@ import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.options import DEFAULT_BUNDLE
+from lpac.cli.radio import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -48,7 +49,7 @@ class Controller(StrEnum):
 
 
 class RadioTransport(StrEnum):
-    """[radio] of fleet.toml."""
+    """How messages travel."""
 
     MESH = "mesh"
     ROUTER = "router"
@@ -136,12 +137,14 @@ def sim(
         ),
     ] = False,
     transport: Annotated[
-        RadioTransport,
+        RadioTransport | None,
         typer.Option(
-            help="mavlink, px4: whether robots say what they say to each other, to a router, or "
-            "to all at once."
+            help="point: the radio that such a team would have, by a model of one Wi-Fi channel; "
+            "mavlink, px4: whether robots say what they say to each other (mesh, if not given), to "
+            "a router, or to all at once."
         ),
-    ] = RadioTransport.MESH,
+    ] = None,
+    wifi: WifiFile = None,
     script: Annotated[
         bool,
         typer.Option(help="mavlink, px4: take off, cover and land; else wait for `lpac ground`."),
@@ -178,7 +181,7 @@ def sim(
             errors=errors,
             sensor=sensor,
             secure=secure,
-            transport=transport.value,
+            transport="mesh" if transport is None else transport.value,
         )
 
         if vehicle is VehicleKind.SIMULATED:
@@ -195,9 +198,14 @@ def sim(
         _launch(fleet_scenario, bundle, px4, as_json, out, prepared)
         return
     from edge.core.frames import ModelScale
+    from lpac.radio.modelled import ModelledRadio
     from lpac.sim.experiment import FIELD_SCALE, Scenario
 
     assert count is not None
+    found = calibration(wifi, transport=transport is not None)
+    if transport and (loss or delay):
+        both = f"--{'loss' if loss else 'delay'} and --transport"
+        raise ValueError(f"{both}: the model itself says what is lost, and how late messages are")
     scenario = Scenario(
         controller=controller.value,
         robots=count,
@@ -208,6 +216,7 @@ def sim(
         scale=FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0),
         loss=loss,
         delay_s=delay,
+        radio=ModelledRadio(transport.value, found.wifi) if transport else None,
         max_message_age_s=max_message_age,
     )
     if out:
@@ -227,6 +236,9 @@ def sim(
         else "the world has no importance anywhere, so that there was nothing to cover"
     )
     typer.echo(f"{controller.value}, {count} robots, seed {seed}: {result}")
+    if transport:
+        typer.echo(f"{transport.value}: {link_line(*scenario.link)}; it takes the Wi-Fi for")
+        typer.echo("\n".join(wifi_lines(found)))
     if out:
         typer.echo(f"see {out / 'flight.png'}")
 
@@ -241,7 +253,8 @@ _ONLY_FOR = {
     "sensor": (VehicleKind.SIMULATED, VehicleKind.MAVLINK, VehicleKind.PX4),
     "recorded": (VehicleKind.SIMULATED,),
     "px4": (VehicleKind.PX4,),
-    "transport": (VehicleKind.MAVLINK, VehicleKind.PX4),
+    "transport": (VehicleKind.POINT, VehicleKind.MAVLINK, VehicleKind.PX4),
+    "wifi": (VehicleKind.POINT,),
     "script": (VehicleKind.MAVLINK, VehicleKind.PX4),
 }
 

@@ -14,7 +14,7 @@ Costs are normalised by a world's at the start, with all robots. What the number
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +42,7 @@ from lpac.evaluate.flights import (
     RobotModel,
 )
 from lpac.evaluate.worlds import SET_UPS, WorldSet
+from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName
 
 FAILS_ABOVE = 1.5
@@ -80,6 +81,7 @@ class Condition(NamedTuple):
     position_error_m: float = 0.0
     robot: RobotModel = "point"
     payload: PayloadType = "float16"
+    radio: ModelledRadio | None = None
 
     @property
     def name(self) -> str:
@@ -87,6 +89,8 @@ class Condition(NamedTuple):
         words = [self.set_up]
         if self.loss:
             words.append(f"{100.0 * self.loss:g} % of messages lost")
+        if self.radio:
+            words.append(f"{self.radio.transport} by the model")
         if self.lost.robots:
             robots = SET_UPS[self.set_up].robots
             words.append(f"{self.lost.robots} of {robots} robots lost at {self.lost.at_s:g} s")
@@ -169,6 +173,7 @@ class Evaluation:
                 set_up=condition.set_up,
                 duration_s=self.duration_s,
                 loss=condition.loss if method.trained else 0.0,
+                radio=condition.radio if method.trained else None,
                 lost=condition.lost if method.trained else lost,
                 lag_s=condition.lag_s,
                 position_error_m=condition.position_error_m,
@@ -281,6 +286,7 @@ def as_json(
                 "name": condition.name,
                 "set_up": condition.set_up,
                 "loss": condition.loss,
+                "radio_model": _radio_json(condition),
                 "payload": condition.payload,
                 "lost_robots": condition.lost.robots,
                 "lost_at_s": condition.lost.at_s,
@@ -293,6 +299,13 @@ def as_json(
             for condition, of_all in results.items()
         ],
     }
+
+
+def _radio_json(condition: Condition) -> dict[str, Any] | None:
+    if condition.radio is None:
+        return None
+    link = condition.radio.link(SET_UPS[condition.set_up].robots, condition.payload)
+    return {**asdict(condition.radio), **link._asdict()}
 
 
 def verdict_of(a: MethodResult, b: MethodResult) -> Verdict:

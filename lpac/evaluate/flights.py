@@ -15,9 +15,10 @@ import numpy as np
 import edge
 from edge.core.wire import PayloadType
 from edge.policy.bundle import Bundle, BundleError, load_bundle
-from lpac import analysis, evaluate, sim
+from lpac import analysis, evaluate, radio, sim
 from lpac.analysis.coverage import Coverage
 from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
+from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName
 from lpac.sim.batch import PolicyFailedError, fly_batch
 from lpac.sim.cores import Pool
@@ -90,6 +91,7 @@ class EvaluationFlight:
     loss: float = 0.0
     lost: LostRobots = NONE_LOST
     delay_s: float = 0.0
+    radio: ModelledRadio | None = None
     max_message_age_s: float = 0.8
     payload: PayloadType = "float16"
     clocks: Clocks = field(default_factory=Clocks)
@@ -103,9 +105,9 @@ class EvaluationFlight:
         return (
             f"{self.flier} {self.flown_by}: {self.world_set} {self.world} {self.set_up}, "
             f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
-            f", delay {self.delay_s:g} s, ages to {self.max_message_age_s:g} s, {self.payload}, "
-            f"{self.clocks}, lag {self.lag_s:g} s, positions to {self.position_error_m:g} m"
-            f", {self.robot}"
+            f", delay {self.delay_s:g} s, {self.radio}, ages to {self.max_message_age_s:g} s, "
+            f"{self.payload}, {self.clocks}, lag {self.lag_s:g} s, "
+            f"positions to {self.position_error_m:g} m, {self.robot}"
         )
 
 
@@ -209,6 +211,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         scale=FIELD_SCALE,
         loss=flight.loss,
         delay_s=flight.delay_s,
+        radio=flight.radio,
         max_message_age_s=flight.max_message_age_s,
         payload=flight.payload,
         clocks=flight.clocks,
@@ -272,7 +275,7 @@ class KeptFlights:
 
     def __init__(self, folder: Path) -> None:
         """Raises OSError."""
-        flown_by = {"code": code_digest(edge, analysis, evaluate, sim)}
+        flown_by = {"code": code_digest(edge, analysis, evaluate, radio, sim)}
         self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
         self._costs = {
             line["flight"]: FlownCost(tuple(line["time_s"]), tuple(line["cost"]))

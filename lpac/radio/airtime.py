@@ -83,10 +83,12 @@ class Wifi:
     `queue_s` is how long something waits in queues that are full. `ground_wired`: ground and router
     are at the access point's wire; else they are one more station.
 
+    The values that stand here are what docs/scaling.md assumes.
+
     Raises ValueError that names an impossible value.
     """
 
-    data_rate_mbit_s: float
+    data_rate_mbit_s: float = 220.0
     multicast_rate_mbit_s: float = 6.0
     frame_loss: float = 0.05
     queue_s: float = 0.3
@@ -134,12 +136,15 @@ class Traffic:
 class Airtime:
     """How much of the channel's time is asked for: above 1 in `total` it does not get it.
 
-    `shares` are by topic, `message_s` is what one robot's message to all its receivers takes,
-    acknowledgements included, `contenders` how many stations want to send at once, on average, and
-    `collision` the probability that a transmission collides.
+    `shares` are by topic, with the idle slots and gaps that it takes to get a turn. `busy` is the
+    share without them, in which somebody sends: so a radio counts it. `message_s` is what one
+    robot's message to all its receivers takes, acknowledgements included, `contenders` how many
+    stations want to send at once, on average, and `collision` the probability that a transmission
+    collides.
     """
 
     shares: Mapping[str, float]
+    busy: float
     message_s: float
     contenders: float
     collision: float
@@ -267,11 +272,12 @@ def _queue(
     transport: Transport, wifi: Wifi, traffic: Traffic, robots: float
 ) -> tuple[float, Airtime]:
     """How long messages wait, s, and what they take when those that wait are sent together."""
-    # How often a message for one station comes to its queue; a group's do not wait for each other.
-    comes_hz = 0.0
-    if transport != "multicast":
-        messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]
-        comes_hz = math.fsum(f.senders * f.rate_hz * f.robots for f in messages) / robots
+    if transport == "multicast":
+        load = _airtime(transport, wifi, traffic, robots)
+        return min(load.message_s * _waiting(load.total), wifi.queue_s), load
+    # How often a message for one station comes to its queue.
+    messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]
+    comes_hz = math.fsum(f.senders * f.rate_hz * f.robots for f in messages) / robots
 
     def load_after(wait_s: float) -> Airtime:
         return _airtime(transport, wifi, traffic, robots, 1.0 + comes_hz * wait_s)
@@ -387,13 +393,17 @@ class _Use(NamedTuple):
 class _Channel:
     """How long transmissions take on a channel that `contenders` want at once.
 
-    Where a receiver's messages wait, `together` of them go as one A-MPDU.
+    Where a receiver's messages wait, `together` of them go as one A-MPDU. Without `gaps` only what
+    is sent counts.
     """
 
-    def __init__(self, wifi: Wifi, contenders: float = 1.0, together: float = 1.0) -> None:
+    def __init__(
+        self, wifi: Wifi, contenders: float = 1.0, together: float = 1.0, *, gaps: bool = True
+    ) -> None:
         self._wifi = wifi
         self._contention = _contention(contenders)
         self._together = together
+        self._gaps = gaps
 
     @property
     def collision(self) -> float:
@@ -429,12 +439,14 @@ class _Channel:
         rounds = math.fsum(1.0 - (1.0 - loss**n) ** frames for n in range(_ATTEMPTS))
         rounds = each + (rounds - each) / self._together
         data_us = frames * each * frame_us / rounds
-        return turns * rounds * self._won(_PREAMBLE_US + data_us + _SIFS_US + _ACK_US)
+        return turns * rounds * self._won(_PREAMBLE_US + data_us + _ACK_US, _SIFS_US)
 
-    def _won(self, exchange_us: float) -> float:
+    def _won(self, sent_us: float, gap_us: float = 0.0) -> float:
         """One exchange, with what it takes to get its turn. A collision lasts as long as it."""
         idle_slots, collisions, _ = self._contention
-        return idle_slots * _SLOT_US + (1.0 + collisions) * (_DIFS_US + exchange_us)
+        if not self._gaps:
+            return (1.0 + collisions) * sent_us
+        return idle_slots * _SLOT_US + (1.0 + collisions) * (_DIFS_US + sent_us + gap_us)
 
 
 def _data_us(packet_bytes: float, rate_mbit_s: float) -> float:
@@ -486,8 +498,10 @@ def _airtime(
     contenders = _contenders([_share(transport, wifi, alone, flow) for flow in flows], stations)
     channel = _Channel(wifi, contenders, together)
     shares = {flow.topic: _share(transport, wifi, channel, flow).total for flow in flows}
+    sending = _Channel(wifi, contenders, together, gaps=False)
+    busy = math.fsum(_share(transport, wifi, sending, flow).total for flow in flows)
     message_s = 1e-6 * _message_us(transport, wifi, channel, flows[0]).total
-    return Airtime(MappingProxyType(shares), message_s, contenders, channel.collision)
+    return Airtime(MappingProxyType(shares), busy, message_s, contenders, channel.collision)
 
 
 def _contenders(shares: Sequence[_Use], stations: float) -> float:

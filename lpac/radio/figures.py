@@ -28,7 +28,7 @@ PAYLOADS: tuple[PayloadType, ...] = ("float16", "int8")
 # The example's field: ten robots in 32 x 32 m, whose messages are of use within 16 m.
 PER_M2, RANGE_M = 10 / 32**2, 16.0
 NEIGHBOURS = PER_M2 * math.pi * RANGE_M**2
-RATE_MBIT_S, MOST = 220.0, 0.6
+MOST = 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,21 +47,15 @@ class Topology:
         )
 
 
-_WIRED = Wifi(data_rate_mbit_s=RATE_MBIT_S)
+_WIRED = Wifi()
 TOPOLOGIES = (
     Topology("mesh", "mesh", _WIRED),
-    Topology(
-        "router on a laptop in the Wi-Fi", "router",
-        Wifi(data_rate_mbit_s=RATE_MBIT_S, ground_wired=False),
-    ),
+    Topology("router on a laptop in the Wi-Fi", "router", Wifi(ground_wired=False)),
     Topology("router on a wire", "router", _WIRED),
     Topology("router on a wire, by place", "router", _WIRED, NEIGHBOURS),
     Topology("multicast at 6 Mbit/s", "multicast", _WIRED),
-    Topology(
-        "multicast at 24 Mbit/s", "multicast",
-        Wifi(data_rate_mbit_s=RATE_MBIT_S, multicast_rate_mbit_s=24.0),
-    ),
-)  # fmt: skip
+    Topology("multicast at 24 Mbit/s", "multicast", Wifi(multicast_rate_mbit_s=24.0)),
+)
 
 
 def tables() -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,8 @@ from edge.policy.bundle import Bundle, BundleError
 from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
+from lpac.radio.airtime import LinkQuality
+from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
 from lpac.sim.failure import Failure, alive_at, require_possible
 from lpac.sim.medium import Medium
@@ -44,7 +46,8 @@ class Scenario:
     units, and `max_speed_m_s` are the bundle's where they are None. `position_bias` is, per robot
     and in model units, by how much its knowledge of its position is wrong; `lag_s` the time
     constant with which velocities follow what is told; ages and `payload` are those of
-    `PacParameters`. Baselines know true positions and do not fail.
+    `PacParameters`. With a `radio` its model says what is lost and late in a team of `robots`, and
+    `loss` and `delay_s` are 0. Baselines know true positions, do not fail, and need no radio.
 
     Raises ValueError that names what is impossible.
     """
@@ -59,6 +62,7 @@ class Scenario:
     scale: ModelScale = FIELD_SCALE
     loss: float = 0.0
     delay_s: float = 0.0
+    radio: ModelledRadio | None = None
     max_message_age_s: float = 0.8
     max_input_age_s: float = 1.0
     payload: PayloadType = "float16"
@@ -83,6 +87,10 @@ class Scenario:
             raise ValueError(f"duration = {self.duration_s}: must be positive and finite")
         if self.random_feature_count < 0:
             raise ValueError(f"features = {self.random_feature_count}: must be at least 0")
+        if self.radio is not None and (self.loss or self.delay_s):
+            raise ValueError(
+                f"loss = {self.loss}, delay_s = {self.delay_s}: must be 0 with a modelled radio"
+            )
         if not 0.0 <= self.max_message_age_s < np.inf:
             raise ValueError(
                 f"max_message_age_s = {self.max_message_age_s}: must be at least 0 and finite"
@@ -95,7 +103,16 @@ class Scenario:
             )
         if self.controller != "lpac" and self.failures:
             raise ValueError(f"controller = {self.controller!r}: a baseline knows no failures")
+        if self.controller != "lpac" and self.radio is not None:
+            raise ValueError(f"controller = {self.controller!r}: a baseline needs no radio")
         require_possible(self.failures, self.robots)
+
+    @property
+    def link(self) -> LinkQuality:
+        """What messages suffer, as it was asked for, or by the model."""
+        if self.radio is None:
+            return LinkQuality(self.loss, self.delay_s)
+        return self.radio.link(self.robots, self.payload, 1.0 / self.clocks.policy_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,6 +154,7 @@ class SimulatedFlight:
     def summary(self) -> dict[str, Any]:
         """The flight as JSON-ready values; nothing in it depends on the machine's speed."""
         scenario = self.scenario
+        link, radio = scenario.link, scenario.radio
         return {
             "controller": scenario.controller,
             "bundle_id": self.bundle_id,
@@ -148,8 +166,9 @@ class SimulatedFlight:
                 "velocity_scale": scenario.scale.velocity_scale,
             },
             "link": {
-                "loss": scenario.loss,
-                "delay_s": scenario.delay_s,
+                "loss": link.loss,
+                "delay_s": link.delay_s,
+                "by_model": None if radio is None else asdict(radio),
                 "max_message_age_s": scenario.max_message_age_s,
             },
             "messages": self.messages,
@@ -238,6 +257,7 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
     bias_m: F64 | None = None
     if scenario.position_bias is not None:
         bias_m = scale.position_to_mission_m(np.array(scenario.position_bias, np.float64))
+    link = scenario.link
     return Preparation(
         scenario=scenario,
         bundle=bundle,
@@ -259,8 +279,8 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
         clock_rng=clock_rng,
         medium=Medium(
             range_m=perception.communication_range / scale.env_scale,
-            loss=scenario.loss,
-            delay_s=scenario.delay_s,
+            loss=link.loss,
+            delay_s=link.delay_s,
             rng=medium_rng,
         ),
     )

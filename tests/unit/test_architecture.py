@@ -42,13 +42,13 @@ ALLOWED = {
     },
     "lpac.sim": {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
-        "lpac.fleet.writer", "lpac.fleet.authority",
+        "lpac.fleet.writer", "lpac.fleet.authority", "lpac.radio",
     },
     "lpac.radio": {"edge.core", "edge.messages"},
     "lpac.radio.figures": {"edge.core", "edge.messages", "lpac.analysis", "lpac.radio"},
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
-    "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},
+    "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.sim.batch"},
     "lpac.train": {
         *_EDGE, "export", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.evaluate",
     },
@@ -57,7 +57,8 @@ ALLOWED = {
     },
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train", "lpac.ablate",
+        "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
+        "lpac.ablate",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
     },
 }  # fmt: skip
@@ -87,7 +88,7 @@ ONLY_IN = {
     "cryptography": {"lpac/fleet/authority.py", "lpac/fleet/web_certificate.py"},
 }
 # No clock, thread, file or socket: all of it is called by somebody who has them. What several
-# threads call has a lock; a bundle and a configuration are read from their paths.
+# threads call has a lock; bundles, configurations and records are read from their paths.
 PURE = (
     "edge.core", "edge.messages", "edge.identity", "edge.flight", "edge.robot", "lpac.radio",
 )  # fmt: skip
@@ -97,6 +98,8 @@ BUT = {
     "edge/identity/guard.py": {"threading"},
     "edge/robot/node.py": {"pathlib"},
     "edge/robot/config.py": {"pathlib"},
+    "lpac/radio/records.py": {"pathlib"},
+    "lpac/radio/calibration.py": {"pathlib"},
     # Wait for a vehicle, and measure; neither is part of a robot that flies.
     "edge/robot/setup.py": {"time"},
     "edge/robot/benchmark.py": {"time"},

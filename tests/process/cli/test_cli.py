@@ -156,6 +156,19 @@ def test_sim_json_is_the_same_twice() -> None:
     assert 0.0 < result["cost"]["final_normalized"] < 1.0
 
 
+def test_sim_flies_with_the_radio_of_a_field(tmp_path: Path) -> None:
+    wifi = tmp_path / "wifi.toml"
+    wifi.write_text("data_rate_mbit_s = 54\n")
+    options = ("--duration", 1, "--robots", 30, "--transport", "router", "--wifi", wifi)
+    result = lpac("sim", *options)
+    assert result.returncode == 0, result.stderr
+    assert "\nrouter: by the model " in result.stdout
+    assert "data_rate_mbit_s = 54  # from the file\n" in result.stdout
+    assert "frame_loss = 0.05  # assumed\n" in result.stdout
+    link = json.loads(lpac("sim", *options, "--json").stdout)["link"]
+    assert link["loss"] > 0.0 and link["by_model"]["wifi"]["data_rate_mbit_s"] == 54.0
+
+
 def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
     world = tmp_path / "world.env"
     world.write_text("CircularBND 300 200 40 6\nUniform 3 0.001\n10 10\n100 10\n10 90\n")
@@ -181,6 +194,10 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--world", "docs/demo.png"], "docs/demo.png: is not a text file"),
         (["sim", "--out", "README.md"], "README.md"),
         (["sim", "--loss", "2"], "loss = 2.0: must be from 0 to 1"),
+        (["sim", "--transport", "mesh", "--loss", "0.1"], "--loss and --transport: the model"),
+        (["sim", "--transport", "mesh", "--delay", "1"], "--delay and --transport: the model"),
+        (["sim", "--transport", "mesh", "--wifi", "absent.toml"], "absent.toml"),
+        (["sim", "--wifi", "README.md"], "--wifi does nothing without --transport"),
         (["sim", "--world", "absent.env"], "absent.env"),
         (["sim", "--bundle", "absent"], "absent: No such file or directory"),
         (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),

@@ -16,6 +16,7 @@ from ray.cluster_utils import Cluster
 from edge.policy.bundle import load_bundle
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
+from lpac.radio.records import RadioRecord, write_records
 from lpac.sim.cluster import over_ray
 from tests.process.cli.test_cli import error_line, lpac
 
@@ -64,6 +65,28 @@ def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     for figure in (*figures, out / "conditions"):
         assert figure.with_suffix(".png").stat().st_size > 10_000
     assert len(list((out / "worst" / DEFAULT_BUNDLE.name).glob("*.png"))) == 2
+
+
+def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
+    records = tmp_path / "field.jsonl"
+    said = RadioRecord(
+        sender="r1", receiver="r2", transport="multicast", robots=3, message_bytes=1300.0,
+        message_hz=2.5, sent=1000, received=800, rate_mbit_s=100.0,
+    )  # fmt: skip
+    write_records(records, [said])
+    options = ("-k", 1, "--duration", 1, "--baseline", "clairvoyant-cvt", "--transport",
+        "multicast", "--wifi", records, "--out", tmp_path)  # fmt: skip
+    result = lpac("evaluate", *options)
+    assert result.returncode == 0, result.stderr
+    assert "field, multicast by the model: 1 worlds" in result.stdout
+    assert "data_rate_mbit_s = 100  # from the radios' rates, 1 record\n" in result.stdout
+    told = json.loads((tmp_path / "evaluation.json").read_text())
+    ideal, modelled = told["conditions"]
+    assert ideal["radio_model"] is None
+    assert modelled["radio_model"]["loss"] > 0.2
+    assert modelled["results"][0] != ideal["results"][0]
+    assert modelled["results"][1] == ideal["results"][1]
+    assert told["wifi_from"]["frame_loss"] == {"kind": "delivered", "records": 1}
 
 
 def test_killed_it_goes_on(evaluated: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:

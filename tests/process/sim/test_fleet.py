@@ -317,6 +317,7 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
         (["-n", "31"], "robots = 31: must be from 1 to 30"),
         (["--duration", "0"], "duration = 0.0: must be positive and finite"),
         (["--loss", "0.1"], "--loss does nothing with --vehicle mavlink"),
+        (["--wifi", "wifi.toml"], "--wifi does nothing with --vehicle mavlink"),
         (["--controller", "lpac"], "--controller does nothing with --vehicle mavlink"),
         (["--px4", "docs"], "--px4 does nothing with --vehicle mavlink"),
         (["--bundle", "absent"], "absent: No such file or directory"),

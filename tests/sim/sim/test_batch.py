@@ -21,6 +21,8 @@ from edge.core.wire import PAYLOAD_TYPES
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Bundle
 from edge.policy.family import Perceived
+from lpac.radio.airtime import TRANSPORTS, Wifi
+from lpac.radio.modelled import ModelledRadio
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
 from lpac.sim.batch.agents import SingleAgents
 from lpac.sim.batch.seen import SeenMap, ShownWorld
@@ -39,6 +41,8 @@ HARD = Scenario(
     position_bias=((3.0, -4.0),) * 10,
     lag_s=1.0,
 )
+# A channel that is full with few robots.
+SLOW = Wifi(data_rate_mbit_s=8.0, multicast_rate_mbit_s=1.0)
 
 
 def assert_same(one: SimulatedFlight, other: SimulatedFlight) -> None:
@@ -69,14 +73,16 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         failures.append(Failure(robot, from_s, from_s + lasts_s))
     offsets = st.floats(-30.0, 30.0)
     world_size = draw(st.integers(100, 700))
+    radio = draw(st.none() | st.builds(ModelledRadio, st.sampled_from(TRANSPORTS), st.just(SLOW)))
     return Scenario(
         robots=robots,
         seed=draw(st.integers(0, 2**32)),
         duration_s=duration_s,
         random_feature_count=draw(st.integers(0, 5)),
         scale=draw(st.sampled_from([FIELD_SCALE, ModelScale(1.0, 1.0), ModelScale(8.0, 1.0)])),
-        loss=draw(st.sampled_from([0.0, 0.3, 1.0])),
-        delay_s=draw(st.sampled_from([0.0, 0.1, 0.7])),
+        loss=0.0 if radio else draw(st.sampled_from([0.0, 0.3, 1.0])),
+        delay_s=0.0 if radio else draw(st.sampled_from([0.0, 0.1, 0.7])),
+        radio=radio,
         max_message_age_s=draw(st.sampled_from([0.0, 0.5, 0.8, 2.0])),
         max_input_age_s=draw(st.sampled_from([0.05, 1.0])),
         payload=draw(st.sampled_from(PAYLOAD_TYPES)),
@@ -122,9 +128,17 @@ def test_robots_that_see_what_they_explored_fly_the_same(
         Scenario(seed=2, robots=6, loss=0.3),
         Scenario(seed=2, robots=6, payload="float32"),
         Scenario(seed=3, robots=40, duration_s=5.0, world_size=1024, communication_range=128.0),
+        Scenario(seed=4, robots=30, duration_s=10.0, radio=ModelledRadio("router", SLOW)),
         dataclasses.replace(HARD, duration_s=20.0),
     ],
-    ids=["60 s", "60 s with loss", "60 s with float32", "the paper's density", "all at once"],
+    ids=[
+        "60 s",
+        "60 s with loss",
+        "60 s with float32",
+        "the paper's density",
+        "a full channel",
+        "all at once",
+    ],
 )
 def test_long_and_large_flights_too(shipped_bundle: Bundle, scenario: Scenario) -> None:
     [batched] = fly_batch([scenario], shipped_bundle)

@@ -9,8 +9,11 @@ import pytest
 from edge.core.frames import ModelScale
 from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, BundleError
+from lpac.radio.airtime import Wifi
+from lpac.radio.modelled import ModelledRadio
 from lpac.sim.experiment import Controller, Scenario, SimulatedFlight, fly
 from lpac.sim.failure import Failure
+from lpac.sim.ticks import Clocks
 
 CONTROLLERS: tuple[Controller, ...] = (
     "lpac", "decentralized-cvt", "decentralized-cvt-prior", "shared-cvt", "shared-cvt-prior",
@@ -133,6 +136,33 @@ def test_messages_are_lost_delayed_and_out_of_range_as_asked(shipped_bundle: Bun
     assert deaf["broadcasts"] > 0 and deaf["accepted"] == 0
 
 
+def test_with_a_modelled_radio_messages_are_lost_and_late_as_it_says(
+    shipped_bundle: Bundle,
+) -> None:
+    flown = short(
+        shipped_bundle, robots=40, starts_m=((16.0, 16.0),) * 40,
+        radio=ModelledRadio("router", Wifi(data_rate_mbit_s=60.0)), duration_s=3.0,
+    )  # fmt: skip
+    link = flown.scenario.link
+    assert 0.1 < link.loss < 0.9 and link.delay_s > 0.1
+    lost, heard = flown.messages["lost"], flown.messages["broadcasts"] * 39
+    assert lost / heard == pytest.approx(link.loss, abs=0.02)
+    told = flown.summary()["link"]
+    assert (told["loss"], told["delay_s"]) == link
+    assert told["by_model"]["transport"] == "router"
+    assert told["by_model"]["wifi"]["data_rate_mbit_s"] == 60.0
+    assert short(shipped_bundle).summary()["link"]["by_model"] is None
+
+
+def test_what_is_said_more_often_is_lost_more_often() -> None:
+    radio = ModelledRadio("multicast")
+    seldom, often = (
+        Scenario(robots=60, radio=radio, clocks=Clocks(policy_s=policy_s)).link
+        for policy_s in (0.4, 0.2)
+    )
+    assert often.loss > 1.5 * seldom.loss
+
+
 def test_the_papers_mailbox_rule_flies_too(shipped_bundle: Bundle) -> None:
     flight = short(shipped_bundle, max_message_age_s=0.0, delay_s=0.1)
     assert flight.messages["accepted"] > 0 and flight.messages["stale"] == 0
@@ -167,6 +197,11 @@ def test_what_the_swarm_does_depends_on_its_messages(shipped_bundle: Bundle) -> 
         (
             {"failures": (Failure(1, 1.0),), "controller": "clairvoyant-cvt"},
             "a baseline knows no failures",
+        ),
+        ({"loss": 0.1, "radio": ModelledRadio("mesh")}, "loss = 0.1, delay_s = 0.0: must be 0"),
+        (
+            {"radio": ModelledRadio("mesh"), "controller": "clairvoyant-cvt"},
+            "a baseline needs no radio",
         ),
     ],
 )

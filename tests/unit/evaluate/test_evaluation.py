@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from lpac.evaluate.flights import (
     LostRobots,
     groups_of,
 )
+from lpac.radio.modelled import ModelledRadio
 
 WORLDS = 8
 CLAIRVOYANT = Method(name="clairvoyant-cvt", flier="clairvoyant-cvt")
@@ -164,6 +165,26 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
 def test_an_evaluation_that_cannot_be(change: dict[str, object], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         replace(EVALUATION, **change)  # type: ignore[arg-type]
+
+
+def test_with_a_modelled_radio_policies_alone_fly_with_it() -> None:
+    radio = ModelledRadio("mesh")
+    condition = Condition("n100", radio=radio)
+    evaluation = replace(EVALUATION, conditions=(condition,))
+    flights = evaluation.flights()
+    assert {f.radio for f in flights if f.flier == POLICY} == {radio}
+    assert {f.radio for f in flights if f.flier != POLICY} == {None}
+    told = as_json(
+        evaluation, results_of(evaluation, {f: flown(f) for f in flights}), compared=False
+    )
+    [of_condition] = told["conditions"]
+    assert of_condition["name"] == "n100, mesh by the model" and of_condition["loss"] == 0.0
+    link = radio.link(100, "float16")
+    assert of_condition["radio_model"] == {
+        "transport": "mesh", "wifi": asdict(radio.wifi), "loss": link.loss,
+        "delay_s": link.delay_s,
+    }  # fmt: skip
+    assert TOLD["conditions"][0]["radio_model"] is None
 
 
 def test_lost_robots_are_read() -> None:

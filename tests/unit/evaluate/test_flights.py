@@ -21,6 +21,8 @@ from lpac.evaluate.flights import (
     fly_group,
 )
 from lpac.evaluate.worlds import FIELD, draw_world
+from lpac.radio.airtime import Wifi
+from lpac.radio.modelled import ModelledRadio
 from lpac.sim.cores import Outcome, Task
 from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED
@@ -55,9 +57,10 @@ def test_a_batch_tells_what_its_flights_tell(flight: EvaluationFlight) -> None:
         {}, {"loss": 0.5}, {"world": 4}, {"delay_s": 0.3}, {"max_message_age_s": 0.1},
         {"payload": "float32"}, {"clocks": Clocks(perception_s=0.1, policy_s=0.2)},
         {"lag_s": 0.6}, {"position_error_m": 1.5},
+        {"radio": ModelledRadio("multicast", Wifi(frame_loss=0.3))},
     ]  # fmt: skip
     group = tuple(dataclasses.replace(flight, **change) for change in changes)
-    assert len({one.key for one in group}) == len({costs for _, costs in costs_of(group)}) == 9
+    assert len({one.key for one in group}) == len({costs for _, costs in costs_of(group)}) == 10
     assert costs_of(group) == [pair for one in group for pair in costs_of((one,))]
 
 

@@ -87,6 +87,23 @@ def test_one_datagram_goes_up_once_and_down_once() -> None:
     assert 1e6 * found.message_s == pytest.approx(expected_us, rel=2e-3)
 
 
+def test_the_channel_is_busy_while_somebody_sends() -> None:
+    one = LOSSLESS, Traffic(robots=2, message_bytes=1000.0, status_hz=0.0, message_hz=1e-9)
+    often = LOSSLESS, Traffic(robots=2, message_bytes=1000.0, status_hz=0.0, message_hz=0.1)
+    sent_us = (
+        PREAMBLE_US + 8.0 * (1055 + MAC_BYTES) / 220.0 + ACK_US
+        + OLD_PREAMBLE_US + 8.0 * (1055 + MAC_BYTES) / 6.0
+    )  # fmt: skip
+    more = airtime("multicast", *often).busy - airtime("multicast", *one).busy
+    assert more == pytest.approx(1e-6 * sent_us * 2 * 0.1, rel=5e-3)
+
+
+@given(transports, wifis, traffics)
+def test_gaps_are_not_busy(transport: Transport, wifi: Wifi, traffic: Traffic) -> None:
+    found = airtime(transport, wifi, traffic)
+    assert 0.0 < found.busy < found.total
+
+
 def test_one_segment_of_a_mesh_of_two_goes_up_and_down_and_so_does_its_acknowledgement() -> None:
     packet_bytes = 1000 + 27 + 22 + 52  # zenoh, TLS, TCP and IP
     expected_us = 2.0 * unicast_us(packet_bytes, 220.0) + 2.0 * unicast_us(52, 220.0)

@@ -1,0 +1,72 @@
+"""The radio that simulated points fly with: `--transport`, `--wifi`, and what the model says."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from lpac.radio.airtime import Transport
+    from lpac.radio.calibration import Calibration, Source
+
+WifiFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--wifi",
+        metavar="FILE",
+        help="With --transport: what the model takes the Wi-Fi for. A .toml file with any of "
+        "data_rate_mbit_s, multicast_rate_mbit_s, frame_loss, queue_s, ground_wired; or a .jsonl "
+        "file of what a field's radio was like.",
+    ),
+]
+
+
+def transport_named(text: str) -> "Transport":
+    """Raises ValueError."""
+    from lpac.radio.airtime import TRANSPORTS
+
+    for transport in TRANSPORTS:
+        if transport == text:
+            return transport
+    raise ValueError(f"--transport {text}: must be one of {', '.join(TRANSPORTS)}")
+
+
+def calibration(wifi: Path | None, *, transport: bool) -> "Calibration":
+    """What the file says, if any. Raises ConfigError, OSError, ValueError."""
+    from lpac.radio.calibration import read_wifi
+
+    if wifi is not None and not transport:
+        raise ValueError("--wifi does nothing without --transport")
+    return read_wifi(wifi)
+
+
+def link_line(loss: float, delay_s: float) -> str:
+    """What messages suffer."""
+    return (
+        f"by the model {100.0 * loss:.3g} % of messages are lost, and the others travel for "
+        f"{1e3 * delay_s:.3g} ms on average"
+    )
+
+
+def wifi_lines(found: "Calibration") -> list[str]:
+    """Each value of the channel, as TOML, with what it comes from."""
+    return [
+        f"{name} = {_toml(getattr(found.wifi, name))}  # {_text(source)}"
+        for name, source in found.sources.items()
+    ]
+
+
+def _toml(value: float | bool) -> str:
+    return str(value).lower() if isinstance(value, bool) else f"{value:.4g}"
+
+
+def _text(source: "Source") -> str:
+    said = {
+        "assumed": "assumed",
+        "file": "from the file",
+        "rates": "from the radios' rates",
+        "busy": "from how busy the channel was",
+        "delivered": "from what multicast delivered",
+    }[source.kind.value]
+    count = f"{source.records} record{'' if source.records == 1 else 's'}"
+    return f"{said}, {count}" if source.records else said

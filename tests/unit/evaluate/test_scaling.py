@@ -1,0 +1,44 @@
+"""Coverage cost over team size, by transport: what docs/scaling.md shows."""
+
+from pathlib import Path
+from typing import Any
+
+from lpac.evaluate.scaling import IDEAL, draw, table, teams_of
+
+
+def told(set_up: str, worlds: int, costs: dict[str | None, float]) -> dict[str, Any]:
+    """What an evaluation.json has of it."""
+    return {
+        "worlds": worlds,
+        "conditions": [
+            {
+                "set_up": set_up,
+                "radio_model": transport
+                and {"transport": transport, "loss": 0.25, "delay_s": 0.3031},
+                "results": [{"over_clairvoyant": {"ratio_of_means": [cost, cost, cost + 0.1]}}],
+            }
+            for transport, cost in costs.items()
+        ],
+    }
+
+
+TEAMS = [
+    *teams_of(told("n100", 2, {None: 1.1, "mesh": 1.456})),
+    *teams_of(told("field", 10, {None: 1.05, "mesh": 1.06, "multicast": 1.07})),
+]
+
+
+def test_the_table_has_a_row_for_each_radio_and_a_column_for_each_size() -> None:
+    assert table(TEAMS).splitlines() == [
+        "| times the clairvoyant | 10 robots | 100 robots |",
+        "| --- | --- | --- |",
+        "| worlds | 10 | 2 |",
+        f"| {IDEAL} | 1.05 | 1.10 |",
+        "| mesh | 1.06 (25 %, 303 ms) | 1.46 (25 %, 303 ms) |",
+        "| multicast | 1.07 (25 %, 303 ms) |  |",
+    ]
+
+
+def test_it_is_drawn(tmp_path: Path) -> None:
+    draw(TEAMS, tmp_path / "cost.png")
+    assert (tmp_path / "cost.png").stat().st_size > 10_000
