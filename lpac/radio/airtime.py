@@ -26,6 +26,7 @@ from types import MappingProxyType
 from typing import Literal, NamedTuple, get_args
 
 from edge.core.wire import PayloadType
+from edge.identity.group import DATAGRAM_BYTES, PART_BYTES
 from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATE, STATUS
 
 Transport = Literal["mesh", "router", "multicast"]
@@ -334,10 +335,10 @@ def _segments(payload_bytes: float) -> _Packets:
 
 
 def _datagrams(payload_bytes: float) -> _Packets:
-    """What a message becomes over UDP: a datagram, in IP fragments if it is too large for one."""
-    total_bytes = payload_bytes + _ZENOH_BYTES + _UDP_BYTES
-    count = math.ceil(total_bytes / (_MTU_BYTES - _IP_BYTES))
-    return _Packets(count, total_bytes / count + _IP_BYTES)
+    """What a message becomes in a multicast group."""
+    count = math.ceil(payload_bytes / PART_BYTES)
+    around_bytes = DATAGRAM_BYTES - PART_BYTES + _UDP_BYTES + _IP_BYTES
+    return _Packets(count, payload_bytes / count + around_bytes)
 
 
 class _Contention(NamedTuple):

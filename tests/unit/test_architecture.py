@@ -44,8 +44,10 @@ ALLOWED = {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
         "lpac.fleet.writer", "lpac.fleet.authority", "lpac.radio",
     },
-    "lpac.radio": {"edge.core", "edge.messages"},
-    "lpac.radio.figures": {"edge.core", "edge.messages", "lpac.analysis", "lpac.radio"},
+    "lpac.radio": {"edge.core", "edge.messages", "edge.identity"},
+    "lpac.radio.figures": {
+        "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
+    },
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.sim.batch"},
