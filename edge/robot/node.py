@@ -128,6 +128,8 @@ class RobotNode:
         # Two threads take from it; its `next` cannot be interrupted.
         self._message_sequence = itertools.count(1)
         self._message_at_s = -math.inf
+        # How many the policy had, and their bytes.
+        self._sent = (0, 0)
         self._explored_due_s = -math.inf
 
     # What comes
@@ -243,7 +245,11 @@ class RobotNode:
             bundle_tag=tag(self._bundle_id),
             world_tag=tag(assignment.world_id),
         )
-        self._publish(MESSAGE, encode_beacon(beacon) + of_policy)
+        data = encode_beacon(beacon) + of_policy
+        if of_policy:
+            count, total_bytes = self._sent
+            self._sent = count + 1, total_bytes + len(data)
+        self._publish(MESSAGE, data)
 
     def preflight_step(self) -> None:
         """Prepare and check the vehicle, a few times a second; it may wait for the vehicle.
@@ -342,6 +348,8 @@ class RobotNode:
         policy_velocity_m_s = self._pac.control(now_s)
         ground_age_s = control.ground_age_s(now_s)
         energy = control.energy
+        messages_sent, message_bytes_sent = self._sent
+        arrivals = self._pac.mailbox.arrivals()
         return RobotStatus(
             robot_id=robot.robot_id,
             boot_nonce=self._boot_nonce,
@@ -394,6 +402,9 @@ class RobotNode:
             position_quality=self._navigation.position.quality,
             position_cause=self._navigation.position.cause,
             gps_accuracy_m=None if gps is None else gps.accuracy_m,
+            neighbour_arrivals={str(r): each.counts for r, each in arrivals.items()},
+            messages_sent=messages_sent,
+            message_bytes_sent=message_bytes_sent,
         )
 
     def _alarms(self) -> tuple[Reason, ...]:
