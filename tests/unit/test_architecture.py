@@ -47,7 +47,7 @@ ALLOWED = {
     },
     "lpac.radio": {"edge.core", "edge.messages"},
     "lpac.radio.figures": {"edge.core", "edge.messages", "lpac.analysis", "lpac.radio"},
-    "lpac.radio.heat_map": {"lpac.analysis", "lpac.radio"},
+    "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.sim.batch"},

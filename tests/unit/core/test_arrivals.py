@@ -1,15 +1,18 @@
 """What came, and how old it was: counts whose differences tell of any time."""
 
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.arrivals import AGE_EDGES_S, Arrivals
 
+NONE = Arrivals()
 ages_s = st.lists(st.none() | st.floats(0.0, 10.0), max_size=60)
 
 
-def after(ages_s: list[float | None], begun: Arrivals = Arrivals()) -> Arrivals:
+def after(ages_s: list[float | None], begun: Arrivals = NONE) -> Arrivals:
     for age_s in ages_s:
         begun = begun.plus(1, age_s)
     return begun
@@ -49,7 +52,7 @@ def test_a_share_of_them_came_within_an_age_of_the_same_bin(
     edges_s = (0.0, *AGE_EDGES_S)
     assert any(
         low_s <= told_s <= high_s
-        for low_s, high_s in zip(edges_s, edges_s[1:], strict=False)
+        for low_s, high_s in itertools.pairwise(edges_s)
         if any(low_s <= age_s < high_s for age_s in near_s)
     )
 

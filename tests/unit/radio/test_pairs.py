@@ -12,6 +12,7 @@ from lpac.radio.pairs import Blame, Link, Pair, Window, blame, pairs
 from tests.unit.ground import snapshots
 
 HZ, SECONDS = 2.5, 20.0
+NONE = Arrivals()
 SENT = round(HZ * SECONDS)
 
 
@@ -36,7 +37,7 @@ def two(before: Arrivals, after: Arrivals) -> Pair:
     return by_link["r0", "r1"]
 
 
-def came(sent: int, *ages_s: float, since: Arrivals = Arrivals()) -> Arrivals:
+def came(sent: int, *ages_s: float, since: Arrivals = NONE) -> Arrivals:
     for n, age_s in enumerate(ages_s):
         since = since.plus(sent if n == 0 else 0, age_s)
     return since
@@ -141,8 +142,6 @@ def test_each_bad_link_is_told_and_no_good_one(is_good: dict[Link, bool]) -> Non
     told = blame(is_good)
     for (sender, receiver), good in is_good.items():
         named = (
-            (sender, receiver) in told.links
-            or receiver in told.receivers
-            or sender in told.senders
+            (sender, receiver) in told.links or receiver in told.receivers or sender in told.senders
         )
         assert named is not good
