@@ -26,7 +26,9 @@ class Checked(NamedTuple):
     """`robots` are the names of all that should speak, `windows` of those that were heard.
 
     `wifi` is of those whose radios were asked. Each message travels in an envelope of
-    `overhead_bytes`. `loaded`: something else was sent meanwhile, on purpose.
+    `overhead_bytes`. In flight it has `flight_bytes`, sealed, if that is more: robots on the ground
+    have seen little yet, and what they say of it is compressed. `loaded`: something else was sent
+    meanwhile, on purpose.
     """
 
     robots: tuple[str, ...]
@@ -34,6 +36,7 @@ class Checked(NamedTuple):
     wifi: Mapping[str, WifiReading]
     transport: Transport
     overhead_bytes: int = 0
+    flight_bytes: float = 0.0
     loaded: bool = False
 
     @property

@@ -1,5 +1,6 @@
 """What a check of the radio comes to: one sentence, and what is wrong, the worst first."""
 
+import dataclasses
 import math
 import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,17 +29,20 @@ ASSUMED_RATE_MBIT_S = 220.0
 
 
 class Room(NamedTuple):
-    """For how many robots the model sees room on the channel, and what it was told.
+    """For how many robots in flight the model sees room on the channel, and what it was told.
 
-    `model_share` is what it says of the fleet as it is. `rate_mbit_s` is assumed if `rate_told` is
-    not. `busy_share` is what its shares were scaled to meet; None: to nothing.
+    `ground_share` is what it says of this fleet with messages of `ground_bytes`, as they were, and
+    `flight_share` of `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not. `busy_share`
+    is what the model was scaled to meet; None: it was not.
     """
 
     carries: int
-    model_share: float
+    ground_share: float
+    flight_share: float
     rate_mbit_s: float
     rate_told: bool
-    message_bytes: float
+    ground_bytes: float
+    flight_bytes: float
     message_hz: float
     busy_share: float | None
 
@@ -133,8 +137,8 @@ def _channel(checked: Checked, room: Room | None) -> Iterator[_Found]:
     if busy is None or room is None or busy <= MOST_BUSY:
         return
     text = f"the channel is busy {_percent(busy)} of the time"
-    if busy - room.model_share > _MUCH_OF_OTHERS:
-        text += f", of which these robots should take {_percent(room.model_share)}: others take "
+    if busy - room.ground_share > _MUCH_OF_OTHERS:
+        text += f", of which these robots should take {_percent(room.ground_share)}: others take "
         text += "the rest: look for another channel"
     else:
         text += ": that is all that so many robots can be given on one"
@@ -190,16 +194,20 @@ def _room(checked: Checked) -> Room | None:
     rate_mbit_s = statistics.harmonic_mean(rates) if rates else ASSUMED_RATE_MBIT_S
     wifi = Wifi(data_rate_mbit_s=rate_mbit_s)
     share = airtime(checked.transport, wifi, traffic).total
+    flight_bytes = max(traffic.message_bytes, checked.flight_bytes)
+    flight = dataclasses.replace(traffic, message_bytes=flight_bytes)
     # A radio that hears nobody does not count.
     told = [w.busy_share for w in checked.wifi.values() if w.busy_share]
     busy = statistics.median(told) if told and not checked.loaded else None
     most = MOST_BUSY if busy is None else MOST_BUSY * share / busy
     return Room(
-        carries(checked.transport, wifi, traffic, most=most),
+        carries(checked.transport, wifi, flight, most=most),
         share,
+        airtime(checked.transport, wifi, flight).total,
         rate_mbit_s,
         bool(rates),
         traffic.message_bytes,
+        flight_bytes,
         traffic.message_hz,
         busy,
     )

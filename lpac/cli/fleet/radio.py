@@ -52,8 +52,8 @@ def radio(
 ) -> None:
     """Measure who hears whom, as robots on the ground speak: does the radio carry the fleet?
 
-    Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Without
-    --robots for all that have a slot.
+    Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Spares
+    are left out.
     """
     from lpac.ground.station.subscriber import GroundSubscriber
     from lpac.radio.pairs import pairs
@@ -61,10 +61,9 @@ def radio(
     from lpac.radio.verdict import verdict
 
     config, chosen = open_fleet(fleet, robots)
-    if robots is None:
-        chosen = [robot for robot in chosen if config.slot_of(robot.name) is not None]
+    chosen = [robot for robot in chosen if config.slot_of(robot.name) is not None]
     if len(chosen) < 2:
-        raise ValueError("radio: two robots or more are needed to hear each other")
+        raise ValueError("radio: two robots or more with a slot are needed to hear each other")
     computers = [robot for robot in chosen if robot.has_computer]
     if load and not computers:
         raise ValueError("--load: the robots are no computers that could send a bulk stream")
@@ -170,9 +169,11 @@ def _checked(
 ) -> "Checked":
     from edge.identity.envelope import OVERHEAD_BYTES
     from lpac.fleet.radio import reading
+    from lpac.radio.airtime import MESSAGE_BYTES
     from lpac.radio.checked import Checked
 
     then = {outcome.robot.name: outcome.value or [] for outcome in before}
+    flying = next(robot.name for robot in chosen if config.slot_of(robot.name) is not None)
     return Checked(
         robots=tuple(robot.name for robot in chosen),
         windows=windows,
@@ -180,7 +181,8 @@ def _checked(
             o.robot.name: reading(then[o.robot.name], o.value) for o in after if o.value is not None
         },
         transport=config.radio.transport,
-        overhead_bytes=0 if config.keys is None else OVERHEAD_BYTES,
+        overhead_bytes=OVERHEAD_BYTES if config.keys is not None else 0,
+        flight_bytes=MESSAGE_BYTES[config.robot_config(flying).policy.payload],
         loaded=loaded,
     )
 
@@ -234,15 +236,18 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
     """What the room for more comes from."""
     room = told.room
     assert room is not None
-    rate = "the radios' mean" if room.rate_told else f"assumed: {_NOT_TOLD}"
+    assumed = "" if room.rate_told else ", which is assumed"
     text = (
-        f"by the model of docs/scaling.md: {checked.transport}, {room.rate_mbit_s:.0f} Mbit/s "
-        f"({rate}), {room.message_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
-        f"{100.0 * room.model_share:.0f} % of the channel, which carries {room.carries} robots"
+        f"room by the model of docs/scaling.md: {checked.transport} at {room.rate_mbit_s:.0f} "
+        f"Mbit/s{assumed}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
+        f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
+        f"flight {100.0 * room.flight_share:.0f} %, and {room.carries} robots 60 %"
     )
     if room.busy_share is None:
-        return text + ("" if checked.loaded else f"; how busy it is was {_NOT_TOLD}")
-    return text + f", scaled to the {100.0 * room.busy_share:.0f} % that it was busy"
+        return text
+    return (
+        text + f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time"
+    )
 
 
 def _delivered(pair: "Pair") -> "Text":

@@ -233,6 +233,7 @@ def _wifi() -> List[Dict[str, Any]]:
     found = []
     levels = wireless(_read("/proc/net/wireless"))
     names = {os.path.basename(os.path.dirname(p)) for p in glob.glob("/sys/class/net/*/wireless")}
+    names.update(re.findall(r"^\s*Interface (\S+)", _output(["iw", "dev"]), re.MULTILINE))
     for name in sorted(names | set(levels)):
         link = iw_link(_output(["iw", "dev", name, "link"]))
         link["name"] = name

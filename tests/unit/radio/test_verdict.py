@@ -58,7 +58,17 @@ def test_a_fleet_that_hears_itself_well() -> None:
     assert told.sentence == f"carries 10 robots with room for {most - N}"
     assert told.room is not None
     assert (told.room.rate_told, told.room.busy_share) == (False, None)
-    assert (told.room.message_bytes, told.room.message_hz) == (BYTES + 85, 2.5)
+    assert (told.room.ground_bytes, told.room.message_hz) == (BYTES + 85, 2.5)
+    assert told.room.ground_share == told.room.flight_share
+
+
+def test_messages_that_grow_in_flight_leave_less_room() -> None:
+    told, grown = (verdict(checked(flight_bytes=size), heard()).room for size in (900.0, 9000.0))
+    assert told == verdict(checked(), heard()).room
+    assert told and grown
+    assert (grown.ground_share, grown.flight_bytes) == (told.ground_share, 9000.0)
+    assert grown.flight_share > told.flight_share
+    assert grown.carries < told.carries
 
 
 def test_a_channel_that_is_busier_than_the_model_says_has_less_room() -> None:
