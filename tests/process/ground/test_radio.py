@@ -1,6 +1,8 @@
 """`lpac fleet radio` on robots that fly in this process, over real zenoh and a real ground."""
 
 import json
+import os
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,13 +53,16 @@ def fleet(tmp_path: Path) -> Iterator[ThinAir]:
         yield running
 
 
-def ask(station: GroundStation, fleet: FlownFleet, *options: object) -> "Answer":
-    # A busy machine holds robots up for a moment: so long that one late message is no share.
-    environment = {"XDG_RUNTIME_DIR": str(station.runtime)}
-    return lpac_fleet(fleet.fleet_toml, "radio", *options, environment=environment)
-
-
 Answer = subprocess.CompletedProcess[str]
+
+
+def ask(
+    station: GroundStation, fleet: FlownFleet, *options: object, path: str | None = None
+) -> Answer:
+    environment = {"XDG_RUNTIME_DIR": str(station.runtime)}
+    if path is not None:
+        environment["PATH"] = path
+    return lpac_fleet(fleet.fleet_toml, "radio", *options, environment=environment)
 
 
 def told(answer: Answer) -> dict[str, Any]:
@@ -135,6 +140,80 @@ def test_who_is_heard_badly_is_named(fleet: ThinAir, new_station: NewStation) ->
     last = answer.stderr.splitlines()[-1]
     assert last.startswith("lpac: radio: the others hear ") and " of r1" in last
     assert "arrived %: a row hears, a column says" in answer.stdout
+
+
+# Robots' computers are this machine's shell, with a radio that is busy three tenths of the time.
+PROGRAMS = {
+    "ssh": """for last; do :; done
+case "$last" in
+*/dev/zero*) while head -c 100000 /dev/zero; do sleep 0.1; done ;;
+*) exec sh -c "$last" ;;
+esac
+""",
+    "sudo": 'shift\nexec "$@"\n',
+    "iw": """case "$*" in
+dev) printf 'phy#0\\n\\tInterface wlan0\\n\\t\\tifindex 3\\n\\t\\ttype managed\\n' ;;
+*link) printf 'Connected to 70:4f:57:00:aa:01 (on wlan0)\\n\\tSSID: field\\n\\tfreq: 5180\\n'
+  printf '\\tsignal: -58 dBm\\n\\ttx bitrate: 144.4 MBit/s VHT-MCS 7 short GI VHT-NSS 2\\n' ;;
+*survey*) ms=$(date +%s%3N)
+  printf 'Survey data from wlan0\\n\\tfrequency:\\t\\t\\t5180 MHz [in use]\\n'
+  printf '\\tchannel active time:\\t\\t%d ms\\n' $ms
+  printf '\\tchannel busy time:\\t\\t%d ms\\n' $((ms * 3 / 10)) ;;
+esac
+""",
+}
+
+
+@pytest.fixture
+def computers(fleet: ThinAir, tmp_path: Path) -> str:
+    """The PATH with which robots are such computers."""
+    text = re.sub(
+        r'host = "r(\d)\.invalid"',
+        lambda found: f'host = "127.0.0.{int(found[1]) + 1}"',
+        fleet.fleet_toml.read_text(),
+    )
+    fleet.fleet_toml.write_text(text)
+    folder = tmp_path / "programs"
+    folder.mkdir()
+    for name, script in PROGRAMS.items():
+        program = folder / name
+        program.write_text(f"#!/bin/sh\n{script}")
+        program.chmod(0o755)
+    return f"{folder}:{os.environ['PATH']}"
+
+
+def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
+    fleet: ThinAir, new_station: NewStation, computers: str
+) -> None:
+    station = listening(fleet, new_station)
+    answer = ask(station, fleet, "--seconds", 5, "--json", path=computers)
+    found = told(answer)
+    for robot in found["robots"].values():
+        assert robot["wifi_problem"] is None
+        assert robot["wifi"] == {
+            "rate_mbit_s": 144.4, "signal_dbm": -58.0, "busy_share": pytest.approx(0.3, abs=0.01)
+        }  # fmt: skip
+    room = found["room"]
+    assert room["rate_told"]
+    assert room["rate_mbit_s"] == pytest.approx(144.4)
+    assert room["busy_share"] == pytest.approx(0.3, abs=0.01)
+    loaded = told(ask(station, fleet, "--seconds", 5, "--json", "--load", path=computers))
+    assert loaded["bulk_stream"]["robot"] == "r0"
+    assert loaded["bulk_stream"]["rate_mbit_s"] > 0.0
+    assert loaded["room"]["busy_share"] is None
+
+
+def test_a_bulk_stream_that_breaks_off_is_told(
+    fleet: ThinAir, new_station: NewStation, computers: str
+) -> None:
+    station = listening(fleet, new_station)
+    ssh = Path(computers.partition(":")[0], "ssh")
+    ssh.write_text("#!/bin/sh\necho 'ssh: connect: Connection refused' >&2\nexit 255\n")
+    answer = ask(station, fleet, "--seconds", 5, "--load", path=computers)
+    assert answer.returncode == 1
+    assert answer.stderr.splitlines()[-1] == (
+        "lpac: bulk stream from r0: nothing listens on its ssh port"
+    )
 
 
 def test_robots_of_a_simulated_fleet_have_no_computer_to_load_the_radio_from(
