@@ -268,6 +268,19 @@ class LoopStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class RadioCounts:
+    """What a robot and its neighbours said to each other since the start of its program.
+
+    `sent` is how many messages its policy had for them, `sent_bytes` what these had together,
+    without envelopes. `arrivals` is what came of each, also too late: `Arrivals.counts`, by robot.
+    """
+
+    sent: Count
+    sent_bytes: Count
+    arrivals: Annotated[dict[RobotKey, ArrivalCounts], _OfRobots] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class RobotStatus:
     """What a robot says of itself, a few times a second.
 
@@ -278,10 +291,8 @@ class RobotStatus:
     `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
     for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
     `message_counts` is what became of all messages since the start: "accepted", or why not.
-    `neighbour_messages` counts each neighbour's, and `neighbour_arrivals` those that came too late,
-    too, by their ages (`Arrivals.counts`). `messages_sent` is how many the policy had for the
-    neighbours, `message_bytes_sent` what these had together without envelopes, both None from an
-    older program. `ground_age_s` is how long ago the state that it obeys was heard, None if never.
+    `neighbour_messages` counts each neighbour's; `radio_counts` are in one status of some, and None
+    in the others. `ground_age_s` is how long ago the state that it obeys was heard, None if never.
     `position_quality` is what its position is worth, `position_cause` what speaks against it;
     `gps_accuracy_m` is the receiver's own figure. `remote_control` tells whether its pilot's is
     heard, None where there is none. `battery_lasts_s` is how long it flies until its battery is
@@ -340,11 +351,7 @@ class RobotStatus:
     home_s: Seconds | None = None
     endurance_s: Seconds | None = None
     flown_s: Seconds | None = None
-    neighbour_arrivals: Annotated[dict[RobotKey, ArrivalCounts], _OfRobots] = field(
-        default_factory=dict
-    )
-    messages_sent: Count | None = None
-    message_bytes_sent: Count | None = None
+    radio_counts: RadioCounts | None = None
     version: Version = VERSION
 
     def __post_init__(self) -> None:

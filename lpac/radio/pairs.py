@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from edge.core.arrivals import Arrivals
-from edge.messages.mission import RobotStatus
+from edge.messages.mission import RadioCounts, RobotStatus
 
 # Messages are forgotten at this age.
 LATE_S = 0.8
@@ -23,10 +23,17 @@ Link = tuple[str, str]
 
 
 class Window(NamedTuple):
-    """The first and the last that one start of a robot's program said in some time."""
+    """The first and the last status with `radio_counts` of one start of a program in some time."""
 
     first: RobotStatus
     last: RobotStatus
+
+    @property
+    def counts(self) -> tuple[RadioCounts, RadioCounts]:
+        """At its begin, and at its end."""
+        first, last = self.first.radio_counts, self.last.radio_counts
+        assert first is not None and last is not None
+        return first, last
 
     @property
     def duration_s(self) -> float:
@@ -36,12 +43,14 @@ class Window(NamedTuple):
     @property
     def sent(self) -> int:
         """How many messages its policy had for the others."""
-        return (self.last.messages_sent or 0) - (self.first.messages_sent or 0)
+        first, last = self.counts
+        return last.sent - first.sent
 
     @property
     def bytes_sent(self) -> int:
         """What these had together, without envelopes."""
-        return (self.last.message_bytes_sent or 0) - (self.first.message_bytes_sent or 0)
+        first, last = self.counts
+        return last.sent_bytes - first.sent_bytes
 
     @property
     def rate_hz(self) -> float:
@@ -50,10 +59,8 @@ class Window(NamedTuple):
 
     def arrivals(self, sender: int) -> Arrivals:
         """What came of a robot, by its id."""
-        key = str(sender)
-        last, first = (
-            Arrivals.of_counts(status.neighbour_arrivals.get(key, ()))
-            for status in (self.last, self.first)
+        first, last = (
+            Arrivals.of_counts(counts.arrivals.get(str(sender), ())) for counts in self.counts
         )
         return last.since(first)
 

@@ -73,7 +73,7 @@ def obstacles(statuses: Mapping[str, RobotStatus]) -> tuple[str, ...]:
 
     return (
         *those(
-            lambda status: status.messages_sent is None,
+            lambda status: status.radio_counts is None,
             "an older program, which does not count messages: `lpac fleet deploy`",
         ),
         *those(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from edge.messages.mission import RobotStatus
+    from lpac.analysis.snapshot import FleetSnapshot
     from lpac.fleet.hold import Report
     from lpac.fleet.operations import Outcome
     from lpac.fleet.radio import BulkStream, Interface
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from lpac.radio.pairs import Pair, Window
     from lpac.radio.verdict import RadioVerdict
 
-# Statuses come twice a second, and pictures of them five times.
-_HEARD_WITHIN_S = 5.0
+# Counts are in a status of every two seconds.
+_HEARD_WITHIN_S = 6.0
 _LOOK_S = 0.2
 _NOT_TOLD = "not told by the radio"
 
@@ -37,7 +38,7 @@ def radio(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     seconds: Annotated[
-        float, typer.Option(min=5.0, max=3600.0, help="How long is listened, s.")
+        float, typer.Option(min=10.0, max=3600.0, help="How long is listened, s.")
     ] = 20.0,
     load: Annotated[
         bool, typer.Option("--load", help="With a bulk stream from the first robot meanwhile.")
@@ -96,9 +97,17 @@ def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load:
     """Raises ValueError that says what the operator has to do first."""
     from lpac.radio.verdict import obstacles
 
+    statuses: dict[str, RobotStatus] = {}
+
+    def all_told(snapshot: "FleetSnapshot") -> bool:
+        for name, status in _heard(snapshot, names).items():
+            # Not each status has counts.
+            if status.radio_counts is not None or statuses.get(name) is None:
+                statuses[name] = status
+        return len(statuses) == len(names) and all(s.radio_counts for s in statuses.values())
+
     # Who is not heard is missed later.
-    ground.wait_for(lambda _: set(_statuses(ground)) >= set(names), _HEARD_WITHIN_S)
-    statuses = {name: s for name, s in _statuses(ground).items() if name in names}
+    ground.wait_for(all_told, _HEARD_WITHIN_S)
     if not statuses:
         raise ValueError("radio: no robot is heard: `lpac fleet status` tells whether they run")
     hindrances = obstacles(statuses)
@@ -109,9 +118,13 @@ def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load:
         raise ValueError(f"--load: {', '.join(armed)}: armed: disturb no radio in flight")
 
 
-def _statuses(ground: "GroundSubscriber") -> dict[str, "RobotStatus"]:
-    """Of those that are heard now."""
-    return {r.name: r.status for r in ground.snapshot.robots if r.fresh and r.status is not None}
+def _heard(snapshot: "FleetSnapshot", names: Sequence[str]) -> dict[str, "RobotStatus"]:
+    """What those of them say that are heard now."""
+    return {
+        robot.name: robot.status
+        for robot in snapshot.robots
+        if robot.fresh and robot.status is not None and robot.name in names
+    }
 
 
 def _listen(
@@ -124,23 +137,27 @@ def _listen(
     from lpac.fleet.radio import bulk_stream
     from lpac.radio.pairs import Window
 
-    names = {robot.name for robot in chosen}
+    names = [robot.name for robot in chosen]
     windows: dict[str, Window] = {}
+
+    def take(snapshot: "FleetSnapshot") -> bool:
+        for name, status in _heard(snapshot, names).items():
+            known = windows.get(name)
+            if status.radio_counts is None:
+                continue
+            # A program that starts again counts anew.
+            again = known is None or known.first.boot_nonce != status.boot_nonce
+            windows[name] = Window(status if known is None or again else known.first, status)
+        return False
+
     stream = nullcontext() if bulk_from is None else bulk_stream(config, bulk_from)
     with progress_of("listening") as progress, stream as streaming:
         task = progress.add_task("s", total=round(seconds))
         began_s = time.monotonic()
         while (passed_s := time.monotonic() - began_s) < seconds:
-            for name, status in _statuses(ground).items():
-                if name in names:
-                    known = windows.get(name)
-                    # A program that starts again counts anew.
-                    again = known is None or known.first.boot_nonce != status.boot_nonce
-                    first = status if known is None or again else known.first
-                    windows[name] = Window(first, status)
             progress.update(task, completed=int(passed_s))
-            # Raises once the ground has ended.
-            ground.wait_for(lambda _: False, min(_LOOK_S, seconds - passed_s))
+            # Each picture, since not each status has counts. Raises once the ground has ended.
+            ground.wait_for(take, min(_LOOK_S, seconds - passed_s))
     return {name: w for name, w in windows.items() if w.duration_s > 0.0}, streaming
 
 

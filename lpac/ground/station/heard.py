@@ -4,12 +4,12 @@ Pure: time is passed in. Robots are kept by id and boot nonce, that is by the st
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from edge.core.arrivals import Arrivals
-from edge.messages.mission import FlightState, RobotStatus
+from edge.messages.mission import FlightState, RadioCounts, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 
 # Two statuses of one program, of which one is lost, are at most so far apart, unless it has ended.
@@ -114,7 +114,9 @@ class _Robot:
             # Delay only makes a clock look late.
             clock_offset_s=max(heard.clock_ahead_s for heard in recent),
             rates_hz=_rates_hz(recent[0].status, newest),
-            arrivals=_arrivals(program.heard[0].status, newest),
+            arrivals=_arrivals(
+                [h.status.radio_counts for h in program.heard if h.status.radio_counts is not None]
+            ),
             duplicate=self.duplicate,
         )
 
@@ -202,9 +204,11 @@ def _rates_hz(first: RobotStatus, last: RobotStatus) -> dict[str, float]:
     }
 
 
-def _arrivals(first: RobotStatus, last: RobotStatus) -> dict[str, tuple[int, ...]]:
-    before = first.neighbour_arrivals
+def _arrivals(told: Sequence[RadioCounts]) -> dict[str, tuple[int, ...]]:
+    if not told:
+        return {}
+    before = told[0].arrivals
     return {
         robot: Arrivals.of_counts(counts).since(Arrivals.of_counts(before.get(robot, ()))).counts
-        for robot, counts in last.neighbour_arrivals.items()
+        for robot, counts in told[-1].arrivals.items()
     }

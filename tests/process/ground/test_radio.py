@@ -76,7 +76,7 @@ def listening(fleet: FlownFleet, new_station: NewStation) -> GroundStation:
     station.wait_for(all_heard)
     assert station.command(SetOrigin(ORIGIN)).done
     station.wait_for(
-        lambda p: all(r.status and len(r.status.neighbour_arrivals) == 3 for r in p.robots)
+        lambda p: all(r.status and len(r.status.neighbour_messages) == 3 for r in p.robots)
     )
     return station
 
@@ -106,7 +106,7 @@ def test_idle_robots_on_the_ground_speak_as_in_a_mission(
     station = listening(fleet, new_station)
     records = tmp_path / "radio.jsonl"
     answer = ask(
-        station, fleet, "--seconds", 8, "--json", "--record", records, "--out", tmp_path / "out"
+        station, fleet, "--seconds", 12, "--json", "--record", records, "--out", tmp_path / "out"
     )
     found = told(answer)
     assert found["transport"] == "mesh"
@@ -186,7 +186,7 @@ def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
     fleet: ThinAir, new_station: NewStation, computers: str
 ) -> None:
     station = listening(fleet, new_station)
-    answer = ask(station, fleet, "--seconds", 5, "--json", path=computers)
+    answer = ask(station, fleet, "--seconds", 10, "--json", path=computers)
     found = told(answer)
     for robot in found["robots"].values():
         assert robot["wifi_problem"] is None
@@ -197,7 +197,7 @@ def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
     assert room["rate_told"]
     assert room["rate_mbit_s"] == pytest.approx(144.4)
     assert room["busy_share"] == pytest.approx(0.3, abs=0.01)
-    loaded = told(ask(station, fleet, "--seconds", 5, "--json", "--load", path=computers))
+    loaded = told(ask(station, fleet, "--seconds", 10, "--json", "--load", path=computers))
     assert loaded["bulk_stream"]["robot"] == "r0"
     assert loaded["bulk_stream"]["rate_mbit_s"] > 0.0
     assert loaded["room"]["busy_share"] is None
@@ -209,7 +209,7 @@ def test_a_bulk_stream_that_breaks_off_is_told(
     station = listening(fleet, new_station)
     ssh = Path(computers.partition(":")[0], "ssh")
     ssh.write_text("#!/bin/sh\necho 'ssh: connect: Connection refused' >&2\nexit 255\n")
-    answer = ask(station, fleet, "--seconds", 5, "--load", path=computers)
+    answer = ask(station, fleet, "--seconds", 10, "--load", path=computers)
     assert answer.returncode == 1
     assert answer.stderr.splitlines()[-1] == (
         "lpac: bulk stream from r0: nothing listens on its ssh port"

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.arrivals import Arrivals
-from edge.messages.mission import RobotStatus
+from edge.messages.mission import RadioCounts, RobotStatus
 from lpac.radio.pairs import Blame, Link, Pair, Window, blame, pairs
 from tests.unit.ground import snapshots
 
@@ -20,10 +20,12 @@ def said(robot: int, heard: dict[int, Arrivals], *, after_s: float = 0.0) -> Rob
     """By a robot that has said so much, and heard so much, after that time."""
     sent = round(HZ * after_s)
     return snapshots.on_ground(
-        robot, uptime_s=100.0 + after_s, messages_sent=500 + sent,
-        message_bytes_sent=(500 + sent) * 1800,
-        neighbour_arrivals={str(r): each.counts for r, each in heard.items()},
-    )  # fmt: skip
+        robot,
+        uptime_s=100.0 + after_s,
+        radio_counts=RadioCounts(
+            500 + sent, (500 + sent) * 1800, {str(r): each.counts for r, each in heard.items()}
+        ),
+    )
 
 
 def two(before: Arrivals, after: Arrivals) -> Pair:

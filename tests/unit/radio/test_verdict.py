@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.messages.mission import Origin, RobotStatus
+from edge.messages.mission import Origin, RadioCounts, RobotStatus
 from lpac.radio.airtime import Traffic, Wifi, airtime, carries
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import Pair, Window
@@ -20,13 +20,9 @@ NAMES = tuple(f"r{i}" for i in range(N))
 
 
 def spoken(robot: int, sent: int = SENT) -> Window:
-    first = snapshots.status(
-        robot, uptime_s=100.0, messages_sent=500, message_bytes_sent=500 * BYTES
-    )
-    last = replace(
-        first, uptime_s=120.0, messages_sent=500 + sent, message_bytes_sent=(500 + sent) * BYTES
-    )
-    return Window(first, last)
+    first = snapshots.status(robot, uptime_s=100.0, radio_counts=RadioCounts(500, 500 * BYTES))
+    counts = RadioCounts(500 + sent, (500 + sent) * BYTES)
+    return Window(first, replace(first, uptime_s=120.0, radio_counts=counts))
 
 
 def checked(**changes: Any) -> Checked:
@@ -189,7 +185,7 @@ def test_a_record_of_each_pair() -> None:
 # Before
 
 STATUSES: dict[str, RobotStatus] = {
-    name: snapshots.status(i, messages_sent=5) for i, name in enumerate(NAMES[:3])
+    name: snapshots.status(i, radio_counts=RadioCounts(5, 9000)) for i, name in enumerate(NAMES[:3])
 }
 
 
@@ -201,7 +197,7 @@ def test_robots_that_speak_already() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"messages_sent": None}, "r1: an older program"),
+        ({"radio_counts": None}, "r1: an older program"),
         ({"origin": None, "position_m": None}, "r1: no mission origin"),
         ({"position_m": None}, "r1: no position"),
         ({"bundle_id": "ab"}, "r1: another policy than most"),
