@@ -258,7 +258,7 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
         f"room by the model of docs/scaling.md: {checked.transport} at {room.rate_mbit_s:.0f} "
         f"Mbit/s{assumed}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
         f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
-        f"flight {100.0 * room.flight_share:.0f} %; with {room.carries} robots it is below 60 %"
+        f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
     )
     if room.busy_share is None:
         return text
