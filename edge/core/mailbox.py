@@ -11,6 +11,7 @@ from threading import Lock
 from typing import NamedTuple
 
 from edge.core.aggregation import AggregatedMessage
+from edge.core.arrivals import Arrivals
 from edge.core.shared_map import SharedMap
 from edge.core.wire import Rejection
 
@@ -43,6 +44,14 @@ class _LastHeard(NamedTuple):
     at_s: float
 
 
+class _Arrived(NamedTuple):
+    """All that came of a robot, and the newest of it, whatever its age was."""
+
+    boot_epoch: int
+    sequence: int
+    arrivals: Arrivals
+
+
 class Mailbox:
     """One robot's receive buffer. Every method may be called from any thread.
 
@@ -73,6 +82,7 @@ class Mailbox:
         # Outlives the messages: a late duplicate must not pass for news.
         self._heard: dict[int, _LastHeard] = {}
         self._accepted: Counter[int] = Counter()
+        self._arrived: dict[int, _Arrived] = {}
         self._counts: Counter[str] = Counter(
             dict.fromkeys(["accepted", *(reason.value for reason in Rejection)], 0)
         )
@@ -87,6 +97,7 @@ class Mailbox:
         """
         with self._lock:
             rejection = self._rejection(message, now_s, age_s)
+            self._count_arrival(message, age_s, rejection)
             if rejection is None:
                 sender = message.robot_id
                 self._heard[sender] = _LastHeard(message.boot_epoch, message.sequence, now_s)
@@ -136,11 +147,34 @@ class Mailbox:
         with self._lock:
             return dict(self._accepted)
 
+    def arrivals(self) -> dict[int, Arrivals]:
+        """What came of each neighbour so far, also too late or overtaken, by robot id."""
+        with self._lock:
+            return {sender: known.arrivals for sender, known in self._arrived.items()}
+
     def clear(self) -> None:
         """Forget the messages, for a new mission; not the counts, nor what was the newest."""
         with self._lock:
             self._received = {}
             self._handed_out = {}
+
+    def _count_arrival(
+        self, message: AggregatedMessage, age_s: float | None, rejection: Rejection | None
+    ) -> None:
+        sender, epoch, sequence = message.robot_id, message.boot_epoch, message.sequence
+        if rejection is Rejection.OWN:
+            return
+        known = self._arrived.get(sender)
+        if known is None:
+            known = _Arrived(epoch, sequence - 1, Arrivals())
+        elif epoch != known.boot_epoch:
+            if rejection is Rejection.OUTDATED:
+                return  # of an earlier start
+            known = known._replace(boot_epoch=epoch, sequence=sequence - 1)
+        elif sequence == known.sequence:
+            return  # it came twice
+        arrivals = known.arrivals.plus(max(0, sequence - known.sequence), age_s)
+        self._arrived[sender] = _Arrived(epoch, max(sequence, known.sequence), arrivals)
 
     def _silent(self, heard: _LastHeard, now_s: float) -> bool:
         return now_s - heard.at_s > self._restart_silence_s

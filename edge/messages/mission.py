@@ -62,6 +62,8 @@ MustUnderstand = Annotated[tuple[Name, ...], Meta(max_length=20)]
 FailedChecks = Annotated[tuple[FailedCheck, ...], Meta(max_length=MOST_TEXTS)]
 Point = tuple[Metres, Metres]
 Vector = tuple[Metres, Metres, Metres]
+# See `edge.core.arrivals`; a newer program may know more bins.
+ArrivalCounts = Annotated[tuple[Count, ...], Meta(max_length=20)]
 _OfRobots = Meta(max_length=MOST_ROBOTS)
 _OfTexts = Meta(max_length=MOST_TEXTS)
 _NO_REASON = Reason(ReasonCode.OTHER, "")
@@ -266,6 +268,19 @@ class LoopStatus:
 
 
 @dataclass(frozen=True, slots=True)
+class RadioCounts:
+    """What a robot and its neighbours said to each other since the start of its program.
+
+    `sent` is how many messages its policy had for them, `sent_bytes` what these had together,
+    without envelopes. `arrivals` is what came of each, also too late: `Arrivals.counts`, by robot.
+    """
+
+    sent: Count
+    sent_bytes: Count
+    arrivals: Annotated[dict[RobotKey, ArrivalCounts], _OfRobots] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class RobotStatus:
     """What a robot says of itself, a few times a second.
 
@@ -276,13 +291,14 @@ class RobotStatus:
     `global_deg` is its latitude and longitude. `policy_velocity_m_s` (2,) is what the policy asks
     for now, also on the ground; `feature_age_s` is the age of the features that it asks from.
     `message_counts` is what became of all messages since the start: "accepted", or why not.
-    `neighbour_messages` counts each neighbour's. `ground_age_s` is how
-    long ago the state that it obeys was heard, None if never. `position_quality` is what its
-    position is worth, `position_cause` what speaks against it; `gps_accuracy_m` is the receiver's
-    own figure. `remote_control` tells whether its pilot's is heard, None where there is none.
-    `battery_lasts_s` is how long it flies until its battery is critical, `home_s` what it needs to
-    be landed with the reserve left, and `endurance_s` what a full battery would last. `flown_s` is
-    how long ago it was armed, None if it is not, or was so before its program started.
+    `neighbour_messages` counts each neighbour's; `radio_counts` are in one status of some, and None
+    in the others. `ground_age_s` is how long ago the state that it obeys was heard, None if never.
+    `position_quality` is what its position is worth, `position_cause` what speaks against it;
+    `gps_accuracy_m` is the receiver's own figure. `remote_control` tells whether its pilot's is
+    heard, None where there is none. `battery_lasts_s` is how long it flies until its battery is
+    critical, `home_s` what it needs to be landed with the reserve left, and `endurance_s` what a
+    full battery would last. `flown_s` is how long ago it was armed, None if it is not, or was so
+    before its program started.
 
     What is not finite, of what may be None, is None: whatever a sensor says, nobody else has to
     look. Raises ValueError for what must be there and is not finite.
@@ -335,6 +351,7 @@ class RobotStatus:
     home_s: Seconds | None = None
     endurance_s: Seconds | None = None
     flown_s: Seconds | None = None
+    radio_counts: RadioCounts | None = None
     version: Version = VERSION
 
     def __post_init__(self) -> None:

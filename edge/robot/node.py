@@ -17,7 +17,14 @@ from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_bea
 from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
-from edge.messages.mission import FlightState, LoopStatus, RobotStatus, explored_to_bytes, world_id
+from edge.messages.mission import (
+    FlightState,
+    LoopStatus,
+    RadioCounts,
+    RobotStatus,
+    explored_to_bytes,
+    world_id,
+)
 from edge.messages.topics import (
     EXPLORED,
     MESSAGE,
@@ -42,6 +49,8 @@ _EXPLORED_PERIOD_S = 1.0
 _ARMED_CHECKS_PERIOD_S = 0.95
 # A status without news; what is new goes at once. A little less, since ticks are never early.
 _STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
+# What is said of each neighbour is long, and counts for the difference over many seconds.
+_RADIO_COUNTS_PERIOD_S = 1.9
 # After as many of the policy's periods without a message, a beacon goes alone.
 _SILENT_TICKS = 1.5
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
@@ -125,9 +134,12 @@ class RobotNode:
         # What the ground was told last, and when.
         self._told: tuple[object, ...] = ()
         self._told_at_s = -math.inf
+        self._radio_counts_told_at_s = -math.inf
         # Two threads take from it; its `next` cannot be interrupted.
         self._message_sequence = itertools.count(1)
         self._message_at_s = -math.inf
+        # How many the policy had, and their bytes.
+        self._sent = (0, 0)
         self._explored_due_s = -math.inf
 
     # What comes
@@ -243,7 +255,11 @@ class RobotNode:
             bundle_tag=tag(self._bundle_id),
             world_tag=tag(assignment.world_id),
         )
-        self._publish(MESSAGE, encode_beacon(beacon) + of_policy)
+        data = encode_beacon(beacon) + of_policy
+        if of_policy:
+            count, total_bytes = self._sent
+            self._sent = count + 1, total_bytes + len(data)
+        self._publish(MESSAGE, data)
 
     def preflight_step(self) -> None:
         """Prepare and check the vehicle, a few times a second; it may wait for the vehicle.
@@ -311,6 +327,8 @@ class RobotNode:
         news = _news(status)
         if news != self._told or now_s - self._told_at_s >= _STATUS_PERIOD_S:
             self._told, self._told_at_s = news, now_s
+            if status.radio_counts is not None:
+                self._radio_counts_told_at_s = now_s
             self._publish(STATUS, encode(status))
         if now_s - self._message_at_s > _SILENT_TICKS / self._config.rates.policy_hz:
             # The policy is silent, or hangs: neighbours must not lose this robot's place.
@@ -394,6 +412,11 @@ class RobotNode:
             position_quality=self._navigation.position.quality,
             position_cause=self._navigation.position.cause,
             gps_accuracy_m=None if gps is None else gps.accuracy_m,
+            radio_counts=(
+                self._radio_counts()
+                if now_s - self._radio_counts_told_at_s >= _RADIO_COUNTS_PERIOD_S
+                else None
+            ),
         )
 
     def _alarms(self) -> tuple[Reason, ...]:
@@ -435,6 +458,11 @@ class RobotNode:
         besides = {"not_admitted": not_admitted, "not_understood": self._inbox.not_understood_count}
         counts = self._pac.mailbox.counts() | self._guard.refused()
         return counts | {what: count for what, count in besides.items() if count}
+
+    def _radio_counts(self) -> RadioCounts:
+        sent, sent_bytes = self._sent
+        arrivals = self._pac.mailbox.arrivals().items()
+        return RadioCounts(sent, sent_bytes, {str(robot): each.counts for robot, each in arrivals})
 
     def _is_duplicate(self) -> bool:
         return self._link is not None and self._link.is_claimed(self._config.robot_id)

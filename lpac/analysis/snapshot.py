@@ -63,7 +63,8 @@ class RobotSnapshot:
 
     `age_s` is how long ago that came, `clock_offset_s` how far its clock is ahead of this one.
     `rates_hz` are the rates at which it gets each neighbour's messages (robot id as text), over the
-    last few seconds. `duplicate`: two programs say that they are this robot.
+    last few seconds, `arrivals` what came of each in the last ten (`Arrivals.counts`). `duplicate`:
+    two programs say that they are this robot.
     """
 
     name: str
@@ -72,6 +73,7 @@ class RobotSnapshot:
     age_s: float | None = None
     clock_offset_s: float | None = None
     rates_hz: dict[str, float] = field(default_factory=dict)
+    arrivals: dict[str, tuple[int, ...]] = field(default_factory=dict)
     duplicate: bool = False
 
     @property

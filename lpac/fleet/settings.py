@@ -144,6 +144,11 @@ class RobotHost:
     overrides: Mapping[str, Any] = field(hash=False)
 
     @property
+    def has_computer(self) -> bool:
+        """Whether it is on a computer that ssh could reach; those of `lpac sim` are not."""
+        return not self.host.endswith(".invalid")
+
+    @property
     def mavlink_port(self) -> int:
         """The UDP port of `mavlink_url`."""
         return AutopilotConfig(self.mavlink_url, self.system_id).port

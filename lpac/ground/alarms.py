@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from enum import StrEnum
 from typing import Literal, NamedTuple, TypeVar
 
+from edge.core.arrivals import Arrivals
 from edge.flight.preflight import PreflightLimits
 from edge.messages.codes import (
     BATTERY_REASONS,
@@ -18,6 +19,7 @@ from edge.messages.codes import (
 from edge.messages.mission import AIRBORNE, FlightState, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot, RobotSnapshot
 from lpac.ground.station.station import COMMANDER_SILENT_S
+from lpac.radio.pairs import LATE_S, Blame, Link, blame
 
 Severity = Literal["critical", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("critical", "warning", "note")
@@ -26,6 +28,8 @@ SEVERITIES: tuple[Severity, ...] = ("critical", "warning", "note")
 _BEFORE_S = 2.0
 
 _S = FlightState
+# Where a robot's policy has use for what others say.
+_HEARS_OTHERS = (_S.HOLD, _S.MISSION, _S.RETURN)
 # Of robots, unless their own files say otherwise.
 LIMITS = PreflightLimits()
 # Above the share at which a robot returns by itself: somebody may still decide.
@@ -36,6 +40,9 @@ FEATURE_AGE_S = 1.0
 LATE_MS = 50.0
 # Half of the rate at which robots send.
 _MESSAGE_RATE_HZ = 1.25
+# Of messages, younger than 0.8 s: with so many the field's policy still flies nearly as well. Fewer
+# than ten tell nothing of a share.
+_IN_TIME, _LEAST_SENT = 0.7, 10
 # Of a robot's wall clock, by which it writes its logs.
 _CLOCK_WITHIN_S = 1.0
 _ID = 8
@@ -166,16 +173,39 @@ class _Fleet:
             self.world = self.ground.world_id or self.world
             self.origin = self.ground.origin or self.origin
             self.fence = self.ground.fence or self.fence
+        self.blame = blame(self._links())
 
     def enabled(self, robot: RobotSnapshot) -> bool:
         return self.ground is not None and self.ground.enabled_for(robot.robot_id)
 
-    def in_range(self, a: RobotStatus, b: RobotStatus) -> bool:
+    def _links(self) -> dict[Link, bool]:
+        """Of each two that fly within range, by names: whether the second hears the first well."""
+        flying = [seen for seen in self.fresh if seen.status.state in _HEARS_OTHERS]
+        return {
+            (said.name, heard.name): _hears_well(heard.robot, heard.status, said.robot.robot_id)
+            for heard in flying
+            for said in flying
+            if said is not heard and self._in_range(heard.status, said.status)
+        }
+
+    def _in_range(self, a: RobotStatus, b: RobotStatus) -> bool:
         """Whether two robots are near enough to hear each other."""
         if a.position_m is None or b.position_m is None:
             return False
         range_m = self.setup.communication_range / self.setup.env_scale
         return math.dist(a.position_m[:2], b.position_m[:2]) <= range_m
+
+
+def _hears_well(robot: RobotSnapshot, status: RobotStatus, sender: int) -> bool:
+    """A robot forgets messages that are 0.8 s old; it counts them all the same."""
+    key = str(sender)
+    if key not in status.neighbour_ages_s:
+        return False
+    if robot.rates_hz.get(key, math.inf) < _MESSAGE_RATE_HZ:
+        return False
+    arrivals = Arrivals.of_counts(robot.arrivals.get(key, ()))
+    in_time = arrivals.arrived - arrivals.older_than(LATE_S)
+    return arrivals.sent < _LEAST_SENT or in_time >= _IN_TIME * arrivals.sent
 
 
 def _most_common(values: Iterable[T]) -> T | None:
@@ -334,23 +364,19 @@ def _features(fleet: _Fleet, seen: _Seen) -> _Found:
 
 
 def _neighbours(fleet: _Fleet, seen: _Seen) -> _Found:
-    """Whom it does not hear of those in range; a robot forgets messages that are 0.8 s old."""
-    status, flying = seen.status, (_S.HOLD, _S.MISSION, _S.RETURN)
-    if status.state not in flying:
-        return None
-    badly = []
-    for other in fleet.fresh:
-        key = str(other.robot.robot_id)
-        near = other is not seen and fleet.in_range(status, other.status)
-        if near and other.status.state in flying:
-            rate_hz = seen.robot.rates_hz.get(key, math.inf)
-            if key not in status.neighbour_ages_s or rate_hz < _MESSAGE_RATE_HZ:
-                badly.append(other.name)
-    if not badly:
-        return None
+    """Whom it does not hear well of those in range; what one robot is to blame for, it alone."""
+    found: Blame = fleet.blame
+    deaf, mute = seen.name in found.receivers, seen.name in found.senders
+    badly = [sender for sender, receiver in found.links if receiver == seen.name]
     # The same words for all of them, so that a view can put them together.
     whom = " ".join(badly) if len(badly) <= _NAMES else f"more than {_NAMES} of those in range"
-    return _graver_in_mission(seen), f"hears badly: {whom}"
+    texts_of_it = {
+        "hears nobody in range well": deaf,
+        "nobody in range hears it well": mute,
+        f"hears badly: {whom}": bool(badly),
+    }
+    text = "; ".join(text for text, holds in texts_of_it.items() if holds)
+    return (_graver_in_mission(seen), text) if text else None
 
 
 def _loops(fleet: _Fleet, seen: _Seen) -> _Found:

@@ -32,13 +32,14 @@ ALLOWED = {
     "export": {"edge.core", "edge.policy"},
     "lpac.shipped": set(),
     "lpac.analysis": _EDGE,
-    "lpac.ground": {*_EDGE, "lpac.analysis", "lpac.fleet.settings"},
+    "lpac.ground": {*_EDGE, "lpac.analysis", "lpac.fleet.settings", "lpac.radio"},
     # What describes a fleet; the ground reads it, and the simulator describes its fleets with it.
     "lpac.fleet.settings": _EDGE,
     "lpac.fleet.writer": {*_EDGE, "lpac.fleet.settings"},
     "lpac.fleet.authority": _EDGE,
     "lpac.fleet": {
         *_EDGE, "lpac.shipped", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
+        "lpac.radio",
     },
     "lpac.sim": {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
@@ -48,6 +49,7 @@ ALLOWED = {
     "lpac.radio.figures": {
         "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
     },
+    "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.sim.batch"},
@@ -62,6 +64,7 @@ ALLOWED = {
         "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
         "lpac.ablate",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
+        "lpac.radio.heat_map",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
@@ -76,6 +79,7 @@ ONLY_IN = {
         "lpac/train/",
         "lpac/ablate/",
         "lpac/radio/figures.py",
+        "lpac/radio/heat_map.py",
     },
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},

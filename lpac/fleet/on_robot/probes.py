@@ -222,11 +222,18 @@ def _hottest_c() -> Optional[float]:
 # The radio
 
 
+@call
+def wifi() -> Dict[str, Any]:
+    """What the wireless interfaces tell, of their channels too."""
+    return {"interfaces": _wifi()}
+
+
 def _wifi() -> List[Dict[str, Any]]:
     """The wireless interfaces; empty where there is none."""
     found = []
     levels = wireless(_read("/proc/net/wireless"))
     names = {os.path.basename(os.path.dirname(p)) for p in glob.glob("/sys/class/net/*/wireless")}
+    names.update(re.findall(r"^\s*Interface (\S+)", _output(["iw", "dev"]), re.MULTILINE))
     for name in sorted(names | set(levels)):
         link = iw_link(_output(["iw", "dev", name, "link"]))
         link["name"] = name
@@ -234,6 +241,7 @@ def _wifi() -> List[Dict[str, Any]]:
             link["signal_dbm"] = levels.get(name)
         save = re.search(r"Power save: (on|off)", _output(["iw", "dev", name, "get", "power_save"]))
         link["power_save"] = save.group(1) == "on" if save else None
+        link.update(iw_survey(_output(["iw", "dev", name, "survey", "dump"])))
         found.append(link)
     return found
 
@@ -262,6 +270,19 @@ def iw_link(text: str) -> Dict[str, Any]:
         "signal_dbm": _number(_group(r"signal: (-?[\d.]+) dBm", text)),
         "rate_mbit_s": _number(_group(r"tx bitrate: ([\d.]+) MBit/s", text)),
         "frequency_mhz": _number(_group(r"freq: ([\d.]+)", text)),
+    }
+
+
+def iw_survey(text: str) -> Dict[str, Optional[float]]:
+    """How long its radio has listened to the channel in use, and found it busy, ms.
+
+    Of `iw dev NAME survey dump`; None where the driver does not count.
+    """
+    blocks = re.split(r"^Survey data from .*$", text, flags=re.MULTILINE)
+    used = next((block for block in blocks if re.search(r"frequency:.*\[in use\]", block)), "")
+    return {
+        "active_ms": _number(_group(r"channel active time:\s+(\d+) ms", used)),
+        "busy_ms": _number(_group(r"channel busy time:\s+(\d+) ms", used)),
     }
 
 

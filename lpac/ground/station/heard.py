@@ -4,16 +4,19 @@ Pure: time is passed in. Robots are kept by id and boot nonce, that is by the st
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from edge.messages.mission import FlightState, RobotStatus
+from edge.core.arrivals import Arrivals
+from edge.messages.mission import FlightState, RadioCounts, RobotStatus
 from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
 
 # Two statuses of one program, of which one is lost, are at most so far apart, unless it has ended.
 _STATUS_GAP_S = 1.2
 _RATE_WINDOW_S = 3.0
+# In which a share of messages can be told.
+_ARRIVALS_WINDOW_S = 10.0
 
 # Of a robot's name and a text, when it comes, falls silent, or starts again.
 TellPresence = Callable[[str, str], None]
@@ -43,9 +46,13 @@ class _ProgramStart:
         if self.heard and heard.status.sequence <= self.newest.status.sequence:
             return False
         self.heard.append(heard)
-        while heard.at_s - self.heard[0].at_s > _RATE_WINDOW_S:
+        while heard.at_s - self.heard[0].at_s > _ARRIVALS_WINDOW_S:
             self.heard.popleft()
         return True
+
+    def recent(self) -> list[_HeardStatus]:
+        """What it said in the last few seconds, the newest last."""
+        return [h for h in self.heard if self.newest.at_s - h.at_s <= _RATE_WINDOW_S]
 
 
 class _Robot:
@@ -98,14 +105,18 @@ class _Robot:
         program = self.program
         if program is None:
             return RobotSnapshot(self.name, self.robot_id)
+        recent, newest = program.recent(), program.newest.status
         return RobotSnapshot(
             name=self.name,
             robot_id=self.robot_id,
-            status=program.newest.status,
+            status=newest,
             age_s=now_s - program.newest.at_s,
             # Delay only makes a clock look late.
-            clock_offset_s=max(heard.clock_ahead_s for heard in program.heard),
-            rates_hz=_rates_hz(program.heard[0].status, program.newest.status),
+            clock_offset_s=max(heard.clock_ahead_s for heard in recent),
+            rates_hz=_rates_hz(recent[0].status, newest),
+            arrivals=_arrivals(
+                [h.status.radio_counts for h in program.heard if h.status.radio_counts is not None]
+            ),
             duplicate=self.duplicate,
         )
 
@@ -190,4 +201,14 @@ def _rates_hz(first: RobotStatus, last: RobotStatus) -> dict[str, float]:
     return {
         robot: max(0, count - first.neighbour_messages.get(robot, 0)) / passed_s
         for robot, count in last.neighbour_messages.items()
+    }
+
+
+def _arrivals(told: Sequence[RadioCounts]) -> dict[str, tuple[int, ...]]:
+    if not told:
+        return {}
+    before = told[0].arrivals
+    return {
+        robot: Arrivals.of_counts(counts).since(Arrivals.of_counts(before.get(robot, ()))).counts
+        for robot, counts in told[-1].arrivals.items()
     }

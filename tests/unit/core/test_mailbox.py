@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from edge.core.aggregation import AggregatedMessage
+from edge.core.arrivals import Arrivals
 from edge.core.mailbox import Mailbox
 from edge.core.wire import Rejection
 
@@ -52,6 +53,31 @@ def test_it_counts_what_it_accepts_of_each() -> None:
     assert mailbox.accepted() == {7: 1, 2: 2}
     mailbox.clear()
     assert mailbox.accepted() == {7: 1, 2: 2}
+
+
+def test_what_comes_late_or_overtaken_has_arrived_and_what_does_not_come_is_missed() -> None:
+    mailbox = Mailbox(OWN_ID)
+    assert mailbox.arrivals() == {}
+    received = ((1, 0.01), (2, 0.3), (4, 0.9), (3, 2.0), (4, 0.9), (7, None), (8, 0.01))
+    said = [receive(mailbox, message(1, sequence), age_s=age_s) for sequence, age_s in received]
+    # The fourth overtook the third, both too old for the policy; 5 and 6 never came.
+    assert said[2:5] == [Rejection.STALE] * 3
+    assert said[5] is Rejection.AGE_UNKNOWN
+    receive(mailbox, message(OWN_ID, 1))
+    assert mailbox.arrivals() == {1: Arrivals(8, 1, (2, 0, 0, 0, 1, 0, 1, 1, 0))}
+    mailbox.clear()
+    assert mailbox.arrivals()[1].sent == 8
+
+
+def test_a_sender_that_starts_again_goes_on_in_the_counts() -> None:
+    mailbox = Mailbox(OWN_ID)
+    receive(mailbox, message(1, 900))
+    receive(mailbox, message(1, 901))
+    receive(mailbox, message(1, 1, boot_epoch=11))
+    receive(mailbox, message(1, 902))
+    receive(mailbox, message(1, 3, boot_epoch=11))
+    assert mailbox.arrivals()[1].sent == 5
+    assert mailbox.arrivals()[1].arrived == 4
 
 
 def test_the_newest_of_each_by_robot_id() -> None:

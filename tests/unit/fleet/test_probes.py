@@ -80,6 +80,37 @@ def test_iw_without_a_network_or_not_there() -> None:
     assert probes.iw_link("")["connected"] is None
 
 
+@given(active_ms=st.integers(0, 10**9), busy_ms=st.integers(0, 10**9), at=st.integers(0, 2))
+def test_iw_tells_of_the_channel_in_use(active_ms: int, busy_ms: int, at: int) -> None:
+    used = (
+        "Survey data from wlan0\n\tfrequency:\t\t\t5180 MHz [in use]\n\tnoise:\t\t\t\t-95 dBm\n"
+        f"\tchannel active time:\t\t{active_ms} ms\n\tchannel busy time:\t\t{busy_ms} ms\n"
+        "\tchannel receive time:\t\t900 ms\n\tchannel transmit time:\t\t34 ms\n"
+    )
+    other = (
+        "Survey data from wlan0\n\tfrequency:\t\t\t5200 MHz\n\tnoise:\t\t\t\t-93 dBm\n"
+        "\tchannel active time:\t\t121 ms\n\tchannel busy time:\t\t119 ms\n"
+    )
+    blocks = [other, other]
+    blocks.insert(at, used)
+    found = probes.iw_survey("".join(blocks))
+    assert found == {"active_ms": float(active_ms), "busy_ms": float(busy_ms)}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "command failed: Operation not supported (-95)\n",
+        # Of a driver that only measures noise.
+        "Survey data from wlan0\n\tfrequency:\t\t\t5180 MHz [in use]\n\tnoise:\t\t\t\t-95 dBm\n",
+        "Survey data from wlan0\n\tfrequency:\t\t\t5200 MHz\n\tchannel active time:\t\t121 ms\n",
+    ],
+)
+def test_iw_that_does_not_count_the_channels_time(text: str) -> None:
+    assert probes.iw_survey(text) == {"active_ms": None, "busy_ms": None}
+
+
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers(-1000, 1000) | st.text(max_size=20),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner),
@@ -181,6 +212,7 @@ def test_nothing_that_a_tool_prints_is_a_mistake_of_ours(text: str) -> None:
     assert 0.0 <= probes.ping_summary(text)["loss"] <= 1.0
     assert all(level is None or math.isfinite(level) for level in probes.wireless(text).values())
     probes.iw_link(text)
+    probes.iw_survey(text)
     probes.units(text)
     probes.memory(text)
     probes.synchronized(text)

@@ -1,5 +1,6 @@
 """What an operator is told at once, and that nothing else is."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -183,6 +184,57 @@ def test_what_the_ground_knows_of_a_robot(
     known: dict[str, Any], severity: Severity, code: AlarmCode, text: str
 ) -> None:
     assert told(fleet(known=known)) == (Alarm(severity, "r1", code, text),)
+
+
+IN_TIME, LATE = (25, 0, 24), (25, 0, 10, 0, 0, 0, 0, 0, 15)
+LOST = (25, 0, 12)
+
+
+@pytest.mark.parametrize("arrivals", [LATE, LOST])
+def test_messages_that_come_late_are_as_bad_as_lost_ones(arrivals: tuple[int, ...]) -> None:
+    known = {"arrivals": {"0": IN_TIME, "2": arrivals}}
+    assert told(fleet(known=known)) == (Alarm("warning", "r1", _C.NEIGHBOURS, "hears badly: r2"),)
+    # Three of four: a policy flies with that.
+    assert told(fleet(known={"arrivals": {"2": (4, 0, 3)}})) == ()
+    assert told(fleet(known={"arrivals": {"2": (2, 0, 0)}})) == (), "too few to tell"
+
+
+def beside_each_other(*numbers: int, badly: Callable[[int, int], bool]) -> FleetSnapshot:
+    """Robots that all are in range; `badly` tells of a sender and a receiver."""
+    return snapshot(*(
+        robot(
+            status(i, position_m=(0.5 * i, 12.0, 4.0),
+                   neighbour_ages_s={str(j): 0.1 for j in numbers}),
+            rates_hz={str(j): 2.5 for j in numbers},
+            arrivals={str(j): LOST if badly(j, i) else IN_TIME for j in numbers if j != i},
+        )
+        for i in numbers
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("badly", "text"),
+    [
+        (lambda sender, receiver: receiver == 2, "hears nobody in range well"),
+        (lambda sender, receiver: sender == 2, "nobody in range hears it well"),
+        (
+            lambda sender, receiver: 2 in (sender, receiver),
+            "hears nobody in range well; nobody in range hears it well",
+        ),
+    ],
+)
+def test_what_one_robot_is_to_blame_for_it_alone_is_told(
+    badly: Callable[[int, int], bool], text: str
+) -> None:
+    seen = beside_each_other(0, 1, 2, 3, 4, badly=badly)
+    assert alarms(setup(5), seen) == (Alarm("warning", "r2", _C.NEIGHBOURS, text),)
+
+
+def test_where_nobody_hears_anybody_each_robot_is_told_once() -> None:
+    seen = beside_each_other(0, 1, 2, 3, badly=lambda *_: True)
+    assert [(a.robot, a.text) for a in alarms(setup(4), seen)] == [
+        (f"r{i}", "hears nobody in range well") for i in range(4)
+    ]
 
 
 def test_a_robot_that_falls_silent_says_nothing_else() -> None:

@@ -12,7 +12,7 @@ from edge.core.memory import EXPLORED_CELLS
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.bounds import MOST_ROBOTS
 from edge.messages.codec import encode
-from edge.messages.mission import Echo, GroundState
+from edge.messages.mission import Echo, GroundState, RadioCounts
 from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATE, STATUS
 from lpac.radio.airtime import (
     CARD_BYTES,
@@ -370,11 +370,13 @@ def sealed(message: object) -> int:
     return len(encode(message)) + OVERHEAD_BYTES
 
 
-def heard(robots: int) -> int:
-    """A status of one that hears so many."""
+def heard(robots: int) -> float:
+    """The statuses of one that hears so many, on average."""
     ids = [str(robot) for robot in range(robots)]
     ages_s, messages = dict.fromkeys(ids, 0.123), dict.fromkeys(ids, 1234)
-    return sealed(snapshots.status(0, neighbour_ages_s=ages_s, neighbour_messages=messages))
+    counts = RadioCounts(1234, 2_000_000, dict.fromkeys(ids, (1234, 0, 1200, 34)))
+    status = snapshots.status(0, neighbour_ages_s=ages_s, neighbour_messages=messages)
+    return (3 * sealed(status) + sealed(replace(status, radio_counts=counts))) / 4
 
 
 def told(robots: int) -> int:
@@ -385,7 +387,7 @@ def told(robots: int) -> int:
 
 
 def test_a_status_grows_with_each_that_is_heard() -> None:
-    # 21 bytes while ids have one digit.
+    # 26 bytes while ids have one digit.
     assert (heard(90) - heard(20)) / 70 == pytest.approx(
         (status_bytes(90) - status_bytes(20)) / 70, rel=0.2
     )

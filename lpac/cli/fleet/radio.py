@@ -1,0 +1,340 @@
+"""`lpac fleet radio`: does the radio carry the fleet? Asked before a flight, on the ground."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lpac.cli.fleet.progress import print_problems, run_for_each
+from lpac.cli.ground_requests import interruptible
+from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
+from lpac.cli.printing import BAD, FAINT, GOOD, NOTABLE, print_table, progress_of, styled
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from edge.messages.mission import RobotStatus
+    from lpac.analysis.snapshot import FleetSnapshot
+    from lpac.fleet.hold import Report
+    from lpac.fleet.operations import Outcome
+    from lpac.fleet.radio import BulkStream, Interface
+    from lpac.fleet.settings import FleetConfig, RobotHost
+    from lpac.ground.station.subscriber import GroundSubscriber
+    from lpac.radio.checked import Checked, WifiReading
+    from lpac.radio.pairs import Pair, Window
+    from lpac.radio.verdict import RadioVerdict
+
+# Counts are in a status of every two seconds.
+_HEARD_WITHIN_S = 6.0
+_LOOK_S = 0.2
+_NOT_TOLD = "not told by the radio"
+
+
+def radio(
+    fleet: Fleet = DEFAULT_FLEET,
+    robots: Robots = None,
+    seconds: Annotated[
+        float, typer.Option(min=10.0, max=3600.0, help="How long is listened, s.")
+    ] = 20.0,
+    load: Annotated[
+        bool, typer.Option("--load", help="With a bulk stream from the first robot meanwhile.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="A folder for the heat map: radio.png and .pdf.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="Write a JSON line for each pair to this file.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure who hears whom, as robots on the ground speak: does the radio carry the fleet?
+
+    Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Spares
+    are left out.
+    """
+    from lpac.ground.station.subscriber import GroundSubscriber
+    from lpac.radio.pairs import pairs
+    from lpac.radio.records import write_records
+    from lpac.radio.verdict import verdict
+
+    config, chosen = open_fleet(fleet, robots)
+    chosen = [robot for robot in chosen if config.slot_of(robot.name) is not None]
+    if len(chosen) < 2:
+        raise ValueError("radio: two robots or more with a slot are needed to hear each other")
+    computers = [robot for robot in chosen if robot.has_computer]
+    if load and not computers:
+        raise ValueError("--load: the robots are no computers that could send a bulk stream")
+    with interruptible("radio", "nothing was changed"), GroundSubscriber(config.fleet) as ground:
+        _require_speaking(ground, [robot.name for robot in chosen], load=load)
+        before = _read_wifi(config, computers)
+        windows, stream = _listen(ground, config, chosen, seconds, computers[0] if load else None)
+        after = _read_wifi(config, computers)
+    checked = _checked(config, chosen, windows, before, after, loaded=load)
+    found = pairs(windows)
+    told = verdict(checked, found)
+    if record is not None:
+        write_records(record, checked.records(found))
+    if out is not None:
+        from lpac.radio.heat_map import draw
+
+        draw(checked.robots, found, f"{config.fleet}: {told.sentence}", out / "radio")
+    if as_json:
+        typer.echo(json.dumps(_described(config, checked, found, told, stream, after), indent=2))
+    else:
+        _print(checked, found, told, stream, after)
+    if told.problems:
+        raise ValueError(f"radio: {told.sentence}")
+
+
+# Measuring
+
+
+def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load: bool) -> None:
+    """Raises ValueError that says what the operator has to do first."""
+    from lpac.radio.verdict import obstacles
+
+    statuses: dict[str, RobotStatus] = {}
+
+    def all_told(snapshot: "FleetSnapshot") -> bool:
+        for name, status in _heard(snapshot, names).items():
+            # Not each status has counts.
+            if status.radio_counts is not None or statuses.get(name) is None:
+                statuses[name] = status
+        return len(statuses) == len(names) and all(s.radio_counts for s in statuses.values())
+
+    # Who is not heard is missed later.
+    ground.wait_for(all_told, _HEARD_WITHIN_S)
+    if not statuses:
+        raise ValueError("radio: no robot is heard: `lpac fleet status` tells whether they run")
+    hindrances = obstacles(statuses)
+    if hindrances:
+        raise ValueError(f"radio: {'; '.join(hindrances)}")
+    armed = [name for name, status in statuses.items() if status.armed]
+    if load and armed:
+        raise ValueError(f"--load: {', '.join(armed)}: armed: disturb no radio in flight")
+
+
+def _heard(snapshot: "FleetSnapshot", names: Sequence[str]) -> dict[str, "RobotStatus"]:
+    """What those of them say that are heard now."""
+    return {
+        robot.name: robot.status
+        for robot in snapshot.robots
+        if robot.fresh and robot.status is not None and robot.name in names
+    }
+
+
+def _listen(
+    ground: "GroundSubscriber",
+    config: "FleetConfig",
+    chosen: Sequence["RobotHost"],
+    seconds: float,
+    bulk_from: "RobotHost | None",
+) -> tuple[dict[str, "Window"], "BulkStream | None"]:
+    from lpac.fleet.radio import bulk_stream
+    from lpac.radio.pairs import Window
+
+    names = [robot.name for robot in chosen]
+    windows: dict[str, Window] = {}
+
+    def take(snapshot: "FleetSnapshot") -> bool:
+        for name, status in _heard(snapshot, names).items():
+            known = windows.get(name)
+            if status.radio_counts is None:
+                continue
+            # A program that starts again counts anew.
+            again = known is None or known.first.boot_nonce != status.boot_nonce
+            windows[name] = Window(status if known is None or again else known.first, status)
+        return False
+
+    stream = nullcontext() if bulk_from is None else bulk_stream(config, bulk_from)
+    with progress_of("listening") as progress, stream as streaming:
+        task = progress.add_task("s", total=round(seconds))
+        began_s = time.monotonic()
+        while (passed_s := time.monotonic() - began_s) < seconds:
+            progress.update(task, completed=int(passed_s))
+            # Each picture, since not each status has counts. Raises once the ground has ended.
+            ground.wait_for(take, min(_LOOK_S, seconds - passed_s))
+    return {name: w for name, w in windows.items() if w.duration_s > 0.0}, streaming
+
+
+def _read_wifi(
+    config: "FleetConfig", robots: Sequence["RobotHost"]
+) -> "list[Outcome[list[Interface]]]":
+    from lpac.fleet.radio import read_wifi
+
+    async def one(robot: "RobotHost", report: "Report") -> "list[Interface]":
+        return await read_wifi(config, robot, report)
+
+    outcomes = run_for_each(robots, one) if robots else []
+    if any(outcome.interrupted for outcome in outcomes):
+        raise KeyboardInterrupt
+    return outcomes
+
+
+def _checked(
+    config: "FleetConfig",
+    chosen: Sequence["RobotHost"],
+    windows: Mapping[str, "Window"],
+    before: "Sequence[Outcome[list[Interface]]]",
+    after: "Sequence[Outcome[list[Interface]]]",
+    *,
+    loaded: bool,
+) -> "Checked":
+    from edge.identity.envelope import OVERHEAD_BYTES
+    from lpac.fleet.radio import reading
+    from lpac.radio.airtime import MESSAGE_BYTES
+    from lpac.radio.checked import Checked
+
+    then = {outcome.robot.name: outcome.value or [] for outcome in before}
+    flying = next(robot.name for robot in chosen if config.slot_of(robot.name) is not None)
+    return Checked(
+        robots=tuple(robot.name for robot in chosen),
+        windows=windows,
+        wifi={
+            o.robot.name: reading(then[o.robot.name], o.value) for o in after if o.value is not None
+        },
+        transport=config.radio.transport,
+        overhead_bytes=OVERHEAD_BYTES if config.keys is not None else 0,
+        flight_bytes=MESSAGE_BYTES[config.robot_config(flying).policy.payload],
+        loaded=loaded,
+    )
+
+
+# Telling
+
+
+def _print(
+    checked: "Checked",
+    found: Sequence["Pair"],
+    told: "RadioVerdict",
+    stream: "BulkStream | None",
+    asked: "Sequence[Outcome[list[Interface]]]",
+) -> None:
+    from lpac.radio.pairs import LATE_S
+
+    names = checked.robots
+    by_link = {(pair.receiver, pair.sender): pair for pair in found}
+    for heading, cell in (
+        ("arrived %", partial(_delivered, expected_loss=checked.expected_loss)),
+        ("age p99 s", _age), (f"of {LATE_S:g} s or older %", _late),
+    ):  # fmt: skip
+        typer.echo(f"{heading}: a row hears, a column says")
+        rows: list[list[str | Text]] = [
+            [receiver, *(
+                "" if (pair := by_link.get((receiver, sender))) is None else cell(pair)
+                for sender in names
+            )]
+            for receiver in names
+        ]  # fmt: skip
+        print_table(("", *names), rows, names)
+        typer.echo()
+    if asked:
+        print_table(
+            ("robot", "signal dBm", "rate Mbit/s", "channel busy %"),
+            [[name, *_wifi_cells(checked.wifi.get(name))] for name in names],
+            ("signal dBm", "rate Mbit/s", "channel busy %"),
+        )
+        print_problems(asked)
+        typer.echo()
+    if stream is not None:
+        typer.echo(f"bulk stream from {stream.robot}: {stream.rate_mbit_s:.1f} Mbit/s")
+    for problem in told.problems:
+        typer.secho(problem, fg=BAD)
+    if not told.problems:
+        typer.secho(told.sentence, fg=GOOD)
+    if told.room is not None:
+        typer.secho(_basis(checked, told), dim=True)
+
+
+def _basis(checked: "Checked", told: "RadioVerdict") -> str:
+    """What the room for more comes from."""
+    room = told.room
+    assert room is not None
+    assumed = "" if room.rate_told else ", which is assumed"
+    text = (
+        f"room by the model of docs/scaling.md: {checked.transport} at {room.rate_mbit_s:.0f} "
+        f"Mbit/s{assumed}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
+        f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
+        f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
+    )
+    if room.busy_share is None:
+        return text
+    return (
+        text + f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time"
+    )
+
+
+def _delivered(pair: "Pair", *, expected_loss: float) -> "Text":
+    from lpac.radio.verdict import LEAST_DELIVERED, is_good
+
+    good = is_good(pair, expected_loss)
+    style = GOOD if pair.delivered >= LEAST_DELIVERED else NOTABLE if good else BAD
+    return styled(f"{100.0 * pair.delivered:.0f}", style)
+
+
+def _age(pair: "Pair") -> "Text":
+    from lpac.radio.pairs import LATE_S
+
+    age_s = pair.age_p99_s
+    if age_s is None:
+        return styled("-", FAINT)
+    return styled(
+        f"{age_s:.2f}", BAD if age_s >= LATE_S else NOTABLE if age_s >= LATE_S / 2 else GOOD
+    )
+
+
+def _late(pair: "Pair") -> "Text":
+    from lpac.radio.verdict import MOST_LATE
+
+    if not pair.received:
+        return styled("-", FAINT)
+    share = pair.late_share
+    style = GOOD if not share else NOTABLE if share <= MOST_LATE else BAD
+    return styled(f"{100.0 * share:.0f}", style)
+
+
+def _wifi_cells(wifi: "WifiReading | None") -> list["Text"]:
+    if wifi is None:
+        return [styled("see below", FAINT)]
+    values = (
+        wifi.signal_dbm, wifi.rate_mbit_s,
+        None if wifi.busy_share is None else 100.0 * wifi.busy_share,
+    )  # fmt: skip
+    return [styled(_NOT_TOLD, FAINT) if v is None else styled(f"{v:.0f}", "") for v in values]
+
+
+def _described(
+    config: "FleetConfig",
+    checked: "Checked",
+    found: Sequence["Pair"],
+    told: "RadioVerdict",
+    stream: "BulkStream | None",
+    asked: "Sequence[Outcome[list[Interface]]]",
+) -> dict[str, Any]:
+    problems = {outcome.robot.name: outcome.problem for outcome in asked}
+    return {
+        "fleet": config.fleet,
+        "ok": not told.problems,
+        "sentence": told.sentence,
+        "problems": told.problems,
+        "transport": checked.transport,
+        "room": told.room and told.room._asdict(),
+        "bulk_stream": stream and {"robot": stream.robot, "rate_mbit_s": stream.rate_mbit_s},
+        "robots": {
+            name: {
+                "heard": name in checked.windows,
+                "wifi": (wifi := checked.wifi.get(name)) and wifi._asdict(),
+                "wifi_problem": problems.get(name),
+            }
+            for name in checked.robots
+        },
+        "pairs": [
+            {**pair._asdict(), "delivered": pair.delivered, "late_share": pair.late_share}
+            for pair in found
+        ],
+    }

@@ -1,0 +1,108 @@
+"""What the robots' radios tell of themselves over SSH, and a stream of bytes to disturb them."""
+
+import contextlib
+import os
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from lpac.fleet.hold import Report
+from lpac.fleet.session import UnreachableError, connect, explain, ssh_command
+from lpac.fleet.settings import FleetConfig, RobotHost
+from lpac.radio.checked import WifiReading
+
+_CHUNK_BYTES = 1 << 16
+_ENDS_WITHIN_S = 5.0
+
+Interface = Mapping[str, Any]
+
+
+async def read_wifi(config: FleetConfig, robot: RobotHost, report: Report) -> list[Interface]:
+    """Its wireless interfaces as they are now (`probes.wifi`). Raises FleetError."""
+    report("connect", None)
+    async with connect(config, robot) as session:
+        report("radio", None)
+        interfaces: list[Interface] = (await session.call("wifi"))["interfaces"]
+        return interfaces
+
+
+def reading(before: Sequence[Interface], after: Sequence[Interface]) -> WifiReading:
+    """What a robot's Wi-Fi told between two looks: of the interface that has a network."""
+    now = next((one for one in after if one["connected"]), None)
+    if now is None:
+        return WifiReading()
+    then = next((one for one in before if one["name"] == now["name"]), {})
+    return WifiReading(now["rate_mbit_s"], now["signal_dbm"], _busy_share(then, now))
+
+
+def _busy_share(before: Interface, after: Interface) -> float | None:
+    keys = ("active_ms", "busy_ms")
+    if any(one.get(key) is None for one in (before, after) for key in keys):
+        return None
+    active_ms, busy_ms = (float(after[key]) - float(before[key]) for key in keys)
+    # Some drivers begin to count anew now and then.
+    if before["frequency_mhz"] != after["frequency_mhz"] or active_ms <= 0.0 or busy_ms < 0.0:
+        return None
+    return min(busy_ms / active_ms, 1.0)
+
+
+class BulkStream:
+    """What came of it so far."""
+
+    def __init__(self, robot: str) -> None:
+        self.robot = robot
+        self.received_bytes = 0
+        self._began_s: float | None = None
+
+    @property
+    def rate_mbit_s(self) -> float:
+        """Since the first bytes came."""
+        if self._began_s is None:
+            return 0.0
+        return 8e-6 * self.received_bytes / max(time.monotonic() - self._began_s, 1e-3)
+
+    def add(self, count: int) -> None:
+        """So many bytes came."""
+        if self._began_s is None:
+            self._began_s = time.monotonic()
+        self.received_bytes += count
+
+
+@contextlib.contextmanager
+def bulk_stream(config: FleetConfig, robot: RobotHost) -> Iterator[BulkStream]:
+    """As many bytes from the robot as ssh takes, as of somebody who pulls logs, in this context.
+
+    Raises UnreachableError in the end if it broke off, or nothing came.
+    """
+    ssh, *options, host = ssh_command(config, robot)
+    # Zeros are not to become small on the way.
+    command = [ssh, "-o", "Compression=no", *options, host, "exec cat /dev/zero"]
+    stream = BulkStream(robot.name)
+    # A helper that ssh's configuration starts may hold a pipe open after ssh has ended.
+    with tempfile.TemporaryFile() as complaints:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=complaints,
+            process_group=0,
+        )  # fmt: skip
+        reader = threading.Thread(target=_count, args=(process, stream), daemon=True)
+        reader.start()
+        try:
+            yield stream
+            broken = process.poll() is not None or not stream.received_bytes
+        finally:
+            process.kill()
+            process.wait()
+            reader.join(_ENDS_WITHIN_S)
+        if broken:
+            complaints.seek(0)
+            text = explain(complaints.read().decode(errors="replace"), robot.host)
+            raise UnreachableError(f"bulk stream from {robot.name}: {text}")
+
+
+def _count(process: "subprocess.Popen[bytes]", stream: BulkStream) -> None:
+    assert process.stdout is not None
+    while chunk := os.read(process.stdout.fileno(), _CHUNK_BYTES):
+        stream.add(len(chunk))

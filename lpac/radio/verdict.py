@@ -1,0 +1,225 @@
+"""What a check of the radio comes to: one sentence, and what is wrong, the worst first."""
+
+import dataclasses
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from edge.messages.mission import RobotStatus
+from lpac.radio.airtime import Wifi, airtime, carries
+from lpac.radio.checked import Checked, WifiReading
+from lpac.radio.pairs import LATE_S, Pair, blame
+
+# Mesh and router repeat what is lost until it is through, so that nothing should be missing. Where
+# more is, the radio is at fault; in multicast, more than chance makes of what each frame may lose.
+LEAST_DELIVERED = 0.95
+_CHANCE_DEVIATIONS = 3.0
+# Whoever gets a message late does not use it; and where so many are late, queues are filling.
+MOST_LATE = 0.01
+# Of the fifty of a check, one that is lost or late is chance.
+_BY_CHANCE = 1
+# Of a channel's time; above it delays grow quickly (docs/scaling.md).
+MOST_BUSY = 0.6
+# So much more than the model says of this fleet is not the model's error alone.
+_MUCH_OF_OTHERS = 0.2
+# As `lpac fleet doctor` has it.
+_WEAK_DBM = -75.0
+# Where no radio tells its own; as docs/scaling.md has it.
+ASSUMED_RATE_MBIT_S = 220.0
+
+
+class Room(NamedTuple):
+    """For how many robots in flight the model sees room on the channel, and what it was told.
+
+    `ground_share` is what it says of this fleet with messages of `ground_bytes`, as they were, and
+    `flight_share` of `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not. `busy_share`
+    is what the model was scaled to meet; None: it was not.
+    """
+
+    carries: int
+    ground_share: float
+    flight_share: float
+    rate_mbit_s: float
+    rate_told: bool
+    ground_bytes: float
+    flight_bytes: float
+    message_hz: float
+    busy_share: float | None
+
+
+class RadioVerdict(NamedTuple):
+    """`problems` are the worst first, none if all is well; `room` is None if nobody spoke."""
+
+    sentence: str
+    problems: tuple[str, ...]
+    room: Room | None
+
+
+def obstacles(statuses: Mapping[str, RobotStatus]) -> tuple[str, ...]:
+    """Why robots, by name, do not yet say to each other what they will in a mission; what to do."""
+
+    def those(is_so: Callable[[RobotStatus], bool], text: str) -> Iterator[str]:
+        names = [name for name, status in statuses.items() if is_so(status)]
+        if names:
+            yield f"{', '.join(names)}: {text}"
+
+    def others_than_most(key: str, what: str, fix: str) -> Iterator[str]:
+        values = [getattr(status, key) for status in statuses.values()]
+        known = [value for value in values if value is not None]
+        if known:
+            common = statistics.mode(known)
+            text = f"another {what} than most: who has another one is not listened to: {fix}"
+            yield from those(lambda status: getattr(status, key) not in (None, common), text)
+
+    return (
+        *those(
+            lambda status: status.radio_counts is None,
+            "an older program, which does not count messages: `lpac fleet deploy`",
+        ),
+        *those(
+            lambda status: status.origin is None,
+            "no mission origin, and so no position to speak of: first `lpac mission origin`",
+        ),
+        *those(
+            lambda status: status.origin is not None and status.position_m is None,
+            "no position: wait until its GPS has one",
+        ),
+        *others_than_most("bundle_id", "policy", "`lpac fleet deploy`"),
+        *others_than_most("origin", "mission origin", "`lpac mission origin`"),
+    )
+
+
+def verdict(checked: Checked, pairs: Sequence[Pair]) -> RadioVerdict:
+    """Of what `pairs` found in the windows."""
+    room = _room(checked)
+    found = [
+        *_silent(checked),
+        *_channel(checked, room),
+        *_unheard(checked, pairs),
+    ]
+    problems = tuple(text for _, text in sorted(found, key=lambda each: -each[0]))
+    return RadioVerdict(_sentence(checked, room, problems), problems, room)
+
+
+def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> str:
+    if problems:
+        more = len(problems) - 1
+        return problems[0] + (f"; and {more} more" if more else "")
+    speaking = len(checked.windows)
+    more_robots = 0 if room is None else max(0, room.carries - speaking)
+    beside = " beside a bulk stream" if checked.loaded else ""
+    return f"carries {speaking} robots{beside} with room for {more_robots or 'no more'}"
+
+
+def is_good(pair: Pair, expected_loss: float) -> bool:
+    """Whether the receiver hears enough of the sender, in time.
+
+    `expected_loss` is the share of messages that a radio as it should be loses for good.
+    """
+    missing, expected = pair.sent - pair.received, pair.sent * expected_loss
+    chance = _CHANCE_DEVIATIONS * math.sqrt(expected * (1.0 - expected_loss))
+    enough = pair.delivered >= LEAST_DELIVERED or missing <= max(_BY_CHANCE, expected + chance)
+    return enough and (pair.late <= _BY_CHANCE or pair.late_share <= MOST_LATE)
+
+
+# How bad it is, from 0 to 1, and what is wrong.
+_Found = tuple[float, str]
+
+
+def _silent(checked: Checked) -> Iterator[_Found]:
+    for name in checked.robots:
+        window = checked.windows.get(name)
+        if window is None:
+            yield 1.0, f"{name} is not heard here: `lpac fleet status` tells whether it runs"
+        elif window.sent < 1:
+            yield 1.0, f"{name} says nothing to the others: `lpac watch` tells what it lacks"
+
+
+def _channel(checked: Checked, room: Room | None) -> Iterator[_Found]:
+    busy = None if checked.loaded or room is None else room.busy_share
+    if busy is None or room is None or busy <= MOST_BUSY:
+        return
+    text = f"the channel is busy {_percent(busy)} of the time"
+    if busy - room.ground_share > _MUCH_OF_OTHERS:
+        text += f", of which these robots should take {_percent(room.ground_share)}: others take "
+        text += "the rest: look for another channel"
+    else:
+        text += ": that is all that so many robots can be given on one"
+    yield (busy - MOST_BUSY) / (1.0 - MOST_BUSY), text
+
+
+def _unheard(checked: Checked, pairs: Sequence[Pair]) -> Iterator[_Found]:
+    found = blame(
+        {(pair.sender, pair.receiver): is_good(pair, checked.expected_loss) for pair in pairs}
+    )
+
+    def weak(name: str) -> str:
+        signal_dbm = checked.wifi.get(name, WifiReading()).signal_dbm
+        if signal_dbm is None or signal_dbm >= _WEAK_DBM:
+            return ""
+        return f" (its signal is weak: {signal_dbm:.0f} dBm)"
+
+    def told(its: Sequence[Pair], lost: str, late: str, name: str) -> _Found:
+        total = _sum(its)
+        if total.sent - total.received >= total.late:
+            text = lost.replace("SHARE", _percent(total.delivered))
+        else:
+            age = "" if total.age_p99_s is None else f", p99 {total.age_p99_s:.1f} s"
+            text = f"{late}: {_percent(total.late_share)} at {LATE_S:g} s or older{age}"
+        return 1.0 - total.in_time, text + weak(name)
+
+    for name in found.receivers:
+        its = [pair for pair in pairs if pair.receiver == name]
+        yield told(its, f"{name} hears SHARE of the others", f"all comes late to {name}", name)
+    for name in found.senders:
+        its = [pair for pair in pairs if pair.sender == name]
+        yield told(its, f"the others hear SHARE of {name}", f"{name}'s messages come late", name)
+    for sender, receiver in found.links:
+        its = [pair for pair in pairs if (pair.sender, pair.receiver) == (sender, receiver)]
+        late = f"{sender}'s messages come late to {receiver}"
+        yield told(its, f"{receiver} hears SHARE of {sender}", late, receiver)
+
+
+def _sum(pairs: Sequence[Pair]) -> Pair:
+    ages_s = [pair.age_p99_s for pair in pairs if pair.age_p99_s is not None]
+    return pairs[0]._replace(
+        sent=sum(pair.sent for pair in pairs),
+        received=sum(pair.received for pair in pairs),
+        late=sum(pair.late for pair in pairs),
+        age_p99_s=max(ages_s, default=None),
+    )
+
+
+def _room(checked: Checked) -> Room | None:
+    traffic = checked.traffic
+    if traffic is None:
+        return None
+    rates = [w.rate_mbit_s for w in checked.wifi.values() if w.rate_mbit_s]
+    # The slowest take the most time.
+    rate_mbit_s = statistics.harmonic_mean(rates) if rates else ASSUMED_RATE_MBIT_S
+    wifi = Wifi(data_rate_mbit_s=rate_mbit_s)
+    share = airtime(checked.transport, wifi, traffic).total
+    flight_bytes = max(traffic.message_bytes, checked.flight_bytes)
+    flight = dataclasses.replace(traffic, message_bytes=flight_bytes)
+    # A radio that hears nobody does not count.
+    told = [w.busy_share for w in checked.wifi.values() if w.busy_share]
+    busy = statistics.median(told) if told and not checked.loaded else None
+    most = MOST_BUSY if busy is None else MOST_BUSY * share / busy
+    return Room(
+        carries(checked.transport, wifi, flight, most=most),
+        share,
+        airtime(checked.transport, wifi, flight).total,
+        rate_mbit_s,
+        bool(rates),
+        traffic.message_bytes,
+        flight_bytes,
+        traffic.message_hz,
+        busy,
+    )
+
+
+def _percent(share: float) -> str:
+    """Never 100 % of what is not all, nor 0 % of what is not nothing."""
+    percent = min(99, max(1, math.floor(100.0 * share + 0.5))) if 0.0 < share < 1.0 else 100 * share
+    return f"{percent:.0f} %"
