@@ -78,8 +78,8 @@ def network(
     out: Annotated[Path, typer.Option(help="Folder for network.json and figures.")] = _OUT,
 ) -> None:
     """The paper's network experiments: what a bulk stream gets beside the robots' programs."""
-    from edge.drivers.process_lock import ProcessLock
     from lpac.network.results import as_json as to_json
+    from lpac.train.files import write_atomically
 
     plans = [
         _plan(experiment, _checked(middlewares), robots, repetitions, seconds)
@@ -88,13 +88,11 @@ def network(
     stations = _stations(namespaces, max(plan.stations for plan in plans))
     where = _measured_on(stations, plans[0])
     runs: list[Run] = []
-    out.mkdir(parents=True, exist_ok=True)
-    with ProcessLock("lpac bench network"):
-        for run in _measure(plans, stations):
-            runs.append(run)
-            told = to_json(where, runs)
-            # An interrupted measurement leaves what it has.
-            (out / "network.json").write_text(json.dumps(told, indent=2) + "\n")
+    for run in _measure(plans, stations):
+        runs.append(run)
+        # An interrupted measurement leaves what it has.
+        told = json.dumps(to_json(where, runs), indent=2)
+        write_atomically(out / "network.json", f"{told}\n".encode())
     _draw(runs, out)
     if as_json:
         typer.echo(json.dumps(to_json(where, runs), indent=2))

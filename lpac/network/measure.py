@@ -99,8 +99,8 @@ class NetworkFleet:
         for robot in self._robots[:robots]:
             robot.program.tell("start", middleware, robots, start)
 
-    def meet(self, robots: int, start: int) -> None:
-        """Wait until all of that start have heard each other, or for long enough. Raises OSError"""
+    def meet(self, robots: int, start: int) -> bool:
+        """Wait until all of that start have heard each other: whether they have. Raises OSError."""
         pairs = robots * (robots - 1)
 
         def met() -> bool:
@@ -115,7 +115,7 @@ class NetworkFleet:
                     }
                 )
 
-        self._news.wait(met, _ACQUAINTED_WITHIN_S)
+        return self._news.wait(met, _ACQUAINTED_WITHIN_S)
 
     def stop(self, robots: int) -> tuple[list[Sent], list[Reception]]:
         """End their programs, and give all that was said. Raises OSError."""

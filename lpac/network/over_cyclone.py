@@ -18,7 +18,9 @@ from cyclonedds.util import duration
 from edge.messages.topics import MESSAGE, TOPICS, is_loopback
 from lpac.network.middleware import Peer
 
-_DOMAIN = 77
+# Below the ports that `lpac.sim.ports` gives; each process's are of a block of its own, and so the
+# fleets of two that measure at once on one loopback do not find each other.
+_DOMAINS, _PORTS_OF_A_BLOCK = 50, 200
 _QOS = Qos(
     Policy.Reliability.Reliable(duration(milliseconds=100)),
     Policy.History.KeepLast(10),
@@ -62,9 +64,9 @@ class _Receiver(Listener):  # type: ignore[misc]
 
 
 class _CyclonePeer:
-    def __init__(self, config: str, receive: Callable[[bytes], None]) -> None:
-        self._domain = Domain(_DOMAIN, config)
-        self._participant = DomainParticipant(_DOMAIN)
+    def __init__(self, domain: int, config: str, receive: Callable[[bytes], None]) -> None:
+        self._domain = Domain(domain, config)
+        self._participant = DomainParticipant(domain)
         # As many as the product's robots declare, of which one is said here.
         topics = {
             topic: Topic(self._participant, topic.name, Bytes)
@@ -100,5 +102,6 @@ def open_peer(
 ) -> AbstractContextManager[Peer]:
     """As `OpenPeer`. Robots find each other by themselves, on ports of DDS."""
     address = endpoints[index].rpartition(":")[0]
+    domain = int(endpoints[0].rpartition(":")[2]) // _PORTS_OF_A_BLOCK % _DOMAINS
     config = _LOOPBACK if is_loopback(f"udp/{address}") else _WIFI
-    return _CyclonePeer(config.format(address=address), receive)
+    return _CyclonePeer(domain, config.format(address=address), receive)
