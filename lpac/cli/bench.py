@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,18 +81,20 @@ def network(
     from lpac.network.results import as_json as to_json
     from lpac.train.files import write_atomically
 
+    chosen = _checked(middlewares)
     plans = [
-        _plan(experiment, _checked(middlewares), robots, repetitions, seconds)
+        _plan(experiment, chosen, robots, repetitions, seconds)
         for experiment in _experiments(experiments)
     ]
     stations = _stations(namespaces, max(plan.stations for plan in plans))
     where = _measured_on(stations, plans[0])
     runs: list[Run] = []
-    for run in _measure(plans, stations):
-        runs.append(run)
-        # An interrupted measurement leaves what it has.
-        told = json.dumps(to_json(where, runs), indent=2)
-        write_atomically(out / "network.json", f"{told}\n".encode())
+    with closing(_measure(plans, stations)) as measured:
+        for run in measured:
+            runs.append(run)
+            # An interrupted measurement leaves what it has.
+            told = json.dumps(to_json(where, runs), indent=2)
+            write_atomically(out / "network.json", f"{told}\n".encode())
     _draw(runs, out)
     if as_json:
         typer.echo(json.dumps(to_json(where, runs), indent=2))
@@ -186,7 +188,9 @@ def _measured_on(stations: Sequence["NetworkStation"], plan: "Plan") -> dict[str
     }
 
 
-def _measure(plans: Sequence["Plan"], stations: Sequence["NetworkStation"]) -> "Iterator[Run]":
+def _measure(
+    plans: Sequence["Plan"], stations: Sequence["NetworkStation"]
+) -> "Generator[Run, None, None]":
     """Each run as it is made."""
     from lpac.network.figures import title_of
     from lpac.network.measure import measure
@@ -195,7 +199,7 @@ def _measure(plans: Sequence["Plan"], stations: Sequence["NetworkStation"]) -> "
         task = progress.add_task("", total=sum(1 for plan in plans for _ in plan.runs()))
 
         def tell(repetition: int, robots: int, middleware: str) -> None:
-            doing = f"{robots} robots, {title_of(middleware)}, repetition {repetition}"
+            doing = f"robots: {robots}, {title_of(middleware)}, repetition {repetition}"
             progress.update(task, description=doing)
 
         for plan in plans:
@@ -246,7 +250,8 @@ def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
 
 _LEGEND = (
     "\ndelivered: of the robots' messages, those of the 10 s after a restart if there are some; "
-    "heard after: one robot by another; busy: this machine's processors"
+    "heard after: how long after a restart robots first heard each other, half of all pairs and "
+    "the last; never: pairs that did not until the next; busy: this machine's processors"
 )
 _RESTART_COLUMNS = (
     "", "Mbit/s", "delivered, %", "heard after, s", "the last, s", "never, %", "busy, %", "runs",
