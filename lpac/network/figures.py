@@ -47,8 +47,10 @@ def of_restarts(runs: Sequence[Run]) -> Figure:
                     place + _JITTER, factor * spread.mean, factor * (spread.deviation or 0.0),
                     fmt="s", ms=4, color=colour, lw=1.0, capsize=2,
                 )  # fmt: skip
-            axes.set(ylabel=label, ylim=(0.0, None), xlim=(-0.6, len(shown) - 0.4))
-            axes.set_xticks(range(len(shown)), [title_of(s.middleware) for s in shown])
+            axes.set(ylabel=label, xlim=(-0.6, len(shown) - 0.4))
+            _from_zero(axes)
+            names = [title_of(summary.middleware).replace(" ", "\n") for summary in shown]
+            axes.set_xticks(range(len(shown)), names)
             style.tidy(axes)
         return figure
 
@@ -64,12 +66,13 @@ def over_robots(runs: Sequence[Run]) -> Figure:
             _curve(left, its, "throughput_mbit_s", colour, "-", title_of(middleware))
             if any("age_p50_ms" in summary.measures for summary in its):
                 name = title_of(middleware)
-                _curve(right, its, "age_p50_ms", colour, "-", f"{name}: half of them")
-                _curve(right, its, "age_p99_ms", colour, style.DASHED, f"{name}: 99 %")
-        left.set(xlabel="robots", ylabel="throughput (Mbit/s)", ylim=(0.0, None))
-        right.set(xlabel="robots", ylabel="age of messages, at most (ms)", yscale="log")
-        for axes in (left, right):
-            axes.xaxis.get_major_locator().set_params(integer=True)
+                _curve(right, its, "age_p50_ms", colour, "-", f"{name}, median")
+                _curve(right, its, "age_p99_ms", colour, style.DASHED, f"{name}, 99 %")
+        robots = sorted({summary.robots for summary in of_each})
+        for axes, label in ((left, "throughput (Mbit/s)"), (right, "age of messages (ms)")):
+            axes.set(xlabel="robots", ylabel=label, xlim=(robots[0] - 0.5, robots[-1] + 0.5))
+            axes.set_xticks(robots)
+            _from_zero(axes)
             style.tidy(axes)
             if axes.get_legend_handles_labels()[0]:
                 axes.legend(fontsize=7, handlelength=2.8)
@@ -86,6 +89,10 @@ def _curve(
         [spread.deviation or 0.0 for _, spread in told],
         color=colour, ls=dashes, lw=1.2, marker="o", ms=2.5, capsize=1.5, label=name,
     )  # fmt: skip
+
+
+def _from_zero(axes: Axes) -> None:
+    axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
 
 
 def _colour(of_each: Sequence[Summary], middleware: str) -> str:
