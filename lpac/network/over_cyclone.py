@@ -4,9 +4,19 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Self
+from threading import Event, Thread
+from typing import Self
 
-from cyclonedds.core import DDSException, Listener, Policy, Qos
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import sequence, uint8
@@ -27,6 +37,7 @@ _QOS = Qos(
     Policy.Durability.Volatile,
 )
 _MOST_AT_ONCE = 100
+_LOOK_UP_EVERY = duration(milliseconds=200)
 # On Wi-Fi it finds others by multicast and sends data to each, by itself; an interface of a network
 # namespace does not look like Wi-Fi to it.
 _WIFI = """<CycloneDDS><Domain><General>
@@ -48,23 +59,9 @@ class Bytes(IdlStruct):  # type: ignore[misc]
     data: sequence[uint8]
 
 
-class _Receiver(Listener):  # type: ignore[misc]
-    def __init__(self, receive: Callable[[bytes], None]) -> None:
-        super().__init__()
-        self._receive = receive
-
-    def on_data_available(self, reader: Any) -> None:
-        try:
-            for sample in reader.take(_MOST_AT_ONCE):
-                # Else it is the news that a writer has gone.
-                if isinstance(sample, Bytes):
-                    self._receive(bytes(sample.data))
-        except DDSException as error:
-            sys.stderr.write(f"take: {error}\n")
-
-
 class _CyclonePeer:
     def __init__(self, domain: int, config: str, receive: Callable[[bytes], None]) -> None:
+        self._receive = receive
         self._domain = Domain(domain, config)
         self._participant = DomainParticipant(domain)
         # As many as the product's robots declare, of which one is said here.
@@ -76,14 +73,19 @@ class _CyclonePeer:
         self._writers = {
             topic: DataWriter(self._participant, named, qos=_QOS) for topic, named in topics.items()
         }
-        self._reader = DataReader(
-            self._participant, topics[MESSAGE], qos=_QOS, listener=_Receiver(receive)
-        )
+        self._reader = DataReader(self._participant, topics[MESSAGE], qos=_QOS)
+        self._closed = Event()
+        # Not a listener: DDS calls it with its locks held, for which `write` waits while it holds
+        # Python's, so that now and then a program would stand still for ever.
+        self._receiving = Thread(target=self._take, daemon=True)
 
     def __enter__(self) -> Self:
+        self._receiving.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        self._receiving.join()
         # What nothing refers to takes leave of the others; it has no call for that.
         del self._reader
         self._writers.clear()
@@ -95,6 +97,17 @@ class _CyclonePeer:
             self._writers[MESSAGE].write(Bytes(data))
         except DDSException as error:
             sys.stderr.write(f"write: {error}\n")
+
+    def _take(self) -> None:
+        arrivals = WaitSet(self._participant)
+        news = SampleState.NotRead | ViewState.Any | InstanceState.Any
+        arrivals.attach(ReadCondition(self._reader, news))
+        while not self._closed.is_set():
+            arrivals.wait(_LOOK_UP_EVERY)
+            for sample in self._reader.take(_MOST_AT_ONCE):
+                # Else it is the news that a writer has gone.
+                if isinstance(sample, Bytes):
+                    self._receive(bytes(sample.data))
 
 
 def open_peer(
