@@ -88,6 +88,8 @@ class NetworkFleet:
         return self
 
     def __exit__(self, *_: object) -> None:
+        for robot in self._robots:
+            robot.program.leave()
         self._stack.close()
 
     def load(self, middleware: str) -> None:

@@ -32,7 +32,7 @@ from lpac.radio.airtime import MESSAGE_BYTES
 SIZE_BYTES = round(MESSAGE_BYTES["float16"])
 # Robot, start, sequence, when it was sent.
 _HEAD = struct.Struct("<HHIq")
-_LEAVES_WITHIN_S = 20.0
+_LEAVES_WITHIN_S = 10.0
 _LOOK_AGAIN_S = 0.01
 
 

@@ -13,7 +13,8 @@ from typing import NamedTuple, Self
 
 from lpac.sim.programs import python_program
 
-_ENDS_WITHIN_S = 10.0
+# Longer than a robot's program waits for its own.
+_ENDS_WITHIN_S = 30.0
 _LOOK_AGAIN_S = 0.2
 
 
@@ -109,10 +110,8 @@ class Program:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._leaving = True
-        assert self._process.stdin is not None and self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
+        self.leave()
+        assert self._process.stdout is not None
         try:
             self._process.wait(_ENDS_WITHIN_S)
         except subprocess.TimeoutExpired:
@@ -121,6 +120,13 @@ class Program:
         self._reader.join(_ENDS_WITHIN_S)
         self._process.stdout.close()
         self._errors.close()
+
+    def leave(self) -> None:
+        """Tell it to end; who has several tells all of them before waiting for each."""
+        self._leaving = True
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
 
     def tell(self, *words: object) -> None:
         """One line. Raises OSError if it has ended."""
@@ -143,7 +149,7 @@ class Program:
         for line in self._process.stdout:
             word, _, rest = line.strip().partition(" ")
             if word == "failed":
-                self._problem = rest
+                self._problem = self._problem or rest
             else:
                 self._hear(line)
             self._news.tell()

@@ -54,6 +54,30 @@ def test_robots_hear_each_other_and_do_so_again_after_all_have_restarted(middlew
         assert len(set(heard)) == len(heard)
 
 
+def test_a_program_that_has_ended_by_itself_is_no_result() -> None:
+    with NetworkFleet([LOOPBACK] * 2) as fleet:
+        fleet.start("zenoh", 2, 0)
+        patience_until_s = time.monotonic() + PATIENCE_S
+        while not fleet.meet(2, 0):
+            assert time.monotonic() < patience_until_s
+        first = min(_robots_of(os.getpid()))
+        [program] = _robots_of(first)
+        os.kill(program, signal.SIGKILL)
+        with pytest.raises(OSError, match="robot: its program has ended by itself, with 9"):
+            fleet.stop(2)
+
+
+def _robots_of(parent: int) -> list[int]:
+    """The processes that it has started."""
+    told = [path.read_text() for path in Path(f"/proc/{parent}/task").glob("*/children")]
+    children = [int(child) for children in told for child in children.split()]
+    return [
+        child
+        for child in children
+        if b"lpac.network.robot" in Path(f"/proc/{child}/cmdline").read_bytes()
+    ]
+
+
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """Both experiments, with two robots and zenoh."""
@@ -132,8 +156,8 @@ def test_what_cannot_be_is_one_line(arguments: list[Any], told: str, tmp_path: P
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_however_it_ends_its_programs_end(number: signal.Signals, tmp_path: Path) -> None:
-    mark = f"LPAC_TEST={uuid.uuid4()}"
-    name, _, value = mark.partition("=")
+    name, value = "LPAC_TEST", str(uuid.uuid4())
+    mark = f"{name}={value}"
     command = [sys.executable, "-m", "lpac.cli.main", "bench", "network", "robots", "-n", "2"]
     options = ["--middleware", "zenoh", "--seconds", "1", "--repetitions", "1000"]
     with subprocess.Popen(
