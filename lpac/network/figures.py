@@ -57,7 +57,7 @@ def of_restarts(runs: Sequence[Run]) -> Figure:
 
 def over_robots(runs: Sequence[Run]) -> Figure:
     """Throughput, and the age of messages, over the number of robots whose programs run."""
-    with style.figure(style.WIDTH_IN, 2.6) as figure:
+    with style.figure(style.WIDTH_IN, 2.9) as figure:
         left, right = figure.subplots(1, 2)
         of_each = summaries(runs)
         for middleware in dict.fromkeys(summary.middleware for summary in of_each):
@@ -75,7 +75,10 @@ def over_robots(runs: Sequence[Run]) -> Figure:
             _from_zero(axes)
             style.tidy(axes)
             if axes.get_legend_handles_labels()[0]:
-                axes.legend(fontsize=7, handlelength=2.8)
+                axes.legend(
+                    loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=7,
+                    handlelength=2.8,
+                )  # fmt: skip
         return figure
 
 
