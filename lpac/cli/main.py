@@ -35,6 +35,7 @@ _COMMANDS = {
     "export": "Export a trained torch checkpoint as a bundle that runs without torch.",
     "bundle": "Look at a policy bundle; verify or time it on this machine.",
     "robot": "Fly one robot, or check whether it could.",
+    "bench": "Measure this machine's network: what programs say, and what they leave of it.",
     "log": "What the robots' and the ground's logs hold.",
 }
 # The extra that has a command's packages; without one they are in every install.
@@ -44,6 +45,7 @@ _EXTRAS = {
     "fleet": ("fleet",),
     "export": ("export",),
     "train": ("train", "ablate"),
+    "bench": ("bench",),
 }
 _INTERRUPTED = 130
 

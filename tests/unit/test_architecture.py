@@ -43,13 +43,21 @@ ALLOWED = {
     },
     "lpac.sim": {
         *_EDGE, "edge.robot.log", "lpac.analysis", "lpac.ground", "lpac.fleet.settings",
-        "lpac.fleet.writer", "lpac.fleet.authority", "lpac.radio",
+        "lpac.fleet.writer", "lpac.fleet.authority", "lpac.radio", "lpac.sim.ports",
+        "lpac.sim.programs",
     },
+    # Small helpers of whoever starts programs.
+    "lpac.sim.ports": set(),
+    "lpac.sim.programs": set(),
     "lpac.radio": {"edge.core", "edge.messages", "edge.identity"},
     "lpac.radio.figures": {
         "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
     },
     "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
+    "lpac.network": {
+        "edge.messages", "edge.drivers", "lpac.analysis", "lpac.radio", "lpac.sim.ports",
+        "lpac.sim.programs",
+    },
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
     "lpac.evaluate": {*_EDGE, "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.sim.batch"},
@@ -64,7 +72,7 @@ ALLOWED = {
         "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
         "lpac.ablate",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
-        "lpac.radio.heat_map",
+        "lpac.radio.heat_map", "lpac.network",
     },
 }  # fmt: skip
 # Third-party packages, and the only files or parts that may import them.
@@ -80,9 +88,11 @@ ONLY_IN = {
         "lpac/ablate/",
         "lpac/radio/figures.py",
         "lpac/radio/heat_map.py",
+        "lpac/network/figures.py",
     },
     "mavsdk": {"edge/drivers/"},
     "zenoh": {"edge/drivers/"},
+    "cyclonedds": {"lpac/network/over_cyclone.py"},
     "mcap": {"edge/drivers/"},
     "pymavlink": {"lpac/sim/"},
     "typer": {"lpac/cli/"},

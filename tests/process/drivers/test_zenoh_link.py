@@ -86,10 +86,15 @@ def endpoint() -> str:
     return f"tcp/127.0.0.1:{port}"
 
 
-def eventually(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+def eventually(
+    condition: Callable[[], object],
+    timeout_s: float = 60.0,
+    *,
+    why_not: Callable[[], object] = lambda: None,
+) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline_s
+        assert time.monotonic() < deadline_s, why_not()
         time.sleep(0.01)
 
 
@@ -575,14 +580,18 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
                 for sender, count in seen["heard"].items()
             }
 
-        def heard_more(pairs: list[tuple[int, int]]) -> Callable[[], bool]:
+        def eventually_hear(pairs: list[tuple[int, int]], timeout_s: float = 60.0) -> None:
             before = heard()
 
-            def is_more() -> bool:
+            def deaf() -> list[tuple[int, int]]:
                 now = heard()
-                return all(now.get(pair, 0) > before.get(pair, 0) + 10 for pair in pairs)
+                return [pair for pair in pairs if now.get(pair, 0) <= before.get(pair, 0) + 10]
 
-            return is_more
+            eventually(
+                lambda: not deaf(),
+                timeout_s,
+                why_not=lambda: {"deaf": deaf(), "before": before, "present": present()},
+            )
 
         def present() -> list[list[int]]:
             return [seen["present"] for seen in near.seen() + far.seen()]
@@ -595,14 +604,14 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
         everybody, apart = others(nearby + far_away), others(nearby, far_away)
         pairs_apart = [*permutations(nearby, 2), *permutations(far_away, 2)]
         for _ in range(2):
-            eventually(heard_more(all_pairs))
+            eventually_hear(all_pairs)
             eventually(lambda: present() == everybody)
             silence("add")
             eventually(lambda: present() == apart)
             # Sooner than the 10 s for which a lost connection may hold a thread.
-            eventually(heard_more(pairs_apart), timeout_s=5.0)
+            eventually_hear(pairs_apart, timeout_s=5.0)
             silence("del")
-        eventually(heard_more(all_pairs))
+        eventually_hear(all_pairs)
         silence("add")
         eventually(lambda: present() == apart)
         for robots in (near, far):

@@ -1,0 +1,300 @@
+"""`lpac bench`: measurements on your own machines and networks."""
+
+import json
+import os
+import platform
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lpac.cli.apps import new_app
+from lpac.cli.options import AsJson
+from lpac.cli.printing import print_table, progress_of
+
+if TYPE_CHECKING:
+    from lpac.network.measure import Plan
+    from lpac.network.results import Experiment, Run, Spread, Summary
+    from lpac.network.stations import NetworkStation
+
+app = new_app()
+
+_OUT = Path("out/bench/network")
+# As the paper has them: robots, repetitions, s; of the curves so many repetitions as they need.
+_RESTARTS = (3, 10, 60.0)
+_ROBOTS = (10, 3, 10.0)
+
+
+@app.callback()
+def bench() -> None:
+    """Measure this machine's network: what programs say, and what they leave of it."""
+
+
+@app.command()
+def network(
+    *,
+    experiments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[EXPERIMENT]...",
+            help="restarts: throughput while programs restart; robots: throughput and age of "
+            "messages over the number of robots; both if none is given.",
+        ),
+    ] = None,
+    middlewares: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--middleware",
+            metavar="NAME",
+            help="zenoh and cyclonedds if not given; may be repeated. Robots without programs are "
+            "always measured beside them.",
+        ),
+    ] = None,
+    robots: Annotated[
+        int | None,
+        typer.Option(
+            "--robots",
+            "-n",
+            help="How many restart, 3 if not given; and to how many the curves go, 10.",
+        ),
+    ] = None,
+    repetitions: Annotated[
+        int | None, typer.Option(help="10 of restarts, 3 of each point of the curves.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Of one run: 60 with restarts, 10 of a point.")
+    ] = None,
+    namespaces: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,NAME...",
+            help="Network namespaces, one for each robot, two at least; else this machine's "
+            "loopback, which has no radio.",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+    out: Annotated[Path, typer.Option(help="Folder for network.json and figures.")] = _OUT,
+) -> None:
+    """The paper's network experiments: what a bulk stream gets beside the robots' programs."""
+    from lpac.network.results import as_json as to_json
+    from lpac.train.files import write_atomically
+
+    chosen = _checked(middlewares)
+    plans = [
+        _plan(experiment, chosen, robots, repetitions, seconds)
+        for experiment in _experiments(experiments)
+    ]
+    stations = _stations(namespaces, max(plan.stations for plan in plans))
+    where = _measured_on(stations, plans[0])
+    runs: list[Run] = []
+    with closing(_measure(plans, stations)) as measured:
+        for run in measured:
+            runs.append(run)
+            # An interrupted measurement leaves what it has.
+            told = json.dumps(to_json(where, runs), indent=2)
+            write_atomically(out / "network.json", f"{told}\n".encode())
+    _draw(runs, out)
+    if as_json:
+        typer.echo(json.dumps(to_json(where, runs), indent=2))
+    else:
+        _show(where, runs, out)
+
+
+def _experiments(given: Sequence[str] | None) -> list["Experiment"]:
+    from lpac.network.results import EXPERIMENTS
+
+    for name in given or ():
+        if name not in EXPERIMENTS:
+            raise ValueError(f"{name}: an experiment is one of {', '.join(EXPERIMENTS)}")
+    return [known for known in EXPERIMENTS if not given or known in given]
+
+
+def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
+    """Those that are installed, and nothing. Raises ValueError."""
+    from lpac.network.middleware import MIDDLEWARES, NOTHING
+
+    for name in given or ():
+        if name not in MIDDLEWARES:
+            raise ValueError(f"--middleware {name}: must be one of {', '.join(MIDDLEWARES)}")
+    chosen = [name for name in MIDDLEWARES if not given or name in given]
+    for name in chosen:
+        if MIDDLEWARES[name].version() is None:
+            raise ValueError(
+                f"{MIDDLEWARES[name].title} is not installed here: `pip install "
+                "'lpac-edge[bench]'`, or measure without it: --middleware zenoh"
+            )
+    return (*chosen, NOTHING)
+
+
+def _plan(
+    experiment: "Experiment",
+    middlewares: tuple[str, ...],
+    robots: int | None,
+    repetitions: int | None,
+    seconds: float | None,
+) -> "Plan":
+    from lpac.network.measure import Plan
+
+    its_robots, its_repetitions, its_seconds = _RESTARTS if experiment == "restarts" else _ROBOTS
+    fleet = its_robots if robots is None else robots
+    least = 2 if experiment == "restarts" else 1
+    if fleet < least:
+        raise ValueError(f"--robots {fleet}: {experiment} needs at least {least}")
+    if repetitions is not None and repetitions < 1:
+        raise ValueError(f"--repetitions {repetitions}: must be at least 1")
+    if seconds is not None and not seconds >= 1.0:
+        raise ValueError(f"--seconds {seconds:g}: must be at least 1")
+    return Plan(
+        experiment=experiment,
+        middlewares=middlewares,
+        robots=(fleet,) if experiment == "restarts" else tuple(range(1, fleet + 1)),
+        repetitions=repetitions or its_repetitions,
+        seconds=seconds or its_seconds,
+    )
+
+
+def _stations(namespaces: str | None, needed: int) -> list["NetworkStation"]:
+    from lpac.network.stations import LOOPBACK, station_in
+
+    if namespaces is None:
+        return [LOOPBACK] * needed
+    names = namespaces.split(",")
+    if len(names) < needed:
+        raise ValueError(f"--namespaces: {len(names)} given, and {needed} robots need one each")
+    if len(set(names)) < len(names):
+        raise ValueError("--namespaces: one is given twice; each robot needs its own")
+    return [station_in(name) for name in names[:needed]]
+
+
+def _measured_on(stations: Sequence["NetworkStation"], plan: "Plan") -> dict[str, Any]:
+    from lpac.network.middleware import MIDDLEWARES
+    from lpac.network.robot import SIZE_BYTES
+
+    names = [station.namespace for station in stations]
+    return {
+        "where": "loopback" if names[0] is None else "namespaces",
+        "namespaces": None if names[0] is None else names,
+        "message_bytes": SIZE_BYTES,
+        "cores": len(os.sched_getaffinity(0)),
+        "kernel": platform.release(),
+        "python": platform.python_version(),
+        "versions": {
+            name: middleware.version()
+            for name, middleware in MIDDLEWARES.items()
+            if name in plan.middlewares
+        },
+    }
+
+
+def _measure(
+    plans: Sequence["Plan"], stations: Sequence["NetworkStation"]
+) -> "Generator[Run, None, None]":
+    """Each run as it is made."""
+    from lpac.network.figures import title_of
+    from lpac.network.measure import measure
+
+    with progress_of("runs") as progress:
+        task = progress.add_task("", total=sum(1 for plan in plans for _ in plan.runs()))
+
+        def tell(repetition: int, robots: int, middleware: str) -> None:
+            doing = f"robots: {robots}, {title_of(middleware)}, repetition {repetition}"
+            progress.update(task, description=doing)
+
+        for plan in plans:
+            with closing(measure(plan, stations, tell)) as runs:
+                for run in runs:
+                    progress.update(task, advance=1)
+                    yield run
+
+
+def _draw(runs: Sequence["Run"], out: Path) -> None:
+    from lpac.analysis import style
+    from lpac.network.figures import of_restarts, over_robots
+
+    for experiment, drawn in (("restarts", of_restarts), ("robots", over_robots)):
+        its = [run for run in runs if run.experiment == experiment]
+        if its:
+            style.save(drawn(its), out / experiment)
+
+
+def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
+    from lpac.network.results import summaries
+
+    of_each = summaries(runs)
+    restarts = [summary for summary in of_each if summary.experiment == "restarts"]
+    if restarts:
+        its = [run for run in runs if run.experiment == "restarts"]
+        typer.echo(
+            f"throughput between two of {restarts[0].robots} robots whose programs all restart, "
+            f"{its[0].seconds:.0f} s; mean and standard deviation\n"
+        )
+        print_table(_RESTART_COLUMNS, [_restart_row(one) for one in restarts], _RESTART_COLUMNS[1:])
+    curves = [summary for summary in of_each if summary.experiment == "robots"]
+    if curves:
+        typer.echo(
+            f"{chr(10) if restarts else ''}throughput between two stations while so many robots' "
+            "programs run, and how old their messages are when they arrive\n"
+        )
+        print_table(_CURVE_COLUMNS, [_curve_row(one) for one in curves], _CURVE_COLUMNS[1:])
+    if where["where"] == "loopback":
+        typer.echo(
+            "\nmeasured on this machine's loopback, which has no radio: the stream is as fast as "
+            "the processors are, and takes them from the robots; see --namespaces"
+        )
+    typer.echo(_LEGEND)
+    names = ", ".join(f"{name} {version}" for name, version in where["versions"].items())
+    typer.echo(f"\n{names}; see {out}: network.json and figures")
+
+
+_LEGEND = (
+    "\ndelivered: of the robots' messages, those of the 10 s after a restart if there are some; "
+    "heard after: how long after a restart robots first heard each other, half of all pairs and "
+    "the last; never: pairs that did not until the next; busy: this machine's processors"
+)
+_RESTART_COLUMNS = (
+    "", "Mbit/s", "delivered, %", "heard after, s", "the last, s", "never, %", "busy, %", "runs",
+)  # fmt: skip
+_CURVE_COLUMNS = ("", "robots", "Mbit/s", "age p50, ms", "p99, ms", "delivered, %", "busy, %")
+
+
+def _restart_row(of: "Summary") -> list[str]:
+    from lpac.network.figures import title_of
+
+    told = of.measures
+    return [
+        title_of(of.middleware),
+        _number(told.get("throughput_mbit_s")),
+        _number(told.get("delivered"), 100.0),
+        _number(told.get("heard_again_p50_s"), digits=2),
+        _number(told.get("heard_again_max_s"), digits=2),
+        _number(told.get("never_heard"), 100.0),
+        f"{100.0 * told['processor'].mean:.0f}",
+        str(told["throughput_mbit_s"].runs),
+    ]
+
+
+def _curve_row(of: "Summary") -> list[str]:
+    from lpac.network.figures import title_of
+
+    told = of.measures
+    return [
+        title_of(of.middleware),
+        str(of.robots),
+        _number(told.get("throughput_mbit_s")),
+        _number(told.get("age_p50_ms")),
+        _number(told.get("age_p99_ms")),
+        _number(told.get("delivered"), 100.0),
+        f"{100.0 * told['processor'].mean:.0f}",
+    ]
+
+
+def _number(spread: "Spread | None", factor: float = 1.0, digits: int = 1) -> str:
+    """The mean, and the deviation if there is one."""
+    if spread is None:
+        return ""
+    mean = f"{factor * spread.mean:.{digits}f}"
+    if spread.deviation is None:
+        return mean
+    return f"{mean} ± {factor * spread.deviation:.{digits}f}"

@@ -1,0 +1,120 @@
+"""Robots over Cyclone DDS, with the qualities of service that ROS 2 has by default."""
+
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from threading import Event, Thread
+from typing import Self
+
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+    WaitSet,
+)
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import sequence, uint8
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from edge.messages.topics import MESSAGE, TOPICS, is_loopback
+from lpac.network.middleware import Peer
+
+# Below the ports that `lpac.sim.ports` gives; each process's are of a block of its own, and so the
+# fleets of two that measure at once on one loopback do not find each other.
+_DOMAINS, _PORTS_OF_A_BLOCK = 50, 200
+_QOS = Qos(
+    Policy.Reliability.Reliable(duration(milliseconds=100)),
+    Policy.History.KeepLast(10),
+    Policy.Durability.Volatile,
+)
+_MOST_AT_ONCE = 100
+_LOOK_UP_EVERY = duration(milliseconds=200)
+# On Wi-Fi it finds others by multicast and sends data to each, by itself; an interface of a network
+# namespace does not look like Wi-Fi to it.
+_WIFI = """<CycloneDDS><Domain><General>
+<Interfaces><NetworkInterface address="{address}"/></Interfaces>
+<AllowMulticast>spdp</AllowMulticast></General></Domain></CycloneDDS>"""
+# The loopback has no multicast: there it looks at ports, one after another.
+_LOOPBACK = """<CycloneDDS><Domain><General>
+<Interfaces><NetworkInterface address="{address}"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
+<Peers><Peer address="{address}"/></Peers></Discovery></Domain></CycloneDDS>"""
+
+
+@dataclass
+class Bytes(IdlStruct):  # type: ignore[misc]
+    """What a message is to DDS."""
+
+    data: sequence[uint8]
+
+
+class _CyclonePeer:
+    def __init__(self, domain: int, config: str, receive: Callable[[bytes], None]) -> None:
+        self._receive = receive
+        self._domain = Domain(domain, config)
+        self._participant = DomainParticipant(domain)
+        # As many as the product's robots declare, of which one is said here.
+        topics = {
+            topic: Topic(self._participant, topic.name, Bytes)
+            for topic in TOPICS
+            if topic.sender == "robot"
+        }
+        self._writers = {
+            topic: DataWriter(self._participant, named, qos=_QOS) for topic, named in topics.items()
+        }
+        self._reader = DataReader(self._participant, topics[MESSAGE], qos=_QOS)
+        self._closed = Event()
+        # Not a listener: DDS calls it with its locks held, for which `write` waits while it holds
+        # Python's, so that now and then a program would stand still for ever.
+        self._receiving = Thread(target=self._take, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._receiving.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        self._receiving.join()
+        # What nothing refers to takes leave of the others; it has no call for that.
+        del self._reader
+        self._writers.clear()
+        del self._participant
+        del self._domain
+
+    def publish(self, data: bytes) -> None:
+        try:
+            self._writers[MESSAGE].write(Bytes(data))
+        except DDSException as error:
+            sys.stderr.write(f"write: {error}\n")
+
+    def _take(self) -> None:
+        arrivals = WaitSet(self._participant)
+        news = SampleState.NotRead | ViewState.Any | InstanceState.Any
+        arrivals.attach(ReadCondition(self._reader, news))
+        while not self._closed.is_set():
+            arrivals.wait(_LOOK_UP_EVERY)
+            for sample in self._reader.take(_MOST_AT_ONCE):
+                # Else it is the news that a writer has gone.
+                if isinstance(sample, Bytes):
+                    self._receive(bytes(sample.data))
+
+
+def open_peer(
+    index: int, endpoints: Sequence[str], receive: Callable[[bytes], None]
+) -> AbstractContextManager[Peer]:
+    """As `OpenPeer`. Robots find each other by themselves, on ports of DDS."""
+    address = endpoints[index].rpartition(":")[0]
+    domain = int(endpoints[0].rpartition(":")[2]) // _PORTS_OF_A_BLOCK % _DOMAINS
+    config = _LOOPBACK if is_loopback(f"udp/{address}") else _WIFI
+    return _CyclonePeer(domain, config.format(address=address), receive)
