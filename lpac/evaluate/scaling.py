@@ -111,11 +111,18 @@ def _cell(team: FlownTeam) -> str:
     return f"{team.cost:.2f} ({100.0 * team.loss:.0f} %, {1e3 * team.delay_s:.0f} ms)"
 
 
-if __name__ == "__main__":
-    flown = [
-        team
-        for folder in sys.argv[1:]
-        for team in teams_of(json.loads((Path(folder) / "evaluation.json").read_text()))
-    ]
+def main(folders: Sequence[str]) -> None:
+    """Draw, and print the table, of the evaluations in these folders."""
+    if not folders:
+        sys.exit("which folders? python -m lpac.evaluate.scaling FOLDER...")
+    try:
+        told = [json.loads((Path(f) / "evaluation.json").read_text()) for f in folders]
+    except FileNotFoundError as error:
+        sys.exit(f"{error.filename}: there is none; `lpac evaluate --transport --out` writes it")
+    flown = [team for one in told for team in teams_of(one)]
     draw(flown, Path("docs/scaling-cost.png"))
     sys.stdout.write(table(flown) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
