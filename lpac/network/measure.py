@@ -12,7 +12,7 @@ from threading import Lock
 from typing import NamedTuple, Self
 
 from lpac.network.middleware import NOTHING
-from lpac.network.results import Experiment, Reception, Run, Sent, Window, of_traffic, traffic
+from lpac.network.results import CountedTime, Experiment, Reception, Run, Sent, of_traffic, traffic
 from lpac.network.stations import NetworkStation, News, Program
 from lpac.sim.ports import free_ports
 
@@ -260,7 +260,7 @@ def _run(
         time.sleep(_STREAM_BEGINS_S)
         began, used = time.time(), _ProcessorUse()
         first = stream.count()
-        windows: list[Window] = []
+        windows: list[CountedTime] = []
         for start, lasts_s in _rounds(plan):
             from_s = time.monotonic()
             counted_s = lasts_s
@@ -268,7 +268,7 @@ def _run(
                 counted_s = min(AFTER_S, _COUNTED_PART * lasts_s)
                 if speaks:
                     fleet.start(middleware, robots, start)
-            windows.append(Window(start, from_s, from_s + counted_s))
+            windows.append(CountedTime(start, from_s, from_s + counted_s))
             time.sleep(max(0.0, from_s + lasts_s - time.monotonic()))
             fleet.check()
         last = stream.count()

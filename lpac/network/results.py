@@ -32,7 +32,7 @@ class Reception(NamedTuple):
     at_s: float
 
 
-class Window(NamedTuple):
+class CountedTime(NamedTuple):
     """What programs of that start, the fleet's, said within a time."""
 
     start: int
@@ -55,7 +55,7 @@ class Delivery:
 
 
 def traffic(
-    sent: Iterable[Sent], heard: Iterable[Reception], windows: Sequence[Window], robots: int
+    sent: Iterable[Sent], heard: Iterable[Reception], windows: Sequence[CountedTime], robots: int
 ) -> Delivery:
     """Of programs that were started together, and of those alone."""
     by_start = {window.start: window for window in windows}

@@ -12,11 +12,11 @@ from lpac.network.figures import of_restarts, over_robots
 from lpac.network.measure import Plan
 from lpac.network.middleware import MIDDLEWARES, NOTHING
 from lpac.network.results import (
+    CountedTime,
     Experiment,
     Reception,
     Run,
     Sent,
-    Window,
     as_json,
     of_traffic,
     summaries,
@@ -32,7 +32,7 @@ def test_what_was_said_in_the_window_counts_and_once_for_each_other_robot() -> N
         Reception(by=2, by_start=1, robot=0, start=1, sequence=0, sent_s=10.0, at_s=13.0),
         Reception(by=1, by_start=1, robot=0, start=1, sequence=4, sent_s=14.0, at_s=14.1),
     ]
-    told = traffic(sent, heard, [Window(1, 10.0, 12.0)], robots=3)
+    told = traffic(sent, heard, [CountedTime(1, 10.0, 12.0)], robots=3)
     assert told.delivered == pytest.approx(2 / 6)
     assert told.ages_s == pytest.approx((0.2, 3.0))
     assert [time_s for time_s in told.heard_s if time_s is not None] == pytest.approx([0.2, 3.0])
@@ -45,7 +45,7 @@ def test_what_a_program_of_before_the_restart_heard_does_not_count() -> None:
         Reception(by=1, by_start=0, robot=0, start=1, sequence=0, sent_s=10.0, at_s=10.1),
         Reception(by=1, by_start=1, robot=0, start=0, sequence=9, sent_s=9.9, at_s=10.1),
     ]
-    told = traffic(sent, heard, [Window(1, 10.0, 12.0)], robots=2)
+    told = traffic(sent, heard, [CountedTime(1, 10.0, 12.0)], robots=2)
     assert told.delivered == 0.0 and told.heard_s == (None, None)
     assert of_traffic(told, restarted=True) == {"delivered": 0.0, "never_heard": 1.0}
 
@@ -55,7 +55,7 @@ def test_each_restart_has_a_window_of_its_own() -> None:
         Reception(by=1, by_start=start, robot=0, start=start, sequence=0, sent_s=at_s, at_s=at_s)
         for start, at_s in ((1, 10.5), (2, 21.0))
     ]
-    windows = [Window(1, 10.0, 15.0), Window(2, 20.0, 25.0)]
+    windows = [CountedTime(1, 10.0, 15.0), CountedTime(2, 20.0, 25.0)]
     told = traffic([Sent(0, 1, 0, 10.5), Sent(0, 2, 0, 21.0)], heard, windows, robots=2)
     assert told.delivered == 1.0
     fields = of_traffic(told, restarted=True)
@@ -66,7 +66,7 @@ def test_each_restart_has_a_window_of_its_own() -> None:
 
 
 def test_a_robot_alone_tells_nothing_of_messages() -> None:
-    told = traffic([Sent(0, 0, 0, 1.0)], [], [Window(0, 0.0, 2.0)], robots=1)
+    told = traffic([Sent(0, 0, 0, 1.0)], [], [CountedTime(0, 0.0, 2.0)], robots=1)
     assert of_traffic(told, restarted=False) == {"delivered": None}
 
 
