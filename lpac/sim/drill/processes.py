@@ -69,8 +69,8 @@ _PATIENCE_S = 60.0
 # A vehicle steps every 0.02 s; after as long without a step somebody looks all the same.
 _LOOK_S = 0.5
 _KILLED_S = 10.0
-# An ordinary computer needs half of it; with more, the faults are not those that were to be flown.
-_GROUND_STARTS_WITHIN_S = 4.0
+# A laptop needs less than half of it. If it takes more, it was gone for longer than it should be.
+_GROUND_STARTS_WITHIN_S = 2.0
 # Until PX4 (v1.17) tells of a battery that it is below 25 % or 15 %, once it fell to 0.5 % less.
 _BATTERY_TOLD_S = 5.5
 

@@ -7,8 +7,6 @@ import pytest
 
 from tests.process.cli.test_cli import error_line, lpac
 
-pytestmark = pytest.mark.real_time
-
 # Of programs, the ground, a position, a battery, and a pilot. The longest first.
 FAULTS = (
     "ground-restarts", "program-goes-on", "program-dies", "gps-lost", "battery-critical",
@@ -16,6 +14,8 @@ FAULTS = (
 )  # fmt: skip
 
 
+# As many flights at once as the machine carries.
+@pytest.mark.alone
 def test_six_faults_are_flown_by_processes(tmp_path: Path) -> None:
     named = [option for fault in FAULTS for option in ("--fault", fault)]
     # Of a seed with which they begin early.
@@ -31,6 +31,7 @@ def test_six_faults_are_flown_by_processes(tmp_path: Path) -> None:
         assert list((tmp_path / f"{fault}-2" / "robots").rglob("*.mcap"))
 
 
+@pytest.mark.real_time
 def test_what_cannot_be_flown_is_one_line(tmp_path: Path) -> None:
     for arguments, text in (
         (("--vehicle", "mavlink", "--fault", "radio-dies"), "radio-dies: is not flown with"),
