@@ -6,6 +6,7 @@ have seen, which is what robots that share maps come to know: it goes and looks.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +18,8 @@ from edge.core.perception import PerceptionParameters, window_corner
 from lpac.analysis.coverage import coarse, lloyd_ends
 from lpac.sim.experiment import Preparation
 from lpac.train.config import DataConfig
+
+Indices = npt.NDArray[np.intp]
 
 # How often an expert looks around, s.
 LOOK_PERIOD_S = 0.5
@@ -30,9 +33,12 @@ _STEP = 24.0
 
 
 class Goals(Protocol):
-    """Where robots at `positions` (n, 2), all that are left, should go: (n, 2), model units."""
+    """Where `robots` (m,) of those at `positions` (n, 2), all that are left, should go: (m, 2).
 
-    def __call__(self, positions: F64) -> F64: ...
+    In model units.
+    """
+
+    def __call__(self, positions: F64, robots: Indices) -> F64: ...
 
     def look(self, positions: F64) -> None:
         """Take notice of what the robots there see."""
@@ -54,13 +60,17 @@ class Expert:
         """Take notice of what the robots at `positions` (N, 2) see that are left."""
         self._goals.look(positions[alive])
 
-    def velocities(self, positions: F64, alive: Bools) -> F64:
-        """(N, 2) at true positions (N, 2); 0 of those who are not left."""
-        velocities = np.zeros_like(positions)
-        left = positions[alive]
-        if len(left):
-            goals = self._goals(left)
-            velocities[alive] = cvt_velocity(left, goals, self._max_speed, self._reach)
+    def velocities(self, positions: F64, alive: Bools, robots: Sequence[int] | None = None) -> F64:
+        """(m, 2) of `robots` (m,), or all N, at true positions (N, 2); 0 of who is not left."""
+        asked = np.arange(len(positions)) if robots is None else np.array(robots, np.intp)
+        velocities = np.zeros((len(asked), 2))
+        flying = alive[asked]
+        if flying.any():
+            left = positions[alive]
+            among_left = (np.cumsum(alive) - 1)[asked[flying]]
+            velocities[flying] = cvt_velocity(
+                left[among_left], self._goals(left, among_left), self._max_speed, self._reach
+            )
         return velocities
 
 
@@ -101,12 +111,12 @@ class _Centroids(_Clairvoyant):
         self._importance = importance
         self._coarse: dict[int, tuple[F32, float]] = {}
 
-    def __call__(self, positions: F64) -> F64:
-        robots = len(positions)
-        if robots not in self._coarse:
-            self._coarse[robots] = coarse(self._importance, robots)
-        importance, cells = self._coarse[robots]
-        return voronoi_cells(importance, positions / cells).centroid * cells
+    def __call__(self, positions: F64, robots: Indices) -> F64:
+        left = len(positions)
+        if left not in self._coarse:
+            self._coarse[left] = coarse(self._importance, left)
+        importance, cells = self._coarse[left]
+        return voronoi_cells(importance, positions / cells).centroid[robots] * cells
 
 
 class _LloydEnds(_Clairvoyant):
@@ -118,16 +128,16 @@ class _LloydEnds(_Clairvoyant):
         # By the number of robots that are left.
         self._best: dict[int, F64] = {}
 
-    def __call__(self, positions: F64) -> F64:
-        robots = len(positions)
-        if robots not in self._best:
-            raster, cells = coarse(self._importance, robots)
+    def __call__(self, positions: F64, robots: Indices) -> F64:
+        left = len(positions)
+        if left not in self._best:
+            raster, cells = coarse(self._importance, left)
             ends = lloyd_ends(self._importance, positions, self._runs)
             costs = [voronoi_cells(raster, each / cells).cost.sum() for each in ends]
-            self._best[robots] = ends[int(np.argmin(costs))]
-        goals = self._best[robots]
+            self._best[left] = ends[int(np.argmin(costs))]
+        goals = self._best[left]
         squares = ((positions[:, None] - goals) ** 2).sum(axis=2)
-        return goals[assignment(squares)]
+        return goals[assignment(squares)[robots]]
 
 
 class _Exploring:
@@ -141,10 +151,10 @@ class _Exploring:
         half, world_size = _PITCH // 2, perception.world_size
         self._sensor_size = perception.sensor_size
         self._half_window = perception.local_map_size / 2.0
-        centres = np.arange(half, world_size, _PITCH)
-        self._importance = importance[np.ix_(centres, centres)].astype(np.float64)
-        self._lattice = np.stack(np.meshgrid(centres, centres, indexing="ij"), axis=-1) + 0.5
-        self._seen = np.zeros((len(centres),) * 2, np.bool_)
+        lattice = np.arange(half, world_size, _PITCH)
+        self._importance = importance[np.ix_(lattice, lattice)].astype(np.float64)
+        self._centres = lattice + 0.5
+        self._seen = np.zeros((len(lattice),) * 2, np.bool_)
 
     def look(self, positions: F64) -> None:
         for position in positions:
@@ -158,18 +168,21 @@ class _Exploring:
             )
             self._seen[x, y] = True
 
-    def __call__(self, positions: F64) -> F64:
+    def __call__(self, positions: F64, robots: Indices) -> F64:
         self.look(positions)
-        points = self._lattice.reshape(-1, 2)
-        squares = ((points[:, None] - positions) ** 2).sum(axis=2)
-        nearest = squares.argmin(axis=1)
-        seen, importance = self._seen.ravel(), self._importance.ravel()
-        goals = positions.copy()
-        for robot, position in enumerate(positions):
-            offsets = points - position
-            own = (nearest == robot) & (np.abs(offsets) < self._half_window).all(axis=1)
-            unseen, known = offsets[own & ~seen], offsets[own & seen]
-            weights = importance[own & seen]
+        goals = positions[robots]
+        for row, robot in enumerate(robots):
+            position = positions[robot]
+            x, y = (np.abs(self._centres - at) < self._half_window for at in position)
+            grid = np.meshgrid(self._centres[x], self._centres[y], indexing="ij")
+            points = np.stack(grid, axis=-1).reshape(-1, 2)
+            squares = ((points[:, None] - positions) ** 2).sum(axis=2)
+            own = squares.argmin(axis=1) == robot
+            seen, importance = (
+                values[np.ix_(x, y)].ravel()[own] for values in (self._seen, self._importance)
+            )
+            offsets = points[own] - position
+            unseen, known, weights = offsets[~seen], offsets[seen], importance[seen]
             distance = np.linalg.norm(unseen, axis=1)
             pull = np.exp(-distance / _DECAY)
             away = pull / np.maximum(distance, 1.0)
@@ -179,11 +192,11 @@ class _Exploring:
             exploring = pull.sum() / (pull.sum() + 1.0)
             to_goal = exploring * to_explore + (1.0 - exploring) * to_cover
             # Further than a step where it explores: there it cannot be too fast.
-            goals[robot] += (1.0 + exploring) * to_goal
+            goals[row] += (1.0 + exploring) * to_goal
         return goals
 
 
-def assignment(cost: F64) -> npt.NDArray[np.intp]:
+def assignment(cost: F64) -> Indices:
     """(n,): the column of each row of `cost` (n, n), each once, so that their sum is least.
 
     Shortest augmenting paths with potentials: Jonker and Volgenant, Computing 38 (1987).

@@ -249,13 +249,12 @@ class _Deciding:
                 [degrees[i] for i in deciding],
             )
             velocities[deciding], said[deciding] = steps
-        told: dict[int, F64] = {}
+        by_expert: dict[int, list[int]] = {}
         for i, agent in enumerate(robots):
-            world = self._world_of[agent]
-            if self._by_expert[world]:
-                if world not in told:
-                    told[world] = self._told(world)
-                velocities[i] = told[world][self._robot_of[agent]]
+            if self._by_expert[self._world_of[agent]]:
+                by_expert.setdefault(self._world_of[agent], []).append(i)
+        for world, its in by_expert.items():
+            velocities[its] = self._told(world, [self._robot_of[robots[i]] for i in its])
         return PolicySteps(velocities, said)
 
     def reset(self, robot: int) -> None:
@@ -264,11 +263,11 @@ class _Deciding:
     def _by_policy(self, robots: Sequence[int]) -> list[int]:
         return [i for i, agent in enumerate(robots) if not self._by_expert[self._world_of[agent]]]
 
-    def _told(self, world: int) -> F64:
-        """By the expert, where the world's robots are now."""
+    def _told(self, world: int, robots: Sequence[int]) -> F64:
+        """By the expert to these robots, where the world's robots are now."""
         swarm, scenario = self._flights.swarms[world], self._flights.prepared[world].scenario
         return self._experts[world].velocities(
-            scenario.scale.position_to_model(swarm.positions_m()), swarm.alive
+            scenario.scale.position_to_model(swarm.positions_m()), swarm.alive, robots
         )
 
 
@@ -287,7 +286,7 @@ class _Kept:
             return
         left = list(robots)
         self._inputs.append(arrays)
-        self._velocities.append(expert.velocities(moment.positions, moment.alive)[left])
+        self._velocities.append(expert.velocities(moment.positions, moment.alive, left))
         self._robots.append(len(left))
         self._adjacency.append(moment.adjacency[np.ix_(left, left)].ravel())
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -149,6 +150,8 @@ def test_experts_leave_out_who_is_lost(
     np.testing.assert_allclose(
         velocities[alive], told.velocities(positions[alive], np.ones(9, np.bool_))
     )
+    for few in ([7], [4], [9, 4, 0], []):
+        np.testing.assert_array_equal(told.velocities(positions, alive, few), velocities[few])
 
 
 def test_what_overshoots_is_flown_no_faster(shard: PlannedShard, shipped_bundle: Bundle) -> None:
@@ -188,8 +191,8 @@ class FineCentroids(NamedTuple):
 
     importance: F32
 
-    def __call__(self, positions: F64) -> F64:
-        return voronoi_cells(self.importance, positions).centroid
+    def __call__(self, positions: F64, robots: npt.NDArray[np.intp]) -> F64:
+        return voronoi_cells(self.importance, positions).centroid[robots]
 
     def look(self, positions: F64) -> None:
         pass
