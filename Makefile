@@ -89,6 +89,7 @@ clean: ## remove .venv and everything made
 
 # Stamps: .venv/EXTRA is newer than pyproject.toml when that extra is installed.
 .venv/%: pyproject.toml | .venv/bin/pip
+	@echo "installing what '$*' needs into .venv: a minute or some, by your connection"
 	.venv/bin/pip install --quiet --disable-pip-version-check --editable '.[$*]'
 	@touch $@
 

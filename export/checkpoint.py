@@ -31,6 +31,7 @@ ACTION_SIZE = 2
 POSITION_SIZE = 2
 
 _COMPILED = "_orig_mod."
+_WRAPPED = ("state_dict", "model_state_dict")
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 _IGNORED_PART = "num_batches_tracked"
 
@@ -224,6 +225,10 @@ def _checkpoint(source: _Source) -> Checkpoint:
 
 def _state_dict(path: Path, content: bytes) -> _Source:
     state = _load(content, path)
+    if isinstance(state, dict):
+        # As training programs keep it, beside an optimiser, an epoch and the like.
+        wrapped = [state[key] for key in _WRAPPED if isinstance(state.get(key), dict)]
+        state = wrapped[0] if wrapped else state
     if not isinstance(state, dict):
         raise CheckpointError(
             f"{path}: found a {type(state).__name__}, expected a state dict (tensors by name)"

@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
@@ -244,6 +244,11 @@ def _read(path: Path) -> dict[str, bytes]:
         raise BundleError(
             f"{path}: is neither a bundle directory nor its archive: {error}"
         ) from None
+    if any(PurePosixPath(name).name == "data.pkl" for name in files):
+        raise BundleError(
+            f"{path}: is a torch checkpoint; `lpac export {path} --params FILE.toml -o BUNDLE` "
+            "makes a bundle of it"
+        )
     if _archive(files) != content:
         raise BundleError(f"{path}: the archive's bytes are not those that its content gives")
     return files

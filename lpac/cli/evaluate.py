@@ -123,9 +123,10 @@ def evaluate(
     """Policies and baselines over many worlds: how well they cover, and how surely."""
     from lpac.evaluate.evaluation import as_json as to_json
     from lpac.evaluate.evaluation import results_of
-    from lpac.evaluate.flights import KeptFlights, LostRobots
+    from lpac.evaluate.flights import KeptFlights
     from lpac.evaluate.report import write_results
     from lpac.radio.modelled import ModelledRadio
+    from lpac.sim.failure import LostRobots
 
     given = methods or [str(DEFAULT_BUNDLE)]
     if compare and len(given) != 2:

@@ -1,5 +1,6 @@
 """The `lpac` command: `lpac NAME` is in `lpac.cli.NAME`, and is loaded when it is called."""
 
+import errno
 import importlib
 import os
 import sys
@@ -48,6 +49,17 @@ _EXTRAS = {
     "bench": ("bench",),
 }
 _INTERRUPTED = 130
+_FILE_ERRORS = {
+    errno.ENOENT: "there is no such file or folder",
+    errno.EISDIR: "is a folder; a file is needed",
+    errno.ENOTDIR: "a part of this path is a file; a folder is needed",
+    errno.EEXIST: "is there already, and is no folder",
+    errno.EACCES: "this user may not read or write it",
+    errno.EPERM: "this user may not read or write it",
+    errno.EROFS: "is on a disk that is read-only",
+    errno.ENOSPC: "the disk is full",
+    errno.ENAMETOOLONG: "is too long a name",
+}
 
 
 class _Lpac(CommandList):
@@ -127,8 +139,18 @@ def main() -> None:
     """Run `lpac`; a person's mistake ends in one line and a non-zero exit code."""
     try:
         app()
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        sys.exit(f"lpac: {_in_words(error)}")
+    except ValueError as error:
         sys.exit(f"lpac: {error}")
+
+
+def _in_words(error: OSError) -> str:
+    """What is wrong with which file; as it is, if it is no file's, or a person wrote it."""
+    words = _FILE_ERRORS.get(error.errno or 0)
+    if words is None or error.filename is None:
+        return str(error)
+    return f"{os.fsdecode(error.filename)}: {words}"
 
 
 if __name__ == "__main__":

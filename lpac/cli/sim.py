@@ -2,11 +2,12 @@
 
 import gc
 import json
+import math
 import shlex
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
@@ -23,11 +24,14 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.table import Table
 
+    from edge.core.frames import ModelScale
+    from edge.core.world import Feature
     from lpac.sim.experiment import Scenario, SimulatedFlight
     from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.layout import FleetScenario
     from lpac.sim.fleet.listener import Statuses
     from lpac.sim.fleet.processes import Fleet
+    from lpac.sim.ticks import Clocks
 
 app = new_app()
 
@@ -54,6 +58,14 @@ class RadioTransport(StrEnum):
     MESH = "mesh"
     ROUTER = "router"
     MULTICAST = "multicast"
+
+
+class PayloadName(StrEnum):
+    """What a message's numbers are."""
+
+    FLOAT32 = "float32"
+    FLOAT16 = "float16"
+    INT8 = "int8"
 
 
 class Scale(StrEnum):
@@ -107,6 +119,46 @@ def sim(
     scale: Annotated[
         Scale, typer.Option(help="field: 16 units per m, velocity x 0.25; model: 1 and 1.")
     ] = Scale.FIELD,
+    starts: Annotated[
+        Path | None,
+        typer.Option(
+            help="point: file with a line 'x y' for each robot, where it starts, m of the mission "
+            "frame; else that follows from the seed."
+        ),
+    ] = None,
+    world_size: Annotated[
+        int | None,
+        typer.Option(help="point: side of the world, in model units; else the bundle's."),
+    ] = None,
+    communication_range: Annotated[
+        float | None,
+        typer.Option(
+            "--range", help="point: how far robots are heard, in model units; else the bundle's."
+        ),
+    ] = None,
+    perception_hz: Annotated[float, typer.Option(help="point: how often a robot perceives.")] = 5.0,
+    policy_hz: Annotated[
+        float, typer.Option(help="point: how often its policy decides, and it speaks.")
+    ] = 2.5,
+    control_hz: Annotated[float, typer.Option(help="point: how often it steers.")] = 10.0,
+    lag: Annotated[
+        float, typer.Option(help="point: time constant by which robots follow a velocity, s.")
+    ] = 0.0,
+    position_error: Annotated[
+        float,
+        typer.Option(
+            help="point: how wrong robots are about where they are: standard deviation, m."
+        ),
+    ] = 0.0,
+    lost: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROBOTS@S", help="point: robots lost in flight, such as 2@20: two at 20 s."
+        ),
+    ] = None,
+    payload: Annotated[
+        PayloadName, typer.Option(help="point: what messages carry.")
+    ] = PayloadName.FLOAT16,
     loss: Annotated[float, typer.Option(help="Probability that a message is lost.")] = 0.0,
     delay: Annotated[float, typer.Option(help="Mean delay of a message, s.")] = 0.0,
     max_message_age: Annotated[
@@ -166,6 +218,7 @@ def sim(
     if count is None and vehicle in (VehicleKind.POINT, VehicleKind.SIMULATED):
         raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
     world_features = parse_world(_text(world), str(world)) if world else None
+    _require_something_to_cover(world, world_features, features)
     if vehicle is not VehicleKind.POINT:
         from lpac.sim.fleet.layout import FleetScenario
 
@@ -200,12 +253,14 @@ def sim(
     from edge.core.frames import ModelScale
     from lpac.radio.modelled import ModelledRadio
     from lpac.sim.experiment import FIELD_SCALE, Scenario
+    from lpac.sim.failure import LostRobots
 
     assert count is not None
     found = calibration(wifi, transport=transport is not None)
     if transport and (loss or delay):
         both = f"--{'loss' if loss else 'delay'} and --transport"
         raise ValueError(f"{both}: the model itself says what is lost, and how late messages are")
+    model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
     scenario = Scenario(
         controller=controller.value,
         robots=count,
@@ -213,11 +268,19 @@ def sim(
         duration_s=duration,
         features=world_features,
         random_feature_count=features,
-        scale=FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0),
+        starts_m=None if starts is None else _starts(starts, count),
+        scale=model,
         loss=loss,
         delay_s=delay,
         radio=ModelledRadio(transport.value, found.wifi) if transport else None,
         max_message_age_s=max_message_age,
+        payload=payload.value,
+        world_size=world_size,
+        communication_range=communication_range,
+        lag_s=lag,
+        failures=() if lost is None else LostRobots.parse(lost).failures(count),
+        position_bias=_position_bias(seed, position_error, count, model),
+        clocks=_clocks(perception_hz, policy_hz, control_hz),
     )
     if out:
         out.mkdir(parents=True, exist_ok=True)
@@ -229,13 +292,7 @@ def sim(
     if as_json:
         typer.echo(json.dumps(flight.summary(), indent=2))
         return
-    result = (
-        f"after {duration:g} s the coverage cost is {flight.normalized_cost[-1]:.3f} "
-        "of the initial cost"
-        if flight.importance.any()
-        else "the world has no importance anywhere, so that there was nothing to cover"
-    )
-    typer.echo(f"{controller.value}, {count} robots, seed {seed}: {result}")
+    typer.echo(f"{controller.value}, {count} robots, seed {seed}: {_result(flight, duration)}")
     if transport:
         typer.echo(f"{transport.value}: {link_line(*scenario.link)}; it takes the Wi-Fi for")
         typer.echo("\n".join(wifi_lines(found)))
@@ -246,6 +303,16 @@ def sim(
 _ONLY_FOR = {
     "controller": (VehicleKind.POINT,),
     "scale": (VehicleKind.POINT,),
+    "starts": (VehicleKind.POINT,),
+    "world_size": (VehicleKind.POINT,),
+    "communication_range": (VehicleKind.POINT,),
+    "perception_hz": (VehicleKind.POINT,),
+    "policy_hz": (VehicleKind.POINT,),
+    "control_hz": (VehicleKind.POINT,),
+    "lag": (VehicleKind.POINT,),
+    "position_error": (VehicleKind.POINT,),
+    "lost": (VehicleKind.POINT,),
+    "payload": (VehicleKind.POINT,),
     "loss": (VehicleKind.POINT,),
     "delay": (VehicleKind.POINT,),
     "max_message_age": (VehicleKind.POINT,),
@@ -509,6 +576,63 @@ def fly_points(
             task = progress.add_task(name, total=scenario.duration_s)
             flights.append(fly(scenario, bundle, partial(_show, progress, task)))
     return flights
+
+
+def _result(flight: "SimulatedFlight", duration_s: float) -> str:
+    if not flight.importance.any():
+        return "what there is lies outside of the world, so that there was nothing to cover"
+    cost = flight.normalized_cost[-1]
+    return f"after {duration_s:g} s the coverage cost is {cost:.3f} of the initial cost"
+
+
+def _require_something_to_cover(
+    world: Path | None, of_file: "Sequence[Feature] | None", random_features: int
+) -> None:
+    empty = random_features == 0 if of_file is None else not of_file
+    if empty:
+        what = "--features 0" if world is None else str(world)
+        raise ValueError(f"{what}: the world would have nothing in it to cover")
+
+
+def _starts(path: Path, robots: int) -> tuple[tuple[float, float], ...]:
+    """The positions in the file, m. Raises ValueError that names the line."""
+    starts_m = []
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            x_m, y_m = map(float, line.replace(",", " ").split())
+        except ValueError:
+            raise ValueError(f"{path}: line {number}: must be 'x y', in m") from None
+        starts_m.append((x_m, y_m))
+    if len(starts_m) != robots:
+        raise ValueError(f"{path}: has {len(starts_m)} starts, and there are {robots} robots")
+    return tuple(starts_m)
+
+
+def _position_bias(
+    seed: int, deviation_m: float, robots: int, scale: "ModelScale"
+) -> tuple[tuple[float, float], ...] | None:
+    """What robots take themselves to be off by, in model units."""
+    from lpac.sim.experiment import draw_position_errors_m
+
+    if not 0.0 <= deviation_m < math.inf:
+        raise ValueError(f"--position-error {deviation_m:g}: must be at least 0 and finite")
+    if deviation_m == 0.0 or robots < 1:
+        return None
+    errors_m = draw_position_errors_m(seed, deviation_m, robots)
+    return tuple((x, y) for x, y in (errors_m * scale.env_scale).tolist())
+
+
+def _clocks(perception_hz: float, policy_hz: float, control_hz: float) -> "Clocks":
+    """Raises ValueError for a rate that is impossible."""
+    from lpac.sim.ticks import Clocks
+
+    rates_hz = {"perception": perception_hz, "policy": policy_hz, "control": control_hz}
+    for loop, rate_hz in rates_hz.items():
+        if not 0.0 < rate_hz < math.inf:
+            raise ValueError(f"--{loop}-hz {rate_hz:g}: must be positive and finite")
+    return Clocks(**{f"{loop}_s": 1.0 / rate_hz for loop, rate_hz in rates_hz.items()})
 
 
 def _text(path: Path) -> str:

@@ -33,17 +33,16 @@ from lpac.analysis.statistics import (
 )
 from lpac.evaluate.flights import (
     LLOYD,
-    NONE_LOST,
     POLICY,
     EvaluationFlight,
     Flier,
     FlownCost,
-    LostRobots,
     RobotModel,
 )
 from lpac.evaluate.worlds import SET_UPS, WorldSet
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName
+from lpac.sim.failure import NONE_LOST, LostRobots
 
 FAILS_ABOVE = 1.5
 _RISEN = 1.05

@@ -1,6 +1,5 @@
 """The flights of an evaluation; this is the one place where they are flown."""
 
-import re
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -27,10 +26,11 @@ from lpac.sim.experiment import (
     Scenario,
     SimulatedFlight,
     cost_times_s,
+    draw_position_errors_m,
     fly,
     prepare,
 )
-from lpac.sim.failure import Failure
+from lpac.sim.failure import NONE_LOST, LostRobots
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.kept import KeptOutcomes, code_digest
@@ -50,25 +50,6 @@ RobotModel = Literal["point", "point-from-pad", "whole"]
 # Larger batches of the simulator are no faster.
 _ROBOTS_TOGETHER = 80
 _FLIGHTS = "flights.jsonl"
-_LOST = re.compile(r"(\d+)@(\d+\.?\d*)")
-
-
-class LostRobots(NamedTuple):
-    """So many of the robots are gone from that time of the flight on, s; at 0, they never were."""
-
-    robots: int
-    at_s: float
-
-    @classmethod
-    def parse(cls, text: str) -> "LostRobots":
-        """Of "2@20". Raises ValueError."""
-        found = _LOST.fullmatch(text)
-        if found is None:
-            raise ValueError(f"lost robots {text!r}: must be ROBOTS@SECONDS, such as 2@20")
-        return cls(int(found[1]), float(found[2]))
-
-
-NONE_LOST = LostRobots(0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -193,8 +174,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     lost_late = flight.lost.at_s > 0.0
     robots = set_up.robots if lost_late else left
     starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
-    draw = np.random.default_rng(world.seed)
-    errors_m = draw.normal(0.0, flight.position_error_m, (set_up.robots, 2))
+    errors_m = draw_position_errors_m(world.seed, flight.position_error_m, set_up.robots)
     if flight.robot != "point":
         layout = Layout(_fleet(flight), Path(flight.bundle))
         starts_m = layout.pads_m.tolist()
@@ -219,7 +199,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         communication_range=set_up.communication_range,
         lag_s=flight.lag_s,
         position_bias=tuple((x, y) for x, y in errors) if np.any(errors_m) else None,
-        failures=tuple(Failure(robot, flight.lost.at_s) for robot in range(left, robots)),
+        failures=flight.lost.failures(robots),
     )
 
 

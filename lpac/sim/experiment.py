@@ -373,6 +373,11 @@ def _sample_times_s(duration_s: float) -> list[float]:
     return [*(sample * SAMPLE_S for sample in range(samples)), duration_s]
 
 
+def draw_position_errors_m(seed: int, deviation_m: float, robots: int) -> F64:
+    """(robots, 2): how wrong each is about where it is, normal along each axis."""
+    return np.random.default_rng(seed).normal(0.0, deviation_m, (robots, 2))
+
+
 def _starts_m(scenario: Scenario, world_size: int, rng: np.random.Generator) -> F64:
     if scenario.starts_m is not None:
         return np.array(scenario.starts_m)

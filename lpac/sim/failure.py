@@ -1,8 +1,10 @@
 """Robots that fail in flight."""
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +31,39 @@ class Failure:
                 f"failure of robot {self.robot}: from_s = {self.from_s}, until_s = {self.until_s}: "
                 "must be at least 0, and until_s later"
             )
+
+
+_LOST = re.compile(r"(\d+)@(\d+\.?\d*)")
+
+
+class LostRobots(NamedTuple):
+    """So many of the robots are gone from that time of the flight on, s; at 0, they never were."""
+
+    robots: int
+    at_s: float
+
+    @classmethod
+    def parse(cls, text: str) -> "LostRobots":
+        """Of "2@20". Raises ValueError."""
+        found = _LOST.fullmatch(text)
+        if found is None:
+            raise ValueError(f"lost robots {text!r}: must be ROBOTS@SECONDS, such as 2@20")
+        return cls(int(found[1]), float(found[2]))
+
+    def failures(self, of_robots: int) -> tuple[Failure, ...]:
+        """Those of the last so many of a team; none if they never were. Raises ValueError."""
+        if self.at_s == 0.0:
+            return ()
+        if self.robots >= of_robots:
+            raise ValueError(
+                f"lost robots {self.robots}@{self.at_s:g}: must be fewer than the team's "
+                f"{of_robots}"
+            )
+        lost = range(of_robots - self.robots, of_robots)
+        return tuple(Failure(robot, self.at_s) for robot in lost)
+
+
+NONE_LOST = LostRobots(0, 0.0)
 
 
 def alive_at(robots: int, failures: Iterable[Failure], time_s: float) -> Bools:

@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 
@@ -198,7 +199,20 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--transport", "mesh", "--delay", "1"], "--delay and --transport: the model"),
         (["sim", "--transport", "mesh", "--wifi", "absent.toml"], "absent.toml"),
         (["sim", "--wifi", "README.md"], "--wifi does nothing without --transport"),
-        (["sim", "--world", "absent.env"], "absent.env"),
+        (["sim", "--world", "absent.env"], "absent.env: there is no such file"),
+        (["sim", "--world", "tests"], "tests: is a folder; a file is needed"),
+        (["sim", "--features", "0"], "--features 0: the world would have nothing in it to cover"),
+        (["sim", "--world", "/dev/null"], "/dev/null: the world would have nothing in it"),
+        (["sim", "--starts", "Makefile"], "Makefile: line 1: must be 'x y', in m"),
+        (["sim", "--starts", "/dev/null"], "/dev/null: has 0 starts, and there are 10 robots"),
+        (["sim", "--policy-hz", "0"], "--policy-hz 0: must be positive"),
+        (["sim", "--position-error", "-1"], "--position-error -1: must be at least 0"),
+        (["sim", "--lost", "10@5"], "lost robots 10@5: must be fewer than the team's 10"),
+        (
+            ["sim", "--lag", "1", "--vehicle", "mavlink"],
+            "--lag does nothing with --vehicle mavlink",
+        ),
+        (["sim", "--bundle", f"{SHIPPED}.pt"], "is a torch checkpoint; `lpac export"),
         (["sim", "--bundle", "absent"], "absent: No such file or directory"),
         (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),
         (["bundle", "info", "tests"], "manifest.json is missing"),
@@ -212,9 +226,29 @@ def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
     assert text in error_line(lpac(*arguments))
 
 
-def test_a_world_with_nothing_to_cover_is_said_to_be_one(tmp_path: Path) -> None:
-    result = lpac("sim", "--features", 0, "--duration", 0.2)
-    assert "nothing to cover" in result.stdout
+def test_sim_has_the_knobs_of_an_experiment(tmp_path: Path) -> None:
+    """Each of them changes the flight, and starts are where the file says."""
+    starts = tmp_path / "starts.txt"
+    starts.write_text("".join(f"{3 * i}, {2 * i}\n" for i in range(10)))
+    options: dict[str, list[Any]] = {
+        "as it is": [],
+        "starts": ["--starts", starts],
+        "rates": ["--perception-hz", 1, "--policy-hz", 5, "--control-hz", 20],
+        "range": ["--range", 64],
+        "world": ["--world-size", 300],
+        "lag": ["--lag", 1.3],
+        "errors": ["--position-error", 1],
+        "lost": ["--lost", "2@2"],
+        "payload": ["--payload", "int8"],
+    }
+    flights = {
+        name: json.loads(lpac("sim", "--duration", 5, "--json", *its).stdout)
+        for name, its in options.items()
+    }
+    ends = {name: json.dumps(flight["final_positions_m"]) for name, flight in flights.items()}
+    assert len(set(ends.values())) == len(options)
+    moved = np.array(flights["starts"]["final_positions_m"]) - [[3 * i, 2 * i] for i in range(10)]
+    assert np.linalg.norm(moved, axis=1).max() <= 5 * 1.25 + 0.1
 
 
 def test_what_is_not_installed_is_said_in_one_line() -> None:

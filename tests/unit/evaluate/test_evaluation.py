@@ -22,10 +22,10 @@ from lpac.evaluate.flights import (
     POLICY,
     EvaluationFlight,
     FlownCost,
-    LostRobots,
     groups_of,
 )
 from lpac.radio.modelled import ModelledRadio
+from lpac.sim.failure import LostRobots
 
 WORLDS = 8
 CLAIRVOYANT = Method(name="clairvoyant-cvt", flier="clairvoyant-cvt")

@@ -16,7 +16,6 @@ from lpac.evaluate.flights import (
     EvaluationFlight,
     FlownCost,
     KeptFlights,
-    LostRobots,
     costs_of,
     fly_group,
 )
@@ -24,6 +23,7 @@ from lpac.evaluate.worlds import FIELD, draw_world
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.cores import Outcome, Task
+from lpac.sim.failure import LostRobots
 from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED
 

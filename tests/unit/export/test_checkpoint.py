@@ -267,6 +267,16 @@ def test_torch_files_that_hold_something_else(content: object, line: str, tmp_pa
     assert error_of(content, tmp_path).startswith(line)
 
 
+@pytest.mark.parametrize("key", ["state_dict", "model_state_dict"])
+def test_a_state_dict_among_other_things_is_found(key: str, state: State, tmp_path: Path) -> None:
+    torch.save({"epoch": 3, "optimizer": {"lr": 1e-3}, key: state}, tmp_path / "kept.pt")
+    torch.save(state, tmp_path / "alone.pt")
+    kept, alone = (read_checkpoint(tmp_path / name) for name in ("kept.pt", "alone.pt"))
+    assert kept.geometry == alone.geometry
+    np.testing.assert_array_equal(kept.gnn[0].taps, alone.gnn[0].taps)
+    assert "model_state_dict: found a int" in error_of({"model_state_dict": 3}, tmp_path)
+
+
 @pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")
 def test_files_that_torch_cannot_read(state: State, tmp_path: Path) -> None:
     torch.save(state, tmp_path / "whole.pt")
