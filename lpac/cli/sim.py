@@ -37,6 +37,8 @@ app = new_app()
 
 DEFAULT_OUT = Path("out/sim")
 DEFAULT_ROBOTS = 10
+# Images and actions count for so long, s, or for two periods, if that is longer.
+_INPUT_AGE_S = 1.0
 
 
 class Controller(StrEnum):
@@ -141,6 +143,12 @@ def sim(
         float, typer.Option(help="point: how often its policy decides, and it speaks.")
     ] = 2.5,
     control_hz: Annotated[float, typer.Option(help="point: how often it steers.")] = 10.0,
+    synchronous: Annotated[
+        bool,
+        typer.Option(
+            "--synchronous", help="point: all robots perceive and decide at the same moments."
+        ),
+    ] = False,
     lag: Annotated[
         float, typer.Option(help="point: time constant by which robots follow a velocity, s.")
     ] = 0.0,
@@ -260,6 +268,7 @@ def sim(
     if transport and (loss or delay):
         both = f"--{'loss' if loss else 'delay'} and --transport"
         raise ValueError(f"{both}: the model itself says what is lost, and how late messages are")
+    clocks = _clocks(perception_hz, policy_hz, control_hz, synchronous=synchronous)
     model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
     scenario = Scenario(
         controller=controller.value,
@@ -274,13 +283,14 @@ def sim(
         delay_s=delay,
         radio=ModelledRadio(transport.value, found.wifi) if transport else None,
         max_message_age_s=max_message_age,
+        max_input_age_s=max(_INPUT_AGE_S, 2.0 * clocks.perception_s, 2.0 * clocks.policy_s),
         payload=payload.value,
         world_size=world_size,
         communication_range=communication_range,
         lag_s=lag,
         failures=() if lost is None else LostRobots.parse(lost).failures(count),
         position_bias=_position_bias(seed, position_error, count, model),
-        clocks=_clocks(perception_hz, policy_hz, control_hz),
+        clocks=clocks,
     )
     if out:
         out.mkdir(parents=True, exist_ok=True)
@@ -309,6 +319,7 @@ _ONLY_FOR = {
     "perception_hz": (VehicleKind.POINT,),
     "policy_hz": (VehicleKind.POINT,),
     "control_hz": (VehicleKind.POINT,),
+    "synchronous": (VehicleKind.POINT,),
     "lag": (VehicleKind.POINT,),
     "position_error": (VehicleKind.POINT,),
     "lost": (VehicleKind.POINT,),
@@ -624,7 +635,9 @@ def _position_bias(
     return tuple((x, y) for x, y in (errors_m * scale.env_scale).tolist())
 
 
-def _clocks(perception_hz: float, policy_hz: float, control_hz: float) -> "Clocks":
+def _clocks(
+    perception_hz: float, policy_hz: float, control_hz: float, *, synchronous: bool
+) -> "Clocks":
     """Raises ValueError for a rate that is impossible."""
     from lpac.sim.ticks import Clocks
 
@@ -632,7 +645,12 @@ def _clocks(perception_hz: float, policy_hz: float, control_hz: float) -> "Clock
     for loop, rate_hz in rates_hz.items():
         if not 0.0 < rate_hz < math.inf:
             raise ValueError(f"--{loop}-hz {rate_hz:g}: must be positive and finite")
-    return Clocks(**{f"{loop}_s": 1.0 / rate_hz for loop, rate_hz in rates_hz.items()})
+    return Clocks(
+        perception_s=1.0 / perception_hz,
+        policy_s=1.0 / policy_hz,
+        control_s=1.0 / control_hz,
+        synchronous=synchronous,
+    )
 
 
 def _text(path: Path) -> str:

@@ -74,6 +74,7 @@ class EvaluationFlight:
     delay_s: float = 0.0
     radio: ModelledRadio | None = None
     max_message_age_s: float = 0.8
+    max_input_age_s: float = 1.0
     payload: PayloadType = "float16"
     clocks: Clocks = field(default_factory=Clocks)
     lag_s: float = 0.0
@@ -87,6 +88,7 @@ class EvaluationFlight:
             f"{self.flier} {self.flown_by}: {self.world_set} {self.world} {self.set_up}, "
             f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
             f", delay {self.delay_s:g} s, {self.radio}, ages to {self.max_message_age_s:g} s, "
+            f"inputs to {self.max_input_age_s:g} s, "
             f"{self.payload}, {self.clocks}, lag {self.lag_s:g} s, "
             f"positions to {self.position_error_m:g} m, {self.robot}"
         )
@@ -193,6 +195,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
         delay_s=flight.delay_s,
         radio=flight.radio,
         max_message_age_s=flight.max_message_age_s,
+        max_input_age_s=flight.max_input_age_s,
         payload=flight.payload,
         clocks=flight.clocks,
         world_size=set_up.world_size,

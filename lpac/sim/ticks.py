@@ -15,6 +15,8 @@ Loop = Literal["perception", "policy", "control"]
 class Clocks:
     """Periods of a robot's three loops, s; a tick is early or late by up to `jitter` periods.
 
+    With `synchronous` all robots' loops begin at once, and none is ever early or late.
+
     Raises ValueError that names what is impossible.
     """
 
@@ -22,6 +24,7 @@ class Clocks:
     policy_s: float = 0.4
     control_s: float = 0.1
     jitter: float = 0.05
+    synchronous: bool = False
 
     def __post_init__(self) -> None:
         for name in ("perception_s", "policy_s", "control_s"):
@@ -49,13 +52,14 @@ def ticks(robots: int, clocks: Clocks, rng: np.random.Generator) -> Iterator[Loo
     heap: list[tuple[float, int, float, float, Loop, int]] = []
     order = 0
     now_s = 0.0
+    jitter = 0.0 if clocks.synchronous else clocks.jitter
 
     def upcoming(
         due_s: float, period_s: float, loop: Loop, robot: int
     ) -> tuple[float, int, float, float, Loop, int]:
         nonlocal order
         order += 1
-        lateness_s = clocks.jitter * period_s * (2.0 * rng.random() - 1.0)
+        lateness_s = jitter * period_s * (2.0 * rng.random() - 1.0)
         return max(due_s + lateness_s, now_s), order, due_s, period_s, loop, robot
 
     periods_s: tuple[tuple[Loop, float], ...] = (
@@ -65,7 +69,7 @@ def ticks(robots: int, clocks: Clocks, rng: np.random.Generator) -> Iterator[Loo
     )
     for robot in range(robots):
         for loop, period_s in periods_s:
-            phase_s = period_s * rng.random()
+            phase_s = 0.0 if clocks.synchronous else period_s * rng.random()
             heapq.heappush(heap, upcoming(phase_s, period_s, loop, robot))
     while True:
         now_s, _, due_s, period_s, loop, robot = heap[0]

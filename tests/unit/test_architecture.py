@@ -67,10 +67,11 @@ ALLOWED = {
     "lpac.ablate": {
         *_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate", "lpac.train",
     },
+    "lpac.paper": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate"},
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
         "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
-        "lpac.ablate",
+        "lpac.ablate", "lpac.paper",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
         "lpac.radio.heat_map", "lpac.network",
     },
@@ -86,6 +87,7 @@ ONLY_IN = {
         "lpac/evaluate/",
         "lpac/train/",
         "lpac/ablate/",
+        "lpac/paper/",
         "lpac/radio/figures.py",
         "lpac/radio/heat_map.py",
         "lpac/network/figures.py",

@@ -239,6 +239,7 @@ def test_sim_has_the_knobs_of_an_experiment(tmp_path: Path) -> None:
         "lag": ["--lag", 1.3],
         "errors": ["--position-error", 1],
         "lost": ["--lost", "2@2"],
+        "together": ["--synchronous"],
         "payload": ["--payload", "int8"],
     }
     flights = {

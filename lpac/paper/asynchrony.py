@@ -1,0 +1,180 @@
+"""Rates and asynchrony: what the paper argues, and does not measure.
+
+Its modules run each at a rate of their own, and it argues both for an exchange of messages that is
+slower than perception, and for a faster one. Here one policy, as it is trained, flies over the same
+worlds
+
+- with each of several rates of perception beside each of several rates of the policy, which is that
+  of the exchange: every robot at its own moments, or all at the same ones;
+- with the rates of the field, and messages that are late.
+
+With all robots at the same moments messages cross one hop from one moment to the next, as they do
+in the synchronous graph neural network, and what a robot says is never older than a period.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from lpac.analysis.statistics import (
+    Interval95,
+    bootstrap,
+    mean_over_time,
+    paired_bootstrap,
+    ratio_of_means,
+)
+from lpac.evaluate.evaluation import TrainedBundle
+from lpac.evaluate.flights import POLICY, EvaluationFlight, FlownCost
+from lpac.evaluate.worlds import WorldSet
+from lpac.sim.ticks import Clocks
+
+# What is said of a flight: its cost at these times, s.
+TIMES_S = (15.0, 30.0, 60.0)
+# Whatever the rates are, messages, images and actions count for two periods at least, or a policy
+# at half a hertz would stand still every other second.
+_PERIODS = 2.0
+_FIELD_AGE_S, _FIELD_INPUT_AGE_S = 0.8, 1.0
+
+
+class Timing(NamedTuple):
+    """When robots perceive, and decide and speak; and how late what they say is, on average."""
+
+    perception_hz: float
+    policy_hz: float
+    synchronous: bool = False
+    delay_s: float = 0.0
+
+    @property
+    def clocks(self) -> Clocks:
+        """Control is the field's."""
+        return Clocks(
+            perception_s=1.0 / self.perception_hz,
+            policy_s=1.0 / self.policy_hz,
+            synchronous=self.synchronous,
+        )
+
+
+FIELD = Timing(5.0, 2.5)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AsynchronyPlan:
+    """The timings, and the first `worlds` worlds of a set, over which all of them are flown."""
+
+    bundle: TrainedBundle
+    world_set: WorldSet
+    worlds: int
+    perception_hz: tuple[float, ...] = (1.0, 2.5, 5.0, 10.0)
+    policy_hz: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0, 10.0)
+    delays_s: tuple[float, ...] = (0.0, 0.2, 0.4, 0.8, 1.6)
+
+    def __post_init__(self) -> None:
+        if self.worlds < 1:
+            raise ValueError(f"worlds = {self.worlds}: must be at least 1")
+
+    @property
+    def timings(self) -> list[Timing]:
+        """Each once, the field's first."""
+        rates = [
+            Timing(perception_hz, policy_hz, synchronous)
+            for synchronous in (False, True)
+            for perception_hz in self.perception_hz
+            for policy_hz in self.policy_hz
+        ]
+        late = [FIELD._replace(delay_s=delay_s) for delay_s in self.delays_s]
+        return list(dict.fromkeys([FIELD, *rates, *late]))
+
+    def flights_of(self, timing: Timing) -> list[EvaluationFlight]:
+        """One over each world."""
+        clocks = timing.clocks
+        slowest_s = max(clocks.perception_s, clocks.policy_s)
+        # A message travels one and a half times the mean delay at most.
+        age_s = max(_FIELD_AGE_S, _PERIODS * clocks.policy_s) + 1.5 * timing.delay_s
+        return [
+            EvaluationFlight(
+                flier=POLICY,
+                bundle=self.bundle.path,
+                flown_by=self.bundle.bundle_id,
+                world_set=self.world_set,
+                world=world,
+                set_up="field",
+                duration_s=TIMES_S[-1],
+                delay_s=timing.delay_s,
+                max_message_age_s=age_s,
+                max_input_age_s=max(_FIELD_INPUT_AGE_S, _PERIODS * slowest_s),
+                clocks=clocks,
+            )
+            for world in range(self.worlds)
+        ]
+
+    def flights(self) -> list[EvaluationFlight]:
+        """All of them."""
+        return [flight for timing in self.timings for flight in self.flights_of(timing)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimingResult:
+    """What a timing came to over K worlds: `costs` (K, 3) at `TIMES_S`, over those at the start.
+
+    `area` (K,) is the mean cost over the flight, `over_field` at each of the times the ratio of the
+    mean cost to that with the field's timing over the same worlds, with its paired interval.
+    """
+
+    timing: Timing
+    costs: F64
+    area: F64
+    over_field: tuple[Interval95, ...]
+
+    @property
+    def means(self) -> tuple[Interval95, ...]:
+        """At each of `TIMES_S`, with the interval over other worlds."""
+        return tuple(bootstrap(costs[None]) for costs in self.costs.T)
+
+
+def results_of(
+    plan: AsynchronyPlan, flown: Mapping[EvaluationFlight, FlownCost]
+) -> list[TimingResult]:
+    """Of all of its flights, in the order of its timings."""
+    results = []
+    in_field, _ = _costs(plan, FIELD, flown)
+    for timing in plan.timings:
+        costs, area = _costs(plan, timing, flown)
+        over_field = tuple(
+            paired_bootstrap(own[None], its[None], ratio_of_means, same_trainings=True)
+            for own, its in zip(costs.T, in_field.T, strict=True)
+        )
+        results.append(TimingResult(timing, costs, area, over_field))
+    return results
+
+
+def _costs(
+    plan: AsynchronyPlan, timing: Timing, flown: Mapping[EvaluationFlight, FlownCost]
+) -> tuple[F64, F64]:
+    of_worlds = [flown[flight] for flight in plan.flights_of(timing)]
+    time_s = np.array(of_worlds[0].time_s)
+    curves = np.array([np.array(told.cost) / told.cost[0] for told in of_worlds])
+    costs = np.array([np.interp(TIMES_S, time_s, curve) for curve in curves])
+    return costs, mean_over_time(time_s, curves)
+
+
+def as_json(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> dict[str, Any]:
+    """All numbers, for scripts; intervals as [value, low, high]."""
+    return {
+        "bundle_id": plan.bundle.bundle_id,
+        "world_set": plan.world_set,
+        "worlds": plan.worlds,
+        "times_s": list(TIMES_S),
+        "timings": [
+            {
+                **result.timing._asdict(),
+                "means": [list(mean) for mean in result.means],
+                "over_field": [list(ratio) for ratio in result.over_field],
+                "area": list(bootstrap(result.area[None])),
+                "by_world": result.costs.tolist(),
+            }
+            for result in results
+        ],
+    }

@@ -1,0 +1,158 @@
+"""The experiment on rates and asynchrony as files: figures, CSV, JSON, and README.md."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from lpac.analysis import style
+from lpac.analysis.style import CURVES, WIDTH_IN, tidy
+from lpac.paper.asynchrony import FIELD, TIMES_S, AsynchronyPlan, TimingResult, as_json
+
+_END = len(TIMES_S) - 1
+
+
+def write_report(
+    plan: AsynchronyPlan, results: Sequence[TimingResult], folder: Path, made_by: Mapping[str, str]
+) -> None:
+    """All of it; `made_by` says what made it: the command, versions. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    told = {**as_json(plan, results), "made_by": dict(made_by)}
+    (folder / "async.json").write_text(json.dumps(told, indent=2) + "\n")
+    (folder / "async.csv").write_text(_csv(results))
+    style.save(_rates(plan, results), folder / "rates")
+    style.save(_staleness(results), folder / "staleness")
+    (folder / "README.md").write_text(_text(plan, results, made_by))
+
+
+def _csv(results: Sequence[TimingResult]) -> str:
+    """A row for each timing and world."""
+    rows = io.StringIO()
+    writer = csv.writer(rows, lineterminator="\n")
+    times = [f"cost_at_{time_s:g}_s" for time_s in TIMES_S]
+    writer.writerow(["perception_hz", "policy_hz", "synchronous", "delay_s", "world", *times])
+    for result in results:
+        perception_hz, policy_hz, synchronous, delay_s = result.timing
+        for world, costs in enumerate(result.costs.tolist()):
+            writer.writerow([perception_hz, policy_hz, int(synchronous), delay_s, world, *costs])
+    return rows.getvalue()
+
+
+def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
+    """Cost over the policy's rate, a curve for each rate of perception; early, and at the end."""
+    by_timing = {result.timing: result for result in results}
+    with style.figure(WIDTH_IN, 2.8) as figure:
+        for axes, at in zip(figure.subplots(1, 2), (0, _END), strict=True):
+            for (colour, _), perception_hz in zip(CURVES, plan.perception_hz, strict=False):
+                for synchronous in (False, True):
+                    row = [
+                        by_timing[FIELD._replace(
+                            perception_hz=perception_hz, policy_hz=hz, synchronous=synchronous
+                        )]
+                        for hz in plan.policy_hz
+                    ]  # fmt: skip
+                    label = None if synchronous else f"{perception_hz:g} Hz"
+                    _curve(axes, plan.policy_hz, row, at, colour, label, dashed=synchronous)
+            axes.set_xscale("log")
+            axes.set_xticks(plan.policy_hz, [f"{hz:g}" for hz in plan.policy_hz])
+            axes.minorticks_off()
+            axes.set(
+                xlabel="policy and exchange of messages, Hz",
+                ylabel=f"cost at {TIMES_S[at]:g} s / with the field's rates",
+            )
+            tidy(axes)
+        axes.plot([], [], ls=style.DASHED, color=style.INK, lw=1.0, label="all at the same moments")
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=len(labels), title="perception"
+        )
+        return figure
+
+
+def _staleness(results: Sequence[TimingResult]) -> Figure:
+    """Cost over the mean delay of messages, at the rates of the field."""
+    late = [r for r in results if r.timing._replace(delay_s=0.0) == FIELD]
+    delays_s = [result.timing.delay_s for result in late]
+    with style.figure(WIDTH_IN / 2, 2.6) as figure:
+        axes = figure.subplots()
+        for at, ((colour, _), time_s) in enumerate(zip(CURVES, TIMES_S, strict=False)):
+            _curve(axes, delays_s, late, at, colour, f"at {time_s:g} s", dashed=False)
+        axes.set(xlabel="mean delay of messages, s", ylabel="cost / without delay")
+        tidy(axes)
+        axes.legend()
+        return figure
+
+
+def _curve(
+    axes: Axes,
+    x: Sequence[float],
+    row: Sequence[TimingResult],
+    at: int,
+    colour: str,
+    label: str | None,
+    *,
+    dashed: bool,
+) -> None:
+    values, lows, highs = zip(*(result.over_field[at] for result in row), strict=True)
+    line = style.DASHED if dashed else "-"
+    axes.plot(x, values, ls=line, marker="o", ms=3, mfc="w" if dashed else colour, color=colour,
+              lw=1.0, label=label)  # fmt: skip
+    axes.vlines(x, lows, highs, color=colour, lw=0.6)
+    axes.axhline(1.0, color=style.FAINT, lw=0.8, zorder=0)
+
+
+def _text(plan: AsynchronyPlan, results: Sequence[TimingResult], made_by: Mapping[str, str]) -> str:
+    heading = " | ".join(f"cost at {time_s:g} s" for time_s in TIMES_S)
+    return f"""# Rates and asynchrony
+
+The paper runs perception, exchange of messages and control asynchronously, each at a rate of its
+own, and argues both for an exchange slower than perception (a longer window to hear everybody in)
+and for a faster one. It measures neither. Here the policy of bundle `{plan.bundle.bundle_id[:16]}`,
+trained at the rates of the field alone (perception 5 Hz, policy 2.5 Hz), flies over the first
+{plan.worlds} worlds of the {plan.world_set} set: point robots in the set-up of the field.
+
+![cost over the rates](rates.png)
+
+*Cost over the policy's rate, in terms of that with the field's rates and own moments: above 1 is
+worse. Full lines: each robot at its own moments; dashed: all at the same ones. Bars are 95 %
+intervals of the ratio of means, by worlds in pairs.*
+
+![cost over the delay of messages](staleness.png)
+
+*The same policy at the rates of the field, with messages that are late: each by half to one and a
+half of the mean delay; in terms of the cost without.*
+
+| perception, Hz | policy, Hz | moments | delay, s | {heading} | mean cost over the flight |
+| --- | --- | --- | --- | {" | ".join(["---"] * len(TIMES_S))} | --- |
+{chr(10).join(_row(result) for result in results)}
+
+Cost over that at the start, and in brackets the 95 % interval of its ratio to the cost with the
+field's timing, the first row (bootstrap over worlds in pairs). A robot speaks as often as
+its policy decides, so that the second column is also what the radio is asked for. Messages, images
+and actions count for two of their periods, or as long as in the field if that is longer; late
+messages so much longer as they are late. `async.csv` has a row for each flight, `async.json`
+everything.
+
+Made by {"; ".join(f"{name}: `{value}`" for name, value in made_by.items())}.
+"""
+
+
+def _row(result: TimingResult) -> str:
+    timing = result.timing
+    costs = [
+        f"{mean:.3f} (x {low:.2f} to {high:.2f})"
+        for (mean, _, _), (_, low, high) in zip(result.means, result.over_field, strict=True)
+    ]
+    cells = [
+        f"{timing.perception_hz:g}",
+        f"{timing.policy_hz:g}",
+        "the same" if timing.synchronous else "own",
+        f"{timing.delay_s:g}",
+        *costs,
+        f"{result.area.mean():.3f}",
+    ]
+    return f"| {' | '.join(cells)} |"

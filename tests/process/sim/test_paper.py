@@ -1,0 +1,35 @@
+"""`lpac paper` as a user types it."""
+
+import json
+from pathlib import Path
+
+from edge.policy.bundle import load_bundle
+from lpac.cli.options import DEFAULT_BUNDLE
+from tests.process.cli.test_cli import error_line, lpac
+
+
+def test_rates_and_asynchrony_are_flown_and_kept(tmp_path: Path) -> None:
+    command = ("paper", "async", "--quick", "-k", 1, "--out", tmp_path, "--json")
+    result = lpac(*command)
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    told = json.loads(result.stdout)
+    assert told["bundle_id"] == load_bundle(DEFAULT_BUNDLE).id and told["worlds"] == 1
+    field, *others = told["timings"]
+    assert (field["perception_hz"], field["policy_hz"], field["synchronous"]) == (5.0, 2.5, False)
+    assert field["over_field"] == [[1.0, 1.0, 1.0]] * 3
+    # It covers, and what is another timing is another flight.
+    [[_, _, end]] = field["by_world"]
+    assert 0.0 < end < 0.5
+    ends = {tuple(timing["by_world"][0]) for timing in told["timings"]}
+    assert len(ends) == 1 + len(others) == 13
+    assert (tmp_path / "rates.png").exists() and (tmp_path / "README.md").exists()
+    # What was flown is kept: a world more is all that is flown then.
+    flown = (tmp_path / "flights.jsonl").read_bytes()
+    assert lpac(*command).stdout == result.stdout
+    assert (tmp_path / "flights.jsonl").read_bytes() == flown
+
+
+def test_mistakes_are_one_line(tmp_path: Path) -> None:
+    no_worlds = lpac("paper", "async", "-k", 0, "--out", tmp_path)
+    assert error_line(no_worlds) == "lpac: worlds = 0: must be at least 1"
+    assert "absent" in error_line(lpac("paper", "async", "--bundle", "absent"))
