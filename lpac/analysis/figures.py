@@ -34,6 +34,23 @@ def snapshots(flight: FlightRecord, times_s: Sequence[float]) -> Figure:
         return figure
 
 
+def snapshots_of_several(flights: Mapping[str, FlightRecord], times_s: Sequence[float]) -> Figure:
+    """A row of snapshots of each flight, by its name, all of them over worlds of one size."""
+    count = len(times_s)
+    with style.figure(WIDTH_IN, len(flights) * WIDTH_IN / count + 0.55) as figure:
+        panels = figure.subplots(len(flights), count, squeeze=False, sharex=True, sharey=True)
+        for row, flight in zip(panels, flights.values(), strict=True):
+            for axes, time_s in zip(row, times_s, strict=True):
+                _draw_snapshot(axes, flight, time_s)
+        for axes in panels[1:].ravel():
+            axes.set_title("")
+        _frame(panels, next(iter(flights.values())), margin=False)
+        for axes, name in zip(panels[:, 0], flights, strict=True):
+            axes.set_ylabel(f"{name}\ny (m)")
+        _add_snapshot_legend(figure, has_world=True)
+        return figure
+
+
 def snapshots_and_costs(flights: Mapping[str, FlightRecord]) -> Figure:
     """Snapshots of the first flight above the costs of all, by their names."""
     first = next(iter(flights.values()))
@@ -249,21 +266,29 @@ def _draw_snapshots(
     for axes in panels.ravel()[len(times_s) :]:
         axes.set_visible(False)
     for axes, time_s in zip(panels.ravel(), times_s, strict=False):
-        _draw_world(axes, flight, time_s)
-        _draw_cells(axes, flight, time_s)
-        for robot in flight.robots:
-            _draw_path(axes, robot, 0.0, time_s, style.SWARM)
-        _draw_robots(axes, flight.places_at(time_s), small=True)
-        axes.set_title(f"$t$ = {round(time_s, 1):g} s")
+        _draw_snapshot(axes, flight, time_s)
     _frame(panels, flight, margin=False)
     for axes in panels.ravel()[len(times_s) - columns : len(times_s)]:
         axes.tick_params(labelbottom=True)
         axes.set_xlabel("x (m)")
+    _add_snapshot_legend(figure, has_world=flight.coverage is not None)
+
+
+def _draw_snapshot(axes: Axes, flight: FlightRecord, time_s: float) -> None:
+    _draw_world(axes, flight, time_s)
+    _draw_cells(axes, flight, time_s)
+    for robot in flight.robots:
+        _draw_path(axes, robot, 0.0, time_s, style.SWARM)
+    _draw_robots(axes, flight.places_at(time_s), small=True)
+    axes.set_title(f"$t$ = {round(time_s, 1):g} s")
+
+
+def _add_snapshot_legend(figure: Any, *, has_world: bool) -> None:
     handles: list[Any] = [
         _robot_handle(style.SWARM, "robot, its number"),
         Line2D([], [], color=style.SWARM, lw=1.0, label="path so far"),
     ]
-    if flight.coverage is not None:
+    if has_world:
         handles += _world_handles()
     figure.legend(
         handles=handles, loc="outside upper center", ncols=len(handles), fontsize=6.5,

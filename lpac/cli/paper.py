@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lpac.paper.asynchrony import TimingResult
+    from lpac.sim.experiment import Scenario, SimulatedFlight
 
 app = new_app()
 
@@ -32,10 +33,151 @@ def paper() -> None:
     """Repeat the paper's experiments, and make those that it argues for."""
 
 
+Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder for figures, data and README.md; out/paper/NAME if none."),
+]
+
+
+@app.command()
+def e1(
+    *,
+    bundle: Bundle = DEFAULT_BUNDLE,
+    worlds: Annotated[int, typer.Option("--worlds", "-k", help="Of the validation set.")] = 3,
+    ray: Ray = None,
+    as_json: AsJson = False,
+    out: Out = None,
+) -> None:
+    """Transferability: unseen worlds from the same starts, beside baselines; points fly."""
+    from lpac.paper.experiments import transferability
+    from lpac.paper.report import write_transferability
+
+    _at_least(1, worlds, "--worlds")
+    plan = transferability(worlds)
+    flown = iter(_fly([s for of_world in plan.values() for s in of_world.values()], bundle, ray))
+    flights = {world: {name: next(flown) for name in of_world} for world, of_world in plan.items()}
+    folder = _folder(out, "e1")
+    told = write_transferability(flights, folder, _made_by(f"e1 -k {worlds}", bundle))
+    _tell(
+        told, folder, as_json=as_json,
+        lines=[
+            f"{world}: "
+            + ", ".join(f"{name} {f.normalized_cost[-1]:.3f}" for name, f in of_world.items())
+            for world, of_world in flights.items()
+        ],
+    )  # fmt: skip
+
+
+@app.command()
+def e2(
+    *,
+    bundle: Bundle = DEFAULT_BUNDLE,
+    trials: Annotated[int, typer.Option(help="How often.")] = 3,
+    world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
+    ray: Ray = None,
+    as_json: AsJson = False,
+    out: Out = None,
+) -> None:
+    """Repeatability: one world again and again, starts and GPS a little off; points fly."""
+    from lpac.paper.experiments import repeatability
+    from lpac.paper.report import write_repeatability
+
+    _at_least(2, trials, "--trials")
+    plan = repeatability(trials, world)
+    flights = dict(zip(plan, _fly(list(plan.values()), bundle, ray), strict=True))
+    folder = _folder(out, "e2")
+    made_by = _made_by(f"e2 --trials {trials} --world {world}", bundle)
+    told = write_repeatability(flights, folder, made_by)
+    spread = told["spread"]
+    _tell(
+        told, folder, as_json=as_json,
+        lines=[
+            *(f"{name}: {flight.normalized_cost[-1]:.3f}" for name, flight in flights.items()),
+            f"mean {spread['final_mean']:.3f}, standard deviation {spread['final_deviation']:.3f}",
+        ],
+    )  # fmt: skip
+
+
+@app.command()
+def e3(
+    *,
+    bundle: Bundle = DEFAULT_BUNDLE,
+    world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
+    ray: Ray = None,
+    as_json: AsJson = False,
+    out: Out = None,
+) -> None:
+    """Perturbation: robots are taken away at steady state, and brought back; points fly."""
+    from lpac.paper.experiments import perturbation, perturbed
+    from lpac.paper.report import write_perturbation
+
+    [flight] = _fly([perturbation(world)], bundle, ray)
+    folder = _folder(out, "e3")
+    told = write_perturbation(perturbed(flight), folder, _made_by(f"e3 --world {world}", bundle))
+    _tell(
+        told, folder, as_json=as_json,
+        lines=[
+            f"robot {phase['robot']} {'away' if phase['away'] else 'back'}: "
+            f"{phase['cost_before']:.3f} before, {phase['cost_worst']:.3f} at worst, "
+            f"{phase['cost_end']:.3f} in the end, settled after {phase['settled_s']:.0f} s"
+            for phase in told["phases"]
+        ],
+    )  # fmt: skip
+
+
+def _at_least(least: int, value: int, option: str) -> None:
+    if value < least:
+        raise ValueError(f"{option} {value}: must be at least {least}")
+
+
+def _folder(out: Path | None, name: str) -> Path:
+    folder = out or _OUT / name
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _made_by(command: str, bundle: Path) -> dict[str, str]:
+    from edge.policy.bundle import load_bundle
+
+    return {
+        "command": f"lpac paper {command} --bundle {bundle}",
+        "bundle": load_bundle(bundle).id,
+        "lpac-edge": version("lpac-edge"),
+        "python": platform.python_version(),
+    }
+
+
+def _fly(scenarios: "Sequence[Scenario]", bundle: Path, ray: str | None) -> "list[SimulatedFlight]":
+    """All of them, in their order."""
+    from edge.policy.bundle import load_bundle
+    from lpac.paper.flown import fly_all
+
+    load_bundle(bundle)
+    flown: dict[int, SimulatedFlight] = {}
+    with (
+        progress_of("flights") as progress,
+        closing(fly_all(scenarios, bundle.resolve(), pool(ray))) as told,
+    ):
+        task = progress.add_task("", total=len(scenarios))
+        for number, flight in told:
+            flown[number] = flight
+            progress.update(task, advance=1)
+    return [flown[number] for number in range(len(scenarios))]
+
+
+def _tell(told: dict[str, object], folder: Path, *, lines: "Sequence[str]", as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(told, indent=2))
+        return
+    typer.echo("\n".join(lines))
+    typer.echo(f"\nsee {folder}: README.md, figures, and the data")
+
+
 @app.command("async")
 def asynchrony(
     *,
-    bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
+    bundle: Bundle = DEFAULT_BUNDLE,
     worlds: Annotated[
         int | None,
         typer.Option(
@@ -50,10 +192,7 @@ def asynchrony(
     ] = False,
     ray: Ray = None,
     as_json: AsJson = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(help=f"Folder for figures, data and README.md; {_OUT / 'async'} if none."),
-    ] = None,
+    out: Out = None,
 ) -> None:
     """Rates of perception and of messages, in step or not, and late messages: what they cost."""
     from edge.policy.bundle import load_bundle
@@ -82,12 +221,7 @@ def asynchrony(
                 flown[flight] = cost
                 progress.update(task, advance=1)
         results = results_of(plan, flown)
-        command = f"lpac paper async --bundle {bundle} -k {count}{' --quick' if quick else ''}"
-        made_by = {
-            "command": command,
-            "lpac-edge": version("lpac-edge"),
-            "python": platform.python_version(),
-        }
+        made_by = _made_by(f"async -k {count}{' --quick' if quick else ''}", bundle)
         write_report(plan, results, folder, made_by)
     if as_json:
         typer.echo(json.dumps(to_json(plan, results), indent=2))

@@ -29,7 +29,20 @@ def test_rates_and_asynchrony_are_flown_and_kept(tmp_path: Path) -> None:
     assert (tmp_path / "flights.jsonl").read_bytes() == flown
 
 
+def test_trials_are_flown_over_cores(tmp_path: Path) -> None:
+    result = lpac("paper", "e2", "--trials", 2, "--out", tmp_path, "--json")
+    assert result.returncode == 0, (result.stdout, result.stderr)
+    told = json.loads(result.stdout)
+    assert told == json.loads((tmp_path / "e2.json").read_text())
+    finals = [trial["final"] for trial in told["trials"].values()]
+    assert len(finals) == 2 and finals[0] != finals[1] and max(finals) < 0.8
+    assert told["made_by"]["bundle"] == load_bundle(DEFAULT_BUNDLE).id
+    assert (tmp_path / "repeatability.png").exists() and (tmp_path / "README.md").exists()
+
+
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
     no_worlds = lpac("paper", "async", "-k", 0, "--out", tmp_path)
     assert error_line(no_worlds) == "lpac: worlds = 0: must be at least 1"
     assert "absent" in error_line(lpac("paper", "async", "--bundle", "absent"))
+    assert error_line(lpac("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
+    assert error_line(lpac("paper", "e3", "--world", -1)) == "lpac: world = -1: must be at least 0"

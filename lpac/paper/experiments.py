@@ -1,0 +1,220 @@
+"""The paper's three experiments in the air, with points that fly what the policy decides.
+
+Each is a plan: named scenarios, and from what they came to the numbers. What points leave out is
+said in each report: takeoff and landing, heights, wind, a GPS error that walks.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
+from lpac.evaluate.worlds import DrawnWorld, draw_world
+from lpac.sim.baselines import BaselineName
+from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
+from lpac.sim.failure import Failure, alive_at
+
+# E1: what the policy is held against, and when the field is looked at, s.
+BASELINES: tuple[BaselineName, ...] = (
+    "decentralized-cvt", "decentralized-cvt-prior", "frontier-cvt", "clairvoyant-cvt",
+)  # fmt: skip
+_CONTROLLERS: tuple[Controller, ...] = ("lpac", *BASELINES)
+SNAPSHOTS_S = (0.0, 15.0, 30.0, 60.0)
+# E2: how far from their pads robots are placed, m, how wrong their receivers are, m, and for how
+# long the paper looks, s.
+PLACED_WITHIN_M = 0.1
+GPS_ERROR_M = (1.0, 5.0)
+E2_DURATION_S = 40.0
+# E3: when the first robot is taken, for how long, and how long after its return the next is, s.
+TAKEN_AT_S, AWAY_S, BACK_S = 60.0, 20.0, 40.0
+TAKEN = (0, 3, 7)
+# Settled is what stays within so much of what it comes to in the end.
+_SETTLED = 0.05
+
+
+def _world(number: int) -> DrawnWorld:
+    return draw_world("validation", number, FIELD_SET_UP)
+
+
+def _starts_m(world: DrawnWorld) -> F64:
+    starts_m: F64 = FIELD_SCALE.position_to_mission_m(np.array(world.starts))
+    return starts_m
+
+
+def _pairs(rows: F64) -> tuple[tuple[float, float], ...]:
+    return tuple((x, y) for x, y in rows.tolist())
+
+
+def transferability(worlds: int = 3) -> dict[str, dict[str, Scenario]]:
+    """E1: worlds that no policy was trained on, the same starts; by world, and who flies."""
+    starts_m = _pairs(_starts_m(_world(0)))
+    return {
+        f"world {number}": {
+            controller: Scenario(
+                controller=controller,
+                robots=FIELD_SET_UP.robots,
+                seed=world.seed,
+                features=world.features,
+                starts_m=starts_m,
+                duration_s=SNAPSHOTS_S[-1],
+            )
+            for controller in _CONTROLLERS
+        }
+        for number, world in ((number, _world(number)) for number in range(worlds))
+    }
+
+
+def repeatability(trials: int = 3, world: int = 0) -> dict[str, Scenario]:
+    """E2: one world again and again, from about the same starts, receivers wrong each time anew."""
+    drawn, robots = _world(world), FIELD_SET_UP.robots
+    scenarios = {}
+    for trial in range(trials):
+        rng = np.random.default_rng(np.random.SeedSequence([drawn.seed, trial]))
+        placed_m = _starts_m(drawn) + _around(rng.uniform(0.0, 1.0, robots) ** 0.5, rng)
+        error_m = _around(rng.uniform(*GPS_ERROR_M, robots) / PLACED_WITHIN_M, rng)
+        scenarios[f"trial {trial + 1}"] = Scenario(
+            robots=robots,
+            seed=drawn.seed + trial,
+            features=drawn.features,
+            starts_m=_pairs(placed_m),
+            position_bias=_pairs(error_m * FIELD_SCALE.env_scale),
+            duration_s=E2_DURATION_S,
+        )
+    return scenarios
+
+
+def _around(radii: F64, rng: np.random.Generator) -> F64:
+    """So many times `PLACED_WITHIN_M`, m, each in a direction of its own."""
+    angles = rng.uniform(0.0, 2.0 * np.pi, len(radii))
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    offsets_m: F64 = PLACED_WITHIN_M * radii[:, None] * directions
+    return offsets_m
+
+
+def perturbation(world: int = 0) -> Scenario:
+    """E3: at steady state a robot is taken away, and brought back to where it was; three times."""
+    drawn = _world(world)
+    failures = [
+        Failure(robot, from_s, from_s + AWAY_S)
+        for robot, from_s in zip(TAKEN, _taken_at_s(), strict=True)
+    ]
+    return Scenario(
+        robots=FIELD_SET_UP.robots,
+        seed=drawn.seed,
+        features=drawn.features,
+        starts_m=_pairs(_starts_m(drawn)),
+        duration_s=TAKEN_AT_S + len(TAKEN) * (AWAY_S + BACK_S),
+        failures=tuple(failures),
+    )
+
+
+def _taken_at_s() -> list[float]:
+    return [TAKEN_AT_S + number * (AWAY_S + BACK_S) for number in range(len(TAKEN))]
+
+
+class Phase(NamedTuple):
+    """Of E3: a robot is away, or back; the costs are over that at the start.
+
+    `settled_s` is how long after the phase began the cost last was further than 5 % from what it
+    came to at its end.
+    """
+
+    robot: int
+    away: bool
+    from_s: float
+    until_s: float
+    cost_before: float
+    cost_worst: float
+    cost_end: float
+    settled_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerturbedFlight:
+    """E3's flight, at times (T,), s: `speed_m_s` and `neighbours` (T, N), NaN of who is away."""
+
+    flight: SimulatedFlight
+    time_s: F64
+    speed_m_s: F64
+    neighbours: F64
+    phases: tuple[Phase, ...]
+
+
+def perturbed(flight: SimulatedFlight) -> PerturbedFlight:
+    """What a flight of `perturbation` says."""
+    time_s, positions_m = flight.time_s, flight.positions_m
+    scenario = flight.scenario
+    alive = np.array([alive_at(scenario.robots, scenario.failures, t) for t in time_s.tolist()])
+    speed_m_s = np.linalg.norm(np.gradient(positions_m, SAMPLE_S, axis=0), axis=2)
+    range_m = flight.perception.communication_range / scenario.scale.env_scale
+    apart_m = np.linalg.norm(positions_m[:, :, None] - positions_m[:, None], axis=3)
+    heard = (apart_m < range_m) & alive[:, :, None] & alive[:, None, :]
+    neighbours = heard.sum(axis=2) - 1.0
+    for values in (speed_m_s, neighbours):
+        values[~alive] = np.nan
+    ends_s = [failure.from_s for failure in scenario.failures[1:]] + [scenario.duration_s]
+    phases = tuple(
+        phase
+        for failure, end_s in zip(scenario.failures, ends_s, strict=True)
+        for phase in (
+            _phase(flight, failure.robot, True, failure.from_s, failure.until_s),
+            _phase(flight, failure.robot, False, failure.until_s, end_s),
+        )
+    )
+    return PerturbedFlight(flight, time_s, speed_m_s, neighbours, phases)
+
+
+def _phase(flight: SimulatedFlight, robot: int, away: bool, from_s: float, until_s: float) -> Phase:
+    times_s, cost = flight.cost_time_s, flight.normalized_cost
+    inside = (times_s >= from_s) & (times_s < until_s)
+    its_s, its = times_s[inside], cost[inside]
+    off = np.flatnonzero(np.abs(its / its[-1] - 1.0) > _SETTLED)
+    return Phase(
+        robot=robot,
+        away=away,
+        from_s=from_s,
+        until_s=until_s,
+        cost_before=float(cost[times_s < from_s][-1]),
+        cost_worst=float(its.max()),
+        cost_end=float(its[-1]),
+        settled_s=float(its_s[off[-1]] - from_s) if len(off) else 0.0,
+    )
+
+
+def curves_json(flights: Mapping[str, SimulatedFlight]) -> dict[str, Any]:
+    """Of each flight, by name: its cost over that at the start."""
+    return {
+        name: {
+            "time_s": flight.cost_time_s.tolist(),
+            "normalized_cost": flight.normalized_cost.tolist(),
+            "final": float(flight.normalized_cost[-1]),
+            "final_positions_m": flight.positions_m[-1].tolist(),
+        }
+        for name, flight in flights.items()
+    }
+
+
+def curves_csv(flights: Mapping[str, SimulatedFlight]) -> list[list[object]]:
+    """A heading, and a row for each flight and time."""
+    rows: list[list[object]] = [["flight", "time_s", "cost_over_first"]]
+    for name, flight in flights.items():
+        curve = zip(flight.cost_time_s.tolist(), flight.normalized_cost.tolist(), strict=True)
+        rows += [[name, time_s, cost] for time_s, cost in curve]
+    return rows
+
+
+def spread_of(flights: Sequence[SimulatedFlight]) -> dict[str, float]:
+    """Of E2's trials: how the costs at the end, and the places, differ."""
+    final = np.array([flight.normalized_cost[-1] for flight in flights])
+    curves = np.array([flight.normalized_cost for flight in flights])
+    ends_m = np.array([flight.positions_m[-1] for flight in flights])
+    scatter_m = np.linalg.norm(ends_m - ends_m.mean(axis=0), axis=2)
+    return {
+        "final_mean": float(final.mean()),
+        "final_deviation": float(final.std(ddof=1)),
+        "largest_deviation_in_flight": float(curves.std(axis=0, ddof=1).max()),
+        "mean_scatter_of_ends_m": float(scatter_m.mean()),
+    }

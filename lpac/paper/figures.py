@@ -1,0 +1,68 @@
+"""What the paper's experiments show, where no figure of a flight shows it."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lpac.analysis import style
+from lpac.analysis.style import CURVES, WIDTH_IN, tidy
+from lpac.paper.experiments import PerturbedFlight
+from lpac.sim.experiment import SimulatedFlight
+
+
+def costs_by_world(flights: Mapping[str, Mapping[str, SimulatedFlight]]) -> Figure:
+    """A panel for each world, a curve for each who flew."""
+    with style.figure(WIDTH_IN, 2.6) as figure:
+        panels = figure.subplots(1, len(flights), squeeze=False, sharey=True)[0]
+        for axes, (world, of_world) in zip(panels, flights.items(), strict=True):
+            for (colour, dashes), (name, flight) in zip(CURVES, of_world.items(), strict=False):
+                axes.plot(
+                    flight.cost_time_s, flight.normalized_cost, color=colour, ls=dashes, lw=1.2,
+                    label=name,
+                )  # fmt: skip
+            axes.set(title=world, xlabel="time (s)")
+            tidy(axes)
+        panels[0].set(ylabel=r"coverage cost $J(t)\,/\,J(0)$", ylim=(0.0, None))
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=6.5)
+        return figure
+
+
+def perturbation(perturbed: PerturbedFlight) -> Figure:
+    """Cost, neighbours and speeds over time; shaded while a robot is away."""
+    flight = perturbed.flight
+    with style.figure(WIDTH_IN, 4.6) as figure:
+        cost, neighbours, speed = figure.subplots(3, 1, sharex=True)
+        cost.plot(flight.cost_time_s, flight.normalized_cost, color=style.BLACK, lw=1.3)
+        cost.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, None))
+        for axes, values in ((neighbours, perturbed.neighbours), (speed, perturbed.speed_m_s)):
+            for robot, of_robot in enumerate(values.T):
+                taken = any(failure.robot == robot for failure in flight.scenario.failures)
+                colour = style.VERMILLION if taken else style.FAINT
+                axes.plot(perturbed.time_s, of_robot, color=colour, lw=0.5)
+            mean = np.nanmean(values, axis=1)
+            axes.plot(perturbed.time_s, mean, color=style.BLACK, lw=1.3)
+        neighbours.set(ylabel="neighbours in range")
+        speed.set(ylabel="speed (m/s)", ylim=(0.0, None), xlabel="time (s)",
+                  xlim=(0.0, flight.scenario.duration_s))  # fmt: skip
+        for axes in (cost, neighbours, speed):
+            for failure in flight.scenario.failures:
+                axes.axvspan(failure.from_s, failure.until_s, color=style.NOTHING, zorder=0)
+            tidy(axes)
+        for failure in flight.scenario.failures:
+            middle_s = (failure.from_s + failure.until_s) / 2.0
+            cost.annotate(
+                f"{failure.robot} away", (middle_s, 1.0), xycoords=("data", "axes fraction"),
+                ha="center", va="bottom", fontsize=7,
+            )  # fmt: skip
+        axes_of_legend = [
+            ("black: cost, or the robots' mean", style.BLACK),
+            ("a robot that is taken once", style.VERMILLION),
+            ("another robot", style.FAINT),
+        ]
+        handles = [cost.plot([], [], color=colour)[0] for _, colour in axes_of_legend]
+        figure.legend(
+            handles, [label for label, _ in axes_of_legend], loc="outside upper center", ncols=3
+        )
+        return figure

@@ -1,0 +1,161 @@
+"""The experiments in the air as files: figures as PNG and PDF, CSV, JSON, and README.md."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from lpac.analysis import figures, style
+from lpac.paper import experiments
+from lpac.paper.experiments import PerturbedFlight, curves_csv, curves_json
+from lpac.paper.figures import costs_by_world, perturbation
+from lpac.sim.experiment import SimulatedFlight
+
+_POINTS = (
+    "Points flew, each at once with the velocity that its policy decided: without takeoff and "
+    "landing, heights, wind, and with a GPS error that stays as it is."
+)
+
+
+def write_transferability(
+    flights: Mapping[str, Mapping[str, SimulatedFlight]], folder: Path, made_by: Mapping[str, str]
+) -> dict[str, Any]:
+    """E1's; gives its JSON. Raises OSError."""
+    policies = {world: of_world["lpac"].record for world, of_world in flights.items()}
+    style.save(
+        figures.snapshots_of_several(policies, experiments.SNAPSHOTS_S), folder / "snapshots"
+    )
+    style.save(costs_by_world(flights), folder / "costs")
+    told = {world: curves_json(of_world) for world, of_world in flights.items()}
+    named = {
+        f"{world}, {name}": flight
+        for world, of_world in flights.items()
+        for name, flight in of_world.items()
+    }
+    names = list(next(iter(flights.values())))
+    rows = [
+        [world, *(f"{of_world[name].normalized_cost[-1]:.3f}" for name in names)]
+        for world, of_world in flights.items()
+    ]
+    text = f"""# E1, transferability
+
+The paper flies one policy over three worlds that it was not trained on, from the same starts, and
+shows them at 0, 15, 30 and 60 s; it gives no costs. Here the worlds are the first of the validation
+set, all from the starts of the first. {_POINTS}
+
+![snapshots](snapshots.png)
+
+![costs](costs.png)
+
+Cost after {experiments.SNAPSHOTS_S[-1]:g} s over that at the start:
+
+{_table(["", *names], rows)}
+"""
+    return _write("e1", told, curves_csv(named), text, folder, made_by)
+
+
+def write_repeatability(
+    flights: Mapping[str, SimulatedFlight], folder: Path, made_by: Mapping[str, str]
+) -> dict[str, Any]:
+    """E2's; gives its JSON. Raises OSError."""
+    first = next(iter(flights.values())).record
+    # All of one world: it is drawn below their ends.
+    records = [
+        replace(flight.record, name=name, coverage=first.coverage)
+        for name, flight in flights.items()
+    ]
+    style.save(figures.repeatability(records), folder / "repeatability")
+    spread = experiments.spread_of(list(flights.values()))
+    least_m, most_m = experiments.GPS_ERROR_M
+    rows = [[name, f"{flight.normalized_cost[-1]:.3f}"] for name, flight in flights.items()]
+    text = f"""# E2, repeatability
+
+The paper flies one world three times, each robot placed within 10 cm of the same start, and shows
+the cost over 40 s from the takeoff command: the curves differ, the costs at the end are similar,
+and GPS (1 to 5 m) scatters where robots end. Here {len(flights)} trials over a world of the
+validation set; starts are off by {100 * experiments.PLACED_WITHIN_M:g} cm at most, and each robot
+is wrong about its place by {least_m:g} to {most_m:g} m, each time anew. {_POINTS} The 40 s count
+from the start.
+
+![repeatability](repeatability.png)
+
+{_table(["", f"cost after {experiments.E2_DURATION_S:g} s / at the start"], rows)}
+
+Costs at the end: mean {spread["final_mean"]:.3f}, standard deviation
+{spread["final_deviation"]:.3f}; in flight the deviation is
+{spread["largest_deviation_in_flight"]:.3f} at most. A robot ends
+{spread["mean_scatter_of_ends_m"]:.2f} m from the mean of its ends, on average.
+"""
+    told = {"trials": curves_json(flights), "spread": spread}
+    return _write("e2", told, curves_csv(flights), text, folder, made_by)
+
+
+def write_perturbation(
+    perturbed: PerturbedFlight, folder: Path, made_by: Mapping[str, str]
+) -> dict[str, Any]:
+    """E3's; gives its JSON. Raises OSError."""
+    style.save(perturbation(perturbed), folder / "perturbation")
+    rows = [
+        [
+            f"robot {phase.robot} {'away' if phase.away else 'back'}",
+            f"{phase.from_s:g} to {phase.until_s:g} s",
+            f"{phase.cost_before:.3f}", f"{phase.cost_worst:.3f}", f"{phase.cost_end:.3f}",
+            f"{phase.settled_s:.0f} s",
+        ]
+        for phase in perturbed.phases
+    ]  # fmt: skip
+    headings = ["", "when", "cost before", "worst", "at the end", "settled after"]
+    text = f"""# E3, perturbation
+
+In each of the paper's experiments a pilot takes one robot at steady state, flies it out of the area
+and brings it back to about the same place; it has no figure of its own. Here
+{len(experiments.TAKEN)} robots of one flight are taken one after another: each is gone, says and
+hears nothing and does not count, and is back where it was, knowing nothing. {_POINTS}
+
+![perturbation](perturbation.png)
+
+{_table(headings, rows)}
+
+Costs are over that at the start. Settled: from then on the cost stayed within 5 % of what it came
+to when the next thing happened, or the flight ended.
+"""
+    flight = perturbed.flight
+    told = {
+        "flight": curves_json({"lpac": flight})["lpac"],
+        "phases": [phase._asdict() for phase in perturbed.phases],
+    }
+    rows_csv: list[list[object]] = [["time_s", "robot", "speed_m_s", "neighbours"]]
+    for time_s, speeds, neighbours in zip(
+        perturbed.time_s.tolist(), perturbed.speed_m_s, perturbed.neighbours, strict=True
+    ):
+        robots = enumerate(zip(speeds.tolist(), neighbours.tolist(), strict=True))
+        rows_csv += [[time_s, robot, speed, heard] for robot, (speed, heard) in robots]
+    return _write("e3", told, rows_csv, text, folder, made_by)
+
+
+def _write(
+    name: str,
+    told: Mapping[str, Any],
+    rows: Sequence[Sequence[object]],
+    text: str,
+    folder: Path,
+    made_by: Mapping[str, str],
+) -> dict[str, Any]:
+    document = {**told, "made_by": dict(made_by)}
+    (folder / f"{name}.json").write_text(json.dumps(document, indent=2) + "\n")
+    written = io.StringIO()
+    csv.writer(written, lineterminator="\n").writerows(rows)
+    (folder / f"{name}.csv").write_text(written.getvalue())
+    made = "; ".join(f"{what}: `{value}`" for what, value in made_by.items())
+    (folder / "README.md").write_text(
+        f"{text}\n`{name}.csv` and `{name}.json` have it all. {made}.\n"
+    )
+    return document
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,0 +1,126 @@
+"""The paper's experiments in the air: what is flown, and what is made of it."""
+
+import csv
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge.policy.bundle import Bundle
+from lpac.paper.experiments import (
+    AWAY_S,
+    BASELINES,
+    E2_DURATION_S,
+    TAKEN,
+    TAKEN_AT_S,
+    perturbation,
+    perturbed,
+    repeatability,
+    spread_of,
+    transferability,
+)
+from lpac.paper.report import write_perturbation, write_repeatability, write_transferability
+from lpac.sim.experiment import FIELD_SCALE, fly
+from lpac.sim.failure import Failure
+
+MADE_BY = {"command": "lpac paper ..."}
+
+
+def test_worlds_differ_and_starts_do_not() -> None:
+    plan = transferability(3)
+    assert list(plan) == ["world 0", "world 1", "world 2"]
+    scenarios = [scenario for of_world in plan.values() for scenario in of_world.values()]
+    assert len({scenario.starts_m for scenario in scenarios}) == 1
+    for of_world in plan.values():
+        assert list(of_world) == ["lpac", *BASELINES]
+        assert len({scenario.features for scenario in of_world.values()}) == 1
+        assert all(name == scenario.controller for name, scenario in of_world.items())
+    assert len({scenario.features for scenario in scenarios}) == 3
+
+
+def test_trials_differ_by_placing_and_gps_alone() -> None:
+    trials = list(repeatability(5).values())
+    assert repeatability(5) == repeatability(5)
+    assert len({trial.features for trial in trials}) == 1
+    assert {trial.duration_s for trial in trials} == {E2_DURATION_S}
+    [truth] = {scenario.starts_m for scenario in transferability(1)["world 0"].values()}
+    errors_m = []
+    for trial in trials:
+        assert truth and trial.starts_m and trial.position_bias
+        placed_m = np.linalg.norm(np.subtract(trial.starts_m, truth), axis=1)
+        assert 0.0 < placed_m.max() <= 0.1
+        errors_m.append(np.array(trial.position_bias) / FIELD_SCALE.env_scale)
+        far_m = np.linalg.norm(errors_m[-1], axis=1)
+        assert 1.0 <= far_m.min() < far_m.max() <= 5.0
+    assert all(not np.array_equal(one, other) for one, other in pairwise(errors_m))
+
+
+def test_three_robots_are_taken_one_after_another() -> None:
+    scenario = perturbation()
+    assert [failure.robot for failure in scenario.failures] == list(TAKEN)
+    assert scenario.failures[0].from_s == TAKEN_AT_S
+    for failure, later in pairwise(scenario.failures):
+        assert failure.until_s == failure.from_s + AWAY_S < later.from_s
+    assert scenario.failures[-1].until_s < scenario.duration_s
+
+
+def test_who_is_away_does_not_count(shipped_bundle: Bundle, tmp_path: Path) -> None:
+    scenario = replace(perturbation(), duration_s=6.0, failures=(Failure(2, 2.0, 4.0),))
+    flight = fly(scenario, shipped_bundle)
+    told = perturbed(flight)
+    away = (told.time_s >= 2.0) & (told.time_s < 4.0)
+    np.testing.assert_array_equal(np.isnan(told.speed_m_s[:, 2]), away)
+    assert not np.isnan(np.delete(told.speed_m_s, 2, axis=1)).any()
+    # Who was in its range has one neighbour less.
+    before, after = (int(np.searchsorted(told.time_s, at_s)) for at_s in (1.8, 2.2))
+    lost = np.delete(told.neighbours[before] - told.neighbours[after], 2)
+    assert lost.max() >= 1.0
+    assert np.nanmax(told.speed_m_s) <= 1.25 + 0.01
+    gone, back = told.phases
+    assert (gone.robot, gone.away, gone.from_s, gone.until_s) == (2, True, 2.0, 4.0)
+    assert (back.away, back.from_s, back.until_s) == (False, 4.0, 6.0)
+    cost = dict(zip(flight.cost_time_s.tolist(), flight.normalized_cost.tolist(), strict=True))
+    assert gone.cost_before == cost[1.0] and gone.cost_worst == max(cost[2.0], cost[3.0])
+    assert back.cost_end == cost[5.0]
+
+    write_perturbation(told, tmp_path, MADE_BY)
+    rows = list(csv.DictReader((tmp_path / "e3.csv").read_text().splitlines()))
+    assert len(rows) == 10 * len(told.time_s)
+    document = json.loads((tmp_path / "e3.json").read_text())
+    assert document["made_by"] == MADE_BY and len(document["phases"]) == 2
+    assert (tmp_path / "perturbation.png").stat().st_size > 20_000
+    assert "| robot 2 away | 2 to 4 s |" in (tmp_path / "README.md").read_text()
+
+
+def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) -> None:
+    trials = {
+        name: fly(replace(scenario, duration_s=3.0), shipped_bundle)
+        for name, scenario in repeatability(2).items()
+    }
+    spread = spread_of(list(trials.values()))
+    finals = [flight.normalized_cost[-1] for flight in trials.values()]
+    assert spread["final_mean"] == pytest.approx(np.mean(finals))
+    assert spread["final_deviation"] == pytest.approx(np.std(finals, ddof=1))
+    ends_m = [flight.positions_m[-1] for flight in trials.values()]
+    apart_m = np.linalg.norm(ends_m[0] - ends_m[1], axis=1).mean()
+    assert spread["mean_scatter_of_ends_m"] == pytest.approx(apart_m / 2.0)
+    told = write_repeatability(trials, tmp_path / "e2", MADE_BY)
+    assert told["trials"]["trial 2"]["final"] == pytest.approx(finals[1])
+    assert (tmp_path / "e2" / "repeatability.pdf").exists()
+
+    plan = transferability(2)
+    worlds = {
+        world: {
+            name: fly(replace(of_world[name], duration_s=1.0), shipped_bundle)
+            for name in ("lpac", "decentralized-cvt-prior")
+        }
+        for world, of_world in plan.items()
+    }
+    write_transferability(worlds, tmp_path / "e1", MADE_BY)
+    for name in ("snapshots.png", "snapshots.pdf", "costs.png", "e1.csv", "e1.json"):
+        assert (tmp_path / "e1" / name).stat().st_size > 100
+    text = (tmp_path / "e1" / "README.md").read_text()
+    assert "| world 1 | " in text and "`lpac paper ...`" in text
