@@ -14,7 +14,7 @@ from lpac.cli.options import DEFAULT_BUNDLE, AsJson, Ray, folder_lock, pool
 from lpac.cli.printing import print_table, progress_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from lpac.paper.asynchrony import TimingResult
     from lpac.sim.experiment import Scenario, SimulatedFlight
@@ -26,6 +26,11 @@ _WORLDS, _QUICK_WORLDS = 50, 4
 # Enough to see whether slower or faster is better.
 _QUICK_HZ = {"perception_hz": (1.0, 5.0), "policy_hz": (0.5, 2.5, 10.0)}
 _QUICK_DELAYS_S = (0.0, 0.8)
+_QUICK_SET_UPS = ("field", "n3", "n32", "features-20", "range-128")
+# They take hours.
+_TOO_LARGE = ("n300", "n1000")
+# Robots, repetitions, s.
+_QUICK_NETWORK = (3, 1, 8.0)
 
 
 @app.callback()
@@ -34,6 +39,7 @@ def paper() -> None:
 
 
 Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Little of it, in a few minutes.")]
 Out = Annotated[
     Path | None,
     typer.Option(help="Folder for figures, data and README.md; out/paper/NAME if none."),
@@ -137,13 +143,17 @@ def _folder(out: Path | None, name: str) -> Path:
     return folder
 
 
-def _made_by(command: str, bundle: Path) -> dict[str, str]:
+def _made_by(command: str, bundle: Path | None) -> dict[str, str]:
+    import edge
+    import lpac
     from edge.policy.bundle import load_bundle
+    from lpac.sim.kept import code_digest
 
+    policy = {"bundle": load_bundle(bundle).id} if bundle else {}
     return {
-        "command": f"lpac paper {command} --bundle {bundle}",
-        "bundle": load_bundle(bundle).id,
-        "lpac-edge": version("lpac-edge"),
+        "command": f"lpac paper {command}{f' --bundle {bundle}' if bundle else ''}",
+        **policy,
+        "lpac-edge": f"{version('lpac-edge')}, code {code_digest(edge, lpac)[:12]}",
         "python": platform.python_version(),
     }
 
@@ -187,9 +197,7 @@ def asynchrony(
             f"given, {_QUICK_WORLDS} with --quick.",
         ),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few rates over few worlds: a minute or two.")
-    ] = False,
+    quick: Quick = False,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
@@ -228,6 +236,106 @@ def asynchrony(
         return
     _show(results)
     typer.echo(f"\nsee {folder}: README.md, rates.png, staleness.png, async.csv, async.json")
+
+
+@app.command()
+def transfer(
+    *,
+    bundles: Annotated[
+        list[Path] | None,
+        typer.Option("--bundle", help="Policy bundle; may be repeated. The shipped one if none."),
+    ] = None,
+    worlds: Annotated[
+        int | None,
+        typer.Option("--worlds", "-k", help="Of the validation set: 20, or 2 with --quick."),
+    ] = None,
+    quick: Quick = False,
+    ray: Ray = None,
+    as_json: AsJson = False,
+    out: Out = None,
+) -> None:
+    """Other numbers of robots, features and ranges: `lpac evaluate` in the paper's set-ups."""
+    from lpac.cli.evaluate import evaluate
+    from lpac.evaluate.worlds import SET_UPS
+
+    large = [name for name in SET_UPS if name not in _TOO_LARGE]
+    evaluate(
+        methods=[str(bundle) for bundle in bundles or [DEFAULT_BUNDLE]],
+        set_ups=[*_QUICK_SET_UPS] if quick else large,
+        worlds=worlds if worlds is not None else 2 if quick else 20,
+        baselines=["clairvoyant-cvt"],
+        ray=ray,
+        as_json=as_json,
+        out=_folder(out, "transfer"),
+    )
+
+
+@app.command()
+def network(
+    *,
+    namespaces: Annotated[
+        str | None,
+        typer.Option(metavar="NAME,NAME...", help="As `lpac bench network` has them."),
+    ] = None,
+    quick: Quick = False,
+    as_json: AsJson = False,
+    out: Out = None,
+) -> None:
+    """Table I, and throughput over the number of robots: `lpac bench network`, as installed."""
+    from lpac.cli.bench import network as measure
+    from lpac.network.middleware import MIDDLEWARES
+
+    robots, repetitions, seconds = _QUICK_NETWORK if quick else (None, None, None)
+    measure(
+        middlewares=[name for name, its in MIDDLEWARES.items() if its.version() is not None],
+        robots=robots,
+        repetitions=repetitions,
+        seconds=seconds,
+        namespaces=namespaces,
+        as_json=as_json,
+        out=_folder(out, "network"),
+    )
+
+
+@app.command("all")
+def everything(
+    *,
+    bundle: Bundle = DEFAULT_BUNDLE,
+    quick: Quick = False,
+    ray: Ray = None,
+    out: Out = None,
+) -> None:
+    """All of them, and one page: each claim of the paper beside what came of it here.
+
+    What was made with the same bundle and code is not made again.
+    """
+    from edge.policy.bundle import load_bundle
+    from lpac.paper.repeated import write_page
+
+    folder = out or _OUT
+    loaded = load_bundle(bundle)
+    flying: dict[str, Callable[[Path], None]] = {
+        "e1": lambda its: e1(bundle=bundle, ray=ray, out=its),
+        "e2": lambda its: e2(bundle=bundle, ray=ray, out=its),
+        "e3": lambda its: e3(bundle=bundle, ray=ray, out=its),
+        "transfer": lambda its: transfer(bundles=[bundle], quick=quick, ray=ray, out=its),
+        "async": lambda its: asynchrony(bundle=bundle, quick=quick, ray=ray, out=its),
+        "network": lambda its: network(quick=quick, out=its),
+    }
+    made_by = {}
+    for name, make in flying.items():
+        its = folder / name
+        # A quick one of some is the only one that there is.
+        option = " --quick" if quick and name not in ("e1", "e2", "e3") else ""
+        made_by[name] = _made_by(f"{name}{option}", None if name == "network" else bundle)
+        kept = its / "made_by.json"
+        if kept.exists() and json.loads(kept.read_text()) == made_by[name]:
+            continue
+        typer.echo(f"{name}\n")
+        make(its)
+        typer.echo()
+        kept.write_text(json.dumps(made_by[name]) + "\n")
+    typer.echo(f"see {write_page(folder, loaded, made_by)}")
 
 
 def _show(results: "Sequence[TimingResult]") -> None:

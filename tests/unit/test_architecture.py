@@ -67,7 +67,7 @@ ALLOWED = {
     "lpac.ablate": {
         *_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate", "lpac.train",
     },
-    "lpac.paper": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate"},
+    "lpac.paper": {*_EDGE, "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.evaluate"},
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
         "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
