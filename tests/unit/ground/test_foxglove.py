@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from foxglove import Context
+from foxglove import Context, layouts
 from mcap.reader import make_reader
 
 from edge.drivers.flight_log import ROBOT_TOPICS, FlightLog
@@ -223,6 +223,47 @@ def test_every_panel_is_placed_once() -> None:
     assert panels(LAYOUT["layout"]) == CONFIG.keys()
     kinds = {panel.partition("!")[0] for panel in CONFIG}
     assert kinds == {"3D", "Plot", "StateTransitions", "Table", "RosOut", "RawMessages", "Tab"}
+
+
+_BY_KIND: dict[str, Any] = {
+    "3D": layouts.ThreeDeeConfig,
+    "Plot": layouts.PlotConfig,
+    "StateTransitions": layouts.StateTransitionsConfig,
+    "Table": layouts.TableConfig,
+    "RosOut": layouts.LogConfig,
+    "RawMessages": layouts.RawMessagesConfig,
+}
+_BY_SCHEMA: dict[str, Any] = {
+    "foxglove.Grid": layouts.BaseRendererGridTopicSettings,
+    "foxglove.SceneUpdate": layouts.BaseRendererSceneUpdateTopicSettings,
+    "foxglove.PoseInFrame": layouts.BaseRendererPoseTopicSettings,
+}
+
+
+def keys(kind: Any) -> set[str]:
+    return set(kind()._to_dict())
+
+
+def test_panels_have_settings_that_foxglove_knows() -> None:
+    """As its SDK describes them; a file's panels also have their titles."""
+    topics = schemas()
+    for panel, config in CONFIG.items():
+        kind = panel.partition("!")[0]
+        if kind == "Tab":
+            continue
+        assert config.keys() - {"title", "foxglovePanelTitle"} <= keys(_BY_KIND[kind]), panel
+        for entry in config.get("paths", ()):
+            series = {
+                "Plot": layouts.PlotSeries,
+                "StateTransitions": layouts.StateTransitionsSeries,
+            }
+            assert entry.keys() <= keys(series[kind]), panel
+        for topic, drawn in config.get("topics", {}).items():
+            assert drawn.keys() <= keys(_BY_SCHEMA[topics[topic][0]]), topic
+        assert config.get("cameraState", {}).keys() <= keys(layouts.ThreeDeeCameraState)
+        scene = config.get("scene", {})
+        assert scene.keys() <= keys(layouts.BaseRendererSceneSettings)
+        assert scene.get("transforms", {}).keys() <= keys(layouts.BaseRendererTransforms)
 
 
 def paths() -> list[str]:
