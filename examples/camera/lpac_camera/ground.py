@@ -53,9 +53,14 @@ class Ground:
     def photograph(
         self, camera: Pinhole, position: F64, height: float, rng: np.random.Generator
     ) -> npt.NDArray[np.uint8]:
-        """(rows, columns, 3): what the camera sees from there; beyond the world it is black."""
+        """(rows, columns, 3): what the camera sees from there; nothing grows beyond the world."""
         image = np.moveaxis(_seen(self.colors, TEXELS, camera, position, height), 0, -1)
-        image = image / np.float32(255.0) + _NOISE * rng.standard_normal(image.shape, np.float32)
+        image = image / np.float32(255.0)
+        world = np.array([0.0, len(self.importance)])
+        in_x, in_y = (shares(axis, world)[:, 0] for axis in camera.edges(position, height))
+        beyond = 1.0 - np.outer(in_y[::-1], in_x)[:, :, None]
+        image += beyond * np.mean([_MEADOW, _SOIL], axis=0, dtype=np.float32)
+        image += _NOISE * rng.standard_normal(image.shape, np.float32)
         return np.asarray(np.rint(255.0 * np.clip(image, 0.0, 1.0)), np.uint8)
 
     def cover(self, camera: Pinhole, position: F64, height: float) -> F32:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F64
+from edge.core.perception import part_in_world, window_corner
 from edge.core.ports import Look, SensorOver, SensorSetting
 from edge.core.schema import from_mapping
 from lpac_camera.detector import MARGIN, Detector
@@ -66,7 +67,12 @@ class RenderedCamera:
         importance = self._detector.importance(self.photograph(position, height))
         x, y = self._camera.edges(position, height, MARGIN)
         cells, seen = onto_cells(importance, x, y, position, self._size)
-        return Look(np.clip(smoothed(cells, seen, self._smoothing), 0.0, 1.0), seen)
+        # Beyond the world there is no importance, and none is taken from within it.
+        world = np.zeros_like(seen)
+        corner = window_corner(position, self._size)
+        world[part_in_world(corner, self._size, len(self._ground.importance))[1]] = True
+        means = smoothed(cells, seen & world, self._smoothing)
+        return Look(np.where(world, np.clip(means, 0.0, 1.0), np.float32(0.0)), seen)
 
 
 @contextmanager
