@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from foxglove import Context, layouts
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 
 from edge.drivers.flight_log import ROBOT_TOPICS, FlightLog
 from edge.messages.codec import encode
 from edge.messages.mission import FlightState, explored_to_bytes
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, GroundEvent
-from lpac.cli.foxglove import _LAYOUT
+from lpac.cli.foxglove import _LAYOUT, app
 from lpac.ground.foxglove.channels import Channels
 from lpac.ground.foxglove.logs import convert, ground_logs
 from lpac.ground.foxglove.view import FRAME, FoxgloveView
@@ -189,6 +190,16 @@ def test_without_a_grounds_log_it_says_what_helps(tmp_path: Path) -> None:
         ground_logs(tmp_path)
     with pytest.raises(ValueError, match="is not a folder"):
         ground_logs(tmp_path / "absent")
+
+
+def test_the_commands_write_what_they_say(tmp_path: Path) -> None:
+    recorded(tmp_path / "logs")
+    for arguments in (["layout", "-o", "panels.json"], ["log", "logs", "-o", "fleet.mcap"]):
+        paths = [str(tmp_path / a) if a[0] != "-" and i else a for i, a in enumerate(arguments)]
+        told = CliRunner().invoke(app, paths)
+        assert told.exit_code == 0 and paths[-1] in told.stdout, told
+    assert json.loads((tmp_path / "panels.json").read_text()) == LAYOUT
+    assert (tmp_path / "fleet.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
 
 
 # The layout
