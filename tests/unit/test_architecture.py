@@ -101,6 +101,7 @@ ONLY_IN = {
     "rich": {"lpac/cli/", "lpac/ground/terminal/"},
     "textual": {"lpac/ground/terminal/"},
     "aiohttp": {"lpac/ground/map/"},
+    "foxglove": {"lpac/ground/foxglove/"},
     "tomlkit": {"lpac/fleet/writer.py"},
     "nacl": {"edge/identity/signature.py", "edge/identity/group.py"},
     "cryptography": {"lpac/fleet/authority.py", "lpac/fleet/web_certificate.py"},
