@@ -68,6 +68,10 @@ ALLOWED = {
         *_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate", "lpac.train",
     },
     "lpac.paper": {*_EDGE, "lpac.analysis", "lpac.sim", "lpac.evaluate"},
+    # The Python API: hands on what these have.
+    "lpac.api": {
+        *_EDGE, "lpac.shipped", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.evaluate",
+    },
     "lpac.cli": {
         *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
         "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
