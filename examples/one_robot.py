@@ -54,6 +54,7 @@ for tick in range(10):
         velocity_m_s = robot.control(now_s)  # within the speed limit; None if all is too old
         vehicles.fly(number, np.zeros(2) if velocity_m_s is None else velocity_m_s)
         print(
-            f"{now_s:3.1f} s  robot {number} at {vehicles.position_m(number).round(2)} m, heard {did.senders}, "
-            f"goes {vehicles.velocity_m_s(number).round(2)} m/s, says {len(did.message)} bytes"
+            f"{now_s:3.1f} s  robot {number} at {vehicles.position_m(number).round(2)} m, "
+            f"heard {did.senders}, goes {vehicles.velocity_m_s(number).round(2)} m/s, "
+            f"says {len(did.message)} bytes"
         )

@@ -93,10 +93,15 @@ class _Messages:
         values = {
             name: _column([said.get(k) for k in range(count)]) for name, said in self._said.items()
         }
-        # Of something that a message does not have there is only its parts, which others have.
-        deeper = {name.rpartition(".")[0] for name in values}
+        # What has parts in some messages, and is not there in others, is told by its parts alone.
+        whole = {
+            name
+            for name, said in self._said.items()
+            if all(value is None for value in said.values())
+        }
+        whole &= {name[:k] for name in values for k, sign in enumerate(name) if sign == "."}
         return Columns(
-            np.array(self._time_s), {name: v for name, v in values.items() if name not in deeper}
+            np.array(self._time_s), {name: v for name, v in values.items() if name not in whole}
         )
 
 
