@@ -25,13 +25,13 @@ evaluation = make_evaluation(
     baselines=["decentralized-cvt"],
     conditions=conditions,
     worlds=2,
-    duration_s=8.0,
+    duration_s=6.0,
 )
 print("field:", load_bundle(SHIPPED_BUNDLE).id[:12], "general:", load_bundle(OTHER_BUNDLE).id[:12])
 # With all cores: evaluate(evaluation, over_cores), below `if __name__ == "__main__":`.
 results = evaluate(evaluation)
 for condition, of_all in results.items():
-    print(f"\n{condition.name}: cost after 8 s over the initial cost, a number per world")
+    print(f"\n{condition.name}: cost after 6 s over the initial cost, a number per world")
     for result in of_all:  # `final` is (trainings, worlds)
         print(
             f"  {result.method.name:18} {result.final[0].round(3)}  mean {result.final.mean():.3f}"
