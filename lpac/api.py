@@ -1,13 +1,14 @@
 """The Python API: what a script or a notebook of yours needs, under names that stay.
 
     from pathlib import Path
+    import matplotlib.pyplot as plt
     from lpac.api import (SHIPPED_BUNDLE, Scenario, Condition, draw_costs, draw_snapshot, evaluate,
                           examine, fly, load_bundle, log_arrays, make_evaluation, policy_method)
 
     bundle = load_bundle(SHIPPED_BUNDLE)
 
     def watch(moment):                              # each 0.2 s of the flight
-        if moment.cost < 1e6:                       # J of the paper, model units
+        if moment.time_s > 30.0 and not moment.heard.any():
             moment.stop()
 
     flight = fly(Scenario(robots=10, seed=7, duration_s=60.0), bundle, watch)
@@ -24,7 +25,7 @@
 
     control = log_arrays("out/flight/robots")["robot-3"]["control"]
     control.time_s, control["position_m"]           # (T,), (T, 3): as that robot wrote it
-    [trial] = examine([Path("out/flight/robots")]).trials    # all robots, on one clock
+    [trial] = examine([Path("out/flight")]).trials  # all robots, on one clock
 
 docs/api.md shows each task, one robot's steps by hand too. Names are those of the modules that
 they come from, whose docstrings say more. They change only with a new minor version, and
