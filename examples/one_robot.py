@@ -43,7 +43,6 @@ robots = [
     )
     for number in range(2)
 ]
-
 for tick in range(10):
     now_s = vehicles.now_s = 0.4 * tick
     for number, robot in enumerate(robots):
