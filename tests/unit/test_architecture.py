@@ -31,6 +31,10 @@ ALLOWED = {
     "edge.robot.log": {"edge.core", "edge.flight", "edge.robot", "edge.drivers"},
     "export": {"edge.core", "edge.policy"},
     "lpac.shipped": set(),
+    # The Python API: hands on what these have.
+    "lpac.api": {
+        *_EDGE, "lpac.shipped", "lpac.analysis", "lpac.sim", "lpac.sim.batch", "lpac.evaluate",
+    },
     "lpac.analysis": _EDGE,
     "lpac.ground": {*_EDGE, "lpac.analysis", "lpac.fleet.settings", "lpac.radio"},
     # What describes a fleet; the ground reads it, and the simulator describes its fleets with it.
