@@ -2,11 +2,9 @@
 
 import csv
 import json
-from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -30,10 +28,10 @@ from lpac.paper.experiments import (
 )
 from lpac.paper.flown import fly_whole
 from lpac.paper.report import write_perturbation, write_repeatability, write_transferability
+from lpac.sim.cores import in_this_process
 from lpac.sim.experiment import FIELD_SCALE, fly
 from lpac.sim.failure import Failure
 
-Task, Outcome = TypeVar("Task"), TypeVar("Outcome")
 MADE_BY = {"command": "lpac paper ..."}
 
 
@@ -136,12 +134,6 @@ def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) 
     assert "| world 1 | " in text and "`lpac paper ...`" in text
 
 
-def one_by_one(
-    do: Callable[[Task], Outcome], tasks: Sequence[Task]
-) -> Generator[Outcome, None, None]:
-    yield from map(do, tasks)
-
-
 def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
     """From pads with room between them; what is drawn has where they truly were."""
     plan, points = whole_transferability(DEFAULT_BUNDLE, 2), transferability(2)
@@ -160,7 +152,7 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
         if trial.pads_m
     ]
 
-    records = {str(n): record for n, record in fly_whole(few, DEFAULT_BUNDLE, one_by_one)}
+    records = {str(n): record for n, record in fly_whole(few, DEFAULT_BUNDLE, in_this_process)}
     told = write_repeatability(records, tmp_path, MADE_BY, "Whole robots.")
     for trial in told["trials"].values():
         assert trial["final_true"] != trial["final"] and np.shape(trial["final_positions_m"]) == (
