@@ -29,8 +29,10 @@ _GENERATED: dict[str, Callable[[], str]] = {
 }
 _CODE_BLOCK = re.compile(r"^(```.*?^```|~~~.*?^~~~)", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
+_STYLE = "site.css"
 _PICTURES = (".png", ".svg")
-_LANGUAGES = {".py": "python", ".toml": "toml", ".sh": "sh"}
+# Code is read after a link, and would bury the pages in what a search finds.
+_UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 
 
 class PageError(ValueError):
@@ -74,6 +76,7 @@ def place(path: str) -> str:
 
 def write_pages(folder: Path) -> None:
     """Write the site's sources. Raises PageError for a link that leads nowhere."""
+    shutil.copyfile(ROOT / "handbook" / _STYLE, folder / _STYLE)
     waiting = [*hand_written(), *_GENERATED]
     known = set(waiting)
     while waiting:
@@ -102,7 +105,7 @@ def _text(path: str) -> str:
     text = (ROOT / path).read_text()
     if path.endswith(".md"):
         return text
-    return f"# {path}\n\n````{_LANGUAGES.get(Path(path).suffix, 'text')}\n{text}````\n"
+    return _UNSEARCHED + f"# {path}\n\n````text\n{text}````\n"
 
 
 def _with_links_of_the_site(text: str, page: str) -> str:
