@@ -15,7 +15,7 @@ from handbook.pages import ROOT, PageError, write_pages
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m handbook", description=__doc__)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "site", help="the site's folder")
+    parser.add_argument("--out", type=Path, default=Path("out/site"), help="its folder")
     out: Path = parser.parse_args().out
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     with TemporaryDirectory() as folder:
@@ -31,7 +31,7 @@ def main() -> None:
             )
         except (PageError, Abort, ConfigurationError) as error:
             sys.exit(f"handbook: {error}")
-    print(f"see {out}/index.html")
+    print(f"see {out}/index.html; its search needs a server: python -m http.server -d {out}")
 
 
 if __name__ == "__main__":

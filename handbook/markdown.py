@@ -9,8 +9,8 @@ def cell(text: str) -> str:
 
 
 def code(text: str) -> str:
-    """The same, as code."""
-    return f"`{' '.join(text.split())}`".replace("|", "\\|")
+    """The same as code, in which nothing has a meaning."""
+    return f"`{' '.join(text.split())}`"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

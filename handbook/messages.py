@@ -96,13 +96,11 @@ def _message(cls: type[Any]) -> list[str]:
             or field.default_factory is not dataclasses.MISSING
         )
         kind, bounds = _kind(hints[field.name])
-        rows.append(
-            (f"`{field.name}`", cell(kind), cell(bounds), "" if has_default else "always there")
-        )
+        rows.append((f"`{field.name}`", cell(kind), cell(bounds), "" if has_default else "yes"))
     return [
         f"### {cls.__name__}",
         inspect.getdoc(cls) or "",
-        table(("field", "type", "bounds", ""), rows),
+        table(("field", "type", "bounds", "always there"), rows),
     ]
 
 
@@ -143,7 +141,7 @@ def _bounds(meta: Meta) -> str:
         "at most {} long": meta.max_length, "like `{}`": meta.pattern,
     }  # fmt: skip
     return ", ".join(
-        text.format(value if isinstance(value, str) else f"{value:g}")
+        text.format(f"{value:g}" if isinstance(value, float) else value)
         for text, value in said.items()
         if value is not None
     )

@@ -86,7 +86,7 @@ def write_pages(folder: Path) -> None:
         if path.endswith(_PICTURES):
             shutil.copyfile(ROOT / path, file)
             continue
-        text = _text(path)
+        text = page_text(path)
         for link in links(text):
             linked = target(link, path)
             if linked is None:
@@ -99,7 +99,8 @@ def write_pages(folder: Path) -> None:
         file.write_text(_with_links_of_the_site(text, path))
 
 
-def _text(path: str) -> str:
+def page_text(path: str) -> str:
+    """A page as it is written for the repository; of another file, a page that shows it."""
     if path in _GENERATED:
         return _GENERATED[path]()
     text = (ROOT / path).read_text()

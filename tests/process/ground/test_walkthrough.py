@@ -99,7 +99,9 @@ def test_the_page_can_be_followed_line_by_line(tmp_path: Path) -> None:
 
 def walk(page: str, folder: Path) -> None:
     """Type everything in the section that is to be tried, as it stands there."""
-    (section,) = re.findall(r"^## Try it on this machine\n(.*?)(?=^## )", page + "\n## ", re.S | re.M)
+    (section,) = re.findall(
+        r"^## Try it on this machine\n(.*?)(?=^## )", page + "\n## ", re.S | re.M
+    )
     simulator, stations, flight = re.findall(r"^```sh\n(.*?)^```$", section, re.S | re.M)
     activate, simulate = simulator.splitlines()
     assert activate == ACTIVATE
