@@ -28,7 +28,7 @@ test: lint ## style, types, and every test; as root with real robot hosts too: h
 	@failed=0; \
 	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest "$$@" || failed=1; }; \
 	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
-	some --numprocesses 2 $(BY_FILE) -m real_time; \
+	some --numprocesses auto $(BY_FILE) -m real_time; \
 	some -m alone; \
 	exit $$failed
 

@@ -13,17 +13,27 @@ from edge.policy.family import TOLERANCE
 from edge.policy.lpac.images import EXPLORED, MAP_CHANNELS
 from edge.policy.lpac.manifest import GOLDEN, Images, LpacManifest
 from edge.policy.lpac.policy import LpacPolicy
-from export.checkpoint import Checkpoint, CheckpointError, read_checkpoint
+from export.checkpoint import POSITION_SIZE, Checkpoint, CheckpointError, read_checkpoint
 from export.golden import golden_vectors
 from export.graphs import OPSET, build_graphs
 from export.parameters import PolicyParameters, read_parameters
+from export.training_maps import contradiction
 
 
-def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -> Bundle:
+def export_bundle(
+    checkpoint: Path,
+    parameters: Path,
+    name: str | None = None,
+    *,
+    cnn: Path | None = None,
+    force: bool = False,
+) -> Bundle:
     """Make the bundle of a checkpoint: a state dict's file, or a folder of one file per tensor.
 
-    `parameters` is our parameter file or a coverage_control_params.toml. `name` is the policy's
-    name, by default the checkpoint's. A folder holds no CNN: its bundle is without perception.
+    `parameters` is our parameter file or a coverage_control_params.toml; unless it is a `force`,
+    what the network remembers of its training must not contradict it. `name` is the policy's name,
+    by default the checkpoint's. A folder holds no CNN: its bundle is without perception, but for
+    that of the state dict `cnn`, which replaces a CNN that there is.
 
     The bundle has passed `verify` on this machine. Raises CheckpointError or ConfigError, one line
     each.
@@ -37,10 +47,31 @@ def export_bundle(checkpoint: Path, parameters: Path, name: str | None = None) -
         "parameters": parameters.name,
         "parameters_sha256": hashlib.sha256(parameters.read_bytes()).hexdigest(),
     }
+    if cnn is not None:
+        other = read_checkpoint(cnn)
+        network = _with_cnn(network, other, cnn)
+        provenance |= {"cnn": cnn.name, "cnn_sha256": other.sha256}
+    if network.cnn and not force and (why := contradiction(network.cnn, trained.perception)):
+        raise CheckpointError(
+            f"{parameters}: is hardly what {cnn or checkpoint} was trained with: {why}. "
+            "If it is, --force exports it"
+        )
     try:
         return bundle_of(network, trained, name or checkpoint.stem, provenance)
     except CheckpointError as error:
         raise CheckpointError(f"{checkpoint}: {error}") from None
+
+
+def _with_cnn(network: Checkpoint, other: Checkpoint, path: Path) -> Checkpoint:
+    if other.cnn is None:
+        raise CheckpointError(f"{path}: has no CNN: expected the state dict of a whole network")
+    features, taken = len(other.cnn.linear.bias), network.geometry.feature_sizes[0] - POSITION_SIZE
+    if features != taken:
+        raise CheckpointError(
+            f"{path}: its CNN gives {features} features, expected the {taken} that the graph "
+            "neural network takes beside the position"
+        )
+    return replace(network, cnn=other.cnn)
 
 
 def bundle_of(

@@ -11,12 +11,16 @@ from hypothesis import HealthCheck, settings
 
 from edge.policy.bundle import Bundle, load_bundle, make_bundle
 from edge.policy.lpac.policy import LpacPolicy
+from lpac.sim.fleet.load import robots_carried
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
 
 # The folders below tests/, each a marker; README.md there says what belongs in which.
 TIERS = ("unit", "sim", "process", "host")
+
+# What a machine has to carry, with room to spare, for two files to fly beside each other.
+ROBOTS_AT_ONCE = 9
 
 # What no test in unit/ and sim/ does, as Python's audit events name it.
 OTHERS_ONLY = {
@@ -75,6 +79,13 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     if config.getoption("--vehicle") == "px4" and config.getoption("--px4") is None:
         raise pytest.UsageError("--vehicle px4 needs --px4 with PX4's build folder")
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
+    """How many files fly in real time at once: on a machine that carries no two fleets, one."""
+    if config.option.markexpr != "real_time":
+        return None
+    return 2 if robots_carried(SHIPPED, "mavlink") >= ROBOTS_AT_ONCE else 1
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses by marker

@@ -26,13 +26,21 @@ def export(
     name: Annotated[
         str | None, typer.Option(help="The policy's name; by default the checkpoint's.")
     ] = None,
+    cnn: Annotated[
+        Path | None,
+        typer.Option(help="State dict whose CNN is taken, such as for the authors' folder."),
+    ] = None,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Although the checkpoint contradicts the parameter file."),
+    ] = False,
 ) -> None:
     """Export a trained torch checkpoint as a bundle that runs without torch."""
     from edge.policy.bundle import write_bundle
     from edge.policy.lpac.manifest import LpacManifest
     from export.exporter import export_bundle
 
-    bundle = export_bundle(checkpoint, params, name)
+    bundle = export_bundle(checkpoint, params, name, cnn=cnn, force=force)
     write_bundle(bundle, output)
 
     manifest, lpac = bundle.manifest, LpacManifest.of(bundle.manifest)

@@ -67,6 +67,9 @@ def snapshot_view(setup: FleetSetup, snapshot: FleetSnapshot, alarms: tuple[Alar
         "safety_action": "none" if ground is None else ground.safety_action,
         "safety_action_by": "" if ground is None else ground.safety_action_by or ground.operator,
         "heading_deg": heading_deg,
+        "origin": None
+        if ground is None or ground.origin is None
+        else [ground.origin.latitude_deg, ground.origin.longitude_deg],
         "fence": [_rounded(corner) for corner in fence.vertices_m],
         "buffer": [_rounded(corner) for corner in fence.grown_m(-fence.buffer_m)],
         "running": list(snapshot.running),

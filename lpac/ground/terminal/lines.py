@@ -54,7 +54,7 @@ def line(width: int, *spans: Span) -> Line:
 
 
 def number(value: float | None, width: int, decimals: int = 1) -> str:
-    """As many decimals as there is room for, "-" for what is not known."""
+    """As many decimals as there is room for; "-" for what is not known, ">99" beyond the width."""
     if value is None or not math.isfinite(value):
         return "-".rjust(width)
     for places in range(decimals, -1, -1):
@@ -62,7 +62,7 @@ def number(value: float | None, width: int, decimals: int = 1) -> str:
         text = f"{round(value, places) + 0.0:.{places}f}"
         if len(text) <= width:
             return text.rjust(width)
-    return "#" * width
+    return ">" + "9" * (width - 1) if value > 0.0 else "<-" + "9" * (width - 2)
 
 
 def direction(heading_deg: float, decimals: int = 0) -> str:

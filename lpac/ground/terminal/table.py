@@ -29,7 +29,7 @@ ID = 8
 
 _S = FlightState
 _NARROWEST_NAME, _WIDEST_NAME = 4, 12
-_NARROWEST_REASON = 19
+_NARROWEST_REASON = 30
 
 MARKS: dict[Severity, str] = {"critical": "!", "warning": "*", "note": "-"}
 _STATES: dict[FlightState, TextStyle] = {
@@ -198,6 +198,9 @@ def _oldest(status: RobotStatus) -> Span:
 def _lag(status: RobotStatus) -> Span:
     lag_ms = max((loop.lateness_p99_ms for loop in status.loops.values()), default=None)
     late = lag_ms is not None and lag_ms > LATE_MS
+    # Beyond a second with the unit, as an age has one beyond minutes.
+    if lag_ms is not None and lag_ms >= 999.5:
+        return Span(number(lag_ms / 1000.0, 2, 0) + "s", "warning")
     return Span(number(lag_ms, 3), "warning" if late else "")
 
 
@@ -231,27 +234,28 @@ def _reason(row: Row) -> Span:
     return Span("" if row.robot.status is None else row.robot.status.reason.text)
 
 
-# Left to right. At 80 columns, one of them for the scroll bar, all up to `link` have room.
+# Left to right. At 80 columns, one of them for the scroll bar, ranks up to 9 have room: who reads
+# why a robot is as it is sees where it is on the map.
 _COLUMNS = (
     Column(0, "", "", 1, _mark, left=True),
     Column(2, "state", "", 9, _state, left=True),
     Column(4, "bat", "%", 3, _battery),
-    Column(9, "GPS", "sat", 3, _of_status(_satellites)),
+    Column(8, "GPS", "sat", 3, _of_status(_satellites)),
     Column(5, "mode", "", 8, _of_status(lambda s: Span(s.mode or "-")), left=True),
-    Column(6, "x", "m", 5, _of_status(_coordinate(0, 5))),
-    Column(7, "y", "m", 5, _of_status(_coordinate(1, 5))),
-    Column(8, "h", "m", 4, _of_status(_coordinate(2, 4))),
-    Column(15, "v", "m/s", 3, _of_status(lambda s: Span(number(speed_m_s(s), 3)))),
-    Column(10, "feat", "s", 4, _of_status(_features)),
-    Column(11, "neighbours", "n", 2, _of_status(_neighbours)),
-    Column(13, "", "Hz", 3, _rate),
-    Column(12, "", "s", 3, _of_status(_oldest)),
-    Column(14, "lag", "ms", 3, _of_status(_lag)),
+    Column(10, "x", "m", 5, _of_status(_coordinate(0, 5))),
+    Column(11, "y", "m", 5, _of_status(_coordinate(1, 5))),
+    Column(6, "h", "m", 4, _of_status(_coordinate(2, 4))),
+    Column(16, "v", "m/s", 3, _of_status(lambda s: Span(number(speed_m_s(s), 3)))),
+    Column(9, "feat", "s", 4, _of_status(_features)),
+    Column(12, "neigh", "n", 5, _of_status(_neighbours)),
+    Column(14, "", "Hz", 3, _rate),
+    Column(13, "", "s", 3, _of_status(_oldest)),
+    Column(15, "lag", "ms", 3, _of_status(_lag)),
     Column(3, "link", "s", 4, _link),
     Column(17, "fence", "m", 5, _margin),
     Column(18, "bundle", "", ID, _of_status(lambda s: Span(s.bundle_id[:ID])), left=True),
     Column(19, "world", "", ID, _of_status(lambda s: Span(s.world_id[:ID])), left=True),
-    Column(16, "reason", "", _NARROWEST_REASON, _reason, left=True),
+    Column(7, "reason", "", _NARROWEST_REASON, _reason, left=True),
 )
 
 

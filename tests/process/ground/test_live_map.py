@@ -345,6 +345,14 @@ def check_innocence(seen: Opened) -> None:
     assert "owned" not in seen.page.title()
 
 
+def set_an_origin_that_is_missed(seen: Opened, fleet: str) -> None:
+    wait_for_snapshot(fleet)
+    seen.page.wait_for_selector("#no-origin >> text=no origin")
+    assert command(fleet, SetOrigin(ORIGIN)).done
+    seen.page.wait_for_selector("#no-origin", state="hidden")
+    seen.page.wait_for_selector(f"#origin >> text={ORIGIN.latitude_deg:.5f}")
+
+
 def test_a_flight_by_clicks(few: FlownFleet) -> None:
     with (
         lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"),
@@ -352,8 +360,7 @@ def test_a_flight_by_clicks(few: FlownFleet) -> None:
         opened(address) as seen,
     ):
         page = seen.page
-        wait_for_snapshot(few.name)
-        assert command(few.name, SetOrigin(ORIGIN)).done
+        set_an_origin_that_is_missed(seen, few.name)
         # On a tablet, upright, and on a phone hold is in reach.
         for width, height in ((768, 1024), (400, 800), (1280, 800)):
             page.set_viewport_size({"width": width, "height": height})
@@ -383,7 +390,7 @@ def test_a_flight_by_clicks(few: FlownFleet) -> None:
         page.wait_for_function("() => Number(document.querySelector('#lloyd').textContent) > 0")
         page.wait_for_function("() => Number(document.querySelector('#share').textContent) > 0")
         # One robot, from its drawer.
-        page.click("tr[data-robot=r1]")
+        page.click(r"tr[data-robot=r1] >> text=/^\d+\.\d m$/")
         page.wait_for_selector("#drawer >> text=landing point")
         page.wait_for_selector("#drawer table td >> text=r0")
         page.click("#drawer [data-robot-do=hold]")

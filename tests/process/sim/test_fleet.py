@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from tests.process.cli.test_cli import error_line, lpac
 
 # Worlds in which the swarm's cost hangs little, by 10 % at most, on the clocks' phases, on the last
 # decimetres of the starts and on the vehicles' lag. In others luck decides.
-SEEDS = (0, 14, 18, 19, 23)
+SEEDS = (0, 14, 18)
 ROBOTS = 5
 MISSION_S = 20.0
 # The end of the mission that the cost is taken from: the robots keep moving about their places.
@@ -58,9 +57,10 @@ class Flown(NamedTuple):
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """Five robots over each of five worlds, and two until Ctrl-C; two flights at once.
+    """Five robots over each of three worlds, and two until Ctrl-C; one flight after another.
 
-    By the policy that covers at once: the field's still explores after so few seconds.
+    By the policy that covers at once: the field's still explores after so few seconds. Another
+    file's fleet flies meanwhile, and a slow machine carries no third one.
     """
 
     folder = tmp_path_factory.mktemp("fleet")
@@ -81,10 +81,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             output, _ = process.communicate(timeout=180.0)
         return process.returncode, json.loads(output)
 
-    with ThreadPoolExecutor(2) as at_once:
-        flights = at_once.map(fly, SEEDS)
-        stopped = at_once.submit(fly_until_ctrl_c)
-        return Flown(dict(zip(SEEDS, flights, strict=True)), stopped.result())
+    return Flown({seed: fly(seed) for seed in SEEDS}, fly_until_ctrl_c())
 
 
 Flights = dict[int, tuple[dict[str, Any], Path]]

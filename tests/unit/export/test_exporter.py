@@ -12,8 +12,9 @@ from edge.core.perception import PerceptionParameters
 from edge.policy.bundle import load_bundle
 from edge.policy.lpac.manifest import LpacManifest
 from edge.policy.lpac.policy import LpacPolicy
-from export.checkpoint import CheckpointError
+from export.checkpoint import CheckpointError, Cnn, read_checkpoint
 from export.exporter import export_bundle
+from export.training_maps import outside_share
 from lpac.cli.export import export
 from tests.conftest import ROOT
 from tests.unit.export.states import random_state
@@ -43,6 +44,45 @@ def test_shipped_policy_is_what_its_checkpoint_gives() -> None:
         (provenance["parameters"], provenance["parameters_sha256"]),
     ):
         assert hashlib.sha256((POLICIES / file).read_bytes()).hexdigest() == sha256
+
+
+def test_a_parameter_file_of_another_world_is_refused_unless_it_is_forced(tmp_path: Path) -> None:
+    """Each shipped network says how much of its maps lay outside the world."""
+    text = (POLICIES / f"{NAME}.toml").read_text()
+    other = tmp_path / "other.toml"
+    other.write_text(text.replace("world_size = 512", "world_size = 1024"))
+    for checkpoint in (POLICIES / f"{NAME}.pt", POLICIES / "field" / "field.pt"):
+        share = outside_share(cnn_of(checkpoint))
+        assert share is not None and 0.1 < share < 0.2
+        export_bundle(checkpoint, POLICIES / f"{NAME}.toml")
+        with pytest.raises(CheckpointError, match=r"world_size = 1024.*--force"):
+            export_bundle(checkpoint, other)
+    refused = run(POLICIES / f"{NAME}.pt", "--params", other, "-o", tmp_path / "bundle")
+    assert isinstance(refused.exception, CheckpointError)
+    forced = run(POLICIES / f"{NAME}.pt", "--params", other, "-o", tmp_path / "bundle", "--force")
+    assert forced.exit_code == 0
+    torch.save(random_state(), tmp_path / "untrained.pt")
+    assert outside_share(cnn_of(tmp_path / "untrained.pt")) is None
+
+
+def cnn_of(checkpoint: Path) -> Cnn:
+    cnn = read_checkpoint(checkpoint).cnn
+    assert cnn is not None
+    return cnn
+
+
+def test_the_authors_taps_with_a_cnn_are_a_whole_policy(tmp_path: Path) -> None:
+    parameters, whole = POLICIES / f"{NAME}.toml", POLICIES / f"{NAME}.pt"
+    bundle = export_bundle(AUTHORS_TAPS, parameters, cnn=whole)
+    assert bundle.manifest.perception is not None and "cnn.onnx" in bundle.files
+    assert bundle.files["cnn.onnx"] == load_bundle(POLICIES / NAME).files["cnn.onnx"]
+    sha256 = hashlib.sha256(whole.read_bytes()).hexdigest()
+    assert bundle.manifest.provenance["cnn_sha256"] == sha256
+    with pytest.raises(CheckpointError, match="has no CNN"):
+        export_bundle(AUTHORS_TAPS, parameters, cnn=AUTHORS_TAPS)
+    torch.save(random_state(), tmp_path / "small.pt")
+    with pytest.raises(CheckpointError, match="gives 8 features, expected the 32"):
+        export_bundle(AUTHORS_TAPS, parameters, cnn=tmp_path / "small.pt")
 
 
 def test_two_exports_give_the_same_bytes(tmp_path: Path) -> None:

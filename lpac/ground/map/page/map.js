@@ -239,6 +239,10 @@ function showHead() {
   $("#commander").title = observes ? `${commander} commands, not this station` : commander;
   $("#command").hidden = !observes;
   setText($("#trial"), trial || "–");
+  const { origin } = snapshot;
+  $("#no-origin").hidden = origin !== null;
+  $("#origin").parentElement.hidden = origin === null;
+  if (origin) setText($("#origin"), origin.map((degrees) => degrees.toFixed(5)).join(" "));
   setText($("#enabled"), ours.length ? `${enabled} of ${ours.length}` : "–");
   setText($("#flying"), `${robots.filter((r) => r.in_air).length}`);
   $("#safety-action").hidden = action === "none";

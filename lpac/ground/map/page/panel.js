@@ -33,7 +33,7 @@ export function showFleet(robots, alarmed, selected, onPick) {
     $("#robots tbody"), robots, (robot) => robot.name,
     (robot) => {
       const row = make("tr", "", make("td", "", make("i", "chip")));
-      for (const name of ["name", "state", "n", "n", "n"]) row.append(make("td", name));
+      for (const name of ["name", "state", "n", "n", "n", "n"]) row.append(make("td", name));
       row.children[2].append(make("b"), " ", make("small"));
       row.dataset.robot = robot.name;
       row.tabIndex = 0;
@@ -54,10 +54,11 @@ export function showFleet(robots, alarmed, selected, onPick) {
       setText(cells[2].firstChild, state);
       setText(cells[2].lastChild, remark(robot));
       cells[2].title = [state, robot.reason].filter(Boolean).join(": ");
-      setText(cells[3], robot.battery == null ? "–" : `${Math.round(robot.battery * 100)} %`);
-      setClass(cells[3], `n ${battery(robot.battery)}`);
-      setText(cells[4], number(robot.satellites));
-      setText(cells[5], age(robot.age_s));
+      setText(cells[3], robot.position_m == null ? "–" : `${number(robot.position_m[2], 1)} m`);
+      setText(cells[4], robot.battery == null ? "–" : `${Math.round(robot.battery * 100)} %`);
+      setClass(cells[4], `n ${battery(robot.battery)}`);
+      setText(cells[5], number(robot.satellites));
+      setText(cells[6], age(robot.age_s));
     },
   );
 }
