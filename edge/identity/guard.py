@@ -27,9 +27,11 @@ from edge.messages.topics import (
 )
 
 _MOST_CARDS = 1000
-# How often a card is shown anyway, and at most when somebody new is heard.
-_SHOWN_EVERY_S = 1.0 / CARD.rate_hz
+# How often a card is shown at most when somebody new is heard; then, so that he hears it whatever
+# is lost; and when all know all, which is most of a flight, and nearly for nothing.
 _SHOWN_AT_MOST_EVERY_S = 0.25
+_SHOWN_TO_NEW_EVERY_S, _NEW_FOR_S = 2.0, 20.0
+_SHOWN_EVERY_S = {CARD: 1.0 / CARD.rate_hz, GROUND_CARD: 1.0 / GROUND_CARD.rate_hz}
 # What was on its way when a member's program started again has come by then.
 _LONGEST_TRANSIT_S = 5.0
 
@@ -188,8 +190,9 @@ class SignedGuard:
         self._behind: dict[tuple[bytes, str], _Behind] = {}
         self._refused: Counter[RefusedMessage] = Counter()
         self._sequence = 0
-        self._shown_at_s = -math.inf
-        self._show_soon = False
+        self._shown_at_s = self._new_until_s = -math.inf
+        # A program that begins is new to all.
+        self._show_soon = True
         self._link: Link | None = None
         if revocations and not self.hear_revocations(revocations):
             raise CardError("Revocations: this fleet's authority has not signed it")
@@ -277,12 +280,19 @@ class SignedGuard:
     def _to_show(self) -> tuple[tuple[Topic, bytes], ...]:
         """The own card, and from an operator the revocations, if it is time."""
         now_s = self._clock_s()
+        card = CARD if self.card.role is Role.ROBOT else GROUND_CARD
         with self._lock:
-            wait_s = _SHOWN_AT_MOST_EVERY_S if self._show_soon else _SHOWN_EVERY_S
+            if self._show_soon:
+                wait_s = _SHOWN_AT_MOST_EVERY_S
+            elif now_s < self._new_until_s:
+                wait_s = _SHOWN_TO_NEW_EVERY_S
+            else:
+                wait_s = _SHOWN_EVERY_S[card]
             if now_s - self._shown_at_s < wait_s:
                 return ()
+            if self._show_soon:
+                self._new_until_s = now_s + _NEW_FOR_S
             self._shown_at_s, self._show_soon = now_s, False
-        card = CARD if self.card.role is Role.ROBOT else GROUND_CARD
         shown = [(card, self._membership.card_data)]
         if self.card.role is Role.OPERATOR and self.revocations:
             shown.append((REVOKED, self.revocations))

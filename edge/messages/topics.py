@@ -51,8 +51,9 @@ EXPLORED = Topic("explored", "robot", "bits", 1.0, 5, 2**10, "later", None)
 STATE = Topic("state", "ground", "GroundState", 5.0, 500, 2**16, "now", "ground", 50)
 ORDER = Topic("order", "ground", "Order", 5.0, 500, 2**12, "now", "order")
 WORLD = Topic("world", "ground", "CoverageControl world file", 2.0, 50, 400_000, "later", None, 5)
-# Who is a member, and whose key is not good any more: signed by the fleet's authority.
-CARD = Topic("card", "robot", "Card", 0.5, 10, 2**11, "now", None)
+# Who is a member, and whose key is not good any more: signed by the fleet's authority. While
+# somebody is new, a robot shows its card more often.
+CARD = Topic("card", "robot", "Card", 0.1, 10, 2**11, "now", None)
 GROUND_CARD = Topic("card", "ground", "Card", 0.5, 100, 2**11, "now", None, 10)
 REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 100, 2**15, "now", None, 10)
 

@@ -135,6 +135,22 @@ def test_a_member_shows_its_card_and_is_heard_as_itself(one: Member) -> None:
     assert not one.takes(CARD, "robot/2/card", card)
 
 
+def test_cards_are_rare_once_all_know_all(one: Member, two: Member) -> None:
+    def shown_at_s(until_s: int) -> list[int]:
+        shown = []
+        for now_s in range(int(one.now_s), until_s):
+            one.now_s = float(now_s)
+            if CARD in [topic for topic, _ in one.say(MESSAGE, b"")]:
+                shown.append(now_s)
+        return shown
+
+    # `two` was new, and may have missed some.
+    assert shown_at_s(60) == [*range(0, 20, 2), *range(28, 60, 10)]
+    again = robot(2, start=2)
+    one.hear(again, again.say(MESSAGE, b"begun again"))
+    assert shown_at_s(100) == [*range(59, 79, 2), *range(87, 100, 10)]
+
+
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7), payload=st.binary(max_size=300))
 def test_no_changed_message_is_heard(at: int, bit: int, payload: bytes) -> None:
     one, two = robot(1), robot(2)
