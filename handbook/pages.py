@@ -27,10 +27,11 @@ _GENERATED: dict[str, Callable[[], str]] = {
     "docs/reference/api.md": interfaces.python_api,
     "docs/reference/interfaces.md": interfaces.page,
 }
-_CODE_BLOCK = re.compile(r"^(```.*?^```|~~~.*?^~~~)", re.S | re.M)
+_CODE_BLOCK = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
 _STYLE = "site.css"
-_PICTURES = (".png", ".svg")
+# What a browser shows or saves as it is.
+_COPIED = (".png", ".svg", ".ipynb")
 # Code is read after a link, and would bury the pages in what a search finds.
 _UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 
@@ -51,9 +52,7 @@ def hand_written() -> list[str]:
 
 def links(text: str) -> Iterator[str]:
     """Where a page's links and pictures lead, as they stand there; none of its code blocks."""
-    for part in _CODE_BLOCK.split(text):
-        if not part.startswith(("```", "~~~")):
-            yield from (match[2] for match in _LINK.finditer(part))
+    yield from (match[2] for match in _LINK.finditer(_CODE_BLOCK.sub("", text)))
 
 
 def target(link: str, page: str) -> str | None:
@@ -69,7 +68,7 @@ def place(path: str) -> str:
     folder, name = posixpath.split(path)
     if path.endswith(".md"):
         name = "index.md" if name == "README.md" else name
-    elif not path.endswith(_PICTURES):
+    elif not path.endswith(_COPIED):
         return f"source/{path}.md"
     return posixpath.join(re.sub(r"^docs(/|$)", "", folder), name)
 
@@ -83,7 +82,7 @@ def write_pages(folder: Path) -> None:
         path = waiting.pop()
         file = folder / place(path)
         file.parent.mkdir(parents=True, exist_ok=True)
-        if path.endswith(_PICTURES):
+        if path.endswith(_COPIED):
             shutil.copyfile(ROOT / path, file)
             continue
         text = page_text(path)
@@ -91,7 +90,7 @@ def write_pages(folder: Path) -> None:
             linked = target(link, path)
             if linked is None:
                 continue
-            if linked not in _GENERATED and not (ROOT / linked).is_file():
+            if linked not in _GENERATED and not (ROOT / linked).exists():
                 raise PageError(f"{path}: {link}: there is no such file")
             if linked not in known:
                 known.add(linked)
@@ -100,9 +99,13 @@ def write_pages(folder: Path) -> None:
 
 
 def page_text(path: str) -> str:
-    """A page as it is written for the repository; of another file, a page that shows it."""
+    """A page as it is written for the repository; a page that shows another file, or a folder."""
     if path in _GENERATED:
         return _GENERATED[path]()
+    if (ROOT / path).is_dir():
+        files = sorted(file.name for file in (ROOT / path).iterdir() if file.is_file())
+        name = posixpath.basename(path)
+        return "\n".join([f"# {path}\n", *(f"- [{file}]({name}/{file})" for file in files)])
     text = (ROOT / path).read_text()
     if path.endswith(".md"):
         return text
@@ -119,7 +122,8 @@ def _with_links_of_the_site(text: str, page: str) -> str:
         _, hash_, anchor = match[2].partition("#")
         return f"{match[1]}({posixpath.relpath(place(linked), here or '.')}{hash_}{anchor})"
 
-    parts = _CODE_BLOCK.split(text)
-    return "".join(
-        part if part.startswith(("```", "~~~")) else _LINK.sub(mended, part) for part in parts
-    )
+    done, end = [], 0
+    for block in _CODE_BLOCK.finditer(text):
+        done += [_LINK.sub(mended, text[end : block.start()]), block[0]]
+        end = block.end()
+    return "".join([*done, _LINK.sub(mended, text[end:])])

@@ -33,7 +33,7 @@ def test_links_lead_somewhere(page: str) -> None:
         target = pages.target(link, page) or page
         if re.match(r"[a-z]+:", path):
             continue
-        assert target in pages.generated() or (ROOT / target).is_file(), (page, link)
+        assert target in pages.generated() or (ROOT / target).exists(), (page, link)
         if anchor and target.endswith(".md"):
             assert anchor in anchors(target), (page, link)
 
@@ -53,6 +53,13 @@ def test_links_lead_to_the_same_page_on_the_site() -> None:
     assert pages.place("docs/demo.png") == "demo.png"
     assert pages.place("policies/field/README.md") == "policies/field/index.md"
     assert pages.place("edge/core/wire.py") == "source/edge/core/wire.py.md"
+    assert pages.place("examples") == "source/examples.md"
+
+
+def test_a_folder_is_a_page_of_its_files() -> None:
+    assert "- [quick.toml](examples/quick.toml)\n" in pages.page_text("examples")
+    linked = {pages.target(link, "examples") for link in pages.links(pages.page_text("examples"))}
+    assert "examples/field.toml" in linked
 
 
 def test_links_in_code_are_code() -> None:
