@@ -6,16 +6,18 @@ import importlib
 import inspect
 import textwrap
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from edge.core import ports, vehicle
 from edge.core.perception import PerceptionParameters
 from edge.messages import topics
 from edge.policy import bundle, family
-from handbook.markdown import cell
+from handbook.markdown import code
 from lpac.train import family as learnable
 
 _LINE = 88
+_ROOT = Path(__file__).resolve().parent.parent
 # What docs/extending.md speaks of, by the kind of package that needs it.
 _INTERFACES = {
     "A sensor": (ports.SensorDriver, ports.SensorSetting, ports.Sensor, PerceptionParameters),
@@ -82,7 +84,8 @@ def _described(thing: object, name: str, heading: str, imported: object = None) 
     elif inspect.isfunction(thing):
         parts += [_function(thing), inspect.getdoc(thing) or ""]
     else:
-        parts.append(f"`{cell(repr(thing))}`")
+        # A path of the repository is told without the folder that it lies in.
+        parts.append(code(repr(thing).replace(f"{_ROOT}/", "")))
     return "\n\n".join(part for part in parts if part)
 
 
