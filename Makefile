@@ -5,8 +5,8 @@ PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 py
 POLICY := policies/lpac_l2_k3_n10_512
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup check test redteam lint hooks bench export image lock deploy start stop \
-	status fleet-demo screenshots clean
+.PHONY: help demo fly setup check test redteam lint hooks bench docs export image lock deploy start \
+	stop status fleet-demo screenshots clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -49,6 +49,9 @@ hooks: .venv/test ## each git commit then checks style and types of what it hold
 bench: .venv/test ## measure against torch: a table, and out/bench/*.json
 	$(RUN) bench
 
+docs: .venv/docs ## the documentation as a site, with its reference: out/site/index.html
+	$(RUN) handbook
+
 export: .venv/export ## rebuild the shipped policy's bundle from its checkpoint
 	.venv/bin/lpac export $(POLICY).pt --params $(POLICY).toml -o $(POLICY)
 
@@ -81,7 +84,7 @@ fleet-demo: .venv/sim .venv/fleet ## three robot computers on this machine to tr
 	@mkdir -p out
 	$(if $(filter-out 0,$(shell id -u)),sudo) .venv/bin/lpac hosts -n 3 --out out/fleet-demo
 
-screenshots: .venv/test ## the README's pictures of ground control, from a simulated flight (chromium): docs
+screenshots: .venv/test ## the pictures of ground control in docs/, from a simulated flight (chromium): docs
 	PATH="$(CURDIR)/.venv/bin:$$PATH" docs/screenshots.sh
 
 clean: ## remove .venv and everything made

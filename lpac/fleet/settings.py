@@ -277,7 +277,7 @@ def select(config: FleetConfig, names: str | None) -> list[RobotHost]:
 
 
 @dataclass(frozen=True, slots=True)
-class _RobotTable:
+class RobotTable:
     """[robots.NAME] as it is written."""
 
     host: str
@@ -322,7 +322,7 @@ class _RobotTable:
 
 
 @dataclass(frozen=True, slots=True)
-class _FleetTable:
+class FleetTable:
     """fleet.toml as it is written."""
 
     fleet: str
@@ -382,7 +382,7 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
     slots = mapping.get("slots")
     if isinstance(slots, list) and all(isinstance(slot, dict) for slot in slots):
         mapping["slots"] = [{"height": i} | _without_empty(slot) for i, slot in enumerate(slots)]
-    table = from_mapping(_FleetTable, mapping, str(path))
+    table = from_mapping(FleetTable, mapping, str(path))
     _check_keys(table.robot, _ELSEWHERE, f"{path}: robot")
     folder = path.resolve().parent
 
@@ -434,7 +434,7 @@ def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) -> RobotHost:
-    table = from_mapping(_RobotTable, mapping, where)
+    table = from_mapping(RobotTable, mapping, where)
     _check_keys(table.robot, _OF_ONE_ROBOT_ELSEWHERE, f"{where}.robot")
     autopilot = from_mapping(
         AutopilotConfig,

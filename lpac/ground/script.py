@@ -175,16 +175,16 @@ Step = (
     | LandStep
 )  # fmt: skip
 
-_BEFORE: dict[str, type[Step]] = {"origin": OriginStep, "site": SiteStep, "world": WorldStep}
-_STEPS: dict[str, type[Step]] = {
+STEPS_BEFORE: dict[str, type[Step]] = {"origin": OriginStep, "site": SiteStep, "world": WorldStep}
+STEPS: dict[str, type[Step]] = {
     "preflight": PreflightStep, "takeoff": TakeoffStep, "mission": MissionStep,
     "return": ReturnStep, "land": LandStep,
 }  # fmt: skip
-_NAMES = {kind: name for name, kind in (_BEFORE | _STEPS).items()}
+_NAMES = {kind: name for name, kind in (STEPS_BEFORE | STEPS).items()}
 
 
 @dataclass(frozen=True, slots=True)
-class _ScriptTable:
+class ScriptTable:
     """The file as it is written."""
 
     trial: str = ""
@@ -230,14 +230,14 @@ def load_script(path: Path, sites: Sites) -> Script:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
-    table = from_mapping(_ScriptTable, mapping, str(path))
-    before = _steps(table.before, _BEFORE, f"{path}: before")
+    table = from_mapping(ScriptTable, mapping, str(path))
+    before = _steps(table.before, STEPS_BEFORE, f"{path}: before")
     for step in before:
         if isinstance(step, WorldStep):
             _set_world(path, step)
         elif isinstance(step, SiteStep):
             sites.load(step.name)
-    steps = _steps(table.steps, _STEPS, f"{path}: steps")
+    steps = _steps(table.steps, STEPS, f"{path}: steps")
     _check_order(steps, f"{path}: steps")
     return Script(path, table.trial, table.trials, table.robots, before, steps)
 

@@ -1,4 +1,4 @@
-"""The README's walk through a fleet, line by line as it stands there."""
+"""The walk through a fleet in docs/fleet.md, line by line as it stands there."""
 
 import os
 import re
@@ -13,12 +13,12 @@ from lpac.sim.hosts.base import NoHostsError, require_tools
 from tests.conftest import ROOT, SHIPPED
 
 
-def test_the_readme_can_be_followed_line_by_line(amd64_image: Path, tmp_path: Path) -> None:
+def test_the_page_can_be_followed_line_by_line(amd64_image: Path, tmp_path: Path) -> None:
     try:
         require_tools()
     except NoHostsError as reason:
         pytest.skip(str(reason))
-    text = (ROOT / "README.md").read_text()
+    text = (ROOT / "docs" / "fleet.md").read_text()
     (block,) = re.findall(r"```sh\n(\. \.venv/bin/activate\nexport LPAC_FLEET=.*?)```", text, re.S)
     activate, setting, *lines = block.splitlines()
     assert activate == ". .venv/bin/activate"

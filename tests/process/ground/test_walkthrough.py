@@ -1,4 +1,4 @@
-"""The README's walk through ground control, line by line as it stands there."""
+"""The walk through ground control in docs/ground.md, line by line as it stands there."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from tests.conftest import ROOT
 
 pytestmark = pytest.mark.real_time
 
-# The README has ten robots; more than three would only take longer here.
+# The page has ten robots; more than three would only take longer here.
 ROBOTS = int(os.environ.get("LPAC_WALK_ROBOTS", "3"))
 ACTIVATE = ". .venv/bin/activate"
 SETTING = re.compile(r"\. \.venv/bin/activate && export (\w+)=([^\s`]+)")
@@ -93,13 +93,15 @@ class Terminal:
                 return
 
 
-def test_the_readme_can_be_followed_line_by_line(tmp_path: Path) -> None:
-    walk((ROOT / "README.md").read_text(), tmp_path)
+def test_the_page_can_be_followed_line_by_line(tmp_path: Path) -> None:
+    walk((ROOT / "docs" / "ground.md").read_text(), tmp_path)
 
 
-def walk(readme: str, folder: Path) -> None:
-    """Type everything in the section on ground control, as it stands there."""
-    (section,) = re.findall(r"^## Ground control\n(.*?)(?=^## )", readme + "\n## ", re.S | re.M)
+def walk(page: str, folder: Path) -> None:
+    """Type everything in the section that is to be tried, as it stands there."""
+    (section,) = re.findall(
+        r"^## Try it on this machine\n(.*?)(?=^## )", page + "\n## ", re.S | re.M
+    )
     simulator, stations, flight = re.findall(r"^```sh\n(.*?)^```$", section, re.S | re.M)
     activate, simulate = simulator.splitlines()
     assert activate == ACTIVATE

@@ -1,0 +1,38 @@
+"""Build the site, strictly: a warning, such as a broken link, is an error."""
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+from mkdocs.exceptions import Abort, ConfigurationError
+
+from handbook.pages import ROOT, PageError, write_pages
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m handbook", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/site"), help="its folder")
+    out: Path = parser.parse_args().out
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    with TemporaryDirectory() as folder:
+        try:
+            write_pages(Path(folder))
+            build(
+                load_config(
+                    str(ROOT / "mkdocs.yml"),
+                    docs_dir=folder,
+                    site_dir=str(out.resolve()),
+                    strict=True,
+                )
+            )
+        except (PageError, Abort, ConfigurationError) as error:
+            sys.exit(f"handbook: {error}")
+    print(f"see {out}/index.html; its search needs a server: python -m http.server -d {out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""The commands' reference, from the command itself."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from handbook.markdown import cell, code, table
+from lpac.cli.main import app
+
+_WIDE = 200
+# Defaults that are files of the repository are told without it.
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+def page() -> str:
+    """Every command with its arguments and options."""
+    root: Any = typer.main.get_command(app)
+    return "\n\n".join(
+        [
+            "# Commands",
+            "`lpac COMMAND --help` says the same in a terminal. A command whose packages are "
+            "missing says which extra has them. Every command ends with exit code 0 only if it "
+            "did what was asked.",
+            *_below(root, _context(root, None, "lpac")),
+        ]
+    )
+
+
+def names() -> list[str]:
+    """Every command as it is typed: "lpac mission origin"."""
+    root: Any = typer.main.get_command(app)
+    return [context.command_path for _, context in _walk(root, _context(root, None, "lpac"))]
+
+
+def _context(command: Any, parent: Any, name: str) -> Any:
+    return command.context_class(command, parent=parent, info_name=name, max_content_width=_WIDE)
+
+
+def _walk(group: Any, context: Any) -> Iterator[tuple[Any, Any]]:
+    """Each command below a group with its context, groups before what is in them."""
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        its = _context(command, context, name)
+        yield command, its
+        if hasattr(command, "list_commands"):
+            yield from _walk(command, its)
+
+
+def _below(root: Any, context: Any) -> Iterator[str]:
+    for command, its in _walk(root, context):
+        depth = len(its.command_path.split())
+        yield f"{'#' * depth} {its.command_path}"
+        yield "\n".join(line.strip() for line in (command.help or "").splitlines())
+        if hasattr(command, "list_commands"):
+            continue
+        pieces = " ".join(piece for piece in command.collect_usage_pieces(its))
+        yield f"```text\n{its.command_path} {pieces}\n```"
+        records = [parameter.get_help_record(its) for parameter in command.get_params(its)]
+        rows = [
+            (code(name), cell(text.replace(f"{_ROOT}/", "")))
+            for name, text in filter(None, records)
+            if name != "--help"
+        ]
+        if rows:
+            yield table(("argument or option", "what it is"), rows)

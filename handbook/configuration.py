@@ -1,0 +1,224 @@
+"""What may stand in each file, key by key, from the dataclasses that read it."""
+
+import dataclasses
+import inspect
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from edge.policy.bundle import Manifest
+from edge.policy.lpac.manifest import LpacManifest
+from edge.robot.config import RobotConfig
+from export.parameters import PolicyParameters
+from handbook.markdown import cell, code, table
+from lpac.ablate.config import AblationConfig, FlownAs
+from lpac.fleet.settings import FleetTable, RobotTable
+from lpac.ground.script import STEPS, STEPS_BEFORE, ScriptTable
+from lpac.ground.site import SavedSite
+from lpac.radio.airtime import Wifi
+from lpac.train.config import TrainingConfig
+from lpac.train.lpac import LpacNetwork
+
+_ROOT = Path(__file__).resolve().parent.parent
+_REQUIRED = "must be given"
+# Each page with the dataclasses of its file; tests hold the pages to them.
+ROBOT = (RobotConfig,)
+FLEET = (FleetTable, RobotTable)
+GROUND = (ScriptTable, *STEPS_BEFORE.values(), *STEPS.values(), SavedSite, Wifi)
+TRAINING = (TrainingConfig, LpacNetwork, PolicyParameters)
+ABLATION = (AblationConfig, FlownAs)
+MANIFEST = (Manifest, LpacManifest)
+
+
+def robot() -> str:
+    """robot.toml."""
+    return _page(
+        "robot.toml",
+        "A robot's configuration. `lpac fleet deploy` writes it from fleet.toml; by hand it is "
+        "needed only where one robot runs without a fleet. `lpac robot check --config robot.toml` "
+        "reads it and names what is wrong.",
+        _example("docs/robot.toml"),
+        *_tables(RobotConfig, ""),
+    )
+
+
+def fleet() -> str:
+    """fleet.toml."""
+    return _page(
+        "fleet.toml",
+        "The fleet as the workstation sees it: which robots there are, how to reach them, and who "
+        "flies where. `[robot]` and `[robots.NAME.robot]` hold the tables and keys of "
+        "[robot.toml](robot-toml.md).",
+        _example("docs/fleet.toml"),
+        *_tables(FleetTable, ""),
+        *_tables(RobotTable, "robots.NAME"),
+    )
+
+
+def ground() -> str:
+    """Scripts, sites and radios."""
+    steps = [
+        part
+        for where, kinds in (("before", STEPS_BEFORE), ("steps", STEPS))
+        for name, kind in kinds.items()
+        for part in _tables(kind, where, f'[[{where}]], do = "{name}"')
+    ]
+    return _page(
+        "Scripts, sites, radios",
+        "Files that ground control and the simulator read, beside fleet.toml.",
+        "## A script\n\n`lpac mission run SCRIPT.toml` flies it.",
+        _example("docs/script.toml"),
+        *_tables(ScriptTable, ""),
+        *steps,
+        "## A site\n\n`lpac site save` writes it to `sites/NAME.toml`, and `lpac site use` reads "
+        "it.",
+        *_tables(SavedSite, "", "The file"),
+        "## A radio\n\n`--wifi FILE.toml` of `lpac sim` and `lpac evaluate`.",
+        *_tables(Wifi, "", "The file"),
+    )
+
+
+def training() -> str:
+    """What `lpac train` and `lpac export` read."""
+    return _page(
+        "Training",
+        "What `lpac train CONFIG.toml` reads. Lengths are in model units, times in seconds. "
+        "`examples/` has four such files; this is `examples/field.toml`.",
+        _example("examples/field.toml"),
+        *_tables(TrainingConfig, ""),
+        *_tables(LpacNetwork, "network", '[network], family = "lpac"'),
+        "## Parameters of a checkpoint\n\nWhat `lpac export --params` reads, where it is not "
+        "CoverageControl's own file. `[perception]` and `[training]` are as above.",
+        _example("policies/lpac_l2_k3_n10_512.toml"),
+        *_tables(PolicyParameters, "", "The file", but=("perception", "training")),
+    )
+
+
+def ablation() -> str:
+    """What `lpac ablate` reads."""
+    return _page(
+        "Ablation",
+        "What `lpac ablate ABLATION.toml` reads. `train` holds keys of "
+        "[a training](training.md) that are merged into the base.",
+        _example("examples/ablation.toml"),
+        *_tables(AblationConfig, ""),
+        *_tables(FlownAs, "fly"),
+    )
+
+
+def manifest() -> str:
+    """manifest.json of a bundle."""
+    return _page(
+        "Manifest of a bundle",
+        "`manifest.json`, as `lpac bundle info --json` prints it. The bundle's id is the sha256 of "
+        "this file.",
+        *_tables(Manifest, "", "Every family"),
+        *_tables(LpacManifest, "", 'family = "lpac"'),
+    )
+
+
+def keys(cls: type[Any]) -> Iterator[str]:
+    """All keys of a dataclass and of those within it."""
+    for name, hint in _hints(cls).items():
+        yield name
+        within = _within(hint)
+        if within is not None:
+            yield from keys(within)
+
+
+def _page(title: str, *parts: str) -> str:
+    return "\n\n".join([f"# {title}", *parts])
+
+
+def _example(path: str) -> str:
+    text = (_ROOT / path).read_text()
+    return f'```toml title="{path}"\n{text}```'
+
+
+def _tables(
+    cls: type[Any], path: str, title: str | None = None, but: tuple[str, ...] = ()
+) -> Iterator[str]:
+    """A section for the dataclass at `path` of the file, and one for each within it."""
+    yield f"### {title or (f'[{path}]' if path else 'The top of the file')}"
+    yield _about(cls)
+    rows, below = [], []
+    for field in dataclasses.fields(cls):
+        hint = _hints(cls)[field.name]
+        within = _within(hint)
+        if within is not None and field.name not in but:
+            its = f"{path}.{field.name}" if path else field.name
+            several = typing.get_origin(hint) is tuple
+            below.append((within, its, f"[[{its}]]" if several else f"[{its}]"))
+        rows.append((f"`{field.name}`", cell(_kind(hint)), _default(field)))
+    if rows:
+        yield table(("key", "value", "if it is left out"), rows)
+    for within, its, heading in below:
+        yield from _tables(within, its, heading)
+
+
+def _about(cls: type[Any]) -> str:
+    """What a dataclass says of itself, but for what it raises: that is for programs."""
+    paragraphs = (inspect.getdoc(cls) or "").split("\n\n")
+    return "\n\n".join(each for each in paragraphs if not each.startswith("Raises "))
+
+
+def _hints(cls: type[Any]) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def _within(hint: Any) -> type[Any] | None:
+    """The dataclass that a key's table, or each of its tables, is read into."""
+    if dataclasses.is_dataclass(hint):
+        return typing.cast(type[Any], hint)
+    if typing.get_origin(hint) in (tuple, types.UnionType, typing.Union):
+        found = filter(None, map(_within, typing.get_args(hint)))
+        return next(found, None)
+    return None
+
+
+def _kind(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return "table"
+    if origin is Literal:
+        return " or ".join(f"`{_toml(each)}`" for each in arguments)
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(_kind(each) for each in arguments if each is not type(None))
+    if origin is tuple:
+        each = _kind(arguments[0])
+        return "list of tables" if each == "table" else f"list, each {each}"
+    if isinstance(hint, type) and issubclass(hint, StrEnum):
+        return " or ".join(f"`{_toml(str(each))}`" for each in hint)
+    names = {float: "number", int: "whole number", str: "text", bool: "`true` or `false`"}
+    return names.get(hint, "table")
+
+
+def _default(field: "dataclasses.Field[Any]") -> str:
+    if field.default is not dataclasses.MISSING:
+        value = field.default
+    elif field.default_factory is not dataclasses.MISSING:
+        value = field.default_factory()
+    else:
+        return _REQUIRED
+    if value is None or value == {}:
+        return "nothing"
+    within = value[0] if isinstance(value, tuple) and value else value
+    if dataclasses.is_dataclass(within):
+        return "its table's values"
+    return code(_toml(value))
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, tuple | list):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, Mapping):
+        return "{}"
+    return str(value)

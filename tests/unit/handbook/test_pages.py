@@ -1,0 +1,135 @@
+"""The documentation's pages: their links, and a reference that leaves nothing out."""
+
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import typer
+
+from edge.messages.topics import TOPICS
+from handbook import commands, configuration, interfaces, messages, pages
+from lpac.cli.main import app
+from tests.conftest import ROOT
+
+_HEADING = re.compile(r"^#+ (.+)$", re.M)
+_CODE_BLOCK = re.compile(r"^```.*?^```", re.S | re.M)
+
+
+def anchors(page: str) -> set[str]:
+    """What links can lead to on a page, by GitHub's rule, which the site's is set to."""
+    text = _CODE_BLOCK.sub("", pages.page_text(page))
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+        for heading in _HEADING.findall(text)
+    }
+
+
+@pytest.mark.parametrize("page", [*pages.hand_written(), *pages.generated()])
+def test_links_lead_somewhere(page: str) -> None:
+    for link in pages.links(pages.page_text(page)):
+        path, _, anchor = link.partition("#")
+        target = pages.target(link, page) or page
+        if re.match(r"[a-z]+:", path):
+            continue
+        assert target in pages.generated() or (ROOT / target).exists(), (page, link)
+        if anchor and target.endswith(".md"):
+            assert anchor in anchors(target), (page, link)
+
+
+def test_the_readme_needs_no_page_that_is_made_from_code() -> None:
+    """It is read in the repository, where these pages are not."""
+    linked = {pages.target(link, "README.md") for link in pages.links(pages.page_text("README.md"))}
+    assert not linked & set(pages.generated())
+
+
+def test_links_lead_to_the_same_page_on_the_site() -> None:
+    assert pages.target("../README.md#why", "docs/safety.md") == "README.md"
+    assert pages.target("https://arxiv.org", "README.md") is None
+    assert pages.target("#states", "docs/safety.md") is None
+    assert pages.place("README.md") == "index.md"
+    assert pages.place("docs/safety.md") == "safety.md"
+    assert pages.place("docs/demo.png") == "demo.png"
+    assert pages.place("policies/field/README.md") == "policies/field/index.md"
+    assert pages.place("edge/core/wire.py") == "source/edge/core/wire.py.md"
+    assert pages.place("examples") == "source/examples.md"
+
+
+def test_a_folder_is_a_page_of_its_files() -> None:
+    assert "- [quick.toml](examples/quick.toml)" in pages.page_text("examples")
+    linked = {pages.target(link, "examples") for link in pages.links(pages.page_text("examples"))}
+    assert "examples/field.toml" in linked
+
+
+def test_links_in_code_are_code() -> None:
+    text = "[a](b.md)\n\n```toml\n[c](d.md)\n```\n\n[![e](f.png)](g.md)\n"
+    assert list(pages.links(text)) == ["b.md", "g.md"]
+
+
+def test_every_command_and_option_is_in_the_reference() -> None:
+    page = commands.page()
+    root: Any = typer.main.get_command(app)
+    assert {f"lpac {name}" for name in root.list_commands(None)} <= set(commands.names())
+    for name in commands.names():
+        assert f"# {name}\n" in page, name
+        command = root
+        for part in name.split()[1:]:
+            command = command.get_command(None, part)
+        section = page.partition(f"# {name}\n")[2].partition("\n#")[0]
+        for parameter in command.params:
+            if getattr(parameter, "hidden", False) or hasattr(command, "list_commands"):
+                continue
+            for option in [o for o in parameter.opts if o.startswith("-")]:
+                assert option in section, (name, option)
+    assert str(ROOT) not in page + interfaces.python_api()
+
+
+@pytest.mark.parametrize(
+    ("page", "classes"),
+    [
+        (configuration.robot, configuration.ROBOT),
+        (configuration.fleet, configuration.FLEET),
+        (configuration.ground, configuration.GROUND),
+        (configuration.training, configuration.TRAINING),
+        (configuration.ablation, configuration.ABLATION),
+        (configuration.manifest, configuration.MANIFEST),
+    ],
+)
+def test_every_key_is_in_the_reference(
+    page: Callable[[], str], classes: tuple[type[Any], ...]
+) -> None:
+    text = page()
+    for cls in classes:
+        for key in configuration.keys(cls):
+            assert f"| `{key}` |" in text, (cls, key)
+
+
+def test_keys_have_their_defaults_and_kinds() -> None:
+    robot = configuration.robot()
+    assert "| `policy_hz` | number | `2.5` |" in robot
+    assert '| `rc` | `"pilot"` or `"none"` | must be given |' in robot
+    assert '| `type` | text | `"px4"` |' in robot
+    assert "\n### [[data.worlds]]\n" in configuration.training()
+
+
+def test_every_topic_message_and_code_is_in_the_reference() -> None:
+    text = messages.page()
+    for topic in TOPICS:
+        assert f"| `{topic.pattern.replace('*', 'ID')}` |" in text
+    for message in messages.MESSAGES:
+        for field in dataclasses.fields(message):
+            assert f"| `{field.name}` |" in text, (message, field.name)
+    for codes in messages.CODES:
+        for code in codes:
+            assert f"`{code}`" in text
+
+
+def test_interfaces_tell_calls_as_the_source_has_them() -> None:
+    text = interfaces.page()
+    assert "```python\nview(position: F64) -> F32 | None\n```" in text
+    assert "```python\nmanifest: Manifest\n```" in text
+    for name in re.findall(
+        r"`([A-Z]\w+(?:Driver|Family))`", (ROOT / "docs/extending.md").read_text()
+    ):
+        assert f"### {name}\n" in text, name
