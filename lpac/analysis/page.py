@@ -31,7 +31,8 @@ body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; background: #fff;
 h1 { font-size: 1.7rem; margin: .5rem 0; }
 h2 { font-size: 1.3rem; margin: 3rem 0 .3rem; border-top: 2px solid #1a1a1a; padding-top: .6rem; }
 h3, summary { font-size: 1rem; font-weight: 600; margin: 1.5rem 0 .3rem; }
-p { margin: .3rem 0; } .quiet, figcaption { color: #555; font-size: .9rem; }
+p { margin: .3rem 0; overflow-wrap: anywhere; }
+.quiet, figcaption { color: #555; font-size: .9rem; }
 figure { margin: 1.2rem 0; } img { width: 100%; height: auto; display: block; }
 img.narrow { max-width: 42rem; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; font-size: .85rem; }

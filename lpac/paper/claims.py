@@ -339,6 +339,6 @@ def _density() -> Claim:
         "3.1e-5 robots per cell in training, 3.8e-4 in the field.",
         "Robots over cells.",
         f"{trained.robots} / {trained.world_size}² = {densities[0]:.1e}, and {field.robots} / "
-        f"{field.world_size}² = {densities[1]:.1e}: a tenth of what is printed.",
+        f"{field.world_size}² = {densities[1]:.1e}: the second is a tenth of what is printed.",
         Agreement.MISTAKE,
     )

@@ -10,9 +10,10 @@ from typing import Any
 from edge.core.wire import most_bytes
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle
-from lpac.analysis.page import CLOSING, figure, opening, table
+from lpac.analysis.page import CLOSING, figure, opening
 from lpac.paper.claims import Agreement, Claim, Experiments, Sizes, claims_of
 
+_NARROW = ("staleness",)
 TITLE = "The paper, repeated"
 _PAPER = (
     "Agarwal, Vatnsdal, Garcia Camargo, Kumar, Ribeiro: “A Scalable Multi-Robot Framework for "
@@ -118,18 +119,7 @@ def _page(folder: Path, claims: Sequence[Claim], made_by: Mapping[str, Mapping[s
         opening(TITLE),
         f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and what came of it here. "
         "Everything was simulated: no robot of this report has flown.</p>",
-        table(
-            ("", "the paper", "ours", "verdict"),
-            [
-                (
-                    _text(claim.name),
-                    _text(claim.paper),
-                    f"{_text(claim.ours)}<br><span class='quiet'>Rule: {_text(claim.rule)}</span>",
-                    _verdict(claim.verdict),
-                )
-                for claim in claims
-            ],
-        ),
+        *map(_said, claims),
     ]
     for chapter in CHAPTERS:
         if chapter.name not in made_by:
@@ -137,7 +127,7 @@ def _page(folder: Path, claims: Sequence[Claim], made_by: Mapping[str, Mapping[s
         its = folder / chapter.name
         parts.append(f'<h2 id="{chapter.name}">{_text(chapter.title)}</h2>')
         parts += [
-            figure((its / f"{name}.png").read_bytes(), caption)
+            figure((its / f"{name}.png").read_bytes(), caption, narrow=name in _NARROW)
             for name, caption in chapter.figures.items()
             if (its / f"{name}.png").exists()
         ]
@@ -146,6 +136,14 @@ def _page(folder: Path, claims: Sequence[Claim], made_by: Mapping[str, Mapping[s
             f'<p class="quiet">{_text(said)}. Data and figures for print: {chapter.name}/.</p>'
         )
     return "\n".join([*parts, CLOSING]) + "\n"
+
+
+def _said(claim: Claim) -> str:
+    return (
+        f"<h3>{_text(claim.name)}: {_verdict(claim.verdict)}</h3>"
+        f"<p>The paper: {_text(claim.paper)}</p><p>Here: {_text(claim.ours)}</p>"
+        f'<p class="quiet">Rule: {_text(claim.rule)}</p>'
+    )
 
 
 def _verdict(verdict: Agreement) -> str:
