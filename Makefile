@@ -18,7 +18,7 @@ demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torc
 fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly simulated PX4s: out/fly/flight.png
 	.venv/bin/lpac sim --vehicle mavlink --robots auto --seed 5 --duration 50 --out out/fly
 
-setup: .venv/sim .venv/export .venv/fleet .venv/ground ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control
+setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control, Foxglove
 
 check: lint ## style, types, and the quick tests: what a commit has to pass, in two minutes
 	.venv/bin/pytest --numprocesses auto tests/unit tests/sim

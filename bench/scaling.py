@@ -163,7 +163,7 @@ def _no_note(time_s: float) -> None:
 
 def _fly_exactly(scenario: Scenario, bundle: Bundle, note: Note) -> float:
     """Fly; returns what J once a second takes, s, which is not part of the noted time."""
-    flight = fly_exactly(scenario, bundle, note)
+    flight = fly_exactly(scenario, bundle, lambda moment: note(moment.time_s))
     return _cost_s(scenario, flight.importance, flight.positions_m)
 
 

@@ -10,3 +10,7 @@ def shipped(name: str) -> Path:
     """Where a shipped file lies, by its path in the repository."""
     root = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).parents[1]
     return root / name
+
+
+# The policy that flies if no other is named.
+SHIPPED_BUNDLE = shipped("policies/field/field")

@@ -29,15 +29,21 @@ class RobotMap:
         self._unseen = np.float32(unseen)
         self._tiles: dict[tuple[int, int], F32] = {}
 
-    def insert(self, view: F32, corner: tuple[int, int]) -> None:
-        """Write the square `view`, whose lowest cell is `corner`; what is off the world is not."""
+    def insert(self, view: F32, corner: tuple[int, int], seen: Bools | None = None) -> None:
+        """Write the square `view`, whose lowest cell is `corner`; what is off the world is not.
+
+        With `seen`, of the view's shape, only where it is True.
+        """
         size = view.shape[0]
         for key, tile_part, view_part in self._overlaps(corner, size):
             tile = self._tiles.get(key)
             if tile is None:
                 tile = np.full((TILE_SIZE, TILE_SIZE), self._unseen, np.float32)
                 self._tiles[key] = tile
-            tile[tile_part] = view[view_part]
+            if seen is None:
+                tile[tile_part] = view[view_part]
+            else:
+                np.copyto(tile[tile_part], view[view_part], where=seen[view_part])
 
     def window(self, corner: tuple[int, int], out: F32) -> F32:
         """Fill the square `out` from `corner` on and return it; the outside of the world is 0."""
@@ -87,22 +93,30 @@ class RobotMemory:
         # For people: which cells of the coarse raster over the world it has seen.
         self.explored: Bools = np.zeros((EXPLORED_CELLS,) * 2, np.bool_)
 
-    def observe(self, position: F64, view: F32) -> None:
+    def observe(self, position: F64, view: F32, seen: Bools | None = None) -> None:
         """Write the sensor's view (sensor_size, sensor_size) around `position` into the map.
 
-        Those cells of `explored` count as seen whose centre was.
+        With `seen`, of the same shape, only where it is True. Those cells of `explored` count as
+        seen whose centre was.
         """
         size = view.shape[0]
         corner = window_corner(position, size)
-        self._map.insert(view, corner)
+        self._map.insert(view, corner, seen)
         if self._cells:
-            self._cells.see(view, corner)
+            self._cells.see(view, corner, seen)
         scale = EXPLORED_CELLS / self._world_size
         x, y = (
             slice(max(math.ceil(low * scale - 0.5), 0), max(math.ceil(high * scale - 0.5), 0))
             for low, high in ((start, start + size) for start in corner)
         )
-        self.explored[x, y] = True
+        if seen is None:
+            self.explored[x, y] = True
+        else:
+            in_x, in_y = (
+                ((np.arange(EXPLORED_CELLS)[cells] + 0.5) / scale).astype(int) - start
+                for cells, start in zip((x, y), corner, strict=True)
+            )
+            self.explored[x, y] |= seen[np.ix_(in_x, in_y)]
 
     def hear(self, told: SharedMap) -> None:
         """Remember what another robot knows; nothing, if maps are not shared."""

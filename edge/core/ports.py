@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters
 from edge.core.vehicle import Action, Setpoint, VehicleState
 
@@ -20,7 +20,10 @@ class Clock(Protocol):
 
 
 class Sensor(Protocol):
-    """Looks at the importance of the ground below the robot."""
+    """Looks at the importance of the ground below the robot, and sees all that the policy asks for.
+
+    A sensor that sees less, or another part from another height, is a `Camera`.
+    """
 
     def view(self, position: F64) -> F32 | None:
         """The importance around the robot, or None when there is no fresh reading.
@@ -33,9 +36,34 @@ class Sensor(Protocol):
         """
 
 
+class Look(NamedTuple):
+    """What a camera saw: both (sensor_size, sensor_size), indexed and centred as `Sensor.view` is.
+
+    `importance` is finite, also where `seen` is False; there it is not used.
+    """
+
+    importance: F32
+    seen: Bools
+
+
+@runtime_checkable
+class Camera(Protocol):
+    """Looks at the ground from the robot's height, and says which part of it it saw."""
+
+    def look(self, position: F64, height: float) -> Look | None:
+        """What it sees now, or None when there is no fresh reading.
+
+        Called from the perception thread alone.
+
+        `position` (2,) is the robot's, and `height` above its own takeoff point, both in model
+        units. A look that saw nothing, as from the ground, is one all the same; without any the
+        robot would not be ready to take off.
+        """
+
+
 # A sensor over a world file's text, of which the second argument says what it is called in the
 # ValueError for one that cannot be used. A sensor that looks at the real world needs no text.
-SensorOver = Callable[[str, str], Sensor]
+SensorOver = Callable[[str, str], Sensor | Camera]
 
 
 class SensorSetting(NamedTuple):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.perception import PerceptionParameters, overlap, window_corner
 
 Codes = npt.NDArray[np.uint8]
@@ -70,8 +70,11 @@ class SharedCells:
         self._side = -(-parameters.world_size // self._cell)
         self._codes: Codes = np.zeros((self._side, self._side), np.uint8)
 
-    def see(self, view: F32, corner: tuple[int, int]) -> None:
-        """Know all cells that are wholly in the square `view`, whose lowest value is `corner`'s."""
+    def see(self, view: F32, corner: tuple[int, int], seen: Bools | None = None) -> None:
+        """Know all cells that are wholly in the square `view`, whose lowest value is `corner`'s.
+
+        With `seen`, of the view's shape, those all of which it says was seen.
+        """
         (x, stop_x), (y, stop_y) = self._wholly_in(corner, len(view))
         in_x, in_y = (
             slice(low * self._cell - start, high * self._cell - start)
@@ -79,7 +82,11 @@ class SharedCells:
         )
         codes = codes_of(cell_means(view[in_x, in_y], self._cell))
         here, there = self._overlap((x, y), codes.shape)
-        self._codes[here] = codes[there]
+        if seen is None:
+            self._codes[here] = codes[there]
+        else:
+            whole = cell_means(seen[in_x, in_y].astype(np.float32), self._cell) == 1.0
+            np.copyto(self._codes[here], codes[there], where=whole[there])
 
     def see_world(self, codes: Codes, corner: tuple[int, int], size: int) -> None:
         """As `see`, of a view of `size` x `size` of a world whose cells are all `codes`."""

@@ -138,11 +138,12 @@ def _manifest(text: bytes, where: str) -> Manifest:
         raise BundleError(str(error)) from None
 
 
-def load_bundle(path: Path) -> Bundle:
+def load_bundle(path: Path | str) -> Bundle:
     """Read a bundle's directory or archive; raises BundleError that names what is wrong.
 
     Checked here: the schema, every hash, missing and unknown files. The rest is the family's.
     """
+    path = Path(path)
     files = _read(path)
     for name in (MANIFEST, BUNDLE_ID):
         if name not in files:

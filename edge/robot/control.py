@@ -8,7 +8,7 @@ from typing import NamedTuple
 from edge.core import log
 from edge.core.fleet_time import FleetTime
 from edge.core.mailbox import Neighbour
-from edge.core.ports import Odometry, Recorder, Sensor, Vehicle
+from edge.core.ports import Camera, Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
@@ -52,7 +52,7 @@ class GroundWorld(NamedTuple):
     """A world that the ground sent, as a sensor over it; or why it cannot be one."""
 
     world_id: str
-    sensor: Sensor | None
+    sensor: Sensor | Camera | None
     problem: str
 
 
@@ -313,7 +313,7 @@ class FlightControl:
     def _place_in(self, origin: Origin | None, vehicle: VehicleState) -> tuple[float, float] | None:
         return None if origin is None else self._navigation.place_in(origin.frame(), vehicle)
 
-    def _assign(self, assignment: Assignment, sensor: Sensor | None) -> None:
+    def _assign(self, assignment: Assignment, sensor: Sensor | Camera | None) -> None:
         """`sensor` is over the world, None if that stays."""
         before = self.assignment
         if assignment == before:

@@ -21,7 +21,7 @@ from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
 from edge.core.memory import RobotMemory
 from edge.core.perception import clamp_to_world, neighbours_in_range
-from edge.core.ports import Odometry, OdometrySource, Sensor
+from edge.core.ports import Camera, Odometry, OdometrySource, Sensor
 from edge.core.shared_map import SharedMap
 from edge.core.wire import (
     MAX_ROBOT_ID,
@@ -122,7 +122,7 @@ class Pac:
         robot_id: int,
         boot_epoch: int,
         policy: Policy,
-        sensor: Sensor,
+        sensor: Sensor | Camera,
         odometry: OdometrySource,
         parameters: PacParameters,
     ) -> None:
@@ -204,10 +204,11 @@ class Pac:
         if odometry is None:
             return None
         (own,) = self._to_model([odometry.position_m])
-        view = self.sensor.view(own)
-        if view is None or not self._is_valid(view):
+        looked = self._look(own, odometry.position_m[2])
+        if looked is None:
             return None
-        self._memory.observe(own, view)
+        view, seen = looked
+        self._memory.observe(own, view, seen)
         neighbours = self.mailbox.neighbours(now_s)
         heard = self._to_model([neighbour.position_m for neighbour in neighbours])
         near = neighbours_in_range(own, heard, self._perception.communication_range)
@@ -300,6 +301,24 @@ class Pac:
             return None
         numbers = (*odometry.position_m, *odometry.velocity_m_s)
         return odometry if all(map(math.isfinite, numbers)) else None
+
+    def _look(self, own: F64, height_m: float) -> tuple[F32, Bools | None] | None:
+        """What the sensor shows, and where it saw, if that is not everywhere; None without that."""
+        seen = None
+        if isinstance(self.sensor, Camera):
+            height = height_m * self._parameters.scale.env_scale
+            look = self.sensor.look(own, height)
+            if look is None:
+                return None
+            view, seen = look
+            if seen.shape != view.shape or seen.dtype != np.bool_:
+                return None
+        else:
+            shown = self.sensor.view(own)
+            if shown is None:
+                return None
+            view = shown
+        return (view, seen) if self._is_valid(view) else None
 
     def _is_valid(self, view: F32) -> bool:
         """Whether it may go into the map: one cell that is not finite would stay in it."""

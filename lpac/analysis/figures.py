@@ -58,11 +58,44 @@ def snapshots_and_costs(flights: Mapping[str, FlightRecord]) -> Figure:
         rows = figure.add_gridspec(2, 1, height_ratios=(1.12, 0.88))
         above, below = figure.add_subfigure(rows[0]), figure.add_subfigure(rows[1])
         _draw_snapshots(above, first, [share * first.duration_s for share in SNAPSHOTS], 1, 4)
-        axes = below.subplots()
-        for (name, flight), (colour, dashes) in zip(flights.items(), style.CURVES, strict=False):
-            _draw_cost(axes, flight, colour, dashes, name)
-        _frame_costs(axes, max(flight.duration_s for flight in flights.values()))
+        draw_costs(below.subplots(), flights)
         return figure
+
+
+def draw_snapshot(axes: Axes, flight: FlightRecord, time_s: float) -> None:
+    """One of the `snapshots` into axes of yours: robots, their cells, and paths so far, in m."""
+    _draw_snapshot(axes, flight, time_s)
+    _frame(np.array([[axes]]), flight, margin=False)
+
+
+def draw_costs(axes: Axes, flights: Mapping[str, FlightRecord]) -> None:
+    """Normalised coverage cost over time of each flight, by its name, into axes of yours.
+
+    The legend, beside the axes, has the cost at the end; a layout that is "constrained" leaves room
+    for it. Records without a world are left out.
+    """
+    for index, (name, flight) in enumerate(flights.items()):
+        _draw_cost(axes, flight, *style.CURVES[index % len(style.CURVES)], name)
+    _frame_costs(axes, max(flight.duration_s for flight in flights.values()))
+
+
+def draw_states(axes: Axes, flight: FlightRecord) -> None:
+    """A bar per robot, coloured by state, into axes of yours; of points there is nothing to draw.
+
+    The legend is above the axes.
+    """
+    handles = _draw_states(axes, flight)
+    axes.legend(
+        handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, handlelength=1.0,
+        handleheight=0.8,
+    )  # fmt: skip
+    axes.set(xlabel="time since the mission began (s)", xlim=(flight.from_s, flight.to_s))
+
+
+def draw_heights(axes: Axes, flight: FlightRecord) -> None:
+    """Each robot's height above its pad over time, m, into axes of yours; of points it is 0."""
+    _draw_heights(axes, flight)
+    axes.set(xlabel="time since the mission began (s)", xlim=(flight.from_s, flight.to_s))
 
 
 def start_and_end(flight: FlightRecord) -> Figure:

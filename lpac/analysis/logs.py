@@ -112,7 +112,7 @@ class Logs:
         return self.names.get(robot_id, str(robot_id))
 
 
-def read_logs(folders: Sequence[Path], progress: Progress) -> Logs:
+def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> Logs:
     """Read all robots' and grounds' logs below `folders`, and what vehicles tell beside them.
 
     Raises ValueError if there are none, or a folder is not there.

@@ -56,17 +56,10 @@ def page(
     title: str, drawn: Sequence[Drawn], repeatability: bytes | None, notes: Iterable[str]
 ) -> str:
     """The page's HTML."""
-    parts = [
-        "<!doctype html>",
-        f'<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title>',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{_text(title)}</h1>",
-        _summary([d.trial for d in drawn]),
-    ]
+    parts = [opening(title), _summary([d.trial for d in drawn])]
     if repeatability is not None:
         parts.append("<h3>Repeatability</h3>")
-        parts.append(_figure(repeatability, _REPEATABILITY))
+        parts.append(figure(repeatability, _REPEATABILITY))
     parts += [f'<p class="quiet">{_text(note)}</p>' for note in notes]
     for number, (trial, figures) in enumerate(drawn, 1):
         parts.append(f'<h2 id="trial-{number}">{_text(trial.name)}</h2>')
@@ -75,12 +68,28 @@ def page(
             caption = _CAPTIONS[name]
             if name == "messages" and trial.clocks_known:
                 caption += " Clocks are corrected, to a few ms."
-            parts.append(_figure(png, caption, narrow=name == "start-and-end"))
+            parts.append(figure(png, caption, narrow=name == "start-and-end"))
         parts.append(_robots(trial))
         parts.append(_alarms(trial))
         parts.append(_commands(trial))
-    parts.append("</body></html>")
+    parts.append(CLOSING)
     return "\n".join(part for part in parts if part) + "\n"
+
+
+def opening(title: str) -> str:
+    """How a page begins, its heading included."""
+    return "\n".join(
+        (
+            "<!doctype html>",
+            f'<html lang="en"><head><meta charset="utf-8"><title>{_text(title)}</title>',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<style>{_STYLE}</style></head><body>",
+            f"<h1>{_text(title)}</h1>",
+        )
+    )
+
+
+CLOSING = "</body></html>"
 
 
 def _summary(trials: Sequence[FlightRecord]) -> str:
@@ -111,7 +120,7 @@ def _summary(trials: Sequence[FlightRecord]) -> str:
                 _marked(str(sum(trial.restarts.values())), bool(trial.restarts)),
             )
         )
-    return _table(header, rows, numbers=range(1, len(header)))
+    return table(header, rows, numbers=range(1, len(header)))
 
 
 def _about(trial: FlightRecord) -> str:
@@ -156,7 +165,7 @@ def _robots(trial: FlightRecord) -> str:
                 str(trial.restarts.get(robot.name, 0)),
             )
         )
-    return "<h3>Robots</h3>" + _table(header, rows, numbers=range(1, len(header)))
+    return "<h3>Robots</h3>" + table(header, rows, numbers=range(1, len(header)))
 
 
 def _late(loop: LoopLateness | None) -> str:
@@ -167,7 +176,7 @@ def _alarms(trial: FlightRecord) -> str:
     if not trial.alarms:
         return ""
     rows = [(_time(a.time_s), _text(a.robot), _text(a.text)) for a in trial.alarms]
-    return "<h3>Alarms</h3>" + _table(("s", "robot", "alarm"), rows, numbers=(0,))
+    return "<h3>Alarms</h3>" + table(("s", "robot", "alarm"), rows, numbers=(0,))
 
 
 def _commands(trial: FlightRecord) -> str:
@@ -180,15 +189,13 @@ def _commands(trial: FlightRecord) -> str:
     opened = " open" if len(rows) <= _MOST_ROWS else ""
     return (
         f"<details{opened}><summary>Commands ({len(rows)})</summary>"
-        + _table(("s", "who", "robot", "what"), rows, numbers=(0,))
+        + table(("s", "who", "robot", "what"), rows, numbers=(0,))
         + "</details>"
     )
 
 
-def _table(
-    header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()
-) -> str:
-    """`rows` are HTML; the columns in `numbers` are to the right."""
+def table(header: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()) -> str:
+    """A table as HTML: so are `rows`; the columns in `numbers` are to the right."""
     marks = [' class="number"' if column in set(numbers) else "" for column in range(len(header))]
     lines = ['<div class="wide"><table><tr>']
     lines += [f"<th{m}>{_text(name)}</th>" for m, name in zip(marks, header, strict=True)]
@@ -198,7 +205,8 @@ def _table(
     return "".join(lines) + "</tr></table></div>"
 
 
-def _figure(png: bytes, caption: str, *, narrow: bool = False) -> str:
+def figure(png: bytes, caption: str, *, narrow: bool = False) -> str:
+    """A figure as HTML that holds its picture."""
     source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     mark = ' class="narrow"' if narrow else ""
     return (

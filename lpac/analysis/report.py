@@ -69,7 +69,12 @@ class Examined(NamedTuple):
         return {"trials": [_values(trial) for trial in self.trials], "notes": list(self.notes)}
 
 
-def examine(folders: Sequence[Path], wanted: Wanted, progress: Progress) -> Examined:
+_EVERYTHING = Wanted()
+
+
+def examine(
+    folders: Sequence[Path], wanted: Wanted = _EVERYTHING, progress: Progress = lambda *_: None
+) -> Examined:
     """What is in the logs below `folders`.
 
     `progress` gets what is being done, and the share of it. Raises ValueError if there are no logs,

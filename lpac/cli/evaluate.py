@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 
     from edge.core.wire import PayloadType
     from lpac.evaluate.evaluation import Condition, Evaluation, Method, MethodResult
-    from lpac.evaluate.flights import EvaluationFlight, FlownCost, KeptFlights
+    from lpac.evaluate.flights import EvaluationFlight
     from lpac.sim.cores import Pool
     from lpac.sim.experiment import SimulatedFlight
 
@@ -122,8 +121,6 @@ def evaluate(
 ) -> None:
     """Policies and baselines over many worlds: how well they cover, and how surely."""
     from lpac.evaluate.evaluation import as_json as to_json
-    from lpac.evaluate.evaluation import results_of
-    from lpac.evaluate.flights import KeptFlights
     from lpac.evaluate.report import write_results
     from lpac.radio.modelled import ModelledRadio
     from lpac.sim.failure import LostRobots
@@ -158,8 +155,7 @@ def evaluate(
         given, world_set, worlds, duration, set_ups, changes, baselines, transfer=transfer
     )
     cores = pool(ray)
-    kept = KeptFlights(out)
-    results = results_of(evaluation, _fly(evaluation, kept, cores))
+    results = _fly(evaluation, cores, out)
     told = to_json(evaluation, results, compared=compare)
     told["test_set_opened"] = _opened(evaluation)
     sources = {name: source._asdict() for name, source in found.sources.items()}
@@ -195,9 +191,9 @@ def _evaluation(
     *,
     transfer: bool,
 ) -> "Evaluation":
-    from edge.policy.bundle import load_bundle
-    from lpac.evaluate.evaluation import CLAIRVOYANT, Condition, Evaluation, Method
-    from lpac.evaluate.flights import BASELINES, sizes_of, task_of
+    from lpac.evaluate.evaluation import Condition
+    from lpac.evaluate.flights import BASELINES
+    from lpac.evaluate.run import make_evaluation
     from lpac.evaluate.worlds import SET_UPS, WORLD_SETS
 
     chosen_sets = [one for one in WORLD_SETS if one == world_set]
@@ -214,32 +210,18 @@ def _evaluation(
     if transfer and set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
     names = _names(given)
-    policies = [_method(text, name) for text, name in zip(given, names, strict=True)]
-    paths = [training.path for method in policies for training in method.trainings]
-    bundles = {path: load_bundle(Path(path)) for path in paths or [str(DEFAULT_BUNDLE)]}
-    tasks = {task_of(bundle): path for path, bundle in bundles.items()}
-    if len(tasks) > 1:
-        different = "; ".join(f"{path}: {task}" for task, path in tasks.items())
-        raise ValueError(f"bundles of different tasks: {different}")
-    sizes_from, first = next(iter(bundles.items()))
-    named = {method.name for method in policies}
-    others = [
-        Method(name=name, flier=name)
-        for name in BASELINES
-        if name not in named and (not baselines or name in (*baselines, CLAIRVOYANT))
-    ]
-    return Evaluation(
-        methods=(*policies, *others),
-        conditions=tuple(
+    return make_evaluation(
+        [_method(text, name) for text, name in zip(given, names, strict=True)],
+        baselines=[name for name in BASELINES if not baselines or name in baselines],
+        conditions=[
             condition
             for name in (SET_UPS if transfer else set_ups or ["field"])
             for condition in (Condition(name), *(Condition(name, **change) for change in changes))
-        ),
+        ],
         world_set=chosen_sets[0],
         worlds=worlds,
         duration_s=duration_s,
-        sizes_from=sizes_from,
-        sizes=sizes_of(first),
+        sizes_from=DEFAULT_BUNDLE,
     )
 
 
@@ -255,31 +237,28 @@ def _names(given: Sequence[str]) -> list[str]:
 
 def _method(text: str, name: str) -> "Method":
     """A baseline by its name, or bundles by their paths. Raises BundleError."""
-    from edge.policy.bundle import load_bundle
-    from lpac.evaluate.evaluation import Method, TrainedBundle
-    from lpac.evaluate.flights import BASELINES, POLICY
+    from lpac.evaluate.evaluation import Method
+    from lpac.evaluate.flights import BASELINES
+    from lpac.evaluate.run import policy_method
 
     for baseline in BASELINES:
         if baseline == text:
             return Method(name=baseline, flier=baseline)
-    paths = [Path(part) for part in text.split(",")]
-    return Method(
-        name=name,
-        flier=POLICY,
-        trainings=tuple(TrainedBundle(str(p.resolve()), load_bundle(p).id) for p in paths),
-    )
+    return policy_method(name, *map(Path, text.split(",")))
 
 
 def _fly(
-    evaluation: "Evaluation", kept: "KeptFlights", cores: "Pool"
-) -> dict["EvaluationFlight", "FlownCost"]:
-    flights, costs = evaluation.flights(), {}
-    with progress_of("flights") as progress, closing(kept.fly(flights, cores)) as told:
-        task = progress.add_task("", total=len(flights))
-        for flight, flown in told:
-            costs[flight] = flown
-            progress.update(task, advance=1)
-    return costs
+    evaluation: "Evaluation", cores: "Pool", out: Path
+) -> dict["Condition", list["MethodResult"]]:
+    from lpac.evaluate.run import evaluate as fly_all
+
+    with progress_of("flights") as progress:
+        task = progress.add_task("", total=None)
+
+        def tell(done: int, of: int) -> None:
+            progress.update(task, completed=done, total=of)
+
+        return fly_all(evaluation, cores, folder=out, tell=tell)
 
 
 def _opened(evaluation: "Evaluation") -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lpac.shipped import shipped
+from lpac.shipped import SHIPPED_BUNDLE
 
 if TYPE_CHECKING:
     from edge.drivers.process_lock import ProcessLock
@@ -26,7 +26,7 @@ Ray = Annotated[
     typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
 ]
 DEFAULT_FLEET = Path("fleet.toml")
-DEFAULT_BUNDLE = shipped("policies/field/field")
+DEFAULT_BUNDLE = SHIPPED_BUNDLE
 # The name of a lock has some hundred bytes.
 _LOCK_BYTES = 80
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from edge.core.frames import ModelScale
     from edge.core.world import Feature
-    from lpac.sim.experiment import Scenario, SimulatedFlight
+    from lpac.sim.experiment import FlightMoment, Scenario, SimulatedFlight
     from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.layout import FleetScenario
     from lpac.sim.fleet.listener import Statuses
@@ -660,5 +660,5 @@ def _text(path: Path) -> str:
         raise ValueError(f"{path}: is not a text file") from None
 
 
-def _show(progress: "Progress", task: "TaskID", time_s: float) -> None:
-    progress.update(task, completed=time_s)
+def _show(progress: "Progress", task: "TaskID", moment: "FlightMoment") -> None:
+    progress.update(task, completed=moment.time_s)

@@ -71,7 +71,13 @@ class Method:
 
 
 class Condition(NamedTuple):
-    """Under which all methods fly."""
+    """Under which all methods fly: a set-up of `SET_UPS`, by its name, and what is hard about it.
+
+    `loss` is the probability that a message is lost, `lost` robots fail in flight, `lag_s` is the
+    time constant of vehicles, `position_error_m` the standard deviation of robots' errors along
+    each axis, `robot` what flies, `payload` how numbers are sent; a `radio` says what is lost and
+    late instead of `loss`.
+    """
 
     set_up: str
     loss: float = 0.0

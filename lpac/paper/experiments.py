@@ -1,21 +1,24 @@
-"""The paper's three experiments in the air, with points that fly what the policy decides.
+"""The paper's three experiments in the air: with points that fly what the policy decides, or whole.
 
-Each is a plan: named scenarios, and from what they came to the numbers. What points leave out is
-said in each report: takeoff and landing, heights, wind, a GPS error that walks.
+Each is a plan: named scenarios, and from what they came to the numbers, which are those of flight
+records, so that a field day's logs give the same. What points leave out is said in each report.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from edge.core import F64
+from lpac.analysis.flight import FlightRecord
 from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
 from lpac.evaluate.worlds import DrawnWorld, draw_world
 from lpac.sim.baselines import BaselineName
 from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
 from lpac.sim.failure import Failure, alive_at
+from lpac.sim.fleet.layout import FleetScenario, Layout
 
 # E1: what the policy is held against, and when the field is looked at, s.
 BASELINES: tuple[BaselineName, ...] = (
@@ -48,9 +51,12 @@ def _pairs(rows: F64) -> tuple[tuple[float, float], ...]:
     return tuple((x, y) for x, y in rows.tolist())
 
 
-def transferability(worlds: int = 3) -> dict[str, dict[str, Scenario]]:
-    """E1: worlds that no policy was trained on, the same starts; by world, and who flies."""
-    starts_m = _pairs(_starts_m(_world(0)))
+def transferability(worlds: int = 3, starts_m: F64 | None = None) -> dict[str, dict[str, Scenario]]:
+    """E1: worlds that no policy was trained on, the same starts; by world, and who flies.
+
+    `starts_m` (N, 2) are the first world's if none are given.
+    """
+    starts = _pairs(_starts_m(_world(0)) if starts_m is None else starts_m)
     return {
         f"world {number}": {
             controller: Scenario(
@@ -58,13 +64,51 @@ def transferability(worlds: int = 3) -> dict[str, dict[str, Scenario]]:
                 robots=FIELD_SET_UP.robots,
                 seed=world.seed,
                 features=world.features,
-                starts_m=starts_m,
+                starts_m=starts,
                 duration_s=SNAPSHOTS_S[-1],
             )
             for controller in _CONTROLLERS
         }
         for number, world in ((number, _world(number)) for number in range(worlds))
     }
+
+
+def whole_transferability(bundle: Path, worlds: int = 3) -> dict[str, FleetScenario]:
+    """E1 for whole robots, which stand on pads with room between them. Raises BundleError."""
+    pads_m = _pairs(pads_of(bundle))
+    return {
+        f"world {number}": FleetScenario(
+            robots=FIELD_SET_UP.robots,
+            seed=world.seed,
+            features=world.features,
+            pads_m=pads_m,
+            duration_s=SNAPSHOTS_S[-1],
+        )
+        for number, world in ((number, _world(number)) for number in range(worlds))
+    }
+
+
+def pads_of(bundle: Path) -> F64:
+    """(N, 2): where whole robots stand, m. Raises BundleError."""
+    scenario = FleetScenario(robots=FIELD_SET_UP.robots, seed=_world(0).seed)
+    return Layout(scenario, bundle).pads_m
+
+
+def whole_repeatability(bundle: Path, trials: int = 3, world: int = 0) -> dict[str, FleetScenario]:
+    """E2 for whole robots, whose receivers, compasses and winds differ by trial."""
+    drawn, pads_m = _world(world), pads_of(bundle)
+    scenarios = {}
+    for trial in range(trials):
+        rng = np.random.default_rng(np.random.SeedSequence([drawn.seed, trial]))
+        placed_m = pads_m + _around(rng.uniform(0.0, 1.0, len(pads_m)) ** 0.5, rng)
+        scenarios[f"trial {trial + 1}"] = FleetScenario(
+            robots=FIELD_SET_UP.robots,
+            seed=drawn.seed + trial,
+            features=drawn.features,
+            pads_m=_pairs(placed_m),
+            duration_s=E2_DURATION_S,
+        )
+    return scenarios
 
 
 def repeatability(trials: int = 3, world: int = 0) -> dict[str, Scenario]:
@@ -184,37 +228,53 @@ def _phase(flight: SimulatedFlight, robot: int, away: bool, from_s: float, until
     )
 
 
-def curves_json(flights: Mapping[str, SimulatedFlight]) -> dict[str, Any]:
-    """Of each flight, by name: its cost over that at the start."""
+def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
+    """Of each flight, by name: its cost over that at the start, where robots took themselves to be.
+
+    Where their vehicles tell, `final_true` is the same for where these were.
+    """
     return {
         name: {
-            "time_s": flight.cost_time_s.tolist(),
-            "normalized_cost": flight.normalized_cost.tolist(),
-            "final": float(flight.normalized_cost[-1]),
-            "final_positions_m": flight.positions_m[-1].tolist(),
+            "time_s": record.curve_time_s.tolist(),
+            "normalized_cost": record.normalized.tolist(),
+            "final": float(record.normalized[-1]),
+            "final_true": _last_known(record.normalized_true),
+            "final_positions_m": _ends_m(record).tolist(),
         }
-        for name, flight in flights.items()
+        for name, record in records.items()
     }
 
 
-def curves_csv(flights: Mapping[str, SimulatedFlight]) -> list[list[object]]:
+def _last_known(values: F64) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known[-1]) if len(known) else None
+
+
+def _ends_m(record: FlightRecord) -> F64:
+    """(N, 2): where robots took themselves to be in the end; NaN of those that did not fly then."""
+    end_s = record.curve_time_s[-1:]
+    return np.stack([robot.places_at(end_s)[0, :2] for robot in record.robots])
+
+
+def curves_csv(records: Mapping[str, FlightRecord]) -> list[list[object]]:
     """A heading, and a row for each flight and time."""
     rows: list[list[object]] = [["flight", "time_s", "cost_over_first"]]
-    for name, flight in flights.items():
-        curve = zip(flight.cost_time_s.tolist(), flight.normalized_cost.tolist(), strict=True)
+    for name, record in records.items():
+        curve = zip(record.curve_time_s.tolist(), record.normalized.tolist(), strict=True)
         rows += [[name, time_s, cost] for time_s, cost in curve]
     return rows
 
 
-def spread_of(flights: Sequence[SimulatedFlight]) -> dict[str, float]:
+def spread_of(records: Sequence[FlightRecord]) -> dict[str, float]:
     """Of E2's trials: how the costs at the end, and the places, differ."""
-    final = np.array([flight.normalized_cost[-1] for flight in flights])
-    curves = np.array([flight.normalized_cost for flight in flights])
-    ends_m = np.array([flight.positions_m[-1] for flight in flights])
+    end_s = min(record.curve_time_s[-1] for record in records)
+    times_s = np.append(np.arange(0.0, end_s, 1.0), end_s)
+    curves = np.array([np.interp(times_s, r.curve_time_s, r.normalized) for r in records])
+    ends_m = np.array([_ends_m(record) for record in records])
     scatter_m = np.linalg.norm(ends_m - ends_m.mean(axis=0), axis=2)
     return {
-        "final_mean": float(final.mean()),
-        "final_deviation": float(final.std(ddof=1)),
+        "final_mean": float(curves[:, -1].mean()),
+        "final_deviation": float(curves[:, -1].std(ddof=1)),
         "largest_deviation_in_flight": float(curves.std(axis=0, ddof=1).max()),
-        "mean_scatter_of_ends_m": float(scatter_m.mean()),
+        "mean_scatter_of_ends_m": float(np.nanmean(scatter_m)),
     }

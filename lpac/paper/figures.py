@@ -6,26 +6,33 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lpac.analysis import style
+from lpac.analysis.flight import FlightRecord
 from lpac.analysis.style import CURVES, WIDTH_IN, tidy
 from lpac.paper.experiments import PerturbedFlight
-from lpac.sim.experiment import SimulatedFlight
 
 
-def costs_by_world(flights: Mapping[str, Mapping[str, SimulatedFlight]]) -> Figure:
-    """A panel for each world, a curve for each who flew."""
+def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
+    """A panel for each world, a curve for each who flew; thin where vehicles truly were."""
     with style.figure(WIDTH_IN, 2.6) as figure:
-        panels = figure.subplots(1, len(flights), squeeze=False, sharey=True)[0]
-        for axes, (world, of_world) in zip(panels, flights.items(), strict=True):
-            for (colour, dashes), (name, flight) in zip(CURVES, of_world.items(), strict=False):
+        panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
+        for axes, (world, of_world) in zip(panels, records.items(), strict=True):
+            for (colour, dashes), (name, record) in zip(CURVES, of_world.items(), strict=False):
                 axes.plot(
-                    flight.cost_time_s, flight.normalized_cost, color=colour, ls=dashes, lw=1.2,
+                    record.curve_time_s, record.normalized, color=colour, ls=dashes, lw=1.2,
                     label=name,
                 )  # fmt: skip
+                if record.truth:
+                    axes.plot(
+                        record.curve_time_s, record.normalized_true, color=colour, lw=0.5,
+                        label=f"{name}, in truth",
+                    )  # fmt: skip
             axes.set(title=world, xlabel="time (s)")
             tidy(axes)
         panels[0].set(ylabel=r"coverage cost $J(t)\,/\,J(0)$", ylim=(0.0, None))
         handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), fontsize=6.5)
+        figure.legend(
+            handles, labels, loc="outside upper center", ncols=min(len(labels), 5), fontsize=6.5
+        )
         return figure
 
 

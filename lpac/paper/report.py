@@ -9,88 +9,103 @@ from pathlib import Path
 from typing import Any
 
 from lpac.analysis import figures, style
+from lpac.analysis.flight import FlightRecord
 from lpac.paper import experiments
 from lpac.paper.experiments import PerturbedFlight, curves_csv, curves_json
 from lpac.paper.figures import costs_by_world, perturbation
-from lpac.sim.experiment import SimulatedFlight
 
-_POINTS = (
-    "Points flew, each at once with the velocity that its policy decided: without takeoff and "
-    "landing, heights, wind, and with a GPS error that stays as it is."
+_LEAST_M, _MOST_M = experiments.GPS_ERROR_M
+# How it was flown, for the reports.
+POINTS = (
+    "Points flew over worlds of the validation set, each at once with the velocity that its policy "
+    "decided: without takeoff and landing, heights and wind, and with a GPS error, where there is "
+    f"one ({_LEAST_M:g} to {_MOST_M:g} m), that stays as it is."
 )
+WHOLE = (
+    "Whole robots flew over worlds of the validation set, from pads with room between them: their "
+    "programs' loops and separation, on {vehicles}; what they are held against are points from "
+    "the same pads."
+)
+LOGS = "From the logs of flights."
 
 
 def write_transferability(
-    flights: Mapping[str, Mapping[str, SimulatedFlight]], folder: Path, made_by: Mapping[str, str]
+    records: Mapping[str, Mapping[str, FlightRecord]],
+    folder: Path,
+    made_by: Mapping[str, str],
+    flown: str = POINTS,
 ) -> dict[str, Any]:
-    """E1's; gives its JSON. Raises OSError."""
-    policies = {world: of_world["lpac"].record for world, of_world in flights.items()}
+    """E1's: by world, and who flew, the policy first; gives its JSON. Raises OSError."""
+    policies = {world: next(iter(of_world.values())) for world, of_world in records.items()}
     style.save(
         figures.snapshots_of_several(policies, experiments.SNAPSHOTS_S), folder / "snapshots"
     )
-    style.save(costs_by_world(flights), folder / "costs")
-    told = {world: curves_json(of_world) for world, of_world in flights.items()}
+    style.save(costs_by_world(records), folder / "costs")
+    told = {world: curves_json(of_world) for world, of_world in records.items()}
     named = {
-        f"{world}, {name}": flight
-        for world, of_world in flights.items()
-        for name, flight in of_world.items()
+        f"{world}, {name}": record
+        for world, of_world in records.items()
+        for name, record in of_world.items()
     }
-    names = list(next(iter(flights.values())))
+    names = list(next(iter(records.values())))
     rows = [
-        [world, *(f"{of_world[name].normalized_cost[-1]:.3f}" for name in names)]
-        for world, of_world in flights.items()
+        [world, *(_final(of_world[name]) for name in names)] for world, of_world in records.items()
     ]
     text = f"""# E1, transferability
 
 The paper flies one policy over three worlds that it was not trained on, from the same starts, and
-shows them at 0, 15, 30 and 60 s; it gives no costs. Here the worlds are the first of the validation
-set, all from the starts of the first. {_POINTS}
+shows them at 0, 15, 30 and 60 s; it gives no costs. {flown}
 
 ![snapshots](snapshots.png)
 
 ![costs](costs.png)
 
-Cost after {experiments.SNAPSHOTS_S[-1]:g} s over that at the start:
+Cost in the end over that at the start, in brackets where the vehicles truly were, if that is known:
 
 {_table(["", *names], rows)}
 """
     return _write("e1", told, curves_csv(named), text, folder, made_by)
 
 
+def _final(record: FlightRecord) -> str:
+    told = curves_json({"": record})[""]
+    true = "" if told["final_true"] is None else f" ({told['final_true']:.3f})"
+    return f"{told['final']:.3f}{true}"
+
+
 def write_repeatability(
-    flights: Mapping[str, SimulatedFlight], folder: Path, made_by: Mapping[str, str]
+    trials: Mapping[str, FlightRecord],
+    folder: Path,
+    made_by: Mapping[str, str],
+    flown: str = POINTS,
 ) -> dict[str, Any]:
     """E2's; gives its JSON. Raises OSError."""
-    first = next(iter(flights.values())).record
+    first = next(iter(trials.values()))
     # All of one world: it is drawn below their ends.
     records = [
-        replace(flight.record, name=name, coverage=first.coverage)
-        for name, flight in flights.items()
+        replace(record, name=name, coverage=first.coverage) for name, record in trials.items()
     ]
     style.save(figures.repeatability(records), folder / "repeatability")
-    spread = experiments.spread_of(list(flights.values()))
-    least_m, most_m = experiments.GPS_ERROR_M
-    rows = [[name, f"{flight.normalized_cost[-1]:.3f}"] for name, flight in flights.items()]
+    spread = experiments.spread_of(list(trials.values()))
+    rows = [[name, _final(record)] for name, record in trials.items()]
     text = f"""# E2, repeatability
 
 The paper flies one world three times, each robot placed within 10 cm of the same start, and shows
 the cost over 40 s from the takeoff command: the curves differ, the costs at the end are similar,
-and GPS (1 to 5 m) scatters where robots end. Here {len(flights)} trials over a world of the
-validation set; starts are off by {100 * experiments.PLACED_WITHIN_M:g} cm at most, and each robot
-is wrong about its place by {least_m:g} to {most_m:g} m, each time anew. {_POINTS} The 40 s count
-from the start.
+and GPS (1 to 5 m) scatters where robots end. Here {len(trials)} trials, and times count from the
+mission's start: before it nobody covers. {flown}
 
 ![repeatability](repeatability.png)
 
-{_table(["", f"cost after {experiments.E2_DURATION_S:g} s / at the start"], rows)}
+{_table(["", "cost in the end / at the start (in truth)"], rows)}
 
 Costs at the end: mean {spread["final_mean"]:.3f}, standard deviation
 {spread["final_deviation"]:.3f}; in flight the deviation is
 {spread["largest_deviation_in_flight"]:.3f} at most. A robot ends
 {spread["mean_scatter_of_ends_m"]:.2f} m from the mean of its ends, on average.
 """
-    told = {"trials": curves_json(flights), "spread": spread}
-    return _write("e2", told, curves_csv(flights), text, folder, made_by)
+    told = {"trials": curves_json(trials), "spread": spread}
+    return _write("e2", told, curves_csv(trials), text, folder, made_by)
 
 
 def write_perturbation(
@@ -113,7 +128,7 @@ def write_perturbation(
 In each of the paper's experiments a pilot takes one robot at steady state, flies it out of the area
 and brings it back to about the same place; it has no figure of its own. Here
 {len(experiments.TAKEN)} robots of one flight are taken one after another: each is gone, says and
-hears nothing and does not count, and is back where it was, knowing nothing. {_POINTS}
+hears nothing and does not count, and is back where it was, knowing nothing. {POINTS}
 
 ![perturbation](perturbation.png)
 
@@ -124,7 +139,7 @@ to when the next thing happened, or the flight ended.
 """
     flight = perturbed.flight
     told = {
-        "flight": curves_json({"lpac": flight})["lpac"],
+        "flight": curves_json({"lpac": flight.record})["lpac"],
         "phases": [phase._asdict() for phase in perturbed.phases],
     }
     rows_csv: list[list[object]] = [["time_s", "robot", "speed_m_s", "neighbours"]]

@@ -296,6 +296,23 @@ class BaselineSwarm:
             for robot, velocity_m_s in enumerate(velocities_m_s):
                 self._vehicles.fly(robot, velocity_m_s)
 
+    def positions_m(self) -> F64:
+        """The positions (N, 2) now."""
+        return self._vehicles.positions_m()
+
+    def velocities_m_s(self) -> F64:
+        """The velocities (N, 2) that the vehicles are told now."""
+        return self._vehicles.velocities_m_s()
+
+    def heard(self, _: float) -> Bools:
+        """(N, N): nobody; a baseline's knowledge does not come by messages."""
+        return np.zeros((len(self.alive),) * 2, np.bool_)
+
+    @property
+    def alive(self) -> Bools:
+        """(N,): all; a baseline's robots do not fail."""
+        return np.ones(len(self._vehicles.positions_m()), np.bool_)
+
     def message_counts(self) -> dict[str, int]:
         """Empty: a baseline's knowledge does not come by messages."""
         return {}

@@ -26,6 +26,14 @@ class Pool(Protocol):
     ) -> Generator[Outcome, None, None]: ...
 
 
+def in_this_process(
+    do: Callable[[Task], Outcome], tasks: Sequence[Task]
+) -> Generator[Outcome, None, None]:
+    """A `Pool` of no process but this: one task after another, in their order."""
+    for task in tasks:
+        yield do(task)
+
+
 def over_cores(
     do: Callable[[Task], Outcome], tasks: Sequence[Task]
 ) -> Generator[Outcome, None, None]:

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
 from edge.core.wire import MAX_ROBOT_ID, PayloadType
@@ -206,6 +206,16 @@ class Preparation:
     clock_rng: np.random.Generator
     medium: Medium
 
+    def until(self, time_s: float) -> "Preparation":
+        """The same of a flight that ends with that sample. Raises ValueError at its start."""
+        if time_s <= 0.0:
+            raise ValueError("the flight was stopped at its start: nothing was flown")
+        return replace(
+            self,
+            scenario=replace(self.scenario, duration_s=time_s),
+            times_s=[each for each in self.times_s if each <= time_s],
+        )
+
     def flight(
         self, positions_m: F64, messages: dict[str, int], largest_payload: float
     ) -> SimulatedFlight:
@@ -286,13 +296,97 @@ def prepare(scenario: Scenario, bundle: Bundle) -> Preparation:
     )
 
 
-def fly(
-    scenario: Scenario, bundle: Bundle, progress: Callable[[float], None] | None = None
-) -> SimulatedFlight:
+class FlyingSwarm(Protocol):
+    """What can be told of robots in flight."""
+
+    def positions_m(self) -> F64: ...
+    def velocities_m_s(self) -> F64: ...
+    def heard(self, now_s: float) -> Bools: ...
+    @property
+    def alive(self) -> Bools: ...
+
+
+class WorldMoment:
+    """One world at one time of a flight; valid until the flight goes on.
+
+    `positions_m` (N, 2) are the true ones in the mission frame. What is not asked for is not
+    computed, and nothing that the robots do later depends on what is.
+    """
+
+    def __init__(self, prepared: Preparation, swarm: FlyingSwarm, time_s: float) -> None:
+        self.prepared = prepared
+        self.time_s = time_s
+        self._flying = swarm
+        self.positions_m = swarm.positions_m()
+
+    @property
+    def positions(self) -> F64:
+        """(N, 2): true positions in model units."""
+        return self.prepared.scenario.scale.position_to_model(self.positions_m)
+
+    @property
+    def velocities_m_s(self) -> F64:
+        """(N, 2): the velocities that the vehicles are told, mission frame, m/s.
+
+        With a scenario's `lag_s` they follow these; the world's border holds them all the same.
+        """
+        return self._flying.velocities_m_s()
+
+    @property
+    def alive(self) -> Bools:
+        """(N,): who has not failed."""
+        return self._flying.alive
+
+    @property
+    def adjacency(self) -> Bools:
+        """(N, N): who is truly in communication range of whom, and both alive; not oneself."""
+        x, y = self.positions.T
+        distances = np.hypot(x[:, None] - x, y[:, None] - y)
+        np.fill_diagonal(distances, np.inf)
+        near: Bools = distances < self.prepared.perception.communication_range
+        return near & np.logical_and.outer(self.alive, self.alive)
+
+    @property
+    def heard(self) -> Bools:
+        """(N, N), [receiver, sender]: of whom a robot has a message that is fresh.
+
+        Of baselines nobody: they know of each other without messages.
+        """
+        return self._flying.heard(self.time_s)
+
+    @property
+    def cost(self) -> float:
+        """The coverage cost J, in model units, of those who are alive; NaN if nobody is.
+
+        At a flight's `cost_time_s` the same as its `cost`.
+        """
+        scenario, alive = self.prepared.scenario, self.alive
+        if not alive.any():
+            return math.nan
+        coverage = Coverage(self.prepared.importance, scenario.scale.env_scale)
+        return coverage.cost(self.positions_m[alive])
+
+
+class FlightMoment(WorldMoment):
+    """What a flight's watcher is shown."""
+
+    stopped = False
+
+    def stop(self) -> None:
+        """End the flight here: its duration is what it has lasted by now."""
+        self.stopped = True
+
+
+Watch = Callable[[FlightMoment], object]
+
+
+def fly(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -> SimulatedFlight:
     """Simulate `scenario`; `bundle` flies it, or gives a baseline the sizes of its perception.
 
-    `progress` is called with the simulated time. Raises BundleError for a bundle without
-    perception, ValueError for impossible link parameters.
+    `watch` is called at each sample, every `SAMPLE_S` from 0 to the end, and may stop the flight.
+    What it returns is ignored; what it raises comes through. The flight is the same, bit by bit, as
+    without it. Raises BundleError for a bundle without perception, ValueError for impossible link
+    parameters, and for a flight that is stopped at its start.
     """
     prepared = prepare(scenario, bundle)
     perception, parameters = prepared.perception, prepared.parameters
@@ -325,8 +419,13 @@ def fly(
     positions = []
     for time_s, positions_m in zip(times_s, swarm.run(times_s), strict=True):
         positions.append(positions_m)
-        if progress:
-            progress(time_s)
+        if watch is None:
+            continue
+        moment = FlightMoment(prepared, swarm, time_s)
+        watch(moment)
+        if moment.stopped:
+            prepared = prepared.until(time_s)
+            break
     return prepared.flight(np.array(positions), swarm.message_counts(), swarm.largest_payload)
 
 

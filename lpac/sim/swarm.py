@@ -134,6 +134,17 @@ class Swarm(Generic[_Robot]):
         """The true positions (N, 2) now."""
         return self._vehicles.positions_m()
 
+    def velocities_m_s(self) -> F64:
+        """The velocities (N, 2) that the vehicles are told now."""
+        return self._vehicles.velocities_m_s()
+
+    def heard(self, now_s: float) -> Bools:
+        """(N, N), [receiver, sender]: whose message a robot has that is fresh; takes none away."""
+        heard = np.zeros((len(self.robots),) * 2, np.bool_)
+        for receiver, robot in enumerate(self.robots):
+            heard[receiver, [near.robot_id for near in robot.mailbox.neighbours(now_s)]] = True
+        return heard & self.alive[:, None]
+
     @property
     def alive(self) -> Bools:
         """(N,): who has not failed now."""

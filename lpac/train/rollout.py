@@ -17,7 +17,7 @@ from edge.core.perception import PerceptionParameters
 from edge.policy.bundle import Bundle
 from edge.policy.family import Observation
 from lpac.evaluate.worlds import SetUp, draw_world
-from lpac.sim.batch import BatchedFlights, PolicyFailedError, WorldMoment
+from lpac.sim.batch import BatchedFlights, BatchMoment, PolicyFailedError
 from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
 from lpac.sim.experiment import Scenario
 from lpac.sim.failure import Failure
@@ -280,7 +280,7 @@ class _Kept:
         self._robots: list[int] = []
         self._adjacency: list[Bools] = []
 
-    def add(self, moment: WorldMoment, expert: Expert) -> None:
+    def add(self, moment: BatchMoment, expert: Expert) -> None:
         robots, arrays = moment.inputs()
         if not robots:
             return

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge.core import F32, F64, Bools
+from edge.core import F32, F64
 from edge.core.perception import PerceptionParameters
 from edge.core.ports import OdometrySource
 from edge.policy.bundle import Bundle
@@ -20,7 +20,7 @@ from edge.robot.pac import PacParameters
 from lpac.sim.batch.agents import Agents, make_agents
 from lpac.sim.batch.robot import BatchedRobot, DeferredSteps
 from lpac.sim.batch.seen import ShownWorld
-from lpac.sim.experiment import Preparation, Scenario, SimulatedFlight, prepare
+from lpac.sim.experiment import Preparation, Scenario, SimulatedFlight, WorldMoment, prepare
 from lpac.sim.swarm import Swarm
 from lpac.sim.vehicles import PointVehicles
 
@@ -36,34 +36,12 @@ class PolicyInputs(NamedTuple):
     arrays: Mapping[str, F32]
 
 
-class WorldMoment:
+class BatchMoment(WorldMoment):
     """One world of a batch at one time; valid until the batch goes on."""
 
     def __init__(self, prepared: Preparation, swarm: Swarm[BatchedRobot], time_s: float) -> None:
-        self.prepared = prepared
-        self.time_s = time_s
+        super().__init__(prepared, swarm, time_s)
         self._swarm = swarm
-        # (N, 2), true positions in the mission frame, m.
-        self.positions_m = swarm.positions_m()
-
-    @property
-    def positions(self) -> F64:
-        """(N, 2): true positions in model units."""
-        return self.prepared.scenario.scale.position_to_model(self.positions_m)
-
-    @property
-    def alive(self) -> Bools:
-        """(N,): who has not failed."""
-        return self._swarm.alive
-
-    @property
-    def adjacency(self) -> Bools:
-        """(N, N): who is truly in communication range of whom, and both alive; not oneself."""
-        x, y = self.positions.T
-        distances = np.hypot(x[:, None] - x, y[:, None] - y)
-        np.fill_diagonal(distances, np.inf)
-        near: Bools = distances < self.prepared.perception.communication_range
-        return near & np.logical_and.outer(self.alive, self.alive)
 
     def inputs(self) -> PolicyInputs:
         """See `PolicyInputs`. Nothing that the robots do later depends on it."""
@@ -124,12 +102,12 @@ class BatchedFlights:
             if running:
                 self._deferred.compute()
 
-    def moments(self, times_s: Sequence[float]) -> Iterator[tuple[WorldMoment, ...]]:
+    def moments(self, times_s: Sequence[float]) -> Iterator[tuple[BatchMoment, ...]]:
         """All worlds at each of `times_s`, which ascend. Raises PolicyFailedError."""
         for time_s in times_s:
             self.advance([time_s] * len(self.swarms))
             yield tuple(
-                WorldMoment(world, swarm, time_s)
+                BatchMoment(world, swarm, time_s)
                 for world, swarm in zip(self.prepared, self.swarms, strict=True)
             )
 

@@ -27,8 +27,13 @@ def fly_simulated(
 ) -> FleetFlight:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
-    With `logs` the robots write theirs in `folder`; `recorded` is the folder of such a flight,
-    whose policies' steps are taken again. Raises what `SimulatedFleet` does, and RecordingError.
+    Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
+    the script. With `logs` the robots write theirs below `folder`, in robots/ID/logs; `recorded` is
+    the folder of such a flight, whose policies' steps are taken again. Times, positions and costs
+    are in the record; `problem` says what kept the script from its end.
+
+    Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
+    written, and RecordingError.
     """
     earlier = set(folder.rglob("*.mcap"))
     fleet = SimulatedFleet(scenario, folder, bundle, logs=logs, recorded=recorded)

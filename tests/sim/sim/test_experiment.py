@@ -11,7 +11,7 @@ from edge.core.world import GaussianFeature
 from edge.policy.bundle import Bundle, BundleError
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
-from lpac.sim.experiment import Controller, Scenario, SimulatedFlight, fly
+from lpac.sim.experiment import Controller, FlightMoment, Scenario, SimulatedFlight, fly
 from lpac.sim.failure import Failure
 from lpac.sim.ticks import Clocks
 
@@ -45,6 +45,62 @@ def test_a_flight_lasts_as_long_as_asked(
     assert flight.time_s[-1] == flight.cost_time_s[-1] == duration_s
     assert np.all(np.diff(flight.time_s) > 0.0) and np.all(np.diff(flight.time_s) < 0.21)
     assert len(flight.positions_m) == len(flight.time_s)
+
+
+@pytest.mark.parametrize("controller", ["lpac", "decentralized-cvt"])
+def test_who_watches_a_flight_changes_nothing(
+    shipped_bundle: Bundle, controller: Controller
+) -> None:
+    failures = (Failure(2, 1.0, 3.0),) if controller == "lpac" else ()
+    scenario = Scenario(robots=4, duration_s=4.5, controller=controller, failures=failures)
+    unwatched = fly(scenario, shipped_bundle)
+    told: dict[float, tuple[np.ndarray, float]] = {}
+
+    def watch(moment: FlightMoment) -> str:
+        told[moment.time_s] = moment.positions_m, moment.cost
+        assert moment.velocities_m_s.shape == (4, 2)
+        assert np.linalg.norm(moment.velocities_m_s, axis=1).max() <= MAX_SPEED_M_S + 1e-9
+        away = controller == "lpac" and 1.0 <= moment.time_s < 3.0
+        assert moment.alive.tolist() == [True, True, not away, True]
+        assert not (moment.heard | moment.adjacency)[~moment.alive].any()
+        return "ignored"
+
+    watched = fly(scenario, shipped_bundle, watch)
+    assert watched.summary() == unwatched.summary()
+    np.testing.assert_array_equal(watched.positions_m, unwatched.positions_m)
+    assert list(told) == unwatched.time_s.tolist()
+    np.testing.assert_array_equal([p for p, _ in told.values()], unwatched.positions_m)
+    assert [told[t][1] for t in unwatched.cost_time_s.tolist()] == unwatched.cost.tolist()
+
+
+def test_a_robot_hears_whom_it_is_near(shipped_bundle: Bundle) -> None:
+    """Without loss, once all have spoken; a robot that is far from the others hears nobody."""
+    starts_m = ((2.0, 2.0), (4.0, 3.0), (3.0, 5.0), (31.0, 31.0))
+    moments: list[tuple[np.ndarray, np.ndarray]] = []
+    scenario = Scenario(robots=4, duration_s=1.0, starts_m=starts_m)
+    fly(scenario, shipped_bundle, lambda moment: moments.append((moment.heard, moment.adjacency)))
+    assert not moments[0][0].any()
+    np.testing.assert_array_equal(moments[-1][0], moments[-1][1])
+    assert moments[-1][0].sum(axis=1).tolist() == [2, 2, 2, 0]
+
+
+def test_a_flight_is_stopped(shipped_bundle: Bundle) -> None:
+    def stop_at(time_s: float) -> SimulatedFlight:
+        return fly(
+            Scenario(robots=3, duration_s=4.0),
+            shipped_bundle,
+            lambda moment: moment.stop() if moment.time_s >= time_s else None,
+        )
+
+    stopped = stop_at(1.5)
+    whole = fly(Scenario(robots=3, duration_s=4.0), shipped_bundle)
+    samples = len(stopped.time_s)
+    assert 1.5 <= stopped.scenario.duration_s == stopped.time_s[-1] == stopped.cost_time_s[-1] < 1.7
+    np.testing.assert_array_equal(stopped.positions_m, whole.positions_m[:samples])
+    assert stopped.cost[:2].tolist() == whole.cost[:2].tolist()
+    assert stopped.record.duration_s == stopped.scenario.duration_s
+    with pytest.raises(ValueError, match="stopped at its start"):
+        stop_at(0.0)
 
 
 def test_controllers_and_losses_meet_the_same_world_and_starts(shipped_bundle: Bundle) -> None:

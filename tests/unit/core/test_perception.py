@@ -247,3 +247,62 @@ def test_a_copied_robot_looks_at_images_of_its_own(channels: int) -> None:
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(images.images(*looks[0]), first)
     np.testing.assert_array_equal(images.images(*looks[1]), second)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    data=st.data(),
+    world_size=st.integers(8, 300),
+    sensor_size=st.sampled_from([2, 10, 32]),
+    cell=st.sampled_from([0, 4]),
+)
+def test_of_what_a_camera_did_not_see_nothing_is_known(
+    data: st.DataObject, world_size: int, sensor_size: int, cell: int
+) -> None:
+    """Two memories: what was not seen has another importance for each, and both know the same."""
+    parameters = PerceptionParameters(
+        world_size, 64, sensor_size, 50.0, unseen_as_nan=True, shared_map_cell=cell
+    )
+    first, second, whole = (RobotMemory(parameters) for _ in range(3))
+    coordinates = st.floats(-0.2 * world_size, 1.2 * world_size)
+    path = data.draw(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=4))
+    rng = np.random.default_rng(0)
+    ever = np.zeros((world_size, world_size), np.bool_)
+    for place in map(np.array, path):
+        seen = rng.random((sensor_size, sensor_size)) < 0.8
+        view, other = rng.random((2, sensor_size, sensor_size), np.float32)
+        first.observe(place, view, seen)
+        second.observe(place, np.where(seen, view, other), seen)
+        whole.observe(place, view)
+        corner = window_corner(place, sensor_size)
+        in_world, in_view = part_in_world(corner, sensor_size, world_size)
+        ever[in_world] |= seen[in_view]
+    position = np.clip(path[-1], 0.0, world_size)
+    local = first.local_map(position).copy()
+    np.testing.assert_array_equal(local, second.local_map(position))
+    in_world, in_local = part_in_world(window_corner(position, 64), 64, world_size)
+    np.testing.assert_array_equal(np.isnan(local[in_local]), ~ever[in_world])
+    centres = ((np.arange(64) + 0.5) * world_size / 64).astype(int)
+    np.testing.assert_array_equal(first.explored, ever[np.ix_(centres, centres)])
+    if cell:
+        tells, knows = (memory.tell(position) for memory in (first, whole))
+        assert tells is not None and knows is not None
+        known = tells.codes != 0
+        # A cell of which one look has shown a part is not told.
+        np.testing.assert_array_equal(tells.codes[known], second.tell(position).codes[known])  # type: ignore[union-attr]
+        assert not known[knows.codes == 0].any()
+
+
+def test_a_camera_that_sees_everything_is_a_sensor() -> None:
+    parameters = dataclasses.replace(PARAMETERS, shared_map_cell=8)
+    memory, other = RobotMemory(parameters), RobotMemory(parameters)
+    rng, everywhere = np.random.default_rng(0), np.ones((64, 64), np.bool_)
+    for place in rng.uniform(-40.0, 552.0, (20, 2)):
+        view = rng.random((64, 64), np.float32)
+        memory.observe(place, view)
+        other.observe(place, view, everywhere)
+        np.testing.assert_array_equal(memory.local_map(place), other.local_map(place))
+        np.testing.assert_array_equal(memory.explored, other.explored)
+        mine, its = memory.tell(place), other.tell(place)
+        assert mine is not None and its is not None
+        np.testing.assert_array_equal(mine.codes, its.codes)

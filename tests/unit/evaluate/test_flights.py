@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +22,10 @@ from lpac.evaluate.flights import (
 from lpac.evaluate.worlds import FIELD, draw_world
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
-from lpac.sim.cores import Outcome, Task
+from lpac.sim.cores import Outcome, in_this_process
 from lpac.sim.failure import LostRobots
 from lpac.sim.ticks import Clocks
 from tests.conftest import SHIPPED
-
-
-def here(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
-    """A pool of this process alone."""
-    for task in tasks:
-        yield do(task)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +93,7 @@ def test_another_bundle_is_not_taken_for_it(flight: EvaluationFlight) -> None:
 
 
 def test_what_was_flown_is_kept(flight: EvaluationFlight, tmp_path: Path) -> None:
-    first = dict(KeptFlights(tmp_path).fly([flight], here))
+    first = dict(KeptFlights(tmp_path).fly([flight], in_this_process))
 
     def refuse(do: object, tasks: Sequence[object]) -> Generator[Outcome, None, None]:
         raise AssertionError(f"{tasks} were flown")

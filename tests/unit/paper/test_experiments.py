@@ -10,19 +10,25 @@ import numpy as np
 import pytest
 
 from edge.policy.bundle import Bundle
+from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.paper.experiments import (
     AWAY_S,
     BASELINES,
     E2_DURATION_S,
     TAKEN,
     TAKEN_AT_S,
+    pads_of,
     perturbation,
     perturbed,
     repeatability,
     spread_of,
     transferability,
+    whole_repeatability,
+    whole_transferability,
 )
+from lpac.paper.flown import fly_whole
 from lpac.paper.report import write_perturbation, write_repeatability, write_transferability
+from lpac.sim.cores import in_this_process
 from lpac.sim.experiment import FIELD_SCALE, fly
 from lpac.sim.failure import Failure
 
@@ -100,21 +106,23 @@ def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) 
         name: fly(replace(scenario, duration_s=3.0), shipped_bundle)
         for name, scenario in repeatability(2).items()
     }
-    spread = spread_of(list(trials.values()))
+    records = {name: flight.record for name, flight in trials.items()}
+    spread = spread_of(list(records.values()))
     finals = [flight.normalized_cost[-1] for flight in trials.values()]
     assert spread["final_mean"] == pytest.approx(np.mean(finals))
     assert spread["final_deviation"] == pytest.approx(np.std(finals, ddof=1))
     ends_m = [flight.positions_m[-1] for flight in trials.values()]
     apart_m = np.linalg.norm(ends_m[0] - ends_m[1], axis=1).mean()
     assert spread["mean_scatter_of_ends_m"] == pytest.approx(apart_m / 2.0)
-    told = write_repeatability(trials, tmp_path / "e2", MADE_BY)
+    told = write_repeatability(records, tmp_path / "e2", MADE_BY)
     assert told["trials"]["trial 2"]["final"] == pytest.approx(finals[1])
+    assert told["trials"]["trial 2"]["final_true"] is None
     assert (tmp_path / "e2" / "repeatability.pdf").exists()
 
     plan = transferability(2)
     worlds = {
         world: {
-            name: fly(replace(of_world[name], duration_s=1.0), shipped_bundle)
+            name: fly(replace(of_world[name], duration_s=1.0), shipped_bundle).record
             for name in ("lpac", "decentralized-cvt-prior")
         }
         for world, of_world in plan.items()
@@ -124,3 +132,31 @@ def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) 
         assert (tmp_path / "e1" / name).stat().st_size > 100
     text = (tmp_path / "e1" / "README.md").read_text()
     assert "| world 1 | " in text and "`lpac paper ...`" in text
+
+
+def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
+    """From pads with room between them; what is drawn has where they truly were."""
+    plan, points = whole_transferability(DEFAULT_BUNDLE, 2), transferability(2)
+    pads_m = pads_of(DEFAULT_BUNDLE)
+    for world, scenario in plan.items():
+        assert scenario.features == points[world]["lpac"].features
+        np.testing.assert_array_equal(scenario.pads_m, pads_m)
+    trials = list(whole_repeatability(DEFAULT_BUNDLE, 3).values())
+    assert len({trial.seed for trial in trials}) == len({trial.pads_m for trial in trials}) == 3
+    for trial in trials:
+        assert np.linalg.norm(np.array(trial.pads_m) - pads_m, axis=1).max() <= 0.1
+
+    few = [
+        replace(trial, robots=2, pads_m=trial.pads_m[:2], duration_s=3.0)
+        for trial in trials[:2]
+        if trial.pads_m
+    ]
+
+    records = {str(n): record for n, record in fly_whole(few, DEFAULT_BUNDLE, in_this_process)}
+    told = write_repeatability(records, tmp_path, MADE_BY, "Whole robots.")
+    for trial in told["trials"].values():
+        assert trial["final_true"] != trial["final"] and np.shape(trial["final_positions_m"]) == (
+            2,
+            2,
+        )
+    assert "Whole robots." in (tmp_path / "README.md").read_text()

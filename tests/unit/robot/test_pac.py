@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edge.core import F32, F64
+from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetTime
 from edge.core.frames import ModelScale
-from edge.core.ports import Odometry
+from edge.core.ports import Look, Odometry
 from edge.core.wire import Rejection, decode, encode
 from edge.policy.bundle import Bundle, BundleError, Manifest
 from edge.policy.family import GoldenCheck, Observation, Perceived, Policy, PolicyStep
@@ -341,6 +341,58 @@ def test_a_policy_is_shown_what_is_unseen_if_its_manifest_asks(shipped_bundle: B
     np.testing.assert_array_equal(np.isnan(marked), ~seen & (np.arange(256) >= 128)[:, None])
     np.testing.assert_array_equal(np.nan_to_num(marked), plain)
     assert not plain[:128].any()  # outside the world
+
+
+@dataclass
+class LeftHalf:
+    """A camera that sees the left half of its square, and is told from where it looks."""
+
+    importance: F32 = field(default_factory=lambda: np.full((64, 64), 0.5, np.float32))
+    seen: Bools = field(default_factory=lambda: np.arange(64 * 64).reshape(64, 64) < 32 * 64)
+    heights: list[float] = field(default_factory=list)
+
+    def look(self, position: F64, height: float) -> Look | None:
+        assert position.tolist() == [256.0, 256.0]
+        self.heights.append(height)
+        return Look(self.importance, self.seen)
+
+
+def test_a_camera_is_told_its_height_and_what_it_did_not_see_stays_unseen(
+    shipped_bundle: Bundle,
+) -> None:
+    manifest = dataclasses.replace(shipped_bundle.manifest, family="watching", parameters={})
+    assert manifest.perception is not None
+    policy = Watching(
+        dataclasses.replace(
+            manifest, perception=dataclasses.replace(manifest.perception, unseen_as_nan=True)
+        )
+    )
+    robot = make_robot(policy, World())
+    robot.sensor = camera = LeftHalf()
+    assert robot.perceive(0.0) is not None
+    assert camera.heights == [48.0]  # 3 m
+    (local,) = policy.local_maps
+    np.testing.assert_array_equal(local[96:128, 96:160], np.float32(0.5))
+    assert np.isnan(local[128:]).all()
+    assert robot.explored().sum() == 4 * 8
+
+
+@pytest.mark.parametrize(
+    ("importance", "seen"),
+    [
+        (np.zeros((64, 63), np.float32), np.ones((64, 63), np.bool_)),
+        (np.zeros((64, 64), np.float32), np.ones((64, 1), np.bool_)),
+        (np.zeros((64, 64), np.float32), np.ones((64, 64), np.float32)),
+        (np.full((64, 64), np.nan, np.float32), np.zeros((64, 64), np.bool_)),
+    ],
+)
+def test_a_look_that_is_none_is_not_used(
+    shipped_policy: LpacPolicy, importance: F32, seen: Bools
+) -> None:
+    robot = make_robot(shipped_policy, World())
+    robot.sensor = LeftHalf(importance, seen)
+    assert robot.perceive(0.0) is None
+    assert not robot.explored().any()
 
 
 def test_a_new_mission_forgets_map_and_messages(shipped_policy: LpacPolicy) -> None:

@@ -1,0 +1,1 @@
+"""A downward camera for lpac-edge: images in, importance out."""

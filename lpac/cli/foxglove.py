@@ -1,0 +1,59 @@
+"""`lpac foxglove`: the fleet, and its logs, in Foxglove."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lpac.cli.apps import new_app
+from lpac.cli.options import DEFAULT_FLEET, Fleet
+
+app = new_app("foxglove", "The fleet in Foxglove, live or from the ground's logs; and a layout.")
+
+_LAYOUT = Path(__file__).parents[1] / "ground" / "foxglove" / "lpac.layout.json"
+Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.")]
+
+
+@app.command()
+def live(
+    fleet: Fleet = DEFAULT_FLEET,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any that is free.")] = 8765,
+    host: Annotated[
+        str, typer.Option(help="Where to serve; beyond this machine anybody there can look.")
+    ] = "127.0.0.1",
+) -> None:
+    """Serve the fleet to Foxglove, until Ctrl-C; needs `lpac ground`. It only observes."""
+    import asyncio
+
+    from lpac.fleet.settings import load_fleet
+    from lpac.ground.foxglove.live import serve
+
+    name = load_fleet(fleet).fleet
+
+    def ready(its_port: int) -> None:
+        typer.echo(f"fleet {name} for Foxglove: open a connection to ws://{host}:{its_port}")
+        typer.echo("it only observes; `lpac foxglove layout` writes the panels to import")
+        typer.echo("Ctrl-C ends it, and nothing else")
+
+    asyncio.run(serve(name, host=host, port=port, ready=ready))
+
+
+@app.command()
+def log(
+    folder: Annotated[Path, typer.Argument(help="Folder with what `lpac record` wrote.")],
+    out: Out = Path("foxglove.mcap"),
+) -> None:
+    """Turn the ground's logs into one file that Foxglove shows as it shows a fleet live."""
+    from lpac.ground.foxglove.logs import convert, ground_logs
+
+    paths = ground_logs(folder)
+    with typer.progressbar(length=len(paths), label="reading") as bar:
+        convert(paths, out, lambda done: bar.update(done - bar.pos))
+    typer.echo(f"{out}: open it in Foxglove, with the panels of `lpac foxglove layout`")
+
+
+@app.command()
+def layout(out: Out = Path("lpac.layout.json")) -> None:
+    """Write the layout: import it in Foxglove, for a fleet live, and for logs."""
+    out.write_text(_LAYOUT.read_text())
+    typer.echo(f"{out}: in Foxglove, Layouts, Import from file")

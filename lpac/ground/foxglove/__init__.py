@@ -1,0 +1,1 @@
+"""The fleet in Foxglove: live, and from the ground's logs."""

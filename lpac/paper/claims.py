@@ -1,0 +1,344 @@
+"""What the paper says, and what the experiments here say of it. Pure: numbers from their JSON.
+
+A verdict follows from a rule that is written beside the claim, never from a person's impression.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lpac.analysis.statistics import Interval95
+from lpac.evaluate.worlds import FIELD, SET_UPS
+from lpac.paper.asynchrony import FIELD as FIELD_TIMING
+from lpac.paper.asynchrony import TIMES_S, Timing
+from lpac.radio.airtime import Traffic, Transport, Wifi, carries
+
+Json = Mapping[str, Any]
+
+# A cost has settled once it stays within so much of what it comes to in the end.
+_SETTLED = 0.1
+# What a robot that is taken away may cost, and what may remain once it is back.
+_AWAY, _BACK = 1.6, 1.1
+# Robots that cover other worlds as well as the field's come to no more of clairvoyant's cost.
+_TRANSFERS = 1.25
+
+
+class Agreement(StrEnum):
+    """What ours says of the paper's."""
+
+    AGREES = "agrees"
+    DIFFERS = "differs"
+    OPEN = "not told"
+    MISTAKE = "a mistake in the paper"
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """`paper` is what it says, `rule` when ours agrees, `ours` what came out."""
+
+    name: str
+    paper: str
+    rule: str
+    ours: str
+    verdict: Agreement
+
+
+class Experiments(NamedTuple):
+    """What each left, by the name of its command; None: it was not made."""
+
+    e1: Json | None = None
+    e2: Json | None = None
+    e3: Json | None = None
+    asynchrony: Json | None = None
+    transfer: Json | None = None
+    network: Json | None = None
+
+
+class Sizes(NamedTuple):
+    """Of the policy: floats in a message beside its header, and bytes in the air in float16."""
+
+    floats: int
+    message_bytes: int
+
+
+def claims_of(made: Experiments, sizes: Sizes) -> list[Claim]:
+    """All claims that what was made speaks of, in the paper's order."""
+    found = [_size(sizes)]
+    for document, claims in (
+        (made.e1, _e1), (made.e2, _e2), (made.e3, _e3), (made.transfer, _transfer),
+        (made.asynchrony, _asynchrony), (made.network, _network),
+    ):  # fmt: skip
+        if document is not None:
+            found += claims(document)
+    return [*found, _team(), _rotation(), _density()]
+
+
+def _agrees(holds: bool) -> Agreement:
+    return Agreement.AGREES if holds else Agreement.DIFFERS
+
+
+def _size(sizes: Sizes) -> Claim:
+    return Claim(
+        "Message size",
+        "A message's size does not depend on the number of robots.",
+        "The encoding has no part that grows with the number of robots.",
+        f"{sizes.floats} floats, whoever is heard: {sizes.message_bytes} bytes at most in float16, "
+        "with header and shared map. The format has no list of robots.",
+        Agreement.AGREES,
+    )
+
+
+def _e1(e1: Json) -> list[Claim]:
+    worlds = {name: its for name, its in e1.items() if name != "made_by"}
+    settled_s = [_settled_s(its["lpac"]) for its in worlds.values()]
+    ends_s = [its["lpac"]["time_s"][-1] for its in worlds.values()]
+    finals = ", ".join(
+        f"{its['lpac']['final']:.3f} ({its['clairvoyant-cvt']['final']:.3f})"
+        for its in worlds.values()
+    )
+    times = ", ".join(f"{time_s:.0f} s" for time_s in settled_s)
+    early = sum(s <= 0.75 * end_s for s, end_s in zip(settled_s, ends_s, strict=True))
+    return [
+        Claim(
+            "E1: transfers to unseen worlds",
+            "In three worlds that it was not trained on, from the same starts, the robots have "
+            "typically converged within 60 s. No costs are given.",
+            f"In most worlds the cost stays within {100 * _SETTLED:.0f} % of that at 60 s from "
+            "three quarters of the time on.",
+            f"Cost at 60 s over that at the start, with clairvoyant Lloyd's in brackets: {finals}. "
+            f"It had settled after {times}.",
+            _agrees(2 * early > len(worlds)),
+        )
+    ]
+
+
+def _settled_s(flight: Json) -> float:
+    cost = np.array(flight["normalized_cost"])
+    off = np.flatnonzero(np.abs(cost / cost[-1] - 1.0) > _SETTLED)
+    return float(flight["time_s"][off[-1] + 1]) if len(off) else 0.0
+
+
+def _e2(e2: Json) -> list[Claim]:
+    spread = e2["spread"]
+    in_flight, final = spread["largest_deviation_in_flight"], spread["final_deviation"]
+    return [
+        Claim(
+            "E2: repeatable under GPS errors",
+            "Three trials in one world, with robots placed within 10 cm: the curves differ, the "
+            "costs at the end are similar, and GPS scatters where robots start and end.",
+            "The standard deviation over trials is smaller at the end than at some time in flight.",
+            f"{len(e2['trials'])} trials: {spread['final_mean']:.3f} at the end, standard "
+            f"deviation {final:.3f}, in flight up to {in_flight:.3f}. A robot ends "
+            f"{spread['mean_scatter_of_ends_m']:.1f} m from the mean of its ends.",
+            _agrees(final < in_flight),
+        )
+    ]
+
+
+def _e3(e3: Json) -> list[Claim]:
+    away = [phase for phase in e3["phases"] if phase["away"]]
+    back = [phase for phase in e3["phases"] if not phase["away"]]
+    before = [phase["cost_before"] for phase in away]
+    worst = max(p["cost_worst"] / b for p, b in zip(away, before, strict=True))
+    remains = max(p["cost_end"] / b for p, b in zip(back, before, strict=True))
+    settled_s = max(phase["settled_s"] for phase in away)
+    return [
+        Claim(
+            "E3: robust to a robot's removal",
+            "A pilot takes a robot away in steady state and brings it back; the others make up for "
+            "it. No figure is given.",
+            f"Away the cost is at most {_AWAY:g} times that before, and {_BACK:g} times once the "
+            "robot is back.",
+            f"{len(away)} robots taken: at worst {worst:.2f} times the cost before, settled after "
+            f"{settled_s:.0f} s at most; {remains:.2f} times at most once it is back.",
+            _agrees(worst <= _AWAY and remains <= _BACK),
+        )
+    ]
+
+
+def _transfer(transfer: Json) -> list[Claim]:
+    policies = [method["name"] for method in transfer["methods"] if method["bundles"]]
+    parts, over = [], dict.fromkeys(policies, 0.0)
+    for condition in transfer["conditions"]:
+        ratios = []
+        for result in condition["results"]:
+            if result["name"] in over:
+                ratio = result["over_clairvoyant"]["ratio_of_means"][0]
+                over[result["name"]] = max(over[result["name"]], ratio)
+                ratios.append(f"{result['name']} {ratio:.2f}")
+        parts.append(f"{condition['name']}: {', '.join(ratios)}")
+    best = min(over.values())
+    return [
+        Claim(
+            "Transfers to other numbers of robots",
+            "Trained with 32 robots in 1024 x 1024 cells, the policy is flown with 10 in "
+            "512 x 512; its other paper has it with more and fewer robots, features and ranges.",
+            f"One policy comes to at most {_TRANSFERS:g} times clairvoyant Lloyd's cost in all.",
+            f"Mean cost at the end over clairvoyant Lloyd's, {transfer['worlds']} worlds each. "
+            f"{'; '.join(parts)}.",
+            _agrees(best <= _TRANSFERS),
+        )
+    ]
+
+
+def _asynchrony(told: Json) -> list[Claim]:
+    by_timing = {
+        Timing(*(of[name] for name in Timing._fields)): [Interval95(*r) for r in of["over_field"]]
+        for of in told["timings"]
+    }
+
+    def ends(timings: Sequence[Timing]) -> str:
+        return ", ".join(
+            f"{t.policy_hz:g} Hz x {by_timing[t][-1][0]:.2f} "
+            f"({by_timing[t][-1][1]:.2f} to {by_timing[t][-1][2]:.2f})"
+            for t in timings
+        )
+
+    same = [t for t in by_timing if t.perception_hz == FIELD_TIMING.perception_hz]
+    own = [t for t in same if not t.synchronous and t.delay_s == 0.0]
+    slower = [t for t in own if t.policy_hz < FIELD_TIMING.policy_hz]
+    faster = [t for t in own if t.policy_hz > FIELD_TIMING.perception_hz]
+    together = FIELD_TIMING._replace(synchronous=True)
+    count = f"{told['worlds']} worlds, cost at {TIMES_S[-1]:g} s over that with the field's rates"
+    claims = [
+        Claim(
+            "Asynchronous modules",
+            "Perception, exchange and control run each at a rate of its own, and no robot waits "
+            "for another.",
+            "All robots at the same moments are not better than each at its own.",
+            f"{count}. All at the same moments: {ends([together])}.",
+            _agrees(not by_timing[together][-1].high < 1.0),
+        )
+    ]
+    for name, said, timings in (
+        ("An exchange slower than perception",
+         "A slower exchange has a longer window in which to hear everybody.", slower),
+        ("An exchange faster than perception",
+         "A faster exchange lets features travel several hops for each perception.", faster),
+    ):  # fmt: skip
+        if timings:
+            ratios = [by_timing[timing][-1] for timing in timings]
+            better = any(ratio.high < 1.0 for ratio in ratios)
+            worse = all(ratio.low > 1.0 for ratio in ratios)
+            verdict = Agreement.DIFFERS if worse else Agreement.OPEN
+            claims.append(
+                Claim(
+                    name,
+                    f"{said} No measurement of either.",
+                    "It agrees if one such rate is better (its 95 % interval below 1), and differs "
+                    "if all are worse.",
+                    f"{count}. Perception at {FIELD_TIMING.perception_hz:g} Hz, exchange at "
+                    f"{ends(timings)}.",
+                    Agreement.AGREES if better else verdict,
+                )
+            )
+    return claims
+
+
+def _network(network: Json) -> list[Claim]:
+    where = network["measured_on"]["where"]
+    air = (
+        "Measured on one machine's loopback, which has no radio: it says nothing of the air."
+        if where == "loopback"
+        else "Measured between network namespaces."
+    )
+    restarts = {s["middleware"]: s for s in network["summaries"] if s["experiment"] == "restarts"}
+    said = ", ".join(
+        f"{name} {one['throughput_mbit_s']['mean']:.1f} Mbit/s"
+        + (f", {100 * one['delivered']['mean']:.0f} % delivered" if "delivered" in one else "")
+        for name, one in restarts.items()
+    )
+    others = [
+        one["throughput_mbit_s"]["mean"]
+        for name, one in restarts.items()
+        if name not in ("zenoh", "nothing")
+    ]
+    doubled = (
+        bool(others)
+        and "zenoh" in restarts
+        and (restarts["zenoh"]["throughput_mbit_s"]["mean"] > 1.5 * max(others))
+    )
+    curves = [s for s in network["summaries"] if s["experiment"] == "robots"]
+    zenoh = sorted((s for s in curves if s["middleware"] == "zenoh"), key=lambda s: s["robots"])
+    told = ", ".join(f"{s['robots']}: {s['throughput_mbit_s']['mean']:.1f}" for s in zenoh)
+    falls = len(zenoh) > 1 and (
+        zenoh[-1]["throughput_mbit_s"]["mean"] < zenoh[0]["throughput_mbit_s"]["mean"]
+    )
+    on_loopback = where == "loopback"
+    return [
+        Claim(
+            "Table I: throughput while programs restart",
+            "83.3 ± 1.5 Mbit/s with zenoh, 43.2 ± 7.6 without it (ROS 2's default DDS; downlink "
+            "82.9 and 42.7): three robots, 60 s, ten repetitions.",
+            "With zenoh the stream gets more than 1.5 times what it gets with DDS.",
+            f"{said}. {air}",
+            Agreement.OPEN if on_loopback or not others else _agrees(doubled),
+        ),
+        Claim(
+            "Figure: throughput against the number of robots",
+            "It falls as robots are switched on, one after another. No table.",
+            "With the most robots it is lower than with one.",
+            f"Mbit/s by robots that run zenoh: {told}. {air}",
+            Agreement.OPEN if on_loopback else _agrees(falls),
+        ),
+    ]
+
+
+def _team() -> Claim:
+    wifi = Wifi()
+    transports: tuple[Transport, ...] = ("mesh", "router", "multicast")
+    said = ", ".join(
+        f"{transport} {carries(transport, wifi, Traffic(robots=1), most_robots=1000)} robots"
+        for transport in transports
+    )
+    return Claim(
+        "Size of a team",
+        "One access point carried no more than ten robots.",
+        "By our model of one Wi-Fi channel, ten take less than 60 % of it.",
+        f"At 60 % of a channel of {wifi.data_rate_mbit_s:g} Mbit/s, by the model, which no radio "
+        f"was compared with: {said}. The paper's wall is not this one: it says nothing of what "
+        "its robots sent.",
+        Agreement.OPEN,
+    )
+
+
+def printed_rotation(heading_rad: float) -> np.ndarray:
+    """Equation 4 as it is printed, R_z(3 pi / 2 - theta) R_x(pi): mission to north, east, down."""
+    angle = 1.5 * math.pi - heading_rad
+    sin, cos = math.sin(angle), math.cos(angle)
+    about_z = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    rotation: np.ndarray = about_z @ np.diag([1.0, -1.0, -1.0])
+    return rotation
+
+
+def _rotation() -> Claim:
+    parts = []
+    for heading_deg in (0, 30, 90):
+        north, east, _ = printed_rotation(math.radians(heading_deg)) @ np.array([0.0, 1.0, 0.0])
+        azimuth_deg = round(math.degrees(math.atan2(east, north))) % 360
+        parts.append(f"with a heading of {heading_deg}° to {azimuth_deg}°")
+    return Claim(
+        "Equation 4: from the mission's frame to the autopilot's",
+        "R_z(3π/2 - θ) R_x(π), θ being the compass heading of the mission's y axis.",
+        "The mission's y axis has to point to its heading.",
+        f"As it is printed, a robot that is told to fly along y flies {', '.join(parts)}. Ours is "
+        "[[-sin θ, cos θ, 0], [cos θ, sin θ, 0], [0, 0, -1]], by the paper's own convention.",
+        Agreement.MISTAKE,
+    )
+
+
+def _density() -> Claim:
+    field, trained = FIELD, SET_UPS["paper"]
+    densities = [s.robots / s.world_size**2 for s in (trained, field)]
+    return Claim(
+        "Densities of robots",
+        "3.1e-5 robots per cell in training, 3.8e-4 in the field.",
+        "Robots over cells.",
+        f"{trained.robots} / {trained.world_size}² = {densities[0]:.1e}, and {field.robots} / "
+        f"{field.world_size}² = {densities[1]:.1e}: a tenth of what is printed.",
+        Agreement.MISTAKE,
+    )

@@ -1,0 +1,157 @@
+"""The paper, repeated: what its experiments left in a folder, as one page that holds everything."""
+
+import html
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from edge.core.wire import most_bytes
+from edge.drivers.registry import load_policy
+from edge.policy.bundle import Bundle
+from lpac.analysis.page import CLOSING, figure, opening, table
+from lpac.paper.claims import Agreement, Claim, Experiments, Sizes, claims_of
+
+TITLE = "The paper, repeated"
+_PAPER = (
+    "Agarwal, Vatnsdal, Garcia Camargo, Kumar, Ribeiro: “A Scalable Multi-Robot Framework for "
+    "Decentralized and Asynchronous Perception-Action-Communication Loops”"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Chapter:
+    """An experiment of the page: its command, what it is, its data, and its figures' captions."""
+
+    name: str
+    title: str
+    data: str
+    figures: Mapping[str, str]
+
+
+CHAPTERS = (
+    Chapter(
+        "e1", "E1, transferability", "e1.json",
+        {
+            "snapshots": "Three worlds that no policy was trained on, at 0, 15, 30 and 60 s: "
+            "robots, their paths and Voronoi cells over the density, which is faint where no "
+            "robot had looked by then.",
+            "costs": "Coverage cost over that at the start, beside the baselines.",
+        },
+    ),
+    Chapter(
+        "e2", "E2, repeatability", "e2.json",
+        {"repeatability": "Cost of all trials, their mean and standard deviation; end positions."},
+    ),
+    Chapter(
+        "e3", "E3, perturbation", "e3.json",
+        {"perturbation": "Cost, neighbours in range and speeds; shaded while a robot is away."},
+    ),
+    Chapter(
+        "transfer", "Transfer to other teams and worlds", "evaluation.json",
+        {"conditions": "Mean cost at the end over clairvoyant Lloyd's, with 95 % intervals."},
+    ),
+    Chapter(
+        "async", "Rates and asynchrony", "async.json",
+        {
+            "rates": "Cost over the policy's rate, in terms of that with the field's rates. Full "
+            "lines: each robot at its own moments; dashed: all at the same ones.",
+            "staleness": "At the field's rates, with messages that are late.",
+        },
+    ),
+    Chapter(
+        "network", "Network", "network.json",
+        {
+            "restarts": "What a stream between two robots gets while all programs restart.",
+            "robots": "The same over the number of robots, and how old their messages are.",
+        },
+    ),
+)  # fmt: skip
+
+
+def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, str]]) -> Path:
+    """index.html, claims.json and claims.csv of what lies in `folder`; gives the page's path.
+
+    `made_by` says of each experiment what made it; one that is missing there is left out. Raises
+    OSError.
+    """
+    documents = {
+        chapter.name: json.loads((folder / chapter.name / chapter.data).read_text())
+        for chapter in CHAPTERS
+        if chapter.name in made_by
+    }
+    claims = claims_of(
+        Experiments(
+            e1=documents.get("e1"), e2=documents.get("e2"), e3=documents.get("e3"),
+            asynchrony=documents.get("async"), transfer=documents.get("transfer"),
+            network=documents.get("network"),
+        ),
+        sizes_of(bundle),
+    )  # fmt: skip
+    told = {
+        "claims": [_claim_json(claim) for claim in claims],
+        "made_by": {name: dict(its) for name, its in made_by.items()},
+    }
+    (folder / "claims.json").write_text(json.dumps(told, indent=2) + "\n")
+    path = folder / "index.html"
+    path.write_text(_page(folder, claims, made_by))
+    return path
+
+
+def sizes_of(bundle: Bundle) -> Sizes:
+    """Of the messages of a bundle's policy."""
+    policy, perception = load_policy(bundle), bundle.manifest.perception
+    side = perception.shared_map_side if perception else 0
+    return Sizes(policy.message_size, most_bytes(policy.message_size, "float16", side))
+
+
+def _claim_json(claim: Claim) -> dict[str, Any]:
+    return {
+        "name": claim.name, "paper": claim.paper, "rule": claim.rule, "ours": claim.ours,
+        "verdict": claim.verdict.value,
+    }  # fmt: skip
+
+
+def _page(folder: Path, claims: Sequence[Claim], made_by: Mapping[str, Mapping[str, str]]) -> str:
+    parts = [
+        opening(TITLE),
+        f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and what came of it here. "
+        "Everything was simulated: no robot of this report has flown.</p>",
+        table(
+            ("", "the paper", "ours", "verdict"),
+            [
+                (
+                    _text(claim.name),
+                    _text(claim.paper),
+                    f"{_text(claim.ours)}<br><span class='quiet'>Rule: {_text(claim.rule)}</span>",
+                    _verdict(claim.verdict),
+                )
+                for claim in claims
+            ],
+        ),
+    ]
+    for chapter in CHAPTERS:
+        if chapter.name not in made_by:
+            continue
+        its = folder / chapter.name
+        parts.append(f'<h2 id="{chapter.name}">{_text(chapter.title)}</h2>')
+        parts += [
+            figure((its / f"{name}.png").read_bytes(), caption)
+            for name, caption in chapter.figures.items()
+            if (its / f"{name}.png").exists()
+        ]
+        said = "; ".join(f"{what}: {value}" for what, value in made_by[chapter.name].items())
+        parts.append(
+            f'<p class="quiet">{_text(said)}. Data and figures for print: {chapter.name}/.</p>'
+        )
+    return "\n".join([*parts, CLOSING]) + "\n"
+
+
+def _verdict(verdict: Agreement) -> str:
+    bad = verdict in (Agreement.DIFFERS, Agreement.MISTAKE)
+    return f'<span class="bad">{verdict.value}</span>' if bad else verdict.value
+
+
+def _text(text: str) -> str:
+    return html.escape(text)

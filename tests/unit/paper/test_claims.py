@@ -1,0 +1,195 @@
+"""What the experiments say of the paper's claims, and the page that tells it."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lpac.cli.paper
+from edge.core.frames import MissionFrame
+from edge.policy.bundle import Bundle
+from lpac.paper.claims import Agreement, Claim, Experiments, Sizes, claims_of, printed_rotation
+from lpac.paper.repeated import CHAPTERS, sizes_of, write_page
+
+TIME_S = [float(t) for t in range(61)]
+FALLS = [0.2 + 0.8 * math.exp(-t / 8.0) for t in TIME_S]
+SIZES = Sizes(1188, 3600)
+
+
+def flight(cost: list[float]) -> dict[str, Any]:
+    return {"time_s": TIME_S, "normalized_cost": cost, "final": cost[-1]}
+
+
+def of_worlds(*costs: list[float]) -> dict[str, Any]:
+    worlds = {
+        f"world {n}": {"lpac": flight(cost), "clairvoyant-cvt": flight(FALLS)}
+        for n, cost in enumerate(costs)
+    }
+    return {**worlds, "made_by": {}}
+
+
+def repeated(final: float, in_flight: float) -> dict[str, Any]:
+    spread = {
+        "final_mean": 0.3, "final_deviation": final, "largest_deviation_in_flight": in_flight,
+        "mean_scatter_of_ends_m": 1.5,
+    }  # fmt: skip
+    return {"trials": {"1": {}, "2": {}}, "spread": spread}
+
+
+def taken(worst: float, end: float) -> dict[str, Any]:
+    phase = {"cost_before": 0.2, "settled_s": 3.0}
+    return {
+        "phases": [
+            {**phase, "away": True, "cost_worst": worst, "cost_end": 0.21},
+            {**phase, "away": False, "cost_worst": 0.21, "cost_end": end},
+        ]
+    }
+
+
+def rates(together: float, slow: float, fast: float) -> dict[str, Any]:
+    def timing(policy_hz: float, ratio: float, synchronous: bool = False) -> dict[str, Any]:
+        return {
+            "perception_hz": 5.0, "policy_hz": policy_hz, "synchronous": synchronous,
+            "delay_s": 0.0, "over_field": [[ratio, ratio - 0.02, ratio + 0.02]] * 3,
+        }  # fmt: skip
+
+    timings = [timing(2.5, 1.0), timing(2.5, together, True), timing(0.5, slow), timing(10.0, fast)]
+    return {"worlds": 4, "timings": timings}
+
+
+def measured(where: str, zenoh: float, dds: float) -> dict[str, Any]:
+    def summary(experiment: str, middleware: str, robots: int, mbit_s: float) -> dict[str, Any]:
+        spread = {"mean": mbit_s, "deviation": None, "runs": 1}
+        return {
+            "experiment": experiment, "middleware": middleware, "robots": robots,
+            "throughput_mbit_s": spread,
+        }  # fmt: skip
+
+    return {
+        "measured_on": {"where": where},
+        "summaries": [
+            summary("restarts", "zenoh", 3, zenoh), summary("restarts", "cyclonedds", 3, dds),
+            summary("robots", "zenoh", 1, 50.0), summary("robots", "zenoh", 3, 40.0),
+        ],
+    }  # fmt: skip
+
+
+def transferred(over: float) -> dict[str, Any]:
+    result = {"name": "field", "over_clairvoyant": {"ratio_of_means": [over, 1.0, 2.0]}}
+    methods = [{"name": "field", "bundles": [{}]}, {"name": "clairvoyant-cvt", "bundles": []}]
+    return {"worlds": 2, "methods": methods, "conditions": [{"name": "n3", "results": [result]}]}
+
+
+def claim(made: Experiments, name: str) -> Claim:
+    [found] = [claim for claim in claims_of(made, SIZES) if claim.name.startswith(name)]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "agrees", "differs"),
+    [
+        ("E1", Experiments(e1=of_worlds(FALLS, FALLS, FALLS[::-1])),
+         Experiments(e1=of_worlds(FALLS, FALLS[::-1]))),
+        ("E2", Experiments(e2=repeated(0.02, 0.1)), Experiments(e2=repeated(0.1, 0.1))),
+        ("E3", Experiments(e3=taken(0.3, 0.21)), Experiments(e3=taken(0.3, 0.25))),
+        ("E3", Experiments(e3=taken(0.3, 0.21)), Experiments(e3=taken(0.4, 0.21))),
+        ("Transfers", Experiments(transfer=transferred(1.2)),
+         Experiments(transfer=transferred(1.3))),
+        ("Asynchronous", Experiments(asynchrony=rates(1.0, 1.0, 1.0)),
+         Experiments(asynchrony=rates(0.9, 1.0, 1.0))),
+        ("An exchange slower", Experiments(asynchrony=rates(1.0, 0.9, 1.0)),
+         Experiments(asynchrony=rates(1.0, 1.1, 1.0))),
+        ("An exchange faster", Experiments(asynchrony=rates(1.0, 1.0, 0.9)),
+         Experiments(asynchrony=rates(1.0, 1.0, 1.1))),
+        ("Table I", Experiments(network=measured("namespaces", 80.0, 40.0)),
+         Experiments(network=measured("namespaces", 50.0, 40.0))),
+    ],
+)  # fmt: skip
+def test_a_verdict_follows_from_the_numbers(
+    name: str, agrees: Experiments, differs: Experiments
+) -> None:
+    assert claim(agrees, name).verdict is Agreement.AGREES
+    assert claim(differs, name).verdict is Agreement.DIFFERS
+
+
+def test_what_the_data_do_not_tell_is_not_told() -> None:
+    on_loopback = Experiments(network=measured("loopback", 80.0, 40.0))
+    for name in ("Table I", "Figure"):
+        assert claim(on_loopback, name).verdict is Agreement.OPEN
+    undecided = Experiments(asynchrony=rates(1.0, 1.0, 1.0))
+    assert claim(undecided, "An exchange slower").verdict is Agreement.OPEN
+    names = [claim.name for claim in claims_of(Experiments(), SIZES)]
+    assert not any(name.startswith("E1") for name in names) and len(names) == 4
+
+
+def test_the_printed_rotation_is_right_at_a_heading_of_90_degrees_alone() -> None:
+    for heading_deg, right in ((0, False), (30, False), (90, True)):
+        frame = MissionFrame(40.0, -75.0, math.radians(heading_deg))
+        ours = frame.relative_to(40.0, -75.0)
+        printed = printed_rotation(math.radians(heading_deg))
+        for axis in np.eye(3):
+            same = np.allclose(printed @ axis, ours.velocity_to_local(axis))
+            assert same or not right
+        assert right == np.allclose(printed @ [0, 1, 0], ours.velocity_to_local(np.eye(3)[1]))
+    rotation = claim(Experiments(), "Equation 4")
+    assert rotation.verdict is Agreement.MISTAKE
+    assert "heading of 0° to 180°" in rotation.ours and "90° to 90°" in rotation.ours
+
+
+def test_one_page_holds_everything(tmp_path: Path, shipped_bundle: Bundle) -> None:
+    made = {"e2": repeated(0.02, 0.1), "e3": taken(0.3, 0.21)}
+    png = bytes.fromhex("89504e470d0a1a0a")
+    for chapter in CHAPTERS:
+        if chapter.name in made:
+            folder = tmp_path / chapter.name
+            folder.mkdir()
+            (folder / chapter.data).write_text(json.dumps(made[chapter.name]))
+            for figure in chapter.figures:
+                (folder / f"{figure}.png").write_bytes(png)
+    made_by = {name: {"command": f"lpac paper {name} <quick>"} for name in made}
+    page = write_page(tmp_path, shipped_bundle, made_by).read_text()
+    assert page.count("data:image/png;base64,") == 2 and "http" not in page
+    assert "lpac paper e2 &lt;quick&gt;" in page and 'id="e1"' not in page
+    told = json.loads((tmp_path / "claims.json").read_text())
+    assert told["made_by"] == made_by
+    assert {c["name"].split(":")[0] for c in told["claims"]} > {"E2", "E3", "Equation 4"}
+    assert all(claim["rule"] in page.replace("&#x27;", "'") for claim in told["claims"])
+
+
+def test_a_message_has_a_size_of_its_own(shipped_bundle: Bundle) -> None:
+    sizes = sizes_of(shipped_bundle)
+    assert sizes.message_bytes > 2 * sizes.floats > 0
+
+
+def test_what_was_made_is_not_made_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    documents = {
+        "e1": of_worlds(FALLS), "e2": repeated(0.02, 0.1), "e3": taken(0.3, 0.21),
+        "transfer": transferred(1.2), "async": rates(1.0, 1.0, 1.0),
+        "network": measured("loopback", 80.0, 40.0),
+    }  # fmt: skip
+    asked: list[str] = []
+
+    def make(name: str, data: str) -> Any:
+        def made(*, out: Path, **_: object) -> None:
+            asked.append(name)
+            out.mkdir(parents=True, exist_ok=True)
+            (out / data).write_text(json.dumps(documents[name]))
+
+        return made
+
+    for chapter in CHAPTERS:
+        function = "asynchrony" if chapter.name == "async" else chapter.name
+        monkeypatch.setattr(lpac.cli.paper, function, make(chapter.name, chapter.data))
+    lpac.cli.paper.everything(quick=True, out=tmp_path)
+    assert sorted(asked) == sorted(documents)
+    lpac.cli.paper.everything(quick=True, out=tmp_path)
+    assert len(asked) == len(documents)
+    # What is not quick is something else.
+    lpac.cli.paper.everything(out=tmp_path)
+    assert sorted(asked[len(documents) :]) == ["async", "network", "transfer"]
+    assert capsys.readouterr().out.endswith(f"see {tmp_path / 'index.html'}\n")
