@@ -2,10 +2,8 @@
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import textwrap
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from edge.core.perception import PerceptionParameters
 from edge.messages import topics
 from edge.policy import bundle, family
 from handbook.markdown import code
+from lpac import api
 from lpac.train import family as learnable
 
 _LINE = 88
@@ -39,18 +38,12 @@ _INTERFACES = {
 
 def python_api() -> str:
     """`lpac.api`, all of it."""
-    lead = "# Python API"
-    if find_spec("lpac.api") is None:
-        return f"{lead}\n\nThis version has no module `lpac.api`."
-    api = importlib.import_module("lpac.api")
-    names: list[str] = api.__all__
     return "\n\n".join(
         [
-            lead,
-            "`from lpac import api`. What stands here stays from release to release, or the "
-            "changelog says so.",
+            "# Python API",
+            "[The Python API](../api.md) shows how to use it; this is all of `lpac.api`.",
             inspect.getdoc(api) or "",
-            *(_described(getattr(api, name), name, "##") for name in names),
+            *(_described(getattr(api, name), name, "##") for name in api.__all__),
         ]
     )
 
