@@ -19,7 +19,9 @@ _LINE = 88
 _ROOT = Path(__file__).resolve().parent.parent
 # What docs/extending.md speaks of, by the kind of package that needs it.
 _INTERFACES = {
-    "A sensor": (ports.SensorDriver, ports.SensorSetting, ports.Sensor, PerceptionParameters),
+    "A sensor": (
+        ports.SensorDriver, ports.SensorSetting, ports.Sensor, ports.Camera, PerceptionParameters,
+    ),
     "A policy": (
         family.PolicyFamily, family.Policy, family.Agent, family.Observation, family.Perceived,
         family.PolicyStep, family.GoldenCheck, bundle.Manifest, bundle.make_bundle,
