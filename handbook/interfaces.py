@@ -2,10 +2,8 @@
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import textwrap
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +12,16 @@ from edge.core.perception import PerceptionParameters
 from edge.messages import topics
 from edge.policy import bundle, family
 from handbook.markdown import code
+from lpac import api
 from lpac.train import family as learnable
 
 _LINE = 88
 _ROOT = Path(__file__).resolve().parent.parent
 # What docs/extending.md speaks of, by the kind of package that needs it.
 _INTERFACES = {
-    "A sensor": (ports.SensorDriver, ports.SensorSetting, ports.Sensor, PerceptionParameters),
+    "A sensor": (
+        ports.SensorDriver, ports.SensorSetting, ports.Sensor, ports.Camera, PerceptionParameters,
+    ),
     "A policy": (
         family.PolicyFamily, family.Policy, family.Agent, family.Observation, family.Perceived,
         family.PolicyStep, family.GoldenCheck, bundle.Manifest, bundle.make_bundle,
@@ -39,18 +40,12 @@ _INTERFACES = {
 
 def python_api() -> str:
     """`lpac.api`, all of it."""
-    lead = "# Python API"
-    if find_spec("lpac.api") is None:
-        return f"{lead}\n\nThis version has no module `lpac.api`."
-    api = importlib.import_module("lpac.api")
-    names: list[str] = api.__all__
     return "\n\n".join(
         [
-            lead,
-            "`from lpac import api`. What stands here stays from release to release, or the "
-            "changelog says so.",
+            "# Python API",
+            "[The Python API](../api.md) shows how to use it; this is all of `lpac.api`.",
             inspect.getdoc(api) or "",
-            *(_described(getattr(api, name), name, "##") for name in names),
+            *(_described(getattr(api, name), name, "##") for name in api.__all__),
         ]
     )
 

@@ -12,7 +12,7 @@ from msgspec import Meta
 from edge.core import wire
 from edge.core.fence import Fence
 from edge.drivers import flight_log
-from edge.identity import envelope
+from edge.identity import envelope, group
 from edge.identity.card import Card, Revocations
 from edge.messages import beacon, topics
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, Refusal, RefusalCode
@@ -40,6 +40,7 @@ MESSAGES = (
 CODES = (FlightState, CheckCode, ReasonCode, RefusalCode)
 _LAYOUTS = {
     "The beacon": beacon, "The policy's message": wire, "The envelope": envelope,
+    "What goes to all robots at once": group,
 }  # fmt: skip
 _LOGS = {"A robot's log": flight_log, "The ground's log": record}
 
