@@ -203,17 +203,28 @@ def e3(
     *,
     bundle: Bundle = DEFAULT_BUNDLE,
     world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
+    logs: Logs = None,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
 ) -> None:
     """Perturbation: robots are taken away at steady state, and brought back; points fly."""
-    from lpac.paper.experiments import perturbation, perturbed
-    from lpac.paper.report import write_perturbation
+    from lpac.paper.experiments import absences_of, perturbation, perturbed, perturbed_by
+    from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, write_perturbation
 
-    [flight] = _fly([perturbation(world)], bundle, ray)
     folder = _folder(out, "e3")
-    told = write_perturbation(perturbed(flight), folder, _made_by(f"e3 --world {world}", bundle))
+    if logs is None:
+        [flight] = _fly([perturbation(world)], bundle, ray)
+        what = perturbed(flight)
+    else:
+        trials = _logged(logs)
+        if len(trials) > 1:
+            raise ValueError(f"{logs}: has {len(trials)} missions: give the folder of one")
+        what = perturbed_by(trials[0], absences_of(trials[0]), _range_m(bundle))
+    flown = f" --world {world}" if logs is None else f" --logs {logs}"
+    made_by = _made_by(f"e3{flown}", bundle)
+    how = TAKEN_POINTS if logs is None else TAKEN_LOGS
+    told = write_perturbation(what, folder, made_by, how)
     _tell(
         told, folder, as_json=as_json,
         lines=[
@@ -223,6 +234,17 @@ def e3(
             for phase in told["phases"]
         ],
     )  # fmt: skip
+
+
+def _range_m(bundle: Path) -> float:
+    """How far the bundle's robots hear each other in the field's scale."""
+    from edge.policy.bundle import load_bundle
+    from lpac.sim.experiment import FIELD_SCALE
+
+    perception = load_bundle(bundle).manifest.perception
+    if perception is None:
+        raise ValueError(f"{bundle}: has no perception: it cannot fly")
+    return perception.communication_range / FIELD_SCALE.env_scale
 
 
 def _at_least(least: int, value: int, option: str) -> None:

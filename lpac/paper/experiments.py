@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from edge.core import F64
+from edge.messages.mission import FlightState
 from lpac.analysis.flight import FlightRecord
 from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
 from lpac.evaluate.worlds import DrawnWorld, draw_world
 from lpac.sim.baselines import BaselineName
 from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
-from lpac.sim.failure import Failure, alive_at
+from lpac.sim.failure import Failure
 from lpac.sim.fleet.layout import FleetScenario, Layout
 
 # E1: what the policy is held against, and when the field is looked at, s.
@@ -159,6 +160,25 @@ def _taken_at_s() -> list[float]:
     return [TAKEN_AT_S + number * (AWAY_S + BACK_S) for number in range(len(TAKEN))]
 
 
+class Absence(NamedTuple):
+    """A robot was taken away, and brought back; s."""
+
+    robot: str
+    from_s: float
+    until_s: float
+
+
+def absences_of(record: FlightRecord) -> list[Absence]:
+    """When pilots had robots, in the mission."""
+    piloted = [
+        Absence(robot.name, interval.begin_s, min(interval.end_s, record.duration_s))
+        for robot in record.robots
+        for interval in robot.intervals(record.duration_s)
+        if interval.state is FlightState.PILOT and 0.0 <= interval.begin_s < record.duration_s
+    ]
+    return sorted(piloted, key=lambda absence: absence.from_s)
+
+
 class Phase(NamedTuple):
     """Of E3: a robot is away, or back; the costs are over that at the start.
 
@@ -166,7 +186,7 @@ class Phase(NamedTuple):
     came to at its end.
     """
 
-    robot: int
+    robot: str
     away: bool
     from_s: float
     until_s: float
@@ -180,7 +200,8 @@ class Phase(NamedTuple):
 class PerturbedFlight:
     """E3's flight, at times (T,), s: `speed_m_s` and `neighbours` (T, N), NaN of who is away."""
 
-    flight: SimulatedFlight
+    record: FlightRecord
+    absences: Sequence[Absence]
     time_s: F64
     speed_m_s: F64
     neighbours: F64
@@ -189,31 +210,61 @@ class PerturbedFlight:
 
 def perturbed(flight: SimulatedFlight) -> PerturbedFlight:
     """What a flight of `perturbation` says."""
-    time_s, positions_m = flight.time_s, flight.positions_m
     scenario = flight.scenario
-    alive = np.array([alive_at(scenario.robots, scenario.failures, t) for t in time_s.tolist()])
-    speed_m_s = np.linalg.norm(np.gradient(positions_m, SAMPLE_S, axis=0), axis=2)
+    taken = [Absence(str(f.robot), f.from_s, f.until_s) for f in scenario.failures]
     range_m = flight.perception.communication_range / scenario.scale.env_scale
-    apart_m = np.linalg.norm(positions_m[:, :, None] - positions_m[:, None], axis=3)
-    heard = (apart_m < range_m) & alive[:, :, None] & alive[:, None, :]
+    return perturbed_by(flight.record, taken, range_m)
+
+
+def perturbed_by(
+    record: FlightRecord, absences: Sequence[Absence], range_m: float
+) -> PerturbedFlight:
+    """What a flight says in which robots were away, one after another.
+
+    Neighbours are those within `range_m`. Raises ValueError if nobody was.
+    """
+    if not absences:
+        raise ValueError(f"{record.name}: no pilot took a robot in the mission")
+    names = [robot.name for robot in record.robots]
+    time_s = np.append(np.arange(0.0, record.duration_s - 1e-9, SAMPLE_S), record.duration_s)
+    places_m = np.stack([robot.places_at(time_s)[:, :2] for robot in record.robots], axis=1)
+    present = np.isfinite(places_m[..., 0])
+    for name, from_s, until_s in absences:
+        present[(time_s >= from_s) & (time_s < until_s), names.index(name)] = False
+    speed_m_s = np.full(present.shape, np.nan)
+    for robot, here in enumerate(present.T):
+        if here.sum() > 1:
+            # Across a gap it is on the straight way.
+            path_m = np.stack(
+                [np.interp(time_s, time_s[here], places_m[here, robot, k]) for k in (0, 1)], axis=1
+            )
+            speed_m_s[:, robot] = np.linalg.norm(np.gradient(path_m, time_s, axis=0), axis=1)
+    apart_m = np.linalg.norm(places_m[:, :, None] - places_m[:, None], axis=3)
+    heard = (apart_m < range_m) & present[:, :, None] & present[:, None, :]
     neighbours = heard.sum(axis=2) - 1.0
     for values in (speed_m_s, neighbours):
-        values[~alive] = np.nan
-    ends_s = [failure.from_s for failure in scenario.failures[1:]] + [scenario.duration_s]
+        values[~present] = np.nan
+    ends_s = [absence.from_s for absence in absences[1:]] + [record.duration_s]
     phases = tuple(
         phase
-        for failure, end_s in zip(scenario.failures, ends_s, strict=True)
+        for (robot, from_s, until_s), end_s in zip(absences, ends_s, strict=True)
         for phase in (
-            _phase(flight, failure.robot, True, failure.from_s, failure.until_s),
-            _phase(flight, failure.robot, False, failure.until_s, end_s),
+            _phase(record, robot, away=True, from_s=from_s, until_s=until_s),
+            _phase(record, robot, away=False, from_s=until_s, until_s=end_s),
         )
+        if phase is not None
     )
-    return PerturbedFlight(flight, time_s, speed_m_s, neighbours, phases)
+    return PerturbedFlight(record, absences, time_s, speed_m_s, neighbours, phases)
 
 
-def _phase(flight: SimulatedFlight, robot: int, away: bool, from_s: float, until_s: float) -> Phase:
-    times_s, cost = flight.cost_time_s, flight.normalized_cost
-    inside = (times_s >= from_s) & (times_s < until_s)
+def _phase(
+    record: FlightRecord, robot: str, *, away: bool, from_s: float, until_s: float
+) -> Phase | None:
+    """None if it was too short for a cost."""
+    times_s, cost = record.curve_time_s, record.normalized
+    before, inside = cost[times_s < from_s], (times_s >= from_s) & (times_s < until_s)
+    if not inside.any() or not len(before):
+        return None
     its_s, its = times_s[inside], cost[inside]
     off = np.flatnonzero(np.abs(its / its[-1] - 1.0) > _SETTLED)
     return Phase(
@@ -221,7 +272,7 @@ def _phase(flight: SimulatedFlight, robot: int, away: bool, from_s: float, until
         away=away,
         from_s=from_s,
         until_s=until_s,
-        cost_before=float(cost[times_s < from_s][-1]),
+        cost_before=float(before[-1]),
         cost_worst=float(its.max()),
         cost_end=float(its[-1]),
         settled_s=float(its_s[off[-1]] - from_s) if len(off) else 0.0,

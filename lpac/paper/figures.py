@@ -38,29 +38,29 @@ def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
 
 def perturbation(perturbed: PerturbedFlight) -> Figure:
     """Cost, neighbours and speeds over time; shaded while a robot is away."""
-    flight = perturbed.flight
+    record, absences = perturbed.record, perturbed.absences
+    away = {absence.robot for absence in absences}
     with style.figure(WIDTH_IN, 4.6) as figure:
         cost, neighbours, speed = figure.subplots(3, 1, sharex=True)
-        cost.plot(flight.cost_time_s, flight.normalized_cost, color=style.BLACK, lw=1.3)
+        cost.plot(record.curve_time_s, record.normalized, color=style.BLACK, lw=1.3)
         cost.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, None))
         for axes, values in ((neighbours, perturbed.neighbours), (speed, perturbed.speed_m_s)):
-            for robot, of_robot in enumerate(values.T):
-                taken = any(failure.robot == robot for failure in flight.scenario.failures)
-                colour = style.VERMILLION if taken else style.FAINT
+            for robot, of_robot in zip(record.robots, values.T, strict=True):
+                colour = style.VERMILLION if robot.name in away else style.FAINT
                 axes.plot(perturbed.time_s, of_robot, color=colour, lw=0.5)
-            mean = np.nanmean(values, axis=1)
+            mean = np.ma.masked_invalid(values).mean(axis=1).filled(np.nan)
             axes.plot(perturbed.time_s, mean, color=style.BLACK, lw=1.3)
         neighbours.set(ylabel="neighbours in range")
         speed.set(ylabel="speed (m/s)", ylim=(0.0, None), xlabel="time (s)",
-                  xlim=(0.0, flight.scenario.duration_s))  # fmt: skip
+                  xlim=(0.0, record.duration_s))  # fmt: skip
         for axes in (cost, neighbours, speed):
-            for failure in flight.scenario.failures:
-                axes.axvspan(failure.from_s, failure.until_s, color=style.NOTHING, zorder=0)
+            for _, from_s, until_s in absences:
+                axes.axvspan(from_s, until_s, color=style.NOTHING, zorder=0)
             tidy(axes)
-        for failure in flight.scenario.failures:
-            middle_s = (failure.from_s + failure.until_s) / 2.0
+        for robot_name, from_s, until_s in absences:
+            middle_s = (from_s + until_s) / 2.0
             cost.annotate(
-                f"{failure.robot} away", (middle_s, 1.0), xycoords=("data", "axes fraction"),
+                f"{robot_name} away", (middle_s, 1.0), xycoords=("data", "axes fraction"),
                 ha="center", va="bottom", fontsize=7,
             )  # fmt: skip
         axes_of_legend = [

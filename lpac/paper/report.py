@@ -26,7 +26,15 @@ WHOLE = (
     "programs' loops and separation, on {vehicles}; what they are held against are points from "
     "the same pads."
 )
+TAKEN_POINTS = (
+    f"{POINTS} A robot that is taken is gone: it says and hears nothing and does not count; it is "
+    "back where it was, knowing nothing."
+)
 LOGS = "From the logs of flights."
+TAKEN_LOGS = (
+    "From the log of a flight: a robot counts as taken while a pilot has it, and counts for the "
+    "cost where it is meanwhile."
+)
 
 
 def write_transferability(
@@ -109,7 +117,10 @@ Costs at the end: mean {spread["final_mean"]:.3f}, standard deviation
 
 
 def write_perturbation(
-    perturbed: PerturbedFlight, folder: Path, made_by: Mapping[str, str]
+    perturbed: PerturbedFlight,
+    folder: Path,
+    made_by: Mapping[str, str],
+    flown: str = POINTS,
 ) -> dict[str, Any]:
     """E3's; gives its JSON. Raises OSError."""
     style.save(perturbation(perturbed), folder / "perturbation")
@@ -126,9 +137,8 @@ def write_perturbation(
     text = f"""# E3, perturbation
 
 In each of the paper's experiments a pilot takes one robot at steady state, flies it out of the area
-and brings it back to about the same place; it has no figure of its own. Here
-{len(experiments.TAKEN)} robots of one flight are taken one after another: each is gone, says and
-hears nothing and does not count, and is back where it was, knowing nothing. {POINTS}
+and brings it back to about the same place; it has no figure of its own. Here a robot of one flight
+is taken {len(perturbed.absences)} times. {flown}
 
 ![perturbation](perturbation.png)
 
@@ -137,17 +147,16 @@ hears nothing and does not count, and is back where it was, knowing nothing. {PO
 Costs are over that at the start. Settled: from then on the cost stayed within 5 % of what it came
 to when the next thing happened, or the flight ended.
 """
-    flight = perturbed.flight
     told = {
-        "flight": curves_json({"lpac": flight.record})["lpac"],
+        "flight": curves_json({"": perturbed.record})[""],
         "phases": [phase._asdict() for phase in perturbed.phases],
     }
     rows_csv: list[list[object]] = [["time_s", "robot", "speed_m_s", "neighbours"]]
     for time_s, speeds, neighbours in zip(
         perturbed.time_s.tolist(), perturbed.speed_m_s, perturbed.neighbours, strict=True
     ):
-        robots = enumerate(zip(speeds.tolist(), neighbours.tolist(), strict=True))
-        rows_csv += [[time_s, robot, speed, heard] for robot, (speed, heard) in robots]
+        its = zip(perturbed.record.robots, speeds.tolist(), neighbours.tolist(), strict=True)
+        rows_csv += [[time_s, robot.name, speed, heard] for robot, speed, heard in its]
     return _write("e3", told, rows_csv, text, folder, made_by)
 
 

@@ -5,11 +5,16 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
+from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
+from lpac.analysis.flight import RobotRecord
+from lpac.analysis.logs import LoggedStatus
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.paper.experiments import (
     AWAY_S,
@@ -17,9 +22,11 @@ from lpac.paper.experiments import (
     E2_DURATION_S,
     TAKEN,
     TAKEN_AT_S,
+    absences_of,
     pads_of,
     perturbation,
     perturbed,
+    perturbed_by,
     repeatability,
     spread_of,
     transferability,
@@ -86,7 +93,7 @@ def test_who_is_away_does_not_count(shipped_bundle: Bundle, tmp_path: Path) -> N
     assert lost.max() >= 1.0
     assert np.nanmax(told.speed_m_s) <= 1.25 + 0.01
     gone, back = told.phases
-    assert (gone.robot, gone.away, gone.from_s, gone.until_s) == (2, True, 2.0, 4.0)
+    assert (gone.robot, gone.away, gone.from_s, gone.until_s) == ("2", True, 2.0, 4.0)
     assert (back.away, back.from_s, back.until_s) == (False, 4.0, 6.0)
     cost = dict(zip(flight.cost_time_s.tolist(), flight.normalized_cost.tolist(), strict=True))
     assert gone.cost_before == cost[1.0] and gone.cost_worst == max(cost[2.0], cost[3.0])
@@ -99,6 +106,28 @@ def test_who_is_away_does_not_count(shipped_bundle: Bundle, tmp_path: Path) -> N
     assert document["made_by"] == MADE_BY and len(document["phases"]) == 2
     assert (tmp_path / "perturbation.png").stat().st_size > 20_000
     assert "| robot 2 away | 2 to 4 s |" in (tmp_path / "README.md").read_text()
+
+
+def test_in_a_log_robots_are_taken_while_a_pilot_has_them(shipped_bundle: Bundle) -> None:
+    record = fly(replace(perturbation(), duration_s=6.0, failures=()), shipped_bundle).record
+    assert absences_of(record) == []
+    with pytest.raises(ValueError, match="no pilot took a robot"):
+        perturbed_by(record, [], 16.0)
+
+    def said(robot: RobotRecord, time_s: float) -> LoggedStatus:
+        piloted = robot.robot_id == 4 and 2.0 <= time_s < 3.0
+        state = FlightState.PILOT if piloted else FlightState.MISSION
+        return cast(LoggedStatus, SimpleNamespace(state=state))
+
+    robots = tuple(replace(r, said=tuple(said(r, t) for t in r.time_s)) for r in record.robots)
+    record = replace(record, robots=robots)
+    absences = absences_of(record)
+    assert [absence.robot for absence in absences] == ["4"]
+    assert absences[0][1:] == pytest.approx((2.0, 3.0))
+    told = perturbed_by(record, absences, 16.0)
+    assert [(phase.robot, phase.away) for phase in told.phases] == [("4", True), ("4", False)]
+    away = (told.time_s >= 2.0) & (told.time_s < 3.0)
+    assert away.any() and np.isnan(told.neighbours[away, 4]).all()
 
 
 def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) -> None:
