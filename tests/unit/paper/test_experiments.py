@@ -13,7 +13,7 @@ import pytest
 
 from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
-from lpac.analysis.flight import RobotRecord
+from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.analysis.logs import LoggedStatus
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.paper.experiments import (
@@ -110,17 +110,23 @@ def test_who_is_away_does_not_count(shipped_bundle: Bundle, tmp_path: Path) -> N
 
 def test_in_a_log_robots_are_taken_while_a_pilot_has_them(shipped_bundle: Bundle) -> None:
     record = fly(replace(perturbation(), duration_s=6.0, failures=()), shipped_bundle).record
-    assert absences_of(record) == []
     with pytest.raises(ValueError, match="no pilot took a robot"):
         perturbed_by(record, [], 16.0)
 
-    def said(robot: RobotRecord, time_s: float) -> LoggedStatus:
-        piloted = robot.robot_id == 4 and 2.0 <= time_s < 3.0
+    def said(robot: RobotRecord, time_s: float, from_s: float) -> LoggedStatus:
+        piloted = robot.robot_id == 4 and from_s <= time_s < 3.0
         state = FlightState.PILOT if piloted else FlightState.MISSION
         return cast(LoggedStatus, SimpleNamespace(state=state))
 
-    robots = tuple(replace(r, said=tuple(said(r, t) for t in r.time_s)) for r in record.robots)
-    record = replace(record, robots=robots)
+    def logged(from_s: float) -> FlightRecord:
+        robots = (
+            replace(robot, said=tuple(said(robot, t, from_s) for t in robot.time_s.tolist()))
+            for robot in record.robots
+        )
+        return replace(record, robots=tuple(robots))
+
+    assert absences_of(logged(3.0)) == []
+    record = logged(2.0)
     absences = absences_of(record)
     assert [absence.robot for absence in absences] == ["4"]
     assert absences[0][1:] == pytest.approx((2.0, 3.0))
