@@ -134,6 +134,10 @@ class Swarm(Generic[_Robot]):
         """The true positions (N, 2) now."""
         return self._vehicles.positions_m()
 
+    def velocities_m_s(self) -> F64:
+        """The velocities (N, 2) that the vehicles fly, as they were told."""
+        return self._vehicles.velocities_m_s()
+
     @property
     def alive(self) -> Bools:
         """(N,): who has not failed now."""

@@ -52,6 +52,10 @@ class PointVehicles:
             moved_m += self._excess_m_s[:, robot] * faded_s
         return self._held_inside(moved_m, start_m)
 
+    def velocities_m_s(self) -> F64:
+        """The velocities (N, 2) that they were told."""
+        return self._velocity_m_s.T.copy()
+
     def velocity_m_s(self, robot: int) -> F64:
         """The velocity (2,) that one vehicle was told."""
         return self._velocity_m_s[:, robot]

@@ -52,6 +52,11 @@ class WorldMoment:
         return self.prepared.scenario.scale.position_to_model(self.positions_m)
 
     @property
+    def velocities(self) -> F64:
+        """(N, 2): velocities in model units/s, as the vehicles were told."""
+        return self.prepared.scenario.scale.velocity_to_model(self._swarm.velocities_m_s())
+
+    @property
     def alive(self) -> Bools:
         """(N,): who has not failed."""
         return self._swarm.alive
