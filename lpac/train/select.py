@@ -19,7 +19,6 @@ from lpac.train.config import SelectConfig
 from lpac.train.task import Task
 
 
-
 class Candidate(NamedTuple):
     """The weights after so many epochs of a round."""
 

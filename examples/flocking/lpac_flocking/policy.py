@@ -69,7 +69,9 @@ class FlockingPolicy:
             self.geometry = Geometry(hops, (FEATURES, width))
             self.velocities(np.zeros((1, hops + 1, FEATURES), np.float32))
         except (KeyError, ValueError, OSError) as error:
-            raise BundleError(f"bundle {self.manifest.name!r}: is not of flocking: {error}") from None
+            raise BundleError(
+                f"bundle {self.manifest.name!r}: is not of flocking: {error}"
+            ) from None
 
     @property
     def message_size(self) -> int:
@@ -123,7 +125,9 @@ class FlockingAgent:
         """Each step writes all that it reads."""
 
 
-def swarm_velocities(policy: FlockingPolicy, adjacency: npt.NDArray[np.bool_], features: F32) -> F32:
+def swarm_velocities(
+    policy: FlockingPolicy, adjacency: npt.NDArray[np.bool_], features: F32
+) -> F32:
     """(N, 2): what a swarm flies after K exchanges of messages; `adjacency` is (N, N)."""
     degrees = adjacency.sum(axis=1).tolist()
     agents = [policy.agent() for _ in degrees]

@@ -1,4 +1,4 @@
-"""The expert, which knows the whole flock, and what a good flight is. See `lpac.train.task.Task`."""
+"""The expert, which knows the whole flock, and what a good flight is: a `lpac.train.task.Task`."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
