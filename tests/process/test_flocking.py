@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from edge.core.schema import ConfigError
 from edge.policy.bundle import load_bundle
@@ -23,13 +24,13 @@ SOURCE = ROOT / "examples" / "flocking"
 QUICK = (SOURCE / "quick.toml").read_text()
 # A training of seconds.
 LESS = {
-    "flights = 60\nstates = 40\nduration_s = 40.0": "flights = 12\nstates = 20\nduration_s = 20.0",
+    "flights = 24\nstates = 40\nduration_s = 30.0": "flights = 12\nstates = 20\nduration_s = 20.0",
     "robots = [4, 14]": "robots = [4, 8]",
     "epochs = 30": "epochs = 40",
-    "rounds = 3\nflights = 60\nduration_s = 60.0\nepochs = 20": (
+    "rounds = 2\nflights = 16\nduration_s = 40.0\nepochs = 20": (
         "rounds = 1\nflights = 8\nduration_s = 20.0\nepochs = 20"
     ),
-    "worlds = 10\nevery_epochs = 20": (
+    "worlds = 5\nduration_s = 40.0\nevery_epochs = 30": (
         'worlds = 1\nset_ups = ["n5"]\nduration_s = 20.0\nevery_epochs = 40'
     ),
 }
@@ -51,9 +52,12 @@ def bundle(site: Path) -> Path:
     for more, less in LESS.items():
         assert more in text
         text = text.replace(more, less)
+    threads = torch.get_num_threads()
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(site))
+        torch.set_num_threads(1)  # as in README.md
         told = TrainingRun(config_of(text, "tiny", SOURCE), site / "run", lambda _: None).run(here)
+    torch.set_num_threads(threads)
     assert told["baselines"] == {}
     assert "a flock's" in (site / "run" / "README.md").read_text()
     return Path(told["bundle"])
