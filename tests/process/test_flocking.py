@@ -26,7 +26,7 @@ QUICK = (SOURCE / "quick.toml").read_text()
 LESS = {
     "flights = 24\nstates = 40\nduration_s = 30.0": "flights = 12\nstates = 20\nduration_s = 20.0",
     "robots = [4, 14]": "robots = [4, 8]",
-    "epochs = 30": "epochs = 40",
+    "epochs = 30\nbatch": "epochs = 40\nbatch",
     "rounds = 2\nflights = 16\nduration_s = 40.0\nepochs = 20": (
         "rounds = 1\nflights = 8\nduration_s = 20.0\nepochs = 20"
     ),
