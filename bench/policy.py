@@ -152,11 +152,14 @@ class EdgeRobot:
     def _observation(self) -> Observation:
         moment = self._moment
         return Observation(
-            moment.position, moment.memory.local_map(moment.position), moment.neighbours
+            moment.position,
+            moment.memory.local_map(moment.position),
+            moment.neighbours,
+            np.zeros(2),
         )
 
     def _make_images(self) -> F32:
-        return self._images.images(*self._observation())
+        return self._images.images(*self._observation()[:3])
 
     def _layers(self) -> F32:
         features = self.features

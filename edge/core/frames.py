@@ -161,6 +161,10 @@ class ModelScale:
         """The policy's velocity as the one to fly, m/s in the mission frame."""
         return velocity_model * self.velocity_scale
 
+    def velocity_to_model(self, velocity_mission_m_s: _Array) -> _Array:
+        """Mission velocity, m/s, as the policy's."""
+        return velocity_mission_m_s / self.velocity_scale
+
 
 def _require_on_earth(what: str, latitude_deg: float, longitude_deg: float) -> None:
     if not -90.0 <= latitude_deg <= 90.0:

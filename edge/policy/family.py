@@ -35,12 +35,14 @@ class Observation(NamedTuple):
     (local_map_size, local_map_size), indexed [x, y], is the importance around it as far as it was
     seen, 0 outside the world; `edge.core.perception.window_corner` says which cell is where. Cells
     that were not seen have the manifest's `unknown_importance`, or are NaN if `unseen_as_nan` is
-    set there. `neighbours` (n, 2) are the positions of the robots in communication range.
+    set there. `neighbours` (n, 2) are the positions of the robots in communication range;
+    `velocity` (2,) is the robot's own, in model units/s as a `PolicyStep` has it.
     """
 
     position: F64
     local_map: F32
     neighbours: F64
+    velocity: F64
 
 
 class Perceived(NamedTuple):

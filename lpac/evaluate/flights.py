@@ -1,6 +1,6 @@
 """The flights of an evaluation; this is the one place where they are flown."""
 
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cache
@@ -253,11 +253,16 @@ def _loaded(path: str) -> Bundle:
     return load_bundle(Path(path))
 
 
+# Flies a group, in whatever process it is, and says what came of each flight.
+CostsOf = Callable[[FlightGroup], list[tuple[EvaluationFlight, FlownCost]]]
+
+
 class KeptFlights:
     """What came of flights, in a folder: who asks again for one that was flown there has it."""
 
-    def __init__(self, folder: Path) -> None:
-        """Raises OSError."""
+    def __init__(self, folder: Path, costs: CostsOf = costs_of) -> None:
+        """`costs` flies them; a folder has those of one alone. Raises OSError."""
+        self._costs_of = costs
         flown_by = {"code": code_digest(edge, analysis, evaluate, radio, sim)}
         self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
         self._costs = {
@@ -277,7 +282,7 @@ class KeptFlights:
                 missing.append(flight)
         if not missing:
             return
-        with closing(pool(costs_of, groups_of(missing))) as groups:
+        with closing(pool(self._costs_of, groups_of(missing))) as groups:
             for flight, flown in chain.from_iterable(groups):
                 self._costs[flight.key] = flown
                 self._kept.add({"flight": flight.key, "time_s": flown.time_s, "cost": flown.cost})

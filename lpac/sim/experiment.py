@@ -333,6 +333,11 @@ class WorldMoment:
         return self._flying.velocities_m_s()
 
     @property
+    def velocities(self) -> F64:
+        """(N, 2): the same in model units/s."""
+        return self.prepared.scenario.scale.velocity_to_model(self.velocities_m_s)
+
+    @property
     def alive(self) -> Bools:
         """(N,): who has not failed."""
         return self._flying.alive

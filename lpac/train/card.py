@@ -17,7 +17,8 @@ from lpac.sim.baselines import BaselineName
 from lpac.train.config import TrainingConfig
 from lpac.train.files import write_atomically
 from lpac.train.fit import EpochLoss
-from lpac.train.select import CLAIRVOYANT, ClosedLoopCost, JudgedCandidate, flights_of
+from lpac.train.select import ClosedLoopCost, JudgedCandidate, flights_of
+from lpac.train.task import CLAIRVOYANT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,6 +26,7 @@ class ModelCard:
     """All that the card tells; `shards` are the data's facts by name, hours of one machine."""
 
     config: TrainingConfig
+    expert: str
     digest: str
     bundle_id: str
     best: JudgedCandidate
@@ -52,6 +54,13 @@ def write_card(card: ModelCard, folder: Path, bundle: Bundle, path: Path) -> Non
     figures = folder / "figures"
     style.save(_losses(card), figures / "losses")
     style.save(_costs(card), figures / "costs")
+    if CLAIRVOYANT in card.baselines:
+        _write_worlds(card, figures, bundle, path)
+    write_atomically(folder / "README.md", _text(card).encode())
+
+
+def _write_worlds(card: ModelCard, figures: Path, bundle: Bundle, path: Path) -> None:
+    """How the policy covered two of them, beside who knows all."""
     select = card.config.select
     flights = flights_of(select, POLICY, path, bundle.id)
     clairvoyant = flights_of(select, CLAIRVOYANT, path, sizes_of(bundle))
@@ -61,7 +70,6 @@ def write_card(card: ModelCard, folder: Path, bundle: Bundle, path: Path) -> Non
             CLAIRVOYANT: fly_group((clairvoyant[index],))[0][1],
         }
         write_world(flown, figures / f"{name}-world")
-    write_atomically(folder / "README.md", _text(card).encode())
 
 
 def _losses(card: ModelCard) -> Figure:
@@ -96,9 +104,8 @@ def _costs(card: ModelCard) -> Figure:
         ):
             values = [getattr(each.cost, name) for each in card.judged]
             axes.plot(places, values, color=colour, ls=dashes, marker=".", lw=1.2, label=name)
-        for baseline, grey in zip(
-            card.baselines, (style.INK, style.GREY, style.FAINT), strict=True
-        ):
+        greys = (style.INK, style.GREY, style.FAINT)
+        for baseline, grey in zip(card.baselines, greys, strict=False):
             axes.axhline(
                 card.baselines[baseline].mean, color=grey, lw=0.8, ls=":", label=f"{baseline}, mean"
             )
@@ -122,12 +129,12 @@ def _text(card: ModelCard) -> str:
     flown = sum(facts["flights"] for facts in card.shards.values())
     states = sum(facts["states"] for facts in card.shards.values())
     robots = sum(facts["robots"] for facts in card.shards.values())
-    expert = {
-        "clairvoyant-cvt": "ClairvoyantCVT, which knows the whole world",
-        "best-of-lloyd": f"the best of {data.lloyd_runs} runs of Lloyd's algorithm on the whole "
-        "world",
-        "exploring-cvt": "ExploringCVT, which knows what all robots together have seen",
-    }[data.expert]
+    shown = """
+The first validation world, and the worst:
+
+![first](figures/first-world.png)
+![worst](figures/worst-world.png)
+"""
     rows = [f"| **{name}** | {_row(best.cost)} |"]
     rows += [f"| {name}, with int8 payloads | {_row(card.int8)} |"]
     rows += [f"| {each} | {_row(cost)} |" for each, cost in card.baselines.items()]
@@ -147,7 +154,7 @@ Licence: {config.export.licence}. `{name}.pt` is the checkpoint, `{name}/` the b
 ## Data
 
 {states} states of swarms, {robots} of robots, from {flown} flights over worlds of the training set,
-seed {config.seed}; the expert is {expert}. In round 0 it flew, then the policy
+seed {config.seed}; the expert is {card.expert}. In round 0 it flew, then the policy
 in {dagger.rounds} DAgger rounds. Worlds: {trained}. Flown at
 {data.scale.env_scale * data.scale.velocity_scale:g} times the policy's velocities.
 
@@ -172,12 +179,7 @@ round {best.candidate.round}, epoch {best.candidate.epoch}. Cost at the end over
 {chr(10).join(rows)}
 
 ![costs](figures/costs.png)
-
-The first validation world, and the worst:
-
-![first](figures/first-world.png)
-![worst](figures/worst-world.png)
-
+{shown if CLAIRVOYANT in card.baselines else ""}
 ## Limits
 
 It was chosen by these worlds, so that they flatter it: `lpac evaluate {name}` on others tells how

@@ -60,8 +60,14 @@ class Expert:
         """Take notice of what the robots at `positions` (N, 2) see that are left."""
         self._goals.look(positions[alive])
 
-    def velocities(self, positions: F64, alive: Bools, robots: Sequence[int] | None = None) -> F64:
-        """(m, 2) of `robots` (m,), or all N, at true positions (N, 2); 0 of who is not left."""
+    def velocities(
+        self,
+        positions: F64,
+        alive: Bools,
+        robots: Sequence[int] | None = None,
+        moving: F64 | None = None,
+    ) -> F64:
+        """See `Teacher`; it does not matter how they move."""
         asked = np.arange(len(positions)) if robots is None else np.array(robots, np.intp)
         velocities = np.zeros((len(asked), 2))
         flying = alive[asked]

@@ -18,6 +18,8 @@ from export.parameters import PolicyParameters
 if TYPE_CHECKING:  # the processes that fly do without
     import torch
 
+    from lpac.train.task import Task
+
 # Of R robots by name: (R, ...), float16 or float32.
 Inputs = Mapping[str, npt.NDArray[np.floating]]
 StateDict = Mapping[str, "torch.Tensor"]
@@ -39,6 +41,10 @@ class TrainableModule(Protocol):
 
 class Learnable(Protocol):
     """One network of a family: its sizes, without weights."""
+
+    @property
+    def task(self) -> "Task":
+        """What it is trained for."""
 
     def module(self, actions_mean: F32, actions_std: F32) -> "torch.nn.Module":
         """A new `TrainableModule`, drawn from torch's generator.

@@ -30,6 +30,7 @@ from export.checkpoint import (
 from export.exporter import bundle_of
 from export.parameters import PolicyParameters
 from lpac.train.family import Inputs, StateDict
+from lpac.train.task import CoverageTask
 
 _FIRST_CONVOLUTION = "cnn_backbone.conv0.weight"
 # A count that nothing is computed from, which not every checkpoint has.
@@ -82,6 +83,11 @@ class LpacNetwork:
     def _side(self) -> int:
         """Of the images that the last convolution puts out."""
         return self.image_size - len(self.cnn_channels) * (self.kernel - 1)
+
+    @property
+    def task(self) -> CoverageTask:
+        """See `Learnable`."""
+        return CoverageTask()
 
     def module(self, actions_mean: F32, actions_std: F32) -> "LpacModule":
         """See `Learnable`."""

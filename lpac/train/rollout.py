@@ -22,7 +22,8 @@ from lpac.sim.batch.agents import Agents, Inputs, PolicySteps, make_agents
 from lpac.sim.experiment import Scenario
 from lpac.sim.failure import Failure
 from lpac.train.config import DaggerConfig, DataConfig, Disturbances
-from lpac.train.expert import LOOK_PERIOD_S, Expert, make_expert
+from lpac.train.expert import LOOK_PERIOD_S
+from lpac.train.task import CoverageTask, Task, Teacher
 
 # Of one shard: larger batches of the simulator are no faster, and a kill costs one.
 _ROBOTS_TOGETHER = 40
@@ -54,6 +55,7 @@ class ShardTask(NamedTuple):
 
     shard: PlannedShard
     bundle: Bundle
+    task: Task = CoverageTask()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,12 +171,12 @@ class FlownShard(NamedTuple):
 
 def fly_shard(task: ShardTask) -> FlownShard:
     """Fly it, in whatever process this is. Raises BundleError, ValueError."""
-    shard, bundle = task
+    shard, bundle, taught = task
     begun_s = time.process_time()
     deciding = _Deciding([flight.by_expert for flight in shard.flights])
     scenarios = [flight.scenario for flight in shard.flights]
     flights = BatchedFlights(scenarios, bundle, agents=deciding.of)
-    experts = [make_expert(shard.data, world) for world in flights.prepared]
+    experts = [taught.teacher(shard.data, world) for world in flights.prepared]
     deciding.watch(flights, experts)
     looks_s = np.arange(0.0, max(shard.times_s), LOOK_PERIOD_S).tolist()
     times_s = sorted({*shard.times_s, *looks_s})
@@ -205,7 +207,7 @@ class _Deciding:
         self._policy = make_agents(bundle, perceptions)
         return self
 
-    def watch(self, flights: BatchedFlights, experts: Sequence[Expert]) -> None:
+    def watch(self, flights: BatchedFlights, experts: Sequence[Teacher]) -> None:
         """What the experts know; before anybody decides."""
         self._flights = flights
         self._experts = experts
@@ -267,7 +269,10 @@ class _Deciding:
         """By the expert to these robots, where the world's robots are now."""
         swarm, scenario = self._flights.swarms[world], self._flights.prepared[world].scenario
         return self._experts[world].velocities(
-            scenario.scale.position_to_model(swarm.positions_m()), swarm.alive, robots
+            scenario.scale.position_to_model(swarm.positions_m()),
+            swarm.alive,
+            robots,
+            scenario.scale.velocity_to_model(swarm.velocities_m_s()),
         )
 
 
@@ -280,13 +285,15 @@ class _Kept:
         self._robots: list[int] = []
         self._adjacency: list[Bools] = []
 
-    def add(self, moment: BatchMoment, expert: Expert) -> None:
+    def add(self, moment: BatchMoment, expert: Teacher) -> None:
         robots, arrays = moment.inputs()
         if not robots:
             return
         left = list(robots)
         self._inputs.append(arrays)
-        self._velocities.append(expert.velocities(moment.positions, moment.alive, left))
+        self._velocities.append(
+            expert.velocities(moment.positions, moment.alive, left, moment.velocities)
+        )
         self._robots.append(len(left))
         self._adjacency.append(moment.adjacency[np.ix_(left, left)].ravel())
 

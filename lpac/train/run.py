@@ -66,7 +66,7 @@ class TrainingRun:
         self._fit = Fit(
             read.network, config.fit, config.dagger, config.seed, folder / "fit.pt", read.initial
         )
-        self._selection = Selection(folder, read.digest, config.select)
+        self._selection = Selection(folder, read.digest, config.select, read.network.task)
         self._plans = [
             plan_round(config.data, config.dagger, config.seed, round_)
             for round_ in range(config.dagger.rounds + 1)
@@ -106,7 +106,7 @@ class TrainingRun:
         if not missing:
             return
         bundle = self._flying(round_)
-        tasks = [ShardTask(shard, bundle) for shard in missing.values()]
+        tasks = [ShardTask(shard, bundle, self._network.task) for shard in missing.values()]
         work.begin()
         work.show("generate", round_)
         with closing(pool(fly_shard, tasks)) as outcomes:
@@ -209,6 +209,7 @@ class TrainingRun:
         write_bundle(bundle, self._folder / name)
         card = ModelCard(
             config=config,
+            expert=self._network.task.expert_name(config.data),
             digest=self._digest,
             bundle_id=bundle.id,
             best=best,
@@ -231,7 +232,11 @@ class TrainingRun:
             "selected": _judged_json(best),
             "candidates": [_judged_json(each) for each in self._selection.judged],
             "baselines": {each: _cost_json(cost) for each, cost in baselines.items()},
-            "below_decentralized_cvt": best.cost.mean < baselines["decentralized-cvt"].mean,
+            **{
+                f"below_{name.replace('-', '_')}": best.cost.mean < baselines[name].mean
+                for name in ("decentralized-cvt",)
+                if name in baselines
+            },
             "states": sum(facts["states"] for facts in self._shards.facts.values()),
             "hours": {
                 "generate_cpu": card.generate_hours,
@@ -251,7 +256,8 @@ class TrainingRun:
             )
             for flight in flights[:_PAYLOAD_FLIGHTS]
         ]
-        with closing(pool(fly_shard, [ShardTask(shard, bundle) for shard in shards])) as outcomes:
+        tasks = [ShardTask(shard, bundle, self._network.task) for shard in shards]
+        with closing(pool(fly_shard, tasks)) as outcomes:
             return max(states.largest_payload for _, states, _ in outcomes)
 
 

@@ -16,10 +16,7 @@ from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool
 from lpac.sim.kept import KeptOutcomes
 from lpac.train.config import SelectConfig
-
-# What a policy is held against in the model card.
-BASELINES: tuple[BaselineName, ...] = ("decentralized-cvt", "decentralized-cvt-prior")
-CLAIRVOYANT: BaselineName = "clairvoyant-cvt"
+from lpac.train.task import Task
 
 
 class Candidate(NamedTuple):
@@ -91,10 +88,11 @@ def flights_of(
 class Selection:
     """The candidates of a run that were judged; kept in a folder."""
 
-    def __init__(self, folder: Path, config: str, select: SelectConfig) -> None:
+    def __init__(self, folder: Path, config: str, select: SelectConfig, task: Task) -> None:
         """`config` is the digest of the run's. Raises OSError."""
         self._select = select
-        self._flights = KeptFlights(folder)
+        self._task = task
+        self._flights = KeptFlights(folder, task.costs)
         self._kept = KeptOutcomes(folder / "candidates.jsonl", {"config": config})
 
     @property
@@ -141,7 +139,9 @@ class Selection:
         self, path: Path, bundle: Bundle, pool: Pool
     ) -> dict[BaselineName, ClosedLoopCost]:
         """Over the same worlds, with the bundle's sizes."""
-        names = (*BASELINES, CLAIRVOYANT)
+        names = self._task.baselines
+        if not names:
+            return {}
         flights = [
             flight
             for name in names

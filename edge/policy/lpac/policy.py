@@ -51,7 +51,7 @@ class LpacAgent:
 
     def observe(self, observation: Observation) -> Perceived:
         """x_i: the CNN's 32 features of the images, and the 2 of the position."""
-        images = self._images.images(*observation)
+        images = self._images.images(*observation[:3])
         position = position_feature(observation.position, self._world_size)
         features = np.concatenate([self._policy.image_features(images)[0], position])
         return Perceived(features, {"images": images.copy(), "position_feature": position})

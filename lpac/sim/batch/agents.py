@@ -83,7 +83,7 @@ class LpacAgents:
     def inputs(self, robot: int, observation: Observation) -> Inputs:
         """The images (channels, size, size), and the position feature (2,)."""
         perception = self._perceptions[robot]
-        [images] = self._images[perception].images(*observation)
+        [images] = self._images[perception].images(*observation[:3])
         return {
             "images": images.copy(),
             "position_feature": position_feature(observation.position, perception.world_size),

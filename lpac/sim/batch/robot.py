@@ -149,11 +149,15 @@ class _Said(NamedTuple):
 
 
 class _Perceived(NamedTuple):
-    """When the robot looked, from where (2,), where those in range were (n, 2), what it tells."""
+    """When the robot looked, from where (2,), where those in range were (n, 2), what it tells.
+
+    `velocity` (2,) is its own, in model units/s.
+    """
 
     time_s: float
     own: F64
     neighbours: F64
+    velocity: F64
     shared: SharedMap | None
 
 
@@ -207,14 +211,17 @@ class BatchedRobot:
 
     def perceive(self, now_s: float) -> None:
         """See, and remember who is there."""
-        own = self._own()[1]
+        odometry, own = self._own()
         self._seen.observe(own)
         heard = self.mailbox.neighbours(now_s)
         near = self._in_range(own, heard)
         for neighbour, is_near in zip(heard, near, strict=True):
             if is_near and neighbour.shared is not None:
                 self._seen.hear(neighbour.shared)
-        self._perceived = _Perceived(now_s, own, self._to_model(heard)[near], self._seen.tell(own))
+        velocity = self._parameters.scale.velocity_to_model(np.array(odometry.velocity_m_s[:2]))
+        self._perceived = _Perceived(
+            now_s, own, self._to_model(heard)[near], velocity, self._seen.tell(own)
+        )
 
     def inputs(self, now_s: float) -> Inputs | None:
         """What its policy takes of what it last perceived; None if that is too old."""
@@ -225,7 +232,10 @@ class BatchedRobot:
         return self._deferred.agents.inputs(
             self.agent,
             Observation(
-                position, self._seen.local_map(position, self._local_map), perceived.neighbours
+                position,
+                self._seen.local_map(position, self._local_map),
+                perceived.neighbours,
+                perceived.velocity,
             ),
         )
 

@@ -307,8 +307,7 @@ class Watching:
         return iter(())
 
     def observe(self, observation: Observation) -> Perceived:
-        _, local_map, _ = observation
-        self.local_maps.append(local_map.copy())
+        self.local_maps.append(observation.local_map.copy())
         return Perceived(np.zeros(2, np.float32), {})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:

@@ -1,0 +1,1 @@
+"""Flocking: a second family of policies, and the second task, beside coverage."""
