@@ -220,7 +220,8 @@ class Pac:
         # Outside the world the policy is told the nearest point of it, where training kept the
         # robots: it never sees an input that it could not have been trained on.
         position = clamp_to_world(own, self._perception.world_size)
-        velocity = self._parameters.scale.velocity_to_model(np.array(odometry.velocity_m_s[:2]))
+        velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
+        velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
         perceived = self._agent.observe(
             Observation(position, self._memory.local_map(position), heard[near], velocity)
         )

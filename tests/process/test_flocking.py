@@ -24,14 +24,14 @@ SOURCE = ROOT / "examples" / "flocking"
 QUICK = (SOURCE / "quick.toml").read_text()
 # A training of seconds.
 LESS = {
-    "flights = 24\nstates = 40\nduration_s = 30.0": "flights = 12\nstates = 20\nduration_s = 20.0",
-    "robots = [4, 14]": "robots = [4, 8]",
+    "flights = 24\nstates = 40\nduration_s = 30.0": "flights = 6\nstates = 20\nduration_s = 15.0",
+    "robots = [4, 14]": "robots = [4, 6]",
     "epochs = 30\nbatch": "epochs = 40\nbatch",
     "rounds = 2\nflights = 16\nduration_s = 40.0\nepochs = 20": (
-        "rounds = 1\nflights = 8\nduration_s = 20.0\nepochs = 20"
+        "rounds = 1\nflights = 5\nduration_s = 15.0\nepochs = 30"
     ),
     "worlds = 5\nduration_s = 40.0\nevery_epochs = 30": (
-        'worlds = 1\nset_ups = ["n5"]\nduration_s = 20.0\nevery_epochs = 40'
+        'worlds = 1\nset_ups = ["n5"]\nduration_s = 10.0\nevery_epochs = 40'
     ),
 }
 
@@ -95,8 +95,8 @@ def test_robots_that_hear_each_other_come_to_fly_alike(bundle: Path) -> None:
 
 def test_whole_robots_fly_it(site: Path, bundle: Path) -> None:
     told = lpac(
-        site, "sim", "--vehicle", "simulated", "--bundle", str(bundle), "-n", "3",
-        "--duration", "5", "--json",
+        site, "sim", "--vehicle", "simulated", "--bundle", str(bundle), "-n", "2",
+        "--duration", "4", "--json",
     )  # fmt: skip
     flight = json.loads(told)
     assert flight["took_off"] and flight["all_landed"] and flight["problem"] is None, flight

@@ -13,7 +13,7 @@ from edge.core import F64
 from edge.policy.bundle import Bundle, load_bundle
 from lpac.analysis import style
 from lpac.sim.experiment import Scenario, fly, prepare
-from lpac_flocking.task import FlockExpert, disagreement_m_s
+from lpac_flocking.task import FlockExpert, disagreement_m_s, speed_m_s
 
 _STEP_S = 0.2
 
@@ -67,8 +67,11 @@ def main() -> None:
         right.legend(fontsize=7)
         style.save(figure, told.out)
     for name, (positions_m, _, _) in curves.items():
-        apart = disagreement_m_s(time_s, positions_m)
-        print(f"{name}: {apart[-25:].mean():.3f} m/s apart in the last 5 s")
+        apart, speed = (of(time_s, positions_m) for of in (disagreement_m_s, speed_m_s))
+        print(
+            f"{name}: in the last 5 s {apart[-25:].mean():.3f} m/s apart, "
+            f"the flock at {speed[-25:].mean():.3f} m/s"
+        )
 
 
 if __name__ == "__main__":

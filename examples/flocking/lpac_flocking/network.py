@@ -3,8 +3,10 @@
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -96,7 +98,7 @@ class FlockingNetwork:
     def _untrained(self) -> "FlockingModule":
         return self.module(np.zeros(2, np.float32), np.ones(2, np.float32))
 
-    def _golden(self, state: StateDict) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
+    def _golden(self, state: StateDict) -> dict[str, npt.NDArray[Any]]:
         rng = np.random.default_rng(0)
         features = rng.normal(size=(_GOLDEN_ROBOTS, FEATURES)).astype(np.float32)
         adjacency = np.triu(rng.random((_GOLDEN_ROBOTS,) * 2) < 0.5, 1)

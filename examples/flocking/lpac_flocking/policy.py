@@ -6,6 +6,7 @@ velocities, and of who is further away, it learns by the messages.
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -145,13 +146,13 @@ def swarm_velocities(
     return np.stack([step.velocity for step in steps])
 
 
-def npz(arrays: Mapping[str, npt.NDArray[np.generic]]) -> bytes:
+def npz(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
     """A file of arrays, in memory."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    np.savez(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
-def _arrays(content: bytes) -> dict[str, npt.NDArray[np.float32]]:
+def _arrays(content: bytes) -> dict[str, npt.NDArray[Any]]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         return dict(file)

@@ -55,13 +55,15 @@ class FlockExpert:
                 gather /= max(1.0, float(np.hypot(*gather)))
                 velocities[row] = common + _PART * away + _GATHER * gather
         speeds = np.hypot(*velocities.T)[:, None]
-        return velocities * np.minimum(1.0, self._max_speed / np.maximum(speeds, 1e-9))
+        velocities *= np.minimum(1.0, self._max_speed / np.maximum(speeds, 1e-9))
+        return velocities
 
     def _common(self, velocity: F64, place: F64) -> F64:
         """(2,): the flock's next velocity."""
         around = np.array([-place[1], place[0]])
-        wanted = velocity + _TURN * _CRUISE * (around - place * np.hypot(*place) ** 2)
-        return _CRUISE * wanted / max(float(np.hypot(*wanted)), 0.5 * _CRUISE)
+        wanted: F64 = velocity + _TURN * _CRUISE * (around - place * np.hypot(*place) ** 2)
+        wanted *= _CRUISE / max(float(np.hypot(*wanted)), 0.5 * _CRUISE)
+        return wanted
 
 
 class FlockingTask(NamedTuple):
@@ -97,7 +99,7 @@ def cost_of(flown: SimulatedFlight) -> float:
     """See `FlockingTask.costs`."""
     half = len(flown.time_s) // 2
     scale = flown.scenario.scale
-    cruise_m_s = scale.velocity_to_mission_m_s(np.float64(_CRUISE))
+    cruise_m_s = _CRUISE * scale.velocity_scale
     apart = disagreement_m_s(flown.time_s, flown.positions_m)[half:].mean() / cruise_m_s
     speed = speed_m_s(flown.time_s, flown.positions_m)[half:].mean() / cruise_m_s
     offsets_m = flown.positions_m - flown.positions_m.mean(axis=1, keepdims=True)

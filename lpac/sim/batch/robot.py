@@ -218,7 +218,8 @@ class BatchedRobot:
         for neighbour, is_near in zip(heard, near, strict=True):
             if is_near and neighbour.shared is not None:
                 self._seen.hear(neighbour.shared)
-        velocity = self._parameters.scale.velocity_to_model(np.array(odometry.velocity_m_s[:2]))
+        velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
+        velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
         self._perceived = _Perceived(
             now_s, own, self._to_model(heard)[near], velocity, self._seen.tell(own)
         )
