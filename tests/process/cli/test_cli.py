@@ -85,7 +85,7 @@ def test_every_command_that_people_are_pointed_to_exists() -> None:
     parts = ("edge", "lpac")
     programs = [path for part in parts for path in (ROOT / part).rglob("*.py")]
     for path in [*(page for page in pages if page.suffix in (".md", ".toml")), *programs]:
-        for name, sub in re.findall(r"`lpac ([a-z]+)(?: ([a-z]+))?", path.read_text()):
+        for name, sub in re.findall(r"`lpac ([a-z]+)(?: ([a-z0-9]+))?", path.read_text()):
             assert name in commands, (path, name)
             below = getattr(commands[name], "commands", {})
             assert not below or not sub or sub in below, (path, name, sub)
