@@ -51,6 +51,10 @@ class Opened:
                 f"tr[data-robot='{robot}'][data-state='{state}']", state="attached"
             )
 
+    def wait_for_next(self, action: str) -> None:
+        """Wait until the page shows this command as the next step. Raises TimeoutError."""
+        self.page.wait_for_selector(f"#bar [data-do={action}].next")
+
     def act(self, action: str, *, sure: bool = False) -> None:
         """Click a command of the bar; `sure`: and yes in what it asks then."""
         self.page.click(f"#bar [data-do={action}]")

@@ -289,6 +289,9 @@ def test_a_page_flies_the_fleet(fleet: Fleet, tmp_path: Path) -> None:
                 ("takeoff", _S.HOLD), ("start", _S.MISSION), ("hold", _S.HOLD),
                 ("land", _S.LANDED),
             ):  # fmt: skip
+                if action in ("takeoff", "start"):
+                    # The browser's start may have kept a busy machine's robots from being ready.
+                    seen.wait_for_next(action)
                 seen.act(action, sure=action in ("takeoff", "land"))
                 seen.wait_for_states(dict.fromkeys(NAMES, state.value))
                 if action == "start":
