@@ -40,7 +40,7 @@ from lpac.ground.station.protocol import (
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from tests.conftest import ROOT, SHIPPED
-from tests.process.ground.browser import live_map, opened
+from tests.process.ground.browser import MOST_TRIES, live_map, opened
 from tests.said import problem
 
 pytestmark = pytest.mark.real_time
@@ -56,7 +56,6 @@ NOT_YET = (
     ResultCode.NOT_HEARD, ResultCode.NOT_OBEYING, ResultCode.NOT_READY, RefusalCode.NOT_ANSWERED,
     RefusalCode.NOT_READY, RefusalCode.CHECKS_RUNNING,
 )  # fmt: skip
-MOST_TRIES = 3
 
 
 @pytest.fixture(scope="module")
@@ -289,10 +288,8 @@ def test_a_page_flies_the_fleet(fleet: Fleet, tmp_path: Path) -> None:
                 ("takeoff", _S.HOLD), ("start", _S.MISSION), ("hold", _S.HOLD),
                 ("land", _S.LANDED),
             ):  # fmt: skip
-                if action in ("takeoff", "start"):
-                    # The browser's start may have kept a busy machine's robots from being ready.
-                    seen.wait_for_next(action)
-                seen.act(action, sure=action in ("takeoff", "land"))
+                # The browser may keep a busy machine's robots from being ready for a moment.
+                seen.act_in_the_end(action, sure=action in ("takeoff", "land"))
                 seen.wait_for_states(dict.fromkeys(NAMES, state.value))
                 if action == "start":
                     seen.screenshot(snapshot)
