@@ -203,27 +203,47 @@ def e3(
     *,
     bundle: Bundle = DEFAULT_BUNDLE,
     world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
+    vehicle: Annotated[
+        VehicleKind, typer.Option(help="point, or simulated: whole robots, which pilots take.")
+    ] = VehicleKind.POINT,
     logs: Logs = None,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
 ) -> None:
-    """Perturbation: robots are taken away at steady state, and brought back; points fly."""
-    from lpac.paper.experiments import absences_of, perturbation, perturbed, perturbed_by
-    from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, write_perturbation
+    """Perturbation: robots are taken away at steady state, and brought back."""
+    from lpac.paper.experiments import (
+        absences_of,
+        perturbation,
+        perturbed,
+        perturbed_by,
+        whole_perturbation,
+    )
+    from lpac.paper.flown import fly_piloted
+    from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, TAKEN_WHOLE, write_perturbation
 
     folder = _folder(out, "e3")
-    if logs is None:
-        [flight] = _fly([perturbation(world)], bundle, ray)
-        what = perturbed(flight)
-    else:
+    if logs is not None:
         trials = _logged(logs)
         if len(trials) > 1:
             raise ValueError(f"{logs}: has {len(trials)} missions: give the folder of one")
-        what = perturbed_by(trials[0], absences_of(trials[0]), _range_m(bundle))
-    flown = f" --world {world}" if logs is None else f" --logs {logs}"
-    made_by = _made_by(f"e3{flown}", bundle)
-    how = TAKEN_POINTS if logs is None else TAKEN_LOGS
+        what, how = perturbed_by(trials[0], absences_of(trials[0]), _range_m(bundle)), TAKEN_LOGS
+    elif vehicle is VehicleKind.POINT:
+        [flight] = _fly([perturbation(world)], bundle, ray)
+        what, how = perturbed(flight), TAKEN_POINTS
+    elif vehicle is VehicleKind.SIMULATED:
+        with progress_of("flights") as progress:
+            task = progress.add_task("", total=1)
+            scenario, pilots = whole_perturbation(bundle, world)
+            record = fly_piloted(scenario, bundle, pilots)
+            progress.update(task, advance=1)
+        what, how = perturbed_by(record, absences_of(record), _range_m(bundle)), TAKEN_WHOLE
+    else:
+        raise ValueError(
+            f"--vehicle {vehicle.value}: no pilot takes such a robot here: must be point or "
+            "simulated; fly docs/script.toml, and give its logs by --logs"
+        )
+    made_by = _made_by(f"e3 --world {world}{_flown_with(vehicle, logs)}", bundle)
     told = write_perturbation(what, folder, made_by, how)
     _tell(
         told, folder, as_json=as_json,

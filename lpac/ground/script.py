@@ -332,7 +332,7 @@ class ScriptError(RuntimeError):
 
 
 class ScriptRun:
-    """One run of a script. `robots` are those that it addresses.
+    """One run of a script. `robots` are those that it addresses, `given` whom a pilot has by it.
 
     `fly` and `hold` are procedures: whoever has the ground carries them out.
     """
@@ -354,7 +354,7 @@ class ScriptRun:
         self._sites = sites
         self._ground = ground
         self._listener = listener
-        self._given: set[str] = set()
+        self.given: set[str] = set()
         self._said: set[Hashable] = set()
         self._last_start_s: dict[str, float] = {}
 
@@ -370,7 +370,7 @@ class ScriptRun:
         for trial in range(1, script.trials + 1):
             count = f"trial {trial} of {script.trials}: " if script.trials > 1 else ""
             self._said.clear()
-            self._given.clear()
+            self.given.clear()
             if trial > 1 and not self._listener.may(f"{count}let the robots take off again?"):
                 raise ScriptError(f"{count}not wanted", hold=False)
             yield from self._begin_trial(first + trial - 1, count)
@@ -541,7 +541,7 @@ class ScriptRun:
                 if status is None:
                     self._say_once((name, "not heard"), f"{name} is not heard")
                     continue
-                given = name in self._given or _asked(snapshot.ground, status.robot_id) != "none"
+                given = name in self.given or _asked(snapshot.ground, status.robot_id) != "none"
                 if status.state is not _S.HOLD or given:
                     left_alone.discard(name)
                 if before[name] is _S.MISSION and status.state is not _S.MISSION and not given:
@@ -570,7 +570,7 @@ class ScriptRun:
         name = perturbation.robot
         yield from self._require_of_flying(RobotCommand(perturbation.do, (name,)))
         if perturbation.do == "pilot":
-            self._given.add(name)
+            self.given.add(name)
             self._listener.line(f"{name} is given to a pilot")
             return
 
@@ -582,7 +582,7 @@ class ScriptRun:
             self._look_for_others(self._ground.snapshot)
             raise ScriptError(f"{name} does not come to hold")
         yield from self._require_of_flying(Start((name,)))
-        self._given.discard(name)
+        self.given.discard(name)
         self._listener.line(f"{name} is back in the mission")
 
     def _look_for_others(self, snapshot: FleetSnapshot) -> None:

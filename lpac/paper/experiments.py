@@ -20,6 +20,7 @@ from lpac.sim.baselines import BaselineName
 from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.pilot import PilotFlight
 
 # E1: what the policy is held against, and when the field is looked at, s.
 BASELINES: tuple[BaselineName, ...] = (
@@ -35,6 +36,7 @@ E2_DURATION_S = 40.0
 # E3: when the first robot is taken, for how long, and how long after its return the next is, s.
 TAKEN_AT_S, AWAY_S, BACK_S = 60.0, 20.0, 40.0
 TAKEN = (0, 3, 7)
+_E3_DURATION_S = TAKEN_AT_S + len(TAKEN) * (AWAY_S + BACK_S)
 # Settled is what stays within so much of what it comes to in the end.
 _SETTLED = 0.05
 
@@ -151,9 +153,25 @@ def perturbation(world: int = 0) -> Scenario:
         seed=drawn.seed,
         features=drawn.features,
         starts_m=_pairs(_starts_m(drawn)),
-        duration_s=TAKEN_AT_S + len(TAKEN) * (AWAY_S + BACK_S),
+        duration_s=_E3_DURATION_S,
         failures=tuple(failures),
     )
+
+
+def whole_perturbation(
+    bundle: Path, world: int = 0
+) -> tuple[FleetScenario, tuple[PilotFlight, ...]]:
+    """E3 for whole robots: pilots fly them out of the fence, and back. Raises BundleError."""
+    drawn = _world(world)
+    scenario = FleetScenario(
+        robots=FIELD_SET_UP.robots,
+        seed=drawn.seed,
+        features=drawn.features,
+        pads_m=_pairs(pads_of(bundle)),
+        duration_s=_E3_DURATION_S,
+    )
+    taken = zip(TAKEN, _taken_at_s(), strict=True)
+    return scenario, tuple(PilotFlight(robot, at_s, at_s + AWAY_S) for robot, at_s in taken)
 
 
 def _taken_at_s() -> list[float]:

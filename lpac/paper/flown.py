@@ -15,6 +15,7 @@ from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.flight import fly as fly_fleet
 from lpac.sim.fleet.layout import FleetScenario
+from lpac.sim.fleet.pilot import PilotFlight
 from lpac.sim.fleet.processes import Fleet
 
 
@@ -69,6 +70,17 @@ def _fly_whole(task: _WholeTask) -> _WholeFlown:
     with TemporaryDirectory() as folder:
         flown = fly_simulated(task.scenario, Path(folder), Path(task.bundle))
     return _WholeFlown(task.number, _record(flown))
+
+
+def fly_piloted(
+    scenario: FleetScenario, bundle: Path, pilots: Sequence[PilotFlight]
+) -> FlightRecord:
+    """A flight of whole robots on a simulated clock, some of which pilots take meanwhile.
+
+    Raises BundleError; ValueError if it came to no mission.
+    """
+    with TemporaryDirectory() as folder:
+        return _record(fly_simulated(scenario, Path(folder), bundle, pilots=pilots))
 
 
 def fly_programs(

@@ -30,11 +30,16 @@ TAKEN_POINTS = (
     f"{POINTS} A robot that is taken is gone: it says and hears nothing and does not count; it is "
     "back where it was, knowing nothing."
 )
-LOGS = "From the logs of flights."
-TAKEN_LOGS = (
-    "From the log of a flight: a robot counts as taken while a pilot has it, and counts for the "
-    "cost where it is meanwhile."
+_PILOTED = (
+    "a robot counts as taken while a pilot has it, and counts for the cost where it is meanwhile."
 )
+TAKEN_WHOLE = (
+    "Whole robots flew over a world of the validation set: their programs' loops and separation, "
+    "on simulated PX4s on one simulated clock. A simulated pilot takes the robot by its sticks, "
+    f"flies it out of the fence at its height, and back to where it was; {_PILOTED}"
+)
+LOGS = "From the logs of flights."
+TAKEN_LOGS = f"From the log of a flight: {_PILOTED}"
 
 
 def write_transferability(

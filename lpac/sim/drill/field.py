@@ -145,18 +145,11 @@ class FaultyFleet(ABC):
 
     def outwards(self, robot: int) -> F64:
         """(2,): the way to what it takes to be the fence's nearest line, north and east."""
-        to_mission = self.layout.to_mission
-        place_m = to_mission.local_to_mission(self.vehicles[robot].estimated_position_m)[:2]
-        edges = self.layout.fence.edges()
-        out = -edges.inward[int(np.argmin(edges.distances_m(place_m)))]
-        turned: F64 = (to_mission.rotation @ np.array([*out, 0.0]))[:2]
-        return turned
+        return self.layout.way_out(self.vehicles[robot].estimated_position_m)[0]
 
     def inside_m(self, robot: int) -> float:
         """How far inside that line the vehicle takes itself to be."""
-        estimate_m = self.vehicles[robot].estimated_position_m
-        place_m = self.layout.to_mission.local_to_mission(estimate_m)
-        return self.layout.fence.distance_m(*place_m[:2])
+        return self.layout.way_out(self.vehicles[robot].estimated_position_m)[1]
 
     def place_m(self, robot: int) -> F64:
         """(2,): the pad that a robot stood on at first, where it really is; north and east."""

@@ -1,5 +1,6 @@
 """One flight of a fleet on the simulated clock, by a script of the real ground."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,12 @@ from edge.messages.mission import RobotStatus
 from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
+from lpac.ground.script import Perturbation
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import Say
+from lpac.sim.fleet.pilot import Pilot, PilotFlight
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
 
@@ -24,13 +27,15 @@ def fly_simulated(
     *,
     logs: bool = False,
     recorded: Path | None = None,
+    pilots: Sequence[PilotFlight] = (),
 ) -> FleetFlight:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
     Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
     the script. With `logs` the robots write theirs below `folder`, in robots/ID/logs; `recorded` is
-    the folder of such a flight, whose policies' steps are taken again. Times, positions and costs
-    are in the record; `problem` says what kept the script from its end.
+    the folder of such a flight, whose policies' steps are taken again. `pilots` take robots out of
+    the field, and bring them back. Times, positions and costs are in the record; `problem` says
+    what kept the script from its end.
 
     Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
     written, and RecordingError.
@@ -38,9 +43,18 @@ def fly_simulated(
     earlier = set(folder.rglob("*.mcap"))
     fleet = SimulatedFleet(scenario, folder, bundle, logs=logs, recorded=recorded)
     ground = fleet.ground
+
+    def begin(step: str) -> None:
+        say(step)
+        if step == "mission":
+            for flown in pilots:
+                Pilot(fleet, flown, ground.now_s)
+
     flight = ScriptedFlight(
-        ground, folder / "fleet.toml", scenario.duration_s, on_step=say, say=say
-    )
+        ground, folder / "fleet.toml", scenario.duration_s,
+        perturb=tuple(each for flown in pilots for each in _perturbations(flown)),
+        on_step=begin, say=say,
+    )  # fmt: skip
     notes = _Notes(fleet)
     try:
         problem = ground.carry_out(flight.fly())
@@ -48,6 +62,14 @@ def fly_simulated(
         problem = str(error)
     fleet.close()
     return notes.flight(flight, problem, earlier, folder if logs else None)
+
+
+def _perturbations(flown: PilotFlight) -> tuple[Perturbation, ...]:
+    robot = f"r{flown.robot}"
+    return (
+        Perturbation(flown.from_s, robot, "pilot"),
+        Perturbation(flown.until_s, robot, "rejoin"),
+    )
 
 
 class _Notes:

@@ -123,6 +123,15 @@ class Layout:
         north_m, east_m, _ = self.to_mission.mission_to_local(np.array([*place_m, 0.0])).tolist()
         return north_m, east_m
 
+    def way_out(self, position_ned_m: F64) -> tuple[F64, float]:
+        """From there: the direction (2,), north and east, of the fence's nearest line, and how far
+        inside it that is, m."""
+        place_m = self.to_mission.local_to_mission(position_ned_m)[:2]
+        edges = self.fence.edges()
+        out = -edges.inward[int(np.argmin(edges.distances_m(place_m)))]
+        turned: F64 = (self.to_mission.rotation @ np.array([*out, 0.0]))[:2]
+        return turned, float(self.fence.distance_m(*place_m))
+
     def write(
         self,
         folder: Path,

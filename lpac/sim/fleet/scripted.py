@@ -16,6 +16,7 @@ from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
 from lpac.ground.script import (
     MissionStep,
     OriginStep,
+    Perturbation,
     PreflightStep,
     ReturnStep,
     Script,
@@ -65,10 +66,14 @@ class ScriptedFlight(ScriptListener):
         fleet_toml: Path,
         mission_s: float,
         *,
+        perturb: tuple[Perturbation, ...] = (),
         on_step: Callable[[str], None] = lambda _: None,
         say: Say = lambda _: None,
     ) -> None:
-        """`on_step` is told each step that begins, `say` what robots do that no script has."""
+        """`on_step` is told each step that begins, `say` what robots do that no script has.
+
+        `perturb` is what a `MissionStep` has.
+        """
         self.began_s: dict[str, float] = {}
         self.commands: list[CommandOutcome] = []
         self._at = ""
@@ -83,8 +88,8 @@ class ScriptedFlight(ScriptListener):
             robots=(),
             before=(OriginStep(ORIGIN.latitude_deg, ORIGIN.longitude_deg, ORIGIN.heading_deg),),
             steps=(
-                PreflightStep(_PREFLIGHT_S), TakeoffStep(), MissionStep(mission_s, restart=True),
-                ReturnStep(),
+                PreflightStep(_PREFLIGHT_S), TakeoffStep(),
+                MissionStep(mission_s, restart=True, perturb=perturb), ReturnStep(),
             ),
         )  # fmt: skip
         self._run = ScriptRun(script, Sites(fleet_toml), ground, self)
@@ -145,13 +150,13 @@ class ScriptedFlight(ScriptListener):
     def _take_back(self) -> Procedure[None]:
         """Whose vehicle left offboard by itself, as a busy machine makes it, flies on.
 
-        A script leaves it to its pilot; but nobody takes a simulated robot by hand.
+        Whom the script gives to a pilot is left to that one.
         """
         left = tuple(
             robot.name
             for robot in self._ground.snapshot.robots
             if robot.status and robot.status.state is FlightState.PILOT
-            and robot.status.mode not in PILOTED
+            and robot.status.mode not in PILOTED and robot.name not in self._run.given
         )  # fmt: skip
         if not left or self._ground.now_s - self._taken_back_s < _TAKE_BACK_AGAIN_S:
             return

@@ -1,0 +1,66 @@
+"""A pilot who takes a robot of a simulated fleet out of the field, and brings it back."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.messages.mission import FlightState
+from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.px4.modes import Px4Mode
+
+_LOOKS_S = 0.1
+_GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
+# Beyond the fence's line; when the pilot turns back, and lets the sticks go, before the end.
+_BEYOND_M = 2.0
+_BACK_S, _LETS_GO_S = 9.0, 1.0
+
+
+class PilotFlight(NamedTuple):
+    """From `from_s` of the mission on a pilot has a robot; at `until_s` it is to rejoin.
+
+    Meanwhile it was out of the fence, and is back at about where it was. s, from the mission's
+    start.
+    """
+
+    robot: int
+    from_s: float
+    until_s: float
+
+
+class Pilot:
+    """Flies a robot by its sticks, by sight, at the height that it has."""
+
+    def __init__(self, fleet: SimulatedFleet, flight: PilotFlight, mission_began_s: float) -> None:
+        """Once the robot says that it is the pilot's."""
+        self._robot = fleet.robots[flight.robot]
+        self._vehicle = fleet.vehicles[flight.robot].vehicle
+        self._layout = fleet.layout
+        self._clock = fleet.schedule
+        self._until_s = mission_began_s + flight.until_s
+        self._taken_at_m: F64 | None = None
+        self._out_m: F64 = np.zeros(3)
+        after_s = mission_began_s + flight.from_s - self._clock.monotonic_s()
+        self._looks = self._clock.every(_LOOKS_S, self._look, max(0.0, after_s))
+
+    def _look(self) -> None:
+        left_s = self._until_s - self._clock.monotonic_s()
+        if left_s < _LETS_GO_S:
+            self._vehicle.move_sticks(())
+            self._looks.stop()
+        elif self._taken_at_m is not None:
+            self._fly_to(self._out_m if left_s > _BACK_S else self._taken_at_m)
+        elif self._robot.status is not None and self._robot.status.state is FlightState.PILOT:
+            self._take()
+
+    def _take(self) -> None:
+        here_m = self._vehicle.position_m
+        outwards, inside_m = self._layout.way_out(here_m)
+        self._taken_at_m = here_m.copy()
+        self._out_m = here_m + np.array([*(inside_m + _BEYOND_M) * outwards, 0.0])
+        self._vehicle.pilot(Px4Mode.POSCTL)
+
+    def _fly_to(self, target_m: F64) -> None:
+        wanted_m_s = _GAIN_PER_S * (target_m - self._vehicle.position_m)
+        fastest = max(1.0, float(np.linalg.norm(wanted_m_s)) / _FASTEST_M_S)
+        self._vehicle.move_sticks((wanted_m_s / fastest).tolist())
