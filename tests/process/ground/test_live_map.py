@@ -5,7 +5,7 @@ import datetime
 import json
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,12 +41,18 @@ def _own_sockets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FlownFleet]:
-    """Thirty robots and their ground process; nobody has taken off."""
-    with (
-        FlownFleet(tmp_path_factory.mktemp("fleet"), 30) as robots,
-        lpac("ground", "--fleet", str(robots.fleet_toml), "--name", "alice"),
-    ):
+    """Four robots and their ground process; nobody has taken off."""
+    with _with_ground(tmp_path_factory.mktemp("fleet"), 4) as robots:
         yield robots
+
+
+@contextmanager
+def _with_ground(folder: Path, robots: int) -> Iterator[FlownFleet]:
+    with (
+        FlownFleet(folder, robots) as fleet,
+        lpac("ground", "--fleet", str(fleet.fleet_toml), "--name", "alice"),
+    ):
+        yield fleet
 
 
 # Who may see it
@@ -236,11 +242,11 @@ def test_kill_is_no_action_of_the_map(fleet: FlownFleet) -> None:
 
 
 def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
-    fleet: FlownFleet,
+    tmp_path: Path,
 ) -> None:
     """Five times a second of the ground's own clock, as soon as this machine lets it."""
 
-    async def straight(told_s: list[float]) -> None:
+    async def straight(fleet: FlownFleet, told_s: list[float]) -> None:
         async for told in listen(fleet.name):
             match told:
                 case FleetSnapshot(unix_time_s):
@@ -255,14 +261,14 @@ def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
             and (wanted_s[-1] - wanted_s[0]) / (len(wanted_s) - 1) < 0.3
         )
 
-    async def ask() -> None:
+    async def ask(fleet: FlownFleet) -> None:
         told_s: list[float] = []
         shown_s: list[float] = []
         async with (
             asking(fleet.name) as (address, session),
             session.ws_connect(address + "live") as stream,
         ):
-            direct = asyncio.create_task(straight(told_s))
+            direct = asyncio.create_task(straight(fleet, told_s))
             async with asyncio.timeout(PATIENCE_S):
                 while not keeps_up(told_s, shown_s):
                     text = await stream.receive_str()
@@ -274,7 +280,8 @@ def test_thirty_robots_reach_the_page_as_often_as_the_ground_tells_of_them(
             direct.cancel()
             await asyncio.gather(direct, return_exceptions=True)
 
-    asyncio.run(ask())
+    with _with_ground(tmp_path, 30) as fleet:
+        asyncio.run(ask(fleet))
 
 
 def test_a_page_that_takes_nothing_misses_snapshots() -> None:

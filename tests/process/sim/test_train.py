@@ -25,7 +25,7 @@ from tests.training import SMALL, here, read, said
 # Shards enough to be killed between; and few candidates.
 LONGER = (
     SMALL.replace("flights = 2", "flights = 12", 1)
-    .replace("[2, 3]", "[30, 30]", 1)
+    .replace("[2, 3]", "[15, 15]", 1)
     .replace("every_epochs = 1", "every_epochs = 2")
 )
 
