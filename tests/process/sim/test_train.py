@@ -44,7 +44,7 @@ def start(config: Path, out: Path) -> "subprocess.Popen[str]":
 
 def until_there_is(pattern: str, out: Path, process: "subprocess.Popen[str]") -> None:
     while not list(out.glob(pattern)):
-        assert process.poll() is None
+        assert process.poll() is None, process.communicate()
         time.sleep(0.02)
 
 
