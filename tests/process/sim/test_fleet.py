@@ -42,10 +42,13 @@ MISSION_S = 20.0
 # The end of the mission that the cost is taken from: the robots keep moving about their places.
 LAST_S = 5
 
-ORDER_OF_STATES = [
+OUTWARDS = (
     FlightState.PREFLIGHT, FlightState.ARMING, FlightState.TAKEOFF, FlightState.HOLD,
-    FlightState.MISSION, FlightState.RETURN, FlightState.LAND,
-]  # fmt: skip
+    FlightState.MISSION,
+)  # fmt: skip
+# Who is over its landing point when all are to return lands, and may be told to wait until others
+# are home.
+HOMEWARDS = (FlightState.RETURN, FlightState.LAND)
 
 
 class Flown(NamedTuple):
@@ -98,7 +101,9 @@ def test_all_robots_take_off_cover_and_land(flights: Flights) -> None:
         assert flight["problem"] is None and flight["all_landed"], flight
         for robot in flight["fleet"]:
             states = [change["state"] for change in robot["timeline"]]
-            positions = [states.index(state) for state in ORDER_OF_STATES if state in states]
+            back = states[::-1]
+            positions = [states.index(state) for state in OUTWARDS if state in states]
+            positions += [len(back) - back.index(state) for state in HOMEWARDS if state in back]
             assert positions == sorted(positions)
             assert {FlightState.TAKEOFF, FlightState.MISSION, FlightState.LAND} <= {*states}
             # A machine that is too busy for a moment makes a robot hold; some 3 s later it goes on.
