@@ -7,9 +7,9 @@ stations hear each other, on one channel, and around one access point:
   each receiver, station -> access point -> station, and so does TCP's acknowledgement.
 - `router`: a message goes up to a zenoh router once, and down once for each receiver. A router that
   is itself a station (`Wifi.ground_wired` false) passes all of it on over the air again.
-- `multicast`: what several robots hear goes up once, acknowledged and at the data rate as all that
-  a station sends, and down once for all, at the multicast rate and without acknowledgement. What
-  the ground alone hears goes there by TLS.
+- `multicast`: what robots tell each other goes up once, acknowledged and at the data rate as all
+  that a station sends, and down once for all, at the multicast rate and without acknowledgement.
+  What the ground hears or says goes by way of a router, to each robot by itself.
 
 Per transmission: DIFS, backoff, preamble, data, SIFS and acknowledgement. What goes to one station
 goes as one A-MPDU; and for a robot that sends, all that it has to say goes to the access point,
@@ -537,8 +537,11 @@ def _share(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> 
 
 def _message_us(transport: Transport, wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
     """What one message of a flow takes, to all that hear it."""
-    if transport == "multicast" and flow.robots:
-        return _multicast_us(wifi, channel, flow)
+    if transport == "multicast" and flow.robots and flow.source != "ground":
+        in_group = _multicast_us(wifi, channel, flow)
+        if not flow.to_ground:
+            return in_group
+        return in_group.plus(_message_us(transport, wifi, channel, flow._replace(robots=0.0)))
     from_air = flow.source == "robot" or (flow.source == "ground" and not wifi.ground_wired)
     ground_on_air = flow.to_ground and not wifi.ground_wired
     on_air = flow.robots + (1.0 if ground_on_air else 0.0)
@@ -567,5 +570,5 @@ def _connections_us(channel: _Channel, segments: _Packets, *, up: float, down: f
 
 def _multicast_us(wifi: Wifi, channel: _Channel, flow: _Flow) -> _Use:
     datagrams = _datagrams(flow.payload_bytes)
-    on_wire = flow.source == "wire" or (flow.source == "ground" and wifi.ground_wired)
-    return channel.one_sender(datagrams, 0.0 if on_wire else 1.0).plus(channel.to_group(datagrams))
+    up = channel.one_sender(datagrams, 1.0 if flow.source == "robot" else 0.0)
+    return up.plus(channel.to_group(datagrams))

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.memory import EXPLORED_CELLS
+from edge.core.wire import PayloadType
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.bounds import MOST_ROBOTS
 from edge.messages.codec import encode
@@ -413,6 +414,23 @@ def test_all_sizes_are_within_their_topics_limits() -> None:
         (GROUND_CARD, GROUND_CARD_BYTES),
     ):
         assert size <= topic.limit_bytes
+
+
+@pytest.mark.parametrize(
+    ("robots", "transport", "payload", "emulated"),
+    [
+        (10, "mesh", "float16", 0.352), (10, "mesh", "int8", 0.292),
+        (10, "multicast", "float16", 0.193), (10, "multicast", "int8", 0.161),
+        (20, "multicast", "int8", 0.330),
+    ],
+)  # fmt: skip
+def test_it_asks_for_what_the_programs_links_took_of_emulated_air(
+    robots: int, transport: Any, payload: PayloadType, emulated: float
+) -> None:
+    """docs/scaling.md, "Compared with emulated Wi-Fi"."""
+    wifi = Wifi(data_rate_mbit_s=60.0, ground_wired=False)
+    traffic = Traffic(robots=robots, message_bytes=MESSAGE_BYTES[payload])
+    assert airtime(transport, wifi, traffic).total == pytest.approx(emulated, rel=0.2)
 
 
 def test_the_docs_tables_are_the_models() -> None:

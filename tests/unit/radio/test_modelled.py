@@ -13,7 +13,7 @@ def test_a_mesh_of_a_hundred_loses_and_delays_what_multicast_does_not() -> None:
     mesh = ModelledRadio("mesh", wifi).link(100, "int8")
     multicast = ModelledRadio("multicast", wifi).link(100, "int8")
     assert mesh.loss > 0.8 and mesh.delay_s > 0.3
-    assert multicast.loss < 0.1 and multicast.delay_s < 0.01
+    assert multicast.loss < 0.2 and multicast.delay_s < 0.01
     assert ModelledRadio("mesh", wifi).link(10, "int8").loss == 0.0
 
 
