@@ -7,6 +7,7 @@ the key, the value and what is allowed.
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -15,7 +16,7 @@ from edge.core.fence import Fence
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.wire import MAX_ROBOT_ID, PayloadType
+from edge.core.wire import MAX_ROBOT_ID, PAYLOAD_TYPES, PayloadType
 from edge.flight.energy import EnergyParameters
 from edge.flight.failsafe import required
 from edge.flight.margins import ErrorBudget, Margin
@@ -186,7 +187,11 @@ class Rates:
 
 @dataclass(frozen=True, slots=True)
 class PolicyConfig:
-    """The bundle, the world it flies over, and the paper's scales."""
+    """The bundle, the world it flies over, and the paper's scales.
+
+    `payload`: what its messages are encoded as; by default as the smallest of those that the policy
+    was judged with.
+    """
 
     bundle: str
     world: str
@@ -194,7 +199,7 @@ class PolicyConfig:
     velocity_scale: float = 0.25
     max_message_age_s: float = 0.8
     max_input_age_s: float = 1.0
-    payload: PayloadType = "float16"
+    payload: Literal["smallest", PayloadType] = "smallest"
 
     def __post_init__(self) -> None:
         ModelScale(self.env_scale, self.velocity_scale)
@@ -202,6 +207,20 @@ class PolicyConfig:
             raise ValueError(f"max_message_age_s = {self.max_message_age_s}: must be 0 or above")
         if not 0.0 < self.max_input_age_s < math.inf:
             raise ValueError(f"max_input_age_s = {self.max_input_age_s}: must be above 0")
+
+    def payload_of(self, judged: Sequence[PayloadType]) -> PayloadType:
+        """What messages are encoded as, of what the policy was `judged` with.
+
+        Raises ConfigError if it was not judged with the one that is asked for.
+        """
+        if self.payload == "smallest":
+            return max(judged, key=PAYLOAD_TYPES.index)
+        if self.payload not in judged:
+            raise ConfigError(
+                f"policy: payload = {self.payload!r}: {self.bundle} was judged with "
+                f"{', '.join(judged)} alone (`lpac evaluate --payload`)"
+            )
+        return self.payload
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,16 +330,15 @@ class RobotConfig:
         beyond_m, ceiling_m = self.failsafe.fence_margin_m, self.fence.ceiling_m
         return self.errors.free_ground(self.limits, beyond_m, ceiling_m)
 
-    @property
-    def pac(self) -> PacParameters:
-        """The part of it that the perception-action-communication loop takes."""
+    def pac(self, judged: Sequence[PayloadType]) -> PacParameters:
+        """What the perception-action-communication loop takes; see `PolicyConfig.payload_of`."""
         policy = self.policy
         return PacParameters(
             scale=ModelScale(policy.env_scale, policy.velocity_scale),
             max_speed_m_s=self.limits.max_speed_m_s,
             max_message_age_s=policy.max_message_age_s,
             max_input_age_s=policy.max_input_age_s,
-            payload=policy.payload,
+            payload=policy.payload_of(judged),
         )
 
 

@@ -107,7 +107,7 @@ class RobotNode:
             policy=policy.policy,
             sensor=ports.sensor_over(world, config.policy.world),
             odometry=self._navigation,
-            parameters=config.pac,
+            parameters=config.pac(policy.policy.manifest.payload_types),
         )
         self._control = FlightControl(
             robot=config.robot(boot_nonce),

@@ -68,17 +68,12 @@ _M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 2**19
 def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, SensorOver, str]:
     """Policy, sensor and world, before anything that moves. Raises ValueError or OSError."""
     policy = load_verified_policy(Path(config.policy.bundle))
-    judged = policy.policy.manifest.payload_types
-    if config.policy.payload not in judged:
-        raise ConfigError(
-            f"policy: payload = {config.policy.payload!r}: {config.policy.bundle} was judged with "
-            f"{', '.join(judged)} alone (`lpac evaluate --payload`)"
-        )
-    least_bytes, _ = message_bytes(policy.policy, config.policy.payload)
+    payload = config.policy.payload_of(policy.policy.manifest.payload_types)
+    least_bytes, _ = message_bytes(policy.policy, payload)
     if config.link.group and frames(least_bytes) > MOST_FRAGMENTS:
         raise ConfigError(
             f"link: group = {config.link.group!r}: a message of {config.policy.bundle} in "
-            f"{config.policy.payload} has {least_bytes} bytes, and a group takes {MOST_BYTES}: "
+            f"{payload} has {least_bytes} bytes, and a group takes {MOST_BYTES}: "
             "take another payload, or another transport"
         )
     sensor = config.sensor

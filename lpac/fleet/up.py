@@ -79,9 +79,11 @@ def group_costs(config: FleetConfig) -> list[GroupCost]:
     if config.radio.transport != "multicast":
         return []
     policy = load_policy(load_bundle(config.bundle))
+    judged = policy.manifest.payload_types
     flying = [slot.robot for slot in config.slots if slot.robot is not None]
+    spoken = [config.robot_config(name).policy.payload_of(judged) for name in flying]
     costs = []
-    for payload in dict.fromkeys(config.robot_config(name).policy.payload for name in flying):
+    for payload in dict.fromkeys(spoken):
         least, most = map(frames, message_bytes(policy, payload))
         lost = 1.0 - (1.0 - _LOST) ** least, 1.0 - (1.0 - _LOST) ** most
         costs.append(GroupCost(payload, (least, most), lost))

@@ -57,7 +57,9 @@ def radio(
     Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Spares
     are left out.
     """
+    from edge.policy.bundle import load_bundle
     from lpac.ground.station.subscriber import GroundSubscriber
+    from lpac.radio.airtime import MESSAGE_BYTES
     from lpac.radio.pairs import pairs
     from lpac.radio.records import write_records
     from lpac.radio.verdict import verdict
@@ -69,12 +71,14 @@ def radio(
     computers = [robot for robot in chosen if robot.has_computer]
     if load and not computers:
         raise ValueError("--load: the robots are no computers that could send a bulk stream")
+    judged = load_bundle(config.bundle).manifest.payload_types
+    payload = config.robot_config(chosen[0].name).policy.payload_of(judged)
     with interruptible("radio", "nothing was changed"), GroundSubscriber(config.fleet) as ground:
         _require_speaking(ground, [robot.name for robot in chosen], load=load)
         before = _read_wifi(config, computers)
         windows, stream = _listen(ground, config, chosen, seconds, computers[0] if load else None)
         after = _read_wifi(config, computers)
-    checked = _checked(config, chosen, windows, before, after, loaded=load)
+    checked = _checked(config, chosen, windows, before, after, MESSAGE_BYTES[payload], loaded=load)
     found = pairs(windows)
     told = verdict(checked, found)
     if record is not None:
@@ -182,16 +186,15 @@ def _checked(
     windows: Mapping[str, "Window"],
     before: "Sequence[Outcome[list[Interface]]]",
     after: "Sequence[Outcome[list[Interface]]]",
+    flight_bytes: float,
     *,
     loaded: bool,
 ) -> "Checked":
     from edge.identity.envelope import OVERHEAD_BYTES
     from lpac.fleet.radio import reading
-    from lpac.radio.airtime import MESSAGE_BYTES
     from lpac.radio.checked import Checked
 
     then = {outcome.robot.name: outcome.value or [] for outcome in before}
-    flying = next(robot.name for robot in chosen if config.slot_of(robot.name) is not None)
     return Checked(
         robots=tuple(robot.name for robot in chosen),
         windows=windows,
@@ -200,7 +203,7 @@ def _checked(
         },
         transport=config.radio.transport,
         overhead_bytes=OVERHEAD_BYTES if config.keys is not None else 0,
-        flight_bytes=MESSAGE_BYTES[config.robot_config(flying).policy.payload],
+        flight_bytes=flight_bytes,
         loaded=loaded,
     )
 

@@ -25,6 +25,7 @@ from edge.core.vehicle import (
     VehicleState,
     Velocity,
 )
+from edge.core.wire import FLOAT_PAYLOADS
 from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
@@ -160,7 +161,7 @@ class Flown:
         world = rasterize(random_features(np.random.default_rng(0), 10, 512), 512)
         self.pac = Pac(
             robot_id=config.robot_id, boot_epoch=1, policy=policy, sensor=WorldSensor(world, 64),
-            odometry=self.navigation, parameters=config.pac,
+            odometry=self.navigation, parameters=config.pac(FLOAT_PAYLOADS),
         )  # fmt: skip
         self.control = FlightControl(
             robot=config.robot(boot_nonce=11),

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edge.core.schema import ConfigError
-from edge.robot.config import load_config
+from edge.core.wire import FLOAT_PAYLOADS
+from edge.robot.config import PolicyConfig, load_config
 from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "docs" / "robot.toml"
@@ -131,6 +133,15 @@ def test_a_mistake_is_one_line_that_names_it(
     message = refusal(tmp_path, with_line(old, new))
     for name in names:
         assert name in message
+
+
+def test_messages_are_as_small_as_the_policy_was_judged_with() -> None:
+    policy = PolicyConfig("bundle", "world.env")
+    assert policy.payload_of(("int8", "float32", "float16")) == "int8"
+    assert policy.payload_of(("float16", "float32")) == "float16"
+    assert replace(policy, payload="float32").payload_of(FLOAT_PAYLOADS) == "float32"
+    with pytest.raises(ConfigError, match=r"^policy: payload = 'int8': bundle was judged with "):
+        replace(policy, payload="int8").payload_of(FLOAT_PAYLOADS)
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
