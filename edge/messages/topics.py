@@ -18,10 +18,10 @@ Priority = Literal["now", "later"]
 class Topic:
     """One kind of message.
 
-    `content` names what its bytes are, `rate_hz` is how often one sender says it, `most_hz` how
-    often a key is listened to at most, and `most_of_one_hz` of that one connection, if several
-    speak on the key; `limit_bytes` is the largest that is listened to, `logged` the flight log's
-    topic that holds what came or went.
+    `content` names what its bytes are, `rate_hz` is how often one sender says it (a state less
+    often to a large fleet: see `state_hz`), `most_hz` how often a key is listened to at most, and
+    `most_of_one_hz` of that one connection, if several speak on the key; `limit_bytes` is the
+    largest that is listened to, `logged` the flight log's topic that holds what came or went.
     Of what is sent at once, "later" goes when nothing else waits.
     """
 
@@ -58,6 +58,15 @@ GROUND_CARD = Topic("card", "ground", "Card", 0.5, 100, 2**11, "now", None, 10)
 REVOKED = Topic("revoked", "ground", "Revocations", 0.5, 100, 2**15, "now", None, 10)
 
 TOPICS = (MESSAGE, STATUS, EXPLORED, STATE, ORDER, WORLD, CARD, GROUND_CARD, REVOKED)
+
+# By TCP a state goes to each robot by itself: so many of them a second are enough for a fleet, but
+# each robot needs some before it takes the ground for lost.
+_STATES_HZ, _LEAST_STATE_HZ = 250.0, 2.0
+
+
+def state_hz(robots: float) -> float:
+    """How often a ground says its `STATE` to so many robots, if nothing changes."""
+    return min(STATE.rate_hz, max(_LEAST_STATE_HZ, _STATES_HZ / robots))
 
 
 class Link(Protocol):

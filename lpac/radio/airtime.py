@@ -27,7 +27,7 @@ from typing import Literal, NamedTuple, get_args
 
 from edge.core.wire import PayloadType
 from edge.identity.group import DATAGRAM_BYTES, PART_BYTES
-from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATE, STATUS
+from edge.messages.topics import CARD, EXPLORED, GROUND_CARD, MESSAGE, STATUS, state_hz
 
 Transport = Literal["mesh", "router", "multicast"]
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
@@ -73,8 +73,11 @@ def status_bytes(robots: float) -> float:
 
 
 def state_bytes(robots: float) -> float:
-    """Of a GroundState for so many: it has an echo for each whose status is 0.3 s old at most."""
-    return 495.0 + 42.0 * robots
+    """Of a GroundState for so many.
+
+    It has an echo for each whose status is 0.3 s old at most, which are six of ten; for 16 at most.
+    """
+    return 495.0 + min(42.0 * robots, 70.0 * 16.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -494,7 +497,7 @@ def _flows(traffic: Traffic, robots: float) -> tuple[_Flow, ...]:
         _Flow("status", "robot", robots, traffic.status_hz, status_bytes(1.0 + heard), 0.0, True),
         _Flow("explored", "robot", robots, EXPLORED.rate_hz, EXPLORED_BYTES, 0.0, True),
         _Flow("card", "robot", robots, CARD.rate_hz, CARD_BYTES, share * others, True),
-        _Flow("state", "ground", 1.0, STATE.rate_hz, state_bytes(robots), robots),
+        _Flow("state", "ground", 1.0, state_hz(robots), state_bytes(robots), robots),
         _Flow("ground card", "ground", 1.0, GROUND_CARD.rate_hz, GROUND_CARD_BYTES, robots),
         _Flow("guests' message", "wire", guests, hz, size, share * robots),
         _Flow("guests' card", "wire", guests, CARD.rate_hz, CARD_BYTES, share * robots),

@@ -4,6 +4,7 @@
 """
 
 import base64
+import math
 import traceback
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,7 @@ from edge.messages.topics import (
     Link,
     ReceiveCallback,
     Topic,
+    state_hz,
 )
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot
 from lpac.ground.station.commands import Commands, CommandTask
@@ -31,6 +33,8 @@ from lpac.ground.station.protocol import Request, ServerMessage
 from lpac.ground.station.station import Station
 
 _WORLD_PERIOD_S = 0.5
+# Ticks are not exact.
+_EARLY_S = 0.1
 
 
 class GroundListener(Protocol):
@@ -68,6 +72,7 @@ class GroundNode:
         self._told_setup = setup
         self._kept: GroundState | None = None
         self._published: tuple[int | None, int] = None, 0
+        self._state_at_s = -math.inf
         self._world_at_s = 0.0
         self._complained: set[str] = set()
 
@@ -175,26 +180,32 @@ class GroundNode:
             self._listener.told(setup)
         for event in self.station.new_events():
             self._listener.told(event)
-        state, orders = self.station.published_state(), self.station.published_orders()
-        if self._published != (None if state is None else state.sequence, len(orders)):
+        if self._published != self._to_publish():
             # What is new does not wait for its turn.
             self._publish()
+
+    def _to_publish(self) -> tuple[int | None, int]:
+        return self.station.published_sequence, len(self.station.published_orders())
 
     def _publish(self) -> None:
         station = self.station
         if station.commands and station.state is not None and station.state != self._kept:
             self._kept = station.state
             self._listener.commanded(station.state)
-        state, orders = station.published_state(), station.published_orders()
-        self._published = (None if state is None else state.sequence, len(orders))
+        now_s, before = self._clock.monotonic_s(), self._published
+        self._published = self._to_publish()
         if self._link is None:
             return
         self._guard.introduce()
-        if state is not None:
-            self._link.publish(STATE, encode(state))
-        for order in orders:
+        due = now_s - self._state_at_s > 1.0 / state_hz(len(station.setup.robots)) - _EARLY_S
+        if due or self._published != before:
+            state = station.published_state()
+            if state is not None:
+                self._state_at_s = now_s
+                self._link.publish(STATE, encode(state))
+        for order in station.published_orders():
             self._link.publish(ORDER, encode(order))
-        world, now_s = station.published_world(), self._clock.monotonic_s()
+        world = station.published_world()
         if world is not None and now_s - self._world_at_s >= _WORLD_PERIOD_S:
             self._world_at_s = now_s
             self._link.publish(WORLD, world.encode())

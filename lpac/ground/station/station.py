@@ -60,8 +60,8 @@ _LATELY_S = 10.0
 _EXPIRY_MARGIN_S = 0.5
 _LATER_S = 1e-3
 _EVENTS_KEPT = 200
-# Each status is echoed once or twice.
-_ECHOED_S = 0.3
+# Each status is echoed once or twice, but in large fleets: clocks need no more.
+_ECHOED_S, _MOST_ECHOES = 0.3, 16
 _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
 # Who asks for a hold gets the commander's sequence up by no more at a time.
@@ -111,6 +111,7 @@ class Station:
             self._tell_presence,
             self._tell_state,
         )
+        self._echoed_at_s: dict[int, float] = {}
         self._began_s = now_s
         self._heard_s = now_s  # when the commander was
         self._obeyed_since_s: float | None = None
@@ -734,8 +735,14 @@ class Station:
 
     # What is to be published, a few times a second
 
+    @property
+    def published_sequence(self) -> int | None:
+        """Of the state that is to be published now; None: none is."""
+        state = self.state if self.commands and self.state is not None else self._asked
+        return None if state is None else state.sequence
+
     def published_state(self) -> GroundState | None:
-        """None: nothing is."""
+        """None: nothing is. In large fleets robots are echoed in turns, from call to call."""
         if not self.commands or self.state is None:
             # The commander's time is not this station's to tell.
             asked = self._asked
@@ -749,14 +756,20 @@ class Station:
         )
 
     def _echoes(self) -> dict[str, Echo]:
-        echoes = {}
+        fresh = {}
         for robot in self._robots.names:
             last = self._robots.last(robot, self._now_s)
             if last is not None and last[1] <= _ECHOED_S:
-                status, held_s = last
-                echoes[str(robot)] = Echo(
-                    status.boot_nonce, round(status.uptime_s, 4), round(held_s, 4)
-                )
+                fresh[robot] = last
+        # Whose turn was longest ago.
+        turns = sorted(fresh, key=lambda robot: self._echoed_at_s.get(robot, -math.inf))
+        echoes = {}
+        for robot in turns[:_MOST_ECHOES]:
+            status, held_s = fresh[robot]
+            self._echoed_at_s[robot] = self._now_s
+            echoes[str(robot)] = Echo(
+                status.boot_nonce, round(status.uptime_s, 4), round(held_s, 4)
+            )
         return echoes
 
     def published_orders(self) -> tuple[Order, ...]:

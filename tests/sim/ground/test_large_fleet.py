@@ -1,0 +1,103 @@
+"""What a ground says to more robots than a radio has time for, each by itself."""
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from edge.identity.guard import Unguarded
+from edge.messages.codec import decode, encode
+from edge.messages.mission import GroundState
+from edge.messages.topics import STATE, STATUS, Topic
+from lpac.ground.station.node import GroundNode
+from lpac.ground.station.protocol import SafetyCommand
+from tests.unit.ground.snapshots import setup, status
+
+TICK_S = 0.2
+
+
+@dataclass
+class Ground:
+    """Its clock, its link and who is told, for one that is alone."""
+
+    now_s: float = 0.0
+    said: list[tuple[float, GroundState]] = field(default_factory=list)
+
+    def monotonic_s(self) -> float:
+        return self.now_s
+
+    def unix_s(self) -> float:
+        return 1e9 + self.now_s
+
+    def publish(self, topic: Topic, data: bytes) -> None:
+        if topic == STATE:
+            self.said.append((self.now_s, decode(GroundState, data)))
+
+    def is_claimed(self, _: int) -> bool:
+        return False
+
+    def peers(self) -> int:
+        return 1
+
+    def refused(self) -> int:
+        return 0
+
+    def told(self, _: object) -> None:
+        pass
+
+    def stepped(self) -> None:
+        pass
+
+    def commanded(self, _: object) -> None:
+        pass
+
+
+def flown(robots: int, duration_s: float) -> tuple[Ground, GroundNode]:
+    """A ground that commands, and hears of each robot twice a second, of all at their own times."""
+    ground = Ground()
+    node = GroundNode(setup(robots), ground, ground, Unguarded())
+    node.attach(ground)
+    hear = node.subscriptions[STATUS]
+    node.station.take_command()
+    for tick in range(round(duration_s / TICK_S)):
+        for late in range(2):
+            ground.now_s = TICK_S * (tick + late / 2)
+            for robot in range(robots):
+                # Ten moments in a second, of which each robot has two.
+                if (2 * tick + late - robot) % 5 == 0:
+                    said = status(robot, uptime_s=ground.now_s, sequence=tick)
+                    hear(f"robot/{robot}/status", encode(said))
+        ground.now_s = TICK_S * (tick + 1)
+        node.tick()
+    return ground, node
+
+
+@pytest.mark.parametrize(("robots", "states_hz"), [(10, 5.0), (50, 5.0), (100, 2.5), (300, 2.0)])
+def test_states_are_said_less_often_to_more(robots: int, states_hz: float) -> None:
+    ground, _ = flown(robots, 10.0)
+    assert len(ground.said) / 10.0 == pytest.approx(states_hz, rel=0.1)
+
+
+@pytest.mark.parametrize("robots", [16, 100])
+def test_each_robot_is_echoed_in_its_turn(robots: int) -> None:
+    ground, _ = flown(robots, 20.0)
+    echoed_s: dict[str, list[float]] = {str(robot): [0.0] for robot in range(robots)}
+    for at_s, state in ground.said:
+        assert len(state.echoes) <= 16
+        for robot, echo in state.echoes.items():
+            assert echo.uptime_s + echo.held_s == pytest.approx(at_s)
+            echoed_s[robot].append(at_s)
+    longest_s = max(
+        after_s - before_s
+        for times_s in echoed_s.values()
+        for before_s, after_s in zip(times_s, [*times_s[1:], 20.0], strict=True)
+    )
+    assert longest_s < (1.0 if robots <= 16 else 4.0)
+
+
+def test_what_is_new_is_said_at_once() -> None:
+    ground, node = flown(100, 5.0)
+    before = len(ground.said)
+    ground.now_s += 0.01
+    node.begin(SafetyCommand("hold"))
+    (at_s, state) = ground.said[before]
+    assert at_s == ground.now_s and state.safety_action == "hold"
