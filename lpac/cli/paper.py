@@ -204,7 +204,8 @@ def e3(
     bundle: Bundle = DEFAULT_BUNDLE,
     world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
     vehicle: Annotated[
-        VehicleKind, typer.Option(help="point, or simulated: whole robots, which pilots take.")
+        VehicleKind,
+        typer.Option(help="point; or simulated or mavlink: pilots take whole robots."),
     ] = VehicleKind.POINT,
     logs: Logs = None,
     ray: Ray = None,
@@ -219,7 +220,7 @@ def e3(
         perturbed_by,
         whole_perturbation,
     )
-    from lpac.paper.flown import fly_piloted
+    from lpac.paper.flown import fly_piloted, fly_programs
     from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, TAKEN_WHOLE, write_perturbation
 
     folder = _folder(out, "e3")
@@ -231,17 +232,20 @@ def e3(
     elif vehicle is VehicleKind.POINT:
         [flight] = _fly([perturbation(world)], bundle, ray)
         what, how = perturbed(flight), TAKEN_POINTS
-    elif vehicle is VehicleKind.SIMULATED:
+    elif vehicle is not VehicleKind.PX4:
+        scenario, pilots = whole_perturbation(bundle, world)
         with progress_of("flights") as progress:
             task = progress.add_task("", total=1)
-            scenario, pilots = whole_perturbation(bundle, world)
-            record = fly_piloted(scenario, bundle, pilots)
+            if vehicle is VehicleKind.SIMULATED:
+                record = fly_piloted(scenario, bundle, pilots)
+            else:
+                record = fly_programs(scenario, folder / "flight", bundle, pilots=pilots)
             progress.update(task, advance=1)
         what, how = perturbed_by(record, absences_of(record), _range_m(bundle)), TAKEN_WHOLE
     else:
         raise ValueError(
-            f"--vehicle {vehicle.value}: no pilot takes such a robot here: must be point or "
-            "simulated; fly docs/script.toml, and give its logs by --logs"
+            "--vehicle px4: no pilot takes a real PX4 here: must be point, simulated or mavlink; "
+            "fly docs/script.toml, and give its logs by --logs"
         )
     made_by = _made_by(f"e3 --world {world}{_flown_with(vehicle, logs)}", bundle)
     told = write_perturbation(what, folder, made_by, how)

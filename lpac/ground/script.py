@@ -48,6 +48,8 @@ _START_AGAIN_S = 3.0
 _START_TAKES_S = 7.0
 _REJOIN_WITHIN_S = 15.0
 _PERIOD_S = 0.2
+# What is due in less, by rounding, would never come on a clock that is counted.
+_LEAST_S = 0.01
 
 # The file
 
@@ -554,7 +556,7 @@ class ScriptRun:
                     yield from self._start_again(name)
             if len(statuses) == len(self.robots) and all(map(is_down, statuses.values())):
                 raise ScriptError("nobody flies any more")
-            yield Until(lambda _: False, max(0.0, min(free_s, _PERIOD_S)))
+            yield Until(lambda _: False, max(_LEAST_S, min(free_s, _PERIOD_S)))
 
     def _start_again(self, name: str) -> Procedure[None]:
         if self._ground.now_s - self._last_start_s.get(name, -math.inf) < _START_AGAIN_S:

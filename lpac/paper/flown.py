@@ -84,14 +84,19 @@ def fly_piloted(
 
 
 def fly_programs(
-    scenario: FleetScenario, folder: Path, bundle: Path, px4_build: Path | None
+    scenario: FleetScenario,
+    folder: Path,
+    bundle: Path,
+    px4_build: Path | None = None,
+    pilots: Sequence[PilotFlight] = (),
 ) -> FlightRecord:
     """A flight of a program for each robot, in real time; its logs stay in `folder`.
 
-    Their vehicles are PX4s of that build, or simulated. Raises what `lpac sim` does, and ValueError
-    if it came to no mission.
+    Their vehicles are PX4s of that build, or simulated, which `pilots` may take. Raises what
+    `lpac sim` does, and ValueError if it came to no mission.
     """
-    return _record(fly_fleet(Fleet(scenario, folder, bundle, px4_build=px4_build)))
+    fleet = Fleet(scenario, folder, bundle, px4_build=px4_build)
+    return _record(fly_fleet(fleet, pilots=pilots))
 
 
 def _record(flown: FleetFlight) -> FlightRecord:

@@ -9,12 +9,11 @@ from edge.messages.mission import RobotStatus
 from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
-from lpac.ground.script import Perturbation
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import Say
-from lpac.sim.fleet.pilot import Pilot, PilotFlight
+from lpac.sim.fleet.pilot import LOOKS_S, Pilot, PilotFlight
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
 
@@ -48,11 +47,16 @@ def fly_simulated(
         say(step)
         if step == "mission":
             for flown in pilots:
-                Pilot(fleet, flown, ground.now_s)
+                fly_by_hand(flown)
+
+    def fly_by_hand(flown: PilotFlight) -> None:
+        robot, vehicle = fleet.robots[flown.robot], fleet.vehicles[flown.robot].vehicle
+        pilot = Pilot(vehicle, fleet.layout, flown, ground.now_s)
+        fleet.schedule.every(LOOKS_S, lambda: pilot.look(ground.now_s, robot.status))
 
     flight = ScriptedFlight(
         ground, folder / "fleet.toml", scenario.duration_s,
-        perturb=tuple(each for flown in pilots for each in _perturbations(flown)),
+        perturb=tuple(each for flown in pilots for each in flown.perturbations),
         on_step=begin, say=say,
     )  # fmt: skip
     notes = _Notes(fleet)
@@ -62,14 +66,6 @@ def fly_simulated(
         problem = str(error)
     fleet.close()
     return notes.flight(flight, problem, earlier, folder if logs else None)
-
-
-def _perturbations(flown: PilotFlight) -> tuple[Perturbation, ...]:
-    robot = f"r{flown.robot}"
-    return (
-        Perturbation(flown.from_s, robot, "pilot"),
-        Perturbation(flown.until_s, robot, "rejoin"),
-    )
 
 
 class _Notes:

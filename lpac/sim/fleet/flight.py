@@ -24,6 +24,7 @@ from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.fleet.listener import Say
+from lpac.sim.fleet.pilot import Pilot, PilotFlight
 from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
 from lpac.sim.fleet.scripted import CommandOutcome, ScriptedFlight
 from lpac.sim.fleet.vehicles import VehicleError
@@ -173,15 +174,22 @@ class FleetFlight:
 
 
 def fly(
-    fleet: Fleet, say: Say = lambda _: None, watch: Callable[[str], None] = lambda _: None
+    fleet: Fleet,
+    say: Say = lambda _: None,
+    watch: Callable[[str], None] = lambda _: None,
+    *,
+    pilots: Sequence[PilotFlight] = (),
 ) -> FleetFlight:
     """Run a fleet and its ground, and fly the script; `watch` gets the step's name now and then.
+
+    `pilots` take robots with simulated vehicles out of the field, and bring them back.
 
     Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
     FleetError if a robot's program ends before all are heard; OSError, LinkError, GroundError or
     VehicleError if something cannot start.
     """
     moments: dict[str, _Moment] = {}
+    flying_by_hand: list[Pilot] = []
     step = "assemble"
     problem, overloaded = None, False
     with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
@@ -193,6 +201,11 @@ def fly(
             say("landing all robots where they are" if name == "land" else name)
             moments.setdefault(name, _Moment.of(fleet, ground))
             step = name
+            if name == "mission" and fleet.simulated is not None:
+                vehicles, now_s = fleet.simulated.vehicles, ground.told.now_s
+                flying_by_hand[:] = [
+                    Pilot(vehicles[flown.robot], fleet.layout, flown, now_s) for flown in pilots
+                ]
 
         def look() -> None:
             if step == "assemble":
@@ -201,10 +214,16 @@ def fly(
                 fleet.vehicles.require_running()
             if step not in ("assemble", "land"):
                 fleet.require_keeping_up()
+            if fleet.simulated is not None and step == "mission":
+                told = ground.told.snapshot.robots
+                with fleet.simulated.stepped:
+                    for pilot in flying_by_hand:
+                        pilot.look(ground.told.now_s, told[pilot.robot].status)
             watch(step)
 
         flight = ScriptedFlight(
             ground.told, fleet.fleet_toml, fleet.layout.scenario.duration_s,
+            perturb=tuple(each for flown in pilots for each in flown.perturbations),
             on_step=begin, say=fleet.say_unless_behind,
         )  # fmt: skip
         try:

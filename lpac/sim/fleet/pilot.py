@@ -5,11 +5,13 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
-from edge.messages.mission import FlightState
-from lpac.sim.fleet.simulated import SimulatedFleet
+from edge.messages.mission import FlightState, RobotStatus
+from lpac.ground.script import Perturbation
+from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.vehicle import Px4Vehicle
 
-_LOOKS_S = 0.1
+LOOKS_S = 0.1
 _GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
 # Beyond the fence's line; when the pilot turns back, and lets the sticks go, before the end.
 _BEYOND_M = 2.0
@@ -27,30 +29,48 @@ class PilotFlight(NamedTuple):
     from_s: float
     until_s: float
 
+    @property
+    def perturbations(self) -> tuple[Perturbation, Perturbation]:
+        """What the ground orders: the pilot is given the robot, and it is taken back."""
+        robot = f"r{self.robot}"
+        return (
+            Perturbation(self.from_s, robot, "pilot"),
+            Perturbation(self.until_s, robot, "rejoin"),
+        )
+
 
 class Pilot:
-    """Flies a robot by its sticks, by sight, at the height that it has."""
+    """Flies a robot by its sticks, by sight, at the height that it has.
 
-    def __init__(self, fleet: SimulatedFleet, flight: PilotFlight, mission_began_s: float) -> None:
-        """Once the robot says that it is the pilot's."""
-        self._robot = fleet.robots[flight.robot]
-        self._vehicle = fleet.vehicles[flight.robot].vehicle
-        self._layout = fleet.layout
-        self._clock = fleet.schedule
+    `mission_began_s` is by the clock that `look` is told the time of.
+    """
+
+    def __init__(
+        self, vehicle: Px4Vehicle, layout: Layout, flight: PilotFlight, mission_began_s: float
+    ) -> None:
+        self.robot = flight.robot
+        self._vehicle = vehicle
+        self._layout = layout
+        self._from_s = mission_began_s + flight.from_s
         self._until_s = mission_began_s + flight.until_s
         self._taken_at_m: F64 | None = None
         self._out_m: F64 = np.zeros(3)
-        after_s = mission_began_s + flight.from_s - self._clock.monotonic_s()
-        self._looks = self._clock.every(_LOOKS_S, self._look, max(0.0, after_s))
+        self._over = False
 
-    def _look(self) -> None:
-        left_s = self._until_s - self._clock.monotonic_s()
+    def look(self, now_s: float, said: RobotStatus | None) -> None:
+        """Some times a second; `said` is what the robot says of itself, None if nothing.
+
+        The pilot takes it once it says that it is the pilot's.
+        """
+        if self._over or now_s < self._from_s:
+            return
+        left_s = self._until_s - now_s
         if left_s < _LETS_GO_S:
             self._vehicle.move_sticks(())
-            self._looks.stop()
+            self._over = True
         elif self._taken_at_m is not None:
             self._fly_to(self._out_m if left_s > _BACK_S else self._taken_at_m)
-        elif self._robot.status is not None and self._robot.status.state is FlightState.PILOT:
+        elif said is not None and said.state is FlightState.PILOT:
             self._take()
 
     def _take(self) -> None:

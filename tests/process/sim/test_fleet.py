@@ -23,9 +23,12 @@ from edge.messages.mission import FlightState
 from edge.robot.config import load_config
 from lpac.fleet.settings import load_fleet
 from lpac.ground.station.config import load_ground
+from lpac.paper.experiments import absences_of
+from lpac.paper.flown import fly_programs
 from lpac.sim.description import ERRORS
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import FleetListener
+from lpac.sim.fleet.pilot import PilotFlight
 from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
 from tests.conftest import ROOT, SHIPPED
 from tests.process.cli.test_cli import error_line, lpac
@@ -184,6 +187,22 @@ def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
         if match:
             return match
     raise AssertionError(f"{pattern!r} is not among {lines}")
+
+
+@pytest.mark.real_time
+def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None:
+    """As tests/sim/sim/test_pilot.py has it on the simulated clock."""
+    taken = PilotFlight(robot=0, from_s=1.0, until_s=19.0)
+    scenario = FleetScenario(robots=2, seed=3, duration_s=22.0)
+    record = fly_programs(scenario, tmp_path, SHIPPED, pilots=[taken])
+    [absence] = absences_of(record)
+    assert absence.robot == "0"
+    assert np.allclose((absence.from_s, absence.until_s), taken[1:], atol=3.0)
+    truth, fence = record.truth["0"], record.fence
+    assert fence is not None
+    away = (truth.time_s > absence.from_s) & (truth.time_s < absence.until_s)
+    inside_m = [fence.distance_m(x, y) for x, y, _ in truth.position_m[away][::25].tolist()]
+    assert min(inside_m) < -1.0 and inside_m[-1] > 0.0
 
 
 @pytest.mark.real_time
