@@ -48,8 +48,8 @@ def network(
         typer.Option(
             "--middleware",
             metavar="NAME",
-            help="zenoh and cyclonedds if not given; may be repeated. Robots without programs are "
-            "always measured beside them.",
+            help="zenoh, cyclonedds, and fastdds where it is installed, if not given; may be "
+            "repeated. Robots without programs are always measured beside them.",
         ),
     ] = None,
     robots: Annotated[
@@ -118,13 +118,16 @@ def _checked(given: Sequence[str] | None) -> tuple[str, ...]:
     for name in given or ():
         if name not in MIDDLEWARES:
             raise ValueError(f"--middleware {name}: must be one of {', '.join(MIDDLEWARES)}")
-    chosen = [name for name in MIDDLEWARES if not given or name in given]
-    for name in chosen:
-        if MIDDLEWARES[name].version() is None:
+    chosen = []
+    for name, middleware in MIDDLEWARES.items():
+        asked = name in given if given else not middleware.is_optional
+        if asked and middleware.version() is None:
             raise ValueError(
-                f"{MIDDLEWARES[name].title} is not installed here: `pip install "
-                "'lpac-edge[bench]'`, or measure without it: --middleware zenoh"
+                f"{middleware.title} is not installed here: `{middleware.install}`, or measure "
+                "without it: --middleware zenoh"
             )
+        if asked or (not given and middleware.version() is not None):
+            chosen.append(name)
     return (*chosen, NOTHING)
 
 

@@ -4,6 +4,7 @@ import importlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from types import MappingProxyType
 from typing import Protocol
@@ -34,28 +35,51 @@ class OpenPeer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Middleware:
-    """`title` is for people, `package` what pip calls it, `adapter` the module."""
+    """`title` is for people, `adapter` the module, and `install` what a shell does to have it.
+
+    `version` tells which is installed; None: none is. One that `is_optional` is only measured where
+    it is installed.
+    """
 
     title: str
-    package: str
     adapter: str
+    install: str
+    version: Callable[[], str | None]
+    is_optional: bool = False
 
     def open_peer(self) -> OpenPeer:
         """Raises ModuleNotFoundError if it is not installed."""
         opened: OpenPeer = importlib.import_module(self.adapter).open_peer
         return opened
 
-    def version(self) -> str | None:
-        """None if it is not installed."""
-        try:
-            return version(self.package)
-        except PackageNotFoundError:
-            return None
+
+def _of_package(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
+def _of_fast_dds() -> str | None:
+    told: str | None = importlib.import_module("lpac.network.over_fastdds").version()
+    return told
+
+
+_BENCH = "pip install 'lpac-edge[bench]'"
 MIDDLEWARES: Mapping[str, Middleware] = MappingProxyType(
     {
-        "zenoh": Middleware("zenoh", "eclipse-zenoh", "lpac.network.over_zenoh"),
-        "cyclonedds": Middleware("Cyclone DDS", "cyclonedds", "lpac.network.over_cyclone"),
+        "zenoh": Middleware(
+            "zenoh", "lpac.network.over_zenoh", _BENCH, partial(_of_package, "eclipse-zenoh")
+        ),
+        "cyclonedds": Middleware(
+            "Cyclone DDS", "lpac.network.over_cyclone", _BENCH, partial(_of_package, "cyclonedds")
+        ),
+        "fastdds": Middleware(
+            "Fast DDS",
+            "lpac.network.over_fastdds",
+            "sudo apt install g++ libfastrtps-dev",
+            _of_fast_dds,
+            is_optional=True,
+        ),
     }
 )

@@ -8,7 +8,6 @@ import sys
 import time
 import uuid
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,8 @@ INSTALLED = [
     pytest.param(
         name,
         marks=pytest.mark.skipif(
-            find_spec(middleware.package if name != "zenoh" else "zenoh") is None,
-            reason=f"{middleware.title} is not installed: `pip install 'lpac-edge[bench]'`",
+            middleware.version() is None,
+            reason=f"{middleware.title} is not installed: `{middleware.install}`",
         ),
     )
     for name, middleware in MIDDLEWARES.items()
@@ -121,7 +120,9 @@ def test_it_draws_what_it_measured(measured: tuple[Path, dict[str, Any]]) -> Non
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.skipif(find_spec("cyclonedds") is None, reason="Cyclone DDS is not installed")
+@pytest.mark.skipif(
+    MIDDLEWARES["cyclonedds"].version() is None, reason="Cyclone DDS is not installed"
+)
 def test_for_people_it_is_a_table_that_says_where(tmp_path: Path) -> None:
     result = lpac(
         "bench", "network", "restarts", "-n", 2, "--repetitions", 1, "--seconds", 1, "--out",
