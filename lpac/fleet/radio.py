@@ -1,12 +1,14 @@
 """What the robots' radios tell of themselves over SSH, and a stream of bytes to disturb them."""
 
 import contextlib
+import ipaddress
 import os
 import subprocess
 import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from lpac.fleet.hold import Report
@@ -27,6 +29,27 @@ async def read_wifi(config: FleetConfig, robot: RobotHost, report: Report) -> li
         report("radio", None)
         interfaces: list[Interface] = (await session.call("wifi"))["interfaces"]
         return interfaces
+
+
+def in_the_wifi(address: str, root: Path = Path("/")) -> bool:
+    """Whether this computer itself reaches the IPv4 address by Wi-Fi, as far as Linux tells.
+
+    `root` is where its /proc and /sys are.
+    """
+    found = ipaddress.IPv4Address(address)
+    routes: list[tuple[int, str]] = []
+    with contextlib.suppress(OSError):
+        for line in (root / "proc/net/route").read_text().splitlines()[1:]:
+            interface, destination, _, _, _, _, _, mask, *_ = line.split()
+            network, bits = (
+                int.from_bytes(bytes.fromhex(h), "little") for h in (destination, mask)
+            )
+            if int(found) & bits == network:
+                routes.append((bits, interface))
+    if not routes:
+        return False
+    _, interface = max(routes)
+    return (root / "sys/class/net" / interface / "phy80211").exists()
 
 
 def reading(before: Sequence[Interface], after: Sequence[Interface]) -> WifiReading:

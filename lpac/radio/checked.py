@@ -28,7 +28,7 @@ class Checked(NamedTuple):
     `wifi` is of those whose radios were asked. Each message travels in an envelope of
     `overhead_bytes`. In flight it has `flight_bytes`, sealed, if that is more: robots on the ground
     have seen little yet, and what they say of it is compressed. `loaded`: something else was sent
-    meanwhile, on purpose.
+    meanwhile, on purpose. `ground_wired`: the ground's computer is not in the Wi-Fi itself.
     """
 
     robots: tuple[str, ...]
@@ -38,6 +38,7 @@ class Checked(NamedTuple):
     overhead_bytes: int = 0
     flight_bytes: float = 0.0
     loaded: bool = False
+    ground_wired: bool = True
 
     @property
     def traffic(self) -> Traffic | None:

@@ -198,7 +198,7 @@ def _room(checked: Checked) -> Room | None:
     rates = [w.rate_mbit_s for w in checked.wifi.values() if w.rate_mbit_s]
     # The slowest take the most time.
     rate_mbit_s = statistics.harmonic_mean(rates) if rates else ASSUMED_RATE_MBIT_S
-    wifi = Wifi(data_rate_mbit_s=rate_mbit_s)
+    wifi = Wifi(data_rate_mbit_s=rate_mbit_s, ground_wired=checked.ground_wired)
     share = airtime(checked.transport, wifi, traffic).total
     flight_bytes = max(traffic.message_bytes, checked.flight_bytes)
     flight = dataclasses.replace(traffic, message_bytes=flight_bytes)

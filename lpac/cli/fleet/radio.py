@@ -191,7 +191,7 @@ def _checked(
     loaded: bool,
 ) -> "Checked":
     from edge.identity.envelope import OVERHEAD_BYTES
-    from lpac.fleet.radio import reading
+    from lpac.fleet.radio import in_the_wifi, reading
     from lpac.radio.checked import Checked
 
     then = {outcome.robot.name: outcome.value or [] for outcome in before}
@@ -205,6 +205,7 @@ def _checked(
         overhead_bytes=OVERHEAD_BYTES if config.keys is not None else 0,
         flight_bytes=flight_bytes,
         loaded=loaded,
+        ground_wired=not in_the_wifi(chosen[0].address),
     )
 
 
@@ -265,11 +266,14 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
         f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
         f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
     )
-    if room.busy_share is None:
-        return text
-    return (
-        text + f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time"
-    )
+    if room.busy_share is not None:
+        text += f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time"
+    if not checked.ground_wired:
+        text += (
+            "; this computer is in the Wi-Fi itself, so that what it sends and passes on crosses "
+            "the air twice"
+        )
+    return text
 
 
 def _delivered(pair: "Pair", *, expected_loss: float) -> "Text":

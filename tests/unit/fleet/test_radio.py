@@ -1,10 +1,11 @@
 """What robots' radios tell, between two looks at them."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from lpac.fleet.radio import reading
+from lpac.fleet.radio import in_the_wifi, reading
 from lpac.radio.checked import WifiReading
 
 
@@ -43,3 +44,24 @@ def test_the_interface_that_has_a_network_tells() -> None:
     idle = interface(name="wlan1", connected=False, signal_dbm=None)
     assert reading([], [idle, interface()]) == WifiReading(433.3, -52.0, None)
     assert reading([], [idle]) == reading([], []) == WifiReading()
+
+
+# As Linux tells them: destination, gateway and mask are little-endian.
+ROUTES = """\
+Iface\tDestination\tGateway\tFlags\tRefCnt\tUse\tMetric\tMask\tMTU\tWindow\tIRTT
+eth0\t00000000\t0101A8C0\t0003\t0\t0\t100\t00000000\t0\t0\t0
+wlan0\t0008A8C0\t00000000\t0001\t0\t0\t600\t00FFFFFF\t0\t0\t0
+"""
+
+
+@pytest.mark.parametrize(
+    ("address", "wireless"), [("192.168.8.10", True), ("192.168.1.7", False), ("10.0.0.1", False)]
+)
+def test_a_laptop_knows_whether_it_is_in_the_wifi(
+    tmp_path: Path, address: str, *, wireless: bool
+) -> None:
+    assert not in_the_wifi(address, tmp_path)
+    for name in ("proc/net", "sys/class/net/eth0", "sys/class/net/wlan0/phy80211"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "proc/net/route").write_text(ROUTES)
+    assert in_the_wifi(address, tmp_path) == wireless

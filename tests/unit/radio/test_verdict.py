@@ -88,6 +88,15 @@ def test_messages_that_grow_in_flight_leave_less_room() -> None:
     assert grown.carries < told.carries
 
 
+def test_a_ground_in_the_wifi_itself_takes_more_of_it() -> None:
+    wired, in_the_wifi = (
+        verdict(checked(ground_wired=is_so), heard()).room for is_so in (True, False)
+    )
+    assert wired is not None and in_the_wifi is not None
+    assert in_the_wifi.flight_share > 1.05 * wired.flight_share
+    assert in_the_wifi.carries <= wired.carries
+
+
 def test_a_channel_that_is_busier_than_the_model_says_has_less_room() -> None:
     traffic = Traffic(robots=N, message_bytes=BYTES + 85, message_hz=2.5)
     model = airtime("mesh", Wifi(data_rate_mbit_s=220.0), traffic).total
