@@ -75,9 +75,9 @@ def status_bytes(robots: float) -> float:
 def state_bytes(robots: float) -> float:
     """Of a GroundState for so many.
 
-    It has an echo for each whose status is 0.3 s old at most, which are six of ten; for 16 at most.
+    It has an echo for each whose status is 0.3 s old at most, which are six of ten; for 32 at most.
     """
-    return 495.0 + min(42.0 * robots, 70.0 * 16.0)
+    return 495.0 + min(42.0 * robots, 70.0 * 32.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

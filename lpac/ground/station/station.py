@@ -61,7 +61,7 @@ _EXPIRY_MARGIN_S = 0.5
 _LATER_S = 1e-3
 _EVENTS_KEPT = 200
 # Each status is echoed once or twice, but in large fleets: clocks need no more.
-_ECHOED_S, _MOST_ECHOES = 0.3, 16
+_ECHOED_S, _MOST_ECHOES = 0.3, 32
 _RESULTS_KEPT = 1000
 _AT_PLACE_M = 0.01
 # Who asks for a hold gets the commander's sequence up by no more at a time.

@@ -6,13 +6,16 @@ They cost a small part of what a process for each robot and a server for their v
 import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 from edge.drivers.zenoh_link import ZenohLink
+from edge.messages.topics import ReceiveCallback
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.robots import (
     VEHICLE_STEP_S,
@@ -29,11 +32,18 @@ _LOOK_S = 0.01
 _WARM_S = 12.0
 
 
+class _Arrived(NamedTuple):
+    at_s: float
+    receive: ReceiveCallback
+    key: str
+    data: bytes
+
+
 class LiveFleet(SimulatedRobots):
     """Robots on zenoh, as a context; from other threads they are touched while it is `paused`.
 
     A thread lets their time pass. If the machine is too slow for a moment they are late, and make
-    up for it.
+    up for it; what comes by radio reaches them when it came by their clock, too.
     """
 
     def __init__(
@@ -67,6 +77,7 @@ class LiveFleet(SimulatedRobots):
         )
         self._began_s = 0.0
         self._present = self.robots[: scenario.robots - absent]
+        self._arrived: deque[_Arrived] = deque()
         self._lock = threading.RLock()
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live fleet", daemon=True)
@@ -101,7 +112,19 @@ class LiveFleet(SimulatedRobots):
     def _run(self) -> None:
         while not self._ends.wait(_LOOK_S):
             with self._lock:
+                while self._arrived:
+                    came = self._arrived.popleft()
+                    due_s = came.at_s - self._began_s
+                    self.schedule.at(due_s, partial(came.receive, came.key, came.data))
                 self.schedule.run_until(time.monotonic() - self._began_s)
+
+    def _later(self, receive: ReceiveCallback) -> ReceiveCallback:
+        """Robots that are late would take what came for something that came before it was said."""
+
+        def arrive(key: str, data: bytes) -> None:
+            self._arrived.append(_Arrived(time.monotonic(), receive, key, data))
+
+        return arrive
 
     def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> OpenLink:
         config = robot.config
@@ -113,5 +136,5 @@ class LiveFleet(SimulatedRobots):
             # The port of a second program of a robot is another one.
             listen=config.link.listen if first else ("tcp/127.0.0.1:0",),
             connect=config.link.connect if first else everybody,
-            subscriptions=subscriptions,
+            subscriptions={topic: self._later(hear) for topic, hear in subscriptions.items()},
         )

@@ -373,8 +373,8 @@ def test_the_end_of_a_station(fleet: FlownFleet, new_station: NewStation) -> Non
 
 
 @pytest.mark.alone
-def test_thirty_robots(tmp_path: Path, new_station: NewStation) -> None:
-    with FlownFleet(tmp_path, 30) as fleet:
+def test_many_robots(tmp_path: Path, new_station: NewStation) -> None:
+    with FlownFleet(tmp_path, 20) as fleet:
         station = new_station(fleet.fleet_toml)
         station.wait_for(lambda p: all(robot.fresh for robot in p.robots))
         # It never reads.

@@ -394,11 +394,11 @@ def test_a_status_grows_with_each_that_is_heard() -> None:
     )
 
 
-def test_a_state_has_an_echo_of_sixteen_at_most() -> None:
+def test_a_state_has_an_echo_of_32_at_most() -> None:
     grows = (told(90) - told(20)) / 70
     # Statuses come twice a second: six of ten are that young.
     assert state_bytes(20) - state_bytes(10) == pytest.approx(6 * grows, rel=0.05)
-    assert state_bytes(90) - state_bytes(0) == pytest.approx(16 * grows, rel=0.05)
+    assert state_bytes(90) - state_bytes(0) == pytest.approx(32 * grows, rel=0.05)
 
 
 def test_what_is_explored_has_one_size() -> None:
