@@ -45,17 +45,17 @@ def _library() -> ctypes.CDLL | None:
     # Of another version of Fast DDS it cannot be loaded.
     with suppress(OSError):
         return _loaded(compiled)
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        new = Path(scratch) / "new.so"
-        command = [compiler, "-std=c++17", "-O2", "-shared", "-fPIC", "-o", str(new), str(_SOURCE)]
-        done = subprocess.run(
-            [*command, "-lfastrtps", "-lfastcdr"], check=False, capture_output=True
-        )
-        if done.returncode != 0:
-            return None
-        new.replace(compiled)
-    return _loaded(compiled)
+    with suppress(OSError, subprocess.CalledProcessError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            new = Path(scratch) / "new.so"
+            to_compile = ["-std=c++17", "-O2", "-shared", "-fPIC", "-o", str(new), str(_SOURCE)]
+            subprocess.run(
+                [compiler, *to_compile, "-lfastrtps", "-lfastcdr"], check=True, capture_output=True
+            )
+            new.replace(compiled)
+        return _loaded(compiled)
+    return None
 
 
 def _loaded(path: Path) -> ctypes.CDLL:
