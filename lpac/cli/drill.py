@@ -87,6 +87,7 @@ def drill(
     if out is None:
         out = _OUT if vehicle is DrillVehicle.SIMULATED else Path(f"{_OUT}-{vehicle}")
     real_time = _real_time(vehicle, px4, ray, out, robots, bundle)
+    options = _options(vehicle, px4, robots, bundle)
     if seed is not None and len(chosen) == 1 and real_time is None:
         outcomes = [_fly_again(chosen[0], seed, robots, bundle, out / f"{chosen[0].name}-{seed}")]
     elif seed is not None and len(chosen) == 1 and real_time is not None:
@@ -96,13 +97,13 @@ def drill(
         numbers = range(seeds) if seed is None else [seed]
         flown = partial(pool(ray), fly_order) if real_time is None else real_time.fly_all
         outcomes = _fly(campaign, chosen, list(numbers), flown)
-        result = to_json(outcomes)
+        result = to_json(outcomes, options)
         (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")
-        (out / "drill.xml").write_bytes(as_junit(outcomes))
+        (out / "drill.xml").write_bytes(as_junit(outcomes, options))
     if as_json:
-        typer.echo(json.dumps(to_json(outcomes), indent=2))
+        typer.echo(json.dumps(to_json(outcomes, options), indent=2))
     else:
-        _show(outcomes, _again(vehicle, px4, robots))
+        _show(outcomes, options)
         if real_time is not None:
             late_s = max(outcome.late_s for outcome in outcomes)
             typer.echo(
@@ -172,9 +173,11 @@ def _real_time(
     return RealTimeDrill(out, robots, bundle, px4)
 
 
-def _again(vehicle: DrillVehicle, px4: Path | None, robots: int) -> str:
-    """The options with which the same is flown again."""
+def _options(vehicle: DrillVehicle, px4: Path | None, robots: int, bundle: Path) -> str:
+    """Those with which the same is flown again."""
     options = f"-n {robots}"
+    if bundle != DEFAULT_BUNDLE:
+        options += f" --bundle {bundle}"
     if vehicle is not DrillVehicle.SIMULATED:
         options += f" --vehicle {vehicle}"
     return options if px4 is None else f"{options} --px4 {px4}"
@@ -222,10 +225,10 @@ def _fly_again(
     return outcome
 
 
-def _show(outcomes: list["FlightOutcome"], again: str) -> None:
+def _show(outcomes: list["FlightOutcome"], options: str) -> None:
     from lpac.analysis.statistics import at_most_share
     from lpac.sim.drill.faults import FAULTS
-    from lpac.sim.drill.report import shown, summaries
+    from lpac.sim.drill.report import flown_again_by, shown, summaries
 
     rows = []
     for summary in summaries(outcomes):
@@ -249,17 +252,18 @@ def _show(outcomes: list["FlightOutcome"], again: str) -> None:
     for outcome in broken:
         what = outcome.error or "; ".join(map(shown, outcome.broken))
         typer.echo(f"{outcome.fault}, seed {outcome.seed}: {what}")
-        typer.echo(f"    lpac drill --fault {outcome.fault} --seed {outcome.seed} {again}")
+        typer.echo(f"    {flown_again_by(outcome, options)}")
 
 
 def _list(faults: list["Fault"]) -> None:
     print_table(
-        ("fault", "what happens", "promise", "flown by"),
+        ("fault", "what happens", "promise", "not covered", "flown by"),
         [
             (
                 fault.name,
                 fault.what,
                 fault.promise,
+                fault.uncovered,
                 ", ".join(vehicle for vehicle in DrillVehicle if _flies(vehicle, fault)),
             )
             for fault in faults

@@ -88,7 +88,9 @@ def replay(
             "computes what it computed in flight"
         )
     if not as_json and flown:
-        typer.echo("flight: decides what it decided in flight")
+        passed = sum(flight.passed_over for flight in flights.values())
+        but = f", but for {passed:,} ticks that were passed over" if passed else ""
+        typer.echo(f"flight: decides what it decided in flight{but}")
 
 
 def _policy(

@@ -21,17 +21,18 @@ class Air:
     """What becomes of messages. Any of it may be replaced while it is used.
 
     From one sender to one receiver a message is lost with probability `loss`, arrives twice with
-    `duplication`, and travels `delay_s` on average, anything from half to one and a half of it, so
-    that later ones overtake it. Robots further apart than `range_m` do not hear each other; a
-    ground hears everybody. Who is in different groups of `partition` (robot ids, and grounds')
-    hears nothing of each other; who is in none hears everybody. Nobody hears the `silent`, and the
-    `deaf` hear nobody.
+    `duplication`, with one bit flipped with `corruption`, and travels `delay_s` on average,
+    anything from half to one and a half of it, so that later ones overtake it. Robots further apart
+    than `range_m` do not hear each other; a ground hears everybody. Who is in different groups of
+    `partition` (robot ids, and grounds') hears nothing of each other; who is in none hears
+    everybody. Nobody hears the `silent`, and the `deaf` hear nobody.
 
     Raises ValueError that names an impossible value.
     """
 
     loss: float = 0.0
     duplication: float = 0.0
+    corruption: float = 0.0
     delay_s: float = 0.01
     range_m: float = math.inf
     partition: tuple[frozenset[int], ...] = ()
@@ -39,7 +40,7 @@ class Air:
     deaf: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
-        for name in ("loss", "duplication"):
+        for name in ("loss", "duplication", "corruption"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} = {getattr(self, name)}: must be from 0 to 1")
         if not 0.0 <= self.delay_s < math.inf:
@@ -110,9 +111,12 @@ class Radio:
             if lost < self.air.loss:
                 self.lost += 1
                 continue
+            arrives = data
+            if self.air.corruption and self.rng.random() < self.air.corruption:
+                arrives = _corrupted(data, int(self.rng.integers(8 * len(data))))
             for travel in travels[: 2 if twice < self.air.duplication else 1]:
                 at_s = self.schedule.monotonic_s() + self.air.delay_s * (0.5 + travel)
-                self.schedule.at(at_s, partial(receiver.hear, topic, key, data))
+                self.schedule.at(at_s, partial(receiver.hear, topic, key, arrives))
 
     def _apart(self, sender: int, receiver: int) -> bool:
         if self.air.keeps_apart(sender, receiver):
@@ -165,3 +169,10 @@ class RadioLink:
         """The program has ended."""
         self._subscriptions = {}
         self._radio.leave(self)
+
+
+def _corrupted(data: bytes, bit: int) -> bytes:
+    """The same, but for one bit."""
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)

@@ -17,7 +17,7 @@ from lpac.sim.drill.truth import FlightTruth, VehicleTruth
 from lpac.sim.px4.errors import GREATEST_BIAS_M
 from lpac.sim.px4.modes import Px4Mode
 
-Whose = Literal["hit", "next", "others", "all"]
+Whose = Literal["hit", "next", "others", "all", "first half", "second half"]
 
 _BUDGET = ErrorBudget()
 # What a simulated receiver errs by at worst, and how far wind carries half a drone.
@@ -31,6 +31,10 @@ AT_REST_M_S = 0.5
 _STEP_S = 0.06
 # How long an operator's order may take to start a motor, once it is answered.
 _ARMED_AFTER_S = 1.0
+# From here a vehicle falls on its legs.
+_FALLS_M = 0.5
+# PX4 comes down at 1.5 m/s, and slower near what it takes to be the ground.
+_TOUCHDOWN_M_S = 2.0
 
 LANDING = (Px4Mode.LAND, Px4Mode.DESCEND)
 
@@ -88,18 +92,35 @@ class Apart:
 
 
 @dataclass(frozen=True, slots=True)
+class AllKnown:
+    """The truth is known at all times: nothing that is not a number would break another promise."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        unknown = sum(
+            int((~np.isfinite(each)).sum())
+            for vehicle in flight.vehicles
+            for each in (vehicle.position_m, vehicle.velocity_m_s)
+        )
+        return Figure("what is not a number", unknown, 0, "")
+
+
+@dataclass(frozen=True, slots=True)
 class InsideFence:
-    """Nobody but a pilot goes further beyond the fence's line than stated."""
+    """Nobody but a pilot goes further beyond the fence's line than position errors explain.
+
+    A fault may carry `whose` further.
+    """
 
     beyond_m: float = POSITION_ERROR_M
+    whose: Whose = "all"
 
     def figure(self, flight: FlightTruth) -> Figure:
         edges, margins_m = flight.fence.edges(), [math.inf]
-        for vehicle in flight.vehicles:
+        for vehicle in _of(flight, self.whose):
             flown_m = vehicle.position_m[vehicle.airborne & vehicle.armed & ~vehicle.piloted]
             margins_m += [float(edges.distances_m(place_m).min()) for place_m in flown_m[:, :2]]
-        least_m = min(margins_m)
-        return Figure("true fence margin", least_m, -self.beyond_m, "m", at_least=True)
+        of = " of who is carried" if self.beyond_m != POSITION_ERROR_M else ""
+        return Figure(f"true fence margin{of}", min(margins_m), -self.beyond_m, "m", at_least=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,17 +140,45 @@ class BelowCeiling:
 
 @dataclass(frozen=True, slots=True)
 class NoUnorderedStart:
-    """No motor starts but on a takeoff order that was just given to that robot."""
+    """No motor starts but on a takeoff order just given to that robot, and on each only once."""
 
     def figure(self, flight: FlightTruth) -> Figure:
         unordered = 0
         for robot, vehicle in enumerate(flight.vehicles):
+            orders = flight.ordered("takeoff", robot)
             for at_s in _rises_s(vehicle):
-                unordered += not any(
-                    order.began_s <= at_s <= order.ended_s + _ARMED_AFTER_S
-                    for order in flight.ordered("takeoff", robot)
-                )
+                obeyed = [o for o in orders if o.began_s <= at_s <= o.ended_s + _ARMED_AFTER_S]
+                if obeyed:
+                    orders.remove(obeyed[0])
+                else:
+                    unordered += 1
         return Figure("motors started without an order", unordered, 0, "")
+
+
+@dataclass(frozen=True, slots=True)
+class NobodyFalls:
+    """No motor stops in the air, unless the operator kills that robot."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        highest_m = 0.0
+        for vehicle in _unkilled(flight):
+            stops = np.flatnonzero(vehicle.armed[:-1] & ~vehicle.armed[1:]) + 1
+            highest_m = max(highest_m, float(vehicle.position_m[stops, 2].max(initial=0.0)))
+        return Figure("motors off at a height of", highest_m, _FALLS_M, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class ComesDownGently:
+    """Nobody hits the ground, unless the operator kills that robot."""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        fastest_m_s = 0.0
+        for vehicle in _unkilled(flight):
+            touches = np.flatnonzero(vehicle.airborne[:-1] & ~vehicle.airborne[1:])
+            fastest_m_s = max(
+                fastest_m_s, float(-vehicle.velocity_m_s[touches, 2].min(initial=0.0))
+            )
+        return Figure("touches the ground at", fastest_m_s, _TOUCHDOWN_M_S, "m/s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +208,16 @@ class AllDown:
         return Figure("not down in the end", up, 0, "")
 
 
-def always(beyond_fence_m: float = POSITION_ERROR_M) -> tuple[Criterion, ...]:
-    """What counts in every flight; `beyond_fence_m` is where the fault itself may carry them."""
+def always(beyond_fence_m: float, carried: Whose) -> tuple[Criterion, ...]:
+    """What counts in every flight; the fault itself may bring who is `carried` so far outside."""
+    inside: tuple[Criterion, ...] = (InsideFence(),)
+    if beyond_fence_m != POSITION_ERROR_M:
+        inside = (InsideFence(beyond_fence_m, carried),)
+        if carried == "hit":
+            inside = (InsideFence(whose="others"), *inside)
     return (
-        Apart(), InsideFence(beyond_fence_m), BelowCeiling(), NoUnorderedStart(), PilotIsAlone(),
-        AllDown(),
+        AllKnown(), Apart(), *inside, BelowCeiling(), NoUnorderedStart(), NobodyFalls(),
+        ComesDownGently(), PilotIsAlone(), AllDown(),
     )  # fmt: skip
 
 
@@ -289,12 +343,59 @@ class FliesOn:
     after: str = ""
 
     def figure(self, flight: FlightTruth) -> Figure:
-        since_s, least = _since_s(flight, self.after), 1.0
+        since_s, shares = _since_s(flight, self.after), [1.0]
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
             flown = part.is_in(Px4Mode.OFFBOARD) & part.is_velocity & part.airborne
-            least = min(least, float(flown.mean()) if len(flown) else math.nan)
+            shares.append(float(flown.mean()) if len(flown) else -math.inf)
+        least = min(shares)
         return Figure("share of the mission", least, self.share, "", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Moves:
+    """In its mission it gets about: the way that it flies, in the plane."""
+
+    least_m: float
+    until_s: float
+    whose: Whose = "all"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        ways_m = []
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(flight.fault_s, flight.fault_s + self.until_s)
+            ways_m.append(float(np.hypot(*np.diff(part.position_m[:, :2], axis=0).T).sum()))
+        return Figure("flies at least", min(ways_m), self.least_m, "m", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Holds:
+    """PX4 holds it in time, as the watchdog asks."""
+
+    within_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        delays_s = []
+        for vehicle in _of(flight, self.whose):
+            later = vehicle.between(flight.fault_s, math.inf)
+            at_s = later.time_s[later.is_in(Px4Mode.HOLD)]
+            delays_s.append(float(at_s[0]) - flight.fault_s if len(at_s) else math.inf)
+        return Figure("PX4 holds", max(delays_s), self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
+class KeepsAway:
+    """The one that it was not done to, but whom it concerns, stays so far away, in the air."""
+
+    least_m: float
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        least_m = math.inf
+        for robot, following in zip(flight.hit, _robots(flight, "next"), strict=True):
+            one, other = flight.vehicles[robot], flight.vehicles[following]
+            least_m = min(least_m, float(_distances_m(one, other).min(initial=math.inf)))
+        return Figure("keeps away", least_m, self.least_m, "m", at_least=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,13 +537,23 @@ def judge(bounds: Sequence[Criterion], flight: FlightTruth) -> tuple[Figure, ...
 def _robots(flight: FlightTruth, whose: Whose) -> tuple[int, ...]:
     everybody = tuple(range(len(flight.vehicles)))
     following = tuple((robot + 1) % len(everybody) for robot in flight.hit)
+    half = (len(everybody) + 1) // 2
     return {
         "hit": flight.hit, "next": following, "others": flight.others, "all": everybody,
+        "first half": everybody[:half], "second half": everybody[half:],
     }[whose]  # fmt: skip
 
 
 def _of(flight: FlightTruth, whose: Whose) -> Iterator[VehicleTruth]:
     return (flight.vehicles[robot] for robot in _robots(flight, whose))
+
+
+def _unkilled(flight: FlightTruth) -> Iterator[VehicleTruth]:
+    return (
+        vehicle
+        for robot, vehicle in enumerate(flight.vehicles)
+        if not flight.ordered("kill", robot)
+    )
 
 
 def _since_s(flight: FlightTruth, mark: str) -> float:

@@ -16,7 +16,7 @@ import edge
 import lpac
 from edge.core import log
 from edge.policy.bundle import load_bundle
-from lpac.sim.drill.bounds import Figure, always, judge
+from lpac.sim.drill.bounds import Figure, judge
 from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.drill.truth import FlightTruth
@@ -71,7 +71,7 @@ def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> Fli
     """
     try:
         truth = flown()
-        figures = judge((*always(fault.beyond_fence_m), *fault.bounds), truth)
+        figures = judge(fault.judged_by, truth)
     except Exception as error:
         return FlightOutcome(fault.name, seed, (), f"{type(error).__name__}: {error}")
     unjudged = ""

@@ -15,11 +15,14 @@ from lpac.sim.drill.bounds import (
     Down,
     FallsSilent,
     FliesOn,
+    Holds,
+    KeepsAway,
     KeepsHeight,
     Lands,
     LandsAtPad,
     MissionEnds,
     MotorsOff,
+    Moves,
     NotFaster,
     NotLandedBefore,
     SentNothing,
@@ -27,6 +30,8 @@ from lpac.sim.drill.bounds import (
     StaysDown,
     StraightDown,
     TakesOff,
+    Whose,
+    always,
 )
 from lpac.sim.drill.injections import (
     AutopilotSilent,
@@ -65,6 +70,8 @@ from lpac.sim.drill.injections import (
     ReceiverJumps,
     ReceiverReports,
     RemoteControl,
+    SecondGroundHolds,
+    SecondGroundJoins,
     SecondProgram,
     SensorDies,
     WatchdogDies,
@@ -89,8 +96,15 @@ _CARRIED_M_S = _STORM_M_S + GREATEST_WIND_M_S - Airframe().max_airspeed_m_s
 _CARRIED_M = _CARRIED_M_S * (_STORM_S + 2.0)
 # A hold is asked for 0.5 s after the last tick, and PX4 brakes.
 _STANDS_AFTER_S = 2.5
+# The watchdog asks for it 0.5 s after the last tick; 1 s after the last setpoint PX4 would land.
+_HOLDS = Holds(0.8)
 # From any height of four robots down to the ground, and until the motors stop.
 _LANDING_S = 45.0
+# Across the field at full speed, and down.
+_HOME_S = 35.0 + _LANDING_S
+# It stops within a second once it is told to, and drifts a little without a position.
+_BRAKED = Stands(2.2, 5.0, speed_m_s=0.8)
+_BRAKED_LATER = Stands(3.0, 6.0, speed_m_s=0.8)
 # Its receiver's error walks by up to 0.8 m between takeoff and landing, and gusts carry it.
 _AT_PAD_M = 3.0
 
@@ -103,7 +117,8 @@ class Fault:
     that the seed draws, and hits so many robots, which the seed draws too (0: the whole fleet, at
     once). The operator looks on for `watched_s`, then brings all home; `home` is False where he
     does nothing any more. With `exact` the robots know where they are. `settings` are further keys
-    of robot.toml.
+    of robot.toml. The fault by its nature brings who is `carried` so far outside the fence.
+    `uncovered` says what no margin and no check prevents then, "" if there is nothing.
     """
 
     name: str
@@ -118,6 +133,13 @@ class Fault:
     exact: bool = False
     settings: tuple[tuple[str, str, object], ...] = ()
     beyond_fence_m: float = POSITION_ERROR_M
+    carried: Whose = "hit"
+    uncovered: str = ""
+
+    @property
+    def judged_by(self) -> tuple[Criterion, ...]:
+        """What counts in every flight, and its own bounds."""
+        return (*always(self.beyond_fence_m, self.carried), *self.bounds)
 
 
 def _once(*injections: object) -> tuple[Do, ...]:
@@ -125,12 +147,13 @@ def _once(*injections: object) -> tuple[Do, ...]:
 
 
 _NOBODY = "nothing happens"
+_ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
 
 NOMINAL = Fault(
     name="none", what="nothing fails",
     promise="takeoff, mission, return, each to its own pad",
     does=(), hits=0, watched_s=20.0,
-    bounds=(FliesOn(20.0, 0.95, "all"), LandsAtPad(_AT_PAD_M, "all")),
+    bounds=(FliesOn(20.0, 0.95, "all"), Moves(2.0, 20.0), LandsAtPad(_AT_PAD_M, "all")),
 )  # fmt: skip
 
 _PROGRAMS = (
@@ -145,7 +168,7 @@ _PROGRAMS = (
         promise="the watchdog has PX4 hold after 0.5 s; it lands 60 s later",
         does=_once(ProgramStops(EVER)), watched_s=75.0,
         bounds=(
-            MissionEnds(0.6), Stands(_STANDS_AFTER_S, 55.0), NotLandedBefore(55.0), Lands(62.0),
+            _HOLDS, Stands(_STANDS_AFTER_S, 55.0), NotLandedBefore(55.0), Lands(62.0),
             Down(62.0 + _LANDING_S), FliesOn(20.0),
         ),
     ),
@@ -155,7 +178,7 @@ _PROGRAMS = (
         does=(*_once(ProgramStops(5.0)), Do(20.0, OperatorOrders("start"), mark="start")),
         watched_s=35.0,
         bounds=(
-            MissionEnds(0.6, 19.9), SentNothing(0.3, 6.9), Stands(_STANDS_AFTER_S, 19.9),
+            _HOLDS, MissionEnds(0.6, 19.9), SentNothing(0.3, 6.9), Stands(_STANDS_AFTER_S, 19.9),
             NotLandedBefore(35.0),
             FliesOn(14.0, 0.8, "hit", 4.0, "start"), FliesOn(20.0), LandsAtPad(_AT_PAD_M, "all"),
         ),
@@ -165,7 +188,8 @@ _PROGRAMS = (
         promise="the watchdog has PX4 hold after 0.5 s; the robot holds until start is ordered",
         does=_once(LoopHangs("control", 3.0)),
         bounds=(
-            MissionEnds(0.6), SentNothing(0.3, 4.9), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0),
+            _HOLDS, MissionEnds(0.6), SentNothing(0.3, 4.9), Stands(_STANDS_AFTER_S, 20.0),
+            FliesOn(20.0),
         ),
     ),
     Fault(
@@ -173,8 +197,8 @@ _PROGRAMS = (
         promise="the robot lands where it is after 60 s",
         does=_once(LoopHangs("control", 3.0)), watched_s=70.0,
         bounds=(
-            MissionEnds(0.6), Stands(_STANDS_AFTER_S, 60.0), NotLandedBefore(55.0), Lands(66.0),
-            StraightDown(3.0),
+            _HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 60.0), NotLandedBefore(55.0),
+            Lands(66.0), StraightDown(3.0),
         ),
     ),
     Fault(
@@ -188,8 +212,8 @@ _PROGRAMS = (
         promise="the new one only observes; the vehicle stays in hold and lands 60 s later",
         does=(*_once(ProgramStops(EVER)), Do(3.5, ProgramStarts())), watched_s=80.0,
         bounds=(
-            MissionEnds(0.6), Stands(_STANDS_AFTER_S, 60.0), NotLandedBefore(55.0), Lands(78.0),
-            Down(78.0 + _LANDING_S),
+            _HOLDS, Stands(_STANDS_AFTER_S, 59.0), NotLandedBefore(55.0), Lands(66.0),
+            Down(66.0 + _LANDING_S),
         ),
     ),
     Fault(
@@ -299,7 +323,11 @@ _RADIO = (
         name="cut-in-halves", what="the swarm is cut in halves for 20 s, the ground with the first",
         promise="the first half flies on; the second holds after 3 s, and lands after 13 s",
         does=(*_once(RadioCut("in halves")), Do(20.0, RadioCut("none"))), hits=0, watched_s=40.0,
-        bounds=(),
+        bounds=(
+            FliesOn(20.0, 0.95, "first half"), MissionEnds(3.8, 20.0, "second half"),
+            Stands(7.0, 12.5, "second half"), Lands(14.0, "second half"),
+            Down(14.0 + _LANDING_S, "second half"),
+        ),
     ),
     Fault(
         name="radio-loses-half", what="every other message is lost",
@@ -311,7 +339,7 @@ _RADIO = (
         name="radio-late", what="all messages come 3 s late, 1.5 to 4.5 s",
         promise="late messages are not used; the ground is lost while its newest word is 3 s old",
         does=_once(RadioIs(delay_s=3.0)), hits=0, watched_s=30.0,
-        bounds=(),
+        bounds=(NotLandedBefore(30.0, "all"), LandsAtPad(_AT_PAD_M, "all")),
     ),
     Fault(
         name="radio-very-late", what="all messages come 8 s late, 4 to 12 s",
@@ -323,6 +351,12 @@ _RADIO = (
         name="radio-repeats", what="all messages come twice, and overtake each other",
         promise="the mission goes on",
         does=_once(RadioIs(duplication=1.0, delay_s=0.4)), hits=0,
+        bounds=(FliesOn(20.0, 0.95, "all"), LandsAtPad(_AT_PAD_M, "all")),
+    ),
+    Fault(
+        name="radio-corrupts", what="every other message arrives with a flipped bit",
+        promise="it is not used; the mission goes on",
+        does=_once(RadioIs(corruption=0.5)), hits=0,
         bounds=(FliesOn(20.0, 0.95, "all"), LandsAtPad(_AT_PAD_M, "all")),
     ),
     Fault(
@@ -339,7 +373,8 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(GroundDies()), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Lands(14.0, "all"), Down(14.0 + _LANDING_S, "all"),
+            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
+            Lands(14.0, "all"), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(
@@ -374,15 +409,16 @@ _POSITIONS = (
     Fault(
         name="gps-lost", what="a robot's receiver has no fix any more",
         promise="it stands within 1.1 s, and lands 2.4 s after the loss; the wind has it from 5 s",
+        uncovered=_ADRIFT,
         does=_once(LoseGps()), beyond_fence_m=ADRIFT_M,
-        bounds=(Lands(3.3), Down(_LANDING_S), FliesOn(20.0)),
+        bounds=(_BRAKED, Lands(3.3), Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
         name="gps-lost-for-a-moment", what="a robot's receiver has no fix for 1 s",
         promise="it stands, and flies on once all was well for 3 s",
         does=(*_once(LoseGps()), Do(1.0, LoseGps(lost=False))), watched_s=25.0,
         bounds=(
-            NotLandedBefore(25.0), FliesOn(24.0, 0.8, "hit", 10.0), FliesOn(20.0),
+            _BRAKED, NotLandedBefore(25.0), FliesOn(24.0, 0.8, "hit", 10.0), FliesOn(20.0),
             LandsAtPad(_AT_PAD_M, "all"),
         ),
     ),
@@ -393,13 +429,14 @@ _POSITIONS = (
             Do(t + gap_s, LoseGps(lost=gap_s == 0.0)) for t in range(70) for gap_s in (0.0, 0.6)
         ),
         watched_s=75.0, beyond_fence_m=ADRIFT_M,
-        bounds=(Lands(66.0), FliesOn(20.0)),
+        bounds=(Stands(4.0, 58.0), NotLandedBefore(55.0), Lands(66.0), FliesOn(20.0)),
     ),
     Fault(
         name="receiver-silent", what="a robot's receiver says nothing any more",
         promise="it stands 1.9 s after the receiver's last word, and lands after 3.5 s",
+        uncovered=_ADRIFT,
         does=_once(SensorDies(SimulatedSensor.GPS)), beyond_fence_m=ADRIFT_M,
-        bounds=(Lands(4.5), Down(_LANDING_S), FliesOn(20.0)),
+        bounds=(_BRAKED_LATER, Lands(4.5), Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
         name="gps-inaccurate", what="a robot's receiver says that it is accurate to 7 m only",
@@ -411,24 +448,29 @@ _POSITIONS = (
         name="gps-useless", what="a robot's receiver says that it is accurate to 15 m only",
         promise="it stands, and lands after 2 s",
         does=_once(ReceiverReports(15.0)),
-        bounds=(Lands(3.5), StraightDown(3.0), Down(_LANDING_S), FliesOn(20.0)),
+        bounds=(_BRAKED, Lands(3.5), StraightDown(3.0), Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
         name="gps-jumps", what="a robot's fix jumps by 9 m, and back after 5 s",
         promise="it stands, and flies on once nothing spoke against it for 3 s",
         does=(*_once(ReceiverJumps(9.0)), Do(5.0, ReceiverJumps(0.0))), watched_s=30.0,
         beyond_fence_m=POSITION_ERROR_M + 9.0,
-        bounds=(FliesOn(20.0), NotFaster(2.2, 25.0)),
+        bounds=(
+            NotFaster(2.2, 25.0), NotLandedBefore(30.0), FliesOn(30.0, 0.9, "hit", 12.0),
+            FliesOn(20.0),
+        ),
     ),
     Fault(
         name="estimate-freezes", what="a robot's autopilot tells the same position again and again",
         promise="it stands after 1.4 s, and lands 3 s after the freeze",
+        uncovered=_ADRIFT,
         does=_once(EstimateFreezes()), beyond_fence_m=ADRIFT_M,
-        bounds=(Lands(4.0), Down(_LANDING_S), FliesOn(20.0)),
+        bounds=(_BRAKED_LATER, Lands(4.0), Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
         name="gps-drifts", what="a robot's position drifts by 8 m in 40 s: more than its budget",
         promise="nothing notices it, and no margin covers it: beyond the fence by so much",
+        uncovered="it comes as near to the others, and to the fence, as its error is too large",
         does=(*_once(EstimateDrifts(inwards_m_s=0.2)), Do(40.0, EstimateDrifts())), watched_s=45.0,
         beyond_fence_m=POSITION_ERROR_M + 8.0,
         bounds=(FliesOn(20.0),),
@@ -463,6 +505,7 @@ _POSITIONS = (
     Fault(
         name="gps-lost-in-takeoff", what="a robot's receiver has no fix any more while it climbs",
         promise="it lands",
+        uncovered=_ADRIFT,
         phase="takeoff", does=(Do(10.0, LoseGps()),), beyond_fence_m=ADRIFT_M,
         bounds=(Down(60.0), TakesOff("others")),
     ),
@@ -479,13 +522,13 @@ _ENERGY_AND_AIR = (
         name="battery-low", what="a robot's battery falls below 25 %",
         promise="it returns, and lands at its pad",
         does=_once(Drain(0.245)), watched_s=60.0,
-        bounds=(MissionEnds(4.0), FliesOn(20.0), LandsAtPad(_AT_PAD_M), Down(120.0)),
+        bounds=(MissionEnds(4.0), FliesOn(20.0), LandsAtPad(_AT_PAD_M), Down(_HOME_S)),
     ),
     Fault(
         name="batteries-low", what="five batteries, or all, fall below 25 % at once",
         promise="all return, at their own heights, and land at their pads",
         does=_once(Drain(0.245)), hits=5, home=False, watched_s=60.0,
-        bounds=(MissionEnds(4.0), LandsAtPad(_AT_PAD_M), Down(150.0)),
+        bounds=(MissionEnds(4.0), LandsAtPad(_AT_PAD_M), Down(_HOME_S)),
     ),
     Fault(
         name="battery-critical", what="a robot's battery falls below 15 %",
@@ -508,6 +551,7 @@ _ENERGY_AND_AIR = (
     Fault(
         name="storm", what="a storm of 16 m/s carries a robot over the fence, for 10 s",
         promise="it is flown back; 5 m beyond the fence PX4 holds it, and it lands after 60 s",
+        uncovered="wind beyond its airspeed carries it, whatever it is told",
         does=(*_once(WindBlows(_STORM_M_S)), Do(_STORM_S, WindBlows())), watched_s=90.0,
         beyond_fence_m=POSITION_ERROR_M + 5.0 + _CARRIED_M,
         bounds=(FliesOn(20.0),),
@@ -528,7 +572,7 @@ _ENERGY_AND_AIR = (
         name="does-not-climb", what="a robot's motors do not lift it",
         promise="it gives up after 15 s: LAND, disarm",
         phase="ready", does=_once(MotorWeakens(1.0)), watched_s=30.0,
-        bounds=(TakesOff("others"), Down(120.0)),
+        bounds=(TakesOff("others"), Down(60.0)),
     ),
     Fault(
         name="sensor-dead-before", what="a robot's barometer is dead before takeoff",
@@ -604,6 +648,21 @@ _PEOPLE = (
         bounds=(MissionEnds(0.6, whose="all"), Stands(4.0, 20.0, "all")),
     ),
     Fault(
+        name="second-ground", what="a second operator's ground joins, and commands nothing",
+        promise="robots go on obeying the first one",
+        does=_once(SecondGroundJoins()), hits=0,
+        bounds=(FliesOn(20.0, 0.95, "all"), LandsAtPad(_AT_PAD_M, "all")),
+    ),
+    Fault(
+        name="second-ground-holds", what="a second operator, who does not command, holds all",
+        promise="they hold at once, until start is ordered",
+        does=(*_once(SecondGroundJoins()), Do(6.0, SecondGroundHolds())), hits=0, watched_s=26.0,
+        bounds=(
+            FliesOn(6.0, 0.95, "all"), MissionEnds(7.0, whose="all"), Stands(10.0, 26.0, "all"),
+            NotLandedBefore(26.0, "all"), LandsAtPad(_AT_PAD_M, "all"),
+        ),
+    ),
+    Fault(
         name="landed", what="the operator lands all where they are",
         promise="they come straight down",
         does=(Do(0.0, OperatorOrders("land"), "all"),), hits=0, home=False,
@@ -637,7 +696,7 @@ _PEOPLE = (
             *_once(OperatorOrders("land")), *(Do(t, CarriedToPad()) for t in (55.0, 60.0)),
         ),
         watched_s=65.0, exact=True,
-        bounds=(FliesOn(20.0),),
+        bounds=(FliesOn(20.0), LandsAtPad(8.0, "next")),
     ),
     Fault(
         name="fence-without-a-pad", what="the operator sets a fence without one landing point",
@@ -656,7 +715,7 @@ _PEOPLE = (
             *(Do(84.0 + t, PilotFliesOver(0)) for t in range(20)), Do(104.0, PilotLands()),
         ),
         watched_s=105.0, exact=True,
-        bounds=(),
+        bounds=(KeepsAway(1.0), LandsAtPad(_AT_PAD_M, "next")),
     ),
     Fault(
         name="start-outside", what="who holds finds itself beyond the fence; resume is ordered",
@@ -697,18 +756,21 @@ _PAIRS = (
         name="piloted-while-it-hangs", what="a control loop hangs, and a pilot takes it meanwhile",
         promise="what comes back does not take it from the pilot",
         does=(*_once(LoopHangs("control", 3.0)), Do(1.5, PilotFlies()), Do(12.0, PilotLands())),
-        bounds=(FallsSilent(0.6), FliesOn(20.0)),
+        bounds=(_HOLDS, FallsSilent(0.6), FliesOn(20.0)),
     ),
     Fault(
         name="low-battery-and-no-ground", what="a low battery, and the ground is lost 2 s later",
         promise="it returns, holds after 3 s, and lands after 13 s",
         does=(*_once(Drain(0.245)), Do(2.0, RadioCut("from the ground"))),
         home=False, watched_s=30.0,
-        bounds=(Lands(16.5, "all"), Down(17.0 + _LANDING_S, "all")),
+        bounds=(
+            MissionEnds(6.0, whose="all"), Lands(16.5, "all"), Down(17.0 + _LANDING_S, "all"),
+        ),
     ),
     Fault(
         name="gps-lost-and-radio-dies", what="a robot loses GPS, and the radio dies with it",
         promise="that one lands for its position, all others for the ground",
+        uncovered=_ADRIFT,
         does=_once(LoseGps(), RadioCut("all")), home=False, watched_s=30.0,
         beyond_fence_m=ADRIFT_M,
         bounds=(Lands(3.3), Lands(14.0, "others"), Down(14.0 + _LANDING_S, "all")),
@@ -737,6 +799,7 @@ _PAIRS = (
     Fault(
         name="gps-lost-in-return", what="a robot's receiver has no fix any more on its way home",
         promise="it lands",
+        uncovered=_ADRIFT,
         phase="return", does=_once(LoseGps()), beyond_fence_m=ADRIFT_M,
         bounds=(Down(60.0), LandsAtPad(_AT_PAD_M, "others")),
     ),
@@ -744,17 +807,18 @@ _PAIRS = (
         name="hangs-on-a-bad-radio", what="a program stops for 4 s while half of all is lost",
         promise="it holds until start is ordered; the others fly on",
         does=_once(RadioIs(loss=0.5), ProgramStops(4.0)),
-        bounds=(MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
+        bounds=(_HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
     ),
     Fault(
         name="origin-jumps-as-it-hangs", what="a control loop hangs for 2 s; the origin jumps",
         promise="it holds where it is",
         does=(*_once(LoopHangs("control", 2.0)), Do(1.0, OriginJumps((5.6, -4.2, 0.0)))),
-        bounds=(MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
+        bounds=(_HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
     ),
     Fault(
         name="rejoin-without-gps", what="a pilot has a robot that loses GPS; rejoin is ordered",
         promise="rejoin is refused: the pilot has it",
+        uncovered=_ADRIFT,
         does=(
             *_once(PilotFlies()), Do(3.0, LoseGps()), Do(8.0, OperatorOrders("rejoin")),
             Do(9.0, PilotLands()),
@@ -766,8 +830,8 @@ _PAIRS = (
         name="storm-and-low-battery", what="gusts on all, and a robot's battery is low",
         promise="it returns, and lands at its pad",
         does=(Do(0.0, WindBlows(gusts_m_s=2.0), "all"), Do(1.0, Drain(0.245))), watched_s=60.0,
-        beyond_fence_m=POSITION_ERROR_M + 2.0,
-        bounds=(MissionEnds(5.0), LandsAtPad(_AT_PAD_M + 2.0), Down(125.0)),
+        beyond_fence_m=POSITION_ERROR_M + 2.0, carried="all",
+        bounds=(MissionEnds(5.0), LandsAtPad(_AT_PAD_M + 2.0), Down(1.0 + _HOME_S)),
     ),
 )  # fmt: skip
 

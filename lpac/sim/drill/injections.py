@@ -359,6 +359,7 @@ class RadioIs:
 
     loss: float = 0.0
     duplication: float = 0.0
+    corruption: float = 0.0
     delay_s: float = 0.01
 
 
@@ -392,6 +393,16 @@ class GroundStarts:
     """It starts again on the same laptop."""
 
 
+@dataclass(frozen=True, slots=True)
+class SecondGroundJoins:
+    """Another operator's laptop is on the radio from now on, and commands nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class SecondGroundHolds:
+    """That other operator holds all robots."""
+
+
 OrderedKind = Literal[
     "takeoff", "start", "pilot", "rejoin", "kill", "disarm", "hold", "return", "land", "resume"
 ]
@@ -412,7 +423,8 @@ class FenceWithout:
 Injection = (
     VehicleInjection | ProgramDies | ProgramStarts | ProgramStops | LoopHangs | WatchdogDies
     | AutopilotSilent | DiskFills | ClockSteps | GroundClockSteps | SecondProgram | RadioIs
-    | RadioCut | GroundStops | GroundDies | GroundStarts | OperatorOrders | FenceWithout
+    | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins | SecondGroundHolds
+    | OperatorOrders | FenceWithout
 )  # fmt: skip
 
 

@@ -40,11 +40,19 @@ class RealTimeDrill:
         self._px4_build = px4_build
 
     def outcome(self, fault: Fault, seed: int) -> FlightOutcome:
-        """Fly and judge; again if it broke a promise while this machine was late."""
-        for _ in range(_TRIES):
-            outcome = outcome_of(fault, seed, lambda: self._fly(fault, seed))
+        """Fly and judge; again if it broke a promise while this machine was late.
+
+        What that flight left stays beside it, in a folder whose name ends in late-1, and so on.
+        """
+        folder = self._folder / f"{fault.name}-{seed}"
+        for number in range(1, _TRIES + 1):
+            outcome = outcome_of(fault, seed, lambda: self._fly(fault, seed, folder))
             if outcome.held or outcome.late_s <= LATE_S:
                 break
+            late = folder.with_name(f"{folder.name}-late-{number}")
+            shutil.rmtree(late, ignore_errors=True)
+            if folder.exists():
+                shutil.copytree(folder, late)
         return outcome
 
     def fly_all(self, tasks: Sequence[FlightTask]) -> Generator[FlightOutcome, None, None]:
@@ -65,8 +73,7 @@ class RealTimeDrill:
             # Its programs have ended. A worker of a pool would go on with the next flight.
             os._exit(1)
 
-    def _fly(self, fault: Fault, seed: int) -> FlightTruth:
-        folder = self._folder / f"{fault.name}-{seed}"
+    def _fly(self, fault: Fault, seed: int, folder: Path) -> FlightTruth:
         shutil.rmtree(folder, ignore_errors=True)
         fleet = Fleet(
             scenario_of(fault, seed, self._robots), folder, self._bundle,

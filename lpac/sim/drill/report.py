@@ -52,14 +52,23 @@ def shown(figure: Figure) -> str:
     return f"{figure.name} {value}{unit} ({how} {figure.limit:.3g})"
 
 
-def as_json(outcomes: Sequence[FlightOutcome]) -> dict[str, Any]:
-    """For scripts: each fault with its worst figures, and each flight that broke a promise."""
+def flown_again_by(outcome: FlightOutcome, options: str) -> str:
+    """The command that flies exactly that flight again; with the drill's further options."""
+    return f"lpac drill --fault {outcome.fault} --seed {outcome.seed} {options}"
+
+
+def as_json(outcomes: Sequence[FlightOutcome], options: str) -> dict[str, Any]:
+    """For scripts: each fault with its worst figures, and each flight that broke a promise.
+
+    `options` are the drill's, for `flown_again_by`.
+    """
     return {
         "faults": [
             {
                 "fault": summary.fault,
                 "what": FAULTS[summary.fault].what,
                 "promise": FAULTS[summary.fault].promise,
+                "uncovered": FAULTS[summary.fault].uncovered,
                 "flights": summary.flights,
                 "broken": summary.broken,
                 "at_most_share": round(at_most_share(summary.flights, summary.broken), 5),
@@ -74,6 +83,7 @@ def as_json(outcomes: Sequence[FlightOutcome]) -> dict[str, Any]:
                 "error": outcome.error,
                 "late_s": round(outcome.late_s, 2),
                 "figures": [_figure_json(figure) for figure in outcome.broken],
+                "again": flown_again_by(outcome, options),
             }
             for outcome in outcomes
             if not outcome.held
@@ -87,8 +97,8 @@ def _figure_json(figure: Figure) -> dict[str, Any]:
     return {**figure._asdict(), "value": value}
 
 
-def as_junit(outcomes: Sequence[FlightOutcome]) -> bytes:
-    """A test suite whose cases are the flights."""
+def as_junit(outcomes: Sequence[FlightOutcome], options: str) -> bytes:
+    """A test suite whose cases are the flights; `options` as of `as_json`."""
     failed = [outcome for outcome in outcomes if not outcome.held]
     suite = ElementTree.Element(
         "testsuite", name="lpac drill", tests=str(len(outcomes)), failures=str(len(failed))
@@ -99,6 +109,9 @@ def as_junit(outcomes: Sequence[FlightOutcome]) -> bytes:
         )
         if not outcome.held:
             message = outcome.error or "; ".join(map(shown, outcome.broken))
-            ElementTree.SubElement(case, "failure", message=message)
+            failure = ElementTree.SubElement(case, "failure", message=message)
+            failure.text = (
+                f"promised: {FAULTS[outcome.fault].promise}\n{flown_again_by(outcome, options)}"
+            )
     xml: bytes = ElementTree.tostring(suite, encoding="utf-8", xml_declaration=True)
     return xml

@@ -12,9 +12,7 @@ import numpy as np
 
 from edge.core import F64
 from lpac.ground.procedure import NothingComesError, Procedure
-from lpac.ground.station.protocol import (
-    Request,
-)
+from lpac.ground.station.protocol import Request, SafetyCommand
 from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.field import FaultyFleet, has_remote_control, scenario_of, settings_of
 from lpac.sim.drill.flight import fly, to_mission, to_ready
@@ -35,6 +33,8 @@ from lpac.sim.drill.injections import (
     ProgramStops,
     RadioCut,
     RadioIs,
+    SecondGroundHolds,
+    SecondGroundJoins,
     SecondProgram,
     VehicleInjection,
     WatchdogDies,
@@ -48,6 +48,8 @@ from lpac.sim.radio import GROUND
 
 # How far a second program's vehicle stands from the first.
 _BESIDE_M = 3.0
+# The other operator.
+_SECOND = "second"
 # All that there is.
 SUPPORTED: tuple[type, ...] = get_args(Injection)
 
@@ -145,10 +147,11 @@ class SimulatedField(FaultyFleet):
                 injection.apply(fleet.vehicles[robot].vehicle, robot, self)
             return
         match injection:
-            case RadioIs(loss, duplication, delay_s):
+            case RadioIs(loss, duplication, corruption, delay_s):
                 fleet.radio.air = replace(
-                    fleet.radio.air, loss=loss, duplication=duplication, delay_s=delay_s
-                )
+                    fleet.radio.air, loss=loss, duplication=duplication, corruption=corruption,
+                    delay_s=delay_s,
+                )  # fmt: skip
             case RadioCut(cut):
                 partition = _partition(cut, len(fleet.robots))
                 fleet.radio.air = replace(fleet.radio.air, partition=partition)
@@ -158,6 +161,10 @@ class SimulatedField(FaultyFleet):
                 self.ground.leave()
             case GroundStarts():
                 fleet.join(self._operator)
+            case SecondGroundJoins():
+                fleet.join(_SECOND)
+            case SecondGroundHolds():
+                fleet.grounds[_SECOND].node.begin(SafetyCommand("hold"))
             case GroundClockSteps(by_s):
                 self.ground.clock.ahead_s += by_s
             case _:

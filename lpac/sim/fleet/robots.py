@@ -76,7 +76,7 @@ class SimulatedRobot:
         self.clock = WallClock(schedule)
         self.node: RobotNode | None = None
         self.watchdog: SimulatedWatchdog | None = None
-        self._no_log = _NoLog()
+        self._disk = _Disk()
         self._said: RobotStatus | None = None
         self.loops: dict[str, Recurrence] = {}
         self._policy = policy
@@ -102,6 +102,7 @@ class SimulatedRobot:
         schedule, boot = self._schedule, self._next_boot()
         if self._logs:
             self._log = open_log(self.config, self._policy.policy.bundle_id.hex(), boot)
+        self._disk.log = self._log
         self.watchdog = SimulatedWatchdog(
             self.vehicle,
             schedule,
@@ -115,7 +116,7 @@ class SimulatedRobot:
                 vehicle=self.vehicle,
                 vehicle_setup=self.vehicle,
                 watchdog=self.watchdog,
-                recorder=self._log or self._no_log,
+                recorder=self._disk,
                 sensor_over=self._sensor_over,
             ),
             self._policy,
@@ -149,7 +150,7 @@ class SimulatedRobot:
 
     def fill_disk(self) -> None:
         """Nothing more can be written: its log says so, as `FlightLog` does."""
-        self._no_log.recording = False
+        self._disk.full = True
 
     def stop(self) -> None:
         """Its program ends, as by a loss of power."""
@@ -163,6 +164,7 @@ class SimulatedRobot:
         if self._log is not None:
             self._log.close()
         self.loops, self._link, self._log, self.node = {}, None, None, None
+        self._disk.log = None
 
 
 class SimulatedRobots:
@@ -332,11 +334,19 @@ class SimulatedWatchdog:
                 self._vehicle.command(Action.LAND)
 
 
-class _NoLog:
-    """A recorder that keeps nothing."""
+class _Disk:
+    """A recorder that keeps what there is a log for, until it is full."""
 
     def __init__(self) -> None:
-        self.recording = True
+        self.log: FlightLog | None = None
+        self.full = False
+
+    @property
+    def recording(self) -> bool:
+        """Whether it could keep more."""
+        return not self.full and (self.log is None or self.log.recording)
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
-        """Not kept."""
+        """Kept if there is a log for it, and room."""
+        if self.log is not None and not self.full:
+            self.log.record(topic, unix_time_s, message)

@@ -17,7 +17,7 @@ from edge.flight.transitions import TRANSITIONS, Transition
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from lpac.ground.station.station import Station
-from lpac.sim.drill.bounds import always, judge
+from lpac.sim.drill.bounds import judge
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.fleet.layout import FleetScenario, Layout
@@ -145,5 +145,5 @@ def _broken(name: str, robots: int) -> list[str]:
         truth = _drill(robots).fly(fault, 0)
     finally:
         log.listen(before)
-    figures = judge((*always(fault.beyond_fence_m), *fault.bounds), truth)
+    figures = judge(fault.judged_by, truth)
     return [figure.name for figure in figures if figure.broken]

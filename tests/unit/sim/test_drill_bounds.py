@@ -9,20 +9,27 @@ import pytest
 
 from edge.core.fence import Fence
 from lpac.sim.drill.bounds import (
+    POSITION_ERROR_M,
     AllDown,
+    AllKnown,
     Apart,
     BelowCeiling,
+    ComesDownGently,
     Criterion,
     Down,
     FallsSilent,
     Figure,
     FliesOn,
+    Holds,
     InsideFence,
+    KeepsAway,
     KeepsHeight,
     Lands,
     LandsAtPad,
     MissionEnds,
     MotorsOff,
+    Moves,
+    NobodyFalls,
     NotFaster,
     NotLandedBefore,
     NoUnorderedStart,
@@ -32,6 +39,8 @@ from lpac.sim.drill.bounds import (
     StaysDown,
     StraightDown,
     TakesOff,
+    Whose,
+    always,
 )
 from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
 from lpac.sim.px4.modes import Px4Mode
@@ -90,6 +99,7 @@ FIRST = WELL.vehicles[0]
 FLOWN_M, BESIDE_M = FIRST.position_m, WELL.vehicles[1].position_m
 AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
 STANDS = replace(WELL, vehicles=(AT_REST, WELL.vehicles[1]))
+STANDS_STILL = changed(WELL, position_m=after(FAULT_S, (5.0, 5.0, 5.0), FLOWN_M))
 PILOTED = after(25.0, Px4Mode.POSCTL, FIRST.mode, 30.0)
 SILENT_S = np.minimum(FIRST.setpoint_at_s, FAULT_S)
 
@@ -103,6 +113,42 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
         changed(WELL, position_m=after(45.0, BESIDE_M * (1.0, 1.0, 0.0), FLOWN_M)),
     ),
     (InsideFence(), WELL, changed(WELL, position_m=after(30.0, (-7.0, 5.0, 5.0), FLOWN_M, 31.0))),
+    # The fault carries the first one, which is hit, but not the second.
+    (
+        InsideFence(whose="others"),
+        changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
+        replace(WELL, vehicles=(FIRST, replace(FIRST, position_m=FLOWN_M - (30.0, 0.0, 0.0)))),
+    ),
+    (
+        InsideFence(25.0, "hit"),
+        changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
+        changed(WELL, position_m=after(30.0, (-26.0, 5.0, 5.0), FLOWN_M, 31.0)),
+    ),
+    (AllKnown(), WELL, changed(WELL, position_m=after(30.0, math.nan, FLOWN_M, 30.1))),
+    (AllKnown(), WELL, changed(WELL, velocity_m_s=after(30.0, math.nan, FLOWN_M, 30.1))),
+    # Its motors stop above its pad, and start again on the same order.
+    (NobodyFalls(), WELL, changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0))),
+    (NoUnorderedStart(), WELL, changed(WELL, armed=after(8.0, False, FIRST.armed, 9.0))),
+    (
+        NobodyFalls(),
+        replace(
+            changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0)),
+            orders=(*WELL.orders, GivenOrder("kill", (0,), 44.9, 45.0)),
+        ),
+        changed(WELL, armed=FIRST.armed & (TIMES_S < 45.0)),
+    ),
+    (ComesDownGently(), WELL, changed(WELL, velocity_m_s=FIRST.velocity_m_s * 5.0)),
+    (Moves(2.0, 15.0, "hit"), WELL, STANDS_STILL),
+    (
+        Holds(1.0),
+        changed(WELL, mode=after(FAULT_S + 0.6, Px4Mode.HOLD, FIRST.mode)),
+        changed(WELL, mode=after(FAULT_S + 1.2, Px4Mode.HOLD, FIRST.mode)),
+    ),
+    (
+        KeepsAway(5.0),
+        WELL,
+        changed(WELL, position_m=after(30.0, BESIDE_M + 2.0, FLOWN_M, 30.1)),
+    ),
     (BelowCeiling(), WELL, changed(WELL, position_m=after(30.0, (5.0, 5.0, 30.0), FLOWN_M, 31.0))),
     (NoUnorderedStart(), WELL, replace(WELL, orders=())),
     (
@@ -167,3 +213,17 @@ def test_what_is_not_known_is_broken() -> None:
     assert Figure("share", math.nan, 0.5, "", at_least=True).broken
     assert Figure("speed", math.nan, 0.5, "m/s").broken
     assert not Figure("apart", math.inf, 0.5, "m", at_least=True).broken
+
+
+def test_who_is_not_hit_is_judged_by_the_fence_whatever_carries_the_other() -> None:
+    cases: tuple[tuple[Whose, set[str]], ...] = (("hit", {"others", "hit"}), ("all", {"all"}))
+    for carried, judged in cases:
+        inside = [bound for bound in always(50.0, carried) if isinstance(bound, InsideFence)]
+        assert {bound.whose for bound in inside} == judged
+    assert [b for b in always(POSITION_ERROR_M, "hit") if isinstance(b, InsideFence)] == [
+        InsideFence()
+    ]
+
+
+def test_a_window_without_a_moment_is_broken() -> None:
+    assert FliesOn(1000.0, whose="hit", from_s=999.0).figure(WELL).broken
