@@ -28,8 +28,8 @@ test: lint ## style, types, and every test; as root with real robot hosts too: h
 	@failed=0; \
 	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest "$$@" || failed=1; }; \
 	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
-	some --numprocesses auto $(BY_FILE) -m real_time; \
-	some -m alone; \
+	some --numprocesses auto $(BY_FILE) -m real_time tests/process tests/host; \
+	some -m alone tests/process tests/host; \
 	exit $$failed
 
 redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"

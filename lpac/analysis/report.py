@@ -264,9 +264,8 @@ def _values(trial: FlightRecord) -> dict[str, Any]:
             "initial": _first(trial.cost, 0),
             "final": _first(trial.cost, -1),
             "normalized": _first(trial.normalized, -1),
-            # Of Lloyd's algorithm, which knows the world; scripts know it by this name.
-            "bound": _number(trial.lloyd),
-            "normalized_bound": _number(trial.normalized_lloyd),
+            "lloyd": _number(trial.lloyd),
+            "normalized_lloyd": _number(trial.normalized_lloyd),
             "time_s": trial.curve_time_s[: len(trial.normalized)].round(3).tolist(),
             "curve": trial.normalized.round(6).tolist(),
         },

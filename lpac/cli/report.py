@@ -80,8 +80,8 @@ def _line(values: dict[str, object]) -> str:
     ]
     if cost["normalized"] is not None:
         words.append(f"cost {cost['normalized']:.2f} of the initial")
-    if cost["normalized_bound"] is not None:
-        words.append(f"Lloyd, who knows the world, {cost['normalized_bound']:.2f}")
+    if cost["normalized_lloyd"] is not None:
+        words.append(f"Lloyd, who knows the world, {cost['normalized_lloyd']:.2f}")
     if isinstance(separation, dict):
         words.append(f"least distance {separation['distance_m']:.2f} m")
     if isinstance(values["messages"], dict) and values["messages"]["loss_share"] is not None:

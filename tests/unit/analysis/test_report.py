@@ -244,8 +244,8 @@ def test_the_numbers_are_those_of_the_flights(found: Examined) -> None:
         assert cost["normalized"] == pytest.approx(flight.cost(end_s) / flight.cost(begin_s))
         middle = np.interp(5.0, cost["time_s"], cost["curve"])
         assert middle == pytest.approx(flight.cost(begin_s + 5.0) / flight.cost(begin_s), rel=1e-3)
-        assert 0.0 < cost["bound"] < cost["final"]
-        assert cost["normalized_bound"] == pytest.approx(cost["bound"] / cost["initial"])
+        assert 0.0 < cost["lloyd"] < cost["final"]
+        assert cost["normalized_lloyd"] == pytest.approx(cost["lloyd"] / cost["initial"])
         end_m = {f"r{robot}": flight.place_m(robot, end_s) for robot in range(3)}
         assert {k: pytest.approx(v) for k, v in values["end_m"].items()} == end_m
         times_s = np.linspace(begin_s, end_s, 500).tolist()
@@ -379,7 +379,7 @@ def test_a_world_without_importance_has_no_normalised_cost(tmp_path: Path) -> No
     assert "cost" not in result.stdout.splitlines()[0] and "nan" not in result.stdout
     assert "note: t1: the world holds no importance: no normalised cost" in result.stdout
     cost = json.loads((tmp_path / "out/report.json").read_text())["trials"][0]["cost"]
-    assert cost["initial"] == 0.0 and cost["normalized"] is cost["normalized_bound"] is None
+    assert cost["initial"] == 0.0 and cost["normalized"] is cost["normalized_lloyd"] is None
     assert cost["curve"] == cost["time_s"] == []
     assert "nan" not in Page((tmp_path / "out/report.html").read_text()).text
     drawn = {path.name for path in (tmp_path / "out").rglob("*.png")}
