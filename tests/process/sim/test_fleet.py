@@ -104,6 +104,24 @@ def test_what_a_flight_leaves_behind(flight: Flight) -> None:
 
 
 @pytest.mark.real_time
+def test_its_logs_say_the_same(flight: Flight) -> None:
+    """`lpac replay` decides what was decided, and `lpac report` has the flight's figures."""
+    told, out = flight
+    replayed = lpac("replay", out / "robots", "--json")
+    assert replayed.returncode == 0, replayed.stderr
+    flights = json.loads(replayed.stdout)["flights"]
+    assert len(flights) >= ROBOTS
+    assert all(each["ticks"] and not each["differing"] for each in flights)
+    (trial,) = json.loads(lpac("report", out, "--json").stdout)["trials"]
+    for reported, flown in ((trial["cost"], "cost"), (trial["truth"]["cost"], "true_cost")):
+        assert [reported[key] for key in ("initial", "final", "normalized")] == [
+            told[flown][key] for key in ("initial", "final", "final_normalized")
+        ]
+    assert trial["fence_margin_m"] == told["fence"]["margin_m"] is not None
+    assert trial["truth"]["separation"]["distance_m"] == told["separation"]["distance_m"]
+
+
+@pytest.mark.real_time
 def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
