@@ -50,16 +50,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    group = parser.getgroup("vehicles")
-    group.addoption(
-        "--vehicle",
-        choices=("simulated", "px4"),
-        default="simulated",
-        help="what tests/process/sim/test_faults.py flies",
-    )
-    group.addoption(
-        "--px4", type=Path, metavar="DIR", help="PX4's build folder, as `make px4_sitl` fills it"
-    )
+    group = parser.getgroup("attacks")
     group.addoption(
         "--tries", type=int, default=60, help="attacks before each hold and kill of an operator"
     )
@@ -74,11 +65,6 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "alone: measures, or flies very many: nothing else runs meanwhile"
     )
-    config.addinivalue_line(
-        "markers", "simulated_only(reason): not flown with --vehicle px4, and why"
-    )
-    if config.getoption("--vehicle") == "px4" and config.getoption("--px4") is None:
-        raise pytest.UsageError("--vehicle px4 needs --px4 with PX4's build folder")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
@@ -95,11 +81,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if tier not in TIERS:
             raise pytest.UsageError(f"{item.path} is in none of the tiers {', '.join(TIERS)}")
         item.add_marker(tier)
-    if config.getoption("--vehicle") != "px4":
-        return
-    for item in items:
-        for marker in item.iter_markers("simulated_only"):
-            item.add_marker(pytest.mark.skip(reason=marker.args[0]))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -5,6 +5,8 @@ made from the robot's uptime, which does not jump, and from when the ground hear
 whose clocks were wrong line up. Without a ground's log their own clocks must do.
 """
 
+import bisect
+import itertools
 import json
 import math
 from collections import defaultdict
@@ -21,7 +23,15 @@ from edge.core.fence import Fence
 from edge.core.schema import from_mapping
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, read, read_metadata
 from edge.messages.codes import Reason, Refusal
-from edge.messages.mission import FlightState, LoopStatus, RobotStatus
+from edge.messages.mission import FlightState, LoopStatus, Origin, RobotStatus
+from lpac.analysis.field_truth import (
+    AUTOPILOT_LOGS,
+    TRUTH_TABLE,
+    Measured,
+    ToMission,
+    read_places,
+    track_of,
+)
 from lpac.analysis.snapshot import FleetSetup, GroundEvent
 from lpac.analysis.truth import TRUTH, TrueTrack, load_truth
 
@@ -113,7 +123,7 @@ class Logs:
 
 
 def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> Logs:
-    """Read all robots' and grounds' logs below `folders`, and what vehicles tell beside them.
+    """Read all robots' and grounds' logs below `folders`, and what tells of the vehicles' truth.
 
     Raises ValueError if there are none, or a folder is not there.
     """
@@ -129,6 +139,9 @@ def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> 
             f"{where}: holds no logs (robot-*.mcap, ground-*.mcap): `lpac fleet pull` fetches them"
         )
     truths = [path for folder in folders for path in sorted(folder.rglob(TRUTH))]
+    if not truths:  # of a simulation, which knows better than any instrument
+        for folder, name in itertools.product(folders, (TRUTH_TABLE, AUTOPILOT_LOGS)):
+            truths += sorted(folder.rglob(name))
     return read_files([*paths, *truths], progress)
 
 
@@ -166,6 +179,10 @@ class _LogReader:
         self._received: dict[Program, list[tuple[float, int, int, float, bool]]] = defaultdict(list)
         self._orders: list[tuple[Program, Ordered]] = []  # in the robot's clock
         self._events: set[GroundEvent] = set()
+        # Unix time -> the origin that robots said to have from then on
+        self._origins: dict[float, Origin] = {}
+        self._origin: Mapping[str, Any] | None = None  # the last of them, as it was logged
+        self._places: list[tuple[Path, Measured]] = []
 
     def take_status(self, status: RobotStatus) -> None:
         """Take what a robot said, as its log would have it."""
@@ -175,9 +192,12 @@ class _LogReader:
     def read(self, path: Path) -> None:
         """Take what is understood of a file; a note tells of the rest."""
         notes = self._logs.notes
-        if path.name == TRUTH:
+        if path.name == TRUTH or not path.match("*.mcap"):
             try:
-                self._logs.truths.append(load_truth(path))
+                if path.name == TRUTH:
+                    self._logs.truths.append(load_truth(path))
+                else:
+                    self._places.append((path, read_places(path)))
             except ValueError as error:
                 notes.append(f"{error}: left out")
             return
@@ -260,9 +280,13 @@ class _LogReader:
         sequence = int(status["sequence"])
         if program in self._statuses and sequence in self._statuses[program]:
             return
-        own_start_s = _time_s(status, "unix_time_s") - _time_s(status, "uptime_s")
+        unix_s = _time_s(status, "unix_time_s")
+        own_start_s = unix_s - _time_s(status, "uptime_s")
         self._statuses[program][sequence] = self._said(status)
         self._own_starts_s[program].append(own_start_s)
+        if status.get("origin") not in (None, self._origin):
+            self._origin = status["origin"]
+            self._origins[unix_s] = _known(Origin, self._origin, "origin")
 
     def _said(self, status: Mapping[str, Any]) -> LoggedStatus:
         for key in ("trial", "bundle_id", "world_id"):
@@ -327,7 +351,48 @@ class _LogReader:
         logs.setups.sort(key=lambda told: told[0])
         for _, setup in logs.setups:
             logs.names.update({robot_id: name for name, robot_id in setup.robots.items()})
+        if self._places:
+            self._take_places()
         return logs
+
+    def _take_places(self) -> None:
+        """Of each robot whose folder holds what an instrument told; of the others nothing."""
+        robots = {self._logs.name(robot_id): robot_id for robot_id in self._logs.statuses}
+        told: dict[int, list[Measured]] = {robot_id: [] for robot_id in robots.values()}
+        unfixed: dict[str, None] = {}
+        for path, places in self._places:
+            of = next((folder.name for folder in path.parents if folder.name in robots), None)
+            if of is None:
+                why = f"is not in the folder of a robot ({', '.join(robots)})"
+                self._logs.notes.append(f"{path}: {why}: left out")
+            elif not len(places.unix_s):
+                unfixed[of] = None
+            elif places.is_global and not self._origins:
+                self._logs.notes.append(f"{path}: no robot told of the mission's origin: left out")
+            else:
+                told[robots[of]].append(places)
+        if unfixed and any(told.values()):
+            self._logs.notes.append(
+                f"no RTK fix in the log of PX4: {', '.join(unfixed)}: less is known in truth"
+            )
+        if any(told.values()):
+            to_mission = self._to_mission()
+            self._logs.truths.append(
+                {robot_id: track_of(files, to_mission) for robot_id, files in told.items()}
+            )
+
+    def _to_mission(self) -> ToMission:
+        times_s = sorted(self._origins)
+        frames = [self._origins[time_s].frame() for time_s in times_s]
+
+        def to_mission(
+            latitude_deg: float, longitude_deg: float, unix_s: float
+        ) -> tuple[float, float]:
+            frame = frames[max(0, bisect.bisect_right(times_s, unix_s) - 1)]
+            x_m, y_m, _ = frame.relative_to(latitude_deg, longitude_deg).local_origin_m.tolist()
+            return x_m, y_m
+
+        return to_mission
 
     def _sort_received(
         self, starts_s: Mapping[Program, float], ahead_s: Mapping[Program, float]

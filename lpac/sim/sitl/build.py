@@ -239,13 +239,6 @@ class Px4Build:
                 longest_s = max(longest_s, (passed_s[:, 0] - passed_s[:, 1]).max(initial=0.0))
         return longest_s
 
-    def last_setpoint_s(self, number: int) -> float:
-        """When the last setpoint had reached a PX4, by its log: `time.monotonic()`."""
-        instance = self._instances[number]
-        with self._heard_lock:
-            setpoints_s = read_setpoints(instance.logs()).time_s
-            return float(instance.to_monotonic_s(setpoints_s)[-1])
-
     def logged_truth(self, number: int) -> list[Truth]:
         """What a PX4's own log says, which is whole once PX4 has ended; [] if it says nothing.
 
@@ -276,10 +269,6 @@ class Px4Build:
                 )
             )  # fmt: skip
         return entries
-
-    def logs(self, number: int) -> list[Path]:
-        """What a PX4 has logged so far, some tenths of a second old."""
-        return self._instances[number].logs()
 
     def pid(self, number: int) -> int:
         """The process of a PX4."""

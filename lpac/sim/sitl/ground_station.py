@@ -17,14 +17,10 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
 from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
-from lpac.sim.px4.vehicle import Truth
 from lpac.sim.px4.world import WorldOrigin
-from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames, payload
-from lpac.sim.sitl.log import read_setpoints, read_truth
+from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames
 
 AIRBORNE_ABOVE_M = 0.15
-# PX4's DESCEND is told as LAND.
-_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 # PX4's own default.
@@ -33,14 +29,9 @@ _SATELLITES = 10
 _EXTERNAL_BATTERY = 1
 _CELLS, _EMPTY_CELL_V, _FULL_CELL_V = 4, 3.6, 4.05
 _UNKNOWN_UINT16, _UNKNOWN_INT16 = 0xFFFF, 0x7FFF
-# Of vehicle_status in PX4's log.
-NAVIGATION_LAND = 18
-# Not in pymavlink's dialect: custom_mode comes first. PX4 has it since v1.15.
-CURRENT_MODE = 436
 _RATES_HZ = {
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20,
     mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: 25,
-    CURRENT_MODE: 20,
 }
 _HEARD = {
     *_RATES_HZ, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
@@ -50,24 +41,19 @@ _HEARD = {
 class RealVehicle:
     """One PX4, over its ground-station link; its fields are changed while `stepped` is held.
 
-    `time_s` is `time.monotonic()` of what was heard last. `truth` is all that was so, `errors_m`
-    by how much PX4's estimate was off each time.
+    `time_s` is `time.monotonic()` of the truth that was heard last; 0 before.
     """
 
-    def __init__(self, px4s: Px4Build, instance: int, world: WorldOrigin) -> None:
+    def __init__(self, instance: int, world: WorldOrigin) -> None:
         self.time_s = 0.0
-        self.mode = Px4Mode.HOLD
         self.armed = False
         self.position_m: F64 = np.zeros(3)
-        self.velocity_m_s: F64 = np.zeros(3)
-        self.truth: list[Truth] = []
-        self.errors_m: list[F64] = []
         self._world = world
         self._local_m: F64 = np.zeros(3)
         self._origin_m: F64 = np.zeros(3)
         self._ground_altitude_m = math.nan
         self._heartbeat_due_s = 0.0
-        self._px4s, self._instance, self._system = px4s, instance, instance + 1
+        self._system = instance + 1
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.connect(("127.0.0.1", GROUND_PORT + instance))
         self._udp.setblocking(False)
@@ -168,16 +154,14 @@ class RealVehicle:
             )
             if self._battery is not None:
                 self._tell_of_battery(self._battery)
-            if not self.truth:
+            if not self.time_s:
                 for message, rate_hz in _RATES_HZ.items():
                     self._command(
                         mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, round(1e6 / rate_hz)
                     )
         while datagram := self._receive():
             for message_id, frame in frames(datagram):
-                if message_id == CURRENT_MODE:
-                    self._take_mode(int.from_bytes(payload(frame, 4), "little"))
-                elif message_id in _HEARD:
+                if message_id in _HEARD:
                     for message in self._mav.parse_buffer(frame) or ():
                         if (message.get_srcSystem(), message.get_srcComponent()) == (
                             self._system, 1,
@@ -188,18 +172,6 @@ class RealVehicle:
         """Say and hear nothing more."""
         self._udp.close()
 
-    def last_setpoint_s(self) -> float:
-        """When the last setpoint reached it, by its log, some tenths of a second old."""
-        return self._px4s.last_setpoint_s(self._instance)
-
-    def silence_before_landing_s(self) -> float:
-        """From the last setpoint until it landed by itself: by its log, in its own time."""
-        logs = self._px4s.logs(self._instance)
-        truth = read_truth(logs, self._world)
-        assert truth is not None
-        landing_s = truth.status_s[truth.navigation_state == NAVIGATION_LAND][0]
-        return float(landing_s - read_setpoints(logs).time_s[-1])
-
     def _receive(self) -> bytes:
         with suppress(ConnectionError, BlockingIOError):
             return self._udp.recv(2048)
@@ -209,7 +181,6 @@ class RealVehicle:
         kind = message.get_type()
         if kind == "HEARTBEAT":
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-            self._take_mode(message.custom_mode)
         elif kind == "LOCAL_POSITION_NED":
             self._local_m = np.array([message.x, message.y, message.z])
         elif kind == "GPS_GLOBAL_ORIGIN":
@@ -220,26 +191,12 @@ class RealVehicle:
         elif kind == "HIL_STATE_QUATERNION":
             self._take_truth(now_s, message)
 
-    def _take_mode(self, custom_mode: int) -> None:
-        self.mode = _MODES.get((custom_mode >> 16 & 0xFF, custom_mode >> 24), self.mode)
-
     def _take_truth(self, now_s: float, message: Any) -> None:
         if math.isnan(self._ground_altitude_m):
             self._ground_altitude_m = message.alt * 1e-3
         north_m, east_m = self._world.to_world(message.lat * 1e-7, message.lon * 1e-7)
         self.time_s = now_s
         self.position_m = np.array([north_m, east_m, self._ground_altitude_m - message.alt * 1e-3])
-        self.velocity_m_s = np.array([message.vx, message.vy, message.vz]) * 1e-2
-        north, east, down = self.position_m.tolist()
-        v_north, v_east, v_down = self.velocity_m_s.tolist()
-        self.errors_m.append(self.estimated_position_m - self.position_m)
-        self.truth.append(
-            Truth(
-                time_s=now_s, position_m=(north, east, down),
-                velocity_m_s=(v_north, v_east, v_down),
-                mode=self.mode, armed=self.armed, landed=self.landed,
-            )
-        )  # fmt: skip
 
 
 class RealVehicles:
@@ -247,7 +204,7 @@ class RealVehicles:
 
     def __init__(self, px4s: Px4Build, world: WorldOrigin) -> None:
         self.stepped = threading.Condition()
-        self.vehicles = tuple(RealVehicle(px4s, i, world) for i in range(len(px4s.autopilots)))
+        self.vehicles = tuple(RealVehicle(i, world) for i in range(len(px4s.autopilots)))
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ground-station")
 

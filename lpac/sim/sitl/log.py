@@ -1,6 +1,5 @@
 """What a real PX4's vehicle did, from the log that PX4 writes (ULog)."""
 
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,10 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from pyulog import ULog
-from pyulog.exceptions import ULogException
 
 from edge.core import F64, Bools
+from lpac.analysis.ulog import Topic, read_topics
 from lpac.sim.px4.world import WorldOrigin
 
 _PLACE, _ATTITUDE, _STATUS = (
@@ -51,7 +49,7 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
 
     A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes.
     """
-    logs = [_topics(path, (_PLACE, _ATTITUDE, _STATUS)) for path in paths]
+    logs = [read_topics(path, (_PLACE, _ATTITUDE, _STATUS)) for path in paths]
     places = [topics[_PLACE] for topics in logs if _PLACE in topics]
     if not places:
         return None
@@ -86,25 +84,11 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
 
 def read_setpoints(paths: Sequence[Path]) -> Px4Setpoints:
     """All setpoints that the logs of one PX4 tell; PX4 notes at most ten a second."""
-    logs = [topics[_SETPOINT] for path in paths if (topics := _topics(path, (_SETPOINT,)))]
+    logs = [topics[_SETPOINT] for path in paths if (topics := read_topics(path, (_SETPOINT,)))]
     time_s = _joined([log["timestamp"] for log in logs]) * 1e-6
     is_velocity = _joined([(log["velocity"] > 0) & (log["position"] == 0) for log in logs]) > 0.0
     order = np.argsort(time_s, kind="stable")
     return Px4Setpoints(time_s[order], is_velocity[order])
-
-
-Topic = dict[str, npt.NDArray[Any]]
-
-
-def _topics(path: Path, names: Sequence[str]) -> dict[str, Topic]:
-    """Topics of these names, of their first instances."""
-    try:
-        with path.open("rb") as file:
-            log = ULog(file, [*names])
-    except (OSError, ULogException, struct.error):
-        # Not even its beginning was written.
-        return {}
-    return {data.name: data.data for data in log.data_list if data.multi_id == 0}
 
 
 def _joined(parts: Sequence[npt.NDArray[Any]]) -> F64:

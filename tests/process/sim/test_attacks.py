@@ -34,7 +34,7 @@ from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import SHIPPED
 from tests.flown import QUICK
 from tests.process.cli.test_cli import error_line, lpac
-from tests.process.sim.fault_rig import FaultRig, flies_on
+from tests.process.sim.fleet_rig import FleetRig, flies_on
 
 pytestmark = pytest.mark.real_time
 
@@ -46,7 +46,7 @@ _S = FlightState
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetRig]:
     """A fleet with keys, in its mission."""
     scenario = FleetScenario(robots=len(ROBOTS), secure=True)
     fleet = Fleet(scenario, tmp_path_factory.mktemp("secure"), SHIPPED)
@@ -54,7 +54,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
     for vehicle in fleet.simulated.vehicles:
         vehicle.parameters |= QUICK
     with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
-        rig = FaultRig(fleet, ground, ROBOTS, fleet.vehicles)  # type: ignore[arg-type]
+        rig = FleetRig(fleet, ground)
         rig.assemble()
         rig.make_ready()
         rig.take_off()
@@ -90,7 +90,7 @@ def certified(files: TlsFiles) -> dict[str, object]:
     }  # fmt: skip
 
 
-def attack(rig: FaultRig, session: zenoh.Session, seal: Callable[[Topic, bytes], bytes]) -> None:
+def attack(rig: FleetRig, session: zenoh.Session, seal: Callable[[Topic, bytes], bytes]) -> None:
     """In the operator's name, and a robot's: states that land all, kills, and false statuses."""
     prefix = f"lpac/{rig.fleet.name}/"
     state = rig.ground.told.snapshot.ground
@@ -120,7 +120,7 @@ def attack(rig: FaultRig, session: zenoh.Session, seal: Callable[[Topic, bytes],
         session.put(f"{prefix}ground/state", data)
 
 
-def nothing_comes_of(rig: FaultRig, once: Callable[[], None]) -> None:
+def nothing_comes_of(rig: FleetRig, once: Callable[[], None]) -> None:
     """It is done twenty times while the robots fly, and all of them go on with their mission."""
     rig.start()
     sequence = rig.status(0).obeyed_sequence
@@ -129,7 +129,7 @@ def nothing_comes_of(rig: FaultRig, once: Callable[[], None]) -> None:
         # Long enough for something to come of it.
         rig.wait_status(0, partial(_is_later, rig.status(0).sequence))
     for robot in ROBOTS:
-        vehicle, status = rig.simulated_vehicle(robot), rig.status(robot)
+        vehicle, status = rig.vehicle(robot), rig.status(robot)
         assert vehicle.armed and not vehicle.landed
         assert flies_on(status), (robot, status.state, status.reason)
         assert (status.operator, status.obeyed_sequence) == ("sim", sequence)
@@ -146,7 +146,7 @@ def as_it_is(_: Topic, data: bytes) -> bytes:
     return data
 
 
-def test_without_a_key_nobody_gets_in(rig: FaultRig) -> None:
+def test_without_a_key_nobody_gets_in(rig: FleetRig) -> None:
     keys = rig.fleet.folder / "keys"
     one_sided = {
         "root_ca_certificate": str(keys / "authority.pem"), "enable_mtls": False,
@@ -165,7 +165,7 @@ def test_without_a_key_nobody_gets_in(rig: FaultRig) -> None:
 
 
 def test_another_fleet_of_the_same_name_does_not_meet_this_one(
-    rig: FaultRig, tmp_path: Path
+    rig: FleetRig, tmp_path: Path
 ) -> None:
     authority = create_authority(tmp_path / "keys", rig.fleet.name)
     new_member(authority, tmp_path / "keys", Role.OPERATOR, "sim")
@@ -187,7 +187,7 @@ def test_another_fleet_of_the_same_name_does_not_meet_this_one(
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
-def test_a_stolen_robots_key_commands_nobody(rig: FaultRig, mode: str) -> None:
+def test_a_stolen_robots_key_commands_nobody(rig: FleetRig, mode: str) -> None:
     """Nor do the operator's own messages, said again by whoever has heard them, or routes them."""
     stolen = stolen_identity(rig)
     # It does not speak as itself here: then the others would take it for that robot's next start.
@@ -217,12 +217,12 @@ def test_a_stolen_robots_key_commands_nobody(rig: FaultRig, mode: str) -> None:
         assert f"{prefix}ground/state" in recorded
 
 
-def stolen_identity(rig: FaultRig) -> Identity:
+def stolen_identity(rig: FleetRig) -> Identity:
     folder = rig.fleet.robots[STOLEN].folder / "identity"
     return load_identity(folder, fleet=rig.fleet.name, unix_s=1.0)
 
 
-def test_half_open_connections_hold_nobody_up(rig: FaultRig) -> None:
+def test_half_open_connections_hold_nobody_up(rig: FleetRig) -> None:
     """Those that say nothing, and those that begin with TLS and do not go on."""
     places = [e.removeprefix("tls/").rsplit(":", 1) for e in rig.fleet.endpoints]
     with ExitStack() as stack:
@@ -238,7 +238,7 @@ def test_half_open_connections_hold_nobody_up(rig: FaultRig) -> None:
 
 
 def test_a_hold_acts_after_any_single_forged_message(
-    rig: FaultRig, pytestconfig: pytest.Config
+    rig: FleetRig, pytestconfig: pytest.Config
 ) -> None:
     """From within, with a robot's certificate, in the ground's name and another robot's."""
     with thief(rig) as says:
@@ -252,7 +252,7 @@ def test_a_hold_acts_after_any_single_forged_message(
 
 
 def test_a_landing_and_a_kill_act_after_any_single_forged_message(
-    rig: FaultRig, pytestconfig: pytest.Config
+    rig: FleetRig, pytestconfig: pytest.Config
 ) -> None:
     with thief(rig) as says:
         for i in range(rounds(pytestconfig, 1)):
@@ -274,11 +274,11 @@ def test_a_landing_and_a_kill_act_after_any_single_forged_message(
                 rig.start()
 
 
-def begin_again(rig: FaultRig) -> None:
+def begin_again(rig: FleetRig) -> None:
     """Who was killed in offboard needs a pilot's mode, and a new start of its program."""
     for robot in ROBOTS:
         with rig.simulated.stepped:
-            rig.simulated_vehicle(robot).set_mode(Px4Mode.HOLD)
+            rig.vehicle(robot).set_mode(Px4Mode.HOLD)
         program, before = rig.fleet.robots[robot], rig.status(robot).boot_nonce
         program.send_signal(signal.SIGTERM)
         assert program.wait(60.0) == 0
@@ -295,7 +295,7 @@ def rounds(config: pytest.Config, few: int) -> int:
 
 
 @contextmanager
-def thief(rig: FaultRig) -> Iterator[Callable[[int], None]]:
+def thief(rig: FleetRig) -> Iterator[Callable[[int], None]]:
     """On the radio with a stolen robot's certificate; says one of four forged messages."""
     stolen = stolen_identity(rig)
     guard = SignedGuard(stolen.membership, lambda: 0.0)
@@ -320,7 +320,7 @@ def thief(rig: FaultRig) -> Iterator[Callable[[int], None]]:
         yield says
 
 
-def test_a_flood_with_an_observers_key_drowns_no_command(rig: FaultRig, tmp_path: Path) -> None:
+def test_a_flood_with_an_observers_key_drowns_no_command(rig: FleetRig, tmp_path: Path) -> None:
     """It may say states, of which robots take a hold alone; a revoked laptop can say as many."""
     new_member(Authority(rig.fleet.folder / "keys", rig.fleet.name), tmp_path, Role.OBSERVER, "eve")
     eve = load_identity(tmp_path, fleet=rig.fleet.name, unix_s=1.0)
@@ -350,14 +350,14 @@ def test_a_flood_with_an_observers_key_drowns_no_command(rig: FaultRig, tmp_path
         assert rig.status(robot).message_counts["no_envelope"] > 100
 
 
-def test_the_operator_goes_on_commanding(rig: FaultRig) -> None:
+def test_the_operator_goes_on_commanding(rig: FleetRig) -> None:
     rig.start()
     rig.done(SafetyCommand("hold"))
     for robot in ROBOTS:
         rig.wait_state(robot, _S.HOLD)
 
 
-def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FaultRig) -> None:
+def test_who_is_revoked_in_flight_is_heard_no_more_and_still_obeys(rig: FleetRig) -> None:
     rig.command(Resume())
     rig.start()
     stolen, fleet = f"r{STOLEN}", ("--fleet", rig.fleet.fleet_toml)

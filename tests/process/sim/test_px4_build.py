@@ -1,6 +1,6 @@
 """The launcher of real PX4s, with a stand-in that takes the same arguments on the same ports.
 
-A real one is flown by `pytest tests/process/sim/test_faults.py --vehicle px4 --px4 DIR`.
+A real one is flown by `lpac drill --vehicle px4 --px4 DIR`.
 """
 
 import fcntl
@@ -28,6 +28,7 @@ from lpac.sim.sitl.log import read_setpoints, read_truth
 from tests.conftest import ROOT
 from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.test_fleet import launched, pid_of, read_until
+from tests.ulog import HEADER, message
 
 pytestmark = pytest.mark.real_time
 
@@ -254,26 +255,27 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
     latitude, longitude, _ = world.to_global(np.array([3.0, -4.0, 0.0]))
     log = tmp_path / "flight.ulg"
     log.write_bytes(
-        b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
-        + ulog("B", bytes(40))
-        + ulog("F", b"vehicle_local_position_groundtruth:uint64_t timestamp;double ref_lat;"
-               b"double ref_lon;float x;float y;float z;float vx;float vy;float vz;")
-        + ulog("F", b"offboard_control_mode:uint64_t timestamp;uint8_t position;uint8_t velocity;")
-        + ulog("F", b"vehicle_status:uint64_t timestamp;uint8_t nav_state;uint8_t arming_state;")
-        + ulog("A", struct.pack("<BH", 0, 0) + b"vehicle_local_position_groundtruth")
-        + ulog("A", struct.pack("<BH", 0, 1) + b"vehicle_status")
-        + ulog("A", struct.pack("<BH", 0, 2) + b"offboard_control_mode")
-        + ulog("D", struct.pack("<HQBB", 2, 1_200_000, 0, 1))
-        + ulog("D", struct.pack("<HQBB", 2, 1_100_000, 1, 0))
-        + ulog("D", struct.pack("<HQBB", 1, 500_000, 4, 1))
+        HEADER
+        + message("B", bytes(40))
+        + message("F", b"vehicle_local_position_groundtruth:uint64_t timestamp;double ref_lat;"
+                  b"double ref_lon;float x;float y;float z;float vx;float vy;float vz;")
+        + message("F", b"offboard_control_mode:uint64_t timestamp;uint8_t position;"
+                  b"uint8_t velocity;")
+        + message("F", b"vehicle_status:uint64_t timestamp;uint8_t nav_state;uint8_t arming_state;")
+        + message("A", struct.pack("<BH", 0, 0) + b"vehicle_local_position_groundtruth")
+        + message("A", struct.pack("<BH", 0, 1) + b"vehicle_status")
+        + message("A", struct.pack("<BH", 0, 2) + b"offboard_control_mode")
+        + message("D", struct.pack("<HQBB", 2, 1_200_000, 0, 1))
+        + message("D", struct.pack("<HQBB", 2, 1_100_000, 1, 0))
+        + message("D", struct.pack("<HQBB", 1, 500_000, 4, 1))
         + b"".join(
-            ulog("D", struct.pack("<HQdd6f", 0, 1_000_000 * i, latitude, longitude,
-                                  1.0 * i, 0.0, -2.0 * i, 0.5, 0.0, -1.0))
+            message("D", struct.pack("<HQdd6f", 0, 1_000_000 * i, latitude, longitude,
+                                     1.0 * i, 0.0, -2.0 * i, 0.5, 0.0, -1.0))
             for i in range(3)
         )
-        + ulog("D", struct.pack("<HQBB", 1, 1_500_000, 14, 2))
+        + message("D", struct.pack("<HQBB", 1, 1_500_000, 14, 2))
         # Killed while it wrote.
-        + ulog("D", bytes(60))[:20]
+        + message("D", bytes(60))[:20]
     )  # fmt: skip
     truth = read_truth([log], world)
     assert truth is not None
@@ -287,11 +289,6 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
     assert setpoints.is_velocity.tolist() == [False, True]
     (tmp_path / "torn.ulg").write_bytes(b"ULog")
     assert read_truth([tmp_path / "torn.ulg"], world) is None
-
-
-def ulog(kind: str, content: bytes) -> bytes:
-    """A message of PX4's log format."""
-    return struct.pack("<HB", len(content), ord(kind)) + content
 
 
 def test_more_instances_than_ports_are_refused(build: Path) -> None:

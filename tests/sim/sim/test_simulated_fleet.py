@@ -21,11 +21,18 @@ from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
 from lpac.analysis.report import Examined, Wanted, examine
-from lpac.analysis.snapshot import RobotSnapshot
+from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.script import ScriptListener, ScriptRun, load_script
 from lpac.ground.site import Sites
-from lpac.ground.station.protocol import Enable, SafetyCommand, SetOrigin, Start, Takeoff
+from lpac.ground.station.protocol import (
+    Enable,
+    RobotCommand,
+    SafetyCommand,
+    SetOrigin,
+    Start,
+    Takeoff,
+)
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
@@ -150,6 +157,65 @@ def test_whose_loop_hangs_is_held_and_whose_program_ends_lands() -> None:
     assert all(each.vehicle.landed and not each.vehicle.armed for each in fleet.vehicles)
 
 
+def of_vehicle(**fields: Any) -> Callable[[SimulatedFleet], None]:
+    """These fields of the first robot's vehicle are so from now on."""
+
+    def change(fleet: SimulatedFleet) -> None:
+        for name, value in fields.items():
+            setattr(fleet.vehicles[0].vehicle, name, value)
+
+    return change
+
+
+def loop_hangs(name: str) -> Callable[[SimulatedFleet], None]:
+    return lambda fleet: fleet.robots[0].loops[name].hang(60.0)
+
+
+def left_to_hold(fleet: SimulatedFleet) -> None:
+    fleet.vehicles[0].vehicle.set_mode(Px4Mode.HOLD)
+
+
+def flown_by_a_pilot(fleet: SimulatedFleet) -> None:
+    fleet.vehicles[0].vehicle.pilot()
+
+
+def killed(fleet: SimulatedFleet) -> None:
+    fleet.ground.node.begin(RobotCommand("kill", ("r0",)))
+
+
+@pytest.mark.parametrize(
+    ("fault", "state", "reason"),
+    [
+        (of_vehicle(gps_lost=True), FlightState.LAND, ReasonCode.POSITION_LOST),
+        (of_vehicle(battery_remaining=0.145), FlightState.LAND, ReasonCode.BATTERY_CRITICAL),
+        (of_vehicle(battery_remaining=0.245), FlightState.RETURN, ReasonCode.BATTERY_LOW),
+        (loop_hangs("policy"), FlightState.HOLD, ReasonCode.POLICY_STALE),
+        (loop_hangs("perception"), FlightState.HOLD, ReasonCode.POLICY_STALE),
+        (left_to_hold, FlightState.PILOT, ReasonCode.LEFT_OFFBOARD),
+        (flown_by_a_pilot, FlightState.PILOT, ReasonCode.PILOT),
+        (killed, FlightState.FAULT, ReasonCode.KILLED),
+    ],
+)
+def test_a_robot_says_what_befell_it_and_the_other_flies_on(
+    fault: Callable[[SimulatedFleet], None], state: FlightState, reason: ReasonCode
+) -> None:
+    fleet = in_mission()
+    fault(fleet)
+
+    def says_so(told: FleetSnapshot) -> bool:
+        return told.robots[0].status is not None and told.robots[0].status.state is state
+
+    assert fleet.ground.carry_out(_until(says_so, 10.0))
+    said, other = (robot.status for robot in fleet.ground.snapshot.robots)
+    assert said is not None and other is not None
+    assert said.reason.code is reason and said.reason in said.alarms
+    assert other.state is FlightState.MISSION
+    # Nor does it fly on when it is ordered to.
+    assert not fleet.ground.command(Start(("r0",))).done
+    again = fleet.ground.snapshot.robots[0].status
+    assert again is not None and again.state is not FlightState.MISSION
+
+
 def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     scenario = FleetScenario(robots=2, seed=3)
     fleet = SimulatedFleet(scenario, tmp_path, SHIPPED, absent=1)
@@ -178,6 +244,11 @@ def test_programs_start_late_and_start_again(tmp_path: Path) -> None:
     again.carry_out(_pass(5.0))
     assert (other.node.station.commands, other.node.station.commander) == (False, "operator")
     assert again.node.station.commands and not twin.node.station.commands
+
+
+def _until(condition: Callable[[FleetSnapshot], bool], at_most_s: float) -> Procedure[bool]:
+    came: bool = yield Until(condition, at_most_s)
+    return came
 
 
 def _until_all(condition: Callable[[RobotSnapshot], bool], at_most_s: float) -> Procedure[bool]:

@@ -1,0 +1,178 @@
+"""A fleet of programs in its mission, and what tests order it and ask of it."""
+
+import time
+from collections.abc import Callable
+
+from edge.core.vehicle import PILOTED
+from edge.messages.codes import ReasonCode, texts
+from edge.messages.mission import ON_GROUND, FlightState, RobotStatus, is_too_low
+from lpac.ground.station.protocol import (
+    CommandReport,
+    Enable,
+    Request,
+    ResultCode,
+    RobotCommand,
+    SafetyCommand,
+    SetOrigin,
+    Start,
+    Takeoff,
+)
+from lpac.sim.fleet.ground import GroundProgram
+from lpac.sim.fleet.layout import ORIGIN
+from lpac.sim.fleet.listener import Statuses
+from lpac.sim.fleet.processes import Fleet
+from lpac.sim.px4.vehicle import Px4Vehicle
+from tests.robot_rig import HELD_UP, NOT_YET
+
+_S = FlightState
+
+# A robot that this machine kept waiting, or that passes another which lands, rightly leaves the
+# mission too.
+_BY_ITSELF = (
+    ReasonCode.CONTROL_SILENT,
+    ReasonCode.POLICY_STALE,
+    ReasonCode.LEFT_OFFBOARD,
+    ReasonCode.TOO_CLOSE,
+    ReasonCode.TAKEN_BACK,
+)
+
+
+def flies_on(status: RobotStatus) -> bool:
+    """Whether it flies its mission, or left it for what it rightly leaves it for."""
+    return status.state is _S.MISSION or status.reason.code in _BY_ITSELF
+
+
+class FleetRig:
+    """A running fleet of simulated vehicles, under a ground that commands it."""
+
+    def __init__(self, fleet: Fleet, ground: GroundProgram) -> None:
+        assert fleet.simulated is not None
+        self.fleet = fleet
+        self.ground = ground
+        self.listener = fleet.heard
+        self.simulated = fleet.simulated
+
+    # The operator's part
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What their operator calls them."""
+        return tuple(robot.name for robot in self.fleet.robots)
+
+    def command(self, request: Request) -> CommandReport:
+        """Command something that is possible as such; not every robot may do it."""
+        report = self.ground.command(request)
+        assert report.problem is None, report
+        return report
+
+    def done(self, request: Request) -> CommandReport:
+        """Command it until it is done of all, but for what lasts a moment."""
+        until_s = time.monotonic() + 60.0
+        while not (report := self.command(request)).done:
+            for result in report.results:
+                for_a_moment = result.refusal in HELD_UP or result.code in NOT_YET
+                assert result.code is ResultCode.DONE or for_a_moment, report
+            assert time.monotonic() < until_s, report
+        return report
+
+    def assemble(self) -> None:
+        """Wait until the ground hears all."""
+        self._wait_for_all("assemble", lambda told: True, self.fleet.require_running, 240.0)
+        heard = self.ground.told.wait_for(lambda told: all(r.fresh for r in told.robots), 60.0)
+        assert heard, self.ground.told.snapshot
+
+    def make_ready(self) -> None:
+        """Origin, and their checks, until all are passed."""
+        self.command(SetOrigin(ORIGIN))
+        self._wait_for_all(
+            "make ready",
+            lambda told: told.state is _S.PREFLIGHT and told.ready,
+            lambda: self.command(Enable()),
+            240.0,
+        )
+
+    def take_off(self) -> None:
+        """All come to hold at their heights; who was held up on its way lands, and tries again."""
+
+        def order() -> None:
+            statuses = {self.names[r]: s for r, s in self.listener.statuses().items()}
+            low = [n for n, s in statuses.items() if s.state is _S.HOLD and is_too_low(s)]
+            if low:
+                self.command(SafetyCommand("land", tuple(low), wait=True))
+            waiting = [n for n, s in statuses.items() if s.state in ON_GROUND]
+            if waiting:
+                self.command(Takeoff(tuple(waiting)))
+
+        self._wait_for_all(
+            "take off", lambda told: told.state is _S.HOLD and not is_too_low(told), order, 300.0
+        )
+
+    def start(self) -> None:
+        """All fly their mission; who left offboard without a pilot is taken back before."""
+
+        def order() -> None:
+            left = [
+                self.names[robot]
+                for robot, status in self.listener.statuses().items()
+                if status.state is _S.PILOT and status.mode not in PILOTED
+            ]
+            if left:
+                self.command(RobotCommand("rejoin", tuple(left)))
+            self.command(Start(self.names))
+
+        self._wait_for_all("start", lambda told: told.state is _S.MISSION, order, 80.0)
+
+    def _wait_for_all(
+        self,
+        name: str,
+        holds: Callable[[RobotStatus], bool],
+        order: Callable[[], object],
+        at_most_s: float,
+    ) -> None:
+        """Order it again and again until it holds of all."""
+
+        def all_are(statuses: Statuses) -> bool:
+            return len(statuses) == len(self.names) and all(map(holds, statuses.values()))
+
+        until_s = time.monotonic() + at_most_s
+        while not self.listener.wait_for(all_are, 0.2):
+            assert time.monotonic() < until_s, (name, self.told(), self.ground.told.snapshot.ground)
+            order()
+
+    def told(self) -> dict[int, tuple[str, str, str | None, str]]:
+        """What the robots say of themselves, for whoever reads a failure."""
+        statuses = sorted(self.listener.statuses().items())
+        return {r: (s.state, s.reason.text, s.mode, texts(s.failed_checks)) for r, s in statuses}
+
+    def status(self, robot: int) -> RobotStatus:
+        """Its newest status."""
+        return self.listener.history(robot)[-1].status
+
+    def wait_status(self, robot: int, holds: Callable[[RobotStatus], object]) -> RobotStatus:
+        """Wait for a status of which something holds; returns that one."""
+        found: list[RobotStatus] = []
+
+        def is_found(statuses: Statuses) -> bool:
+            if robot in statuses and holds(statuses[robot]):
+                found.append(statuses[robot])
+            return bool(found)
+
+        assert self.listener.wait_for(is_found, 60.0), self.told()
+        return found[0]
+
+    def wait_state(self, robot: int, state: FlightState) -> RobotStatus:
+        """Wait until the robot says that it is in this state; returns what it says."""
+        return self.wait_status(robot, lambda status: status.state is state)
+
+    # The vehicles' part
+
+    def vehicle(self, robot: int) -> Px4Vehicle:
+        """The robot's vehicle."""
+        return self.simulated.vehicles[robot]
+
+    def wait_vehicle(self, robot: int, holds: Callable[[Px4Vehicle], bool]) -> None:
+        """Wait until something holds of the vehicle."""
+        vehicle = self.vehicle(robot)
+        with self.simulated.stepped:
+            found = self.simulated.stepped.wait_for(lambda: holds(vehicle), 120.0)
+        assert found, (robot, self.told(), vehicle.truth[-1])
