@@ -3,6 +3,8 @@
 PYTHON ?= $(firstword $(foreach name,python3 python3.14 python3.13 python3.12 python3.11,\
 	$(shell $(name) -c 'import sys; sys.version_info >= (3, 11) and print("$(name)")' 2>/dev/null)))
 POLICY := policies/lpac_l2_k3_n10_512
+# Tests start hundreds of programs: each would compile all that it loads.
+unexport PYTHONDONTWRITEBYTECODE
 RUN := .venv/bin/python -m
 
 .PHONY: help demo fly setup check test redteam lint hooks bench docs export image lock deploy start \
