@@ -30,6 +30,11 @@ _WORLDS, _QUICK_WORLDS = 50, 4
 _QUICK_HZ = {"perception_hz": (1.0, 5.0), "policy_hz": (0.5, 2.5, 10.0)}
 _QUICK_DELAYS_S = (0.0, 0.8)
 _QUICK_SET_UPS = ("field", "n3", "n32", "features-20", "range-128")
+_VEHICLES = {
+    VehicleKind.SIMULATED: "simulated PX4s on one simulated clock",
+    VehicleKind.MAVLINK: "simulated PX4s, a program for each robot, in real time",
+    VehicleKind.PX4: "real PX4s that run as software, a program for each robot",
+}
 # They take hours.
 _TOO_LARGE = ("n300", "n1000")
 # Robots, repetitions, s.
@@ -170,13 +175,17 @@ def _fly_whole(
                     by_number[number] = record
                     progress.update(task, advance=1)
             return {name: by_number[number] for number, name in enumerate(plan)}
-        if (vehicle is VehicleKind.PX4) != (px4 is not None):
-            raise ValueError("--px4 names PX4's build folder, and belongs to --vehicle px4")
+        _check_px4(vehicle, px4)
         for name, scenario in plan.items():
             its = folder / name.replace(" ", "-")
             records[name] = flown.fly_programs(scenario, its, bundle, px4)
             progress.update(task, advance=1)
     return records
+
+
+def _check_px4(vehicle: VehicleKind, px4: Path | None) -> None:
+    if (vehicle is VehicleKind.PX4) != (px4 is not None):
+        raise ValueError("--px4 names PX4's build folder, and belongs to --vehicle px4")
 
 
 def _flown_with(vehicle: VehicleKind, logs: Path | None) -> str:
@@ -190,12 +199,9 @@ def _how(vehicle: VehicleKind, logs: Path | None) -> str:
 
     if logs is not None:
         return LOGS
-    vehicles = {
-        VehicleKind.SIMULATED: "simulated PX4s on one simulated clock",
-        VehicleKind.MAVLINK: "simulated PX4s, a program for each robot, in real time",
-        VehicleKind.PX4: "real PX4s that run as software, a program for each robot",
-    }
-    return WHOLE.format(vehicles=vehicles[vehicle]) if vehicle in vehicles else POINTS
+    if vehicle is VehicleKind.POINT:
+        return POINTS
+    return WHOLE.format(vehicles=_VEHICLES[vehicle])
 
 
 @app.command()
@@ -204,9 +210,9 @@ def e3(
     bundle: Bundle = DEFAULT_BUNDLE,
     world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
     vehicle: Annotated[
-        VehicleKind,
-        typer.Option(help="point; or simulated or mavlink: pilots take whole robots."),
+        VehicleKind, typer.Option(help="point; or whole robots, of which a pilot takes some.")
     ] = VehicleKind.POINT,
+    px4: Px4 = None,
     logs: Logs = None,
     ray: Ray = None,
     as_json: AsJson = False,
@@ -232,21 +238,18 @@ def e3(
     elif vehicle is VehicleKind.POINT:
         [flight] = _fly([perturbation(world)], bundle, ray)
         what, how = perturbed(flight), TAKEN_POINTS
-    elif vehicle is not VehicleKind.PX4:
+    else:
         scenario, pilots = whole_perturbation(bundle, world)
         with progress_of("flights") as progress:
             task = progress.add_task("", total=1)
             if vehicle is VehicleKind.SIMULATED:
                 record = fly_piloted(scenario, bundle, pilots)
             else:
-                record = fly_programs(scenario, folder / "flight", bundle, pilots=pilots)
+                _check_px4(vehicle, px4)
+                record = fly_programs(scenario, folder / "flight", bundle, px4, pilots)
             progress.update(task, advance=1)
-        what, how = perturbed_by(record, absences_of(record), _range_m(bundle)), TAKEN_WHOLE
-    else:
-        raise ValueError(
-            "--vehicle px4: no pilot takes a real PX4 here: must be point, simulated or mavlink; "
-            "fly docs/script.toml, and give its logs by --logs"
-        )
+        what = perturbed_by(record, absences_of(record), _range_m(bundle))
+        how = TAKEN_WHOLE.format(vehicles=_VEHICLES[vehicle])
     made_by = _made_by(f"e3 --world {world}{_flown_with(vehicle, logs)}", bundle)
     told = write_perturbation(what, folder, made_by, how)
     _tell(

@@ -92,7 +92,7 @@ def fly_programs(
 ) -> FlightRecord:
     """A flight of a program for each robot, in real time; its logs stay in `folder`.
 
-    Their vehicles are PX4s of that build, or simulated, which `pilots` may take. Raises what
+    Their vehicles, which `pilots` may take, are PX4s of that build, or simulated. Raises what
     `lpac sim` does, and ValueError if it came to no mission.
     """
     fleet = Fleet(scenario, folder, bundle, px4_build=px4_build)

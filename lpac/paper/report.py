@@ -35,7 +35,7 @@ _PILOTED = (
 )
 TAKEN_WHOLE = (
     "Whole robots flew over a world of the validation set: their programs' loops and separation, "
-    "on simulated PX4s on one simulated clock. A simulated pilot takes the robot by its sticks, "
+    "on {vehicles}. A simulated pilot takes the robot by its sticks, "
     f"flies it out of the fence at its height, and back to where it was; {_PILOTED}"
 )
 LOGS = "From the logs of flights."

@@ -39,6 +39,7 @@ class FaultyVehicle(Protocol):
     """Where a vehicle is, and takes itself to be: the world's frame, (3,), m."""
 
     position_m: F64
+    rc_connected: bool
 
     @property
     def estimated_position_m(self) -> F64: ...

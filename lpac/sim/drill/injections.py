@@ -1,6 +1,7 @@
 """What can be done to a fleet in flight. Each kind of vehicle says which of it it can (`supports`).
 
-Those below `VehicleInjection` are done to a simulated vehicle, whoever flies it.
+Those below `VehicleInjection` are done to a simulated vehicle, whoever flies it. Those below
+`PilotInjection` are what somebody with a remote control, or a ground station, does with any.
 """
 
 import math
@@ -10,6 +11,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from edge.core import F64
+from lpac.sim.fleet.pilot import PilotedVehicle
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
 
@@ -48,6 +50,14 @@ class VehicleInjection:
     """Something that is done to a simulated vehicle."""
 
     def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+        """Do it now."""
+        raise NotImplementedError
+
+
+class PilotInjection(VehicleInjection):
+    """Something that is done by way of the vehicle's remote control, or its mode."""
+
+    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
         """Do it now."""
         raise NotImplementedError
 
@@ -202,12 +212,12 @@ class MotorWeakens(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
-class RemoteControl(VehicleInjection):
+class RemoteControl(PilotInjection):
     """Somebody's remote control is on and heard, or not."""
 
     on: bool
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
         vehicle.rc_connected = self.on
 
 
@@ -223,32 +233,32 @@ class ParameterIs(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
-class ModeIs(VehicleInjection):
+class ModeIs(PilotInjection):
     """A ground station asks for a mode of PX4."""
 
     mode: Px4Mode
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
         vehicle.set_mode(self.mode)
 
 
 @dataclass(frozen=True, slots=True)
-class PilotFlies(VehicleInjection):
+class PilotFlies(PilotInjection):
     """A pilot takes it by remote control, and flies it outwards and up at these speeds."""
 
     outwards_m_s: float = 0.0
     up_m_s: float = 0.0
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
         north, east = (self.outwards_m_s * around.outwards(robot)).tolist()
         vehicle.pilot(Px4Mode.POSCTL, (north, east, -self.up_m_s))
 
 
 @dataclass(frozen=True, slots=True)
-class PilotLands(VehicleInjection):
+class PilotLands(PilotInjection):
     """The pilot who has it lands it."""
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
         vehicle.move_sticks(())
         vehicle.set_mode(Px4Mode.LAND)
 
@@ -270,7 +280,7 @@ class CarriedToPad(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
-class PilotFliesOver(VehicleInjection):
+class PilotFliesOver(PilotInjection):
     """A pilot flies it over a robot's pad, at that robot's height; for one second.
 
     `pad` is how many robots on that one is.
@@ -278,7 +288,7 @@ class PilotFliesOver(VehicleInjection):
 
     pad: int = 1
 
-    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
         pad_m, height_m = around.place_m(robot + self.pad), around.height_m(robot + self.pad)
         # Over everybody's heads on the way there.
         if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:

@@ -35,9 +35,9 @@ from lpac.sim.drill.injections import (
     GroundStops,
     Injection,
     LoseGps,
-    ModeIs,
     OperatorOrders,
     OriginJumps,
+    PilotInjection,
     ProgramDies,
     ProgramStarts,
     ProgramStops,
@@ -61,8 +61,8 @@ _PROGRAMS = (
 # Nobody cuts this machine's own network, fills its disk or steps its clock, and no loop of a
 # program that is as in the field hangs on demand.
 MAVLINK: tuple[type, ...] = (VehicleInjection, AutopilotSilent, *_PROGRAMS)
-# What a ground station can do to a real one, and PX4's own simulator to its vehicle.
-PX4: tuple[type, ...] = (LoseGps, BatteryIs, OriginJumps, ModeIs, *_PROGRAMS)
+# What a ground station or a pilot can do to a real one, and PX4's own simulator to its vehicle.
+PX4: tuple[type, ...] = (LoseGps, BatteryIs, OriginJumps, PilotInjection, *_PROGRAMS)
 
 # How long a command may take, each robot.
 _PATIENCE_S = 60.0
@@ -393,7 +393,7 @@ class Px4Field(ProcessField):
         return self.fleet.vehicles.stood_still_s(began_s)
 
     def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
-        """By its ground station's link."""
+        """By its ground station's link, or its pilot's remote control."""
         vehicle = self.vehicles[robot]
         match injection:
             case LoseGps(lost):
@@ -404,8 +404,8 @@ class Px4Field(ProcessField):
                 vehicle.change_battery(remaining)
             case OriginJumps(by_m):
                 vehicle.jump_estimator_origin(*by_m)
-            case ModeIs(mode):
-                vehicle.set_mode(mode)
+            case PilotInjection():
+                injection.apply(vehicle, robot, self)
             case _:
                 raise TypeError(f"{injection} is not done to a real PX4")
 

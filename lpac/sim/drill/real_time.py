@@ -79,14 +79,15 @@ class RealTimeDrill:
             scenario_of(fault, seed, self._robots), folder, self._bundle,
             px4_build=self._px4_build, settings=settings_of(fault),
         )  # fmt: skip
-        if fleet.simulated is not None and has_remote_control(fault):
-            for vehicle in fleet.simulated.vehicles:
-                vehicle.rc_connected = True
         with (
             fleet,
             GroundProgram(fleet.fleet_toml, fleet.name) as ground,
             process_field(fleet, ground) as field,
         ):
+            if has_remote_control(fault):
+                with field.stepped:
+                    for vehicle in field.vehicles:
+                        vehicle.rc_connected = True
             timeline = field.fly(fault, seed)
         truth = field.truth(timeline)
         write_figure(fault, truth, folder)

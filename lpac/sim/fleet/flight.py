@@ -4,6 +4,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,12 +23,14 @@ from lpac.ground.station.client import GroundError
 from lpac.ground.station.commands import in_words
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram
-from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.layout import WORLD, FleetScenario, Layout
 from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.pilot import Pilot, PilotFlight
 from lpac.sim.fleet.processes import Backlog, Fleet, OverloadError, Usage, process_usage
 from lpac.sim.fleet.scripted import CommandOutcome, ScriptedFlight
-from lpac.sim.fleet.vehicles import VehicleError
+from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
+from lpac.sim.sitl.build import Px4Build
+from lpac.sim.sitl.ground_station import RealVehicles
 
 _LOOPS = ("perception", "policy", "control")
 _IN_TIME = Backlog(0.0, 0.0)
@@ -182,7 +185,7 @@ def fly(
 ) -> FleetFlight:
     """Run a fleet and its ground, and fly the script; `watch` gets the step's name now and then.
 
-    `pilots` take robots with simulated vehicles out of the field, and bring them back.
+    `pilots` take robots out of the field, and bring them back.
 
     Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
     FleetError if a robot's program ends before all are heard; OSError, LinkError, GroundError or
@@ -192,7 +195,11 @@ def fly(
     flying_by_hand: list[Pilot] = []
     step = "assemble"
     problem, overloaded = None, False
-    with fleet, GroundProgram(fleet.fleet_toml, fleet.name) as ground:
+    with (
+        fleet,
+        GroundProgram(fleet.fleet_toml, fleet.name) as ground,
+        _in_sight(fleet) if pilots else nullcontext() as seen,
+    ):
 
         def begin(name: str) -> None:
             nonlocal step
@@ -201,10 +208,11 @@ def fly(
             say("landing all robots where they are" if name == "land" else name)
             moments.setdefault(name, _Moment.of(fleet, ground))
             step = name
-            if name == "mission" and fleet.simulated is not None:
-                vehicles, now_s = fleet.simulated.vehicles, ground.told.now_s
+            if name == "mission" and seen is not None:
+                now_s = ground.told.now_s
                 flying_by_hand[:] = [
-                    Pilot(vehicles[flown.robot], fleet.layout, flown, now_s) for flown in pilots
+                    Pilot(seen.vehicles[flown.robot], fleet.layout, flown, now_s)
+                    for flown in pilots
                 ]
 
         def look() -> None:
@@ -214,9 +222,9 @@ def fly(
                 fleet.vehicles.require_running()
             if step not in ("assemble", "land"):
                 fleet.require_keeping_up()
-            if fleet.simulated is not None and step == "mission":
+            if seen is not None and step == "mission":
                 told = ground.told.snapshot.robots
-                with fleet.simulated.stepped:
+                with seen.stepped:
                     for pilot in flying_by_hand:
                         pilot.look(ground.told.now_s, told[pilot.robot].status)
             watch(step)
@@ -242,6 +250,17 @@ def fly(
         lateness = fleet.lateness()
     # The vehicles' own logs are whole once they have ended.
     return _record(fleet, flight, moments, problem, lateness, overloaded)
+
+
+@contextmanager
+def _in_sight(fleet: Fleet) -> Iterator[SimulatedVehicles | RealVehicles]:
+    """Its vehicles, as pilots see and fly them."""
+    if fleet.simulated is not None:
+        yield fleet.simulated
+        return
+    assert isinstance(fleet.vehicles, Px4Build)
+    with RealVehicles(fleet.vehicles, WORLD) as vehicles:
+        yield vehicles
 
 
 class _Moment(NamedTuple):

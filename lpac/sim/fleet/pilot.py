@@ -1,6 +1,7 @@
 """A pilot who takes a robot of a simulated fleet out of the field, and brings it back."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -9,13 +10,32 @@ from edge.messages.mission import FlightState, RobotStatus
 from lpac.ground.script import Perturbation
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.modes import Px4Mode
-from lpac.sim.px4.vehicle import Px4Vehicle
 
 LOOKS_S = 0.1
 _GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
 # Beyond the fence's line; when the pilot turns back, and lets the sticks go, before the end.
 _BEYOND_M = 2.0
 _BACK_S, _LETS_GO_S = 9.0, 1.0
+
+
+class PilotedVehicle(Protocol):
+    """What a pilot sees of a vehicle, and does with its remote control: `Px4Vehicle`, or a PX4.
+
+    `position_m` (3,) is where it really is, `rc_connected` whether the remote control is heard.
+    """
+
+    position_m: F64
+    mode: Px4Mode
+    rc_connected: bool
+
+    def pilot(self, mode: Px4Mode = ..., stick_velocity_m_s: Sequence[float] = ()) -> Any:
+        """The remote control is on, its switch on that mode, and its sticks are held so."""
+
+    def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
+        """North, east, down; empty means centred."""
+
+    def set_mode(self, mode: Px4Mode) -> Any:
+        """Ask for a mode."""
 
 
 class PilotFlight(NamedTuple):
@@ -46,7 +66,7 @@ class Pilot:
     """
 
     def __init__(
-        self, vehicle: Px4Vehicle, layout: Layout, flight: PilotFlight, mission_began_s: float
+        self, vehicle: PilotedVehicle, layout: Layout, flight: PilotFlight, mission_began_s: float
     ) -> None:
         self.robot = flight.robot
         self._vehicle = vehicle

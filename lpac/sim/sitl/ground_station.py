@@ -1,13 +1,15 @@
-"""Real PX4s for whoever does faults to them: what is done to them, and what they do.
+"""Real PX4s for whoever does faults to them, or is their pilot: what is done, and what they do.
 
-What is done to a PX4 comes from a ground station on its ground-station link; where the vehicle
-really is tells PX4's own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
+What is done to a PX4 comes from a ground station on its ground-station link, and so do a pilot's
+sticks, which PX4 takes from there in simulation (COM_RC_IN_MODE); where the vehicle really is tells
+PX4's own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
 """
 
 import math
 import socket
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
@@ -23,6 +25,15 @@ from lpac.sim.sitl.build import GROUND_PORT, Px4Build, frames
 AIRBORNE_ABOVE_M = 0.15
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
+_MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
+# PX4 misses sticks after half a second, and takes a pilot's mode only with sticks.
+_STICKS_PERIOD_S, _MODE_AGAIN_S = 0.05, 0.3
+# Full sticks; PX4's own are curved, slack in the middle, and 10 m/s.
+_STICKS_M_S = 4.0
+_AS_THE_STICKS_SAY = {
+    "MPC_VEL_MANUAL": _STICKS_M_S, "MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_MAX_DN": 1.5,
+    "MPC_XY_MAN_EXPO": 0.0, "MPC_Z_MAN_EXPO": 0.0, "MPC_HOLD_DZ": 0.0,
+}  # fmt: skip
 # PX4's own default.
 _SATELLITES = 10
 # BAT1_SOURCE: what MAVLink tells, instead of PX4's own simulator. And cells as the simulator's.
@@ -46,13 +57,18 @@ class RealVehicle:
 
     def __init__(self, instance: int, world: WorldOrigin) -> None:
         self.time_s = 0.0
+        self.mode = Px4Mode.HOLD
         self.armed = False
         self.position_m: F64 = np.zeros(3)
+        self.rc_connected = False
         self._world = world
         self._local_m: F64 = np.zeros(3)
         self._origin_m: F64 = np.zeros(3)
         self._ground_altitude_m = math.nan
-        self._heartbeat_due_s = 0.0
+        self._heartbeat_due_s = self._sticks_due_s = self._mode_due_s = 0.0
+        self._heading_rad = 0.0
+        self._sticks_m_s: tuple[float, ...] = (0.0, 0.0, 0.0)
+        self._pilots_mode: Px4Mode | None = None
         self._system = instance + 1
         self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._udp.connect(("127.0.0.1", GROUND_PORT + instance))
@@ -80,6 +96,19 @@ class RealVehicle:
         """A ground station asks for a mode."""
         custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         self._command(mavlink.MAV_CMD_DO_SET_MODE, custom, *CUSTOM_MODES[mode])
+
+    def pilot(
+        self, mode: Px4Mode = Px4Mode.POSCTL, stick_velocity_m_s: Sequence[float] = ()
+    ) -> None:
+        """A pilot switches on the remote control, to `mode`, and holds the sticks."""
+        self.rc_connected, self._pilots_mode = True, mode
+        for name, value in _AS_THE_STICKS_SAY.items():
+            self.set_parameter(name, value, mavlink.MAV_PARAM_TYPE_REAL32)
+        self.move_sticks(stick_velocity_m_s)
+
+    def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
+        """North, east, down; empty means centred."""
+        self._sticks_m_s = tuple(velocity_m_s) or (0.0, 0.0, 0.0)
 
     def lose_gps(self, *, lost: bool = True) -> None:
         """Its receiver sees no satellite from now on, or sees them again."""
@@ -159,6 +188,14 @@ class RealVehicle:
                     self._command(
                         mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, round(1e6 / rate_hz)
                     )
+        if self.rc_connected and now_s >= self._sticks_due_s:
+            self._sticks_due_s = now_s + _STICKS_PERIOD_S
+            self._send(self._sticks())
+        if self._pilots_mode is self.mode:
+            self._pilots_mode = None
+        if self._pilots_mode is not None and now_s >= self._mode_due_s:
+            self._mode_due_s = now_s + _MODE_AGAIN_S
+            self.set_mode(self._pilots_mode)
         while datagram := self._receive():
             for message_id, frame in frames(datagram):
                 if message_id in _HEARD:
@@ -172,6 +209,20 @@ class RealVehicle:
         """Say and hear nothing more."""
         self._udp.close()
 
+    def _sticks(self) -> Any:
+        """As of somebody who looks along the vehicle's nose; throttle is 500 in the middle."""
+        north, east, down = self._sticks_m_s
+        cos, sin = math.cos(self._heading_rad), math.sin(self._heading_rad)
+        shares = [
+            (cos * north + sin * east) / _STICKS_M_S,
+            (cos * east - sin * north) / _STICKS_M_S,
+            -down / _AS_THE_STICKS_SAY["MPC_Z_VEL_MAX_UP" if down < 0.0 else "MPC_Z_VEL_MAX_DN"],
+        ]
+        pitch, roll, throttle = (round(1000.0 * min(max(share, -1.0), 1.0)) for share in shares)
+        return mavlink.MAVLink_manual_control_message(
+            self._system, pitch, roll, (1000 + throttle) // 2, 0, 0
+        )
+
     def _receive(self) -> bytes:
         with suppress(ConnectionError, BlockingIOError):
             return self._udp.recv(2048)
@@ -181,6 +232,8 @@ class RealVehicle:
         kind = message.get_type()
         if kind == "HEARTBEAT":
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+            custom = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24
+            self.mode = _MODES.get(custom, self.mode)
         elif kind == "LOCAL_POSITION_NED":
             self._local_m = np.array([message.x, message.y, message.z])
         elif kind == "GPS_GLOBAL_ORIGIN":
@@ -197,6 +250,8 @@ class RealVehicle:
         north_m, east_m = self._world.to_world(message.lat * 1e-7, message.lon * 1e-7)
         self.time_s = now_s
         self.position_m = np.array([north_m, east_m, self._ground_altitude_m - message.alt * 1e-3])
+        w, x, y, z = message.attitude_quaternion
+        self._heading_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 class RealVehicles:

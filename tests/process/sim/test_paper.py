@@ -46,5 +46,5 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert "absent" in error_line(lpac("paper", "async", "--bundle", "absent"))
     assert error_line(lpac("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
     assert error_line(lpac("paper", "e3", "--world", -1)) == "lpac: world = -1: must be at least 0"
-    no_pilot = lpac("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
-    assert "--vehicle px4: no pilot takes a real PX4 here" in error_line(no_pilot)
+    no_build = lpac("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
+    assert "--px4 names PX4's build folder" in error_line(no_build)

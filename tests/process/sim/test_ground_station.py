@@ -1,0 +1,119 @@
+"""What a pilot does with a real PX4, on the link where PX4 listens to a ground station."""
+
+import math
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
+from lpac.sim.px4.world import WorldOrigin
+from lpac.sim.sitl.build import GROUND_PORT
+from lpac.sim.sitl.ground_station import RealVehicle
+
+# Far from those that flights use.
+INSTANCE = 73
+SYSTEM = INSTANCE + 1
+
+
+class Px4EndOfTheLink:
+    """Says what a PX4 says to a ground station, and hears what comes."""
+
+    def __init__(self, udp: socket.socket) -> None:
+        self.udp = udp
+        self.mav: Any = mavlink.MAVLink(None, srcSystem=SYSTEM, srcComponent=1)
+        self.mav.robust_parsing = True
+        self.peer: Any = None
+
+    def hear(self) -> list[Any]:
+        """All that has come."""
+        messages: list[Any] = []
+        while True:
+            try:
+                data, self.peer = self.udp.recvfrom(2048)
+            except BlockingIOError:
+                return messages
+            messages += self.mav.parse_buffer(data) or ()
+
+    def say(self, message: Any) -> None:
+        self.udp.sendto(message.pack(self.mav), self.peer)
+
+    def is_in(self, mode: Px4Mode) -> None:
+        main, sub = CUSTOM_MODES[mode]
+        self.say(
+            mavlink.MAVLink_heartbeat_message(
+                mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4,
+                mavlink.MAV_MODE_FLAG_SAFETY_ARMED, main << 16 | sub << 24, 4, 3,
+            )
+        )  # fmt: skip
+
+    def is_heading(self, heading_rad: float) -> None:
+        half = heading_rad / 2.0
+        latitude, longitude, altitude_m = WorldOrigin().to_global(np.zeros(3))
+        self.say(
+            mavlink.MAVLink_hil_state_quaternion_message(
+                0, [math.cos(half), 0.0, 0.0, math.sin(half)], 0.0, 0.0, 0.0,
+                round(latitude * 1e7), round(longitude * 1e7), round(altitude_m * 1e3),
+                0, 0, 0, 0, 0, 0, 0, 0,
+            )
+        )  # fmt: skip
+
+
+@pytest.fixture
+def link() -> Iterator[tuple[RealVehicle, Px4EndOfTheLink]]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", GROUND_PORT + INSTANCE))
+        udp.setblocking(False)
+        vehicle = RealVehicle(INSTANCE, WorldOrigin())
+        yield vehicle, Px4EndOfTheLink(udp)
+        vehicle.close()
+
+
+def only(messages: list[Any], kind: str) -> list[Any]:
+    return [message for message in messages if message.get_type() == kind]
+
+
+def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
+    link: tuple[RealVehicle, Px4EndOfTheLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle, px4 = link
+    now_s = 100.0
+    monkeypatch.setattr("lpac.sim.sitl.ground_station.time.monotonic", lambda: now_s)
+    vehicle.exchange()
+    assert not only(px4.hear(), "MANUAL_CONTROL"), "no remote control is on"
+    px4.is_in(Px4Mode.OFFBOARD)
+    # North is to the left of a nose that points east.
+    px4.is_heading(math.pi / 2.0)
+    vehicle.exchange()
+    assert (vehicle.mode, vehicle.armed) == (Px4Mode.OFFBOARD, True)
+    vehicle.pilot(Px4Mode.POSCTL, (2.0, 1.0, -1.5))
+    asked = 0
+    for _ in range(10):
+        now_s += 0.1
+        vehicle.exchange()
+        heard = px4.hear()
+        (sticks,) = only(heard, "MANUAL_CONTROL")
+        assert (sticks.target, sticks.x, sticks.y, sticks.z) == (SYSTEM, 250, -500, 750)
+        modes = only(heard, "COMMAND_LONG")
+        asked += sum(m.command == mavlink.MAV_CMD_DO_SET_MODE for m in modes)
+    assert asked >= 3
+    px4.is_in(Px4Mode.POSCTL)
+    vehicle.exchange()
+    assert vehicle.mode is Px4Mode.POSCTL
+    px4.hear()
+    vehicle.move_sticks(())
+    now_s += 1.0
+    vehicle.exchange()
+    heard = px4.hear()
+    (sticks,) = only(heard, "MANUAL_CONTROL")
+    assert (sticks.x, sticks.y, sticks.z) == (0, 0, 500)
+    commands = [m.command for m in only(heard, "COMMAND_LONG")]
+    assert mavlink.MAV_CMD_DO_SET_MODE not in commands
+    # Lost, it says nothing more.
+    vehicle.rc_connected = False
+    now_s += 1.0
+    vehicle.exchange()
+    assert not only(px4.hear(), "MANUAL_CONTROL")
