@@ -15,7 +15,7 @@ from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.flight import fly as fly_fleet
 from lpac.sim.fleet.layout import FleetScenario
-from lpac.sim.fleet.pilot import PilotFlight
+from lpac.sim.fleet.pilot import FOR_A_PILOT, PilotFlight
 from lpac.sim.fleet.processes import Fleet
 
 
@@ -95,7 +95,8 @@ def fly_programs(
     Their vehicles, which `pilots` may take, are PX4s of that build, or simulated. Raises what
     `lpac sim` does, and ValueError if it came to no mission.
     """
-    fleet = Fleet(scenario, folder, bundle, px4_build=px4_build)
+    settings = FOR_A_PILOT if pilots else None
+    fleet = Fleet(scenario, folder, bundle, px4_build=px4_build, settings=settings)
     return _record(fly_fleet(fleet, pilots=pilots))
 
 

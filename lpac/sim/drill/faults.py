@@ -595,6 +595,7 @@ _PEOPLE = (
     Fault(
         name="pilot-takes-it", what="a pilot takes a robot by remote control, and flies it 15 s",
         promise="nothing is sent to it any more; it is its own until the operator orders rejoin",
+        settings=(_RC,),
         does=(
             *_once(PilotFlies(0.0, 0.0)), Do(2.0, PilotFlies(-1.0, 0.0)), Do(8.0, PilotFlies()),
             Do(15.0, OperatorOrders("rejoin")), Do(20.0, OperatorOrders("start"), mark="start"),
@@ -608,6 +609,7 @@ _PEOPLE = (
     Fault(
         name="pilot-lands-it", what="a pilot takes a robot, and lands it",
         promise="nothing is sent to it any more",
+        settings=(_RC,),
         does=(*_once(PilotFlies()), Do(6.0, PilotLands())),
         bounds=(FallsSilent(1.1), Down(8.0 + _LANDING_S), FliesOn(20.0)),
     ),
@@ -708,6 +710,7 @@ _PEOPLE = (
     Fault(
         name="somebody-over-the-pad", what="a pilot hovers above another's pad, at its height",
         promise="the one that comes home keeps 1.5 m away, and waits",
+        settings=(_RC,),
         does=(
             *(Do(float(t), PilotFliesOver()) for t in range(80)),
             Do(45.0, OperatorOrders("return"), "next"),
@@ -744,18 +747,21 @@ _PAIRS = (
     Fault(
         name="critical-while-piloted", what="a battery is critical while a pilot flies",
         promise="the pilot comes before it: nothing is sent",
+        settings=(_RC,),
         does=(*_once(PilotFlies()), Do(3.0, Drain(0.145)), Do(12.0, PilotLands())),
         bounds=(FallsSilent(1.1), NotLandedBefore(11.9), FliesOn(20.0)),
     ),
     Fault(
         name="killed-while-piloted", what="the operator kills a robot that a pilot flies",
         promise="kill comes before the pilot",
+        settings=(_RC,),
         does=(*_once(PilotFlies()), Do(3.0, OperatorOrders("kill"))),
         bounds=(MotorsOff(3.6), FliesOn(20.0)),
     ),
     Fault(
         name="piloted-while-it-hangs", what="a control loop hangs, and a pilot takes it meanwhile",
         promise="what comes back does not take it from the pilot",
+        settings=(_RC,),
         does=(*_once(LoopHangs("control", 3.0)), Do(1.5, PilotFlies()), Do(12.0, PilotLands())),
         bounds=(_HOLDS, FallsSilent(0.6), FliesOn(20.0)),
     ),
@@ -820,6 +826,7 @@ _PAIRS = (
         name="rejoin-without-gps", what="a pilot has a robot that loses GPS; rejoin is ordered",
         promise="rejoin is refused: the pilot has it",
         uncovered=_ADRIFT,
+        settings=(_RC,),
         does=(
             *_once(PilotFlies()), Do(3.0, LoseGps()), Do(8.0, OperatorOrders("rejoin")),
             Do(9.0, PilotLands()),

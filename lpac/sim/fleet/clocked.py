@@ -13,7 +13,7 @@ from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
 from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import Say
-from lpac.sim.fleet.pilot import LOOKS_S, Pilot, PilotFlight
+from lpac.sim.fleet.pilot import FOR_A_PILOT, LOOKS_S, Pilot, PilotFlight
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
 
@@ -40,8 +40,17 @@ def fly_simulated(
     written, and RecordingError.
     """
     earlier = set(folder.rglob("*.mcap"))
-    fleet = SimulatedFleet(scenario, folder, bundle, logs=logs, recorded=recorded)
+    fleet = SimulatedFleet(
+        scenario,
+        folder,
+        bundle,
+        settings=FOR_A_PILOT if pilots else None,
+        logs=logs,
+        recorded=recorded,
+    )
     ground = fleet.ground
+    for each in fleet.vehicles:
+        each.vehicle.rc_connected = bool(pilots)
 
     def begin(step: str) -> None:
         say(step)

@@ -185,7 +185,7 @@ def fly(
 ) -> FleetFlight:
     """Run a fleet and its ground, and fly the script; `watch` gets the step's name now and then.
 
-    `pilots` take robots out of the field, and bring them back.
+    `pilots` take robots, which are set up `FOR_A_PILOT`, out of the field, and bring them back.
 
     Ctrl-C lands all, and so do a vehicle that ends, and a machine that does not keep up. Raises
     FleetError if a robot's program ends before all are heard; OSError, LinkError, GroundError or
@@ -200,6 +200,10 @@ def fly(
         GroundProgram(fleet.fleet_toml, fleet.name) as ground,
         _in_sight(fleet) if pilots else nullcontext() as seen,
     ):
+        if seen is not None:
+            with seen.stepped:
+                for vehicle in seen.vehicles:
+                    vehicle.rc_connected = True
 
         def begin(name: str) -> None:
             nonlocal step

@@ -1,6 +1,6 @@
 """A pilot who takes a robot of a simulated fleet out of the field, and brings it back."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -11,6 +11,8 @@ from lpac.ground.script import Perturbation
 from lpac.sim.fleet.layout import Layout
 from lpac.sim.px4.modes import Px4Mode
 
+# What robots' configuration says where a pilot may take them: PX4 obeys no other remote control.
+FOR_A_PILOT: Mapping[str, Mapping[str, object]] = {"failsafe": {"rc": "pilot"}}
 LOOKS_S = 0.1
 _GAIN_PER_S, _FASTEST_M_S = 0.8, 3.0
 # Beyond the fence's line; when the pilot turns back, and lets the sticks go, before the end.

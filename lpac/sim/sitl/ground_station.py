@@ -1,8 +1,9 @@
 """Real PX4s for whoever does faults to them, or is their pilot: what is done, and what they do.
 
-What is done to a PX4 comes from a ground station on its ground-station link, and so do a pilot's
-sticks, which PX4 takes from there in simulation (COM_RC_IN_MODE); where the vehicle really is tells
-PX4's own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
+What is done to a PX4 comes from a ground station on its ground-station link, and so does what the
+receiver of its remote control hears (RC_CHANNELS_OVERRIDE; sticks by MANUAL_CONTROL are no remote
+control to PX4, which a pilot's robots are to obey alone). Where the vehicle really is tells PX4's
+own vehicle model. The names are those of `lpac.sim.px4.vehicle.Px4Vehicle`.
 """
 
 import math
@@ -26,13 +27,17 @@ AIRBORNE_ABOVE_M = 0.15
 _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
-# PX4 misses sticks after half a second, and takes a pilot's mode only with sticks.
+# PX4 misses a remote control after half a second, and takes a pilot's mode only with one.
 _STICKS_PERIOD_S, _MODE_AGAIN_S = 0.05, 0.3
 # Full sticks; PX4's own are curved, slack in the middle, and 10 m/s.
 _STICKS_M_S = 4.0
 _AS_THE_STICKS_SAY = {
     "MPC_VEL_MANUAL": _STICKS_M_S, "MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_MAX_DN": 1.5,
     "MPC_XY_MAN_EXPO": 0.0, "MPC_Z_MAN_EXPO": 0.0, "MPC_HOLD_DZ": 0.0,
+}  # fmt: skip
+# A receiver that was calibrated: which channel is which stick, from 1 on, and 1000 to 2000 us each.
+_CHANNELS = {
+    "RC_CHAN_CNT": 4, "RC_MAP_ROLL": 1, "RC_MAP_PITCH": 2, "RC_MAP_THROTTLE": 3, "RC_MAP_YAW": 4,
 }  # fmt: skip
 # PX4's own default.
 _SATELLITES = 10
@@ -60,7 +65,7 @@ class RealVehicle:
         self.mode = Px4Mode.HOLD
         self.armed = False
         self.position_m: F64 = np.zeros(3)
-        self.rc_connected = False
+        self._rc_connected = False
         self._world = world
         self._local_m: F64 = np.zeros(3)
         self._origin_m: F64 = np.zeros(3)
@@ -79,6 +84,20 @@ class RealVehicle:
         self._battery_mav: Any = mavlink.MAVLink(
             None, srcSystem=self._system, srcComponent=mavlink.MAV_COMP_ID_BATTERY
         )
+
+    @property
+    def rc_connected(self) -> bool:
+        """Whether somebody's remote control is on, and heard."""
+        return self._rc_connected
+
+    @rc_connected.setter
+    def rc_connected(self, heard: bool) -> None:
+        if heard and not self._rc_connected:
+            for name, value in _AS_THE_STICKS_SAY.items():
+                self.set_parameter(name, value, mavlink.MAV_PARAM_TYPE_REAL32)
+            for name, number in _CHANNELS.items():
+                self.set_parameter(name, number, mavlink.MAV_PARAM_TYPE_INT32)
+        self._rc_connected = heard
 
     @property
     def landed(self) -> bool:
@@ -102,8 +121,6 @@ class RealVehicle:
     ) -> None:
         """A pilot switches on the remote control, to `mode`, and holds the sticks."""
         self.rc_connected, self._pilots_mode = True, mode
-        for name, value in _AS_THE_STICKS_SAY.items():
-            self.set_parameter(name, value, mavlink.MAV_PARAM_TYPE_REAL32)
         self.move_sticks(stick_velocity_m_s)
 
     def move_sticks(self, velocity_m_s: Sequence[float]) -> None:
@@ -210,17 +227,17 @@ class RealVehicle:
         self._udp.close()
 
     def _sticks(self) -> Any:
-        """As of somebody who looks along the vehicle's nose; throttle is 500 in the middle."""
+        """What the receiver hears from somebody who looks along the vehicle's nose."""
         north, east, down = self._sticks_m_s
         cos, sin = math.cos(self._heading_rad), math.sin(self._heading_rad)
-        shares = [
-            (cos * north + sin * east) / _STICKS_M_S,
+        shares = (
             (cos * east - sin * north) / _STICKS_M_S,
+            (cos * north + sin * east) / _STICKS_M_S,
             -down / _AS_THE_STICKS_SAY["MPC_Z_VEL_MAX_UP" if down < 0.0 else "MPC_Z_VEL_MAX_DN"],
-        ]
-        pitch, roll, throttle = (round(1000.0 * min(max(share, -1.0), 1.0)) for share in shares)
-        return mavlink.MAVLink_manual_control_message(
-            self._system, pitch, roll, (1000 + throttle) // 2, 0, 0
+        )
+        roll, pitch, throttle = (round(1500.0 + 500.0 * min(max(s, -1.0), 1.0)) for s in shares)
+        return mavlink.MAVLink_rc_channels_override_message(
+            self._system, 1, roll, pitch, throttle, 1500, 0, 0, 0, 0
         )
 
     def _receive(self) -> bytes:

@@ -76,6 +76,11 @@ def only(messages: list[Any], kind: str) -> list[Any]:
     return [message for message in messages if message.get_type() == kind]
 
 
+def channels(sticks: Any) -> tuple[int, ...]:
+    """Roll, pitch, throttle, yaw."""
+    return sticks.chan1_raw, sticks.chan2_raw, sticks.chan3_raw, sticks.chan4_raw
+
+
 def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
     link: tuple[RealVehicle, Px4EndOfTheLink], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,7 +88,7 @@ def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
     now_s = 100.0
     monkeypatch.setattr("lpac.sim.sitl.ground_station.time.monotonic", lambda: now_s)
     vehicle.exchange()
-    assert not only(px4.hear(), "MANUAL_CONTROL"), "no remote control is on"
+    assert not only(px4.hear(), "RC_CHANNELS_OVERRIDE"), "no remote control is on"
     px4.is_in(Px4Mode.OFFBOARD)
     # North is to the left of a nose that points east.
     px4.is_heading(math.pi / 2.0)
@@ -95,8 +100,8 @@ def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
         now_s += 0.1
         vehicle.exchange()
         heard = px4.hear()
-        (sticks,) = only(heard, "MANUAL_CONTROL")
-        assert (sticks.target, sticks.x, sticks.y, sticks.z) == (SYSTEM, 250, -500, 750)
+        (sticks,) = only(heard, "RC_CHANNELS_OVERRIDE")
+        assert sticks.target_system == SYSTEM and channels(sticks) == (1250, 1625, 1750, 1500)
         modes = only(heard, "COMMAND_LONG")
         asked += sum(m.command == mavlink.MAV_CMD_DO_SET_MODE for m in modes)
     assert asked >= 3
@@ -108,12 +113,12 @@ def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
     now_s += 1.0
     vehicle.exchange()
     heard = px4.hear()
-    (sticks,) = only(heard, "MANUAL_CONTROL")
-    assert (sticks.x, sticks.y, sticks.z) == (0, 0, 500)
+    (sticks,) = only(heard, "RC_CHANNELS_OVERRIDE")
+    assert channels(sticks) == (1500,) * 4
     commands = [m.command for m in only(heard, "COMMAND_LONG")]
     assert mavlink.MAV_CMD_DO_SET_MODE not in commands
     # Lost, it says nothing more.
     vehicle.rc_connected = False
     now_s += 1.0
     vehicle.exchange()
-    assert not only(px4.hear(), "MANUAL_CONTROL")
+    assert not only(px4.hear(), "RC_CHANNELS_OVERRIDE")

@@ -188,7 +188,7 @@ def killed(fleet: SimulatedFleet) -> None:
     [
         (of_vehicle(gps_lost=True), FlightState.LAND, ReasonCode.POSITION_LOST),
         (of_vehicle(battery_remaining=0.145), FlightState.LAND, ReasonCode.BATTERY_CRITICAL),
-        (of_vehicle(battery_remaining=0.245), FlightState.RETURN, ReasonCode.BATTERY_LOW),
+        (of_vehicle(battery_remaining=0.24), FlightState.RETURN, ReasonCode.BATTERY_LOW),
         (loop_hangs("policy"), FlightState.HOLD, ReasonCode.POLICY_STALE),
         (loop_hangs("perception"), FlightState.HOLD, ReasonCode.POLICY_STALE),
         (left_to_hold, FlightState.PILOT, ReasonCode.LEFT_OFFBOARD),
@@ -205,7 +205,7 @@ def test_a_robot_says_what_befell_it_and_the_other_flies_on(
     def says_so(told: FleetSnapshot) -> bool:
         return told.robots[0].status is not None and told.robots[0].status.state is state
 
-    assert fleet.ground.carry_out(_until(says_so, 10.0))
+    assert fleet.ground.carry_out(_until(says_so, 20.0))
     said, other = (robot.status for robot in fleet.ground.snapshot.robots)
     assert said is not None and other is not None
     assert said.reason.code is reason and said.reason in said.alarms
