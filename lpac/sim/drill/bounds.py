@@ -193,7 +193,8 @@ class PilotIsAlone:
                 sent_s = np.unique(vehicle.between(begin_s, end_s).setpoint_at_s)
                 sent_s = sent_s[(sent_s > begin_s) & (sent_s <= end_s)]
                 for at_s in rejoined_s:
-                    sent_s = sent_s[(sent_s < at_s) | (sent_s > at_s + _REJOIN_S)]
+                    # A vehicle's clock is a step behind what is done in between.
+                    sent_s = sent_s[(sent_s < at_s - _STEP_S) | (sent_s > at_s + _REJOIN_S)]
                 if len(sent_s):
                     latest_s = max(latest_s, float(sent_s.max()) - begin_s)
         return Figure("last setpoint to a pilot's vehicle", latest_s, PILOT_NOTICED_S, "s")
