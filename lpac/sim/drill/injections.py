@@ -2,6 +2,7 @@
 
 Those below `VehicleInjection` are done to a simulated vehicle, whoever flies it. Those below
 `PilotInjection` are what somebody with a remote control, or a ground station, does with any.
+(Who is to hover over a place by one look a second must know how a simulated vehicle answers.)
 """
 
 import math
@@ -280,7 +281,7 @@ class CarriedToPad(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
-class PilotFliesOver(PilotInjection):
+class PilotFliesOver(VehicleInjection):
     """A pilot flies it over a robot's pad, at that robot's height; for one second.
 
     `pad` is how many robots on that one is.
@@ -288,7 +289,7 @@ class PilotFliesOver(PilotInjection):
 
     pad: int = 1
 
-    def apply(self, vehicle: PilotedVehicle, robot: int, around: Surroundings) -> None:
+    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
         pad_m, height_m = around.place_m(robot + self.pad), around.height_m(robot + self.pad)
         # Over everybody's heads on the way there.
         if math.dist(vehicle.position_m[:2], pad_m) > _PILOT_ARRIVED_M:

@@ -93,10 +93,7 @@ class RealVehicle:
     @rc_connected.setter
     def rc_connected(self, heard: bool) -> None:
         if heard and not self._rc_connected:
-            for name, value in _AS_THE_STICKS_SAY.items():
-                self.set_parameter(name, value, mavlink.MAV_PARAM_TYPE_REAL32)
-            for name, number in _CHANNELS.items():
-                self.set_parameter(name, number, mavlink.MAV_PARAM_TYPE_INT32)
+            self._calibrate()
         self._rc_connected = heard
 
     @property
@@ -191,6 +188,17 @@ class RealVehicle:
     def exchange(self) -> None:
         """Say what is due, and take all that has come."""
         now_s = time.monotonic()
+        self._say(now_s)
+        while datagram := self._receive():
+            for message_id, frame in frames(datagram):
+                if message_id in _HEARD:
+                    for message in self._mav.parse_buffer(frame) or ():
+                        if (message.get_srcSystem(), message.get_srcComponent()) == (
+                            self._system, 1,
+                        ):  # fmt: skip
+                            self._hear(now_s, message)
+
+    def _say(self, now_s: float) -> None:
         if now_s >= self._heartbeat_due_s:
             self._heartbeat_due_s = now_s + _HEARTBEAT_PERIOD_S
             self._send(
@@ -200,7 +208,10 @@ class RealVehicle:
             )
             if self._battery is not None:
                 self._tell_of_battery(self._battery)
+            # It does not listen from the first moment on.
             if not self.time_s:
+                if self._rc_connected:
+                    self._calibrate()
                 for message, rate_hz in _RATES_HZ.items():
                     self._command(
                         mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, round(1e6 / rate_hz)
@@ -213,18 +224,16 @@ class RealVehicle:
         if self._pilots_mode is not None and now_s >= self._mode_due_s:
             self._mode_due_s = now_s + _MODE_AGAIN_S
             self.set_mode(self._pilots_mode)
-        while datagram := self._receive():
-            for message_id, frame in frames(datagram):
-                if message_id in _HEARD:
-                    for message in self._mav.parse_buffer(frame) or ():
-                        if (message.get_srcSystem(), message.get_srcComponent()) == (
-                            self._system, 1,
-                        ):  # fmt: skip
-                            self._hear(now_s, message)
 
     def close(self) -> None:
         """Say and hear nothing more."""
         self._udp.close()
+
+    def _calibrate(self) -> None:
+        for name, value in _AS_THE_STICKS_SAY.items():
+            self.set_parameter(name, value, mavlink.MAV_PARAM_TYPE_REAL32)
+        for name, number in _CHANNELS.items():
+            self.set_parameter(name, number, mavlink.MAV_PARAM_TYPE_INT32)
 
     def _sticks(self) -> Any:
         """What the receiver hears from somebody who looks along the vehicle's nose."""
