@@ -89,6 +89,13 @@ def in_mission() -> SimulatedFleet:
     return _in_mission().copy()
 
 
+@cache
+def _on_their_way() -> SimulatedFleet:
+    fleet = in_mission()
+    fleet.ground.carry_out(_pass(8.0))
+    return fleet
+
+
 def states(fleet: SimulatedFleet) -> set[FlightState]:
     return {
         robot.status.state for robot in fleet.ground.snapshot.robots if robot.status is not None
@@ -199,13 +206,13 @@ def killed(fleet: SimulatedFleet) -> None:
 def test_a_robot_says_what_befell_it_and_the_other_flies_on(
     fault: Callable[[SimulatedFleet], None], state: FlightState, reason: ReasonCode
 ) -> None:
-    fleet = in_mission()
+    fleet = _on_their_way().copy()
     fault(fleet)
 
     def says_so(told: FleetSnapshot) -> bool:
         return told.robots[0].status is not None and told.robots[0].status.state is state
 
-    assert fleet.ground.carry_out(_until(says_so, 20.0))
+    assert fleet.ground.carry_out(_until(says_so, 10.0))
     said, other = (robot.status for robot in fleet.ground.snapshot.robots)
     assert said is not None and other is not None
     assert said.reason.code is reason and said.reason in said.alarms
