@@ -4,11 +4,11 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -49,11 +49,12 @@ def over_processes(
     Raises ChildProcessError if one of them is killed.
     """
     workers = min(len(tasks), at_most)
-    # A fork would inherit threads that do not run there.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _obey_parent)
+    # A fork would inherit threads that do not run there. Tasks come as the workers begin: until
+    # Python 3.11.6, a pool whose worker was killed waits forever for one to read a large task.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (do, tasks))
     try:
         with _without_interrupts():
-            given = [pool.submit(do, task) for task in tasks]
+            given: list[Future[Any]] = [pool.submit(_do_nth, n) for n in range(len(tasks))]
         for done in as_completed(given):
             yield done.result()
     except BrokenProcessPool:
@@ -90,6 +91,21 @@ def _without_interrupts() -> Iterator[None]:
             signal.signal(signal.SIGINT, before)
     if came:
         signal.raise_signal(signal.SIGINT)
+
+
+_given: tuple[Callable[[Any], Any], Sequence[Any]]
+
+
+def _begin(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> None:
+    """A worker knows what to do before it is told which."""
+    global _given  # noqa: PLW0603
+    _given = do, tasks
+    _obey_parent()
+
+
+def _do_nth(n: int) -> Any:
+    do, tasks = _given
+    return do(tasks[n])
 
 
 def _obey_parent() -> None:
