@@ -7,8 +7,9 @@ import math
 import re
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict
 from threading import Lock
+from types import SimpleNamespace
 from typing import Any
 
 from edge.core.vehicle import (
@@ -80,9 +81,10 @@ class Px4Telemetry:
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._state = VehicleState()
-        # What was made last: of which state, with which other fields.
-        self._told: tuple[VehicleState, dict[str, Any], VehicleState] | None = None
+        # The fields of a `VehicleState` in the making.
+        self._heard = SimpleNamespace(**asdict(VehicleState()))
+        # What was made of it last, unless it has changed since: with which other fields.
+        self._told: tuple[dict[str, Any], VehicleState] | None = None
         self._clock = _VehicleClock()
         self._twin = _TwinWatch()
         self._sys_status_at_s = -math.inf
@@ -128,20 +130,20 @@ class Px4Telemetry:
         same object.
         """
         with self._lock:
-            state = self._state
-            fields = of_link | {"connected": now_s - state.heartbeat_at_s < _CONNECTED_WITHIN_S}
-            armable = state.armable
+            heard = self._heard
+            fields = of_link | {"connected": now_s - heard.heartbeat_at_s < _CONNECTED_WITHIN_S}
+            armable = heard.armable
             if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
                 armable = None
                 fields |= dict.fromkeys(("armable", "battery", "voltage_v", "remote_control"))
-            if state.armed:
+            if heard.armed:
                 told = self._events.told(self._told_since_s(now_s))
-                fields["warnings"] = without_repetition((*told, *self._events.wrong(state.mode)))
+                fields["warnings"] = without_repetition((*told, *self._events.wrong(heard.mode)))
             elif not armable:
                 fields["problems"] = self._why_not_armed(now_s - _TOLD_FOR_S)
-            if self._told is None or self._told[0] is not state or self._told[1] != fields:
-                self._told = state, fields, replace(state, **fields)
-            return self._told[2]
+            if self._told is None or self._told[0] != fields:
+                self._told = fields, VehicleState(**vars(heard) | fields)
+            return self._told[1]
 
     def needs_origin(self) -> bool:
         """Whether the position jumped, and an origin that is as new has not come yet."""
@@ -174,7 +176,7 @@ class Px4Telemetry:
         since_s = now_s - _TOLD_FOR_S
         return (
             min(since_s, self._failsafe_at_s - _FAILSAFE_LATE_S)
-            if self._state.failsafe
+            if self._heard.failsafe
             else since_s
         )
 
@@ -182,19 +184,20 @@ class Px4Telemetry:
         """By PX4's checks; a vehicle that does not tell them may have said it in a text."""
         texts = {text: None for at_s, text in self._texts if at_s >= since_s}
         said = tuple(AutopilotReason("text", (), text) for text in texts)
-        return self._events.why_not_armed(self._state.mode) or said
+        return self._events.why_not_armed(self._heard.mode) or said
 
     def _change(self, **changes: Any) -> None:
-        self._state = replace(self._state, **changes)
+        vars(self._heard).update(changes)
+        self._told = None
 
     def _on_heartbeat(self, fields: Fields, now_s: float) -> None:
         if fields["autopilot"] == _AUTOPILOT_INVALID:
             return
         failsafe = fields["system_status"] in (_CRITICAL, _EMERGENCY)
-        if failsafe and not self._state.failsafe:
+        if failsafe and not self._heard.failsafe:
             self._failsafe_at_s = now_s
         armed = bool(fields["base_mode"] & _SAFETY_ARMED)
-        if armed and not self._state.armed:
+        if armed and not self._heard.armed:
             self._change(height_jumped_m=0.0)
         self._change(
             mode=Mode(mode_name(fields["custom_mode"])),
@@ -218,7 +221,7 @@ class Px4Telemetry:
     def _on_gps_raw_int(self, fields: Fields, now_s: float) -> None:
         hundredths, satellites = fields["eph"], fields["satellites_visible"]
         accuracy_mm, has_fix = fields["h_acc"], fields["fix_type"] >= _FIX_3D
-        at_s = -math.inf if self._state.gps is None else self._state.gps.at_s
+        at_s = -math.inf if self._heard.gps is None else self._heard.gps.at_s
         if fields["time_usec"] != self._gps_time_us:
             # PX4 goes on telling of a receiver from which nothing comes any more.
             self._gps_time_us, at_s = fields["time_usec"], now_s - self._clock.delay_s
@@ -239,7 +242,7 @@ class Px4Telemetry:
 
     def _offset_m(self, place: GlobalOrigin) -> float | None:
         """How far in the plane a place is from the newest position."""
-        origin, position_m = self._state.origin, self._state.position_local_m
+        origin, position_m = self._heard.origin, self._heard.position_local_m
         if origin is None or position_m is None:
             return None
         north_m, east_m, _ = _shift_m(origin, place)
@@ -270,7 +273,7 @@ class Px4Telemetry:
             fields["latitude"] / 1e7, fields["longitude"] / 1e7, fields["altitude"] / 1e3
         )
         self._origin_at_s = now_s
-        if self._state.position_local_m is None:
+        if self._heard.position_local_m is None:
             self._change(origin=self._origin)
 
     def _on_local_position_ned(self, fields: Fields, now_s: float) -> None:
@@ -282,23 +285,23 @@ class Px4Telemetry:
         was_held_back = self._jump_at_s is not None
         if self._is_held_back(position_m, velocity_m_s, at_s, now_s):
             return
-        state = self._state
-        changed = (position_m, velocity_m_s) != (state.position_local_m, state.velocity_local_m_s)
-        between_s = max(at_s - state.position_at_s, 0.0)
+        heard = self._heard
+        changed = (position_m, velocity_m_s) != (heard.position_local_m, heard.velocity_local_m_s)
+        between_s = max(at_s - heard.position_at_s, 0.0)
         off_m = self._off_m(position_m, velocity_m_s, between_s, self._origin)
         # That it jumped was seen at once: the time that it was held back makes it no motion.
-        unexplained = was_held_back and self._origin == state.origin
+        unexplained = was_held_back and self._origin == heard.origin
         uncertain_s = 0.0 if unexplained else between_s
         jumped = _is_jump(off_m, uncertain_s)
-        height_jumped_m = state.height_jumped_m
-        if jumped and state.armed and between_s <= _HEIGHT_JUMP_WITHIN_S:
+        height_jumped_m = heard.height_jumped_m
+        if jumped and heard.armed and between_s <= _HEIGHT_JUMP_WITHIN_S:
             height_jumped_m -= off_m[2]
         self._change(
             position_local_m=position_m,
             velocity_local_m_s=velocity_m_s,
             position_at_s=at_s,
-            position_changed_at_s=at_s if changed else state.position_changed_at_s,
-            jumped_at_s=at_s if jumped else state.jumped_at_s,
+            position_changed_at_s=at_s if changed else heard.position_changed_at_s,
+            jumped_at_s=at_s if jumped else heard.jumped_at_s,
             height_jumped_m=height_jumped_m,
             origin=self._origin,
         )
@@ -307,15 +310,15 @@ class Px4Telemetry:
         self, position_m: Vector, velocity_m_s: Vector, at_s: float, now_s: float
     ) -> bool:
         """Whether the position may belong to another origin than the one that is known."""
-        if self._origin != self._state.origin:
+        if self._origin != self._heard.origin:
             self._jump_at_s = None
         elif self._jump_at_s is not None:
             answered = self._origin_at_s > self._jump_at_s
             if answered or now_s - self._jump_at_s > _ORIGIN_ANSWER_S:
                 self._jump_at_s = None
         else:
-            between_s = max(at_s - self._state.position_at_s, 0.0)
-            off_m = self._off_m(position_m, velocity_m_s, between_s, self._state.origin)
+            between_s = max(at_s - self._heard.position_at_s, 0.0)
+            off_m = self._off_m(position_m, velocity_m_s, between_s, self._heard.origin)
             if _is_jump(off_m, between_s):
                 self._jump_at_s = now_s
         return self._jump_at_s is not None
@@ -328,8 +331,8 @@ class Px4Telemetry:
         origin: GlobalOrigin | None,
     ) -> Vector:
         """How far a position from that origin lies from where motion led from the last one."""
-        last_m, last_m_s = self._state.position_local_m, self._state.velocity_local_m_s
-        last_origin = self._state.origin
+        last_m, last_m_s = self._heard.position_local_m, self._heard.velocity_local_m_s
+        last_origin = self._heard.origin
         if last_m is None or last_m_s is None:
             return 0.0, 0.0, 0.0
         shift_m = (0.0, 0.0, 0.0)

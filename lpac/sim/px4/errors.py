@@ -57,7 +57,8 @@ class Wave(NamedTuple):
 
     def at(self, time_s: float) -> float:
         """How far it has walked since time 0."""
-        return self.about(time_s) - self.about(0.0)
+        now_rad = self.rate_rad_s * time_s + self.phase_rad
+        return self.amplitude * (math.sin(now_rad) - math.sin(self.phase_rad))
 
     def about(self, time_s: float) -> float:
         """How far it is from its middle."""

@@ -134,9 +134,11 @@ class Estimator:
     def _follow(self, jump_m: F64, dt_s: float) -> None:
         """Go after a fix that jumped; where that is too far to be true, wait, then start over."""
         off_m = jump_m - self._followed_m
-        if math.hypot(*off_m) <= GPS_GATE_M:
+        far_m = math.hypot(*off_m.tolist())
+        if far_m <= GPS_GATE_M:
             self._rejects_since_s = math.inf
-            self._followed_m = self._followed_m + off_m * (dt_s / GPS_FOLLOW_S)
+            if far_m:
+                self._followed_m = self._followed_m + off_m * (dt_s / GPS_FOLLOW_S)
         else:
             self._rejects_since_s = min(self._rejects_since_s, self._time_s)
             if self._time_s - self._rejects_since_s >= GPS_REJECTED_S:

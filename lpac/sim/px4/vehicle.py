@@ -115,6 +115,10 @@ class SimulatedSensor(Enum):
     BATTERY = "battery"
 
 
+# North, east, down: single numbers, which cost a tenth of what arrays of three do.
+_Vector = tuple[float, float, float]
+_STILL: _Vector = (0.0, 0.0, 0.0)
+
 _ARMED_BY, _DISARMED_BY = 9489139, 16017271
 _BY_COMMAND, _BY_LANDING, _BEFORE_FLIGHT, _BY_FAILSAFE = 4, 6, 7, 14
 _ARMING_DENIED, _DISARMING_DENIED = 133277, 9091509
@@ -535,10 +539,11 @@ class Px4Vehicle:
         self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + VERTICAL_DRIFT_M_S * float(
             draws[6]
         ) * math.sqrt(2.0 * decay)
-        decay = dt_s / WIND_COMPENSATION_S
-        self._gust = self._gust * (1.0 - decay) + self.gust_m_s * draws[7:10] * math.sqrt(
-            2.0 * decay
-        )
+        if self.gust_m_s or self._gust.any():
+            decay = dt_s / WIND_COMPENSATION_S
+            self._gust = self._gust * (1.0 - decay) + self.gust_m_s * draws[7:10] * math.sqrt(
+                2.0 * decay
+            )
 
     def _watch_sensors(self) -> None:
         if self.dead_sensors or self._dead_since_s:
@@ -770,25 +775,27 @@ class Px4Vehicle:
         if not self.armed:
             self._fall(dt_s)
             return
-        velocity_m_s, yaw_rad, lag_s = self._command()
-        velocity_m_s = self._limit(velocity_m_s)
+        command, yaw_rad, lag_s = self._command()
+        to_north, to_east, to_down = self._limit(command)
         on_ground = self.position_m[2] >= 0.0
-        if on_ground and velocity_m_s[2] >= 0.0:
-            velocity_m_s = np.zeros(3)
-        acceleration = (velocity_m_s - self.velocity_m_s) / (lag_s, lag_s, self._airframe.lag_s)
+        if on_ground and to_down >= 0.0:
+            to_north = to_east = to_down = 0.0
         parameters = self.parameters
-        acceleration[:2] = _shorten(acceleration[:2], parameters["MPC_ACC_HOR"])
+        v_north, v_east, v_down = self.velocity_m_s.tolist()
+        north, east = _shorten(
+            (to_north - v_north) / lag_s, (to_east - v_east) / lag_s, parameters["MPC_ACC_HOR"]
+        )
         if self._compass_rad:
             # It takes its nose to be where it is not, and so pushes the wrong way.
             cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
-            north, east = acceleration[:2].tolist()
-            acceleration[:2] = cos * north + sin * east, cos * east - sin * north
+            north, east = cos * north + sin * east, cos * east - sin * north
         built_in_loss = 0.0 if self._errors is None else self._errors.thrust_loss
         thrust = 1.0 - max(built_in_loss, self.motor_loss)
-        acceleration[2] = min(
-            max(acceleration[2], -thrust * parameters["MPC_ACC_UP_MAX"]),
+        down = min(
+            max((to_down - v_down) / self._airframe.lag_s, -thrust * parameters["MPC_ACC_UP_MAX"]),
             parameters["MPC_ACC_DOWN_MAX"],
         )
+        acceleration = np.array([north, east, down])
         unmet_m_s = self.air_m_s - self.compensated_wind_m_s
         if not on_ground:
             # However slowly it follows a command, it holds against a push as ever.
@@ -824,23 +831,25 @@ class Px4Vehicle:
         self.yaw_rate_rad_s = min(max(error_rad / dt_s, -YAW_RATE_RAD_S), YAW_RATE_RAD_S)
         self.heading_rad = (self.heading_rad + self.yaw_rate_rad_s * dt_s) % math.tau
 
-    def _limit(self, velocity_m_s: F64) -> F64:
+    def _limit(self, command: _Vector) -> _Vector:
         """The vehicle's own speed limits, the ramp of a takeoff, and what the wind leaves."""
         parameters = self.parameters
-        horizontal = _shorten(velocity_m_s[:2], parameters["MPC_XY_VEL_MAX"])
-        wind = self.air_m_s[:2]
-        horizontal = _shorten(horizontal - wind, self._airframe.max_airspeed_m_s) + wind
-        down = max(velocity_m_s[2], -parameters["MPC_Z_VEL_MAX_UP"])
+        north, east = _shorten(command[0], command[1], parameters["MPC_XY_VEL_MAX"])
+        wind_north, wind_east, _ = self.air_m_s.tolist()
+        north, east = _shorten(
+            north - wind_north, east - wind_east, self._airframe.max_airspeed_m_s
+        )
+        down = max(command[2], -parameters["MPC_Z_VEL_MAX_UP"])
         down = down * self._ramp() if down < 0.0 else min(down, parameters["MPC_Z_VEL_MAX_DN"])
-        if self.position_m[2] >= 0.0:
-            # The first command upwards after spool-up starts the ramp.
-            spooled = self.time_s - self._armed_at_s >= parameters["COM_SPOOLUP_TIME"]
-            if spooled and velocity_m_s[2] < -0.1 and self._lift_began_s is None:
-                self._lift_began_s = self.time_s
-            if velocity_m_s[2] >= -0.1:
-                self._lift_began_s = None
-            horizontal = np.zeros(2)
-        return np.array([horizontal[0], horizontal[1], down])
+        if self.position_m[2] < 0.0:
+            return north + wind_north, east + wind_east, down
+        # The first command upwards after spool-up starts the ramp.
+        spooled = self.time_s - self._armed_at_s >= parameters["COM_SPOOLUP_TIME"]
+        if spooled and command[2] < -0.1 and self._lift_began_s is None:
+            self._lift_began_s = self.time_s
+        if command[2] >= -0.1:
+            self._lift_began_s = None
+        return 0.0, 0.0, down
 
     def _ramp(self) -> float:
         if self._lift_began_s is None:
@@ -848,15 +857,16 @@ class Px4Vehicle:
         ramp_s = self.parameters["MPC_TKO_RAMP_T"]
         return min(1.0, (self.time_s - self._lift_began_s) / ramp_s) if ramp_s > 0.0 else 1.0
 
-    def _command(self) -> tuple[F64, float, float]:
+    def _command(self) -> tuple[_Vector, float, float]:
         """Velocity, world frame, m/s; yaw, rad or NaN; horizontal lag, s."""
         lag_s = self._airframe.lag_s
         if self.landed and self.mode not in CAN_LEAVE_GROUND:
-            return np.zeros(3), math.nan, lag_s
+            return _STILL, math.nan, lag_s
+        wind_north, wind_east, _ = self.air_m_s.tolist()
         if self.mode is Px4Mode.DESCEND:
-            descent = [*self.air_m_s[:2], self.parameters["MPC_LAND_SPEED"]]
             # Level, it is carried along by the air as fast as that drags it.
-            return np.array(descent), math.nan, 1.0 / DRAG_PER_S
+            descent = wind_north, wind_east, self.parameters["MPC_LAND_SPEED"]
+            return descent, math.nan, 1.0 / DRAG_PER_S
         if self.mode is Px4Mode.OFFBOARD and self._setpoint is not None:
             return self._follow(self._setpoint)
         if self.mode is Px4Mode.TAKEOFF:
@@ -866,80 +876,71 @@ class Px4Vehicle:
         if self.mode is Px4Mode.RETURN:
             return self._return(), math.nan, lag_s
         if self.mode in PILOTED and self._sticks_m_s.any():
-            return self._sticks_m_s, math.nan, lag_s
+            north, east, down = self._sticks_m_s.tolist()
+            return (north, east, down), math.nan, lag_s
         if self.mode in PILOTED and self.mode is not Px4Mode.POSCTL:
-            return np.array([*self.air_m_s[:2], 0.0]), math.nan, lag_s
+            return (wind_north, wind_east, 0.0), math.nan, lag_s
         return self._hold(), math.nan, lag_s
 
-    def _follow(self, setpoint: Px4Setpoint) -> tuple[F64, float, float]:
-        gains = (self.parameters["MPC_XY_P"],) * 2 + (self.parameters["MPC_Z_P"],)
-        errors_m = (setpoint.position_m - self.local_position_m).tolist()
-        drifts_m_s = (0.0, 0.0, self._vertical_drift_m_s)
-        command = np.array(
-            [
-                (0.0 if math.isnan(velocity_m_s) else velocity_m_s)
-                + (drift_m_s if math.isnan(error_m) else gain * error_m)
-                for velocity_m_s, error_m, gain, drift_m_s in zip(
-                    setpoint.velocity_m_s.tolist(), errors_m, gains, drifts_m_s, strict=True
-                )
-            ]
+    def _follow(self, setpoint: Px4Setpoint) -> tuple[_Vector, float, float]:
+        parameters = self.parameters
+        gain, gain_down = parameters["MPC_XY_P"], parameters["MPC_Z_P"]
+        off_north, off_east, off_down = (setpoint.position_m - self.local_position_m).tolist()
+        to_north, to_east, to_down = setpoint.velocity_m_s.tolist()
+        north, east = _shorten(
+            _axis(to_north, off_north, gain, 0.0),
+            _axis(to_east, off_east, gain, 0.0),
+            parameters["MPC_XY_VEL_MAX"],
         )
-        command[:2] = _shorten(command[:2], self.parameters["MPC_XY_VEL_MAX"])
+        down = _axis(to_down, off_down, gain_down, self._vertical_drift_m_s)
         airframe = self._airframe
-        bare_velocity = math.isnan(errors_m[0])
+        bare_velocity = math.isnan(off_north)
         lag_s = airframe.offboard_velocity_lag_s if bare_velocity else airframe.lag_s
-        return command, setpoint.yaw_rad, lag_s
+        return (north, east, down), setpoint.yaw_rad, lag_s
 
-    def _hold(self) -> F64:
+    def _hold(self) -> _Vector:
         """Brake, then stay where the vehicle came to rest."""
         if self._hold_m is None:
-            if math.sqrt(float(self.velocity_m_s @ self.velocity_m_s)) > STOPPED_M_S:
-                return np.zeros(3)
+            if math.hypot(*self.velocity_m_s.tolist()) > STOPPED_M_S:
+                return _STILL
             self._hold_m = self.estimated_position_m
         return self._toward(self._hold_m)
 
-    def _climb(self) -> F64:
-        command = self._hold()
+    def _climb(self) -> _Vector:
+        north, east, _ = self._hold()
         error_m = float(self.estimated_position_m[2]) - self._takeoff_down_m
         if error_m < ARRIVED_M and self._took_off:
             self._set_intended_mode(Px4Mode.HOLD)
         speed_m_s = min(error_m * self.parameters["MPC_Z_P"], self.parameters["MPC_TKO_SPEED"])
-        command[2] = -speed_m_s
-        return command
+        return north, east, -speed_m_s
 
-    def _descend(self) -> F64:
-        command = self._hold()
-        near = -self.position_m[2] < SLOW_DESCENT_BELOW_M
-        command[2] = self.parameters["MPC_LAND_SPEED" if near else "MPC_Z_VEL_MAX_DN"]
-        return command
+    def _descend(self) -> _Vector:
+        north, east, _ = self._hold()
+        return north, east, self._descent_m_s(-float(self.position_m[2]))
 
-    def _return(self) -> F64:
+    def _descent_m_s(self, height_m: float) -> float:
+        near = height_m < SLOW_DESCENT_BELOW_M
+        return self.parameters["MPC_LAND_SPEED" if near else "MPC_Z_VEL_MAX_DN"]
+
+    def _return(self) -> _Vector:
         """Climb to the return altitude, fly home, land."""
         assert self.home_m is not None
-        offset_m = self.home_m - self.estimated_position_m
-        height_m = float(offset_m[2])
-        if math.hypot(offset_m[0], offset_m[1]) < 1.0:
-            command = self._toward(self.home_m)
-            near = height_m < SLOW_DESCENT_BELOW_M
-            command[2] = self.parameters["MPC_LAND_SPEED" if near else "MPC_Z_VEL_MAX_DN"]
-            return command
-        return_height_m = self.parameters["RTL_RETURN_ALT"]
-        if height_m < return_height_m - ARRIVED_M:
-            command = self._hold()
-            command[2] = -min(return_height_m - height_m, self.parameters["MPC_Z_VEL_MAX_UP"])
-            return command
-        command = self._toward(self.home_m)
-        command[2] = 0.0
-        return command
+        off_north_m, off_east_m, height_m = (self.home_m - self.estimated_position_m).tolist()
+        if math.hypot(off_north_m, off_east_m) < 1.0:
+            north, east, _ = self._toward(self.home_m)
+            return north, east, self._descent_m_s(height_m)
+        missing_m = self.parameters["RTL_RETURN_ALT"] - height_m
+        if missing_m > ARRIVED_M:
+            north, east, _ = self._hold()
+            return north, east, -min(missing_m, self.parameters["MPC_Z_VEL_MAX_UP"])
+        north, east, _ = self._toward(self.home_m)
+        return north, east, 0.0
 
-    def _toward(self, target_m: F64) -> F64:
-        error_m = target_m - self.estimated_position_m
-        command = np.empty(3)
-        command[:2] = _shorten(
-            self.parameters["MPC_XY_P"] * error_m[:2], self.parameters["MPC_XY_CRUISE"]
-        )
-        command[2] = self.parameters["MPC_Z_P"] * error_m[2]
-        return command
+    def _toward(self, target_m: F64) -> _Vector:
+        off_north, off_east, off_down = (target_m - self.estimated_position_m).tolist()
+        gain, gain_down = self.parameters["MPC_XY_P"], self.parameters["MPC_Z_P"]
+        north, east = _shorten(gain * off_north, gain * off_east, self.parameters["MPC_XY_CRUISE"])
+        return north, east, gain_down * off_down
 
     # Ground
 
@@ -997,6 +998,15 @@ class Px4Vehicle:
         return "velocity" if math.isnan(self._setpoint.position_m[0]) else "position"
 
 
-def _shorten(vector: F64, length: float) -> F64:
-    norm = math.sqrt(float(vector @ vector))
-    return vector if norm <= length else vector * (length / norm)
+def _axis(velocity_m_s: float, error_m: float, gain: float, drift_m_s: float) -> float:
+    """What a setpoint asks for along one axis, where a NaN asks for nothing."""
+    feed_m_s = 0.0 if math.isnan(velocity_m_s) else velocity_m_s
+    return feed_m_s + (drift_m_s if math.isnan(error_m) else gain * error_m)
+
+
+def _shorten(north: float, east: float, length: float) -> tuple[float, float]:
+    norm = math.hypot(north, east)
+    if norm <= length:
+        return north, east
+    share = length / norm
+    return share * north, share * east

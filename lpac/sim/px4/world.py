@@ -33,9 +33,12 @@ class WorldOrigin:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FencePolygon:
-    """Where the vehicle must stay (or must not go): (latitude, longitude) in deg, in order."""
+    """Where the vehicle must stay (or must not go): (latitude, longitude) in deg, in order.
+
+    Each is its own: to compare their corners fifty times a second costs more than all else here.
+    """
 
     inclusion: bool
     vertices_deg: tuple[tuple[float, float], ...]
