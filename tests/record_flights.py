@@ -536,7 +536,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "remote_control_lost_lands": (
         _remote_control_lost, {"failsafe": {"rc": "pilot", "rc_lost": "land"}},
     ),
-    "near_neighbour": (_near_neighbour, {}),
+    "near_neighbour": (_near_neighbour, _PILOTED),
     "comes_down_above": (_comes_down_above, {}),
     "landing_point_taken": (_landing_point_taken, {}),
     "offboard_refused": (_offboard_refused, {}),

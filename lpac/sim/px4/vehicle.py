@@ -366,9 +366,13 @@ class Px4Vehicle:
 
     @property
     def rc_heard(self) -> bool:
-        """Whether somebody's remote control is on, and heard."""
+        """Whether somebody's remote control is on, and listened to."""
         is_stale = self._errors is not None and self._errors.is_remote_control_stale(self.time_s)
-        return self.rc_connected and not is_stale
+        return self.rc_connected and not is_stale and not self._no_manual_control
+
+    @property
+    def _no_manual_control(self) -> bool:
+        return int(self.parameters["COM_RC_IN_MODE"]) == 4
 
     @property
     def battery_warning(self) -> int:
@@ -489,7 +493,7 @@ class Px4Vehicle:
             self._hold_m = None
         bit = 2 if self.mode is Px4Mode.OFFBOARD else 1
         override = int(self.parameters["COM_RC_OVERRIDE"]) & bit
-        if self.mode not in PILOTED and override and self.rc_connected and self._sticks_m_s.any():
+        if self.mode not in PILOTED and override and self.rc_heard and self._sticks_m_s.any():
             self.set_mode(Px4Mode.POSCTL)
 
     def jump_estimator_origin(self, north_m: float, east_m: float, down_m: float = 0.0) -> None:
@@ -587,7 +591,6 @@ class Px4Vehicle:
             is_there.add(Component.REMOTE_CONTROL)
         if not self._ground_station_lost():
             is_there.add(Component.COMMUNICATION_LINKS)
-        disabled = int(parameters["COM_RC_IN_MODE"]) == 4
         required = int(parameters["NAV_DLL_ACT"]) > 0
         # In flight a battery does not get better.
         self._battery_warning = max(
@@ -607,7 +610,9 @@ class Px4Vehicle:
             (self.home_m is None and self.estimator.is_ready, checks.NO_HOME),
             (
                 not self.rc_heard,
-                checks.MANUAL_CONTROL_DISABLED if disabled else checks.NO_MANUAL_CONTROL,
+                checks.MANUAL_CONTROL_DISABLED
+                if self._no_manual_control
+                else checks.NO_MANUAL_CONTROL,
             ),
             (True, battery[self._battery_warning - 1]),
             (self.silent_s(SimulatedSensor.BATTERY) > BATTERY_TIMEOUT_S, checks.BATTERY_SILENT),
@@ -705,7 +710,7 @@ class Px4Vehicle:
         setting = int(self.parameters["COM_OBL_RC_ACT"])
         if setting in OFFBOARD_LOSS_ACTIONS:
             return OFFBOARD_LOSS_ACTIONS[setting]
-        if self.rc_connected:
+        if self.rc_heard:
             return FailsafeAction.POSCTL
         return LINK_LOSS_ACTIONS.get(int(self.parameters["NAV_RCL_ACT"]), FailsafeAction.NONE)
 
@@ -714,7 +719,7 @@ class Px4Vehicle:
         if (
             not self._rc_at_arming
             or self.rc_heard
-            or int(self.parameters["COM_RC_IN_MODE"]) == 4
+            or self._no_manual_control
             or int(self.parameters["COM_RCL_EXCEPT"]) & excepted
         ):
             return FailsafeAction.NONE

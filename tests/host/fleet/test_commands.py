@@ -160,6 +160,8 @@ def test_a_vehicle_whose_program_is_gone_is_landed_over_ssh(operator: Operator) 
         with r2.stepped:
             r2.vehicle.take_off(math.nan)
             assert r2.stepped.wait_for(lambda: r2.vehicle.position_m[2] < -1.0, 120.0)
+            listens_to = r2.vehicle.parameters["COM_RC_IN_MODE"]
+            r2.vehicle.parameters["COM_RC_IN_MODE"] = 3
             r2.vehicle.pilot()
         assert land(1)["problem"] == "a pilot flies it (position): he lands it"
         with r2.stepped:
@@ -174,6 +176,7 @@ def test_a_vehicle_whose_program_is_gone_is_landed_over_ssh(operator: Operator) 
             assert r2.vehicle.mode is Px4Mode.LAND
             assert r2.stepped.wait_for(lambda: not r2.vehicle.armed, 120.0)
             r2.vehicle.rc_connected = False
+            r2.vehicle.parameters["COM_RC_IN_MODE"] = listens_to
     operator.json("start", "--robots", "r2")
 
 

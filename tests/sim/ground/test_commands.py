@@ -24,6 +24,7 @@ from lpac.ground.station.protocol import (
     Takeoff,
 )
 from lpac.sim.fleet.layout import ORIGIN
+from lpac.sim.px4.modes import Px4Mode
 from tests.said import not_done, problem
 from tests.sim.ground.field import Field, Stage, a_field
 from tests.sim.ground.test_station import OTHER_WORLD
@@ -299,7 +300,7 @@ def test_a_refusal_is_not_the_reason_of_who_left_hold_since() -> None:
     field.until(lambda: field.robots[0].said.orders)
     field.run(1.0)
     assert start.report is None  # It is asked again for a while.
-    field.robots[0].vehicle.pilot()
+    field.robots[0].vehicle.set_mode(Px4Mode.HOLD)
     field.until(lambda: start.report)
     assert start.report is not None
     (result,) = start.report.results

@@ -320,6 +320,13 @@ def test_manual_modes_need_a_remote_control() -> None:
     assert hovering().set_mode(Px4Mode.POSCTL) is MavResult.TEMPORARILY_REJECTED
 
 
+def test_nobody_takes_a_vehicle_that_listens_to_no_remote_control() -> None:
+    vehicle = in_offboard(velocity(1.0), rc=True, COM_RC_IN_MODE=4, COM_RC_OVERRIDE=3)
+    assert vehicle.pilot(Px4Mode.POSCTL, (0.0, -2.0, 0.0)) is MavResult.TEMPORARILY_REJECTED
+    run(vehicle, 3.0, velocity(1.0))
+    assert mode_of(vehicle) is Px4Mode.OFFBOARD
+
+
 # Other failsafes
 
 

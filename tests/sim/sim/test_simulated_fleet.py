@@ -36,6 +36,7 @@ from lpac.ground.station.protocol import (
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
+from lpac.sim.fleet.pilot import FOR_A_PILOT
 from lpac.sim.fleet.recorded import RecordingError
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
@@ -77,9 +78,13 @@ def to_mission(ground: SimulatedGround) -> Procedure[None]:
 
 
 @cache
-def _in_mission() -> SimulatedFleet:
+def _in_mission(for_a_pilot: bool = False) -> SimulatedFleet:
+    settings = FOR_A_PILOT if for_a_pilot else None
     with tempfile.TemporaryDirectory() as folder:
-        fleet = a_fleet(Path(folder), robots=2)
+        scenario = FleetScenario(robots=2, seed=3)
+        fleet = SimulatedFleet(scenario, Path(folder), SHIPPED, settings=settings)
+    for each in fleet.vehicles:
+        each.vehicle.rc_connected = for_a_pilot
     fleet.ground.carry_out(to_mission(fleet.ground))
     return fleet
 
@@ -90,8 +95,8 @@ def in_mission() -> SimulatedFleet:
 
 
 @cache
-def _on_their_way() -> SimulatedFleet:
-    fleet = in_mission()
+def _on_their_way(for_a_pilot: bool) -> SimulatedFleet:
+    fleet = _in_mission(for_a_pilot).copy()
     fleet.ground.carry_out(_pass(8.0))
     return fleet
 
@@ -206,7 +211,7 @@ def killed(fleet: SimulatedFleet) -> None:
 def test_a_robot_says_what_befell_it_and_the_other_flies_on(
     fault: Callable[[SimulatedFleet], None], state: FlightState, reason: ReasonCode
 ) -> None:
-    fleet = _on_their_way().copy()
+    fleet = _on_their_way(for_a_pilot=fault is flown_by_a_pilot).copy()
     fault(fleet)
 
     def says_so(told: FleetSnapshot) -> bool:
