@@ -21,6 +21,7 @@ BENCHES = (
     "payloads",
     "stolen_key",
     "flood",
+    "hearing",
     "loops",
     "release",
     "position",

@@ -388,8 +388,10 @@ def _out_of_range(
 ) -> Rejection | None:
     """Which number in it no honest robot says."""
     (time_s, uncertainty_s), payload = times_s, message.payload
-    numbers = (*times_s, *message.position_m, *message.velocity_m_s)
-    if not (all(map(math.isfinite, numbers)) and np.isfinite(payload).all()):
+    # NaN where one of them is.
+    largest = float(np.abs(payload).max()) if payload.size else 0.0
+    numbers = (*times_s, *message.position_m, *message.velocity_m_s, largest)
+    if not all(map(math.isfinite, numbers)):
         return Rejection.NON_FINITE
     possible = (
         message.boot_epoch < _MOST_EPOCH
@@ -400,6 +402,6 @@ def _out_of_range(
     )
     if not possible:
         return Rejection.IMPOSSIBLE
-    if payload_limit is not None and payload.size and np.abs(payload).max() > payload_limit:
+    if payload_limit is not None and largest > payload_limit:
         return Rejection.PAYLOAD_RANGE
     return None

@@ -32,6 +32,7 @@ What is out of a field's range is said as the field's greatest or least.
 """
 
 import math
+import struct
 import zlib
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -43,6 +44,8 @@ from edge.messages.mission import FlightState
 BEACON_BYTES = 64
 _HEAD = b"LB\x01"
 _CRC_AT = 60
+_FIELDS = struct.Struct("<3xH6sI6s9s3h3B2H3s6sI2HI")
+assert _FIELDS.size == BEACON_BYTES
 _STATES = tuple(FlightState)
 _ARMED, _DISARMED, _PLACED = 1, 2, 4
 _UNKNOWN = 65_535
@@ -124,20 +127,25 @@ def decode_beacon(data: bytes | memoryview) -> Beacon:
     body = bytes(data[:BEACON_BYTES])
     if not body.startswith(_HEAD):
         raise MessageError("Beacon: of another version, or none")
-    if zlib.crc32(body[:_CRC_AT]) != _number(body, _CRC_AT, 4):
+    (
+        robot_id, epoch, sequence, sent_at, place, *velocity_cm_s, state, bits, system_id,
+        accuracy_cm, flown_s, slot_height, landing_point, frame_id, bundle_tag, world_tag, checksum,
+    ) = _FIELDS.unpack(body)  # fmt: skip
+    if zlib.crc32(body[:_CRC_AT]) != checksum:
         raise MessageError("Beacon: its checksum is wrong")
-    state, bits, system_id = body[36:39]
     if state >= len(_STATES):
         raise MessageError(f"Beacon: state {state} is not known")
-    x_m, y_m, z_m = (_number(body, at, 3, signed=True) / 1e2 for at in (21, 24, 27))
-    vx_m_s, vy_m_s, vz_m_s = (_number(body, at, 2, signed=True) / 1e2 for at in (30, 32, 34))
-    accuracy_cm, flown_s = _number(body, 39, 2), _number(body, 41, 2)
+    x_m, y_m, z_m = (number / 1e2 for number in _int24s(place))
+    vx_m_s, vy_m_s, vz_m_s = (number / 1e2 for number in velocity_cm_s)
+    slot_height_m, landing_x_m, landing_y_m = (
+        number / 1e3 for number in _int24s(slot_height + landing_point)
+    )
     placed = bool(bits & _PLACED)
     return Beacon(
-        robot_id=_number(body, 3, 2),
-        boot_epoch=_number(body, 5, 6),
-        sequence=_number(body, 11, 4),
-        sent_at_s=_number(body, 15, 6) / 1e3,
+        robot_id=robot_id,
+        boot_epoch=int.from_bytes(epoch, "little"),
+        sequence=sequence,
+        sent_at_s=int.from_bytes(sent_at, "little") / 1e3,
         position_m=(x_m, y_m, z_m) if placed else None,
         velocity_m_s=(vx_m_s, vy_m_s, vz_m_s) if placed else None,
         state=_STATES[state],
@@ -145,14 +153,11 @@ def decode_beacon(data: bytes | memoryview) -> Beacon:
         system_id=system_id or None,
         gps_accuracy_m=None if accuracy_cm == _UNKNOWN else accuracy_cm / 1e2,
         flown_s=None if flown_s == _UNKNOWN else float(flown_s),
-        slot_height_m=_number(body, 43, 3, signed=True) / 1e3,
-        landing_point_m=(
-            _number(body, 46, 3, signed=True) / 1e3,
-            _number(body, 49, 3, signed=True) / 1e3,
-        ),
-        frame_id=_number(body, 52, 4),
-        bundle_tag=_number(body, 56, 2),
-        world_tag=_number(body, 58, 2),
+        slot_height_m=slot_height_m,
+        landing_point_m=(landing_x_m, landing_y_m),
+        frame_id=frame_id,
+        bundle_tag=bundle_tag,
+        world_tag=world_tag,
     )
 
 
@@ -168,5 +173,7 @@ def _packed(value: float, size: int, signed: bool) -> bytes:
     return round(min(max(value, least), greatest)).to_bytes(size, "little", signed=signed)
 
 
-def _number(data: bytes, at: int, size: int, *, signed: bool = False) -> int:
-    return int.from_bytes(data[at : at + size], "little", signed=signed)
+def _int24s(data: bytes) -> list[int]:
+    return [
+        int.from_bytes(data[at : at + 3], "little", signed=True) for at in range(0, len(data), 3)
+    ]
