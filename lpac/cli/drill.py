@@ -50,7 +50,9 @@ def drill(
         list[str] | None,
         typer.Option("--fault", metavar="NAME", help="Only this fault; may be repeated."),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Fly each fault with so many seeds, from 0 on.")] = 1,
+    seeds: Annotated[
+        int | None, typer.Option(help="Fly each fault with so many seeds, from 0 on; 1 if none.")
+    ] = None,
     seed: Annotated[
         int | None,
         typer.Option(help="Fly exactly this one; of one fault with its flight logs and a figure."),
@@ -79,8 +81,7 @@ def drill(
     if listing:
         _list(chosen)
         return
-    if seeds < 1:
-        raise ValueError(f"--seeds {seeds}: must be at least 1")
+    numbers = _numbers(seeds, seed)
     if not 2 <= robots <= 10:
         raise ValueError(f"--robots {robots}: must be from 2 to 10")
     chosen = _flown(chosen, vehicle, by_name=bool(faults))
@@ -93,15 +94,14 @@ def drill(
     elif seed is not None and len(chosen) == 1 and real_time is not None:
         outcomes = [real_time.outcome(chosen[0], seed)]
     else:
-        campaign = Campaign(out, vehicle, robots, bundle)
-        numbers = range(seeds) if seed is None else [seed]
+        campaign = Campaign(out, vehicle, robots, bundle, px4)
         flown = partial(pool(ray), fly_order) if real_time is None else real_time.fly_all
-        outcomes = _fly(campaign, chosen, list(numbers), flown)
-        result = to_json(outcomes, options)
-        (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")
-        (out / "drill.xml").write_bytes(as_junit(outcomes, options))
+        outcomes = _fly(campaign, chosen, numbers, flown)
+    result = to_json(outcomes, options)
+    (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")
+    (out / "drill.xml").write_bytes(as_junit(outcomes, options))
     if as_json:
-        typer.echo(json.dumps(to_json(outcomes, options), indent=2))
+        typer.echo(json.dumps(result, indent=2))
     else:
         _show(outcomes, options)
         if real_time is not None:
@@ -112,6 +112,17 @@ def drill(
             )
     if not all(outcome.held for outcome in outcomes):
         raise typer.Exit(1)
+
+
+def _numbers(seeds: int | None, seed: int | None) -> list[int]:
+    """The seeds to fly."""
+    if seeds is not None and seed is not None:
+        raise ValueError("--seeds and --seed: give one of them")
+    if seeds is not None and seeds < 1:
+        raise ValueError(f"--seeds {seeds}: must be at least 1")
+    if seed is not None and seed < 0:
+        raise ValueError(f"--seed {seed}: must be at least 0")
+    return list(range(seeds or 1)) if seed is None else [seed]
 
 
 def _chosen(names: list[str] | None) -> list["Fault"]:
@@ -207,10 +218,11 @@ def _fly_again(
 ) -> "FlightOutcome":
     """The same flight once more, with the robots' logs and a figure."""
     from edge.core import log
+    from lpac.analysis.truth import TRUTH, write_truth
     from lpac.sim.drill.campaign import outcome_of
     from lpac.sim.drill.figure import write_figure
     from lpac.sim.drill.simulated import SimulatedDrill
-    from lpac.sim.drill.truth import FlightTruth
+    from lpac.sim.drill.truth import FlightTruth, tracks_of
 
     log.listen(log.show_errors)
     folder.mkdir(parents=True, exist_ok=True)
@@ -218,10 +230,14 @@ def _fly_again(
     def flown() -> FlightTruth:
         truth = SimulatedDrill(robots, bundle).fly(fault, seed, logs=folder)
         write_figure(fault, truth, folder)
+        write_truth(tracks_of(truth), folder / TRUTH)
         return truth
 
     outcome = outcome_of(fault, seed, flown)
-    typer.echo(f"see {folder / 'drill.png'}; `lpac report {folder}` has more", err=True)
+    typer.echo(
+        f"see {folder / 'drill.png'}; if a mission was flown, `lpac report {folder}` has more",
+        err=True,
+    )
     return outcome
 
 

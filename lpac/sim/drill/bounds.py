@@ -354,6 +354,27 @@ class FliesOn:
 
 
 @dataclass(frozen=True, slots=True)
+class ComesBack:
+    """Once so much time has passed, it is back inside, or PX4 holds or lands it.
+
+    Inside as far as position errors explain.
+    """
+
+    within_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        edges, latest_s = flight.fence.edges(), 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(flight.fault_s, math.inf)
+            flown = part.airborne & part.armed & ~part.is_in(Px4Mode.HOLD, *LANDING)
+            for at_s, place_m in zip(part.time_s[flown], part.position_m[flown, :2], strict=True):
+                if edges.distances_m(place_m).min() < -POSITION_ERROR_M:
+                    latest_s = max(latest_s, float(at_s) - flight.fault_s)
+        return Figure("flown beyond the fence", latest_s, self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
 class Moves:
     """In its mission it gets about: the way that it flies, in the plane."""
 

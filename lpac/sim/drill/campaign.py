@@ -21,6 +21,7 @@ from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.drill.truth import FlightTruth
 from lpac.sim.kept import KeptOutcomes, code_digest
+from lpac.sim.sitl.build import build_digest
 
 _FLIGHTS = "flights.jsonl"
 # Two ticks of control that a robot left out in a flight, or as much of the vehicles' time.
@@ -97,12 +98,14 @@ def _drill(robots: int, bundle: str) -> SimulatedDrill:
 class Campaign:
     """The flights of one set-up, whose outcomes are in `folder`."""
 
-    def __init__(self, folder: Path, vehicle: str, robots: int, bundle: Path) -> None:
+    def __init__(
+        self, folder: Path, vehicle: str, robots: int, bundle: Path, px4_build: Path | None = None
+    ) -> None:
         """Raises BundleError, OSError."""
         self._robots, self._bundle = robots, str(bundle.resolve())
         flown_by = {
             "vehicle": vehicle, "robots": robots, "bundle": load_bundle(bundle).id,
-            "code": code_digest(edge, lpac),
+            "code": code_digest(edge, lpac), "px4": px4_build and build_digest(px4_build),
         }  # fmt: skip
         self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
         outcomes = map(_outcome, self._kept.lines)

@@ -11,6 +11,7 @@ from typing import Literal
 
 from lpac.sim.drill.bounds import (
     POSITION_ERROR_M,
+    ComesBack,
     Criterion,
     Down,
     FallsSilent,
@@ -190,7 +191,7 @@ _PROGRAMS = (
         does=_once(LoopHangs("control", 3.0)),
         bounds=(
             _HOLDS, MissionEnds(0.6), SentNothing(0.3, 4.9), Stands(_STANDS_AFTER_S, 20.0),
-            FliesOn(20.0),
+            NotLandedBefore(20.0), FliesOn(20.0),
         ),
     ),
     Fault(
@@ -227,13 +228,19 @@ _PROGRAMS = (
         name="policy-dies", what="a robot's policy gives no answer any more",
         promise="the robot holds within 1 s, until start is ordered, which is refused",
         does=(*_once(LoopHangs("policy", EVER)), Do(8.0, OperatorOrders("start"))),
-        bounds=(MissionEnds(1.3), Stands(4.0, 20.0), FliesOn(20.0), LandsAtPad(_AT_PAD_M, "all")),
+        bounds=(
+            MissionEnds(1.3), Stands(4.0, 20.0), NotLandedBefore(20.0), FliesOn(20.0),
+            LandsAtPad(_AT_PAD_M, "all"),
+        ),
     ),
     Fault(
         name="sensor-dies", what="a robot's perception gives nothing any more",
         promise="the robot holds within 2 s",
         does=_once(LoopHangs("perception", EVER)),
-        bounds=(MissionEnds(2.3), Stands(5.0, 20.0), FliesOn(20.0), LandsAtPad(_AT_PAD_M, "all")),
+        bounds=(
+            MissionEnds(2.3), Stands(5.0, 20.0), NotLandedBefore(20.0), FliesOn(20.0),
+            LandsAtPad(_AT_PAD_M, "all"),
+        ),
     ),
     Fault(
         name="autopilot-silent",
@@ -280,6 +287,13 @@ _RADIO = (
         promise="they are forgotten after 0.8 s; the mission goes on",
         does=_once(RadioCut("from each other")), hits=0,
         bounds=(FliesOn(20.0, 0.95, "all"),),
+    ),
+    Fault(
+        name="neighbours-silent-before",
+        what="robots hear nothing of each other before takeoff, but the ground",
+        promise="nobody takes off: they would not keep apart",
+        phase="ready", does=_once(RadioCut("from each other")), hits=0, home=False,
+        bounds=(StaysDown("all"),),
     ),
     Fault(
         name="ground-lost", what="no robot hears the ground any more, nor it them, for 10 s",
@@ -338,7 +352,7 @@ _RADIO = (
     ),
     Fault(
         name="radio-late", what="all messages come 3 s late, 1.5 to 4.5 s",
-        promise="late messages are not used; the ground is lost while its newest word is 3 s old",
+        promise="who has no word of the ground that is younger than 3 s holds; nobody lands",
         does=_once(RadioIs(delay_s=3.0)), hits=0, watched_s=30.0,
         bounds=(NotLandedBefore(30.0, "all"), LandsAtPad(_AT_PAD_M, "all")),
     ),
@@ -346,7 +360,7 @@ _RADIO = (
         name="radio-very-late", what="all messages come 8 s late, 4 to 12 s",
         promise="a late ground is a lost one: hold after 3 s; it still lands them",
         does=_once(RadioIs(delay_s=8.0)), hits=0, watched_s=30.0,
-        bounds=(MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all")),
+        bounds=(MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), Lands(14.0, "all")),
     ),
     Fault(
         name="radio-repeats", what="all messages come twice, and overtake each other",
@@ -547,7 +561,7 @@ _ENERGY_AND_AIR = (
         name="battery-silent", what="nothing is told of a robot's battery any more",
         promise="an alarm; the mission goes on",
         does=_once(SensorDies(SimulatedSensor.BATTERY)),
-        bounds=(FliesOn(20.0),),
+        bounds=(FliesOn(20.0, 0.9, "all"),),
     ),
     Fault(
         name="storm", what="a storm of 16 m/s carries a robot over the fence, for 10 s",
@@ -555,7 +569,7 @@ _ENERGY_AND_AIR = (
         uncovered="wind beyond its airspeed carries it, whatever it is told",
         does=(*_once(WindBlows(_STORM_M_S)), Do(_STORM_S, WindBlows())), watched_s=90.0,
         beyond_fence_m=POSITION_ERROR_M + 5.0 + _CARRIED_M,
-        bounds=(FliesOn(20.0),),
+        bounds=(ComesBack(_STORM_S + 30.0), FliesOn(20.0)),
     ),
     Fault(
         name="gusts", what="gusts of 2 m/s (standard deviation) besides the wind, on all",
@@ -617,7 +631,9 @@ _PEOPLE = (
         name="ground-station-holds-it", what="somebody's ground station sets PX4's hold",
         promise="the program lets go: nothing is sent to it any more, until rejoin",
         does=(*_once(ModeIs(Px4Mode.HOLD)), Do(12.0, OperatorOrders("rejoin"))),
-        bounds=(FallsSilent(1.2, 11.9), Stands(3.0, 20.0), FliesOn(20.0)),
+        bounds=(
+            FallsSilent(1.2, 11.9), Stands(3.0, 20.0), NotLandedBefore(20.0), FliesOn(20.0),
+        ),
     ),
     Fault(
         name="ground-station-lands-it", what="somebody's ground station sets PX4's landing",
@@ -648,7 +664,9 @@ _PEOPLE = (
         name="held", what="the operator holds all",
         promise="they stand where they are, until start is ordered",
         does=(Do(0.0, OperatorOrders("hold"), "all"),), hits=0,
-        bounds=(MissionEnds(0.6, whose="all"), Stands(4.0, 20.0, "all")),
+        bounds=(
+            MissionEnds(0.6, whose="all"), Stands(4.0, 20.0, "all"), NotLandedBefore(20.0, "all"),
+        ),
     ),
     Fault(
         name="second-ground", what="a second operator's ground joins, and commands nothing",
@@ -742,7 +760,10 @@ _PAIRS = (
         name="critical-and-held", what="a critical battery, and the operator holds all 1 s later",
         promise="the landing comes before the hold",
         does=(*_once(Drain(0.145)), Do(5.0, OperatorOrders("hold"), "all")),
-        bounds=(Lands(3.5), Down(_LANDING_S), Stands(9.0, 20.0, "others")),
+        bounds=(
+            Lands(3.5), Down(_LANDING_S), Stands(9.0, 20.0, "others"),
+            NotLandedBefore(20.0, "others"),
+        ),
     ),
     Fault(
         name="critical-while-piloted", what="a battery is critical while a pilot flies",
@@ -814,13 +835,19 @@ _PAIRS = (
         name="hangs-on-a-bad-radio", what="a program stops for 4 s while half of all is lost",
         promise="it holds until start is ordered; the others fly on",
         does=_once(RadioIs(loss=0.5), ProgramStops(4.0)),
-        bounds=(_HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
+        bounds=(
+            _HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), NotLandedBefore(20.0),
+            FliesOn(20.0),
+        ),
     ),
     Fault(
         name="origin-jumps-as-it-hangs", what="a control loop hangs for 2 s; the origin jumps",
         promise="it holds where it is",
         does=(*_once(LoopHangs("control", 2.0)), Do(1.0, OriginJumps((5.6, -4.2, 0.0)))),
-        bounds=(_HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), FliesOn(20.0)),
+        bounds=(
+            _HOLDS, MissionEnds(0.6), Stands(_STANDS_AFTER_S, 20.0), NotLandedBefore(20.0),
+            FliesOn(20.0),
+        ),
     ),
     Fault(
         name="rejoin-without-gps", what="a pilot has a robot that loses GPS; rejoin is ordered",

@@ -63,6 +63,10 @@ class FaultyFleet(ABC):
     def now_s(self) -> float:
         """The vehicles' clock."""
 
+    @abstractmethod
+    def unix_now_s(self) -> float:
+        """Unix time, as whoever writes the robots' logs has it."""
+
     @property
     @abstractmethod
     def vehicles(self) -> Sequence[FaultyVehicle]:
@@ -139,7 +143,7 @@ class FaultyFleet(ABC):
         return FlightTruth(
             self.vehicle_truths(), timeline.hit, timeline.fault_s, timeline.calm_s, timeline.marks,
             tuple(self.orders), layout.fence, layout.pads_m, layout.scenario.budget.drone_m,
-            self.late_s(), self.wanders_m_s,
+            self.late_s(), self.wanders_m_s, self.unix_now_s() - self.now_s(),
         )  # fmt: skip
 
     # Where vehicles are

@@ -191,6 +191,10 @@ class ProcessField(FaultyFleet):
                 for robot in robots:
                     self._inject_program(injection, robot)
 
+    def unix_now_s(self) -> float:
+        """This machine's."""
+        return time.time()
+
     def late_s(self) -> float:
         """As it was in `fly`."""
         return self._late_s

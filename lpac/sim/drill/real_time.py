@@ -7,13 +7,14 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 
 from edge.core import log
+from lpac.analysis.truth import TRUTH, write_truth
 from lpac.sim.cores import over_processes
 from lpac.sim.drill.campaign import LATE_S, FlightOutcome, FlightTask, outcome_of
 from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.field import has_remote_control, scenario_of, settings_of
 from lpac.sim.drill.figure import write_figure
 from lpac.sim.drill.processes import process_field
-from lpac.sim.drill.truth import FlightTruth
+from lpac.sim.drill.truth import FlightTruth, tracks_of
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.sitl.build import require_build
@@ -91,4 +92,5 @@ class RealTimeDrill:
             timeline = field.fly(fault, seed)
         truth = field.truth(timeline)
         write_figure(fault, truth, folder)
+        write_truth(tracks_of(truth), folder / TRUTH)
         return truth

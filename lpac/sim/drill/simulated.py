@@ -86,6 +86,10 @@ class SimulatedField(FaultyFleet):
         """The simulated clock."""
         return self.fleet.schedule.monotonic_s()
 
+    def unix_now_s(self) -> float:
+        """Of all clocks that were not stepped."""
+        return self.fleet.schedule.unix_s()
+
     def at(self, after_s: float, do: Do, hit: tuple[int, ...]) -> None:
         """Have something happen, so much later."""
         self.fleet.schedule.at(self.now_s() + after_s, partial(self.happen, do, hit))

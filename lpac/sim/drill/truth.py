@@ -13,6 +13,7 @@ import numpy.typing as npt
 from edge.core import F64, Bools
 from edge.core.fence import Fence
 from edge.core.frames import LocalTransform
+from lpac.analysis.truth import TrueTrack
 from lpac.sim.px4.modes import PILOTED, Px4Mode
 from lpac.sim.px4.vehicle import Truth
 
@@ -83,6 +84,7 @@ class FlightTruth:
     further times by their names. `pads_m` (N, 2) is where they really stood at first. `late_s` is
     how far the machine that flew it was behind real time; 0 on a simulated clock. `wanders_m_s` is
     how much faster than a simulated one a vehicle at rest may be, after an estimate that wanders.
+    `unix_s` is Unix time when the vehicles' clock was 0.
     """
 
     vehicles: tuple[VehicleTruth, ...]
@@ -96,6 +98,7 @@ class FlightTruth:
     drone_m: float
     late_s: float = 0.0
     wanders_m_s: float = 0.0
+    unix_s: float = 0.0
 
     @property
     def others(self) -> tuple[int, ...]:
@@ -105,6 +108,14 @@ class FlightTruth:
     def ordered(self, kind: str, robot: int) -> list[GivenOrder]:
         """All orders of that kind to the robot."""
         return [each for each in self.orders if each.kind == kind and robot in each.robots]
+
+
+def tracks_of(flight: FlightTruth) -> dict[int, TrueTrack]:
+    """Where each robot's vehicle was, in Unix time, for `lpac report`."""
+    return {
+        robot: TrueTrack(v.time_s + flight.unix_s, v.position_m, v.airborne)
+        for robot, v in enumerate(flight.vehicles)
+    }
 
 
 def vehicle_truth(entries: Sequence[Truth], to_mission: LocalTransform) -> VehicleTruth:

@@ -7,6 +7,7 @@ would all send to one port. What really happened is in PX4's log, which is read 
 """
 
 import fcntl
+import hashlib
 import json
 import math
 import os
@@ -40,6 +41,7 @@ from lpac.sim.sitl import ordinary
 from lpac.sim.sitl.log import read_setpoints, read_truth
 
 MAX_INSTANCES = 10
+_PROGRAM = Path("bin", "px4")
 LISTEN_PORT = 14580
 CLIENT_PORT = 14540
 GROUND_PORT = 18570
@@ -299,7 +301,7 @@ class Px4Build:
         with (folder / "px4.log").open("wb") as output:
             instance.process = subprocess.Popen(
                 [sys.executable, "-I", ordinary.__file__, str(os.getpid()),
-                 str(self.build / "bin" / "px4"), "-i", str(instance.number), "-d",
+                 str(self.build / _PROGRAM), "-i", str(instance.number), "-d",
                  str(self.build / "etc")],
                 cwd=folder, env=self._environment(instance),
                 stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
@@ -396,9 +398,15 @@ def require_build(build: Path) -> Path:
     return build
 
 
+def build_digest(build: Path) -> str:
+    """Of the program in a build: another one may fly otherwise. Raises OSError."""
+    with (build / _PROGRAM).open("rb") as program:
+        return hashlib.file_digest(program, "sha256").hexdigest()
+
+
 def _build_fault(build: Path) -> str:
     """Why a folder is no build of PX4's simulator that this machine can fly; "" if it is one."""
-    program = build / "bin" / "px4"
+    program = build / _PROGRAM
     give = (
         "give the folder that `make px4_sitl` of PX4 fills, such as "
         "PX4-Autopilot/build/px4_sitl_default"

@@ -92,7 +92,7 @@ def test_a_flight_again_is_that_flight_with_logs_and_figure(
     worst = {figure["name"]: figure["value"] for figure in told["worst"]}
     assert worst == {figure.name: figure.value for figure in first.figures}
     folder = tmp_path / "landed-1"
-    assert (folder / "drill.png").exists()
+    assert (folder / "drill.png").exists() and (tmp_path / "drill.xml").exists()
     assert len(list(folder.glob("robots/*/logs/*.mcap"))) == ROBOTS
 
 
@@ -100,6 +100,8 @@ def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
     for arguments, text in (
         (("--fault", "nothing"), "--fault nothing: there is none; `lpac drill --list` has all"),
         (("--seeds", 0), "--seeds 0: must be at least 1"),
+        (("--seed", -1), "--seed -1: must be at least 0"),
+        (("--seeds", 2, "--seed", 1), "--seeds and --seed: give one of them"),
         (("-n", 1), "--robots 1: must be from 2 to 10"),
         (("--ray", "127.0.0.1:1"), "127.0.0.1:1"),
     ):

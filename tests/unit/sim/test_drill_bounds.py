@@ -14,6 +14,7 @@ from lpac.sim.drill.bounds import (
     AllKnown,
     Apart,
     BelowCeiling,
+    ComesBack,
     ComesDownGently,
     Criterion,
     Down,
@@ -42,6 +43,7 @@ from lpac.sim.drill.bounds import (
     Whose,
     always,
 )
+from lpac.sim.drill.faults import FAULTS, Fault
 from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
 from lpac.sim.px4.modes import Px4Mode
 
@@ -123,6 +125,16 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
         InsideFence(25.0, "hit"),
         changed(WELL, position_m=after(30.0, (-20.0, 5.0, 5.0), FLOWN_M, 31.0)),
         changed(WELL, position_m=after(30.0, (-26.0, 5.0, 5.0), FLOWN_M, 31.0)),
+    ),
+    # Outside it is held, or flown as before.
+    (
+        ComesBack(3.0),
+        changed(
+            WELL,
+            position_m=after(30.0, (-7.0, 5.0, 5.0), FLOWN_M, 33.0),
+            mode=after(30.0, Px4Mode.HOLD, FIRST.mode, 33.0),
+        ),
+        changed(WELL, position_m=after(30.0, (-7.0, 5.0, 5.0), FLOWN_M, 33.0)),
     ),
     (AllKnown(), WELL, changed(WELL, position_m=after(30.0, math.nan, FLOWN_M, 30.1))),
     (AllKnown(), WELL, changed(WELL, velocity_m_s=after(30.0, math.nan, FLOWN_M, 30.1))),
@@ -207,6 +219,25 @@ def test_a_bound_sees_what_it_is_for(
 ) -> None:
     assert not bound.figure(kept).broken, bound.figure(kept)
     assert bound.figure(broken).broken, bound.figure(broken)
+
+
+HOLDING = [
+    fault for fault in FAULTS.values()
+    if any(isinstance(b, Stands) and b.until_s >= fault.watched_s for b in fault.bounds)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", HOLDING, ids=lambda fault: fault.name)
+def test_who_is_to_hold_and_lands_instead_breaks_a_promise(fault: Fault) -> None:
+    held = tuple(
+        replace(v, mode=np.where(v.mode == Px4Mode.OFFBOARD, Px4Mode.HOLD, v.mode))
+        for v in STANDS.vehicles
+    )
+    # Soon after the fault, and softly.
+    landed = tuple(replace(v, mode=after(FAULT_S + 3.0, Px4Mode.LAND, v.mode)) for v in held)
+    one = replace(STANDS, vehicles=landed)
+    waits = [bound for bound in fault.bounds if isinstance(bound, NotLandedBefore)]
+    assert any(bound.figure(one).broken for bound in waits)
 
 
 def test_what_is_not_known_is_broken() -> None:
