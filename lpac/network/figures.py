@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from lpac.analysis import style
 from lpac.network.middleware import MIDDLEWARES
-from lpac.network.results import Run, Summary, summaries
+from lpac.network.results import Run, Summary, left_out, summaries
 
 _JITTER = 0.12
 
@@ -35,7 +35,8 @@ def of_restarts(runs: Sequence[Run]) -> Figure:
                 values = [
                     factor * value
                     for run in runs
-                    if run.middleware == summary.middleware
+                    if run.met
+                    and run.middleware == summary.middleware
                     and (value := getattr(run, measure)) is not None
                 ]
                 spread = summary.measures[measure]
@@ -52,6 +53,7 @@ def of_restarts(runs: Sequence[Run]) -> Figure:
             names = [title_of(summary.middleware).replace(" ", "\n") for summary in shown]
             axes.set_xticks(range(len(shown)), names)
             style.tidy(axes)
+        figure.supxlabel(left_out(runs), fontsize=7)
         return figure
 
 
@@ -79,6 +81,7 @@ def over_robots(runs: Sequence[Run]) -> Figure:
                     loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, fontsize=7,
                     handlelength=2.8,
                 )  # fmt: skip
+        figure.supxlabel(left_out(runs), fontsize=7)
         return figure
 
 

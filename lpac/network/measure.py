@@ -253,9 +253,10 @@ def _run(
 ) -> Run:
     speaks = middleware != NOTHING
     restarted = plan.experiment == "restarts"
+    met = True
     if speaks:
         fleet.start(middleware, robots, 0)
-        fleet.meet(robots, 0)
+        met = fleet.meet(robots, 0)
     with Stream(*stations[:STREAM_STATIONS]) as stream:
         time.sleep(_STREAM_BEGINS_S)
         began, used = time.time(), _ProcessorUse()
@@ -287,6 +288,7 @@ def _run(
         seconds=last.at_s - first.at_s,
         throughput_mbit_s=8e-6 * (last.received - first.received) / (last.at_s - first.at_s),
         processor=processor,
+        met=met,
         **told,
     )
 

@@ -93,7 +93,9 @@ class Run:
     `began` is in s since 1970. `delivered` is a share, after restarts if the run has some, and
     `age_…_ms` are of what was delivered. `heard_again_…_s` are over all pairs of robots and all
     restarts; `never_heard` is the share of the pairs that had not heard each other when the next
-    restart came. `processor` is the share of this machine's processors that was in use.
+    restart came. `processor` is the share of this machine's processors that was in use. `met` tells
+    whether all robots had heard each other before the run began: what they say to those that they
+    have not met counts as lost.
     """
 
     experiment: Experiment
@@ -104,6 +106,7 @@ class Run:
     seconds: float
     throughput_mbit_s: float
     processor: float
+    met: bool
     delivered: float | None = None
     age_p50_ms: float | None = None
     age_p99_ms: float | None = None
@@ -143,7 +146,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """All runs with one middleware and so many robots; a measure that no run has is not in it."""
+    """Runs with one middleware and so many robots; a measure that no run has is not in it."""
 
     experiment: Experiment
     middleware: str
@@ -152,11 +155,12 @@ class Summary:
 
 
 def summaries(runs: Sequence[Run]) -> list[Summary]:
-    """In the order of their first runs."""
-    kinds = dict.fromkeys((run.experiment, run.middleware, run.robots) for run in runs)
+    """Of those in which robots had met, in the order of their first runs."""
+    counted = [run for run in runs if run.met]
+    kinds = dict.fromkeys((run.experiment, run.middleware, run.robots) for run in counted)
     told = []
     for kind in kinds:
-        its = [run for run in runs if (run.experiment, run.middleware, run.robots) == kind]
+        its = [run for run in counted if (run.experiment, run.middleware, run.robots) == kind]
         measures = {}
         for measure in MEASURES:
             values = [value for run in its if (value := getattr(run, measure)) is not None]
@@ -165,6 +169,16 @@ def summaries(runs: Sequence[Run]) -> list[Summary]:
                 measures[measure] = Spread(statistics.mean(values), deviation, len(values))
         told.append(Summary(*kind, measures))
     return told
+
+
+def left_out(runs: Sequence[Run]) -> str:
+    """How many runs the summaries leave out, and why; "" if none."""
+    unmet = sum(not run.met for run in runs)
+    if not unmet:
+        return ""
+    return (
+        f"left out: {unmet} of {len(runs)} runs, before which robots had not all heard each other"
+    )
 
 
 def as_json(measured_on: Mapping[str, Any], runs: Sequence[Run]) -> dict[str, Any]:

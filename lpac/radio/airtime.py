@@ -244,13 +244,8 @@ def cells(
     return None
 
 
-def link_quality(
-    transport: Transport, wifi: Wifi, traffic: Traffic, *, in_range: float = 1.0
-) -> LinkQuality:
-    """What a robot's message to a robot in range suffers: `lpac.sim.medium.Medium` takes the two.
-
-    `in_range` is the share of the other robots that a robot's radio reaches: so many share the
-    channel with it and hear it, and of all others it notices nothing.
+def link_quality(transport: Transport, wifi: Wifi, traffic: Traffic) -> LinkQuality:
+    """What a robot's message to another suffers: `lpac.sim.medium.Medium` takes the two.
 
     A message waits as in a queue of random arrivals and equal jobs (Pollaczek and Khinchine), a job
     being one message to all its receivers. What waits for one receiver is sent together, which
@@ -259,13 +254,10 @@ def link_quality(
     chance to be dropped. In multicast nothing is sent together, and each of a message's frames is
     lost for good by noise or by a collision; elsewhere it is repeated, and takes time only.
 
-    Raises what `airtime` does, and ValueError for an impossible share.
+    Raises what `airtime` does.
     """
     _require_possible(transport, traffic)
-    if not 0.0 <= in_range <= 1.0:
-        raise ValueError(f"in_range = {in_range}: must be from 0 to 1")
-    robots = 1.0 + in_range * (traffic.robots - 1)
-    wait_s, load = _queue(transport, wifi, traffic, robots)
+    wait_s, load = _queue(transport, wifi, traffic)
     delivery = min(1.0, 1.0 / load.total)
     if transport == "multicast":
         frames = _datagrams(traffic.message_bytes).number
@@ -283,10 +275,9 @@ def lost_for_good(transport: Transport, wifi: Wifi, message_bytes: float) -> flo
     return 1.0 - delivered
 
 
-def _queue(
-    transport: Transport, wifi: Wifi, traffic: Traffic, robots: float
-) -> tuple[float, Airtime]:
+def _queue(transport: Transport, wifi: Wifi, traffic: Traffic) -> tuple[float, Airtime]:
     """How long messages wait, s, and what they take when those that wait are sent together."""
+    robots = traffic.robots
     if transport == "multicast":
         load = _airtime(transport, wifi, traffic, robots)
         return min(load.message_s * _waiting(load.total), wifi.queue_s), load
@@ -484,7 +475,7 @@ class _Flow(NamedTuple):
 _MESSAGES = ("message", "guests' message")
 
 
-def _flows(traffic: Traffic, robots: float) -> tuple[_Flow, ...]:
+def _flows(traffic: Traffic, robots: int) -> tuple[_Flow, ...]:
     others, guests = robots - 1.0, float(traffic.guests)
     # Of those whose words a robot could hear, the share whose words it is sent.
     share = 1.0
@@ -505,7 +496,7 @@ def _flows(traffic: Traffic, robots: float) -> tuple[_Flow, ...]:
 
 
 def _airtime(
-    transport: Transport, wifi: Wifi, traffic: Traffic, robots: float, together: float = 1.0
+    transport: Transport, wifi: Wifi, traffic: Traffic, robots: int, together: float = 1.0
 ) -> Airtime:
     flows = _flows(traffic, robots)
     stations = robots + (1.0 if wifi.ground_wired else 2.0)

@@ -12,10 +12,11 @@
   with a router what is lost is repeated, so that nobody sees it.
 
 The rest stays assumed: what a full queue is worth would take a channel that somebody fills, whose
-traffic is in no record. Channels more than half busy are left to the radios' rates alone, since
-what waits is sent together then, and the model is at its worst. It knows no distances: what is
-found is a mean over the pairs and places that were recorded, and a channel that other networks keep
-busy looks slow.
+traffic is in no record. For the same reason records beside a bulk stream are left out. Each record
+is held against the model with its own `ground_wired`. Channels more than half busy are left to the
+radios' rates alone, since what waits is sent together then, and the model is at its worst. It knows
+no distances: what is found is a mean over the pairs and places that were recorded, and a channel
+that other networks keep busy looks slow.
 """
 
 import math
@@ -93,6 +94,8 @@ def read_wifi(path: Path | None) -> Calibration:
 def calibrated(records: Sequence[RadioRecord], assumed: Wifi | None = None) -> Calibration:
     """What the records say, in place of what is `assumed`: if not given, what `Wifi` has."""
     wifi, sources = assumed or Wifi(), dict[str, Source]()
+    # What a bulk stream takes of the channel, and does to messages, is not in the model.
+    records = [each for each in records if not each.loaded]
     for _ in range(_ROUNDS):
         for name, find in _FINDERS:
             found = find(records, wifi)
@@ -143,8 +146,8 @@ def _by_busy(
     def too_busy(rate_mbit_s: float) -> float:
         changed = _with(wifi, name, rate_mbit_s)
         return math.fsum(
-            count * (airtime(transport, changed, traffic).busy - share)
-            for (transport, traffic), (share, count) in busy.items()
+            count * (airtime(transport, replace(changed, ground_wired=wired), traffic).busy - share)
+            for (transport, wired, traffic), (share, count) in busy.items()
         )
 
     rate_mbit_s = _where_zero(too_busy, *_RATES_MBIT_S) if told else None
@@ -159,10 +162,11 @@ def _frame_loss(records: Sequence[RadioRecord], wifi: Wifi) -> _Found | None:
 
     def too_much(frame_loss: float) -> float:
         changed = _with(wifi, "frame_loss", frame_loss)
-        return math.fsum(
-            count * (1.0 - link_quality(transport, changed, traffic).loss - share)
-            for (transport, traffic), (share, count) in delivered.items()
-        )
+        total = 0.0
+        for (transport, wired, traffic), (share, count) in delivered.items():
+            quality = link_quality(transport, replace(changed, ground_wired=wired), traffic)
+            total += count * (1.0 - quality.loss - share)
+        return total
 
     # More arrived than the model's collisions let through, or next to nothing.
     least, most = _LOSSES
@@ -181,16 +185,20 @@ def _is_quiet(record: RadioRecord) -> bool:
     return record.busy_share is None or record.busy_share <= _MOST_BUSY
 
 
+# What the model tells records apart by: the bool is `ground_wired`.
+_Alike = tuple[Transport, bool, Traffic]
+
+
 def _means(
     records: Iterable[RadioRecord], value: Callable[[RadioRecord], float]
-) -> dict[tuple[Transport, Traffic], tuple[float, int]]:
+) -> dict[_Alike, tuple[float, int]]:
     """Of records that the model cannot tell apart: the mean, and how many they are."""
-    alike = defaultdict(list)
+    alike: defaultdict[_Alike, list[float]] = defaultdict(list)
     for each in records:
         traffic = Traffic(
             robots=each.robots, message_bytes=each.message_bytes, message_hz=each.message_hz
         )
-        alike[each.transport, traffic].append(value(each))
+        alike[each.transport, each.ground_wired, traffic].append(value(each))
     return {key: (fmean(values), len(values)) for key, values in alike.items()}
 
 

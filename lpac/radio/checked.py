@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from lpac.radio.airtime import Traffic, Transport, Wifi, lost_for_good
-from lpac.radio.pairs import Pair, Window
+from lpac.radio.pairs import Pair, Window, pairs
 from lpac.radio.records import RadioRecord
 
 
@@ -23,12 +23,13 @@ class WifiReading(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """`robots` are the names of all that should speak, `windows` of those that were heard.
+    """`robots` are the names of those that are judged, `windows` of all that were heard.
 
-    `wifi` is of those whose radios were asked. Each message travels in an envelope of
-    `overhead_bytes`. In flight it has `flight_bytes`, sealed, if that is more: robots on the ground
-    have seen little yet, and what they say of it is compressed. `loaded`: something else was sent
-    meanwhile, on purpose. `ground_wired`: the ground's computer is not in the Wi-Fi itself.
+    Of the fleet: what others of it say is on the air, too. `wifi` is of those whose radios were
+    asked. Each message travels in an envelope of `overhead_bytes`. In flight it has `flight_bytes`,
+    sealed, if that is more: robots on the ground have seen little yet, and what they say of it is
+    compressed. `loaded`: something else was sent meanwhile, on purpose. `ground_wired`: the
+    ground's computer is not in the Wi-Fi itself.
     """
 
     robots: tuple[str, ...]
@@ -61,9 +62,13 @@ class Checked(NamedTuple):
             return 0.0
         return lost_for_good(self.transport, Wifi(), traffic.message_bytes)
 
-    def records(self, pairs: Sequence[Pair]) -> list[RadioRecord]:
+    def pairs(self) -> tuple[Pair, ...]:
+        """Of those that are judged."""
+        return pairs({name: self.windows[name] for name in self.robots if name in self.windows})
+
+    def records(self, found: Sequence[Pair]) -> list[RadioRecord]:
         """One of each pair that was found in the windows, for a model of this field's radio."""
-        return [self._record(pair) for pair in pairs]
+        return [self._record(pair) for pair in found]
 
     def _record(self, pair: Pair) -> RadioRecord:
         said, heard = self.windows[pair.sender], self.windows[pair.receiver]
@@ -89,4 +94,6 @@ class Checked(NamedTuple):
             rate_mbit_s=wifi.rate_mbit_s,
             signal_dbm=wifi.signal_dbm,
             busy_share=wifi.busy_share,
+            loaded=self.loaded,
+            ground_wired=self.ground_wired,
         )

@@ -18,7 +18,8 @@ class RadioRecord:
     `receiver_height_m` above its own takeoff point. Of `sent` messages of `message_bytes`, sealed,
     said `message_hz` times a second to each that is to hear them, `received` arrived; ages are how
     long those travelled. `rate_mbit_s` and `signal_dbm` are of the receiver's Wi-Fi, `busy_share`
-    is the share of the channel's time that somebody sent in, by anybody.
+    is the share of the channel's time that somebody sent in, by anybody. `loaded`: a bulk stream
+    was sent meanwhile, on purpose. `ground_wired`: ground and router were not in the Wi-Fi.
 
     Raises ValueError that names an impossible value.
     """
@@ -31,6 +32,8 @@ class RadioRecord:
     message_hz: float
     sent: int
     received: int
+    loaded: bool
+    ground_wired: bool
     age_p50_s: float | None = None
     age_p99_s: float | None = None
     distance_m: float | None = None

@@ -19,7 +19,7 @@ _CHANCE_DEVIATIONS = 3.0
 MOST_LATE = 0.01
 # Of the fifty of a check, one that is lost or late is chance.
 _BY_CHANCE = 1
-# Of a channel's time; above it delays grow quickly (docs/scaling.md).
+# Of a channel's time, with gaps; above it delays grow quickly (docs/scaling.md).
 MOST_BUSY = 0.6
 # So much more than the model says of this fleet is not the model's error alone.
 _MUCH_OF_OTHERS = 0.2
@@ -32,11 +32,14 @@ ASSUMED_RATE_MBIT_S = 220.0
 class Room(NamedTuple):
     """For how many robots in flight the model sees room on the channel, and what it was told.
 
-    `ground_share` is what it says of this fleet with messages of `ground_bytes`, as they were, and
-    `flight_share` of `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not. `busy_share`
-    is what the model was scaled to meet; None: it was not.
+    `ground_share` is what the `robots` that spoke ask for with messages of `ground_bytes`, as they
+    were, and `flight_share` with `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not.
+    `busy_share` is what radios counted, without gaps, where the model has `model_busy_share`; None:
+    nobody told. The two shares and the room are scaled by that; if it is so much more that others
+    must be on the channel, the room is what these leave.
     """
 
+    robots: int
     carries: int
     ground_share: float
     flight_share: float
@@ -46,6 +49,7 @@ class Room(NamedTuple):
     flight_bytes: float
     message_hz: float
     busy_share: float | None
+    model_busy_share: float
 
 
 class RadioVerdict(NamedTuple):
@@ -95,7 +99,7 @@ def verdict(checked: Checked, pairs: Sequence[Pair]) -> RadioVerdict:
     room = _room(checked)
     found = [
         *_silent(checked),
-        *_channel(checked, room),
+        *_channel(room),
         *_unheard(checked, pairs),
     ]
     problems = tuple(text for _, text in sorted(found, key=lambda each: -each[0]))
@@ -106,10 +110,15 @@ def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> s
     if problems:
         more = len(problems) - 1
         return problems[0] + (f"; and {more} more" if more else "")
-    speaking = len(checked.windows)
-    more_robots = 0 if room is None else max(0, room.carries - speaking)
-    beside = " beside a bulk stream" if checked.loaded else ""
-    return f"carries {speaking} robots{beside} with room for {more_robots or 'no more'}"
+    # Where nobody speaks, that is a problem.
+    assert room is not None
+    of_which, beside = "", " beside a bulk stream" if checked.loaded else ""
+    if room.robots > len(checked.robots):
+        of_which = f", of which {', '.join(checked.robots)} were judged,"
+    more_robots = room.carries - room.robots
+    return (
+        f"carries {room.robots} robots{of_which}{beside} with room for {more_robots or 'no more'}"
+    )
 
 
 def is_good(pair: Pair, expected_loss: float) -> bool:
@@ -136,17 +145,22 @@ def _silent(checked: Checked) -> Iterator[_Found]:
             yield 1.0, f"{name} says nothing to the others: `lpac watch` tells what it lacks"
 
 
-def _channel(checked: Checked, room: Room | None) -> Iterator[_Found]:
-    busy = None if checked.loaded or room is None else room.busy_share
-    if busy is None or room is None or busy <= MOST_BUSY:
+def _channel(room: Room | None) -> Iterator[_Found]:
+    if room is None or room.carries >= room.robots:
         return
-    text = f"the channel is busy {_percent(busy)} of the time"
-    if busy - room.ground_share > _MUCH_OF_OTHERS:
-        text += f", of which these robots should take {_percent(room.ground_share)}: others take "
-        text += "the rest: look for another channel"
+    busy, model_busy = room.busy_share, room.model_busy_share
+    if busy is not None and _is_of_others(busy, model_busy):
+        text = (
+            f"the channel is busy {_percent(busy)} of the time, of which these robots should take "
+            f"{_percent(model_busy)}: others take the rest: look for another channel"
+        )
     else:
-        text += ": that is all that so many robots can be given on one"
-    yield (busy - MOST_BUSY) / (1.0 - MOST_BUSY), text
+        text = (
+            f"in flight these {room.robots} robots ask for {_percent(room.flight_share)} of the "
+            f"channel, of which they can use {_percent(MOST_BUSY)}: it carries "
+            f"{room.carries or 'none'}"
+        )
+    yield 1.0 - room.carries / room.robots, text
 
 
 def _unheard(checked: Checked, pairs: Sequence[Pair]) -> Iterator[_Found]:
@@ -199,24 +213,33 @@ def _room(checked: Checked) -> Room | None:
     # The slowest take the most time.
     rate_mbit_s = statistics.harmonic_mean(rates) if rates else ASSUMED_RATE_MBIT_S
     wifi = Wifi(data_rate_mbit_s=rate_mbit_s, ground_wired=checked.ground_wired)
-    share = airtime(checked.transport, wifi, traffic).total
+    ground = airtime(checked.transport, wifi, traffic)
     flight_bytes = max(traffic.message_bytes, checked.flight_bytes)
     flight = dataclasses.replace(traffic, message_bytes=flight_bytes)
     # A radio that hears nobody does not count.
     told = [w.busy_share for w in checked.wifi.values() if w.busy_share]
     busy = statistics.median(told) if told and not checked.loaded else None
-    most = MOST_BUSY if busy is None else MOST_BUSY * share / busy
+    # Radios count no gaps. A little more than the model says is the model's error, much is others'.
+    others = busy - ground.busy if busy is not None and _is_of_others(busy, ground.busy) else 0.0
+    scale = 1.0 if busy is None or others else busy / ground.busy
+    most = MOST_BUSY - others
     return Room(
-        carries(checked.transport, wifi, flight, most=most),
-        share,
-        airtime(checked.transport, wifi, flight).total,
-        rate_mbit_s,
-        bool(rates),
-        traffic.message_bytes,
-        flight_bytes,
-        traffic.message_hz,
-        busy,
+        robots=traffic.robots,
+        carries=(carries(checked.transport, wifi, flight, most=most / scale) if most > 0.0 else 0),
+        ground_share=scale * ground.total,
+        flight_share=scale * airtime(checked.transport, wifi, flight).total,
+        rate_mbit_s=rate_mbit_s,
+        rate_told=bool(rates),
+        ground_bytes=traffic.message_bytes,
+        flight_bytes=flight_bytes,
+        message_hz=traffic.message_hz,
+        busy_share=busy,
+        model_busy_share=ground.busy,
     )
+
+
+def _is_of_others(busy: float, model_busy: float) -> bool:
+    return busy - model_busy > _MUCH_OF_OTHERS
 
 
 def _percent(share: float) -> str:

@@ -55,12 +55,11 @@ def radio(
     """Measure who hears whom, as robots on the ground speak: does the radio carry the fleet?
 
     Needs `lpac ground`, and robots with a mission origin; nothing is asked of them. Spares
-    are left out.
+    are left out. With --robots these alone are judged, on the air that all robots share.
     """
     from edge.policy.bundle import load_bundle
     from lpac.ground.station.subscriber import GroundSubscriber
     from lpac.radio.airtime import MESSAGE_BYTES
-    from lpac.radio.pairs import pairs
     from lpac.radio.records import write_records
     from lpac.radio.verdict import verdict
 
@@ -76,10 +75,10 @@ def radio(
     with interruptible("radio", "nothing was changed"), GroundSubscriber(config.fleet) as ground:
         _require_speaking(ground, [robot.name for robot in chosen], load=load)
         before = _read_wifi(config, computers)
-        windows, stream = _listen(ground, config, chosen, seconds, computers[0] if load else None)
+        windows, stream = _listen(ground, config, seconds, computers[0] if load else None)
         after = _read_wifi(config, computers)
     checked = _checked(config, chosen, windows, before, after, MESSAGE_BYTES[payload], loaded=load)
-    found = pairs(windows)
+    found = checked.pairs()
     told = verdict(checked, found)
     if record is not None:
         write_records(record, checked.records(found))
@@ -135,14 +134,14 @@ def _heard(snapshot: "FleetSnapshot", names: Sequence[str]) -> dict[str, "RobotS
 def _listen(
     ground: "GroundSubscriber",
     config: "FleetConfig",
-    chosen: Sequence["RobotHost"],
     seconds: float,
     bulk_from: "RobotHost | None",
 ) -> tuple[dict[str, "Window"], "BulkStream | None"]:
+    """Of all robots with a slot: who is not judged takes airtime, too."""
     from lpac.fleet.radio import bulk_stream
     from lpac.radio.pairs import Window
 
-    names = [robot.name for robot in chosen]
+    names = [slot.robot for slot in config.slots if slot.robot is not None]
     windows: dict[str, Window] = {}
 
     def take(snapshot: "FleetSnapshot") -> bool:
@@ -267,7 +266,10 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
         f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
     )
     if room.busy_share is not None:
-        text += f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time"
+        text += (
+            f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time, "
+            f"where the model has {100.0 * room.model_busy_share:.0f} %"
+        )
     if not checked.ground_wired:
         text += (
             "; this computer is in the Wi-Fi itself, so that what it sends and passes on crosses "

@@ -104,6 +104,7 @@ def test_it_tells_what_it_measured_and_where(measured: tuple[Path, dict[str, Any
         assert set(MEASURES) < set(run)
         assert run["throughput_mbit_s"] > 0.0 and run["seconds"] >= 2.0
         assert 0.0 <= run["processor"] <= 1.0
+        assert run["met"]
         if run["middleware"] == NOTHING:
             assert run["delivered"] is None and run["never_heard"] is None
     restarted, together = told["runs"][0], told["runs"][4]

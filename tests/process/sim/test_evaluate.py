@@ -71,7 +71,8 @@ def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
     records = tmp_path / "field.jsonl"
     said = RadioRecord(
         sender="r1", receiver="r2", transport="multicast", robots=3, message_bytes=1300.0,
-        message_hz=2.5, sent=1000, received=800, rate_mbit_s=100.0,
+        message_hz=2.5, sent=1000, received=800, loaded=False, ground_wired=True,
+        rate_mbit_s=100.0,
     )  # fmt: skip
     write_records(records, [said])
     options = ("-k", 1, "--duration", 1, "--baseline", "clairvoyant-cvt", "--transport",

@@ -1,12 +1,24 @@
-"""What robots' radios tell, between two looks at them."""
+"""What robots' radios tell, between two looks at them, and what all of them take of the air."""
 
+import json
+import re
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
+from edge.messages.mission import RadioCounts
+from lpac.analysis.snapshot import FleetSnapshot
+from lpac.cli.main import app
 from lpac.fleet.radio import in_the_wifi, reading
 from lpac.radio.checked import WifiReading
+from tests.unit.cli.test_fleet import write_fleet
+from tests.unit.ground import snapshots
 
 
 def interface(**changes: Any) -> dict[str, Any]:
@@ -65,3 +77,45 @@ def test_a_laptop_knows_whether_it_is_in_the_wifi(
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "proc/net/route").write_text(ROUTES)
     assert in_the_wifi(address, tmp_path) == wireless
+
+
+class _Ground:
+    """Hears three robots that say 2.5 messages a second, on a clock that does not wait."""
+
+    now_s = 0.0
+
+    def wait_for(self, until: Callable[[FleetSnapshot], bool], timeout_s: float) -> None:
+        self.now_s += timeout_s
+        sent = round(2.5 * self.now_s)
+        said = RadioCounts(sent, 1800 * sent, {str(n): (sent, 0, sent) for n in (1, 2, 3)})
+        changes = {"uptime_s": self.now_s, "radio_counts": said, "armed": False}
+        robots = [snapshots.robot(snapshots.status(n, **changes)) for n in (1, 2, 3)]
+        until(snapshots.snapshot(*robots))
+
+
+def test_who_is_not_asked_about_takes_airtime_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, ground = write_fleet(tmp_path, 22, flying=3), _Ground()
+    # Robots without computers, as those of `lpac sim`.
+    path.write_text(re.sub(r'"(127.0.0.(\d))"', r'"r\2.invalid"\naddress = "\1"', path.read_text()))
+    monkeypatch.setattr(
+        "lpac.ground.station.subscriber.GroundSubscriber", lambda _: nullcontext(ground)
+    )
+    clock = SimpleNamespace(monotonic=lambda: ground.now_s)
+    monkeypatch.setattr(sys.modules["lpac.cli.fleet.radio"], "time", clock)
+
+    def asked(*options: object) -> dict[str, Any]:
+        words = ["fleet", "radio", "--fleet", path, "--json", *options]
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert result.exception is None, result.exception
+        found: dict[str, Any] = json.loads(result.stdout)
+        return found
+
+    two = asked("--robots", "r1,r3")
+    assert {(p["sender"], p["receiver"]) for p in two["pairs"]} == {("r1", "r3"), ("r3", "r1")}
+    room = two["room"]["carries"] - 3
+    assert two["sentence"] == (
+        f"carries 3 robots, of which r1, r3 were judged, with room for {room}"
+    )
+    assert asked()["sentence"] == f"carries 3 robots with room for {room}"

@@ -4,6 +4,7 @@ from importlib.metadata import PackageNotFoundError
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -18,6 +19,7 @@ from lpac.network.results import (
     Run,
     Sent,
     as_json,
+    left_out,
     of_traffic,
     summaries,
     traffic,
@@ -71,11 +73,16 @@ def test_a_robot_alone_tells_nothing_of_messages() -> None:
 
 
 def _run(
-    middleware: str, throughput: float, robots: int = 3, experiment: Experiment = "restarts"
+    middleware: str,
+    throughput: float,
+    robots: int = 3,
+    experiment: Experiment = "restarts",
+    *,
+    met: bool = True,
 ) -> Run:
     return Run(
         experiment=experiment, middleware=middleware, robots=robots, repetition=1, began=0.0,
-        seconds=10.0, throughput_mbit_s=throughput, processor=0.5,
+        seconds=10.0, throughput_mbit_s=throughput, processor=0.5, met=met,
         delivered=None if middleware == NOTHING else 0.9,
         age_p50_ms=None if middleware == NOTHING else 9.0,
     )  # fmt: skip
@@ -90,6 +97,19 @@ def test_a_summary_has_the_mean_and_the_deviation_of_what_was_measured() -> None
     told = as_json({"where": "loopback"}, runs)
     assert told["summaries"][0]["throughput_mbit_s"]["mean"] == 72.0
     assert [run["throughput_mbit_s"] for run in told["runs"]] == [70.0, 80.0, 74.0]
+
+
+def test_runs_whose_robots_had_not_met_are_left_out_and_counted() -> None:
+    met = [_run("zenoh", 70.0), _run(NOTHING, 80.0)]
+    runs = [*met, _run("zenoh", 20.0, met=False), _run("cyclonedds", 30.0, met=False)]
+    assert summaries(runs) == summaries(met)
+    told = "left out: 2 of 4 runs, before which robots had not all heard each other"
+    assert (left_out(met), left_out(runs)) == ("", told)
+    assert [run["met"] for run in as_json({}, runs)["runs"]] == [True, True, False, False]
+    figure = of_restarts(runs)
+    dots = [line.get_xydata() for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert [np.asarray(dot)[:, 1].tolist() for dot in dots] == [[70.0], [80.0]]
+    assert figure.get_supxlabel() == told
 
 
 def test_middlewares_take_turns() -> None:

@@ -213,11 +213,9 @@ def test_a_faster_channel_takes_less(
         assert total(transport, changed, traffic) <= total(transport, wifi, traffic) * (1 + 1e-9)
 
 
-@given(transports, wifis, traffics, st.floats(0.0, 1.0))
-def test_loss_and_delay_are_bounded(
-    transport: Transport, wifi: Wifi, traffic: Traffic, in_range: float
-) -> None:
-    loss, delay_s = link_quality(transport, wifi, traffic, in_range=in_range)
+@given(transports, wifis, traffics)
+def test_loss_and_delay_are_bounded(transport: Transport, wifi: Wifi, traffic: Traffic) -> None:
+    loss, delay_s = link_quality(transport, wifi, traffic)
     assert 0.0 <= loss <= 1.0
     # In a queue, and on its way.
     assert 0.0 <= delay_s <= 2.0 * wifi.queue_s + 1e-9
@@ -267,14 +265,6 @@ def test_a_full_channel_still_carries_what_is_sent_together() -> None:
     quality = link_quality("mesh", WIFI, thirty)
     assert quality.loss == 0.0
     assert quality.delay_s > 5.0 * link_quality("mesh", WIFI, TEN).delay_s
-
-
-@EACH
-def test_who_is_out_of_range_takes_nothing_and_hears_nothing(transport: Transport) -> None:
-    hundred = Traffic(robots=100)
-    near = link_quality(transport, WIFI, hundred, in_range=9 / 99)
-    assert near == pytest.approx(link_quality(transport, WIFI, TEN))
-    assert near.loss <= link_quality(transport, WIFI, hundred).loss
 
 
 # Cells
@@ -358,8 +348,6 @@ def test_impossible_questions_are_named() -> None:
         airtime("mesh", WIFI, replace(TEN, guests=3))
     with pytest.raises(ValueError, match=r"^most = 0\.0: must be above 0"):
         carries("mesh", WIFI, TEN, most=0.0)
-    with pytest.raises(ValueError, match=r"^in_range = 1\.5: must be from 0 to 1"):
-        link_quality("mesh", WIFI, TEN, in_range=1.5)
     with pytest.raises(ValueError, match=r"^robots = 11: must be from 1 to 10"):
         guests_around(11, of=10, **PLACE)
 

@@ -21,6 +21,7 @@ wifis = st.builds(
     data_rate_mbit_s=st.floats(20.0, 800.0),
     multicast_rate_mbit_s=st.floats(2.0, 54.0),
     frame_loss=st.floats(0.0, 0.4),
+    ground_wired=st.booleans(),
 )
 
 
@@ -34,6 +35,7 @@ def measured(
     return RadioRecord(
         sender="r1", receiver="r2", transport=transport, robots=robots, message_bytes=size,
         message_hz=traffic.message_hz, sent=sent, received=round(sent * (1.0 - quality.loss)),
+        loaded=False, ground_wired=wifi.ground_wired,
         age_p50_s=quality.delay_s,
         rate_mbit_s=wifi.data_rate_mbit_s if rates else None,
         busy_share=min(1.0, airtime(transport, wifi, traffic).busy) if busy else None,
@@ -99,6 +101,14 @@ def test_a_busy_channel_tells_nothing_but_the_radios_rates() -> None:
     heard = replace(measured(FIELD, "multicast", 5), busy_share=0.8, received=1)
     assert kinds([busy, heard]) == {}
     assert kinds([replace(busy, rate_mbit_s=90.0)]) == {"data_rate_mbit_s": SourceKind.RATES}
+
+
+def test_what_was_recorded_beside_a_bulk_stream_tells_nothing() -> None:
+    """Else what the stream pushes out would be taken for lost by noise."""
+    quiet = [measured(FIELD, "multicast", 5, rates=True)]
+    beside = [replace(each, loaded=True, busy_share=None, received=1) for each in quiet]
+    assert kinds(beside) == {}
+    assert calibrated([*quiet, *beside]) == calibrated(quiet)
 
 
 def test_a_channel_that_the_model_cannot_explain_tells_no_rate() -> None:

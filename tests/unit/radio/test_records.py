@@ -15,13 +15,13 @@ from lpac.radio.records import RadioRecord, read_records, write_records
 
 RECORD = RadioRecord(
     sender="r1", receiver="r2", transport="mesh", robots=3, message_bytes=1880.0, message_hz=2.5,
-    sent=100, received=97, age_p50_s=0.004, age_p99_s=0.03, distance_m=12.5,
-    sender_heading_deg=271.0, receiver_height_m=5.0, rate_mbit_s=180.0, signal_dbm=-61.0,
-    busy_share=0.2,
+    sent=100, received=97, loaded=False, ground_wired=True, age_p50_s=0.004, age_p99_s=0.03,
+    distance_m=12.5, sender_heading_deg=271.0, receiver_height_m=5.0, rate_mbit_s=180.0,
+    signal_dbm=-61.0, busy_share=0.2,
 )  # fmt: skip
 UNKNOWN = RadioRecord(
     sender="r1", receiver="ground", transport="multicast", robots=3, message_bytes=1880.0,
-    message_hz=2.5, sent=100, received=0,
+    message_hz=2.5, sent=100, received=0, loaded=True, ground_wired=False,
 )  # fmt: skip
 
 maybe_positive = st.none() | st.floats(0.0, 1e9)
@@ -36,6 +36,8 @@ records = st.integers(1, 10**9).flatmap(
         message_hz=st.floats(0.01, 1e3),
         sent=st.just(sent),
         received=st.integers(0, sent),
+        loaded=st.booleans(),
+        ground_wired=st.booleans(),
         age_p50_s=maybe_positive,
         age_p99_s=maybe_positive,
         distance_m=maybe_positive,
@@ -87,6 +89,7 @@ def test_a_line_has_all_keys_and_may_lack_what_is_not_known(tmp_path: Path) -> N
         ({"message_hz": None}, "message_hz = None: expected float"),
         ({"message_hz": 10**400}, "message_hz: is too large a number"),
         ({"transport": "pigeon"}, "transport = 'pigeon': allowed are 'mesh', 'router', 'multi"),
+        ({"loaded": None}, "loaded = None: expected bool"),
         ({"colour": "red"}, "unknown key 'colour'"),
     ],
 )
@@ -103,6 +106,14 @@ def test_a_missing_key_is_named(tmp_path: Path) -> None:
     path = tmp_path / "records.jsonl"
     path.write_text('{"sender": "r1"}\n')
     with pytest.raises(ConfigError, match="line 1: receiver is missing"):
+        read_records(path)
+
+
+@pytest.mark.parametrize("key", ["loaded", "ground_wired"])
+def test_a_file_of_before_says_not_under_what_it_was_measured(tmp_path: Path, key: str) -> None:
+    path = tmp_path / "records.jsonl"
+    path.write_text(json.dumps({k: v for k, v in asdict(RECORD).items() if k != key}))
+    with pytest.raises(ConfigError, match=f"line 1: {key} is missing"):
         read_records(path)
 
 

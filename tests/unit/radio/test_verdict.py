@@ -99,16 +99,17 @@ def test_a_ground_in_the_wifi_itself_takes_more_of_it() -> None:
 
 def test_a_channel_that_is_busier_than_the_model_says_has_less_room() -> None:
     traffic = Traffic(robots=N, message_bytes=BYTES + 85, message_hz=2.5)
-    model = airtime("mesh", Wifi(data_rate_mbit_s=220.0), traffic).total
+    # As radios count it: without gaps.
+    model = airtime("mesh", Wifi(data_rate_mbit_s=220.0), traffic).busy
     same, busier = (
         verdict(checked(wifi=wifi(busy_share=share)), heard()) for share in (model, 1.5 * model)
     )
-    assert same.room and busier.room
-    assert same.room.carries == verdict(checked(), heard()).room.carries  # type: ignore[union-attr]
+    unscaled = verdict(checked(), heard()).room
+    assert same.room and busier.room and unscaled
+    assert same.room == unscaled._replace(rate_told=True, busy_share=model)
     assert N < busier.room.carries < same.room.carries
     assert busier.room.busy_share == pytest.approx(1.5 * model)
-    full = verdict(checked(wifi=wifi(busy_share=0.6)), heard())
-    assert full.sentence == "carries 10 robots with room for no more"
+    assert busier.room.flight_share == pytest.approx(1.5 * unscaled.flight_share)
 
 
 def test_a_slow_rate_has_less_room() -> None:
@@ -117,8 +118,30 @@ def test_a_slow_rate_has_less_room() -> None:
     assert told.room is not None and told.room.rate_told
     assert told.room.rate_mbit_s == pytest.approx(N / (9 / 220.0 + 1 / 6.0))
     assert N < told.room.carries < verdict(checked(wifi=wifi()), heard()).room.carries  # type: ignore[union-attr]
+
+
+def test_a_channel_that_is_too_small_for_these_robots_is_a_problem() -> None:
     slow = verdict(checked(wifi=wifi(rate_mbit_s=6.0)), heard())
-    assert slow.sentence == "carries 10 robots with room for no more"
+    assert slow.problems == (
+        "in flight these 10 robots ask for 235 % of the channel, of which they can use 60 %: it "
+        "carries 5",
+    )
+    assert slow.sentence == slow.problems[0]
+    busy = verdict(checked(wifi=wifi(busy_share=0.31)), heard())
+    assert busy.sentence.startswith("in flight these 10 robots ask for 62 % of the channel")
+    # Beside a stream, too, of which nothing is asked.
+    assert verdict(checked(wifi=wifi(rate_mbit_s=6.0), loaded=True), heard()).problems
+    grown = verdict(checked(flight_bytes=1e6), heard())
+    assert grown.sentence.endswith("it carries 1")
+
+
+def test_where_a_few_are_judged_the_others_still_take_airtime() -> None:
+    few = checked(robots=NAMES[:2], windows={**checked().windows, "r9": spoken(9, sent=0)})
+    assert {(pair.sender, pair.receiver) for pair in few.pairs()} == {("r0", "r1"), ("r1", "r0")}
+    told = verdict(few, [pair for pair in heard() if {pair.sender, pair.receiver} <= {"r0", "r1"}])
+    # r9 is silent, which is no fault of those that are judged.
+    assert told.problems == ()
+    assert told.sentence == "carries 9 robots, of which r0, r1 were judged, with room for 7"
 
 
 @pytest.mark.parametrize(
@@ -173,6 +196,10 @@ def test_a_channel_that_others_take() -> None:
     (problem,) = verdict(checked(wifi=wifi(busy_share=0.8)), heard()).problems
     assert problem.startswith("the channel is busy 80 % of the time, of which these robots should ")
     assert problem.endswith("others take the rest: look for another channel")
+    # Who takes less leaves room for some.
+    alone, beside = (verdict(checked(wifi=wifi(busy_share=busy)), heard()) for busy in (None, 0.38))
+    assert alone.room is not None and beside.room is not None and beside.problems == ()
+    assert N <= beside.room.carries < alone.room.carries
     # A stream of the check's own is no stranger.
     loaded = verdict(checked(wifi=wifi(busy_share=0.8), loaded=True), heard())
     assert loaded.problems == ()
@@ -207,9 +234,11 @@ def test_a_record_of_each_pair() -> None:
         sender="r1", receiver="r2", transport="mesh", robots=N, message_bytes=BYTES + 85,
         message_hz=2.5, sent=SENT, received=40, age_p50_s=1.3, age_p99_s=1.3, distance_m=5.0,
         sender_heading_deg=0.0, receiver_height_m=4.0, rate_mbit_s=130.0, signal_dbm=-61.0,
-        busy_share=0.3,
+        busy_share=0.3, loaded=False, ground_wired=True,
     )  # fmt: skip
     assert by_link["r2", "r1"].signal_dbm is None
+    (beside, *_) = checked(loaded=True, ground_wired=False).records(heard())
+    assert (beside.loaded, beside.ground_wired) == (True, False)
 
 
 # Before
