@@ -20,6 +20,7 @@ from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.group import (
     TOPICS_OF_GROUP,
     Assembly,
+    Fragment,
     GroupKey,
     MessageNumber,
     datagrams,
@@ -34,7 +35,8 @@ _BUFFER_BYTES = 2**19
 # How soon it looks whether it is to end; and tries again to join, where there is no network yet.
 _WAKES_S, _JOINS_AGAIN_S = 0.25, 0.5
 _FORGETS_AFTER_S = 5.0
-# An interface that went, or an access point that forgot who listens, takes a membership away.
+# An interface that went, or an access point that forgot who listens, takes a membership away. What
+# this robot says itself comes back all the same, and is no sign of one.
 _REJOINS_AFTER_S = 5.0
 _CLOSE_TIMEOUT_S = 1.0
 # Own messages that may still come back.
@@ -141,17 +143,14 @@ class MulticastLink:
         heard_at_s = time.monotonic()
         while not self._closed.is_set() and time.monotonic() - heard_at_s < _REJOINS_AFTER_S:
             with suppress(TimeoutError):
-                self._take(receiver.recv(2048))
-                heard_at_s = time.monotonic()
+                fragment = open_datagram(receiver.recv(2048), self._keys)
+                if fragment is None:
+                    self._strangers += 1
+                elif fragment.sender != self._robot_id or not self._is_own(fragment.number):
+                    heard_at_s = time.monotonic()
+                    self._take(fragment, heard_at_s)
 
-    def _take(self, data: bytes) -> None:
-        fragment = open_datagram(data, self._keys)
-        if fragment is None:
-            self._strangers += 1
-            return
-        if fragment.sender == self._robot_id and self._is_own(fragment.number):
-            return
-        now_s = time.monotonic()
+    def _take(self, fragment: Fragment, now_s: float) -> None:
         message = self._assembly.add(fragment, now_s)
         callback = self._callbacks.get(fragment.topic)
         if message is None or callback is None:

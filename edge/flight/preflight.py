@@ -58,7 +58,8 @@ class PreflightInputs:
     and `landing_point_m` (2,) are in the mission frame; the slot's height is above the takeoff
     point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
     `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
-    robots that were heard lately, `not_understood` those who said what cannot be read.
+    robots that were heard lately, `not_understood` those who said what cannot be read, `unheard`
+    those that the ground hears and this one does not.
     `ground_age_s` is how long ago the ground was heard, None if never; the fleet's time is known to
     `time_uncertainty_s`, None if it is not.
     """
@@ -84,6 +85,7 @@ class PreflightInputs:
     errors: ErrorBudget
     neighbours: Sequence[HeardBeacon]
     not_understood: Sequence[str]
+    unheard: Sequence[int]
     rc: RemoteControl
     ground_age_s: float | None
     time_uncertainty_s: float | None
@@ -322,6 +324,12 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
         yield FailedCheck(
             CheckCode.NOT_UNDERSTOOD,
             f"{robot} runs another version of this program: deploy one to all",
+        )
+    for robot_id in inputs.unheard:
+        yield FailedCheck(
+            CheckCode.OTHER_NOT_HEARD,
+            f"the ground hears robot {robot_id}, and this robot does not, which would not keep "
+            "away from it: `lpac fleet radio` tells who hears whom",
         )
     for beacon, _ in others:
         other = f"robot {beacon.robot_id}"

@@ -61,7 +61,8 @@ PART_BYTES = DATAGRAM_BYTES - _HEAD.size - _TAG_BYTES - _FRAGMENT.size
 MOST_BYTES = MOST_FRAGMENTS * PART_BYTES
 # A sender's fragments come one after another; a fourth message in pieces means that one is lost.
 _MOST_PARTIAL = 3
-_MOST_SENDERS = 300
+# Both topics of each robot of the largest fleet with certificates, and some.
+_MOST_SENDERS = 600
 
 
 class GroupKey(NamedTuple):
@@ -182,8 +183,6 @@ class Assembly:
     def add(self, fragment: Fragment, now_s: float) -> bytes | None:
         """The message that the fragment completes, if it does. `now_s` is a monotonic clock's."""
         sender = self._sender(fragment)
-        if sender is None:
-            return None
         silent = now_s - sender.newest_at_s > self._forget_after_s
         if fragment.number <= sender.newest and not silent:
             self.old += 1
@@ -201,12 +200,15 @@ class Assembly:
     def heard(self, fragment: Fragment, now_s: float) -> None:
         """The message that this fragment completed was its sender's, and so is its number."""
         sender = self._sender(fragment)
-        if sender is not None:
-            sender.newest, sender.newest_at_s = fragment.number, now_s
-            sender.partial = {n: p for n, p in sender.partial.items() if n > fragment.number}
+        sender.newest, sender.newest_at_s = fragment.number, now_s
+        sender.partial = {n: p for n, p in sender.partial.items() if n > fragment.number}
 
-    def _sender(self, fragment: Fragment) -> _Sender | None:
-        who = fragment.topic, fragment.sender
-        if who not in self._senders and len(self._senders) >= _MOST_SENDERS:
-            return None
-        return self._senders.setdefault(who, _Sender())
+    def _sender(self, fragment: Fragment) -> _Sender:
+        who, senders = (fragment.topic, fragment.sender), self._senders
+        if who not in senders:
+            if len(senders) >= _MOST_SENDERS:
+                # A member may claim any number of ids: those go first of which nothing was heard,
+                # and then who was silent for longest.
+                del senders[min(senders, key=lambda each: senders[each].newest_at_s)]
+            senders[who] = _Sender()
+        return senders[who]

@@ -67,6 +67,7 @@ class CheckCode(_Code):
     # The other robots.
     DUPLICATE_ID = "duplicate_id"
     NOT_UNDERSTOOD = "not_understood"
+    OTHER_NOT_HEARD = "other_not_heard"
     SAME_SYSTEM_ID = "same_system_id"
     OTHER_BUNDLE = "other_bundle"
     OTHER_WORLD = "other_world"

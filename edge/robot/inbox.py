@@ -24,6 +24,9 @@ from edge.messages.mission import (
 _MOST_ORDERS = 64
 _MOST_STATES = 16
 _BEACON_LIFETIME_S = 3.0
+# The ground names whom it hears now, in large fleets in turns. Whoever it has named for so long is
+# heard by a robot, too, unless their radios do not reach each other.
+_AT_GROUND_LASTS_S, _HEARD_AFTER_S = 2.0, 5.0
 # A hold that somebody else than the commander asks for counts for as long as it is said; robots
 # hear a state five times a second. The commander's next states end it, so that nobody who asks for
 # one can get far ahead of the commander.
@@ -40,6 +43,13 @@ class _Arrived(NamedTuple):
 class _ArrivedOrder(NamedTuple):
     data: bytes
     speaker: Speaker
+    at_s: float
+
+
+class _AtGround(NamedTuple):
+    """A robot that the ground hears: since when, and when it said so last."""
+
+    since_s: float
     at_s: float
 
 
@@ -78,6 +88,9 @@ class Inbox:
         # Who said lately what could not be read, as `peers` found it.
         self.not_understood: tuple[str, ...] = ()
         self.not_understood_count = 0
+        # Robots that the ground hears and this one does not, as `peers` found it.
+        self.unheard: tuple[int, ...] = ()
+        self._at_ground: dict[int, _AtGround] = {}
 
     def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """A ground's state arrived."""
@@ -128,8 +141,17 @@ class Inbox:
                     )
             elif self._counts(state, arrived.at_s):
                 self._ground, self._ground_at_s = state, arrived.at_s
+                self._put_echoes(state, arrived.at_s)
                 self._safety_form, self.ground_refusal = "none", ""
         return self._with_asked_hold(now_s), now_s - self._ground_at_s
+
+    def _put_echoes(self, state: GroundState, at_s: float) -> None:
+        with self._lock:
+            for robot_id in map(int, state.echoes):
+                known = self._at_ground.get(robot_id)
+                goes_on = known is not None and at_s - known.at_s <= _AT_GROUND_LASTS_S
+                since_s = known.since_s if known is not None and goes_on else at_s
+                self._at_ground[robot_id] = _AtGround(since_s, at_s)
 
     def _with_asked_hold(self, now_s: float) -> GroundState | None:
         ground, asked = self._ground, self._asked_hold
@@ -235,6 +257,15 @@ class Inbox:
                 if now_s - at_s <= _BEACON_LIFETIME_S
             }
             self.not_understood = tuple(self._strangers)
+            self.unheard = tuple(
+                robot_id
+                for robot_id, at_ground in sorted(self._at_ground.items())
+                if robot_id != self._robot_id
+                and robot_id not in self._beacons
+                and f"robot {robot_id}" not in self._strangers
+                and at_ground.at_s - at_ground.since_s >= _HEARD_AFTER_S
+                and now_s - at_ground.at_s <= _AT_GROUND_LASTS_S
+            )
             return tuple(self._beacons.values())
 
 

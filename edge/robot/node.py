@@ -288,6 +288,7 @@ class RobotNode:
             odometry=self._navigation.odometry(),
             peers=peers,
             not_understood=self._inbox.not_understood,
+            unheard=self._inbox.unheard,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
             card_problem=self._guard.card_problem(unix_now_s),

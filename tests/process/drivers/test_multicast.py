@@ -9,6 +9,7 @@ from typing import Self
 
 import pytest
 
+from edge.drivers import multicast
 from edge.drivers.radio import zenoh_radio
 from edge.drivers.zenoh_link import ZenohLink, ZenohRouter
 from edge.identity.card import Card, Role, signed
@@ -198,3 +199,23 @@ def test_without_a_network_it_opens_and_waits_for_one(group: Group) -> None:
     with Robot(nowhere, 1) as first:
         first.link.publish(MESSAGE, b"to nobody")
         first.link.publish(MESSAGE, b"x" * 100_000)  # More than a group takes.
+
+
+def test_a_robot_that_hears_only_itself_joins_again(
+    group: Group, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    join, joined = multicast._joined, []
+
+    def joining(its: Group) -> socket.socket:
+        joined.append(join(its))
+        return joined[-1]
+
+    monkeypatch.setattr(multicast, "_REJOINS_AFTER_S", 0.5)
+    monkeypatch.setattr(multicast, "_joined", joining)
+    with Robot(group, 1) as first:
+
+        def again() -> bool:
+            first.link.publish(MESSAGE, b"does anybody hear this?")
+            return len(joined) > 2
+
+        eventually(again)

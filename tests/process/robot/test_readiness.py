@@ -55,6 +55,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "odometry": None,
         "peers": (),
         "not_understood": (),
+        "unheard": (),
         "duplicate": False,
         "watchdog_alive": True,
         "card_problem": None,

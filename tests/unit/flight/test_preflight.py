@@ -82,6 +82,7 @@ READY = PreflightInputs(
     errors=ErrorBudget(),
     neighbours=(HeardBeacon(NEIGHBOUR, 99.8),),
     not_understood=(),
+    unheard=(),
     rc="none",
     ground_age_s=0.4,
     time_uncertainty_s=0.05,
@@ -107,6 +108,11 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         {"rc": "pilot"},
         _C.REMOTE_CONTROL_NOT_HEARD,
         "remote control is not heard, and the config has a pilot: switch it on",
+    ),
+    (
+        {"unheard": (4,)},
+        _C.OTHER_NOT_HEARD,
+        "the ground hears robot 4, and this robot does not, which would not keep away from it",
     ),
     (
         {"not_understood": ("robot 4",)},

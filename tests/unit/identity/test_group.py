@@ -113,6 +113,17 @@ def test_what_was_not_its_senders_makes_nothing_old() -> None:
     assert put_together(assembly, sent(b"m" * 2000, 1)) == [b"m" * 2000]
 
 
+def test_a_member_with_a_thousand_names_deafens_nobody() -> None:
+    assembly = Assembly()
+    before = sent(b"before", 1)
+    assert put_together(assembly, before) == [b"before"]
+    for sender in range(1000, 3000):
+        put_together(assembly, sent(b"me, too", sender=sender), heard=False)
+    assert put_together(assembly, sent(b"m" * 2000, sender=8)) == [b"m" * 2000]
+    # Who was heard is still known.
+    assert put_together(assembly, before) == []
+
+
 def test_an_open_fleets_robot_may_come_back_with_an_earlier_clock() -> None:
     def comes_through(assembly: Assembly, sequence: int, start: int, now_s: float) -> bool:
         fragment = open_datagram(sent(b"hello", sequence, start=start)[0], (KEY,))

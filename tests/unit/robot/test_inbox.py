@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from edge.identity.card import Role
 from edge.identity.guard import Speaker
 from edge.messages.codec import encode
-from edge.messages.mission import GroundState, Order, OrderForm, Origin
+from edge.messages.mission import Echo, GroundState, Order, OrderForm, Origin
 from edge.robot.inbox import Inbox
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
@@ -180,6 +180,31 @@ def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
     for now_s, names in ((2.0, ["robot 4"]), (4.5, [])):
         assert inbox.peers(now_s) == ()
         assert list(inbox.not_understood) == names
+
+
+def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
+    inbox, both = make_inbox(), {"2": Echo(1, 1.0, 0.0), "3": Echo(1, 1.0, 0.0)}
+
+    def unheard(now_s: float, *, echoed: bool = True, heard: bool = False) -> tuple[int, ...]:
+        state = dataclasses.replace(STATE, echoes=both if echoed else {})
+        inbox.put_ground(encode(state), ANYBODY, now_s)
+        inbox.ground(now_s)
+        if heard:
+            beacon = dataclasses.replace(NEIGHBOUR, robot_id=2, sequence=int(now_s * 10.0))
+            inbox.put_beacon(beacon, now_s)
+        inbox.peers(now_s)
+        return inbox.unheard
+
+    # Its program has only just begun.
+    assert [unheard(now_s) for now_s in (1.0, 2.0, 4.0, 5.9)] == [()] * 4
+    assert unheard(6.1) == (2,)
+    assert unheard(7.0, heard=True) == ()
+    assert unheard(9.0) == unheard(9.9) == ()
+    assert unheard(10.1) == (2,)
+    # The ground hears it no more, either.
+    assert unheard(11.0, echoed=False) == (2,)
+    assert unheard(12.2, echoed=False) == ()
+    assert unheard(13.0) == ()
 
 
 def test_of_who_does_not_command_only_a_hold_counts() -> None:
