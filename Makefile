@@ -37,7 +37,7 @@ test: lint ## style, types, and every test; as root with real robot hosts too: h
 redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"
 	.venv/bin/pytest -v --tries 1000 tests/sim/ground/test_attacks.py tests/process/sim/test_attacks.py \
 		tests/sim/ground/test_late.py tests/process/drivers/test_zenoh_link.py \
-		tests/process/cli/test_enemy_files.py tests/unit/identity tests/unit/messages \
+		tests/process/drivers/test_multicast.py tests/process/cli/test_enemy_files.py tests/unit/identity tests/unit/messages \
 		tests/unit/core/test_lateness.py
 
 lint: .venv/test ## style, and strict types of the product and its tests

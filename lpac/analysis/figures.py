@@ -152,7 +152,10 @@ def costs(flights: Sequence[FlightRecord]) -> Figure:
 
 
 def repeatability(flights: Sequence[FlightRecord]) -> Figure:
-    """All trials' cost, their mean and spread; and where the robots ended, trial by trial."""
+    """All trials' cost, their mean and spread; and where the robots ended, trial by trial.
+
+    Thin curves are costs where the vehicles truly were, of trials that tell it.
+    """
     colours = style.trial_colours(len(flights))
     with style.figure(WIDTH_IN, 3.1) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
@@ -161,19 +164,23 @@ def repeatability(flights: Sequence[FlightRecord]) -> Figure:
         curves = np.array([np.interp(times_s, f.curve_time_s, f.normalized) for f in flights])
         for flight, colour in zip(flights, colours, strict=True):
             left.plot(flight.curve_time_s, flight.normalized, color=colour, lw=0.8)
+            if flight.truth:
+                left.plot(flight.curve_time_s, flight.normalized_true, color=colour, lw=0.4)
         mean, deviation = curves.mean(axis=0), curves.std(axis=0, ddof=1)
         left.fill_between(times_s, mean - deviation, mean + deviation, color=FAINT, alpha=0.6, lw=0)
         left.plot(times_s, mean, color="k", lw=1.8)
         lloyd = float(np.mean([flight.normalized_lloyd for flight in flights]))
         left.axhline(lloyd, color="k", lw=0.8, ls=style.DOTTED)
+        handles = [
+            Line2D([], [], color="k", lw=1.8, label=f"mean, {mean[-1]:.2f} at {end_s:.0f} s"),
+            Patch(color=FAINT, label=f"standard deviation, {deviation[-1]:.3f}"),
+            Line2D([], [], color="k", lw=0.8, ls=style.DOTTED, label=f"{LLOYD}, {lloyd:.2f}"),
+        ]
+        if any(flight.truth for flight in flights):
+            handles.append(Line2D([], [], color=INK, lw=0.4, label="a trial, in truth"))
         left.legend(
-            handles=[
-                Line2D([], [], color="k", lw=1.8, label=f"mean, {mean[-1]:.2f} at {end_s:.0f} s"),
-                Patch(color=FAINT, label=f"standard deviation, {deviation[-1]:.3f}"),
-                Line2D([], [], color="k", lw=0.8, ls=style.DOTTED, label=f"{LLOYD}, {lloyd:.2f}"),
-            ],
-            loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, handlelength=1.6, fontsize=7,
-            columnspacing=1.0, borderaxespad=0.2,
+            handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2,
+            handlelength=1.6, fontsize=7, columnspacing=1.0, borderaxespad=0.2,
         )  # fmt: skip
         _frame_cost_axes(left, max(flight.duration_s for flight in flights))
         if all(flight.coverage is flights[0].coverage for flight in flights):

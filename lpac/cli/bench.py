@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from lpac.network.results import Experiment, Run, Spread, Summary
     from lpac.network.stations import NetworkStation
 
-app = new_app()
+app = new_app(
+    "bench", "Measure this machine's network: what programs say, and what they leave of it."
+)
 
 _OUT = Path("out/bench/network")
 # As the paper has them: robots, repetitions, s; of the curves so many repetitions as they need.
@@ -29,7 +31,7 @@ _ROBOTS = (10, 3, 10.0)
 
 @app.callback()
 def bench() -> None:
-    """Measure this machine's network: what programs say, and what they leave of it."""
+    """So that `network` is a command of its own."""
 
 
 @app.command()
@@ -223,7 +225,7 @@ def _draw(runs: Sequence["Run"], out: Path) -> None:
 
 
 def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
-    from lpac.network.results import summaries
+    from lpac.network.results import left_out, summaries
 
     of_each = summaries(runs)
     restarts = [summary for summary in of_each if summary.experiment == "restarts"]
@@ -246,6 +248,8 @@ def _show(where: dict[str, Any], runs: Sequence["Run"], out: Path) -> None:
             "\nmeasured on this machine's loopback, which has no radio: the stream is as fast as "
             "the processors are, and takes them from the robots; see --namespaces"
         )
+    if left := left_out(runs):
+        typer.echo(f"\n{left}")
     typer.echo(_LEGEND)
     names = ", ".join(f"{name} {version}" for name, version in where["versions"].items())
     typer.echo(f"\n{names}; see {out}: network.json and figures")

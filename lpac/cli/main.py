@@ -22,7 +22,7 @@ _COMMANDS = {
     "evaluate": "Policies and baselines over many worlds: how well they cover, and how surely.",
     "train": "Train a policy, or go on with it where it was stopped; chosen by how it flies.",
     "ablate": "Train a method without each of its parts, and say what each of them is worth.",
-    "paper": "Repeat the paper's experiments, and make those that it argues for.",
+    "paper": "Repeat the paper's experiments, and run those it argues for but does not report.",
     "drill": "Do faults to a fleet in flight, and judge by the vehicles' truth what is promised.",
     "hosts": "Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
     "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",

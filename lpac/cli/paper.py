@@ -2,6 +2,7 @@
 
 import json
 import platform
+import shlex
 from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
@@ -19,10 +20,13 @@ if TYPE_CHECKING:
 
     from lpac.analysis.flight import FlightRecord
     from lpac.paper.asynchrony import TimingResult
+    from lpac.sim.cores import Pool
     from lpac.sim.experiment import Scenario, SimulatedFlight
     from lpac.sim.fleet.layout import FleetScenario
 
-app = new_app()
+app = new_app(
+    "paper", "Repeat the paper's experiments, and run those it argues for but does not report."
+)
 
 _OUT = Path("out/paper")
 _WORLDS, _QUICK_WORLDS = 50, 4
@@ -35,18 +39,20 @@ _VEHICLES = {
     VehicleKind.MAVLINK: "simulated PX4s, a program for each robot, in real time",
     VehicleKind.PX4: "real PX4s that run as software, a program for each robot",
 }
+_QUICKLY = {False: "", True: " --quick"}
 # They take hours.
 _TOO_LARGE = ("n300", "n1000")
 # Robots, repetitions, s.
 _QUICK_NETWORK = (3, 1, 8.0)
 
-
-@app.callback()
-def paper() -> None:
-    """Repeat the paper's experiments, and make those that it argues for."""
-
-
 Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
+FlownBundle = Annotated[
+    Path | None,
+    typer.Option(
+        help="Policy bundle, the shipped one if not given; with --logs the one that flew, if it is "
+        "not where the robots had it."
+    ),
+]
 Vehicle = Annotated[
     VehicleKind, typer.Option(help="Points, or whole robots, as `lpac sim` has them.")
 ]
@@ -54,7 +60,14 @@ Px4 = Annotated[Path | None, typer.Option(help="px4: PX4's build folder.")]
 Logs = Annotated[
     Path | None, typer.Option(help="Fly nothing: folder of logs of flights, as of a field day.")
 ]
-Quick = Annotated[bool, typer.Option("--quick", help="Little of it, in a few minutes.")]
+Trial = Annotated[
+    list[str] | None,
+    typer.Option("--trial", metavar="NAME", help="--logs: only this mission; may be repeated."),
+]
+WorldFile = Annotated[
+    Path | None, typer.Option(help="--logs: the world file, if it is not beside the logs.")
+]
+Quick = Annotated[bool, typer.Option("--quick", help="A small version that takes minutes.")]
 Out = Annotated[
     Path | None,
     typer.Option(help="Folder for figures, data and README.md; out/paper/NAME if none."),
@@ -64,37 +77,45 @@ Out = Annotated[
 @app.command()
 def e1(
     *,
-    bundle: Bundle = DEFAULT_BUNDLE,
+    bundle: FlownBundle = None,
     worlds: Annotated[int, typer.Option("--worlds", "-k", help="Of the validation set.")] = 3,
     vehicle: Vehicle = VehicleKind.POINT,
     px4: Px4 = None,
     logs: Logs = None,
+    trial: Trial = None,
+    world_file: WorldFile = None,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
 ) -> None:
     """Transferability: unseen worlds from the same starts, beside baselines."""
     from lpac.paper.experiments import pads_of, transferability, whole_transferability
-    from lpac.paper.report import write_transferability
+    from lpac.paper.report import LOGS, POINTS, WHOLE_BESIDE_POINTS, write_transferability
 
     _at_least(1, worlds, "--worlds")
-    folder = _folder(out, "e1")
+    _check_options(vehicle, px4, logs, trial, world_file)
+    folder = out or _OUT / "e1"
     records: dict[str, dict[str, FlightRecord]]
     if logs is not None:
-        records = {trial.name: {"flight": trial} for trial in _logged(logs)}
+        trials = _logged(logs, trial, world_file, bundle)
+        records = {name: {"flight": record} for name, record in trials.items()}
+        made_by, how = _made_from_logs("e1", logs, trial, world_file, bundle, trials), LOGS
     else:
-        whole = {}
-        if vehicle is not VehicleKind.POINT:
-            plan = whole_transferability(bundle, worlds)
-            whole = _fly_whole(plan, bundle, vehicle, px4, ray, folder)
-        points = transferability(worlds, pads_of(bundle) if whole else None)
+        cores, flown_by = pool(ray), bundle or DEFAULT_BUNDLE
+        is_whole = vehicle is not VehicleKind.POINT
+        plan = whole_transferability(flown_by, worlds) if is_whole else {}
+        points = transferability(worlds, pads_of(flown_by) if is_whole else None)
+        seeds = {world: of_world["lpac"].seed for world, of_world in points.items()}
+        made_by = _made_by(f"e1 -k {worlds}{_option(vehicle)}", [flown_by], seeds)
+        how = WHOLE_BESIDE_POINTS.format(vehicles=_VEHICLES[vehicle]) if is_whole else POINTS
+        folder.mkdir(parents=True, exist_ok=True)
+        whole = _fly_whole(plan, flown_by, vehicle, px4, cores, folder) if plan else {}
         named = {(w, name): one for w, of_world in points.items() for name, one in of_world.items()}
-        flown = dict(zip(named, _fly(list(named.values()), bundle, ray), strict=True))
+        flown = dict(zip(named, _fly(list(named.values()), flown_by, cores), strict=True))
         records = {world: {"whole robots": record} for world, record in whole.items()}
         for (world, name), flight in flown.items():
             records.setdefault(world, {})[name] = flight.record
-    made_by = _made_by(f"e1 -k {worlds}{_flown_with(vehicle, logs)}", bundle)
-    told = write_transferability(records, folder, made_by, _how(vehicle, logs))
+    told = write_transferability(records, folder, made_by, how)
     _tell(
         told, folder, as_json=as_json,
         lines=[
@@ -108,49 +129,94 @@ def e1(
 @app.command()
 def e2(
     *,
-    bundle: Bundle = DEFAULT_BUNDLE,
+    bundle: FlownBundle = None,
     trials: Annotated[int, typer.Option(help="How often.")] = 3,
     world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
     vehicle: Vehicle = VehicleKind.POINT,
     px4: Px4 = None,
     logs: Logs = None,
+    trial: Trial = None,
+    world_file: WorldFile = None,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
 ) -> None:
     """Repeatability: one world again and again, starts and GPS a little off."""
-    from lpac.paper.experiments import repeatability, whole_repeatability
-    from lpac.paper.report import write_repeatability
+    from lpac.paper.experiments import repeatability, who_is_missing, whole_repeatability
+    from lpac.paper.report import LOGS, POINTS, WHOLE, write_repeatability
 
     _at_least(2, trials, "--trials")
-    folder = _folder(out, "e2")
+    _check_options(vehicle, px4, logs, trial, world_file)
+    folder = out or _OUT / "e2"
     if logs is not None:
-        records = {trial.name: trial for trial in _logged(logs)}
+        records = _logged(logs, trial, world_file, bundle)
         _at_least(2, len(records), f"missions in {logs}:")
-    elif vehicle is VehicleKind.POINT:
-        plan = repeatability(trials, world)
-        flown = _fly(list(plan.values()), bundle, ray)
-        records = {name: flight.record for name, flight in zip(plan, flown, strict=True)}
+        made_by, how = _made_from_logs("e2", logs, trial, world_file, bundle, records), LOGS
     else:
-        whole = whole_repeatability(bundle, trials, world)
-        records = _fly_whole(whole, bundle, vehicle, px4, ray, folder)
-    made_by = _made_by(f"e2 --trials {trials} --world {world}{_flown_with(vehicle, logs)}", bundle)
-    told = write_repeatability(records, folder, made_by, _how(vehicle, logs))
+        cores, flown_by = pool(ray), bundle or DEFAULT_BUNDLE
+        command = f"e2 --trials {trials} --world {world}{_option(vehicle)}"
+        if vehicle is VehicleKind.POINT:
+            plan, how = repeatability(trials, world), POINTS
+            made_by = _made_by(command, [flown_by], {n: one.seed for n, one in plan.items()})
+            folder.mkdir(parents=True, exist_ok=True)
+            flown = _fly(list(plan.values()), flown_by, cores)
+            records = {name: flight.record for name, flight in zip(plan, flown, strict=True)}
+        else:
+            whole = whole_repeatability(flown_by, trials, world)
+            how = WHOLE.format(vehicles=_VEHICLES[vehicle])
+            made_by = _made_by(command, [flown_by], {n: one.seed for n, one in whole.items()})
+            folder.mkdir(parents=True, exist_ok=True)
+            records = _fly_whole(whole, flown_by, vehicle, px4, cores, folder)
+    told = write_repeatability(records, folder, made_by, how)
     spread = told["spread"]
     _tell(
         told, folder, as_json=as_json,
         lines=[
-            *(f"{name}: {record.normalized[-1]:.3f}" for name, record in records.items()),
+            f"cost after {spread['end_s']:.0f} s",
+            *(f"{name}: {one['final']:.3f}" for name, one in told["trials"].items()),
             f"mean {spread['final_mean']:.3f}, standard deviation {spread['final_deviation']:.3f}",
+            *who_is_missing(spread),
         ],
     )  # fmt: skip
 
 
-def _logged(folder: Path) -> "Sequence[FlightRecord]":
-    """The missions in the logs below a folder."""
+def _check_options(
+    vehicle: VehicleKind,
+    px4: Path | None,
+    logs: Path | None,
+    trial: "Sequence[str] | None",
+    world_file: Path | None,
+) -> None:
+    """An option that would do nothing is a mistake."""
+    if logs is not None and vehicle is not VehicleKind.POINT:
+        raise ValueError("--vehicle does nothing with --logs")
+    if vehicle is VehicleKind.PX4 and px4 is None:
+        raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+    if vehicle is not VehicleKind.PX4 and px4 is not None:
+        beside = "--logs" if logs is not None else f"--vehicle {vehicle.value}"
+        raise ValueError(f"--px4 does nothing with {beside}")
+    if logs is None and (trial or world_file is not None):
+        raise ValueError(f"--{'trial' if trial else 'world-file'} does nothing without --logs")
+
+
+def _logged(
+    logs: Path, trial: "Sequence[str] | None", world_file: Path | None, bundle: Path | None
+) -> "dict[str, FlightRecord]":
+    """The missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
     from lpac.analysis.report import Wanted, examine
 
-    return examine([folder], Wanted(), lambda *_: None).trials
+    wanted = Wanted(trials=tuple(trial or ()), world=world_file, bundle=bundle)
+    examined = examine([logs], wanted)
+    # As the option is called here.
+    notes = [note.replace("--world", "--world-file") for note in examined.notes]
+    for record in examined.trials:
+        if not len(record.normalized):
+            why = [note for note in notes if note.startswith(f"{record.name}: ")]
+            others = "; or choose other missions with --trial" if len(examined.trials) > 1 else ""
+            raise ValueError("; ".join(why or [f"{record.name}: no cost is known"]) + others)
+    for note in notes:
+        typer.echo(f"note: {note}", err=True)
+    return {record.name: record for record in examined.trials}
 
 
 def _fly_whole(
@@ -158,7 +224,7 @@ def _fly_whole(
     bundle: Path,
     vehicle: VehicleKind,
     px4: Path | None,
-    ray: str | None,
+    cores: "Pool",
     folder: Path,
 ) -> "dict[str, FlightRecord]":
     """Whole robots; in real time one flight after another, whose logs stay in `folder`."""
@@ -169,13 +235,12 @@ def _fly_whole(
         task = progress.add_task("", total=len(plan))
         if vehicle is VehicleKind.SIMULATED:
             scenarios = list(plan.values())
-            with closing(flown.fly_whole(scenarios, bundle.resolve(), pool(ray))) as told:
+            with closing(flown.fly_whole(scenarios, bundle.resolve(), cores)) as told:
                 by_number = {}
                 for number, record in told:
                     by_number[number] = record
                     progress.update(task, advance=1)
             return {name: by_number[number] for number, name in enumerate(plan)}
-        _check_px4(vehicle, px4)
         for name, scenario in plan.items():
             its = folder / name.replace(" ", "-")
             records[name] = flown.fly_programs(scenario, its, bundle, px4)
@@ -183,37 +248,18 @@ def _fly_whole(
     return records
 
 
-def _check_px4(vehicle: VehicleKind, px4: Path | None) -> None:
-    if (vehicle is VehicleKind.PX4) != (px4 is not None):
-        raise ValueError("--px4 names PX4's build folder, and belongs to --vehicle px4")
-
-
-def _flown_with(vehicle: VehicleKind, logs: Path | None) -> str:
-    if logs is not None:
-        return f" --logs {logs}"
-    return "" if vehicle is VehicleKind.POINT else f" --vehicle {vehicle.value}"
-
-
-def _how(vehicle: VehicleKind, logs: Path | None) -> str:
-    from lpac.paper.report import LOGS, POINTS, WHOLE
-
-    if logs is not None:
-        return LOGS
-    if vehicle is VehicleKind.POINT:
-        return POINTS
-    return WHOLE.format(vehicles=_VEHICLES[vehicle])
-
-
 @app.command()
 def e3(
     *,
-    bundle: Bundle = DEFAULT_BUNDLE,
+    bundle: FlownBundle = None,
     world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
     vehicle: Annotated[
         VehicleKind, typer.Option(help="point; or whole robots, of which a pilot takes some.")
     ] = VehicleKind.POINT,
     px4: Px4 = None,
     logs: Logs = None,
+    trial: Trial = None,
+    world_file: WorldFile = None,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
@@ -229,28 +275,36 @@ def e3(
     from lpac.paper.flown import fly_piloted, fly_programs
     from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, TAKEN_WHOLE, write_perturbation
 
-    folder = _folder(out, "e3")
+    _check_options(vehicle, px4, logs, trial, world_file)
+    folder, flown_by = out or _OUT / "e3", bundle or DEFAULT_BUNDLE
+    command = f"e3 --world {world}{_option(vehicle)}"
     if logs is not None:
-        trials = _logged(logs)
+        trials = _logged(logs, trial, world_file, bundle)
         if len(trials) > 1:
-            raise ValueError(f"{logs}: has {len(trials)} missions: give the folder of one")
-        what, how = perturbed_by(trials[0], absences_of(trials[0]), _range_m(bundle)), TAKEN_LOGS
+            raise ValueError(f"{logs}: has {', '.join(trials)}: choose one mission with --trial")
+        [record] = trials.values()
+        what = perturbed_by(record, absences_of(record), _range_m(flown_by, _flown_by(trials)))
+        made_by, how = _made_from_logs("e3", logs, trial, world_file, bundle, trials), TAKEN_LOGS
     elif vehicle is VehicleKind.POINT:
-        [flight] = _fly([perturbation(world)], bundle, ray)
-        what, how = perturbed(flight), TAKEN_POINTS
+        plan, cores, how = perturbation(world), pool(ray), TAKEN_POINTS
+        made_by = _made_by(command, [flown_by], {"flight": plan.seed})
+        folder.mkdir(parents=True, exist_ok=True)
+        [flight] = _fly([plan], flown_by, cores)
+        what = perturbed(flight)
     else:
-        scenario, pilots = whole_perturbation(bundle, world)
+        scenario, pilots = whole_perturbation(flown_by, world)
+        made_by = _made_by(command, [flown_by], {"flight": scenario.seed})
+        how = TAKEN_WHOLE.format(vehicles=_VEHICLES[vehicle])
+        range_m = _range_m(flown_by)
+        folder.mkdir(parents=True, exist_ok=True)
         with progress_of("flights") as progress:
             task = progress.add_task("", total=1)
             if vehicle is VehicleKind.SIMULATED:
-                record = fly_piloted(scenario, bundle, pilots)
+                record = fly_piloted(scenario, flown_by, pilots)
             else:
-                _check_px4(vehicle, px4)
-                record = fly_programs(scenario, folder / "flight", bundle, px4, pilots)
+                record = fly_programs(scenario, folder / "flight", flown_by, px4, pilots)
             progress.update(task, advance=1)
-        what = perturbed_by(record, absences_of(record), _range_m(bundle))
-        how = TAKEN_WHOLE.format(vehicles=_VEHICLES[vehicle])
-    made_by = _made_by(f"e3 --world {world}{_flown_with(vehicle, logs)}", bundle)
+        what = perturbed_by(record, absences_of(record), range_m)
     told = write_perturbation(what, folder, made_by, how)
     _tell(
         told, folder, as_json=as_json,
@@ -263,14 +317,23 @@ def e3(
     )  # fmt: skip
 
 
-def _range_m(bundle: Path) -> float:
-    """How far the bundle's robots hear each other in the field's scale."""
+def _range_m(path: Path, flown: "Sequence[str] | None" = None) -> float:
+    """How far the bundle's robots hear each other in the field's scale.
+
+    Raises ValueError if it is none of `flown`, ids of bundles.
+    """
     from edge.policy.bundle import load_bundle
     from lpac.sim.experiment import FIELD_SCALE
 
-    perception = load_bundle(bundle).manifest.perception
+    bundle = load_bundle(path)
+    perception = bundle.manifest.perception
     if perception is None:
-        raise ValueError(f"{bundle}: has no perception: it cannot fly")
+        raise ValueError(f"{path}: has no perception: it cannot fly")
+    if flown is not None and bundle.id not in flown:
+        raise ValueError(
+            f"{path}: is not what flew, {' and '.join(its[:16] for its in flown)}: give that with "
+            "--bundle, which says how far robots hear each other"
+        )
     return perception.communication_range / FIELD_SCALE.env_scale
 
 
@@ -279,37 +342,72 @@ def _at_least(least: int, value: int, option: str) -> None:
         raise ValueError(f"{option} {value}: must be at least {least}")
 
 
-def _folder(out: Path | None, name: str) -> Path:
-    folder = out or _OUT / name
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+def _option(vehicle: VehicleKind) -> str:
+    return "" if vehicle is VehicleKind.POINT else f" --vehicle {vehicle.value}"
 
 
-def _made_by(command: str, bundle: Path | None) -> dict[str, str]:
+def _made_by(
+    command: str, bundles: "Sequence[Path]", seeds: "Mapping[str, int] | None" = None
+) -> dict[str, str]:
+    """What made an experiment: its command, its policies, its scenarios' seeds, and versions."""
+    from edge.policy.bundle import load_bundle
+
+    named = "".join(f" --bundle {path}" for path in bundles if path != DEFAULT_BUNDLE)
+    return _provenance(command + named, [load_bundle(path).id for path in bundles], seeds or {})
+
+
+def _made_from_logs(
+    name: str,
+    logs: Path,
+    trial: "Sequence[str] | None",
+    world_file: Path | None,
+    bundle: Path | None,
+    records: "Mapping[str, FlightRecord]",
+) -> dict[str, str]:
+    options = [
+        ("--logs", str(logs)),
+        *(("--trial", its) for its in trial or ()),
+        *(("--world-file", str(its)) for its in [world_file] if its is not None),
+        *(("--bundle", str(its)) for its in [bundle] if its is not None),
+    ]
+    command = " ".join([name, *(f"{option} {shlex.quote(value)}" for option, value in options)])
+    return _provenance(command, _flown_by(records), {})
+
+
+def _flown_by(records: "Mapping[str, FlightRecord]") -> list[str]:
+    """The ids of the policies' bundles."""
+    robots = [robot for record in records.values() for robot in record.robots]
+    return sorted({said.bundle_id for robot in robots for said in robot.said})
+
+
+def _provenance(
+    command: str, bundle_ids: "Sequence[str]", seeds: "Mapping[str, int]"
+) -> dict[str, str]:
     import edge
     import lpac
-    from edge.policy.bundle import load_bundle
     from lpac.sim.kept import code_digest
 
-    policy = {"bundle": load_bundle(bundle).id} if bundle else {}
+    told = {
+        "bundle": ", ".join(bundle_ids),
+        "seeds": ", ".join(f"{name} {seed}" for name, seed in seeds.items()),
+    }
     return {
-        "command": f"lpac paper {command}{f' --bundle {bundle}' if bundle else ''}",
-        **policy,
+        "command": f"lpac paper {command}",
+        **{what: value for what, value in told.items() if value},
         "lpac-edge": f"{version('lpac-edge')}, code {code_digest(edge, lpac)[:12]}",
         "python": platform.python_version(),
+        **{package: version(package) for package in ("numpy", "onnxruntime")},
     }
 
 
-def _fly(scenarios: "Sequence[Scenario]", bundle: Path, ray: str | None) -> "list[SimulatedFlight]":
+def _fly(scenarios: "Sequence[Scenario]", bundle: Path, cores: "Pool") -> "list[SimulatedFlight]":
     """All of them, in their order."""
-    from edge.policy.bundle import load_bundle
     from lpac.paper.flown import fly_all
 
-    load_bundle(bundle)
     flown: dict[int, SimulatedFlight] = {}
     with (
         progress_of("flights") as progress,
-        closing(fly_all(scenarios, bundle.resolve(), pool(ray))) as told,
+        closing(fly_all(scenarios, bundle.resolve(), cores)) as told,
     ):
         task = progress.add_task("", total=len(scenarios))
         for number, flight in told:
@@ -351,10 +449,13 @@ def asynchrony(
     from lpac.paper.asynchrony import AsynchronyPlan, results_of
     from lpac.paper.asynchrony import as_json as to_json
     from lpac.paper.asynchrony_report import write_report
+    from lpac.paper.repeated import sizes_of
 
     count = worlds if worlds is not None else _QUICK_WORLDS if quick else _WORLDS
+    loaded = load_bundle(bundle)
     plan = AsynchronyPlan(
-        bundle=TrainedBundle(str(bundle.resolve()), load_bundle(bundle).id),
+        bundle=TrainedBundle(str(bundle.resolve()), loaded.id),
+        message_bytes=sizes_of(loaded).of_two,
         world_set="validation",
         worlds=count,
         **({**_QUICK_HZ, "delays_s": _QUICK_DELAYS_S} if quick else {}),
@@ -371,7 +472,7 @@ def asynchrony(
                 flown[flight] = cost
                 progress.update(task, advance=1)
         results = results_of(plan, flown)
-        made_by = _made_by(f"async -k {count}{' --quick' if quick else ''}", bundle)
+        made_by = _made_by(f"async -k {count}{_QUICKLY[quick]}", [bundle])
         write_report(plan, results, folder, made_by)
     if as_json:
         typer.echo(json.dumps(to_json(plan, results), indent=2))
@@ -399,17 +500,23 @@ def transfer(
     """Other numbers of robots, features and ranges: `lpac evaluate` in the paper's set-ups."""
     from lpac.cli.evaluate import evaluate
     from lpac.evaluate.worlds import SET_UPS
+    from lpac.paper.report import write_transfer
 
-    large = [name for name in SET_UPS if name not in _TOO_LARGE]
+    folder, flown = out or _OUT / "transfer", bundles or [DEFAULT_BUNDLE]
+    count = worlds if worlds is not None else 2 if quick else 20
+    made_by = _made_by(f"transfer -k {count}{_QUICKLY[quick]}", flown)
     evaluate(
-        methods=[str(bundle) for bundle in bundles or [DEFAULT_BUNDLE]],
-        set_ups=[*_QUICK_SET_UPS] if quick else large,
-        worlds=worlds if worlds is not None else 2 if quick else 20,
+        methods=[str(bundle) for bundle in flown],
+        set_ups=[*_QUICK_SET_UPS]
+        if quick
+        else [name for name in SET_UPS if name not in _TOO_LARGE],
+        worlds=count,
         baselines=["clairvoyant-cvt"],
         ray=ray,
         as_json=as_json,
-        out=_folder(out, "transfer"),
+        out=folder,
     )
+    write_transfer(json.loads((folder / "evaluation.json").read_text()), folder, made_by)
 
 
 @app.command()
@@ -426,7 +533,9 @@ def network(
     """Table I, and throughput over the number of robots: `lpac bench network`, as installed."""
     from lpac.cli.bench import network as measure
     from lpac.network.middleware import MIDDLEWARES
+    from lpac.paper.report import write_network
 
+    folder = out or _OUT / "network"
     robots, repetitions, seconds = _QUICK_NETWORK if quick else (None, None, None)
     measure(
         middlewares=[name for name, its in MIDDLEWARES.items() if its.version() is not None],
@@ -435,8 +544,11 @@ def network(
         seconds=seconds,
         namespaces=namespaces,
         as_json=as_json,
-        out=_folder(out, "network"),
+        out=folder,
     )
+    where = "" if namespaces is None else f" --namespaces {namespaces}"
+    made_by = _made_by(f"network{where}{_QUICKLY[quick]}", [])
+    write_network(json.loads((folder / "network.json").read_text()), folder, made_by)
 
 
 @app.command("all")
@@ -468,8 +580,8 @@ def everything(
     for name, make in flying.items():
         its = folder / name
         # A quick one of some is the only one that there is.
-        option = " --quick" if quick and name not in ("e1", "e2", "e3") else ""
-        made_by[name] = _made_by(f"{name}{option}", None if name == "network" else bundle)
+        option = _QUICKLY[quick and name not in ("e1", "e2", "e3")]
+        made_by[name] = _made_by(f"{name}{option}", [] if name == "network" else [bundle])
         kept = its / "made_by.json"
         if kept.exists() and json.loads(kept.read_text()) == made_by[name]:
             continue

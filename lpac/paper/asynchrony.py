@@ -56,15 +56,24 @@ class Timing(NamedTuple):
             synchronous=self.synchronous,
         )
 
+    @property
+    def rounds(self) -> float:
+        """How often messages are exchanged for each perception."""
+        return self.policy_hz / self.perception_hz
+
 
 FIELD = Timing(5.0, 2.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AsynchronyPlan:
-    """The timings, and the first `worlds` worlds of a set, over which all of them are flown."""
+    """The timings, and the first `worlds` worlds of a set, over which all of them are flown.
+
+    `message_bytes` is the most that a robot says at a time.
+    """
 
     bundle: TrainedBundle
+    message_bytes: int
     world_set: WorldSet
     worlds: int
     perception_hz: tuple[float, ...] = (1.0, 2.5, 5.0, 10.0)
@@ -74,6 +83,10 @@ class AsynchronyPlan:
     def __post_init__(self) -> None:
         if self.worlds < 1:
             raise ValueError(f"worlds = {self.worlds}: must be at least 1")
+
+    def said_kb_s(self, policy_hz: float) -> float:
+        """What a robot says at most in a second, kB."""
+        return policy_hz * self.message_bytes / 1000.0
 
     @property
     def timings(self) -> list[Timing]:
@@ -170,6 +183,8 @@ def as_json(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> dict[str, 
         "timings": [
             {
                 **result.timing._asdict(),
+                "rounds_per_perception": result.timing.rounds,
+                "said_kb_s": plan.said_kb_s(result.timing.policy_hz),
                 "means": [list(mean) for mean in result.means],
                 "over_field": [list(ratio) for ratio in result.over_field],
                 "area": list(bootstrap(result.area[None])),

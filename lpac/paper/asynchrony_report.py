@@ -1,8 +1,5 @@
 """The experiment on rates and asynchrony as files: figures, CSV, JSON, and README.md."""
 
-import csv
-import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +9,8 @@ from matplotlib.figure import Figure
 from lpac.analysis import style
 from lpac.analysis.style import CURVES, WIDTH_IN, tidy
 from lpac.paper.asynchrony import FIELD, TIMES_S, AsynchronyPlan, TimingResult, as_json
+from lpac.paper.files import table, write_experiment
+from lpac.paper.report import EXACT_POINTS
 
 _END = len(TIMES_S) - 1
 
@@ -20,26 +19,25 @@ def write_report(
     plan: AsynchronyPlan, results: Sequence[TimingResult], folder: Path, made_by: Mapping[str, str]
 ) -> None:
     """All of it; `made_by` says what made it: the command, versions. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    told = {**as_json(plan, results), "made_by": dict(made_by)}
-    (folder / "async.json").write_text(json.dumps(told, indent=2) + "\n")
-    (folder / "async.csv").write_text(_csv(results))
     style.save(_rates(plan, results), folder / "rates")
     style.save(_staleness(results), folder / "staleness")
-    (folder / "README.md").write_text(_text(plan, results, made_by))
+    told, text = as_json(plan, results), _text(plan, results)
+    write_experiment("async", told, _rows(plan, results), text, folder, EXACT_POINTS, made_by)
 
 
-def _csv(results: Sequence[TimingResult]) -> str:
-    """A row for each timing and world."""
-    rows = io.StringIO()
-    writer = csv.writer(rows, lineterminator="\n")
+def _rows(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> list[list[object]]:
+    """A heading, and a row for each timing and world."""
     times = [f"cost_at_{time_s:g}_s" for time_s in TIMES_S]
-    writer.writerow(["perception_hz", "policy_hz", "synchronous", "delay_s", "world", *times])
+    rows: list[list[object]] = [
+        ["perception_hz", "policy_hz", "synchronous", "delay_s", "rounds_per_perception",
+         "said_kb_s", "world", *times]
+    ]  # fmt: skip
     for result in results:
         perception_hz, policy_hz, synchronous, delay_s = result.timing
-        for world, costs in enumerate(result.costs.tolist()):
-            writer.writerow([perception_hz, policy_hz, int(synchronous), delay_s, world, *costs])
-    return rows.getvalue()
+        of_timing = [perception_hz, policy_hz, int(synchronous), delay_s, result.timing.rounds,
+                     plan.said_kb_s(policy_hz)]  # fmt: skip
+        rows += [[*of_timing, world, *costs] for world, costs in enumerate(result.costs.tolist())]
+    return rows
 
 
 def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
@@ -65,6 +63,13 @@ def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
                 ylabel=f"cost at {TIMES_S[at]:g} s / with the field's rates",
             )
             tidy(axes)
+            # What these rates ask of the radio.
+            above = axes.twiny()
+            above.set(xscale="log", xlim=axes.get_xlim(), xlabel="said by a robot, kB/s at most")
+            said_kb_s = [plan.said_kb_s(hz) for hz in plan.policy_hz]
+            above.set_xticks(plan.policy_hz, [f"{kb_s:.2g}" for kb_s in said_kb_s])
+            above.minorticks_off()
+            above.spines[["right"]].set_visible(False)
         axes.plot([], [], ls=style.DASHED, color=style.INK, lw=1.0, label="all at the same moments")
         handles, labels = axes.get_legend_handles_labels()
         figure.legend(
@@ -105,15 +110,18 @@ def _curve(
     axes.axhline(1.0, color=style.FAINT, lw=0.8, zorder=0)
 
 
-def _text(plan: AsynchronyPlan, results: Sequence[TimingResult], made_by: Mapping[str, str]) -> str:
-    heading = " | ".join(f"cost at {time_s:g} s" for time_s in TIMES_S)
+def _text(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> str:
+    headings = ["perception, Hz", "policy, Hz", "rounds per perception", "said, kB/s", "moments",
+                "delay, s",
+                *(f"cost at {time_s:g} s" for time_s in TIMES_S),
+                "mean cost over the flight"]  # fmt: skip
     return f"""# Rates and asynchrony
 
 The paper runs perception, exchange of messages and control asynchronously, each at a rate of its
 own, and argues both for an exchange slower than perception (a longer window to hear everybody in)
 and for a faster one. It measures neither. Here the policy of bundle `{plan.bundle.bundle_id[:16]}`,
 trained at the rates of the field alone (perception 5 Hz, policy 2.5 Hz), flies over the first
-{plan.worlds} worlds of the {plan.world_set} set: point robots in the set-up of the field.
+{plan.worlds} worlds of the {plan.world_set} set, in the set-up of the field. {EXACT_POINTS}
 
 ![cost over the rates](rates.png)
 
@@ -126,33 +134,29 @@ intervals of the ratio of means, by worlds in pairs.*
 *The same policy at the rates of the field, with messages that are late: each by half to one and a
 half of the mean delay; in terms of the cost without.*
 
-| perception, Hz | policy, Hz | moments | delay, s | {heading} | mean cost over the flight |
-| --- | --- | --- | --- | {" | ".join(["---"] * len(TIMES_S))} | --- |
-{chr(10).join(_row(result) for result in results)}
+{table(headings, [_row(plan, result) for result in results])}
 
 Cost over that at the start, and in brackets the 95 % interval of its ratio to the cost with the
-field's timing, the first row (bootstrap over worlds in pairs). A robot speaks as often as
-its policy decides, so that the second column is also what the radio is asked for. Messages, images
-and actions count for two of their periods, or as long as in the field if that is longer; late
-messages so much longer as they are late. `async.csv` has a row for each flight, `async.json`
-everything.
-
-Made by {"; ".join(f"{name}: `{value}`" for name, value in made_by.items())}.
+field's timing, the first row (bootstrap over worlds in pairs). A robot speaks as often as its
+policy decides: *said* is what that asks of the radio, at most, since messages are compressed.
+Messages, images and actions count for two of their periods, or as long as in the field if that is
+longer; late messages so much longer as they are late.
 """
 
 
-def _row(result: TimingResult) -> str:
+def _row(plan: AsynchronyPlan, result: TimingResult) -> list[str]:
     timing = result.timing
     costs = [
         f"{mean:.3f} (x {low:.2f} to {high:.2f})"
         for (mean, _, _), (_, low, high) in zip(result.means, result.over_field, strict=True)
     ]
-    cells = [
+    return [
         f"{timing.perception_hz:g}",
         f"{timing.policy_hz:g}",
+        f"{timing.rounds:.2g}",
+        f"{plan.said_kb_s(timing.policy_hz):.2g}",
         "the same" if timing.synchronous else "own",
         f"{timing.delay_s:g}",
         *costs,
         f"{result.area.mean():.3f}",
     ]
-    return f"| {' | '.join(cells)} |"

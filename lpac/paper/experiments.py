@@ -2,10 +2,15 @@
 
 Each is a plan: named scenarios, and from what they came to the numbers, which are those of flight
 records, so that a field day's logs give the same. What points leave out is said in each report.
+
+A record's cost is that of the places in it. Points' are where they truly are; those of whole robots
+and of logs are where the robots took themselves to be, and where the vehicles tell, the true cost
+is known beside it.
 """
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +18,7 @@ import numpy as np
 
 from edge.core import F64
 from edge.messages.mission import FlightState
-from lpac.analysis.flight import FlightRecord
+from lpac.analysis.flight import COST_PERIOD_S, FlightRecord
 from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
 from lpac.evaluate.worlds import DrawnWorld, draw_world
 from lpac.sim.baselines import BaselineName
@@ -297,53 +302,126 @@ def _phase(
     )
 
 
-def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
-    """Of each flight, by name: its cost over that at the start, where robots took themselves to be.
+def looked_at_from_s(trials: Mapping[str, FlightRecord]) -> dict[str, float]:
+    """When E2 begins to look at each trial, by name; s, in the trial's own time.
 
-    Where their vehicles tell, `final_true` is the same for where these were.
+    That is the takeoff command, or for all trials the mission's begin, 0, if one of them has none,
+    as points have not, or had it earlier than E2 looks.
+    """
+    found_s = {name: _takeoff_s(record) for name, record in trials.items()}
+    if any(not -E2_DURATION_S < at_s <= 0.0 for at_s in found_s.values()):
+        return dict.fromkeys(trials, 0.0)
+    return found_s
+
+
+def _takeoff_s(record: FlightRecord) -> float:
+    """When the first robot armed, which is what a takeoff command makes of it; NaN if none did."""
+    armed_s = [
+        time_s
+        for robot in record.robots
+        for time_s, said in zip(robot.time_s.tolist(), robot.said, strict=False)
+        if said.state is FlightState.ARMING
+    ]
+    return min(armed_s, default=math.nan)
+
+
+def looked_at(record: FlightRecord, from_s: float) -> FlightRecord:
+    """The `E2_DURATION_S` of a trial from a time on, or as much as there is; times count from it.
+
+    Before the mission robots count for the cost where they stand, too.
+    """
+    end_s = min(E2_DURATION_S, record.duration_s - from_s)
+    robots = tuple(
+        replace(
+            robot,
+            time_s=robot.time_s - from_s,
+            flying=robot.flying | (robot.time_s < 0.0) if from_s < 0.0 else robot.flying,
+        )
+        for robot in record.robots
+    )
+    return replace(
+        record,
+        begin_s=record.begin_s + from_s,
+        duration_s=end_s,
+        from_s=0.0,
+        to_s=end_s,
+        robots=robots,
+        truth={name: track.shifted(-from_s) for name, track in record.truth.items()},
+        cost_time_s=np.append(np.arange(0.0, end_s - COST_PERIOD_S / 2.0, COST_PERIOD_S), end_s),
+    )
+
+
+def true_curve(record: FlightRecord) -> F64:
+    """(C,): the cost for where the robots truly were, over the first; NaN where it is not known."""
+    points = not any(robot.said for robot in record.robots)
+    return record.normalized if points else record.normalized_true
+
+
+def curves_json(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
+    """Of each flight, by name: its cost and its true cost over those at the start.
+
+    A true cost that is not known is None. The positions are of who was in the air in the end, by
+    robot, as the record has them.
     """
     return {
         name: {
             "time_s": record.curve_time_s.tolist(),
             "normalized_cost": record.normalized.tolist(),
+            "normalized_true_cost": [_known(cost) for cost in true_curve(record).tolist()],
             "final": float(record.normalized[-1]),
-            "final_true": _last_known(record.normalized_true),
-            "final_positions_m": _ends_m(record).tolist(),
+            "final_true": _known(true_curve(record)[-1]),
+            "final_positions_m": record.places_at(record.curve_time_s[-1]),
         }
         for name, record in records.items()
     }
 
 
-def _last_known(values: F64) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(known[-1]) if len(known) else None
-
-
-def _ends_m(record: FlightRecord) -> F64:
-    """(N, 2): where robots took themselves to be in the end; NaN of those that did not fly then."""
-    end_s = record.curve_time_s[-1:]
-    return np.stack([robot.places_at(end_s)[0, :2] for robot in record.robots])
+def _known(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def curves_csv(records: Mapping[str, FlightRecord]) -> list[list[object]]:
-    """A heading, and a row for each flight and time."""
-    rows: list[list[object]] = [["flight", "time_s", "cost_over_first"]]
-    for name, record in records.items():
-        curve = zip(record.curve_time_s.tolist(), record.normalized.tolist(), strict=True)
-        rows += [[name, time_s, cost] for time_s, cost in curve]
+    """A heading, and a row for each flight and time; a true cost that is not known is empty."""
+    rows: list[list[object]] = [["flight", "time_s", "cost_over_first", "true_cost_over_first"]]
+    for name, told in curves_json(records).items():
+        curves = (told["time_s"], told["normalized_cost"], told["normalized_true_cost"])
+        rows += [[name, *row] for row in zip(*curves, strict=True)]
     return rows
 
 
-def spread_of(records: Sequence[FlightRecord]) -> dict[str, float]:
-    """Of E2's trials: how the costs at the end, and the places, differ."""
-    end_s = min(record.curve_time_s[-1] for record in records)
+def spread_of(records: Mapping[str, FlightRecord]) -> dict[str, Any]:
+    """Of E2's trials: how the costs at the end of the shortest, and the places there, differ.
+
+    Places are compared of the robots that were in the air there in all trials; `missing` are the
+    others, by trial. Raises ValueError if nobody was in all.
+    """
+    end_s = min(float(record.curve_time_s[-1]) for record in records.values())
     times_s = np.append(np.arange(0.0, end_s, 1.0), end_s)
-    curves = np.array([np.interp(times_s, r.curve_time_s, r.normalized) for r in records])
-    ends_m = np.array([_ends_m(record) for record in records])
-    scatter_m = np.linalg.norm(ends_m - ends_m.mean(axis=0), axis=2)
+    curves = np.array([np.interp(times_s, r.curve_time_s, r.normalized) for r in records.values()])
+    ends_m = {trial: record.places_at(end_s) for trial, record in records.items()}
+    robots = dict.fromkeys(robot.name for record in records.values() for robot in record.robots)
+    missing = {
+        trial: [name for name in robots if name not in places_m]
+        for trial, places_m in ends_m.items()
+    }
+    common = [name for name in robots if not any(name in names for names in missing.values())]
+    if not common:
+        raise ValueError("no robot was in the air at the end of all trials")
+    common_m = np.array([[places_m[name] for name in common] for places_m in ends_m.values()])
+    scatter_m = np.linalg.norm(common_m - common_m.mean(axis=0), axis=2)
     return {
+        "end_s": end_s,
         "final_mean": float(curves[:, -1].mean()),
         "final_deviation": float(curves[:, -1].std(ddof=1)),
         "largest_deviation_in_flight": float(curves.std(axis=0, ddof=1).max()),
-        "mean_scatter_of_ends_m": float(np.nanmean(scatter_m)),
+        "mean_scatter_of_ends_m": float(scatter_m.mean()),
+        "missing": {trial: names for trial, names in missing.items() if names},
     }
+
+
+def who_is_missing(spread: Mapping[str, Any]) -> list[str]:
+    """A sentence for each trial of `spread_of` in which a robot is missing."""
+    return [
+        f"At the end of {trial} not in the air, and so not compared: {', '.join(names)}."
+        for trial, names in spread["missing"].items()
+    ]

@@ -37,12 +37,14 @@ def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
 
 
 def perturbation(perturbed: PerturbedFlight) -> Figure:
-    """Cost, neighbours and speeds over time; shaded while a robot is away."""
+    """Cost, thin in truth, neighbours and speeds over time; shaded while a robot is away."""
     record, absences = perturbed.record, perturbed.absences
     away = {absence.robot for absence in absences}
     with style.figure(WIDTH_IN, 4.6) as figure:
         cost, neighbours, speed = figure.subplots(3, 1, sharex=True)
         cost.plot(record.curve_time_s, record.normalized, color=style.BLACK, lw=1.3)
+        if record.truth:
+            cost.plot(record.curve_time_s, record.normalized_true, color=style.BLACK, lw=0.5)
         cost.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, None))
         for axes, values in ((neighbours, perturbed.neighbours), (speed, perturbed.speed_m_s)):
             for robot, of_robot in zip(record.robots, values.T, strict=True):
@@ -63,13 +65,16 @@ def perturbation(perturbed: PerturbedFlight) -> Figure:
                 f"{robot_name} away", (middle_s, 1.0), xycoords=("data", "axes fraction"),
                 ha="center", va="bottom", fontsize=7,
             )  # fmt: skip
-        axes_of_legend = [
-            ("black: cost, or the robots' mean", style.BLACK),
-            ("a robot that is taken once", style.VERMILLION),
-            ("another robot", style.FAINT),
+        legend = [
+            ("cost, or the robots' mean", style.BLACK, 1.5),
+            ("a robot that is taken once", style.VERMILLION, 1.5),
+            ("another robot", style.FAINT, 1.5),
         ]
-        handles = [cost.plot([], [], color=colour)[0] for _, colour in axes_of_legend]
+        if record.truth:
+            legend.insert(1, ("cost, in truth", style.BLACK, 0.5))
+        handles = [cost.plot([], [], color=colour, lw=lw)[0] for _, colour, lw in legend]
         figure.legend(
-            handles, [label for label, _ in axes_of_legend], loc="outside upper center", ncols=3
-        )
+            handles, [label for label, _, _ in legend], loc="outside upper center",
+            ncols=len(legend),
+        )  # fmt: skip
         return figure

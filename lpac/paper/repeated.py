@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from edge.core.wire import most_bytes
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle
+from edge.policy.family import Observation
 from lpac.analysis.page import CLOSING, figure, opening
 from lpac.paper.claims import Agreement, Claim, Experiments, Sizes, claims_of
 
@@ -23,17 +26,19 @@ _PAPER = (
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
-    """An experiment of the page: its command, what it is, its data, and its figures' captions."""
+    """An experiment of the page: its command, what it is, and its figures' captions.
+
+    Its JSON is NAME/NAME.json.
+    """
 
     name: str
     title: str
-    data: str
     figures: Mapping[str, str]
 
 
 CHAPTERS = (
     Chapter(
-        "e1", "E1, transferability", "e1.json",
+        "e1", "E1, transferability",
         {
             "snapshots": "Three worlds that no policy was trained on, at 0, 15, 30 and 60 s: "
             "robots, their paths and Voronoi cells over the density, which is faint where no "
@@ -42,19 +47,19 @@ CHAPTERS = (
         },
     ),
     Chapter(
-        "e2", "E2, repeatability", "e2.json",
+        "e2", "E2, repeatability",
         {"repeatability": "Cost of all trials, their mean and standard deviation; end positions."},
     ),
     Chapter(
-        "e3", "E3, perturbation", "e3.json",
+        "e3", "E3, perturbation",
         {"perturbation": "Cost, neighbours in range and speeds; shaded while a robot is away."},
     ),
     Chapter(
-        "transfer", "Transfer to other teams and worlds", "evaluation.json",
+        "transfer", "Transfer to other teams and worlds",
         {"conditions": "Mean cost at the end over clairvoyant Lloyd's, with 95 % intervals."},
     ),
     Chapter(
-        "async", "Rates and asynchrony", "async.json",
+        "async", "Rates and asynchrony",
         {
             "rates": "Cost over the policy's rate, in terms of that with the field's rates. Full "
             "lines: each robot at its own moments; dashed: all at the same ones.",
@@ -62,7 +67,7 @@ CHAPTERS = (
         },
     ),
     Chapter(
-        "network", "Network", "network.json",
+        "network", "Network",
         {
             "restarts": "What a stream between two robots gets while all programs restart.",
             "robots": "The same over the number of robots, and how old their messages are.",
@@ -72,13 +77,13 @@ CHAPTERS = (
 
 
 def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, str]]) -> Path:
-    """index.html, claims.json and claims.csv of what lies in `folder`; gives the page's path.
+    """index.html and claims.json of what lies in `folder`; gives the page's path.
 
     `made_by` says of each experiment what made it; one that is missing there is left out. Raises
     OSError.
     """
     documents = {
-        chapter.name: json.loads((folder / chapter.name / chapter.data).read_text())
+        chapter.name: json.loads((folder / chapter.name / f"{chapter.name}.json").read_text())
         for chapter in CHAPTERS
         if chapter.name in made_by
     }
@@ -96,15 +101,24 @@ def write_page(folder: Path, bundle: Bundle, made_by: Mapping[str, Mapping[str, 
     }
     (folder / "claims.json").write_text(json.dumps(told, indent=2) + "\n")
     path = folder / "index.html"
-    path.write_text(_page(folder, claims, made_by))
+    flown = {name: document["flown"] for name, document in documents.items()}
+    path.write_text(_page(folder, claims, flown, made_by))
     return path
 
 
 def sizes_of(bundle: Bundle) -> Sizes:
-    """Of the messages of a bundle's policy."""
+    """Of the messages of a bundle's policy. Raises BundleError if no robot can fly it."""
     policy, perception = load_policy(bundle), bundle.manifest.perception
-    side = perception.shared_map_side if perception else 0
-    return Sizes(policy.message_size, most_bytes(policy.message_size, "float16", side))
+    agent = policy.agent()
+    assert perception is not None
+    local_map = np.zeros((perception.local_map_size,) * 2, np.float32)
+    sizes = []
+    for others in (2, 100):
+        nowhere = Observation(np.zeros(2), local_map, np.zeros((others, 2)), np.zeros(2))
+        heard = [np.zeros(policy.message_size, np.float32)] * others
+        said = agent.step(agent.observe(nowhere).features, heard, others).payload
+        sizes.append(most_bytes(said.size, "float16", perception.shared_map_side))
+    return Sizes(*sizes)
 
 
 def _claim_json(claim: Claim) -> dict[str, Any]:
@@ -114,7 +128,12 @@ def _claim_json(claim: Claim) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _page(folder: Path, claims: Sequence[Claim], made_by: Mapping[str, Mapping[str, str]]) -> str:
+def _page(
+    folder: Path,
+    claims: Sequence[Claim],
+    flown: Mapping[str, str],
+    made_by: Mapping[str, Mapping[str, str]],
+) -> str:
     parts = [
         opening(TITLE),
         f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and what came of it here. "
@@ -126,6 +145,7 @@ def _page(folder: Path, claims: Sequence[Claim], made_by: Mapping[str, Mapping[s
             continue
         its = folder / chapter.name
         parts.append(f'<h2 id="{chapter.name}">{_text(chapter.title)}</h2>')
+        parts.append(f"<p>{_text(flown[chapter.name])}</p>")
         parts += [
             figure((its / f"{name}.png").read_bytes(), caption, narrow=name in _NARROW)
             for name, caption in chapter.figures.items()

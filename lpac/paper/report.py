@@ -1,9 +1,6 @@
-"""The experiments in the air as files: figures as PNG and PDF, CSV, JSON, and README.md."""
+"""The experiments as files: figures as PNG and PDF, CSV, JSON, and README.md."""
 
-import csv
-import io
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,19 +10,24 @@ from lpac.analysis.flight import FlightRecord
 from lpac.paper import experiments
 from lpac.paper.experiments import PerturbedFlight, curves_csv, curves_json
 from lpac.paper.figures import costs_by_world, perturbation
+from lpac.paper.files import table, write_csv, write_experiment
 
 _LEAST_M, _MOST_M = experiments.GPS_ERROR_M
 # How it was flown, for the reports.
-POINTS = (
+_POINTS = (
     "Points flew over worlds of the validation set, each at once with the velocity that its policy "
-    "decided: without takeoff and landing, heights and wind, and with a GPS error, where there is "
-    f"one ({_LEAST_M:g} to {_MOST_M:g} m), that stays as it is."
+    "decided: without takeoff and landing, heights and wind"
 )
+POINTS = (
+    f"{_POINTS}, and with a GPS error, where there is one ({_LEAST_M:g} to {_MOST_M:g} m), that "
+    "stays as it is."
+)
+EXACT_POINTS = f"{_POINTS}, and without GPS errors."
 WHOLE = (
     "Whole robots flew over worlds of the validation set, from pads with room between them: their "
-    "programs' loops and separation, on {vehicles}; what they are held against are points from "
-    "the same pads."
+    "programs' loops and separation, on {vehicles}."
 )
+WHOLE_BESIDE_POINTS = f"{WHOLE} What they are held against are points from the same pads."
 TAKEN_POINTS = (
     f"{POINTS} A robot that is taken is gone: it says and hears nothing and does not count; it is "
     "back where it was, knowing nothing."
@@ -40,6 +42,11 @@ TAKEN_WHOLE = (
 )
 LOGS = "From the logs of flights."
 TAKEN_LOGS = f"From the log of a flight: {_PILOTED}"
+NETWORK = "No vehicles: programs that send what robots send, beside a stream, measured {where}."
+_COSTS = (
+    "Costs are over that at the start: of points where they are; of whole robots and logs where "
+    "they took themselves to be, and in truth where that is known."
+)
 
 
 def write_transferability(
@@ -54,7 +61,7 @@ def write_transferability(
         figures.snapshots_of_several(policies, experiments.SNAPSHOTS_S), folder / "snapshots"
     )
     style.save(costs_by_world(records), folder / "costs")
-    told = {world: curves_json(of_world) for world, of_world in records.items()}
+    told = {"worlds": {world: curves_json(of_world) for world, of_world in records.items()}}
     named = {
         f"{world}, {name}": record
         for world, of_world in records.items()
@@ -73,17 +80,18 @@ shows them at 0, 15, 30 and 60 s; it gives no costs. {flown}
 
 ![costs](costs.png)
 
-Cost in the end over that at the start, in brackets where the vehicles truly were, if that is known:
+The cost at the end, in brackets in truth. {_COSTS}
 
-{_table(["", *names], rows)}
+{table(["", *names], rows)}
 """
-    return _write("e1", told, curves_csv(named), text, folder, made_by)
+    return write_experiment("e1", told, curves_csv(named), text, folder, flown, made_by)
 
 
 def _final(record: FlightRecord) -> str:
+    """With the true one in brackets where vehicles tell."""
     told = curves_json({"": record})[""]
-    true = "" if told["final_true"] is None else f" ({told['final_true']:.3f})"
-    return f"{told['final']:.3f}{true}"
+    known = record.truth and told["final_true"] is not None
+    return f"{told['final']:.3f}" + (f" ({told['final_true']:.3f})" if known else "")
 
 
 def write_repeatability(
@@ -92,33 +100,56 @@ def write_repeatability(
     made_by: Mapping[str, str],
     flown: str = POINTS,
 ) -> dict[str, Any]:
-    """E2's; gives its JSON. Raises OSError."""
+    """E2's; gives its JSON. Raises OSError; ValueError if no robot was in all trials."""
+    from_s = experiments.looked_at_from_s(trials)
+    looked_at = {name: experiments.looked_at(trials[name], from_s[name]) for name in trials}
     first = next(iter(trials.values()))
     # All of one world: it is drawn below their ends.
     records = [
-        replace(record, name=name, coverage=first.coverage) for name, record in trials.items()
+        replace(record, name=name, coverage=first.coverage) for name, record in looked_at.items()
     ]
+    spread = experiments.spread_of(looked_at)
     style.save(figures.repeatability(records), folder / "repeatability")
-    spread = experiments.spread_of(list(trials.values()))
-    rows = [[name, _final(record)] for name, record in trials.items()]
+    rows = [
+        [name, _final(record), f"{-from_s[name]:.0f} s", _final(trials[name])]
+        for name, record in looked_at.items()
+    ]
+    headings = ["", f"cost after {spread['end_s']:.0f} s (in truth)", "mission began after",
+                "cost at the mission's end / at its start"]  # fmt: skip
     text = f"""# E2, repeatability
 
 The paper flies one world three times, each robot placed within 10 cm of the same start, and shows
-the cost over 40 s from the takeoff command: the curves differ, the costs at the end are similar,
-and GPS (1 to 5 m) scatters where robots end. Here {len(trials)} trials, and times count from the
-mission's start: before it nobody covers. {flown}
+the cost over {experiments.E2_DURATION_S:g} s from the takeoff command: the curves differ, the costs
+at the end are similar, and GPS (1 to 5 m) scatters where robots end. Here {len(trials)} trials.
+{_looked_at_text(from_s)} {flown}
 
 ![repeatability](repeatability.png)
 
-{_table(["", "cost in the end / at the start (in truth)"], rows)}
+{table(headings, rows)}
 
-Costs at the end: mean {spread["final_mean"]:.3f}, standard deviation
-{spread["final_deviation"]:.3f}; in flight the deviation is
+{_COSTS}
+
+Costs after {spread["end_s"]:.0f} s: mean {spread["final_mean"]:.3f}, standard deviation
+{spread["final_deviation"]:.3f}; before that the deviation is
 {spread["largest_deviation_in_flight"]:.3f} at most. A robot ends
 {spread["mean_scatter_of_ends_m"]:.2f} m from the mean of its ends, on average.
+{" ".join(experiments.who_is_missing(spread))}
 """
-    told = {"trials": curves_json(trials), "spread": spread}
-    return _write("e2", told, curves_csv(trials), text, folder, made_by)
+    told = {"trials": curves_json(looked_at), "mission_from_s": {n: -s for n, s in from_s.items()},
+            "spread": spread}  # fmt: skip
+    return write_experiment("e2", told, curves_csv(looked_at), text, folder, flown, made_by)
+
+
+def _looked_at_text(from_s: Mapping[str, float]) -> str:
+    if any(from_s.values()):
+        return (
+            "Times count from the takeoff command here, too. Our robots take off one after "
+            "another; until the mission begins, those on their pads count where they stand."
+        )
+    return (
+        "Times count from the mission's begin: points have no takeoff, and nor has a log that "
+        "does not tell of it, or in which it was earlier than that."
+    )
 
 
 def write_perturbation(
@@ -147,10 +178,11 @@ is taken {len(perturbed.absences)} times. {flown}
 
 ![perturbation](perturbation.png)
 
-{_table(headings, rows)}
+{table(headings, rows)}
 
-Costs are over that at the start. Settled: from then on the cost stayed within 5 % of what it came
-to when the next thing happened, or the flight ended.
+{_COSTS} The true one is the thin line, and is not in this table. Settled: from then on the cost
+stayed within 5 % of what it came to when the next thing happened, or the flight ended.
+`e3-cost.csv` has the cost over time, `e3.csv` speeds and neighbours.
 """
     told = {
         "flight": curves_json({"": perturbed.record})[""],
@@ -162,29 +194,98 @@ to when the next thing happened, or the flight ended.
     ):
         its = zip(perturbed.record.robots, speeds.tolist(), neighbours.tolist(), strict=True)
         rows_csv += [[time_s, robot.name, speed, heard] for robot, speed, heard in its]
-    return _write("e3", told, rows_csv, text, folder, made_by)
+    write_csv(curves_csv({"flight": perturbed.record}), folder / "e3-cost.csv")
+    return write_experiment("e3", told, rows_csv, text, folder, flown, made_by)
 
 
-def _write(
-    name: str,
-    told: Mapping[str, Any],
-    rows: Sequence[Sequence[object]],
-    text: str,
-    folder: Path,
-    made_by: Mapping[str, str],
+def write_transfer(
+    told: Mapping[str, Any], folder: Path, made_by: Mapping[str, str]
 ) -> dict[str, Any]:
-    document = {**told, "made_by": dict(made_by)}
-    (folder / f"{name}.json").write_text(json.dumps(document, indent=2) + "\n")
-    written = io.StringIO()
-    csv.writer(written, lineterminator="\n").writerows(rows)
-    (folder / f"{name}.csv").write_text(written.getvalue())
-    made = "; ".join(f"{what}: `{value}`" for what, value in made_by.items())
-    (folder / "README.md").write_text(
-        f"{text}\n`{name}.csv` and `{name}.json` have it all. {made}.\n"
+    """Beside what `lpac evaluate` wrote, whose JSON is `told`; gives all JSON. Raises OSError."""
+    policies = [method["name"] for method in told["methods"] if method["bundles"]]
+    rows, rows_csv = [], [_TRANSFER_COLUMNS]
+    for condition in told["conditions"]:
+        of_all = {result["name"]: result for result in condition["results"]}
+        rows.append([condition["name"], *(_transferred(of_all[name]) for name in policies)])
+        rows_csv += [
+            [condition["name"], name, training, world, cost, over]
+            for name, result in of_all.items()
+            for training, of_training in enumerate(
+                zip(result["by_world"]["final"], result["by_world"]["over_clairvoyant"],
+                    strict=True)
+            )
+            for world, (cost, over) in enumerate(zip(*of_training, strict=True))
+        ]  # fmt: skip
+    text = f"""# Transfer to other teams and worlds
+
+The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells with 10 robots in
+512 x 512; its other paper has more and fewer robots, features and ranges.
+{EXACT_POINTS}
+
+![mean cost over clairvoyant Lloyd's](conditions.png)
+
+{table(["", *policies], rows)}
+
+Mean cost after {told["duration_s"]:g} s over that at the start, in the first {told["worlds"]}
+worlds of the {told["world_set"]} set, and in brackets what it is times that of Lloyd's algorithm
+that knows the world, with the 95 % interval. A folder for each set-up has its curves.
+"""
+    return write_experiment("transfer", told, rows_csv, text, folder, EXACT_POINTS, made_by)
+
+
+_TRANSFER_COLUMNS: list[object] = [
+    "set_up", "method", "training", "world", "cost_over_first", "over_clairvoyant",
+]  # fmt: skip
+
+
+def _transferred(result: Mapping[str, Any]) -> str:
+    ratio, low, high = result["over_clairvoyant"]["ratio_of_means"]
+    return f"{result['final']['mean'][0]:.3f} (x {ratio:.2f}, {low:.2f} to {high:.2f})"
+
+
+def write_network(
+    told: Mapping[str, Any], folder: Path, made_by: Mapping[str, str]
+) -> dict[str, Any]:
+    """Beside the figures of `lpac bench network`, whose JSON is `told`; gives all JSON.
+
+    Raises OSError.
+    """
+    measured_on = told["measured_on"]
+    on_loopback = measured_on["where"] == "loopback"
+    where = "on this machine's loopback, which has no radio" if on_loopback else (
+        f"between network namespaces ({', '.join(measured_on['namespaces'])})"
+    )  # fmt: skip
+    flown = NETWORK.format(where=where)
+    rows = [
+        [of["experiment"], of["middleware"], str(of["robots"]),
+         _spread(of.get("throughput_mbit_s")), _spread(of.get("delivered"), 100.0),
+         _spread(of.get("age_p50_ms"))]
+        for of in told["summaries"]
+    ]  # fmt: skip
+    headings = ["", "", "robots", "Mbit/s", "delivered, %", "age p50, ms"]
+    figures_made = "\n\n".join(
+        f"![{name}]({name}.png)" for name in dict.fromkeys(of["experiment"] for of in told["runs"])
     )
-    return document
+    versions = ", ".join(f"{name} {version}" for name, version in measured_on["versions"].items())
+    text = f"""# Network
+
+The paper measures what a stream gets while the programs of three robots restart (Table I), and how
+that falls as robots are switched on one after another. {flown}
+
+{figures_made}
+
+{table(headings, rows)}
+
+Mean and standard deviation over the runs. {versions}; Linux {measured_on["kernel"]},
+{measured_on["cores"]} cores.
+"""
+    runs = told["runs"]
+    rows_csv = [list(runs[0]), *(list(run.values()) for run in runs)]
+    return write_experiment("network", told, rows_csv, text, folder, flown, made_by)
 
 
-def _table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [headings, ["---"] * len(headings), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def _spread(of: Mapping[str, Any] | None, factor: float = 1.0) -> str:
+    if of is None:
+        return ""
+    mean = f"{factor * of['mean']:.1f}"
+    return mean if of["deviation"] is None else f"{mean} ± {factor * of['deviation']:.1f}"

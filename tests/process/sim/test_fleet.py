@@ -54,9 +54,11 @@ class Flight(NamedTuple):
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     out = tmp_path_factory.mktemp("fleet")
+    # Other missions of this folder are flown in a mesh, and by way of a router.
     result = lpac(
-        "sim", "--vehicle", "mavlink", "-n", ROBOTS, "--duration", 20, "--json", "--out", out
-    )
+        "sim", "--vehicle", "mavlink", "-n", ROBOTS, "--duration", 20, "--json", "--out", out,
+        "--secure", "--transport", "multicast",
+    )  # fmt: skip
     assert result.stdout, result.stderr
     return Flight(json.loads(result.stdout), out)
 
@@ -211,7 +213,7 @@ def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
 def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None:
     """As tests/sim/sim/test_pilot.py has it on the simulated clock."""
     taken = PilotFlight(robot=0, from_s=1.0, until_s=19.0)
-    scenario = FleetScenario(robots=2, seed=3, duration_s=22.0)
+    scenario = FleetScenario(robots=2, seed=3, duration_s=22.0, secure=True, transport="router")
     record = fly_programs(scenario, tmp_path, SHIPPED, pilots=[taken])
     [absence] = absences_of(record)
     assert absence.robot == "0"

@@ -36,7 +36,11 @@ def test_trials_are_flown_over_cores(tmp_path: Path) -> None:
     assert told == json.loads((tmp_path / "e2.json").read_text())
     finals = [trial["final"] for trial in told["trials"].values()]
     assert len(finals) == 2 and finals[0] != finals[1] and max(finals) < 0.8
-    assert told["made_by"]["bundle"] == load_bundle(DEFAULT_BUNDLE).id
+    made_by = told["made_by"]
+    assert made_by["bundle"] == load_bundle(DEFAULT_BUNDLE).id
+    # Nothing in it is of this machine alone.
+    assert made_by["command"] == "lpac paper e2 --trials 2 --world 0"
+    assert made_by["seeds"].startswith("trial 1 ") and "numpy" in made_by
     assert (tmp_path / "repeatability.png").exists() and (tmp_path / "README.md").exists()
 
 
@@ -47,4 +51,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert error_line(lpac("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
     assert error_line(lpac("paper", "e3", "--world", -1)) == "lpac: world = -1: must be at least 0"
     no_build = lpac("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
-    assert "--px4 names PX4's build folder" in error_line(no_build)
+    assert error_line(no_build) == "lpac: --vehicle px4 needs --px4 with PX4's build folder"
+    no_px4 = lpac("paper", "e1", "--px4", tmp_path, "--out", tmp_path / "new")
+    assert error_line(no_px4) == "lpac: --px4 does nothing with --vehicle point"
+    assert not (tmp_path / "new").exists()

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from lpac.paper.asynchrony_report import write_report
 
 PLAN = AsynchronyPlan(
     bundle=TrainedBundle("somewhere", "0123456789abcdef01"),
+    message_bytes=2000,
     world_set="validation",
     worlds=3,
     perception_hz=(1.0, 5.0),
@@ -76,8 +78,10 @@ def test_the_report_has_every_flight_and_says_what_made_it(tmp_path: Path) -> No
     first = {name: float(value) for name, value in rows[0].items()}
     assert (first["perception_hz"], first["policy_hz"], first["world"]) == (5.0, 2.5, 0.0)
     assert first["cost_at_60_s"] == pytest.approx(0.24)
+    assert (first["rounds_per_perception"], first["said_kb_s"]) == (0.5, 5.0)
     told = json.loads((tmp_path / "async.json").read_text())
     assert told.pop("made_by") == {"command": "lpac paper async --quick"}
+    assert told.pop("flown") in (tmp_path / "README.md").read_text()
     assert told == json.loads(json.dumps(as_json(PLAN, results)))
     assert told["times_s"] == list(TIMES_S)
     text = (tmp_path / "README.md").read_text()
@@ -90,4 +94,4 @@ def test_the_report_has_every_flight_and_says_what_made_it(tmp_path: Path) -> No
 
 def test_impossible_numbers_of_worlds_are_named() -> None:
     with pytest.raises(ValueError, match="worlds = 0: must be at least 1"):
-        AsynchronyPlan(bundle=PLAN.bundle, world_set="validation", worlds=0)
+        replace(PLAN, worlds=0)

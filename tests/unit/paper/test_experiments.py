@@ -30,11 +30,17 @@ from lpac.paper.experiments import (
     repeatability,
     spread_of,
     transferability,
+    who_is_missing,
     whole_repeatability,
     whole_transferability,
 )
 from lpac.paper.flown import fly_whole
-from lpac.paper.report import write_perturbation, write_repeatability, write_transferability
+from lpac.paper.report import (
+    POINTS,
+    write_perturbation,
+    write_repeatability,
+    write_transferability,
+)
 from lpac.sim.cores import in_this_process
 from lpac.sim.experiment import FIELD_SCALE, fly
 from lpac.sim.failure import Failure
@@ -105,6 +111,8 @@ def test_who_is_away_does_not_count(shipped_bundle: Bundle, tmp_path: Path) -> N
     document = json.loads((tmp_path / "e3.json").read_text())
     assert document["made_by"] == MADE_BY and len(document["phases"]) == 2
     assert (tmp_path / "perturbation.png").stat().st_size > 20_000
+    costs = list(csv.DictReader((tmp_path / "e3-cost.csv").read_text().splitlines()))
+    assert float(costs[-1]["cost_over_first"]) == document["flight"]["final"]
     assert "| robot 2 away | 2 to 4 s |" in (tmp_path / "README.md").read_text()
 
 
@@ -142,7 +150,7 @@ def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) 
         for name, scenario in repeatability(2).items()
     }
     records = {name: flight.record for name, flight in trials.items()}
-    spread = spread_of(list(records.values()))
+    spread = spread_of(records)
     finals = [flight.normalized_cost[-1] for flight in trials.values()]
     assert spread["final_mean"] == pytest.approx(np.mean(finals))
     assert spread["final_deviation"] == pytest.approx(np.std(finals, ddof=1))
@@ -151,7 +159,9 @@ def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) 
     assert spread["mean_scatter_of_ends_m"] == pytest.approx(apart_m / 2.0)
     told = write_repeatability(records, tmp_path / "e2", MADE_BY)
     assert told["trials"]["trial 2"]["final"] == pytest.approx(finals[1])
-    assert told["trials"]["trial 2"]["final_true"] is None
+    # Points are where they are, whatever their receivers say.
+    assert told["trials"]["trial 2"]["final_true"] == told["trials"]["trial 2"]["final"]
+    assert told["flown"] == POINTS and set(told["mission_from_s"].values()) == {0.0}
     assert (tmp_path / "e2" / "repeatability.pdf").exists()
 
     plan = transferability(2)
@@ -167,6 +177,24 @@ def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) 
         assert (tmp_path / "e1" / name).stat().st_size > 100
     text = (tmp_path / "e1" / "README.md").read_text()
     assert "| world 1 | " in text and "`lpac paper ...`" in text
+
+
+def test_trials_of_different_teams_are_compared_by_name(shipped_bundle: Bundle) -> None:
+    plan = {n: replace(one, duration_s=2.0) for n, one in repeatability(2).items()}
+    trials = {n: fly(one, shipped_bundle).record for n, one in plan.items()}
+    first, second = trials.values()
+    trials["trial 2"] = replace(second, robots=second.robots[3:])
+    spread = spread_of(trials)
+    assert spread["missing"] == {"trial 2": ["0", "1", "2"]}
+    assert who_is_missing(spread) == [
+        "At the end of trial 2 not in the air, and so not compared: 0, 1, 2."
+    ]
+    ends_m = [np.array([r.position_m[-1, :2] for r in record.robots]) for record in (first, second)]
+    apart_m = np.linalg.norm(ends_m[0] - ends_m[1], axis=1)[3:].mean()
+    assert spread["mean_scatter_of_ends_m"] == pytest.approx(apart_m / 2.0)
+    trials["trial 1"] = replace(first, robots=first.robots[:3])
+    with pytest.raises(ValueError, match="no robot was in the air at the end of all trials"):
+        spread_of(trials)
 
 
 def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
@@ -189,9 +217,17 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
 
     records = {str(n): record for n, record in fly_whole(few, DEFAULT_BUNDLE, in_this_process)}
     told = write_repeatability(records, tmp_path, MADE_BY, "Whole robots.")
-    for trial in told["trials"].values():
-        assert trial["final_true"] != trial["final"] and np.shape(trial["final_positions_m"]) == (
-            2,
-            2,
-        )
+    for name, trial in told["trials"].items():
+        assert trial["final_true"] != trial["final"] and set(trial["final_positions_m"]) == {
+            "0",
+            "1",
+        }
+        # From the takeoff command on, before which nobody moves.
+        began_s = told["mission_from_s"][name]
+        assert 2.0 < began_s < 40.0
+        assert trial["time_s"][0] == 0.0
+        assert trial["time_s"][-1] == pytest.approx(began_s + records[name].duration_s)
+        assert trial["normalized_true_cost"][:2] == pytest.approx([1.0, 1.0], abs=1e-3)
+    rows = list(csv.DictReader((tmp_path / "e2.csv").read_text().splitlines()))
+    assert float(rows[-1]["true_cost_over_first"]) == told["trials"]["1"]["final_true"]
     assert "Whole robots." in (tmp_path / "README.md").read_text()

@@ -1,0 +1,158 @@
+"""`lpac paper` on the logs of a field day, and what it leaves beside its figures."""
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+import lpac.analysis.report
+from edge.messages.mission import FlightState
+from edge.policy.bundle import load_bundle
+from lpac.analysis.flight import FlightRecord
+from lpac.analysis.logs import LoggedStatus
+from lpac.analysis.report import Examined, Wanted
+from lpac.cli.options import DEFAULT_BUNDLE
+from lpac.cli.paper import e1, e2, e3
+from lpac.cli.sim import VehicleKind
+from lpac.paper.report import write_network, write_transfer
+from lpac.sim.experiment import Scenario, fly
+
+MADE_BY = {"command": "lpac paper ..."}
+
+
+def said(time_s: float, bundle_id: str) -> LoggedStatus:
+    """A pilot has the robot from the second to the third second."""
+    state = FlightState.PILOT if 2.0 <= time_s < 3.0 else FlightState.MISSION
+    return cast(LoggedStatus, SimpleNamespace(state=state, bundle_id=bundle_id))
+
+
+@pytest.fixture
+def mission() -> FlightRecord:
+    """Of two robots, as logs have it."""
+    bundle = load_bundle(DEFAULT_BUNDLE)
+    record = fly(Scenario(robots=2, duration_s=5.0), bundle).record
+    robots = tuple(
+        replace(r, said=tuple(said(t, bundle.id) for t in r.time_s.tolist())) for r in record.robots
+    )
+    return replace(record, name="paper-1", robots=robots)
+
+
+@pytest.fixture
+def day(mission: FlightRecord, monkeypatch: pytest.MonkeyPatch) -> list[Wanted]:
+    """Logs of two missions, the second over a world that is not there; gives what was wanted."""
+    asked: list[Wanted] = []
+
+    def examine(_: Sequence[Path], wanted: Wanted) -> Examined:
+        asked.append(wanted)
+        other = replace(mission, name="paper-2", coverage=None)
+        trials = [t for t in (mission, other) if not wanted.trials or t.name in wanted.trials]
+        return Examined(tuple(trials), ("paper-2: world 1234 is not here; give it with --world",))
+
+    monkeypatch.setattr(lpac.analysis.report, "examine", examine)
+    return asked
+
+
+def test_a_world_that_is_not_there_is_one_line_that_says_what_to_do(
+    day: list[Wanted], tmp_path: Path
+) -> None:
+    for command in (e1, e2, e3):
+        with pytest.raises(ValueError, match=r"^paper-2: .* with --world-file; or choose other"):
+            command(logs=tmp_path, out=tmp_path / "out")
+    e1(logs=tmp_path, trial=["paper-1"], world_file=Path("a.env"), out=tmp_path / "out")
+    assert day[-1] == Wanted(trials=("paper-1",), world=Path("a.env"))
+
+
+@pytest.mark.usefixtures("day")
+def test_one_mission_of_a_day_is_chosen_and_its_own_policy_named(tmp_path: Path) -> None:
+    e3(logs=Path("day 1"), trial=["paper-1"], out=tmp_path)
+    made_by = json.loads((tmp_path / "e3.json").read_text())["made_by"]
+    # What played no part in it is not there.
+    assert made_by["command"] == "lpac paper e3 --logs 'day 1' --trial paper-1"
+    assert made_by["bundle"] == load_bundle(DEFAULT_BUNDLE).id and "seeds" not in made_by
+    assert {"numpy", "onnxruntime", "python", "lpac-edge"} < set(made_by)
+
+
+def test_neighbours_are_those_in_range_of_the_policy_that_flew(
+    mission: FlightRecord, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    robots = tuple(
+        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
+        for r in mission.robots
+    )
+    examined = Examined((replace(mission, robots=robots),), ())
+    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: examined)
+    with pytest.raises(ValueError, match="is not what flew, 0123456789abcdef: give that with --b"):
+        e3(logs=tmp_path, out=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"px4": Path("build")}, "--px4 does nothing with --vehicle point"),
+        ({"px4": Path("build"), "logs": Path()}, "--px4 does nothing with --logs"),
+        ({"vehicle": VehicleKind.SIMULATED, "px4": Path("build")}, "--px4 does nothing with"),
+        ({"vehicle": VehicleKind.SIMULATED, "logs": Path()}, "--vehicle does nothing with --logs"),
+        ({"vehicle": VehicleKind.PX4}, "--vehicle px4 needs --px4"),
+        ({"trial": ["a"]}, "--trial does nothing without --logs"),
+        ({"world_file": Path("a.env")}, "--world-file does nothing without --logs"),
+        ({"bundle": Path("absent")}, "absent: "),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_no_folder(
+    options: dict[str, Any], problem: str, tmp_path: Path
+) -> None:
+    for command in (e1, e2, e3):
+        with pytest.raises((ValueError, OSError), match=problem):
+            command(**options, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_evaluation_gets_its_table_and_what_made_it(tmp_path: Path) -> None:
+    by_world = {"final": [[0.3, 0.4]], "over_clairvoyant": [[1.0, 1.2]]}
+    over = {"ratio_of_means": [1.1, 1.0, 1.2]}
+    result = {"final": {"mean": [0.35, 0.3, 0.4]}, "over_clairvoyant": over, "by_world": by_world}
+    told = {
+        "world_set": "validation", "worlds": 2, "duration_s": 60.0,
+        "methods": [{"name": "field", "bundles": [{}]}, {"name": "lloyd", "bundles": []}],
+        "conditions": [
+            {"name": "n3", "results": [{"name": n, **result} for n in ("field", "lloyd")]}
+        ],
+    }  # fmt: skip
+    document = write_transfer(told, tmp_path, MADE_BY)
+    assert document == {**told, "flown": document["flown"], "made_by": MADE_BY}
+    rows = list(csv.DictReader((tmp_path / "transfer.csv").read_text().splitlines()))
+    assert len(rows) == 4
+    assert (rows[1]["method"], rows[1]["world"], rows[1]["cost_over_first"]) == (
+        "field",
+        "1",
+        "0.4",
+    )
+    text = (tmp_path / "README.md").read_text()
+    assert "| n3 | 0.350 (x 1.10, 1.00 to 1.20) |" in text and "`lpac paper ...`" in text
+
+
+def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> None:
+    run = {"experiment": "robots", "middleware": "zenoh", "robots": 2, "delivered": None}
+    spread = {"mean": 75.04, "deviation": 0.5, "runs": 3}
+    told = {
+        "measured_on": {
+            "where": "namespaces", "namespaces": ["drone0", "drone1"], "cores": 2, "kernel": "6.1",
+            "versions": {"zenoh": "1.10"},
+        },
+        "summaries": [
+            {"experiment": "robots", "middleware": "zenoh", "robots": 2,
+             "throughput_mbit_s": spread}
+        ],
+        "runs": [run],
+    }  # fmt: skip
+    document = write_network(told, tmp_path, MADE_BY)
+    assert "between network namespaces (drone0, drone1)" in document["flown"]
+    [row] = csv.DictReader((tmp_path / "network.csv").read_text().splitlines())
+    assert row == {"experiment": "robots", "middleware": "zenoh", "robots": "2", "delivered": ""}
+    text = (tmp_path / "README.md").read_text()
+    assert "| robots | zenoh | 2 | 75.0 ± 0.5 |  |  |" in text and "(robots.png)" in text
