@@ -164,6 +164,13 @@ def sim(
             metavar="ROBOTS@S", help="point: robots lost in flight, such as 2@20: two at 20 s."
         ),
     ] = None,
+    away: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROBOT@FROM-UNTIL",
+            help="point: a robot that is gone for a while, such as 3@60-80; may be repeated.",
+        ),
+    ] = None,
     payload: Annotated[
         PayloadName, typer.Option(help="point: what messages carry.")
     ] = PayloadName.FLOAT16,
@@ -261,7 +268,7 @@ def sim(
     from edge.core.frames import ModelScale
     from lpac.radio.modelled import ModelledRadio
     from lpac.sim.experiment import FIELD_SCALE, Scenario
-    from lpac.sim.failure import LostRobots
+    from lpac.sim.failure import Failure, LostRobots
 
     assert count is not None
     found = calibration(wifi, transport=transport is not None)
@@ -288,7 +295,10 @@ def sim(
         world_size=world_size,
         communication_range=communication_range,
         lag_s=lag,
-        failures=() if lost is None else LostRobots.parse(lost).failures(count),
+        failures=(
+            *(() if lost is None else LostRobots.parse(lost).failures(count)),
+            *map(Failure.parse, away or ()),
+        ),
         position_bias=_position_bias(seed, position_error, count, model),
         clocks=clocks,
     )
@@ -323,6 +333,7 @@ _ONLY_FOR = {
     "lag": (VehicleKind.POINT,),
     "position_error": (VehicleKind.POINT,),
     "lost": (VehicleKind.POINT,),
+    "away": (VehicleKind.POINT,),
     "payload": (VehicleKind.POINT,),
     "loss": (VehicleKind.POINT,),
     "delay": (VehicleKind.POINT,),

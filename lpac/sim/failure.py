@@ -32,8 +32,18 @@ class Failure:
                 "must be at least 0, and until_s later"
             )
 
+    @classmethod
+    def parse(cls, text: str) -> "Failure":
+        """Of "3@60-80", robot 3 from 60 to 80 s. Raises ValueError."""
+        found = _AWAY.fullmatch(text)
+        if found is None:
+            raise ValueError(f"robot away {text!r}: must be ROBOT@FROM-UNTIL in s, such as 3@60-80")
+        return cls(int(found[1]), float(found[2]), float(found[3]))
 
-_LOST = re.compile(r"(\d+)@(\d+\.?\d*)")
+
+_SECONDS = r"(\d+\.?\d*)"
+_AWAY = re.compile(rf"(\d+)@{_SECONDS}-{_SECONDS}")
+_LOST = re.compile(rf"(\d+)@{_SECONDS}")
 
 
 class LostRobots(NamedTuple):

@@ -208,6 +208,7 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--policy-hz", "0"], "--policy-hz 0: must be positive"),
         (["sim", "--position-error", "-1"], "--position-error -1: must be at least 0"),
         (["sim", "--lost", "10@5"], "lost robots 10@5: must be fewer than the team's 10"),
+        (["sim", "--away", "3@20-10"], "failure of robot 3: from_s = 20.0, until_s = 10.0: must"),
         (
             ["sim", "--lag", "1", "--vehicle", "mavlink"],
             "--lag does nothing with --vehicle mavlink",

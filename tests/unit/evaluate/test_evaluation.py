@@ -25,7 +25,7 @@ from lpac.evaluate.flights import (
     groups_of,
 )
 from lpac.radio.modelled import ModelledRadio
-from lpac.sim.failure import LostRobots
+from lpac.sim.failure import Failure, LostRobots
 
 WORLDS = 8
 CLAIRVOYANT = Method(name="clairvoyant-cvt", flier="clairvoyant-cvt")
@@ -192,3 +192,7 @@ def test_lost_robots_are_read() -> None:
     for text in ("2", "2@", "two@20", "2@-1"):
         with pytest.raises(ValueError, match="must be ROBOTS@SECONDS, such as 2@20"):
             LostRobots.parse(text)
+    assert Failure.parse("3@60-80.5") == Failure(3, 60.0, 80.5)
+    for text in ("3", "3@60", "r3@60-80", "3@-1-80"):
+        with pytest.raises(ValueError, match="must be ROBOT@FROM-UNTIL in s, such as 3@60-80"):
+            Failure.parse(text)
