@@ -376,7 +376,7 @@ def _share(told: Mapping[str, Any]) -> str:
 def _against(policy: Mapping[str, Any], baseline: str) -> "Text":
     """Whether better, and in how many worlds it ends above the baseline."""
     above, verdict = policy["above"][baseline], policy["against"][baseline]
-    text = {"a": "better", "b": "worse", None: "not told"}[verdict["better"]]
+    text = {"a": "better", "b": "worse", None: "undecided"}[verdict["better"]]
     style = {"a": GOOD, "b": BAD, None: ""}[verdict["better"]]
     return styled(f"{text}, above it in {100.0 * above['share']:.3g} %", style)
 

@@ -36,7 +36,7 @@ class Agreement(StrEnum):
 
     AGREES = "agrees"
     DIFFERS = "differs"
-    OPEN = "not told"
+    OPEN = "undecided"
     MISTAKE = "a mistake in the paper"
 
 

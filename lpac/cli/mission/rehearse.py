@@ -33,7 +33,7 @@ def rehearse(
         bool, typer.Option("--json", help="Print one JSON object a line, once a second.")
     ] = False,
 ) -> None:
-    """Show where disarmed robots believe to be, and where the policy would fly them.
+    """Show where disarmed robots believe they are, and where the policy would fly them.
 
     The arrow is meant in the mission frame, y up; the words from the robot's nose.
     """
