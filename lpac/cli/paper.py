@@ -67,6 +67,12 @@ Trial = Annotated[
 WorldFile = Annotated[
     Path | None, typer.Option(help="--logs: the world file, if it is not beside the logs.")
 ]
+Namespaces = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME,NAME...", help="Of the network experiment, as `lpac bench network` has them."
+    ),
+]
 Quick = Annotated[bool, typer.Option("--quick", help="A small version that takes minutes.")]
 Out = Annotated[
     Path | None,
@@ -89,7 +95,12 @@ def e1(
     out: Out = None,
 ) -> None:
     """Transferability: unseen worlds from the same starts, beside baselines."""
-    from lpac.paper.experiments import pads_of, transferability, whole_transferability
+    from lpac.paper.experiments import (
+        WHOLE_ROBOTS,
+        pads_of,
+        transferability,
+        whole_transferability,
+    )
     from lpac.paper.report import LOGS, POINTS, WHOLE_BESIDE_POINTS, write_transferability
 
     _at_least(1, worlds, "--worlds")
@@ -112,7 +123,7 @@ def e1(
         whole = _fly_whole(plan, flown_by, vehicle, px4, cores, folder) if plan else {}
         named = {(w, name): one for w, of_world in points.items() for name, one in of_world.items()}
         flown = dict(zip(named, _fly(list(named.values()), flown_by, cores), strict=True))
-        records = {world: {"whole robots": record} for world, record in whole.items()}
+        records = {world: {WHOLE_ROBOTS: record} for world, record in whole.items()}
         for (world, name), flight in flown.items():
             records.setdefault(world, {})[name] = flight.record
     told = write_transferability(records, folder, made_by, how)
@@ -522,10 +533,7 @@ def transfer(
 @app.command()
 def network(
     *,
-    namespaces: Annotated[
-        str | None,
-        typer.Option(metavar="NAME,NAME...", help="As `lpac bench network` has them."),
-    ] = None,
+    namespaces: Namespaces = None,
     quick: Quick = False,
     as_json: AsJson = False,
     out: Out = None,
@@ -546,8 +554,7 @@ def network(
         as_json=as_json,
         out=folder,
     )
-    where = "" if namespaces is None else f" --namespaces {namespaces}"
-    made_by = _made_by(f"network{where}{_QUICKLY[quick]}", [])
+    made_by = _made_by(f"network{_of_namespaces(namespaces)}{_QUICKLY[quick]}", [])
     write_network(json.loads((folder / "network.json").read_text()), folder, made_by)
 
 
@@ -556,31 +563,35 @@ def everything(
     *,
     bundle: Bundle = DEFAULT_BUNDLE,
     quick: Quick = False,
+    namespaces: Namespaces = None,
     ray: Ray = None,
     out: Out = None,
 ) -> None:
     """All of them, and one page: each claim of the paper beside what came of it here.
 
-    What was made with the same bundle and code is not made again.
+    Whole robots fly e1, e2 and e3, and points with --quick. What was made with the same bundle and
+    code is not made again.
     """
     from edge.policy.bundle import load_bundle
     from lpac.paper.repeated import write_page
 
     folder = out or _OUT
     loaded = load_bundle(bundle)
+    vehicle = VehicleKind.POINT if quick else VehicleKind.SIMULATED
     flying: dict[str, Callable[[Path], None]] = {
-        "e1": lambda its: e1(bundle=bundle, ray=ray, out=its),
-        "e2": lambda its: e2(bundle=bundle, ray=ray, out=its),
-        "e3": lambda its: e3(bundle=bundle, ray=ray, out=its),
+        "e1": lambda its: e1(bundle=bundle, vehicle=vehicle, ray=ray, out=its),
+        "e2": lambda its: e2(bundle=bundle, vehicle=vehicle, ray=ray, out=its),
+        "e3": lambda its: e3(bundle=bundle, vehicle=vehicle, ray=ray, out=its),
         "transfer": lambda its: transfer(bundles=[bundle], quick=quick, ray=ray, out=its),
         "async": lambda its: asynchrony(bundle=bundle, quick=quick, ray=ray, out=its),
-        "network": lambda its: network(quick=quick, out=its),
+        "network": lambda its: network(quick=quick, namespaces=namespaces, out=its),
     }
     made_by = {}
     for name, make in flying.items():
         its = folder / name
-        # A quick one of some is the only one that there is.
-        option = _QUICKLY[quick and name not in ("e1", "e2", "e3")]
+        option = _option(vehicle) if name in ("e1", "e2", "e3") else _QUICKLY[quick]
+        if name == "network":
+            option = _of_namespaces(namespaces) + option
         made_by[name] = _made_by(f"{name}{option}", [] if name == "network" else [bundle])
         kept = its / "made_by.json"
         if kept.exists() and json.loads(kept.read_text()) == made_by[name]:
@@ -590,6 +601,10 @@ def everything(
         typer.echo()
         kept.write_text(json.dumps(made_by[name]) + "\n")
     typer.echo(f"see {write_page(folder, loaded, made_by)}")
+
+
+def _of_namespaces(names: str | None) -> str:
+    return "" if names is None else f" --namespaces {names}"
 
 
 def _show(results: "Sequence[TimingResult]") -> None:

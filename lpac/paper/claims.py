@@ -4,7 +4,7 @@ A verdict follows from a rule that is written beside the claim, never from a per
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -15,6 +15,7 @@ from lpac.analysis.statistics import Interval95
 from lpac.evaluate.worlds import FIELD, SET_UPS
 from lpac.paper.asynchrony import FIELD as FIELD_TIMING
 from lpac.paper.asynchrony import TIMES_S, Timing
+from lpac.paper.experiments import WHOLE_ROBOTS
 from lpac.radio.airtime import Traffic, Transport, Wifi, carries
 
 Json = Mapping[str, Any]
@@ -98,12 +99,16 @@ def _size(sizes: Sizes) -> Claim:
 
 def _e1(e1: Json) -> list[Claim]:
     worlds = e1["worlds"]
-    settled_s = [_settled_s(its["lpac"]) for its in worlds.values()]
-    ends_s = [its["lpac"]["time_s"][-1] for its in worlds.values()]
+    flown = [its.get(WHOLE_ROBOTS, its["lpac"]) for its in worlds.values()]
+    settled_s = [_settled_s(flight) for flight in flown]
+    ends_s = [flight["time_s"][-1] for flight in flown]
+    is_whole = all(WHOLE_ROBOTS in its for its in worlds.values())
+    beside = ("lpac", "clairvoyant-cvt") if is_whole else ("clairvoyant-cvt",)
     finals = ", ".join(
-        f"{its['lpac']['final']:.3f} ({its['clairvoyant-cvt']['final']:.3f})"
-        for its in worlds.values()
+        f"{flight['final']:.3f} ({_finals(its[name] for name in beside)})"
+        for flight, its in zip(flown, worlds.values(), strict=True)
     )
+    others = "points' and clairvoyant Lloyd's" if is_whole else "clairvoyant Lloyd's"
     times = ", ".join(f"{time_s:.0f} s" for time_s in settled_s)
     early = sum(s <= 0.75 * end_s for s, end_s in zip(settled_s, ends_s, strict=True))
     return [
@@ -113,11 +118,15 @@ def _e1(e1: Json) -> list[Claim]:
             "typically converged within 60 s. No costs are given.",
             f"In most worlds the cost stays within {100 * _SETTLED:.0f} % of that at 60 s from "
             "three quarters of the time on.",
-            f"Cost at 60 s over that at the start, with clairvoyant Lloyd's in brackets: {finals}. "
+            f"Cost at 60 s over that at the start, with {others} in brackets: {finals}. "
             f"It had settled after {times}.",
             _agrees(2 * early > len(worlds)),
         )
     ]
+
+
+def _finals(flights: Iterable[Json]) -> str:
+    return ", ".join(f"{flight['final']:.3f}" for flight in flights)
 
 
 def _settled_s(flight: Json) -> float:

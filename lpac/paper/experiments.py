@@ -33,6 +33,8 @@ BASELINES: tuple[BaselineName, ...] = (
 )  # fmt: skip
 _CONTROLLERS: tuple[Controller, ...] = ("lpac", *BASELINES)
 SNAPSHOTS_S = (0.0, 15.0, 30.0, 60.0)
+# What these are called beside the points.
+WHOLE_ROBOTS = "whole robots"
 # E2: how far from their pads robots are placed, m, how wrong their receivers are, m, and for how
 # long the paper looks, s.
 PLACED_WITHIN_M = 0.1
