@@ -103,6 +103,15 @@ def test_whole_robots_fly_it(site: Path, bundle: Path) -> None:
     assert all(robot["messages"]["accepted"] > 0 for robot in flight["fleet"])
 
 
+def test_the_drill_promises_the_same_of_it(site: Path, bundle: Path) -> None:
+    told = lpac(
+        site, "drill", "--bundle", str(bundle), "--fault", "none", "-n", "2", "--json",
+        "--out", str(site / "drill"),
+    )  # fmt: skip
+    [fault] = json.loads(told)["faults"]
+    assert (fault["flights"], fault["broken"]) == (1, 0)
+
+
 @pytest.mark.usefixtures("installed")
 def test_a_robot_alone_and_one_upon_another_have_finite_features() -> None:
     from lpac_flocking.policy import FEATURES, features_of  # noqa: PLC0415
