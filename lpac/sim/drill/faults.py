@@ -71,8 +71,10 @@ from lpac.sim.drill.injections import (
     ReceiverJumps,
     ReceiverReports,
     RemoteControl,
+    SecondGroundDies,
     SecondGroundHolds,
     SecondGroundJoins,
+    SecondGroundTakesCommand,
     SecondProgram,
     SensorDies,
     WatchdogDies,
@@ -681,6 +683,37 @@ _PEOPLE = (
         bounds=(
             FliesOn(6.0, 0.95, "all"), MissionEnds(7.0, whose="all"), Stands(10.0, 26.0, "all"),
             NotLandedBefore(26.0, "all"), LandsAtPad(_AT_PAD_M, "all"),
+        ),
+    ),
+    Fault(
+        name="second-ground-takes-command",
+        what="a second operator takes the command, and the first one orders hold, then land",
+        promise="the mission goes on; they hold and land for the first one, too",
+        does=(
+            *_once(SecondGroundJoins()), Do(6.0, SecondGroundTakesCommand()),
+            Do(16.0, OperatorOrders("hold"), "all"),
+            Do(24.0, OperatorOrders("land"), "all", "landed"),
+        ),
+        hits=0, watched_s=30.0, home=False,
+        bounds=(
+            FliesOn(16.0, 0.95, "all"), MissionEnds(17.0, whose="all"), Stands(20.0, 24.0, "all"),
+            NotLandedBefore(24.0, "all"), Lands(1.5, "all", "landed"), StraightDown(3.0, "all"),
+            Down(25.5 + _LANDING_S, "all"),
+        ),
+    ),
+    Fault(
+        name="second-ground-dies-in-command",
+        what="a second operator takes the command, and is gone; the first one only looks on",
+        promise="hold after 3 s, land where they are after 13 s",
+        does=(
+            *_once(SecondGroundJoins()), Do(6.0, SecondGroundTakesCommand()),
+            Do(12.0, SecondGroundDies(), mark="gone"),
+        ),
+        hits=0, watched_s=40.0, home=False,
+        bounds=(
+            FliesOn(12.0, 0.95, "all"), MissionEnds(3.8, whose="all", after="gone"),
+            Stands(7.0, 12.5, "all", after="gone"), NotLandedBefore(24.5, "all"),
+            Lands(14.0, "all", "gone"), Down(26.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(

@@ -414,6 +414,16 @@ class SecondGroundHolds:
     """That other operator holds all robots."""
 
 
+@dataclass(frozen=True, slots=True)
+class SecondGroundTakesCommand:
+    """That other operator commands the fleet from now on."""
+
+
+@dataclass(frozen=True, slots=True)
+class SecondGroundDies:
+    """That other operator's laptop is gone."""
+
+
 OrderedKind = Literal[
     "takeoff", "start", "pilot", "rejoin", "kill", "disarm", "hold", "return", "land", "resume"
 ]
@@ -435,7 +445,7 @@ Injection = (
     VehicleInjection | ProgramDies | ProgramStarts | ProgramStops | LoopHangs | WatchdogDies
     | AutopilotSilent | DiskFills | ClockSteps | GroundClockSteps | SecondProgram | RadioIs
     | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins | SecondGroundHolds
-    | OperatorOrders | FenceWithout
+    | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders | FenceWithout
 )  # fmt: skip
 
 

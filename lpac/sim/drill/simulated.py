@@ -12,7 +12,7 @@ import numpy as np
 
 from edge.core import F64
 from lpac.ground.procedure import NothingComesError, Procedure
-from lpac.ground.station.protocol import Request, SafetyCommand
+from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.field import FaultyFleet, has_remote_control, scenario_of, settings_of
 from lpac.sim.drill.flight import fly, to_mission, to_ready
@@ -33,8 +33,10 @@ from lpac.sim.drill.injections import (
     ProgramStops,
     RadioCut,
     RadioIs,
+    SecondGroundDies,
     SecondGroundHolds,
     SecondGroundJoins,
+    SecondGroundTakesCommand,
     SecondProgram,
     VehicleInjection,
     WatchdogDies,
@@ -165,15 +167,29 @@ class SimulatedField(FaultyFleet):
                 self.ground.leave()
             case GroundStarts():
                 fleet.join(self._operator)
-            case SecondGroundJoins():
-                fleet.join(_SECOND)
-            case SecondGroundHolds():
-                fleet.grounds[_SECOND].node.begin(SafetyCommand("hold"))
             case GroundClockSteps(by_s):
                 self.ground.clock.ahead_s += by_s
+            case SecondGroundJoins():
+                fleet.join(_SECOND)
+            case SecondGroundHolds() | SecondGroundTakesCommand() | SecondGroundDies():
+                self._inject_second_ground(injection)
             case _:
                 for robot in robots:
                     self._inject_program(injection, robot)
+
+    def _inject_second_ground(
+        self, injection: SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies
+    ) -> None:
+        second = self.fleet.grounds[_SECOND]
+        match injection:
+            case SecondGroundHolds():
+                second.node.begin(SafetyCommand("hold"))
+            case SecondGroundTakesCommand():
+                second.node.begin(TakeCommand())
+            case SecondGroundDies():
+                second.leave()
+            case _:
+                assert_never(injection)
 
     def _inject_program(self, injection: Injection, index: int) -> None:
         robot = self.fleet.robots[index]
