@@ -64,6 +64,7 @@ from lpac.sim.drill.injections import (
     PilotFliesOver,
     PilotLands,
     ProgramDies,
+    ProgramEnds,
     ProgramStarts,
     ProgramStops,
     RadioCut,
@@ -274,6 +275,13 @@ _PROGRAMS = (
         promise="that one does not take off",
         phase="ready", does=_once(SecondProgram()),
         bounds=(StaysDown(), TakesOff("others")),
+    ),
+    Fault(
+        name="program-ends", what="a robot's program is stopped in flight, and on_stop = land",
+        promise="it has PX4 land the vehicle where it is, and ends",
+        # Sooner than PX4 misses its setpoints.
+        does=_once(ProgramEnds()),
+        bounds=(Lands(0.9), StraightDown(3.0), Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
         name="program-dies-in-takeoff", what="a robot's program dies while it climbs",

@@ -311,6 +311,11 @@ class ProgramDies:
 
 
 @dataclass(frozen=True, slots=True)
+class ProgramEnds:
+    """It is told to end (SIGTERM), as `systemctl stop` does."""
+
+
+@dataclass(frozen=True, slots=True)
 class ProgramStarts:
     """It starts again."""
 
@@ -442,10 +447,10 @@ class FenceWithout:
 
 
 Injection = (
-    VehicleInjection | ProgramDies | ProgramStarts | ProgramStops | LoopHangs | WatchdogDies
-    | AutopilotSilent | DiskFills | ClockSteps | GroundClockSteps | SecondProgram | RadioIs
-    | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins | SecondGroundHolds
-    | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders | FenceWithout
+    VehicleInjection | ProgramDies | ProgramEnds | ProgramStarts | ProgramStops | LoopHangs
+    | WatchdogDies | AutopilotSilent | DiskFills | ClockSteps | GroundClockSteps | SecondProgram
+    | RadioIs | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins
+    | SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders | FenceWithout
 )  # fmt: skip
 
 

@@ -39,6 +39,7 @@ from lpac.sim.drill.injections import (
     OriginJumps,
     PilotInjection,
     ProgramDies,
+    ProgramEnds,
     ProgramStarts,
     ProgramStops,
     VehicleInjection,
@@ -55,8 +56,8 @@ from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
 
 # What is done to programs, and what their operator does, on whatever vehicles.
 _PROGRAMS = (
-    ProgramDies, ProgramStops, ProgramStarts, WatchdogDies, GroundDies, GroundStops, GroundStarts,
-    OperatorOrders, FenceWithout,
+    ProgramDies, ProgramEnds, ProgramStops, ProgramStarts, WatchdogDies, GroundDies, GroundStops,
+    GroundStarts, OperatorOrders, FenceWithout,
 )  # fmt: skip
 # Nobody cuts this machine's own network, fills its disk or steps its clock, and no loop of a
 # program that is as in the field hangs on demand.
@@ -244,6 +245,8 @@ class ProcessField(FaultyFleet):
         match injection:
             case ProgramDies():
                 robot.send_signal(signal.SIGKILL)
+            case ProgramEnds():
+                robot.send_signal(signal.SIGTERM)
             case ProgramStarts():
                 # What restarts a program that hangs kills it first.
                 robot.send_signal(signal.SIGKILL)

@@ -29,6 +29,7 @@ from lpac.sim.drill.injections import (
     Injection,
     LoopHangs,
     ProgramDies,
+    ProgramEnds,
     ProgramStarts,
     ProgramStops,
     RadioCut,
@@ -196,6 +197,8 @@ class SimulatedField(FaultyFleet):
         match injection:
             case ProgramDies():
                 robot.stop()
+            case ProgramEnds():
+                robot.end()
             case ProgramStarts():
                 robot.start()
             case ProgramStops(for_s):

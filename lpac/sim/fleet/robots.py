@@ -152,6 +152,15 @@ class SimulatedRobot:
         """Nothing more can be written: its log says so, as `FlightLog` does."""
         self._disk.full = True
 
+    def end(self) -> None:
+        """Its program is told to end, and leaves the vehicle as its configuration says."""
+        assert self.node is not None and self.watchdog is not None
+        action = self.node.leave(Action(self.config.on_stop))
+        if action is not None:
+            self.watchdog.feed(flying=False)
+            self.vehicle.command(action)
+        self.stop()
+
     def stop(self) -> None:
         """Its program ends, as by a loss of power."""
         self._said = self.status
