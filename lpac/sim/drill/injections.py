@@ -450,7 +450,8 @@ Injection = (
     VehicleInjection | ProgramDies | ProgramEnds | ProgramStarts | ProgramStops | LoopHangs
     | WatchdogDies | AutopilotSilent | DiskFills | ClockSteps | GroundClockSteps | SecondProgram
     | RadioIs | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins
-    | SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders | FenceWithout
+    | SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders
+    | FenceWithout
 )  # fmt: skip
 
 
