@@ -1,6 +1,7 @@
 """Many tasks over all cores of this machine. A Ray cluster does the same: `lpac.sim.cluster`."""
 
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -8,6 +9,8 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import active_children, get_context, parent_process, resource_tracker
+from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, Protocol, TypeVar
 
 Task = TypeVar("Task")
@@ -48,13 +51,20 @@ def over_processes(
 
     Raises ChildProcessError if one of them is killed.
     """
-    workers = min(len(tasks), at_most)
-    # A fork would inherit threads that do not run there. Tasks come as the workers begin: until
-    # Python 3.11.6, a pool whose worker was killed waits forever for one to read a large task.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (do, tasks))
+    # Workers read the tasks from a file: who waits for a worker that was killed to take a large one
+    # from a pipe waits forever.
+    with NamedTemporaryFile(prefix="lpac-tasks-") as file:
+        pickle.dump((do, tasks), file)
+        file.flush()
+        yield from _from_workers(min(len(tasks), at_most), len(tasks), file.name)
+
+
+def _from_workers(workers: int, tasks: int, path: str) -> Generator[Any, None, None]:
+    # A fork would inherit threads that do not run there.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (path,))
     try:
         with _without_interrupts():
-            given: list[Future[Any]] = [pool.submit(_do_nth, n) for n in range(len(tasks))]
+            given: list[Future[Any]] = [pool.submit(_do_nth, n) for n in range(tasks)]
         for done in as_completed(given):
             yield done.result()
     except BrokenProcessPool:
@@ -96,11 +106,12 @@ def _without_interrupts() -> Iterator[None]:
 _given: tuple[Callable[[Any], Any], Sequence[Any]]
 
 
-def _begin(do: Callable[[Task], Outcome], tasks: Sequence[Task]) -> None:
+def _begin(path: str) -> None:
     """A worker knows what to do before it is told which."""
     global _given  # noqa: PLW0603
-    _given = do, tasks
     _obey_parent()
+    with Path(path).open("rb") as file:
+        _given = pickle.load(file)
 
 
 def _do_nth(n: int) -> Any:
