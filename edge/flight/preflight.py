@@ -328,8 +328,8 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
     for robot_id in inputs.unheard:
         yield FailedCheck(
             CheckCode.OTHER_NOT_HEARD,
-            f"the ground hears robot {robot_id}, and this robot does not, which would not keep "
-            "away from it: `lpac fleet radio` tells who hears whom",
+            f"the ground hears robot {robot_id}, and this robot does not: they would not keep "
+            "apart; `lpac fleet radio` tells who hears whom",
         )
     for beacon, _ in others:
         other = f"robot {beacon.robot_id}"

@@ -24,9 +24,10 @@ from edge.messages.mission import (
 _MOST_ORDERS = 64
 _MOST_STATES = 16
 _BEACON_LIFETIME_S = 3.0
-# The ground names whom it hears now, in large fleets in turns. Whoever it has named for so long is
-# heard by a robot, too, unless their radios do not reach each other.
-_AT_GROUND_LASTS_S, _HEARD_AFTER_S = 2.0, 5.0
+# The ground names whom it hears; in a large fleet it takes so long until all had their turn.
+_GROUND_NAMES_WITHIN_S = 20.0
+# Whom the ground has heard for so long a robot hears, too, unless their radios do not reach.
+_HEARD_WITHIN_S = 5.0
 # A hold that somebody else than the commander asks for counts for as long as it is said; robots
 # hear a state five times a second. The commander's next states end it, so that nobody who asks for
 # one can get far ahead of the commander.
@@ -46,8 +47,8 @@ class _ArrivedOrder(NamedTuple):
     at_s: float
 
 
-class _AtGround(NamedTuple):
-    """A robot that the ground hears: since when, and when it said so last."""
+class _HeardByGround(NamedTuple):
+    """Since when the ground names a robot among those that it hears, and when it did last."""
 
     since_s: float
     at_s: float
@@ -90,7 +91,8 @@ class Inbox:
         self.not_understood_count = 0
         # Robots that the ground hears and this one does not, as `peers` found it.
         self.unheard: tuple[int, ...] = ()
-        self._at_ground: dict[int, _AtGround] = {}
+        self._heard_by_ground: dict[int, _HeardByGround] = {}
+        self._beacon_at_s: dict[int, float] = {}
 
     def put_ground(self, data: bytes, speaker: Speaker, now_s: float) -> None:
         """A ground's state arrived."""
@@ -113,6 +115,7 @@ class Inbox:
             ) <= (known.beacon.boot_epoch, known.beacon.sequence)  # fmt: skip
             if not late:
                 self._beacons[beacon.robot_id] = HeardBeacon(beacon, now_s)
+                self._beacon_at_s[beacon.robot_id] = now_s
 
     def put_stranger(self, name: str, now_s: float) -> None:
         """A robot's message arrived that could not be read."""
@@ -148,10 +151,10 @@ class Inbox:
     def _put_echoes(self, state: GroundState, at_s: float) -> None:
         with self._lock:
             for robot_id in map(int, state.echoes):
-                known = self._at_ground.get(robot_id)
-                goes_on = known is not None and at_s - known.at_s <= _AT_GROUND_LASTS_S
-                since_s = known.since_s if known is not None and goes_on else at_s
-                self._at_ground[robot_id] = _AtGround(since_s, at_s)
+                before = self._heard_by_ground.get(robot_id)
+                is_new = before is None or at_s - before.at_s > _GROUND_NAMES_WITHIN_S
+                since_s = at_s if before is None or is_new else before.since_s
+                self._heard_by_ground[robot_id] = _HeardByGround(since_s, at_s)
 
     def _with_asked_hold(self, now_s: float) -> GroundState | None:
         ground, asked = self._ground, self._asked_hold
@@ -259,12 +262,13 @@ class Inbox:
             self.not_understood = tuple(self._strangers)
             self.unheard = tuple(
                 robot_id
-                for robot_id, at_ground in sorted(self._at_ground.items())
+                for robot_id, (since_s, at_s) in sorted(self._heard_by_ground.items())
                 if robot_id != self._robot_id
-                and robot_id not in self._beacons
                 and f"robot {robot_id}" not in self._strangers
-                and at_ground.at_s - at_ground.since_s >= _HEARD_AFTER_S
-                and now_s - at_ground.at_s <= _AT_GROUND_LASTS_S
+                and now_s - at_s <= _GROUND_NAMES_WITHIN_S
+                # The ground heard it, and this robot did not.
+                and at_s - max(since_s, self._beacon_at_s.get(robot_id, -math.inf))
+                >= _HEARD_WITHIN_S
             )
             return tuple(self._beacons.values())
 

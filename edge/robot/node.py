@@ -51,8 +51,9 @@ _ARMED_CHECKS_PERIOD_S = 0.95
 _STATUS_PERIOD_S = 1.0 / STATUS.rate_hz - 0.05
 # What is said of each neighbour is long, and counts for the difference over many seconds.
 _RADIO_COUNTS_PERIOD_S = 1.9
-# After as many of the policy's periods without a message, a beacon goes alone.
-_SILENT_TICKS = 1.5
+# After as many of the policy's periods without a message, or so long, a beacon goes alone: others
+# forget one after 3 s.
+_SILENT_TICKS, _SILENT_S = 1.5, 1.0
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 
@@ -331,7 +332,8 @@ class RobotNode:
             if status.radio_counts is not None:
                 self._radio_counts_told_at_s = now_s
             self._publish(STATUS, encode(status))
-        if now_s - self._message_at_s > _SILENT_TICKS / self._config.rates.policy_hz:
+        silent_s = min(_SILENT_TICKS / self._config.rates.policy_hz, _SILENT_S)
+        if now_s - self._message_at_s > silent_s:
             # The policy is silent, or hangs: neighbours must not lose this robot's place.
             self._publish_message()
         vehicle = self._ports.vehicle.state()

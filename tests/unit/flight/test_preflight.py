@@ -112,7 +112,7 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
     (
         {"unheard": (4,)},
         _C.OTHER_NOT_HEARD,
-        "the ground hears robot 4, and this robot does not, which would not keep away from it",
+        "the ground hears robot 4, and this robot does not: they would not keep apart",
     ),
     (
         {"not_understood": ("robot 4",)},

@@ -183,10 +183,11 @@ def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
 
 
 def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
-    inbox, both = make_inbox(), {"2": Echo(1, 1.0, 0.0), "3": Echo(1, 1.0, 0.0)}
+    inbox = make_inbox()
 
-    def unheard(now_s: float, *, echoed: bool = True, heard: bool = False) -> tuple[int, ...]:
-        state = dataclasses.replace(STATE, echoes=both if echoed else {})
+    def unheard(now_s: float, *named: int, heard: bool = False) -> tuple[int, ...]:
+        """What the robot says then, whom the ground has just named."""
+        state = dataclasses.replace(STATE, echoes={str(r): Echo(1, 1.0, 0.0) for r in named})
         inbox.put_ground(encode(state), ANYBODY, now_s)
         inbox.ground(now_s)
         if heard:
@@ -196,15 +197,22 @@ def test_whom_the_ground_hears_and_this_robot_does_not() -> None:
         return inbox.unheard
 
     # Its program has only just begun.
-    assert [unheard(now_s) for now_s in (1.0, 2.0, 4.0, 5.9)] == [()] * 4
-    assert unheard(6.1) == (2,)
-    assert unheard(7.0, heard=True) == ()
-    assert unheard(9.0) == unheard(9.9) == ()
-    assert unheard(10.1) == (2,)
-    # The ground hears it no more, either.
-    assert unheard(11.0, echoed=False) == (2,)
-    assert unheard(12.2, echoed=False) == ()
-    assert unheard(13.0) == ()
+    assert [unheard(now_s, 2, 3) for now_s in (1.0, 2.0, 4.0, 5.9)] == [()] * 4
+    assert unheard(6.1, 2, 3) == (2,)
+    assert unheard(7.0, 2, 3, heard=True) == ()
+    assert unheard(11.9, 2) == ()
+    assert unheard(12.1, 2) == (2,)
+    # Another one's turn; this one's comes after a while, also from a ground that was away.
+    assert unheard(20.0, 3) == (2,)
+    assert unheard(30.0, 2) == (2,)
+    # Who speaks another version says what is wrong itself.
+    inbox.put_stranger("robot 2", 30.1)
+    assert unheard(30.2, 2) == ()
+    # Its program ends: neither the ground hears it, nor this robot.
+    assert unheard(40.0, 2, heard=True) == ()
+    assert [unheard(now_s, 3) for now_s in (42.0, 50.0, 60.1, 70.0)] == [()] * 4
+    # It starts again, and is given the same time.
+    assert [unheard(now_s, 2) for now_s in (80.0, 84.9, 85.1)] == [(), (), (2,)]
 
 
 def test_of_who_does_not_command_only_a_hold_counts() -> None:
