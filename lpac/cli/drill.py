@@ -55,7 +55,10 @@ def drill(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(help="Fly exactly this one; of one fault with its flight logs and a figure."),
+        typer.Option(
+            help="Fly exactly this one; of one fault with its flight logs and a figure, all in "
+            "FAULT-SEED in --out."
+        ),
     ] = None,
     robots: Annotated[int, typer.Option("--robots", "-n", help="Number of robots.")] = 4,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
@@ -97,6 +100,9 @@ def drill(
         campaign = Campaign(out, vehicle, robots, bundle, px4)
         flown = partial(pool(ray), fly_order) if real_time is None else real_time.fly_all
         outcomes = _fly(campaign, chosen, numbers, flown)
+    if seed is not None and len(chosen) == 1:
+        # Beside what it leaves, and not in place of a campaign's.
+        out = out / f"{chosen[0].name}-{seed}"
     result = to_json(outcomes, options)
     (out / "drill.json").write_text(json.dumps(result, indent=2) + "\n")
     (out / "drill.xml").write_bytes(as_junit(outcomes, options))

@@ -350,7 +350,8 @@ _RADIO = (
         does=(*_once(RadioCut("in halves")), Do(20.0, RadioCut("none"))), hits=0, watched_s=40.0,
         bounds=(
             FliesOn(20.0, 0.95, "first half"), MissionEnds(3.8, 20.0, "second half"),
-            Stands(7.0, 12.5, "second half"), Lands(14.0, "second half"),
+            Stands(7.0, 12.5, "second half"), NotLandedBefore(12.5, "second half"),
+            Lands(14.0, "second half"),
             Down(14.0 + _LANDING_S, "second half"),
         ),
     ),
@@ -370,7 +371,10 @@ _RADIO = (
         name="radio-very-late", what="all messages come 8 s late, 4 to 12 s",
         promise="a late ground is a lost one: hold after 3 s; it still lands them",
         does=_once(RadioIs(delay_s=8.0)), hits=0, watched_s=30.0,
-        bounds=(MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), Lands(14.0, "all")),
+        bounds=(
+            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
+            Lands(14.0, "all"),
+        ),
     ),
     Fault(
         name="radio-repeats", what="all messages come twice, and overtake each other",
@@ -389,8 +393,8 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s; they stay down when it wakes",
         does=_once(GroundStops(60.0)), hits=0, watched_s=70.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), Lands(14.0, "all"),
-            Down(14.0 + _LANDING_S, "all"),
+            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
+            Lands(14.0, "all"), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(

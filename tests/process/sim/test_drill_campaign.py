@@ -12,6 +12,8 @@ from xml.etree import ElementTree
 import pytest
 from ray.cluster_utils import Cluster
 
+from lpac.analysis.logs import read_logs
+from lpac.analysis.truth import TRUTH, load_truth
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.sim.cluster import over_ray
 from lpac.sim.cores import over_cores
@@ -92,7 +94,13 @@ def test_a_flight_again_is_that_flight_with_logs_and_figure(
     worst = {figure["name"]: figure["value"] for figure in told["worst"]}
     assert worst == {figure.name: figure.value for figure in first.figures}
     folder = tmp_path / "landed-1"
-    assert (folder / "drill.png").exists() and (tmp_path / "drill.xml").exists()
+    assert (folder / "drill.png").exists() and (folder / "drill.xml").exists()
+    # On the clock of the robots' logs.
+    truth, logs = load_truth(folder / TRUTH), read_logs([folder])
+    assert len(truth) == ROBOTS
+    for robot, track in truth.items():
+        said_s = [status.time_s for status in logs.statuses[robot]]
+        assert track.time_s[0] <= said_s[0] + 1.0 and said_s[-1] <= track.time_s[-1] + 1.0
     assert len(list(folder.glob("robots/*/logs/*.mcap"))) == ROBOTS
 
 
