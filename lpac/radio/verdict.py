@@ -21,8 +21,8 @@ MOST_LATE = 0.01
 _BY_CHANCE = 1
 # Of a channel's time, with gaps; above it delays grow quickly (docs/scaling.md).
 MOST_BUSY = 0.6
-# So much more than the model says of this fleet is not the model's error alone.
-_MUCH_OF_OTHERS = 0.2
+# Times what the model says that a fleet's radios count; what is more is not this fleet's.
+_MODEL_ERR = 1.5
 # As `lpac fleet doctor` has it.
 _WEAK_DBM = -75.0
 # Where no radio tells its own; as docs/scaling.md has it.
@@ -35,8 +35,8 @@ class Room(NamedTuple):
     `ground_share` is what the `robots` that spoke ask for with messages of `ground_bytes`, as they
     were, and `flight_share` with `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not.
     `busy_share` is what radios counted, without gaps, where the model has `model_busy_share`; None:
-    nobody told. The two shares and the room are scaled by that; if it is so much more that others
-    must be on the channel, the room is what these leave.
+    nobody told. The two shares and the room are scaled by that, as far as the model may err; what
+    is more others take, `others_share` with gaps, and the room is what these leave.
     """
 
     robots: int
@@ -50,6 +50,7 @@ class Room(NamedTuple):
     message_hz: float
     busy_share: float | None
     model_busy_share: float
+    others_share: float
 
 
 class RadioVerdict(NamedTuple):
@@ -148,18 +149,13 @@ def _silent(checked: Checked) -> Iterator[_Found]:
 def _channel(room: Room | None) -> Iterator[_Found]:
     if room is None or room.carries >= room.robots:
         return
-    busy, model_busy = room.busy_share, room.model_busy_share
-    if busy is not None and _is_of_others(busy, model_busy):
-        text = (
-            f"the channel is busy {_percent(busy)} of the time, of which these robots should take "
-            f"{_percent(model_busy)}: others take the rest: look for another channel"
-        )
-    else:
-        text = (
-            f"in flight these {room.robots} robots ask for {_percent(room.flight_share)} of the "
-            f"channel, of which they can use {_percent(MOST_BUSY)}: it carries "
-            f"{room.carries or 'none'}"
-        )
+    left = max(0.0, MOST_BUSY - room.others_share)
+    text = (
+        f"in flight these {room.robots} robots ask for {_percent(room.flight_share)} of the "
+        f"channel, of which they can use {_percent(left)}: it carries {room.carries or 'none'}"
+    )
+    if room.others_share > 0.0:
+        text += f"; others take {_percent(room.others_share)}: look for another channel"
     yield 1.0 - room.carries / room.robots, text
 
 
@@ -219,9 +215,10 @@ def _room(checked: Checked) -> Room | None:
     # A radio that hears nobody does not count.
     told = [w.busy_share for w in checked.wifi.values() if w.busy_share]
     busy = statistics.median(told) if told and not checked.loaded else None
-    # Radios count no gaps. A little more than the model says is the model's error, much is others'.
-    others = busy - ground.busy if busy is not None and _is_of_others(busy, ground.busy) else 0.0
-    scale = 1.0 if busy is None or others else busy / ground.busy
+    # Radios count no gaps.
+    counted = 1.0 if busy is None else busy / ground.busy
+    scale = min(counted, _MODEL_ERR)
+    others = min(1.0, (counted - scale) * ground.total)
     most = MOST_BUSY - others
     return Room(
         robots=traffic.robots,
@@ -235,11 +232,8 @@ def _room(checked: Checked) -> Room | None:
         message_hz=traffic.message_hz,
         busy_share=busy,
         model_busy_share=ground.busy,
+        others_share=others,
     )
-
-
-def _is_of_others(busy: float, model_busy: float) -> bool:
-    return busy - model_busy > _MUCH_OF_OTHERS
 
 
 def _percent(share: float) -> str:

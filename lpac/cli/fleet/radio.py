@@ -270,6 +270,8 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
             f"; scaled, since the channel was busy {100.0 * room.busy_share:.0f} % of the time, "
             f"where the model has {100.0 * room.model_busy_share:.0f} %"
         )
+        if room.others_share > 0.0:
+            text += f"; others are taken to have {100.0 * room.others_share:.0f} %"
     if not checked.ground_wired:
         text += (
             "; this computer is in the Wi-Fi itself, so that what it sends and passes on crosses "
