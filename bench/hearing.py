@@ -10,9 +10,9 @@ import socket
 import tempfile
 import time
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
-from multiprocessing.queues import Queue
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -63,15 +63,11 @@ def measure(
     others: tuple[int, ...] = (0, 9, 99), seconds: float = 20.0, robots: int = 10
 ) -> Report:
     """Each number of others in turn; they say what so many robots of a flight said."""
-    spawn = get_context("spawn")
     heard: list[Heard] = []
     for count in others:
         progress(f"hearing: {count} others, {seconds:g} s")
-        told: Queue[Heard] = spawn.Queue()
-        process = spawn.Process(target=_hear, args=(count, seconds, robots, told))
-        process.start()
-        heard.append(told.get(timeout=300.0))
-        process.join()
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+            heard.append(alone.submit(_hear, count, seconds, robots).result())
     by_count = {each.others: each for each in heard}
     idle = by_count[0].cpu_percent if 0 in by_count else 0.0
     rows = []
@@ -103,7 +99,7 @@ def measure(
     )
 
 
-def _hear(others: int, seconds: float, robots: int, told: "Queue[Heard]") -> None:
+def _hear(others: int, seconds: float, robots: int) -> Heard:
     """In a process of its own, so that nothing else is counted."""
     log.listen(log.show_errors)
     port, zenoh_port = free_ports(2)
@@ -130,7 +126,7 @@ def _hear(others: int, seconds: float, robots: int, told: "Queue[Heard]") -> Non
             cpu_s, took_s = time.process_time() - cpu_s, time.monotonic() - began_s
             sent, taken = speaking.sent - sent_before, _taken(fleet) - before
         fleet.close()
-    told.put(Heard(others, sent / took_s, taken / sent if sent else 1.0, 100.0 * cpu_s / took_s))
+    return Heard(others, sent / took_s, taken / sent if sent else 1.0, 100.0 * cpu_s / took_s)
 
 
 def _taken(fleet: SimulatedFleet) -> int:

@@ -573,6 +573,7 @@ def everything(
     code is not made again.
     """
     from edge.policy.bundle import load_bundle
+    from lpac.paper.files import MADE_FOR_ALL
     from lpac.paper.repeated import write_page
 
     folder = out or _OUT
@@ -593,7 +594,7 @@ def everything(
         if name == "network":
             option = _of_namespaces(namespaces) + option
         made_by[name] = _made_by(f"{name}{option}", [] if name == "network" else [bundle])
-        kept = its / "made_by.json"
+        kept = its / MADE_FOR_ALL
         if kept.exists() and json.loads(kept.read_text()) == made_by[name]:
             continue
         typer.echo(f"{name}\n")

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+MADE_FOR_ALL = "made_by.json"
+
 
 def write_experiment(
     name: str,
@@ -24,6 +26,8 @@ def write_experiment(
     """
     document = {**told, "flown": flown, "made_by": dict(made_by)}
     folder.mkdir(parents=True, exist_ok=True)
+    # `lpac paper all` knows by this what it made itself, and need not make again.
+    (folder / MADE_FOR_ALL).unlink(missing_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(document, indent=2) + "\n")
     write_csv(rows, folder / f"{name}.csv")
     made = "; ".join(f"{what}: `{value}`" for what, value in made_by.items())

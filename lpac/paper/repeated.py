@@ -11,6 +11,8 @@ import numpy as np
 
 from edge.core.wire import most_bytes
 from edge.drivers.registry import load_policy
+from edge.identity.envelope import OVERHEAD_BYTES
+from edge.messages.beacon import BEACON_BYTES
 from edge.policy.bundle import Bundle
 from edge.policy.family import Observation
 from lpac.analysis.page import CLOSING, figure, opening
@@ -117,7 +119,8 @@ def sizes_of(bundle: Bundle) -> Sizes:
         nowhere = Observation(np.zeros(2), local_map, np.zeros((others, 2)), np.zeros(2))
         heard = [np.zeros(policy.message_size, np.float32)] * others
         said = agent.step(agent.observe(nowhere).features, heard, others).payload
-        sizes.append(most_bytes(said.size, "float16", perception.shared_map_side))
+        of_policy = most_bytes(said.size, "float16", perception.shared_map_side)
+        sizes.append(BEACON_BYTES + of_policy + OVERHEAD_BYTES)
     return Sizes(*sizes)
 
 

@@ -111,7 +111,7 @@ def write_repeatability(
     spread = experiments.spread_of(looked_at)
     style.save(figures.repeatability(records), folder / "repeatability")
     rows = [
-        [name, _final(record), f"{-from_s[name]:.0f} s", _final(trials[name])]
+        [name, _final(record), f"{0.0 - from_s[name]:.0f} s", _final(trials[name])]
         for name, record in looked_at.items()
     ]
     headings = ["", f"cost after {spread['end_s']:.0f} s (in truth)", "mission began after",
@@ -135,8 +135,11 @@ Costs after {spread["end_s"]:.0f} s: mean {spread["final_mean"]:.3f}, standard d
 {spread["mean_scatter_of_ends_m"]:.2f} m from the mean of its ends, on average.
 {" ".join(experiments.who_is_missing(spread))}
 """
-    told = {"trials": curves_json(looked_at), "mission_from_s": {n: -s for n, s in from_s.items()},
-            "spread": spread}  # fmt: skip
+    told = {
+        "trials": curves_json(looked_at),
+        "mission_from_s": {name: 0.0 - at_s for name, at_s in from_s.items()},
+        "spread": spread,
+    }
     return write_experiment("e2", told, curves_csv(looked_at), text, folder, flown, made_by)
 
 
@@ -147,8 +150,8 @@ def _looked_at_text(from_s: Mapping[str, float]) -> str:
             "another; until the mission begins, those on their pads count where they stand."
         )
     return (
-        "Times count from the mission's begin: points have no takeoff, and nor has a log that "
-        "does not tell of it, or in which it was earlier than that."
+        "Times count from the mission's begin: points have no takeoff, and logs may not tell of "
+        f"it, or tell of one more than {experiments.E2_DURATION_S:g} s earlier."
     )
 
 
@@ -267,6 +270,10 @@ def write_network(
         f"![{name}]({name}.png)" for name in dict.fromkeys(of["experiment"] for of in told["runs"])
     )
     versions = ", ".join(f"{name} {version}" for name, version in measured_on["versions"].items())
+    unmet = sum(not run["met"] for run in told["runs"])
+    not_met = (
+        f"Runs left out, since robots had not all heard each other: {unmet}. " if unmet else ""
+    )
     text = f"""# Network
 
 The paper measures what a stream gets while the programs of three robots restart (Table I), and how
@@ -276,7 +283,7 @@ that falls as robots are switched on one after another. {flown}
 
 {table(headings, rows)}
 
-Mean and standard deviation over the runs. {versions}; Linux {measured_on["kernel"]},
+Mean and standard deviation over the runs. {not_met}{versions}; Linux {measured_on["kernel"]},
 {measured_on["cores"]} cores.
 """
     runs = told["runs"]

@@ -137,7 +137,7 @@ def test_an_evaluation_gets_its_table_and_what_made_it(tmp_path: Path) -> None:
 
 
 def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> None:
-    run = {"experiment": "robots", "middleware": "zenoh", "robots": 2, "delivered": None}
+    run = {"experiment": "robots", "middleware": "zenoh", "robots": 2, "met": False}
     spread = {"mean": 75.04, "deviation": 0.5, "runs": 3}
     told = {
         "measured_on": {
@@ -153,6 +153,9 @@ def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> N
     document = write_network(told, tmp_path, MADE_BY)
     assert "between network namespaces (drone0, drone1)" in document["flown"]
     [row] = csv.DictReader((tmp_path / "network.csv").read_text().splitlines())
-    assert row == {"experiment": "robots", "middleware": "zenoh", "robots": "2", "delivered": ""}
+    assert row == {
+        "experiment": "robots", "middleware": "zenoh", "robots": "2", "met": "False",
+    }  # fmt: skip
     text = (tmp_path / "README.md").read_text()
     assert "| robots | zenoh | 2 | 75.0 ± 0.5 |  |  |" in text and "(robots.png)" in text
+    assert "Runs left out, since robots had not all heard each other: 1." in text
