@@ -44,13 +44,14 @@ class _Sizes(NamedTuple):
 class Wanted:
     """What the report is to be of: only the missions called `trials` (none: all), snapshots at
     `times_s` (none: at the begin, a quarter, half and all of each), over the world in `world`, for
-    the policy in `bundle`.
+    the policy in `bundle`. `world_option` is what its reader gives the world by.
     """
 
     trials: tuple[str, ...] = ()
     times_s: tuple[float, ...] = ()
     world: Path | None = None
     bundle: Path | None = None
+    world_option: str = "--world"
 
     def __post_init__(self) -> None:
         for time_s in self.times_s:
@@ -124,6 +125,7 @@ class _Worlds:
         self._logs = logs
         self._bundle = wanted.bundle
         self._notes = notes
+        self._world_option = wanted.world_option
         self._given = None if wanted.world is None else wanted.world.read_text("utf-8-sig")
         self._texts = {setup.world_id: setup.world for _, setup in logs.setups if setup.world}
         paths = [path for folder in folders for path in sorted(folder.rglob("*.env"))]
@@ -158,14 +160,15 @@ class _Worlds:
         text = self._given
         if text is not None and id_of(text) not in flown:
             self._notes.append(
-                f"{mission.name}: --world is {id_of(text)}, and the robots flew over {flown[0]}"
+                f"{mission.name}: {self._world_option} is {id_of(text)}, and the robots flew over "
+                f"{flown[0]}"
             )
         if text is None:
             text = self._texts.get(flown[0])
         if text is None:
             self._notes.append(
                 f"{mission.name}: world {flown[0]} is not here: no density, no cost; "
-                "give it with --world"
+                f"give it with {self._world_option}"
             )
             return None
         name = id_of(text)

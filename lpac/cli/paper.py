@@ -216,16 +216,16 @@ def _logged(
     """The missions in the logs below a folder, by name. Raises ValueError if one has no cost."""
     from lpac.analysis.report import Wanted, examine
 
-    wanted = Wanted(trials=tuple(trial or ()), world=world_file, bundle=bundle)
+    wanted = Wanted(
+        trials=tuple(trial or ()), world=world_file, bundle=bundle, world_option="--world-file"
+    )
     examined = examine([logs], wanted)
-    # As the option is called here.
-    notes = [note.replace("--world", "--world-file") for note in examined.notes]
     for record in examined.trials:
         if not len(record.normalized):
-            why = [note for note in notes if note.startswith(f"{record.name}: ")]
+            why = [note for note in examined.notes if note.startswith(f"{record.name}: ")]
             others = "; or choose other missions with --trial" if len(examined.trials) > 1 else ""
             raise ValueError("; ".join(why or [f"{record.name}: no cost is known"]) + others)
-    for note in notes:
+    for note in examined.notes:
         typer.echo(f"note: {note}", err=True)
     return {record.name: record for record in examined.trials}
 

@@ -271,9 +271,7 @@ def write_network(
     )
     versions = ", ".join(f"{name} {version}" for name, version in measured_on["versions"].items())
     unmet = sum(not run["met"] for run in told["runs"])
-    not_met = (
-        f"Runs left out, since robots had not all heard each other: {unmet}. " if unmet else ""
-    )
+    not_met = f"Left out are {unmet}, before which robots had not all met. " if unmet else ""
     text = f"""# Network
 
 The paper measures what a stream gets while the programs of three robots restart (Table I), and how

@@ -51,7 +51,8 @@ def day(mission: FlightRecord, monkeypatch: pytest.MonkeyPatch) -> list[Wanted]:
         asked.append(wanted)
         other = replace(mission, name="paper-2", coverage=None)
         trials = [t for t in (mission, other) if not wanted.trials or t.name in wanted.trials]
-        return Examined(tuple(trials), ("paper-2: world 1234 is not here; give it with --world",))
+        note = f"paper-2: world 1234 is not here; give it with {wanted.world_option}"
+        return Examined(tuple(trials), (note,))
 
     monkeypatch.setattr(lpac.analysis.report, "examine", examine)
     return asked
@@ -64,7 +65,7 @@ def test_a_world_that_is_not_there_is_one_line_that_says_what_to_do(
         with pytest.raises(ValueError, match=r"^paper-2: .* with --world-file; or choose other"):
             command(logs=tmp_path, out=tmp_path / "out")
     e1(logs=tmp_path, trial=["paper-1"], world_file=Path("a.env"), out=tmp_path / "out")
-    assert day[-1] == Wanted(trials=("paper-1",), world=Path("a.env"))
+    assert (day[-1].trials, day[-1].world) == (("paper-1",), Path("a.env"))
 
 
 @pytest.mark.usefixtures("day")
@@ -158,4 +159,4 @@ def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> N
     }  # fmt: skip
     text = (tmp_path / "README.md").read_text()
     assert "| robots | zenoh | 2 | 75.0 ± 0.5 |  |  |" in text and "(robots.png)" in text
-    assert "Runs left out, since robots had not all heard each other: 1." in text
+    assert "Left out are 1, before which robots had not all met." in text
