@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from edge.core import F32, F64
 from edge.core.coverage import cell_corners, coverage_cost, voronoi_cells
-from edge.core.world import parse_world, rasterize
+from edge.core.world import Feature, parse_world, rasterize
 from edge.messages.mission import STEERED, FlightState, RobotStatus
 from lpac.analysis.snapshot import FleetSnapshot
 
@@ -47,11 +47,15 @@ class World(Protocol):
 class Coverage:
     """Coverage of one world. Positions are (N, 2) in the mission frame, m, also outside the world.
 
-    `importance` is (world_size, world_size), indexed [x, y]; `size_m` is the world's side.
+    `importance` is (world_size, world_size), indexed [x, y], and what `features` come to, if these
+    are known; `size_m` is the world's side.
     """
 
-    def __init__(self, importance: F32, cells_per_m: float) -> None:
+    def __init__(
+        self, importance: F32, cells_per_m: float, features: tuple[Feature, ...] = ()
+    ) -> None:
         self.importance = importance
+        self.features = features
         self.size_m = len(importance) / cells_per_m
         self.cells_per_m = cells_per_m
 
@@ -60,7 +64,7 @@ class Coverage:
         """Raises ValueError if the world's text is no world file."""
         features = parse_world(world.world, f"world {world.world_id}")
         importance = rasterize(features, world.world_size, world.truncation, world.norm)
-        return cls(importance, world.env_scale)
+        return cls(importance, world.env_scale, features)
 
     def cost(self, positions_m: F64) -> float:
         """The coverage cost J of the paper in model units (see `coverage_cost`); N >= 1."""

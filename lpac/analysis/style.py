@@ -40,6 +40,10 @@ CURVES: tuple[tuple[str, Any], ...] = (
     (SKY, (0, (3, 1, 1, 1))),
     (VERMILLION, "-"),
 )
+# For more than that: a policy beside all baselines.
+MANY_CURVES: tuple[tuple[str, Any], ...] = (
+    *CURVES, (ORANGE, "-"), (GREY, "--"), (YELLOW, "-."), (FAINT, "-"),
+)  # fmt: skip
 _ROBOTS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
 # What is written on these is white.
 DARK = (BLUE, GREEN, VERMILLION, BLACK)

@@ -29,6 +29,7 @@ app = new_app(
 )
 
 _OUT = Path("out/paper")
+_E1_WORLDS, _E2_TRIALS, _WORLD = 3, 3, 0
 _WORLDS, _QUICK_WORLDS = 50, 4
 # Enough to see whether slower or faster is better.
 _QUICK_HZ = {"perception_hz": (1.0, 5.0), "policy_hz": (0.5, 2.5, 10.0)}
@@ -60,6 +61,10 @@ Px4 = Annotated[Path | None, typer.Option(help="px4: PX4's build folder.")]
 Logs = Annotated[
     Path | None, typer.Option(help="Fly nothing: folder of logs of flights, as of a field day.")
 ]
+World = Annotated[
+    int | None,
+    typer.Option(help=f"Number of the world, of the validation set; {_WORLD} if not given."),
+]
 Trial = Annotated[
     list[str] | None,
     typer.Option("--trial", metavar="NAME", help="--logs: only this mission; may be repeated."),
@@ -84,7 +89,10 @@ Out = Annotated[
 def e1(
     *,
     bundle: FlownBundle = None,
-    worlds: Annotated[int, typer.Option("--worlds", "-k", help="Of the validation set.")] = 3,
+    worlds: Annotated[
+        int | None,
+        typer.Option("--worlds", "-k", help=f"Of the validation set; {_E1_WORLDS} if not given."),
+    ] = None,
     vehicle: Vehicle = VehicleKind.POINT,
     px4: Px4 = None,
     logs: Logs = None,
@@ -101,16 +109,17 @@ def e1(
         transferability,
         whole_transferability,
     )
-    from lpac.paper.report import LOGS, POINTS, WHOLE_BESIDE_POINTS, write_transferability
+    from lpac.paper.report import POINTS, WHOLE_BESIDE_POINTS, write_transferability
 
+    _check_options(vehicle, px4, logs, trial, world_file, {"--worlds": worlds, "--ray": ray})
+    worlds = _E1_WORLDS if worlds is None else worlds
     _at_least(1, worlds, "--worlds")
-    _check_options(vehicle, px4, logs, trial, world_file)
     folder = out or _OUT / "e1"
     records: dict[str, dict[str, FlightRecord]]
     if logs is not None:
         trials = _logged(logs, trial, world_file, bundle)
-        records = {name: {"flight": record} for name, record in trials.items()}
-        made_by, how = _made_from_logs("e1", logs, trial, world_file, bundle, trials), LOGS
+        records, how = _beside_points(trials, bundle or DEFAULT_BUNDLE)
+        made_by = _made_from_logs("e1", logs, trial, world_file, bundle, trials)
     else:
         cores, flown_by = pool(ray), bundle or DEFAULT_BUNDLE
         is_whole = vehicle is not VehicleKind.POINT
@@ -141,8 +150,10 @@ def e1(
 def e2(
     *,
     bundle: FlownBundle = None,
-    trials: Annotated[int, typer.Option(help="How often.")] = 3,
-    world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
+    trials: Annotated[
+        int | None, typer.Option(help=f"How often; {_E2_TRIALS} times if not given.")
+    ] = None,
+    world: World = None,
     vehicle: Vehicle = VehicleKind.POINT,
     px4: Px4 = None,
     logs: Logs = None,
@@ -156,8 +167,11 @@ def e2(
     from lpac.paper.experiments import repeatability, who_is_missing, whole_repeatability
     from lpac.paper.report import LOGS, POINTS, WHOLE, write_repeatability
 
+    unused = {"--trials": trials, "--world": world, "--ray": ray}
+    _check_options(vehicle, px4, logs, trial, world_file, unused)
+    trials = _E2_TRIALS if trials is None else trials
+    world = _WORLD if world is None else world
     _at_least(2, trials, "--trials")
-    _check_options(vehicle, px4, logs, trial, world_file)
     folder = out or _OUT / "e2"
     if logs is not None:
         records = _logged(logs, trial, world_file, bundle)
@@ -197,8 +211,12 @@ def _check_options(
     logs: Path | None,
     trial: "Sequence[str] | None",
     world_file: Path | None,
+    of_flights: "Mapping[str, object]",
 ) -> None:
-    """An option that would do nothing is a mistake."""
+    """An option that would do nothing is a mistake, as `of_flights` is with logs."""
+    given = [option for option, value in of_flights.items() if value is not None]
+    if logs is not None and given:
+        raise ValueError(f"{given[0]} does nothing with --logs")
     if logs is not None and vehicle is not VehicleKind.POINT:
         raise ValueError("--vehicle does nothing with --logs")
     if vehicle is VehicleKind.PX4 and px4 is None:
@@ -228,6 +246,33 @@ def _logged(
     for note in examined.notes:
         typer.echo(f"note: {note}", err=True)
     return {record.name: record for record in examined.trials}
+
+
+def _beside_points(
+    trials: "Mapping[str, FlightRecord]", bundle: Path
+) -> "tuple[dict[str, dict[str, FlightRecord]], str]":
+    """E1 of logs: each mission beside the baselines, if the bundle is what flew; and how."""
+    from edge.policy.bundle import load_bundle
+    from lpac.paper.experiments import beside
+    from lpac.paper.report import LOGS, LOGS_BESIDE_POINTS
+
+    records = {name: {"flight": record} for name, record in trials.items()}
+    if load_bundle(bundle).id not in _flown_by(trials):
+        typer.echo(
+            f"note: {bundle} is not what flew, so nothing says what the baselines would see: they "
+            "are left out; give the bundle that flew with --bundle",
+            err=True,
+        )
+        return records, LOGS
+    named = {
+        (trial, name): scenario
+        for trial, record in trials.items()
+        for name, scenario in beside(record).items()
+    }
+    flown = _fly(list(named.values()), bundle, pool(None))
+    for (trial, name), flight in zip(named, flown, strict=True):
+        records[trial][name] = flight.record
+    return records, LOGS_BESIDE_POINTS
 
 
 def _fly_whole(
@@ -263,7 +308,7 @@ def _fly_whole(
 def e3(
     *,
     bundle: FlownBundle = None,
-    world: Annotated[int, typer.Option(help="Number of the world, of the validation set.")] = 0,
+    world: World = None,
     vehicle: Annotated[
         VehicleKind, typer.Option(help="point; or whole robots, of which a pilot takes some.")
     ] = VehicleKind.POINT,
@@ -286,7 +331,8 @@ def e3(
     from lpac.paper.flown import fly_piloted, fly_programs
     from lpac.paper.report import TAKEN_LOGS, TAKEN_POINTS, TAKEN_WHOLE, write_perturbation
 
-    _check_options(vehicle, px4, logs, trial, world_file)
+    _check_options(vehicle, px4, logs, trial, world_file, {"--world": world, "--ray": ray})
+    world = _WORLD if world is None else world
     folder, flown_by = out or _OUT / "e3", bundle or DEFAULT_BUNDLE
     command = f"e3 --world {world}{_option(vehicle)}"
     if logs is not None:

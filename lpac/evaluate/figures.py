@@ -1,6 +1,7 @@
 """An evaluation's figures."""
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,6 @@ from lpac.analysis.statistics import paired_bootstrap, performance_profile, rati
 from lpac.analysis.style import WIDTH_IN, tidy
 from lpac.evaluate.evaluation import FAILS_ABOVE, Condition, MethodResult
 
-# For more than a figure's curves have: the baselines.
-_LOOKS: tuple[tuple[str, Any], ...] = (
-    *style.CURVES, (style.ORANGE, "-"), (style.GREY, "--"), (style.YELLOW, "-."),
-    (style.FAINT, "-"),
-)  # fmt: skip
 _BAND = (0.1, 0.9)
 _MOST_RIVALS = 4
 
@@ -146,4 +142,4 @@ def _plain_ticks(axes: Axes) -> None:
 
 
 def _looks(results: Sequence[MethodResult]) -> list[tuple[MethodResult, tuple[str, Any]]]:
-    return [(result, _LOOKS[i % len(_LOOKS)]) for i, result in enumerate(results)]
+    return list(zip(results, cycle(style.MANY_CURVES), strict=False))

@@ -19,18 +19,15 @@ import numpy as np
 from edge.core import F64
 from edge.messages.mission import FlightState
 from lpac.analysis.flight import COST_PERIOD_S, FlightRecord
+from lpac.evaluate.flights import BASELINES
 from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
 from lpac.evaluate.worlds import DrawnWorld, draw_world
-from lpac.sim.baselines import BaselineName
 from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
 from lpac.sim.failure import Failure
 from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.fleet.pilot import PilotFlight
 
-# E1: what the policy is held against, and when the field is looked at, s.
-BASELINES: tuple[BaselineName, ...] = (
-    "decentralized-cvt", "decentralized-cvt-prior", "frontier-cvt", "clairvoyant-cvt",
-)  # fmt: skip
+# E1: who flies, and when the field is looked at, s.
 _CONTROLLERS: tuple[Controller, ...] = ("lpac", *BASELINES)
 SNAPSHOTS_S = (0.0, 15.0, 30.0, 60.0)
 # What these are called beside the points.
@@ -95,6 +92,30 @@ def whole_transferability(bundle: Path, worlds: int = 3) -> dict[str, FleetScena
             duration_s=SNAPSHOTS_S[-1],
         )
         for number, world in ((number, _world(number)) for number in range(worlds))
+    }
+
+
+def beside(record: FlightRecord) -> dict[str, Scenario]:
+    """E1 for a logged flight: the baselines over its world, from where its robots began.
+
+    They fly at the field's scale of speeds. Nobody is there if its world is not, or nobody began.
+    """
+    starts_m = tuple(record.places_at(0.0).values())
+    if record.coverage is None or not record.coverage.features or not starts_m:
+        return {}
+    coverage = record.coverage
+    scale = replace(FIELD_SCALE, env_scale=coverage.cells_per_m)
+    return {
+        name: Scenario(
+            controller=name,
+            robots=len(starts_m),
+            features=coverage.features,
+            starts_m=starts_m,
+            world_size=len(coverage.importance),
+            scale=scale,
+            duration_s=record.duration_s,
+        )
+        for name in BASELINES
     }
 
 

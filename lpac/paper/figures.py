@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from lpac.analysis import style
 from lpac.analysis.flight import FlightRecord
-from lpac.analysis.style import CURVES, WIDTH_IN, tidy
+from lpac.analysis.style import MANY_CURVES, WIDTH_IN, tidy
 from lpac.paper.experiments import PerturbedFlight
 
 
@@ -16,7 +16,8 @@ def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
     with style.figure(WIDTH_IN, 2.6) as figure:
         panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
         for axes, (world, of_world) in zip(panels, records.items(), strict=True):
-            for (colour, dashes), (name, record) in zip(CURVES, of_world.items(), strict=False):
+            looks = zip(of_world.items(), MANY_CURVES, strict=False)
+            for (name, record), (colour, dashes) in looks:
                 axes.plot(
                     record.curve_time_s, record.normalized, color=colour, ls=dashes, lw=1.2,
                     label=name,

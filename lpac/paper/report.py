@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lpac.analysis import figures, style
 from lpac.analysis.flight import FlightRecord
 from lpac.paper import experiments
@@ -41,6 +43,9 @@ TAKEN_WHOLE = (
     f"flies it out of the fence at its height, and back to where it was; {_PILOTED}"
 )
 LOGS = "From the logs of flights."
+LOGS_BESIDE_POINTS = (
+    f"{LOGS} What they are held against are points from where the robots were as the mission began."
+)
 TAKEN_LOGS = f"From the log of a flight: {_PILOTED}"
 NETWORK = "No vehicles: programs that send what robots send, beside a stream, measured {where}."
 _COSTS = (
@@ -190,6 +195,10 @@ stayed within 5 % of what it came to when the next thing happened, or the flight
     told = {
         "flight": curves_json({"": perturbed.record})[""],
         "phases": [phase._asdict() for phase in perturbed.phases],
+        "neighbours": {
+            "mean": float(np.nanmean(perturbed.neighbours)),
+            "others": len(perturbed.record.robots) - 1,
+        },
     }
     rows_csv: list[list[object]] = [["time_s", "robot", "speed_m_s", "neighbours"]]
     for time_s, speeds, neighbours in zip(

@@ -11,13 +11,22 @@ import pytest
 import lpac.cli.paper
 from edge.core.frames import MissionFrame
 from edge.policy.bundle import Bundle
-from lpac.paper.claims import Agreement, Claim, Experiments, Sizes, claims_of, printed_rotation
+from lpac.paper.claims import (
+    Agreement,
+    Claim,
+    Effort,
+    Experiments,
+    Sizes,
+    claims_of,
+    printed_rotation,
+)
 from lpac.paper.experiments import WHOLE_ROBOTS
-from lpac.paper.repeated import CHAPTERS, sizes_of, write_page
+from lpac.paper.repeated import CHAPTERS, effort_of, sizes_of, write_page
 
 TIME_S = [float(t) for t in range(61)]
 FALLS = [0.2 + 0.8 * math.exp(-t / 8.0) for t in TIME_S]
 SIZES = Sizes(3600, 3600)
+EFFORT = Effort(4e-3, 5e-3)
 
 
 def flight(cost: list[float]) -> dict[str, Any]:
@@ -50,13 +59,14 @@ def repeated(deviation: float) -> dict[str, Any]:
     return {"trials": {"1": {}, "2": {}}, "spread": spread}
 
 
-def taken(worst: float, end: float) -> dict[str, Any]:
+def taken(worst: float, end: float, neighbours: float = 2.0) -> dict[str, Any]:
     phase = {"cost_before": 0.2, "settled_s": 3.0}
     return {
         "phases": [
             {**phase, "away": True, "cost_worst": worst, "cost_end": 0.21},
             {**phase, "away": False, "cost_worst": 0.21, "cost_end": end},
-        ]
+        ],
+        "neighbours": {"mean": neighbours, "others": 9},
     }
 
 
@@ -95,7 +105,7 @@ def transferred(over: float) -> dict[str, Any]:
 
 
 def claim(made: Experiments, name: str) -> Claim:
-    [found] = [claim for claim in claims_of(made, SIZES) if claim.name.startswith(name)]
+    [found] = [claim for claim in claims_of(made, SIZES, EFFORT) if claim.name.startswith(name)]
     return found
 
 
@@ -109,6 +119,8 @@ def claim(made: Experiments, name: str) -> Claim:
         ("E2", Experiments(e2=repeated(0.05)), Experiments(e2=repeated(0.07))),
         ("E3", Experiments(e3=taken(0.3, 0.21)), Experiments(e3=taken(0.3, 0.25))),
         ("E3", Experiments(e3=taken(0.3, 0.21)), Experiments(e3=taken(0.4, 0.21))),
+        ("Decentralised", Experiments(e3=taken(0.3, 0.21)),
+         Experiments(e3=taken(0.3, 0.21, neighbours=6.0))),
         ("Transfers", Experiments(transfer=transferred(1.2)),
          Experiments(transfer=transferred(1.3))),
         ("Asynchronous", Experiments(asynchrony=rates(1.0, 1.0, 1.0)),
@@ -137,8 +149,8 @@ def test_what_the_data_do_not_tell_is_not_told() -> None:
     # Robots in step at 0.95 times the cost, and the interval does not say which side of 5 % it is.
     in_step = Experiments(asynchrony=rates(0.95, 1.0, 1.0))
     assert claim(in_step, "Asynchronous").verdict is Agreement.OPEN
-    names = [claim.name for claim in claims_of(Experiments(), SIZES)]
-    assert not any(name.startswith("E1") for name in names) and len(names) == 4
+    names = [claim.name for claim in claims_of(Experiments(), SIZES, EFFORT)]
+    assert not any(name.startswith("E1") for name in names) and len(names) == 5
 
 
 def test_the_printed_rotation_is_right_at_a_heading_of_90_degrees_alone() -> None:
@@ -184,8 +196,22 @@ def test_a_message_does_not_grow_with_who_is_heard(shipped_bundle: Bundle) -> No
         (sizes, Agreement.AGREES),
         (Sizes(sizes.of_two, sizes.of_two + 1), Agreement.DIFFERS),
     ):
-        [size] = [one for one in claims_of(Experiments(), told) if one.name == "Message size"]
+        [size] = [
+            one for one in claims_of(Experiments(), told, EFFORT) if one.name == "Message size"
+        ]
         assert size.verdict is verdict
+
+
+def test_a_step_among_a_hundred_is_held_against_one_among_two(shipped_bundle: Bundle) -> None:
+    measured = effort_of(shipped_bundle)
+    assert measured.of_two_s > 0.0 and measured.of_hundred_s > 0.0
+    for effort, verdict in (
+        (Effort(4e-3, 7.9e-3), Agreement.AGREES),
+        (Effort(4e-3, 8.1e-3), Agreement.DIFFERS),
+    ):
+        found = claims_of(Experiments(), SIZES, effort)
+        [computation] = [one for one in found if one.name == "Computation"]
+        assert computation.verdict is verdict
 
 
 def test_what_was_made_is_not_made_again(

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,12 +13,14 @@ import pytest
 import lpac.analysis.report
 from edge.messages.mission import FlightState
 from edge.policy.bundle import load_bundle
+from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord
 from lpac.analysis.logs import LoggedStatus
 from lpac.analysis.report import Examined, Wanted
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.cli.paper import e1, e2, e3
 from lpac.cli.sim import VehicleKind
+from lpac.evaluate.flights import BASELINES
 from lpac.paper.report import write_network, write_transfer
 from lpac.sim.experiment import Scenario, fly
 
@@ -35,11 +37,14 @@ def said(time_s: float, bundle_id: str) -> LoggedStatus:
 def mission() -> FlightRecord:
     """Of two robots, as logs have it."""
     bundle = load_bundle(DEFAULT_BUNDLE)
-    record = fly(Scenario(robots=2, duration_s=5.0), bundle).record
+    flight = fly(Scenario(robots=2, duration_s=5.0), bundle)
+    record, coverage = flight.record, flight.record.coverage
+    assert coverage is not None
     robots = tuple(
         replace(r, said=tuple(said(t, bundle.id) for t in r.time_s.tolist())) for r in record.robots
     )
-    return replace(record, name="paper-1", robots=robots)
+    read = Coverage(coverage.importance, coverage.cells_per_m, flight.features)
+    return replace(record, name="paper-1", robots=robots, coverage=read)
 
 
 @pytest.fixture
@@ -76,6 +81,56 @@ def test_one_mission_of_a_day_is_chosen_and_its_own_policy_named(tmp_path: Path)
     assert made_by["command"] == "lpac paper e3 --logs 'day 1' --trial paper-1"
     assert made_by["bundle"] == load_bundle(DEFAULT_BUNDLE).id and "seeds" not in made_by
     assert {"numpy", "onnxruntime", "python", "lpac-edge"} < set(made_by)
+
+
+@pytest.mark.usefixtures("day")
+def test_a_logged_flight_is_held_against_baselines_from_where_it_began(
+    mission: FlightRecord, tmp_path: Path
+) -> None:
+    e1(logs=tmp_path, trial=["paper-1"], out=tmp_path)
+    told = json.loads((tmp_path / "e1.json").read_text())
+    [of_world] = told["worlds"].values()
+    assert list(of_world) == ["flight", *BASELINES]
+    flown = of_world["flight"]
+    assert flown["final"] == pytest.approx(mission.normalized[-1])
+    for its in of_world.values():
+        assert its["time_s"] == flown["time_s"] and its["normalized_cost"][0] == 1.0
+    assert of_world["clairvoyant-cvt"]["final"] < min(1.0, flown["final"])
+    assert "points from where the robots were" in told["flown"]
+
+
+def test_a_logged_flight_of_another_policy_has_no_baselines(
+    mission: FlightRecord,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    robots = tuple(
+        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
+        for r in mission.robots
+    )
+    examined = Examined((replace(mission, robots=robots),), ())
+    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: examined)
+    e1(logs=tmp_path, out=tmp_path)
+    told = json.loads((tmp_path / "e1.json").read_text())
+    assert [list(of_world) for of_world in told["worlds"].values()] == [["flight"]]
+    assert "give the bundle that flew with --bundle" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (e1, {"worlds": 3}), (e1, {"ray": "auto"}), (e2, {"trials": 3}), (e2, {"world": 0}),
+        (e3, {"world": 0}), (e3, {"ray": "auto"}),
+    ],
+)  # fmt: skip
+def test_what_chooses_flights_is_a_mistake_with_logs(
+    command: Callable[..., None], options: dict[str, Any], tmp_path: Path
+) -> None:
+    [name] = options
+    with pytest.raises(ValueError, match=f"^--{name} does nothing with --logs$"):
+        command(**options, logs=tmp_path, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_neighbours_are_those_in_range_of_the_policy_that_flew(

@@ -16,9 +16,9 @@ from edge.policy.bundle import Bundle
 from lpac.analysis.flight import FlightRecord, RobotRecord
 from lpac.analysis.logs import LoggedStatus
 from lpac.cli.options import DEFAULT_BUNDLE
+from lpac.evaluate.flights import BASELINES
 from lpac.paper.experiments import (
     AWAY_S,
-    BASELINES,
     E2_DURATION_S,
     TAKEN,
     TAKEN_AT_S,
