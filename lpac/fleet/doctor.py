@@ -52,6 +52,7 @@ _NO_AUTOPILOT = (
     CheckCode.OTHER_AUTOPILOT,
     CheckCode.SYSTEM_ID_WRONG,
 )
+_UP = "lpac fleet up"
 # What other checks of the doctor's say.
 _SAID_ELSEWHERE = (
     *_NO_AUTOPILOT,
@@ -221,7 +222,10 @@ def judge(
     facts = found.facts
     yield _identity(config, robot, facts)
     yield _card(config, robot, facts["card"])
-    yield _release(config, robot, {name: other.facts for name, other in fleet.items()})
+    of_all = {name: other.facts for name, other in fleet.items()}
+    if config.radio.transport == "multicast" and config.keys is not None:
+        yield _group(robot, of_all)
+    yield _release(config, robot, of_all)
     yield _program(config, robot, fleet)
     yield _system(facts)
     yield _disk(facts)
@@ -233,7 +237,7 @@ def judge(
     yield _mavlink(robot, facts)
     yield _px4(robot, facts)
     yield _vision_hub(config, robot, facts["vision_hub"])
-    yield _doors(robot, facts)
+    yield _doors(config, robot, facts)
     yield _commanders(config, robot, facts)
     yield _containers(config, robot, facts["containers"])
     yield from _vehicle(robot, facts, found.vehicle)
@@ -290,7 +294,31 @@ def _card(config: FleetConfig, robot: RobotHost, card: str | None) -> DoctorChec
     return DoctorCheck(name, "ok", f"a member of fleet {own.fleet} until {until}")
 
 
-def _doors(robot: RobotHost, facts: Facts) -> DoctorCheck:
+def _group(robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:
+    """Whether it has the key by which robots hear each other in multicast."""
+    name = "group key"
+    has = {other: facts["group_keys"] for other, facts in fleet.items()}
+    if has[robot.name] is None:
+        return DoctorCheck(name, "FAILED", "it has none: it hears nobody", _UP)
+    others = _others_than_most(has, robot.name)
+    if others:
+        found = f"it has another one than {', '.join(others)}: they do not hear each other"
+        return DoctorCheck(name, "FAILED", found, _UP)
+    return DoctorCheck(name, "ok", "it has the one that the others have")
+
+
+def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
+    """Who has something else than a robot; nobody if it has what most have.
+
+    Where no half of the fleet agrees, nobody is right.
+    """
+    [(most, count)] = Counter(has.values()).most_common(1)
+    if has[robot] == most and 2 * count > len(has):
+        return []
+    return [other for other, its in has.items() if its != has[robot]]
+
+
+def _doors(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
     """Ways to the vehicle past the fleet's keys."""
     name = "doors"
     users = facts["factory_passwords"]
@@ -298,6 +326,8 @@ def _doors(robot: RobotHost, facts: Facts) -> DoctorCheck:
         found = f"{', '.join(users)}: no password, or the one that every VOXL comes with"
         return DoctorCheck(name, "FAILED", found, on(robot, *(f"passwd {user}" for user in users)))
     expected = {("tcp", robot.port or 22), ("tcp", robot.zenoh_port)}
+    if config.radio.transport == "multicast":
+        expected.add(("udp", int(config.radio.group.rpartition(":")[2])))
     others = [
         each for each in facts["open_ports"] if (each["protocol"], each["port"]) not in expected
     ]
@@ -328,7 +358,7 @@ def _release(config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Facts]) 
     facts = fleet[robot.name]
     name = "release"
     if facts["pending"] is not None:
-        return DoctorCheck(name, "FAILED", "a switch of releases was interrupted", "lpac fleet up")
+        return DoctorCheck(name, "FAILED", "a switch of releases was interrupted", _UP)
     versions = facts["versions"]
     if facts["current"] is None or versions is None:
         return DoctorCheck(name, "FAILED", "there is none", _deploy(robot))
@@ -338,16 +368,10 @@ def _release(config: FleetConfig, robot: RobotHost, fleet: Mapping[str, Facts]) 
             for other, its in fleet.items()
             if its["versions"] is not None
         }
-        [(most, count)] = Counter(has.values()).most_common(1)
-        own = has[robot.name]
-        # Where no half of the fleet agrees, nobody is right.
-        if count == len(has) or (own == most and 2 * count > len(has)):
-            continue
-        others = ", ".join(other for other, its in has.items() if its != own)
-        return DoctorCheck(
-            name, "FAILED", f"its {part} is {own[:12]}, another one than that of {others}",
-            "lpac fleet deploy",
-        )  # fmt: skip
+        others = _others_than_most(has, robot.name)
+        if others:
+            found = f"its {part} is {has[robot.name][:12]}, another one than that of "
+            return DoctorCheck(name, "FAILED", found + ", ".join(others), "lpac fleet deploy")
     if not is_configured(config, robot, facts):
         found = f"its configuration is not the one of {config.path.name}"
         return DoctorCheck(name, "FAILED", found, _deploy(robot))
@@ -442,9 +466,9 @@ def _clock(facts: Facts, clock: ClockOffset) -> DoctorCheck:
     found = f"{_duration(abs(offset_s))} {way} the laptop's (± {1000.0 * uncertainty_s:.0f} ms)"
     found += ", kept by a time server" if facts["synchronized"] else ""
     if abs(offset_s) > MOST_CLOCK_OFFSET_S + uncertainty_s:
-        return DoctorCheck("clock", "FAILED", found, "lpac fleet up")
+        return DoctorCheck("clock", "FAILED", found, _UP)
     if abs(offset_s) > GOOD_CLOCK_OFFSET_S + uncertainty_s:
-        return DoctorCheck("clock", "warning", found, "lpac fleet up")
+        return DoctorCheck("clock", "warning", found, _UP)
     return DoctorCheck("clock", "ok", found)
 
 

@@ -2,7 +2,6 @@
 
 import base64
 import binascii
-import hashlib
 import json
 import os
 import shutil
@@ -70,7 +69,7 @@ def identity_key(fresh: bool) -> Dict[str, Any]:
             card = file.read()
     # An Ed25519 key is the last 32 bytes of its DER (RFC 8410).
     public_key = binascii.hexlify(der[-32:]).decode()
-    return {"public_key": public_key, "card": card, "group_keys": _group_keys_sha256()}
+    return {"public_key": public_key, "card": card, "group_keys": probes.group_keys_sha256()}
 
 
 @call
@@ -91,14 +90,6 @@ def set_card(files: Dict[str, str], fresh: bool, mavlink_port: int) -> Dict[str,
     _own_identity()
     signatures.trust_authority(base64.b64decode(files[_AUTHORITY]))
     return {}
-
-
-def _group_keys_sha256() -> Optional[str]:
-    try:
-        with open(os.path.join(_MEMBERSHIP, _GROUP_KEYS), "rb") as file:
-            return hashlib.sha256(file.read()).hexdigest()
-    except FileNotFoundError:
-        return None
 
 
 @call

@@ -4,6 +4,7 @@ Nothing here changes anything, but `set_clock`.
 """
 
 import glob
+import hashlib
 import json
 import os
 import re
@@ -89,6 +90,7 @@ def facts(directory: str, mavlink_port: int, names: List[str]) -> Dict[str, Any]
         units=units(known_units(names)),
         containers=known_containers(),
         card=_card(),
+        group_keys=group_keys_sha256(),
         open_ports=open_ports(_output(["ss", "-H", "-t", "-u", "-l", "-n", "-p"])),
         factory_passwords=_factory_passwords(),
     )
@@ -98,6 +100,15 @@ def facts(directory: str, mavlink_port: int, names: List[str]) -> Dict[str, Any]
 def _card() -> Optional[str]:
     """The file with who this robot is in its fleet; None if it has no card."""
     return _read(os.path.join(_PRIVATE, "lpac/identity/identity.json")) or None
+
+
+def group_keys_sha256() -> Optional[str]:
+    """Of the file with the multicast group's keys, in hexadecimal digits; None without keys."""
+    try:
+        with open(os.path.join(_PRIVATE, "lpac/identity/group-keys"), "rb") as file:
+            return hashlib.sha256(file.read()).hexdigest()
+    except OSError:
+        return None
 
 
 def open_ports(text: str) -> List[Dict[str, Any]]:

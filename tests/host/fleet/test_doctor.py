@@ -256,7 +256,10 @@ def test_up_gives_robots_the_key_of_their_group(enrolled: SimulatedHosts, tmp_pa
         assert kept.read_bytes() == authority.group_keys()
         assert kept.stat().st_mode & 0o077 == 0
         assert asyncio.run(bring_up(config, robot, time.monotonic(), unwatched)) == ((), ())
+        assert run_doctor(enrolled, host.name)[host.name]["group key"].verdict == "ok"
         kept.unlink()
+        lost = run_doctor(enrolled, host.name)[host.name]["group key"]
+        assert (lost.verdict, lost.fix) == ("FAILED", "lpac fleet up")
         arrival = asyncio.run(bring_up(config, robot, time.monotonic(), unwatched))
         assert arrival == (("it was given a new key of the group",), ())
         assert kept.read_bytes() == authority.group_keys()

@@ -105,7 +105,8 @@ def well(config: FleetConfig, name: str) -> Examination:
             "voxl-px4": {**runs}, "voxl-mavlink-server": {**runs}, "voxl-vision-hub": {**runs},
             "voxl-microdds-agent": {**idle}, "old_ros": {**idle},
         },
-        "containers": [], "card": card_of(config, robot), "factory_passwords": [],
+        "containers": [], "card": card_of(config, robot), "group_keys": "00ff",
+        "factory_passwords": [],
         "open_ports": [{"protocol": "tcp", "port": 22, "program": "sshd"},
                        {"protocol": "tcp", "port": 7447, "program": "python3"}],
     }  # fmt: skip
@@ -195,6 +196,23 @@ def test_who_does_not_reach_the_router_is_told_to_start_it(config: FleetConfig) 
         checks = {check.name: check for check in judge(routed, routed.robots["r1"], fleet)}
         assert (checks["program"].verdict, checks["program"].fix) == (verdict, fix)
     assert "router at 192.168.8.2:7447" in checks["program"].found
+
+
+def test_robots_in_multicast_need_one_key(config: FleetConfig) -> None:
+    assert "group key" not in judged(config)
+    sending = dataclasses.replace(config, radio=RadioConfig("multicast", "192.168.8.2:7447"))
+    for keys, verdict, found in (
+        ("00ff", "ok", "that the others have"),
+        (None, "FAILED", "it has none"),
+        ("11ff", "FAILED", "another one than r2, r3"),
+    ):
+        check = judged(sending, put("group_keys", keys))["group key"]
+        assert (check.verdict, check.fix) == (verdict, "" if verdict == "ok" else "lpac fleet up")
+        assert found in check.found
+    # Where they speak is no door.
+    port = {"protocol": "udp", "port": 7450, "program": "python3"}
+    assert judged(sending, put("open_ports", [port]))["doors"].verdict == "ok"
+    assert judged(config, put("open_ports", [port]))["doors"].verdict == "warning"
 
 
 def container(**about: object) -> list[dict[str, object]]:
