@@ -24,7 +24,7 @@ from lpac.evaluate.worlds import FIELD as FIELD_SET_UP
 from lpac.evaluate.worlds import DrawnWorld, draw_world
 from lpac.sim.experiment import FIELD_SCALE, SAMPLE_S, Controller, Scenario, SimulatedFlight
 from lpac.sim.failure import Failure
-from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.layout import FleetScenario, Layout, pads_for_all
 from lpac.sim.fleet.pilot import PilotFlight
 
 # E1: who flies, and when the field is looked at, s.
@@ -81,12 +81,15 @@ def transferability(worlds: int = 3, starts_m: F64 | None = None) -> dict[str, d
 
 
 def whole_transferability(bundle: Path, worlds: int = 3) -> dict[str, FleetScenario]:
-    """E1 for whole robots, which stand on pads with room between them. Raises BundleError."""
+    """E1 for whole robots, which stand on pads with room between them. Raises BundleError.
+
+    Their receivers, and the wind, are the same in all worlds.
+    """
     pads_m = _pairs(pads_of(bundle))
     return {
         f"world {number}": FleetScenario(
             robots=FIELD_SET_UP.robots,
-            seed=world.seed,
+            seed=_world(0).seed,
             features=world.features,
             pads_m=pads_m,
             duration_s=SNAPSHOTS_S[-1],
@@ -126,20 +129,27 @@ def pads_of(bundle: Path) -> F64:
 
 
 def whole_repeatability(bundle: Path, trials: int = 3, world: int = 0) -> dict[str, FleetScenario]:
-    """E2 for whole robots, whose receivers, compasses and winds differ by trial."""
-    drawn, pads_m = _world(world), pads_of(bundle)
-    scenarios = {}
-    for trial in range(trials):
-        rng = np.random.default_rng(np.random.SeedSequence([drawn.seed, trial]))
-        placed_m = pads_m + _around(rng.uniform(0.0, 1.0, len(pads_m)) ** 0.5, rng)
-        scenarios[f"trial {trial + 1}"] = FleetScenario(
+    """E2 for whole robots, whose receivers, compasses and winds differ by trial.
+
+    Raises BundleError; ValueError if no pads are apart for the receivers of so many trials.
+    """
+    drawn = _world(world)
+    scenarios = [
+        FleetScenario(
             robots=FIELD_SET_UP.robots,
             seed=drawn.seed + trial,
             features=drawn.features,
-            pads_m=_pairs(placed_m),
             duration_s=E2_DURATION_S,
         )
-    return scenarios
+        for trial in range(trials)
+    ]
+    pads_m = pads_for_all(scenarios, bundle, PLACED_WITHIN_M)
+    placed = {}
+    for trial, scenario in enumerate(scenarios):
+        rng = np.random.default_rng(np.random.SeedSequence([drawn.seed, trial]))
+        placed_m = pads_m + _around(rng.uniform(0.0, 1.0, len(pads_m)) ** 0.5, rng)
+        placed[f"trial {trial + 1}"] = replace(scenario, pads_m=_pairs(placed_m))
+    return placed
 
 
 def repeatability(trials: int = 3, world: int = 0) -> dict[str, Scenario]:

@@ -1,8 +1,8 @@
 """What a simulated fleet is before it runs: its world and field, and where its robots stand."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +114,8 @@ class Layout:
             )
         self.vehicles: tuple[Px4Vehicle, ...] = ()
         if without_vehicles:
-            self.pads_m = self.landing_points_m = self._draw_pads(np.zeros((scenario.robots, 2)))
+            exact_m = np.zeros((1, scenario.robots, 2))
+            self.pads_m = self.landing_points_m = self._draw_pads(exact_m)
         else:
             self.pads_m, self.landing_points_m, self.vehicles = self._draw_vehicles()
 
@@ -207,7 +208,7 @@ class Layout:
         biases_m = np.zeros((robots, 2))
         if self.scenario.errors:
             biases_m = np.array([self._horizontal(Px4Vehicle(seed=s).gps_bias_m) for s in seeds])
-        pads_m = self._draw_pads(biases_m)
+        pads_m = self._draw_pads(biases_m[None])
         headings_rad = np.random.default_rng(seeds).uniform(0.0, math.tau, robots).tolist()
         vehicles = []
         for seed, pad_m, heading_rad in zip(seeds, pads_m, headings_rad, strict=True):
@@ -224,19 +225,18 @@ class Layout:
         return pads_m, pads_m + biases_m, tuple(vehicles)
 
     def _draw_pads(self, biases_m: F64) -> F64:
-        """Pads (N, 2) apart from each other, both in truth and as the robots see them."""
+        """Pads (N, 2) apart from each other, in truth and as robots with each (N, 2) see them."""
         if self.scenario.pads_m is not None:
             return np.array(self.scenario.pads_m)
         rng = np.random.default_rng([self.scenario.seed, 1])
-        robots, field_m = len(biases_m), self.field_m
-        for inside_m in _PADS_INSIDE_FIELD_M:
-            pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, self.apart_m, rng)
-            if pads_m is not None:
-                return pads_m
+        robots, field_m = biases_m.shape[1], self.field_m
+        pads_m = _pads_within(biases_m, field_m, self.apart_m, rng)
+        if pads_m is not None:
+            return pads_m
         fit = next(
             fewer
             for fewer in range(robots - 1, 0, -1)
-            if _pads_apart(biases_m[:fewer], 0.0, field_m, self.apart_m, rng) is not None
+            if _pads_apart(biases_m[:, :fewer], 0.0, field_m, self.apart_m, rng) is not None
         )
         raise ValueError(
             f"robots = {robots}: {fit} fit on {field_m:g} x {field_m:g} m, with pads "
@@ -249,17 +249,53 @@ class Layout:
         return turned
 
 
+def pads_for_all(scenarios: Sequence[FleetScenario], bundle: Path, spare_m: float = 0.0) -> F64:
+    """Pads (N, 2) on which the robots of each scenario may stand, within `spare_m`.
+
+    They are apart in truth, and as the receivers of each scenario see them. Raises ValueError if
+    there is no room, BundleError.
+    """
+    nowhere_m = tuple((0.0, 0.0) for _ in range(scenarios[0].robots))
+    layouts = [Layout(replace(scenario, pads_m=nowhere_m), bundle) for scenario in scenarios]
+    apart_m, field_m = layouts[0].apart_m, layouts[0].field_m
+    pads_m = _pads_within(
+        np.stack([layout.landing_points_m for layout in layouts]),
+        field_m,
+        apart_m + 2.0 * spare_m,
+        np.random.default_rng([scenarios[0].seed, 1]),
+    )
+    if pads_m is None:
+        raise ValueError(
+            f"no pads on {field_m:g} x {field_m:g} m were found that are {apart_m:g} m apart for "
+            f"all that receivers err by in {len(scenarios)} flights: fly fewer"
+        )
+    return pads_m
+
+
+def _pads_within(
+    biases_m: F64, field_m: float, apart_m: float, rng: np.random.Generator
+) -> F64 | None:
+    """As far inside the field as there is room; see `_pads_apart`."""
+    for inside_m in _PADS_INSIDE_FIELD_M:
+        pads_m = _pads_apart(biases_m, inside_m, field_m - inside_m, apart_m, rng)
+        if pads_m is not None:
+            return pads_m
+    return None
+
+
 def _pads_apart(
     biases_m: F64, low_m: float, high_m: float, apart_m: float, rng: np.random.Generator
 ) -> F64 | None:
-    """Places (N, 2) within a square, `apart_m` from each other, and so with the biases added.
+    """Places (N, 2) within a square, `apart_m` from each other, and so with each of `biases_m`
+    (B, N, 2) added.
 
     Drawn in the cells of a grid, then pushed apart; None if they find no room.
     """
-    robots = len(biases_m)
+    robots = biases_m.shape[1]
     side = math.ceil(math.sqrt(robots))
-    lowest_m, highest_m = np.maximum(low_m, low_m - biases_m), np.minimum(high_m, high_m - biases_m)
-    truth_and_seen_m = np.stack([np.zeros_like(biases_m), biases_m])
+    truth_and_seen_m = np.concatenate([np.zeros((1, robots, 2)), biases_m])
+    lowest_m = (low_m - truth_and_seen_m).max(axis=0)
+    highest_m = (high_m - truth_and_seen_m).min(axis=0)
     wanted_m = apart_m * (1.0 + _PAD_SLACK)
     itself = np.arange(robots)
     for _ in range(_PAD_DRAWS):

@@ -2,8 +2,9 @@
 
 import csv
 import json
+import math
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -20,6 +21,7 @@ from lpac.evaluate.flights import BASELINES
 from lpac.paper.experiments import (
     AWAY_S,
     E2_DURATION_S,
+    PLACED_WITHIN_M,
     TAKEN,
     TAKEN_AT_S,
     absences_of,
@@ -44,6 +46,7 @@ from lpac.paper.report import (
 from lpac.sim.cores import in_this_process
 from lpac.sim.experiment import FIELD_SCALE, fly
 from lpac.sim.failure import Failure
+from lpac.sim.fleet.layout import Layout
 
 MADE_BY = {"command": "lpac paper ..."}
 
@@ -206,8 +209,15 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
         np.testing.assert_array_equal(scenario.pads_m, pads_m)
     trials = list(whole_repeatability(DEFAULT_BUNDLE, 3).values())
     assert len({trial.seed for trial in trials}) == len({trial.pads_m for trial in trials}) == 3
-    for trial in trials:
-        assert np.linalg.norm(np.array(trial.pads_m) - pads_m, axis=1).max() <= 0.1
+    for one, other in pairwise(trials):
+        offsets_m = np.array(one.pads_m) - np.array(other.pads_m)
+        assert np.linalg.norm(offsets_m, axis=1).max() <= 2.0 * PLACED_WITHIN_M
+    for scenario in (*plan.values(), *trials):
+        # Or the ground refuses the fleet.
+        layout = Layout(scenario, DEFAULT_BUNDLE)
+        for places_m in (layout.pads_m, layout.landing_points_m):
+            apart_m = [math.dist(a, b) for a, b in combinations(places_m.tolist(), 2)]
+            assert min(apart_m) >= layout.apart_m
 
     few = [
         replace(trial, robots=2, pads_m=trial.pads_m[:2], duration_s=3.0)
