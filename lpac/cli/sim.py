@@ -428,11 +428,8 @@ def _fly_on_clock(
     recorded: Path | None,
 ) -> None:
     """Fly whole robots on one simulated clock; exit code 1 unless it ended as it should."""
-    from edge.core import log
     from lpac.sim.fleet.clocked import fly_simulated
 
-    # What ten robots say to their own logs is nothing for a person.
-    log.listen(log.show_errors)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (_, say):
         flight = fly_simulated(
             scenario, out or Path(nowhere), bundle, say, logs=out is not None, recorded=recorded

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from edge.core import log
 from edge.messages.mission import RobotStatus
 from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
@@ -34,11 +35,28 @@ def fly_simulated(
     the script. With `logs` the robots write theirs below `folder`, in robots/ID/logs; `recorded` is
     the folder of such a flight, whose policies' steps are taken again. `pilots` take robots out of
     the field, and bring them back. Times, positions and costs are in the record; `problem` says
-    what kept the script from its end.
+    what kept the script from its end. Of what robots say meanwhile only errors are shown.
 
     Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
     written, and RecordingError.
     """
+    # What ten robots say to their own logs is nothing for a person.
+    listener = log.listen(log.show_errors)
+    try:
+        return _fly(scenario, folder, bundle, say, logs, recorded, pilots)
+    finally:
+        log.listen(listener)
+
+
+def _fly(
+    scenario: FleetScenario,
+    folder: Path,
+    bundle: Path,
+    say: Say,
+    logs: bool,
+    recorded: Path | None,
+    pilots: Sequence[PilotFlight],
+) -> FleetFlight:
     earlier = set(folder.rglob("*.mcap"))
     fleet = SimulatedFleet(
         scenario,
