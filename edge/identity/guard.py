@@ -31,6 +31,8 @@ _MOST_CARDS = 1000
 # is lost; and when all know all, which is most of a flight, and nearly for nothing.
 _SHOWN_AT_MOST_EVERY_S = 0.25
 _SHOWN_TO_NEW_EVERY_S, _NEW_FOR_S = 2.0, 20.0
+# In the beginning of that where nothing lost is sent again: who begins hears nobody whose card was.
+_SHOWN_IN_HASTE_EVERY_S, _HASTE_S = 0.5, 1.5
 _SHOWN_EVERY_S = {CARD: 1.0 / CARD.rate_hz, GROUND_CARD: 1.0 / GROUND_CARD.rate_hz}
 # What was on its way when a member's program started again has come by then.
 _LONGEST_TRANSIT_S = 5.0
@@ -170,16 +172,23 @@ class SignedGuard:
     """The guard of a member. From any thread.
 
     Nobody needs a list of members: each shows its card, which the authority has signed, now and
-    then and when somebody new is heard. `revocations` is the newest signed list that is known.
+    then and when somebody new is heard; more often in the beginning if the link is `lossy`, and
+    sends nothing again. `revocations` is the newest signed list that is known.
     """
 
     def __init__(
-        self, membership: Membership, clock_s: Callable[[], float], revocations: bytes = b""
+        self,
+        membership: Membership,
+        clock_s: Callable[[], float],
+        revocations: bytes = b"",
+        *,
+        lossy: bool = False,
     ) -> None:
         """Raises CardError for a card or a list that is not this fleet's."""
         self.card = membership.card
         self._membership = membership
         self._clock_s = clock_s
+        self._lossy = lossy
         self._lock = Lock()
         self._members: dict[tuple[Role, str], Card] = {self.card.member: self.card}
         self._cards: dict[bytes, Card] = {self.card.fingerprint: self.card}
@@ -284,6 +293,8 @@ class SignedGuard:
         with self._lock:
             if self._show_soon:
                 wait_s = _SHOWN_AT_MOST_EVERY_S
+            elif self._lossy and now_s < self._new_until_s - _NEW_FOR_S + _HASTE_S:
+                wait_s = _SHOWN_IN_HASTE_EVERY_S
             elif now_s < self._new_until_s:
                 wait_s = _SHOWN_TO_NEW_EVERY_S
             else:

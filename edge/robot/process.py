@@ -118,7 +118,9 @@ def run(config: RobotConfig, stop: threading.Event) -> None:
             config,
             lambda folder: load_identity(folder, fleet=config.fleet, unix_s=clock.unix_s()),
         )
-        signed = None if identity is None else identity.guard(clock.monotonic_s)
+        signed = None
+        if identity is not None:
+            signed = identity.guard(clock.monotonic_s, lossy=bool(config.link.group))
         node = RobotNode(
             config,
             Ports(

@@ -45,9 +45,11 @@ def membership(
 class Member:
     """A guard, what it hears, and what it sends: by topic, as it goes over the air."""
 
-    def __init__(self, member: Membership, revocations: bytes = b"") -> None:
+    def __init__(
+        self, member: Membership, revocations: bytes = b"", *, lossy: bool = False
+    ) -> None:
         self.now_s = 0.0
-        self.guard = SignedGuard(member, lambda: self.now_s, revocations)
+        self.guard = SignedGuard(member, lambda: self.now_s, revocations, lossy=lossy)
         self.heard: list[tuple[str, bytes, Speaker]] = []
         topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
             dict.fromkeys((MESSAGE, STATUS, STATE, ORDER), lambda *said: self.heard.append(said))
@@ -149,6 +151,19 @@ def test_cards_are_rare_once_all_know_all(one: Member, two: Member) -> None:
     again = robot(2, start=2)
     one.hear(again, again.say(MESSAGE, b"begun again"))
     assert shown_at_s(100) == [*range(59, 79, 2), *range(87, 100, 10)]
+
+
+def test_where_cards_get_lost_whoever_is_new_is_shown_them_again_at_once() -> None:
+    one, two = Member(membership(Role.ROBOT, "r1", 1), lossy=True), robot(2)
+    one.say(MESSAGE, b"")
+    one.now_s = 60.0
+    one.hear(two, two.say(MESSAGE, b"begun"))
+    shown_s = []
+    for tenths in range(600, 720):
+        one.now_s = tenths / 10.0
+        if CARD in [topic for topic, _ in one.say(MESSAGE, b"")]:
+            shown_s.append(round(one.now_s - 60.0, 1))
+    assert shown_s == [0.0, 0.5, 1.0, 3.0, 5.0, 7.0, 9.0, 11.0]
 
 
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7), payload=st.binary(max_size=300))
