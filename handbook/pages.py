@@ -31,7 +31,7 @@ _CODE_BLOCK = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
 _STYLE = "site.css"
 # What a browser shows or saves as it is.
-_COPIED = (".png", ".svg", ".ipynb")
+_COPIED = (".png", ".svg", ".ipynb", ".html")
 # Code is read after a link, and would bury the pages in what a search finds.
 _UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 

@@ -143,6 +143,7 @@ Costs after {spread["end_s"]:.0f} s: mean {spread["final_mean"]:.3f}, standard d
     told = {
         "trials": curves_json(looked_at),
         "mission_from_s": {name: 0.0 - at_s for name, at_s in from_s.items()},
+        "mission_final": {name: float(trials[name].normalized[-1]) for name in trials},
         "spread": spread,
     }
     return write_experiment("e2", told, curves_csv(looked_at), text, folder, flown, made_by)
@@ -171,7 +172,7 @@ def write_perturbation(
     rows = [
         [
             f"robot {phase.robot} {'away' if phase.away else 'back'}",
-            f"{phase.from_s:g} to {phase.until_s:g} s",
+            f"{phase.from_s:.0f} to {phase.until_s:.0f} s",
             f"{phase.cost_before:.3f}", f"{phase.cost_worst:.3f}", f"{phase.cost_end:.3f}",
             f"{phase.settled_s:.0f} s",
         ]

@@ -56,7 +56,10 @@ def repeated(deviation: float) -> dict[str, Any]:
         "end_s": 40.0, "final_mean": 0.3, "final_deviation": deviation,
         "largest_deviation_in_flight": 0.1, "mean_scatter_of_ends_m": 1.5,
     }  # fmt: skip
-    return {"trials": {"1": {}, "2": {}}, "spread": spread}
+    return {
+        "trials": {"1": {}, "2": {}}, "spread": spread,
+        "mission_from_s": {"1": 28.0, "2": 27.0}, "mission_final": {"1": 0.2, "2": 0.3},
+    }  # fmt: skip
 
 
 def taken(worst: float, end: float, neighbours: float = 2.0) -> dict[str, Any]:
@@ -138,6 +141,12 @@ def test_a_verdict_follows_from_the_numbers(
 ) -> None:
     assert claim(agrees, name).verdict is Agreement.AGREES
     assert claim(differs, name).verdict is Agreement.DIFFERS
+
+
+def test_where_robots_take_off_one_after_another_the_missions_ends_are_told_too() -> None:
+    assert "28 s after the takeoff command" in claim(Experiments(e2=repeated(0.05)), "E2").ours
+    points = {**repeated(0.05), "mission_from_s": {"1": 0.0, "2": 0.0}}
+    assert "takeoff command" not in claim(Experiments(e2=points), "E2").ours
 
 
 def test_what_the_data_do_not_tell_is_not_told() -> None:
