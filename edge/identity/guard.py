@@ -31,7 +31,8 @@ _MOST_CARDS = 1000
 # is lost; and when all know all, which is most of a flight, and nearly for nothing.
 _SHOWN_AT_MOST_EVERY_S = 0.25
 _SHOWN_TO_NEW_EVERY_S, _NEW_FOR_S = 2.0, 20.0
-# In the beginning of that where nothing lost is sent again: who begins hears nobody whose card was.
+# At first more often where nothing lost is sent again: until a lost card comes once more, whoever
+# begins is deaf to who sent it.
 _SHOWN_IN_HASTE_EVERY_S, _HASTE_S = 0.5, 1.5
 _SHOWN_EVERY_S = {CARD: 1.0 / CARD.rate_hz, GROUND_CARD: 1.0 / GROUND_CARD.rate_hz}
 # What was on its way when a member's program started again has come by then.

@@ -1,8 +1,8 @@
 """How all figures look: for print, for the screen, and for the colour-blind.
 
 Colours are Okabe and Ito's. Density is grey, so that all of them stand out on it. In small maps the
-swarm has one colour, which no curve has; where lines have to be followed each robot has its own.
-These repeat, so robots are labelled as well.
+swarm has one colour, which no curve beside them has; where lines have to be followed each robot has
+its own. These repeat, so robots are labelled as well.
 """
 
 import io
@@ -40,7 +40,7 @@ CURVES: tuple[tuple[str, Any], ...] = (
     (SKY, (0, (3, 1, 1, 1))),
     (VERMILLION, "-"),
 )
-# For more than that: a policy beside all baselines.
+# For more than that, where no map is beside: a policy and all baselines.
 MANY_CURVES: tuple[tuple[str, Any], ...] = (
     *CURVES, (ORANGE, "-"), (GREY, "--"), (YELLOW, "-."), (FAINT, "-"),
 )  # fmt: skip

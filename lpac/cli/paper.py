@@ -50,8 +50,8 @@ Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
 FlownBundle = Annotated[
     Path | None,
     typer.Option(
-        help="Policy bundle, the shipped one if not given; with --logs the one that flew, if it is "
-        "not where the robots had it."
+        help="Policy bundle, the shipped one if not given; with --logs the one that flew, by which "
+        "e1's baselines fly and e3 knows how far robots hear."
     ),
 ]
 Vehicle = Annotated[
@@ -126,6 +126,7 @@ def e1(
         plan = whole_transferability(flown_by, worlds) if is_whole else {}
         points = transferability(worlds, pads_of(flown_by) if is_whole else None)
         seeds = {world: of_world["lpac"].seed for world, of_world in points.items()}
+        seeds |= {f"{world}, {WHOLE_ROBOTS}": scenario.seed for world, scenario in plan.items()}
         made_by = _made_by(f"e1 -k {worlds}{_option(vehicle)}", [flown_by], seeds)
         how = WHOLE_BESIDE_POINTS.format(vehicles=_VEHICLES[vehicle]) if is_whole else POINTS
         folder.mkdir(parents=True, exist_ok=True)
@@ -167,8 +168,8 @@ def e2(
     from lpac.paper.experiments import repeatability, who_is_missing, whole_repeatability
     from lpac.paper.report import LOGS, POINTS, WHOLE, write_repeatability
 
-    unused = {"--trials": trials, "--world": world, "--ray": ray}
-    _check_options(vehicle, px4, logs, trial, world_file, unused)
+    of_flights = {"--trials": trials, "--world": world, "--ray": ray}
+    _check_options(vehicle, px4, logs, trial, world_file, of_flights)
     trials = _E2_TRIALS if trials is None else trials
     world = _WORLD if world is None else world
     _at_least(2, trials, "--trials")
@@ -213,7 +214,7 @@ def _check_options(
     world_file: Path | None,
     of_flights: "Mapping[str, object]",
 ) -> None:
-    """An option that would do nothing is a mistake, as `of_flights` is with logs."""
+    """An option that would do nothing is a mistake: with logs each that is given `of_flights`."""
     given = [option for option, value in of_flights.items() if value is not None]
     if logs is not None and given:
         raise ValueError(f"{given[0]} does nothing with --logs")
@@ -251,24 +252,28 @@ def _logged(
 def _beside_points(
     trials: "Mapping[str, FlightRecord]", bundle: Path
 ) -> "tuple[dict[str, dict[str, FlightRecord]], str]":
-    """E1 of logs: each mission beside the baselines, if the bundle is what flew; and how."""
+    """E1 of logs: each mission that the bundle flew beside the baselines; and how."""
     from edge.policy.bundle import load_bundle
     from lpac.paper.experiments import beside
     from lpac.paper.report import LOGS, LOGS_BESIDE_POINTS
 
     records = {name: {"flight": record} for name, record in trials.items()}
-    if load_bundle(bundle).id not in _flown_by(trials):
+    own = [load_bundle(bundle).id]
+    others = [name for name, record in trials.items() if _flown_by({name: record}) != own]
+    if others:
         typer.echo(
-            f"note: {bundle} is not what flew, so nothing says what the baselines would see: they "
-            "are left out; give the bundle that flew with --bundle",
+            f"note: {bundle} is not what flew {', '.join(others)}, so nothing says what baselines "
+            "would see: they are left out; give the bundle that flew with --bundle",
             err=True,
         )
-        return records, LOGS
     named = {
         (trial, name): scenario
         for trial, record in trials.items()
+        if trial not in others
         for name, scenario in beside(record).items()
     }
+    if not named:
+        return records, LOGS
     flown = _fly(list(named.values()), bundle, pool(None))
     for (trial, name), flight in zip(named, flown, strict=True):
         records[trial][name] = flight.record

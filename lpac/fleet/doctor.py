@@ -295,16 +295,16 @@ def _card(config: FleetConfig, robot: RobotHost, card: str | None) -> DoctorChec
 
 
 def _group(robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:
-    """Whether it has the key by which robots hear each other in multicast."""
+    """Whether it has the key that the others have: by it robots hear each other in multicast."""
     name = "group key"
-    has = {other: facts["group_keys"] for other, facts in fleet.items()}
-    if has[robot.name] is None:
-        return DoctorCheck(name, "FAILED", "it has none: it hears nobody", _UP)
+    has = {other: its["group_keys"] for other, its in fleet.items() if its["group_keys"]}
+    if robot.name not in has:
+        return DoctorCheck(name, "FAILED", "it has none: its program does not start", _UP)
     others = _others_than_most(has, robot.name)
     if others:
-        found = f"it has another one than {', '.join(others)}: they do not hear each other"
+        found = f"it has another one than {', '.join(others)}: not all of them hear each other"
         return DoctorCheck(name, "FAILED", found, _UP)
-    return DoctorCheck(name, "ok", "it has the one that the others have")
+    return DoctorCheck(name, "ok", f"it has one, and so have {len(has)} of {len(fleet)} robots")
 
 
 def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:

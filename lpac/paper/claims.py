@@ -113,12 +113,13 @@ def _computation(effort: Effort) -> Claim:
         "Computation",
         "What a robot computes does not depend on the number of robots.",
         f"A step with a hundred others heard, all in range, takes at most {_AS_LONG:g} times as "
-        "long as one with two.",
-        f"Perception and policy, measured in turns on one core: {1e3 * effort.of_two_s:.2f} ms "
-        f"with two, {1e3 * effort.of_hundred_s:.2f} ms with a hundred, {ratio:.2f} times as long. "
-        "The networks see as much in both; maps are drawn and sums are made of as many as are "
-        "heard. To authenticate and decode what others say is not in this "
-        "(`python -m bench hearing`), and grows with all that send.",
+        "long as one with two: fifty times as many may not cost more than as much again.",
+        f"Perception and policy, on one core of the machine that wrote this page, in turns: "
+        f"{1e3 * effort.of_two_s:.2f} ms with two, {1e3 * effort.of_hundred_s:.2f} ms with a "
+        f"hundred, {ratio:.2f} times as long. The networks compute the same in both; only drawing "
+        "the maps and adding up messages grows with the number heard. Authenticating and decoding "
+        "what others say is not included, and grows with all that send "
+        "(`python -m bench hearing`).",
         _agrees(ratio <= _AS_LONG),
     )
 
@@ -127,13 +128,12 @@ def _decentralised(e3: Json) -> Claim:
     mean, others = e3["neighbours"]["mean"], e3["neighbours"]["others"]
     return Claim(
         "Decentralised",
-        "Each robot decides by what it senses and what its neighbours say; no robot knows the "
-        "whole graph.",
-        "On average fewer than half of the others are in range, and nobody else's messages reach "
-        "a robot's policy.",
-        f"In E3's flight a robot had {mean:.1f} of {others} others in range, on average. A robot's "
-        "log holds all that reaches its policy, and `lpac replay` comes to the same decisions from "
-        "it alone.",
+        "Each robot decides by what it senses and what its neighbours say.",
+        "A flight with E3's outcome needs no robot to hear most others: on average fewer than half "
+        "of them are in range.",
+        f"In E3's flight a robot had {mean:.1f} of {others} others in range, on average. Nobody "
+        "else's messages reach its policy: its log holds all that does, and `lpac replay` comes to "
+        "the same decisions from that alone.",
         _agrees(mean < others / 2.0),
     )
 
@@ -184,9 +184,9 @@ def _e2(e2: Json) -> list[Claim]:
     later = (
         ""
         if began_s <= 0.0
-        else f" Our robots take off one after another, so that the missions began {began_s:.0f} s "
-        f"after the takeoff command; at their ends the cost over that at their starts is "
-        f"{ends.mean():.3f}, standard deviation {ends.std(ddof=1):.3f}."
+        else f" Our robots take off one after another, so that missions began up to {began_s:.0f} "
+        f"s after the takeoff command; at their ends the cost over that at their starts is "
+        f"{ends.mean():.3f} on average, standard deviation {ends.std(ddof=1):.3f}."
     )
     return [
         Claim(

@@ -199,12 +199,14 @@ def perturbation(world: int = 0) -> Scenario:
 def whole_perturbation(
     bundle: Path, world: int = 0
 ) -> tuple[FleetScenario, tuple[PilotFlight, ...]]:
-    """E3 for whole robots: pilots fly them out of the fence, and back. Raises BundleError."""
-    drawn = _world(world)
+    """E3 for whole robots: pilots fly them out of the fence, and back. Raises BundleError.
+
+    Their receivers, and the wind, are the same in all worlds.
+    """
     scenario = FleetScenario(
         robots=FIELD_SET_UP.robots,
-        seed=drawn.seed,
-        features=drawn.features,
+        seed=_world(0).seed,
+        features=_world(world).features,
         pads_m=_pairs(pads_of(bundle)),
         duration_s=_E3_DURATION_S,
     )

@@ -1,6 +1,7 @@
 """What the paper's experiments show, where no figure of a flight shows it."""
 
 from collections.abc import Mapping
+from itertools import cycle
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,7 +17,7 @@ def costs_by_world(records: Mapping[str, Mapping[str, FlightRecord]]) -> Figure:
     with style.figure(WIDTH_IN, 2.6) as figure:
         panels = figure.subplots(1, len(records), squeeze=False, sharey=True)[0]
         for axes, (world, of_world) in zip(panels, records.items(), strict=True):
-            looks = zip(of_world.items(), MANY_CURVES, strict=False)
+            looks = zip(of_world.items(), cycle(MANY_CURVES), strict=False)
             for (name, record), (colour, dashes) in looks:
                 axes.plot(
                     record.curve_time_s, record.normalized, color=colour, ls=dashes, lw=1.2,

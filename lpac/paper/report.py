@@ -72,9 +72,10 @@ def write_transferability(
         for world, of_world in records.items()
         for name, record in of_world.items()
     }
-    names = list(next(iter(records.values())))
+    names = list(dict.fromkeys(name for of_world in records.values() for name in of_world))
     rows = [
-        [world, *(_final(of_world[name]) for name in names)] for world, of_world in records.items()
+        [world, *(_final(of_world[name]) if name in of_world else "" for name in names)]
+        for world, of_world in records.items()
     ]
     text = f"""# E1, transferability
 

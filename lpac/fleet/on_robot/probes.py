@@ -107,7 +107,7 @@ def group_keys_sha256() -> Optional[str]:
     try:
         with open(os.path.join(_PRIVATE, "lpac/identity/group-keys"), "rb") as file:
             return hashlib.sha256(file.read()).hexdigest()
-    except OSError:
+    except FileNotFoundError:
         return None
 
 

@@ -35,17 +35,23 @@ def fly_simulated(
     the script. With `logs` the robots write theirs below `folder`, in robots/ID/logs; `recorded` is
     the folder of such a flight, whose policies' steps are taken again. `pilots` take robots out of
     the field, and bring them back. Times, positions and costs are in the record; `problem` says
-    what kept the script from its end. Of what robots say meanwhile only errors are shown.
+    what kept the script from its end. Of what robots say meanwhile only errors go to whoever
+    listens to `edge.core.log`.
 
     Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
     written, and RecordingError.
     """
+
+    def hand_on_errors(line: log.Line) -> None:
+        if line.level == "error":
+            before(line)
+
     # What ten robots say to their own logs is nothing for a person.
-    listener = log.listen(log.show_errors)
+    before = log.listen(hand_on_errors)
     try:
         return _fly(scenario, folder, bundle, say, logs, recorded, pilots)
     finally:
-        log.listen(listener)
+        log.listen(before)
 
 
 def _fly(

@@ -252,8 +252,8 @@ class Layout:
 def pads_for_all(scenarios: Sequence[FleetScenario], bundle: Path, spare_m: float = 0.0) -> F64:
     """Pads (N, 2) on which the robots of each scenario may stand, within `spare_m`.
 
-    They are apart in truth, and as the receivers of each scenario see them. Raises ValueError if
-    there is no room, BundleError.
+    They are apart in truth, and as the receivers of each scenario see them; scenarios have the same
+    numbers of robots, and the same budget. Raises ValueError if there is no room, BundleError.
     """
     nowhere_m = tuple((0.0, 0.0) for _ in range(scenarios[0].robots))
     layouts = [Layout(replace(scenario, pads_m=nowhere_m), bundle) for scenario in scenarios]
@@ -267,7 +267,7 @@ def pads_for_all(scenarios: Sequence[FleetScenario], bundle: Path, spare_m: floa
     if pads_m is None:
         raise ValueError(
             f"no pads on {field_m:g} x {field_m:g} m were found that are {apart_m:g} m apart for "
-            f"all that receivers err by in {len(scenarios)} flights: fly fewer"
+            f"all that receivers err by in {len(scenarios)} trials: fly fewer"
         )
     return pads_m
 
@@ -312,6 +312,6 @@ def _pads_apart(
             if distances_m.min() >= apart_m * (1.0 + _PAD_SLACK / 2.0):
                 return places_m
             shares = np.maximum(wanted_m - distances_m, 0.0) / np.maximum(distances_m, 1e-9)
-            # Less than half of what is missing for either of two: crowds come to rest so.
+            # By one bias less than half of what is missing for either of two: crowds come to rest.
             places_m = places_m + 0.35 * (offsets_m * shares[..., None]).sum(axis=(0, 2))
     return None

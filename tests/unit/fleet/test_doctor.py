@@ -202,13 +202,20 @@ def test_robots_in_multicast_need_one_key(config: FleetConfig) -> None:
     assert "group key" not in judged(config)
     sending = dataclasses.replace(config, radio=RadioConfig("multicast", "192.168.8.2:7447"))
     for keys, verdict, found in (
-        ("00ff", "ok", "that the others have"),
+        ("00ff", "ok", "3 of 3 robots"),
         (None, "FAILED", "it has none"),
         ("11ff", "FAILED", "another one than r2, r3"),
     ):
         check = judged(sending, put("group_keys", keys))["group key"]
         assert (check.verdict, check.fix) == (verdict, "" if verdict == "ok" else "lpac fleet up")
         assert found in check.found
+    # Who has none is another matter than who has another one.
+    fleet = {name: well(sending, name) for name in ("r1", "r2", "r3")}
+    for name in ("r2", "r3"):
+        fleet[name] = fleet[name]._replace(facts={**fleet[name].facts, "group_keys": None})
+    checks = {check.name: check for check in judge(sending, sending.robots["r1"], fleet)}
+    assert checks["group key"].verdict == "ok"
+    assert "1 of 3 robots" in checks["group key"].found
     # Where they speak is no door.
     port = {"protocol": "udp", "port": 7450, "program": "python3"}
     assert judged(sending, put("open_ports", [port]))["doors"].verdict == "ok"

@@ -21,7 +21,7 @@ from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.cli.paper import e1, e2, e3
 from lpac.cli.sim import VehicleKind
 from lpac.evaluate.flights import BASELINES
-from lpac.paper.report import write_network, write_transfer
+from lpac.paper.report import LOGS, write_network, write_transfer
 from lpac.sim.experiment import Scenario, fly
 
 MADE_BY = {"command": "lpac paper ..."}
@@ -114,7 +114,29 @@ def test_a_logged_flight_of_another_policy_has_no_baselines(
     e1(logs=tmp_path, out=tmp_path)
     told = json.loads((tmp_path / "e1.json").read_text())
     assert [list(of_world) for of_world in told["worlds"].values()] == [["flight"]]
+    assert told["flown"] == LOGS
     assert "give the bundle that flew with --bundle" in capsys.readouterr().err
+
+
+def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
+    mission: FlightRecord,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    robots = tuple(
+        replace(r, said=tuple(said(t, "0123456789abcdef01") for t in r.time_s.tolist()))
+        for r in mission.robots
+    )
+    other = replace(mission, name="paper-0", robots=robots)
+    examined = Examined((other, mission), ())
+    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: examined)
+    e1(logs=tmp_path, out=tmp_path)
+    told = json.loads((tmp_path / "e1.json").read_text())
+    assert [len(of_world) for of_world in told["worlds"].values()] == [1, 1 + len(BASELINES)]
+    assert "is not what flew paper-0," in capsys.readouterr().err
+    # Who did not fly has an empty cell.
+    assert "|  |  |" in (tmp_path / "README.md").read_text()
 
 
 @pytest.mark.parametrize(

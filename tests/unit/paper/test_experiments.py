@@ -33,6 +33,7 @@ from lpac.paper.experiments import (
     spread_of,
     transferability,
     who_is_missing,
+    whole_perturbation,
     whole_repeatability,
     whole_transferability,
 )
@@ -212,7 +213,8 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
     for one, other in pairwise(trials):
         offsets_m = np.array(one.pads_m) - np.array(other.pads_m)
         assert np.linalg.norm(offsets_m, axis=1).max() <= 2.0 * PLACED_WITHIN_M
-    for scenario in (*plan.values(), *trials):
+    perturbed_elsewhere, _ = whole_perturbation(DEFAULT_BUNDLE, 1)
+    for scenario in (*plan.values(), *trials, perturbed_elsewhere):
         # Or the ground refuses the fleet.
         layout = Layout(scenario, DEFAULT_BUNDLE)
         for places_m in (layout.pads_m, layout.landing_points_m):
