@@ -4,6 +4,7 @@ import json
 import platform
 import shlex
 from contextlib import closing
+from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from lpac.analysis.flight import FlightRecord
+    from lpac.evaluate.flights import RobotModel
     from lpac.paper.asynchrony import TimingResult
     from lpac.sim.cores import Pool
     from lpac.sim.experiment import Scenario, SimulatedFlight
@@ -30,7 +32,8 @@ app = new_app(
 
 _OUT = Path("out/paper")
 _E1_WORLDS, _E2_TRIALS, _WORLD = 3, 3, 0
-_WORLDS, _QUICK_WORLDS = 50, 4
+# Of `async`: points, and whole robots on the simulated clock.
+_WORLDS, _QUICK_WORLDS = {"point": 50, "whole": 8}, {"point": 4, "whole": 2}
 # Enough to see whether slower or faster is better.
 _QUICK_HZ = {"perception_hz": (1.0, 5.0), "policy_hz": (0.5, 2.5, 10.0)}
 _QUICK_DELAYS_S = (0.0, 0.8)
@@ -45,6 +48,14 @@ _QUICKLY = {False: "", True: " --quick"}
 _TOO_LARGE = ("n300", "n1000")
 # Robots, repetitions, s.
 _QUICK_NETWORK = (3, 1, 8.0)
+
+
+class PaperVehicle(StrEnum):
+    """What flies in experiments of very many flights."""
+
+    POINT = "point"
+    SIMULATED = "simulated"
+
 
 Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
 FlownBundle = Annotated[
@@ -495,10 +506,14 @@ def asynchrony(
         typer.Option(
             "--worlds",
             "-k",
-            help=f"The first so many of the validation set; {_WORLDS} if not "
-            f"given, {_QUICK_WORLDS} with --quick.",
+            help=f"The first so many of the validation set; {_WORLDS['point']} points, or "
+            f"{_WORLDS['whole']} whole robots' if not given, with --quick "
+            f"{_QUICK_WORLDS['point']} or {_QUICK_WORLDS['whole']}.",
         ),
     ] = None,
+    vehicle: Annotated[
+        PaperVehicle, typer.Option(help="Points, or whole robots on a simulated clock.")
+    ] = PaperVehicle.POINT,
     quick: Quick = False,
     ray: Ray = None,
     as_json: AsJson = False,
@@ -512,14 +527,17 @@ def asynchrony(
     from lpac.paper.asynchrony import as_json as to_json
     from lpac.paper.asynchrony_report import write_report
     from lpac.paper.repeated import sizes_of
+    from lpac.paper.report import EXACT_POINTS, WHOLE_IN_TRUTH
 
-    count = worlds if worlds is not None else _QUICK_WORLDS if quick else _WORLDS
+    robot: RobotModel = "point" if vehicle is PaperVehicle.POINT else "whole"
+    count = worlds if worlds is not None else (_QUICK_WORLDS if quick else _WORLDS)[robot]
     loaded = load_bundle(bundle)
     plan = AsynchronyPlan(
         bundle=TrainedBundle(str(bundle.resolve()), loaded.id),
         message_bytes=sizes_of(loaded).of_two,
         world_set="validation",
         worlds=count,
+        robot=robot,
         **({**_QUICK_HZ, "delays_s": _QUICK_DELAYS_S} if quick else {}),
     )
     folder = out or _OUT / "async"
@@ -534,8 +552,12 @@ def asynchrony(
                 flown[flight] = cost
                 progress.update(task, advance=1)
         results = results_of(plan, flown)
-        made_by = _made_by(f"async -k {count}{_QUICKLY[quick]}", [bundle])
-        write_report(plan, results, folder, made_by)
+        option = "" if robot == "point" else f" --vehicle {vehicle.value}"
+        made_by = _made_by(f"async -k {count}{option}{_QUICKLY[quick]}", [bundle])
+        how = EXACT_POINTS
+        if robot == "whole":
+            how = WHOLE_IN_TRUTH.format(vehicles=_VEHICLES[VehicleKind.SIMULATED])
+        write_report(plan, results, folder, made_by, how)
     if as_json:
         typer.echo(json.dumps(to_json(plan, results), indent=2))
         return

@@ -32,8 +32,11 @@ from lpac.sim.experiment import (
 )
 from lpac.sim.failure import NONE_LOST, LostRobots
 from lpac.sim.fleet.clocked import fly_simulated
+from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.robots import Settings
 from lpac.sim.kept import KeptOutcomes, code_digest
+from lpac.sim.radio import Air
 from lpac.sim.ticks import Clocks
 
 BASELINES: tuple[BaselineName, ...] = get_args(BaselineName)
@@ -58,8 +61,9 @@ class EvaluationFlight:
 
     `bundle` is the path of the one that flies, or gives a baseline the sizes of sensor and local
     map; `flown_by` is its id, or says these sizes. `position_error_m` is the standard deviation,
-    along each axis, of each robot's error in knowing its position. Baselines have no whole robots.
-    The rest is as `Scenario` has it.
+    along each axis, of each robot's error in knowing its position. Baselines have no whole robots;
+    these have moments and errors of their own, send what their policy was judged with, and lose
+    messages, or have them late, from the mission's start on. The rest is as `Scenario` has it.
     """
 
     flier: Flier
@@ -178,7 +182,7 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
     errors_m = draw_position_errors_m(world.seed, flight.position_error_m, set_up.robots)
     if flight.robot != "point":
-        layout = Layout(_fleet(flight), Path(flight.bundle))
+        layout = Layout(fleet_of(flight), Path(flight.bundle))
         starts_m = layout.pads_m.tolist()
         # What a vehicle takes its pad to be is off by its receiver's bias.
         errors_m = errors_m + layout.landing_points_m - layout.pads_m
@@ -214,7 +218,7 @@ def _best_of_ten(flight: EvaluationFlight) -> FlownCost:
     return FlownCost((0.0, 0.0), cost)
 
 
-def _fleet(flight: EvaluationFlight) -> FleetScenario:
+def fleet_of(flight: EvaluationFlight) -> FleetScenario:
     """Whole robots over the flight's world; where they stand follows from its seed."""
     set_up = SET_UPS[flight.set_up]
     world = draw_world(flight.world_set, flight.world, set_up)
@@ -226,11 +230,41 @@ def _fleet(flight: EvaluationFlight) -> FleetScenario:
     )
 
 
+def settings_of(flight: EvaluationFlight) -> Settings:
+    """What whole robots' configuration has of it."""
+    return {
+        "rates": {
+            "perception_hz": 1.0 / flight.clocks.perception_s,
+            "policy_hz": 1.0 / flight.clocks.policy_s,
+            "control_hz": 1.0 / flight.clocks.control_s,
+        },
+        "policy": {
+            "max_message_age_s": flight.max_message_age_s,
+            "max_input_age_s": flight.max_input_age_s,
+        },
+    }
+
+
 def _whole(flight: EvaluationFlight) -> FlownCost:
-    """Of the places where the vehicles truly are, from the start of the mission on."""
     _bundle(flight)
+    if flight.clocks.synchronous:
+        raise ValueError(f"{flight.key}: whole robots have moments of their own")
+    air = None
+    if flight.loss or flight.delay_s:
+        air = Air(loss=flight.loss, delay_s=max(flight.delay_s, Air().delay_s))
     with TemporaryDirectory() as folder:
-        flown = fly_simulated(_fleet(flight), Path(folder), Path(flight.bundle))
+        flown = fly_simulated(
+            fleet_of(flight), Path(folder), Path(flight.bundle),
+            settings=settings_of(flight), air=air,
+        )  # fmt: skip
+    return whole_cost(flight, flown)
+
+
+def whole_cost(flight: EvaluationFlight, flown: FleetFlight) -> FlownCost:
+    """Of the places where the vehicles truly are, from the start of the mission on.
+
+    Raises ValueError if it came to no mission.
+    """
     record = flown.record
     if flown.problem is not None or not len(record.curve_time_s):
         raise ValueError(f"{flight.key}: {flown.problem or 'nobody flew'}")

@@ -27,7 +27,7 @@ from lpac.analysis.statistics import (
     ratio_of_means,
 )
 from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import POLICY, EvaluationFlight, FlownCost
+from lpac.evaluate.flights import POLICY, EvaluationFlight, FlownCost, RobotModel
 from lpac.evaluate.worlds import WorldSet
 from lpac.sim.ticks import Clocks
 
@@ -69,7 +69,8 @@ FIELD = Timing(5.0, 2.5)
 class AsynchronyPlan:
     """The timings, and the first `worlds` worlds of a set, over which all of them are flown.
 
-    `message_bytes` is the most that a robot says at a time.
+    `message_bytes` is the most that a robot says at a time. Whole robots (`robot`) are never all at
+    the same moments.
     """
 
     bundle: TrainedBundle
@@ -79,6 +80,7 @@ class AsynchronyPlan:
     perception_hz: tuple[float, ...] = (1.0, 2.5, 5.0, 10.0)
     policy_hz: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0, 10.0)
     delays_s: tuple[float, ...] = (0.0, 0.2, 0.4, 0.8, 1.6)
+    robot: RobotModel = "point"
 
     def __post_init__(self) -> None:
         if self.worlds < 1:
@@ -93,7 +95,7 @@ class AsynchronyPlan:
         """Each once, the field's first."""
         rates = [
             Timing(perception_hz, policy_hz, synchronous)
-            for synchronous in (False, True)
+            for synchronous in ((False, True) if self.robot == "point" else (False,))
             for perception_hz in self.perception_hz
             for policy_hz in self.policy_hz
         ]
@@ -119,6 +121,7 @@ class AsynchronyPlan:
                 max_message_age_s=age_s,
                 max_input_age_s=max(_FIELD_INPUT_AGE_S, _PERIODS * slowest_s),
                 clocks=clocks,
+                robot=self.robot,
             )
             for world in range(self.worlds)
         ]
@@ -179,6 +182,7 @@ def as_json(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> dict[str, 
         "bundle_id": plan.bundle.bundle_id,
         "world_set": plan.world_set,
         "worlds": plan.worlds,
+        "robot": plan.robot,
         "times_s": list(TIMES_S),
         "timings": [
             {

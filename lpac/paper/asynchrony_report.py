@@ -16,13 +16,17 @@ _END = len(TIMES_S) - 1
 
 
 def write_report(
-    plan: AsynchronyPlan, results: Sequence[TimingResult], folder: Path, made_by: Mapping[str, str]
+    plan: AsynchronyPlan,
+    results: Sequence[TimingResult],
+    folder: Path,
+    made_by: Mapping[str, str],
+    flown: str = EXACT_POINTS,
 ) -> None:
     """All of it; `made_by` says what made it: the command, versions. Raises OSError."""
     style.save(_rates(plan, results), folder / "rates")
     style.save(_staleness(results), folder / "staleness")
-    told, text = as_json(plan, results), _text(plan, results)
-    write_experiment("async", told, _rows(plan, results), text, folder, EXACT_POINTS, made_by)
+    told, text = as_json(plan, results), _text(plan, results, flown)
+    write_experiment("async", told, _rows(plan, results), text, folder, flown, made_by)
 
 
 def _rows(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> list[list[object]]:
@@ -47,12 +51,15 @@ def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
         for axes, at in zip(figure.subplots(1, 2), (0, _END), strict=True):
             for (colour, _), perception_hz in zip(CURVES, plan.perception_hz, strict=False):
                 for synchronous in (False, True):
-                    row = [
-                        by_timing[FIELD._replace(
+                    timings = [
+                        FIELD._replace(
                             perception_hz=perception_hz, policy_hz=hz, synchronous=synchronous
-                        )]
+                        )
                         for hz in plan.policy_hz
-                    ]  # fmt: skip
+                    ]
+                    row = [by_timing[timing] for timing in timings if timing in by_timing]
+                    if not row:
+                        continue
                     label = None if synchronous else f"{perception_hz:g} Hz"
                     _curve(axes, plan.policy_hz, row, at, colour, label, dashed=synchronous)
             axes.set_xscale("log")
@@ -70,7 +77,10 @@ def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
             above.set_xticks(plan.policy_hz, [f"{kb_s:.2g}" for kb_s in said_kb_s])
             above.minorticks_off()
             above.spines[["right"]].set_visible(False)
-        axes.plot([], [], ls=style.DASHED, color=style.INK, lw=1.0, label="all at the same moments")
+        if plan.robot == "point":
+            axes.plot(
+                [], [], ls=style.DASHED, color=style.INK, lw=1.0, label="all at the same moments"
+            )
         handles, labels = axes.get_legend_handles_labels()
         figure.legend(
             handles, labels, loc="outside upper center", ncols=len(labels), title="perception"
@@ -110,7 +120,12 @@ def _curve(
     axes.axhline(1.0, color=style.FAINT, lw=0.8, zorder=0)
 
 
-def _text(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> str:
+def _text(plan: AsynchronyPlan, results: Sequence[TimingResult], flown: str) -> str:
+    dashed = (
+        " Full lines: each robot at its own moments; dashed: all at the same ones."
+        if plan.robot == "point"
+        else ""
+    )
     headings = ["perception, Hz", "policy, Hz", "rounds per perception", "said, kB/s", "moments",
                 "delay, s",
                 *(f"cost at {time_s:g} s" for time_s in TIMES_S),
@@ -121,13 +136,12 @@ The paper runs perception, exchange of messages and control asynchronously, each
 own, and argues both for an exchange slower than perception (a longer window to hear everybody in)
 and for a faster one. It measures neither. Here the policy of bundle `{plan.bundle.bundle_id[:16]}`,
 trained at the rates of the field alone (perception 5 Hz, policy 2.5 Hz), flies over the first
-{plan.worlds} worlds of the {plan.world_set} set, in the set-up of the field. {EXACT_POINTS}
+{plan.worlds} worlds of the {plan.world_set} set, in the set-up of the field. {flown}
 
 ![cost over the rates](rates.png)
 
 *Cost over the policy's rate, in terms of that with the field's rates and own moments: above 1 is
-worse. Full lines: each robot at its own moments; dashed: all at the same ones. Bars are 95 %
-intervals of the ratio of means, by worlds in pairs.*
+worse.{dashed} Bars are 95 % intervals of the ratio of means, by worlds in pairs.*
 
 ![cost over the delay of messages](staleness.png)
 

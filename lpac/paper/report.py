@@ -30,6 +30,10 @@ WHOLE = (
     "programs' loops and separation, on {vehicles}."
 )
 WHOLE_BESIDE_POINTS = f"{WHOLE} What they are held against are points from the same pads."
+WHOLE_IN_TRUTH = (
+    f"{WHOLE} Costs are of where the vehicles truly were, and messages are late from the mission's "
+    "start on."
+)
 TAKEN_POINTS = (
     f"{POINTS} A robot that is taken is gone: it says and hears nothing and does not count; it is "
     "back where it was, knowing nothing."

@@ -15,8 +15,10 @@ from lpac.sim.fleet.flight import FleetFlight, RobotUsage, flight_of
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.pilot import FOR_A_PILOT, LOOKS_S, Pilot, PilotFlight
+from lpac.sim.fleet.robots import Settings
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.radio import Air
 
 
 def fly_simulated(
@@ -28,15 +30,18 @@ def fly_simulated(
     logs: bool = False,
     recorded: Path | None = None,
     pilots: Sequence[PilotFlight] = (),
+    settings: Settings | None = None,
+    air: Air | None = None,
 ) -> FleetFlight:
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
     Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
     the script. With `logs` the robots write theirs below `folder`, in robots/ID/logs; `recorded` is
     the folder of such a flight, whose policies' steps are taken again. `pilots` take robots out of
-    the field, and bring them back. Times, positions and costs are in the record; `problem` says
-    what kept the script from its end. Of what robots say meanwhile only errors go to whoever
-    listens to `edge.core.log`.
+    the field, and bring them back. `settings` are further keys of robot.toml's tables, for all
+    robots, and `air` is what becomes of messages from the mission's start on. Times, positions and
+    costs are in the record; `problem` says what kept the script from its end. Of what robots say
+    meanwhile only errors go to whoever listens to `edge.core.log`.
 
     Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
     written, and RecordingError.
@@ -49,7 +54,7 @@ def fly_simulated(
     # What ten robots say to their own logs is nothing for a person.
     before = log.listen(hand_on_errors)
     try:
-        return _fly(scenario, folder, bundle, say, logs, recorded, pilots)
+        return _fly(scenario, folder, bundle, say, logs, recorded, pilots, settings, air)
     finally:
         log.listen(before)
 
@@ -62,13 +67,15 @@ def _fly(
     logs: bool,
     recorded: Path | None,
     pilots: Sequence[PilotFlight],
+    settings: Settings | None,
+    air: Air | None,
 ) -> FleetFlight:
     earlier = set(folder.rglob("*.mcap"))
     fleet = SimulatedFleet(
         scenario,
         folder,
         bundle,
-        settings=FOR_A_PILOT if pilots else None,
+        settings={**(settings or {}), **(FOR_A_PILOT if pilots else {})},
         logs=logs,
         recorded=recorded,
     )
@@ -79,6 +86,7 @@ def _fly(
     def begin(step: str) -> None:
         say(step)
         if step == "mission":
+            fleet.radio.air = air or fleet.radio.air
             for flown in pilots:
                 fly_by_hand(flown)
 

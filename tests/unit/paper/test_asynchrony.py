@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from edge.policy.bundle import load_bundle
+from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import EvaluationFlight, FlownCost
+from lpac.evaluate.flights import EvaluationFlight, FlownCost, costs_of, settings_of
 from lpac.paper.asynchrony import FIELD, TIMES_S, AsynchronyPlan, Timing, as_json, results_of
 from lpac.paper.asynchrony_report import write_report
 
+SHIPPED_ID = load_bundle(DEFAULT_BUNDLE).id
 PLAN = AsynchronyPlan(
     bundle=TrainedBundle("somewhere", "0123456789abcdef01"),
     message_bytes=2000,
@@ -54,6 +57,35 @@ def test_each_timing_is_flown_once_over_the_same_worlds() -> None:
             assert flight.max_message_age_s >= 2.0 * flight.clocks.policy_s + 1.5 * timing.delay_s
     field = PLAN.flights_of(FIELD)[0]
     assert (field.max_message_age_s, field.max_input_age_s) == (0.8, 1.0)
+
+
+def test_whole_robots_are_never_all_at_the_same_moments(tmp_path: Path) -> None:
+    plan = replace(PLAN, robot="whole")
+    assert [t for t in PLAN.timings if not t.synchronous] == plan.timings
+    assert {flight.robot for flight in plan.flights()} == {"whole"}
+    write_report(plan, results_of(plan, flown(plan)), tmp_path, {"command": "..."}, "Whole robots.")
+    text = (tmp_path / "README.md").read_text()
+    assert "Whole robots." in text and "dashed" not in text
+
+
+def test_whole_robots_have_the_rates_and_ages_of_a_timing() -> None:
+    plan = replace(
+        PLAN, robot="whole", worlds=1, bundle=TrainedBundle(str(DEFAULT_BUNDLE), SHIPPED_ID)
+    )
+    costs = {}
+    for timing in (FIELD, Timing(5.0, 0.5)):
+        [flight] = plan.flights_of(timing)
+        settings = settings_of(flight)
+        assert settings["rates"]["policy_hz"] == pytest.approx(timing.policy_hz)
+        assert settings["rates"]["perception_hz"] == 5.0
+        assert settings["policy"]["max_message_age_s"] == flight.max_message_age_s
+        [(_, costs[timing])] = costs_of((replace(flight, set_up="n1", duration_s=4.0),))
+    (field, slow) = costs.values()
+    assert field.time_s == slow.time_s == (0.0, 1.0, 2.0, 3.0, 4.0)
+    assert field.cost[0] == pytest.approx(slow.cost[0], rel=1e-3) and field.cost != slow.cost
+    at_once = replace(flight, clocks=replace(flight.clocks, synchronous=True))
+    with pytest.raises(ValueError, match="whole robots have moments of their own"):
+        costs_of((at_once,))
 
 
 def test_results_are_held_against_the_fields() -> None:
