@@ -28,6 +28,8 @@ _SIMILAR = 0.2
 _AWAY, _BACK = 1.6, 1.1
 # Robots that cover other worlds as well as the field's come to no more of clairvoyant's cost.
 _TRANSFERS = 1.25
+# A swarm of whom each hears so many says nothing of those that hear few.
+_NEARLY_ALL = 0.9
 # A step with a hundred heard takes no more than so many times as long as with two.
 _AS_LONG = 2.0
 # What it may cost that each robot has moments of its own.
@@ -129,12 +131,13 @@ def _decentralised(e3: Json) -> Claim:
     return Claim(
         "Decentralised",
         "Each robot decides by what it senses and what its neighbours say.",
-        "A flight with E3's outcome needs no robot to hear most others: on average fewer than half "
-        "of them are in range.",
-        f"In E3's flight a robot had {mean:.1f} of {others} others in range, on average. Nobody "
-        "else's messages reach its policy: its log holds all that does, and `lpac replay` comes to "
-        "the same decisions from that alone.",
-        _agrees(mean < others / 2.0),
+        "Nobody else's messages reach a robot's policy. It is undecided if on average more than "
+        f"{100.0 * _NEARLY_ALL:.0f} % of the others are in range: that could not be told from "
+        "knowing all.",
+        f"In E3's flight a robot had {mean:.1f} of {others} others in range, on average. The "
+        "program gives its policy no other messages; its log holds all that the policy is given, "
+        "and `lpac replay` comes to the same decisions from that alone.",
+        Agreement.OPEN if mean > _NEARLY_ALL * others else Agreement.AGREES,
     )
 
 
