@@ -22,11 +22,11 @@ fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly si
 
 setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control, Foxglove
 
-check: lint ## style, types, and the quick tests: what a commit has to pass, in two minutes
+check: lint ## style, types, and the quick tests: what a commit has to pass, in four minutes on two cores
 	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
 
 BY_FILE := --dist loadfile --no-loadscope-reorder
-test: lint ## style, types, and every test; as root with real robot hosts too: half an hour
+test: lint ## style, types, and every test; as root with real robot hosts too: an hour on two cores
 	@failed=0; \
 	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest "$$@" || failed=1; }; \
 	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
