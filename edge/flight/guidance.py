@@ -107,6 +107,7 @@ def guide(
         velocity_m_s,
         inside_m_s,
         inputs.neighbours,
+        inputs.silent,
         robot.separation,
         limits,
         robot.fence,

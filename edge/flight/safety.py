@@ -57,17 +57,30 @@ class MotionLimits:
             raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
 
 
+class SilenceLimits(NamedTuple):
+    """What a robot that fell silent in flight may do, and how far to stay from where it may be.
+
+    It flies on for at most `flies_on_s`, and comes down at any time, but after at most `hovers_s`.
+    `passing_m` is in the plane, m.
+    """
+
+    passing_m: float
+    flies_on_s: float
+    hovers_s: float
+
+
 class SeparationLimits(NamedTuple):
     """How far to stay from other robots, as estimated, m.
 
     `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
     down through the robot's height, since it keeps to its place and looks for nobody; it has not
-    passed before it is `passing_height_m` away in height.
+    passed before it is `passing_height_m` away in height. `silence`: of who fell silent.
     """
 
     level_m: float
     passing_m: float
     passing_height_m: float
+    silence: SilenceLimits
 
 
 class Closest(NamedTuple):
@@ -104,6 +117,12 @@ def clear_height_m(
         if apart_m < 2.0 * min_separation_m and height_m > position_m[2]:
             heights_m.append(height_m - min_separation_m)
     return min(heights_m)
+
+
+def highest_m(silent: Neighbour, limits: SilenceLimits) -> float:
+    """How high a robot that fell silent in flight may still be, m; 0 or less: it is down."""
+    falls_s = max(silent.age_s - limits.hovers_s, 0.0)
+    return silent.position_m[2] - _PASSING_M_S * falls_s
 
 
 def limit_speed(velocity: F64, max_speed: float) -> F64:
@@ -203,6 +222,7 @@ def brake(
     velocity_m_s: F64,
     wanted_m_s: F64,
     neighbours: Sequence[Neighbour],
+    silent: Sequence[Neighbour],
     separation: SeparationLimits,
     limits: MotionLimits,
     fence: Fence | None,
@@ -219,34 +239,46 @@ def brake(
     does not turn round under it. Climbing is not limited. Giving way to a neighbour leads over no
     edge of `fence`; None where there is none to keep to.
 
+    Those who are `silent` fell so in flight, and nobody knows whether they fly on, hover or come
+    down. Who is below one, or level with it, leaves where it may be as it leaves who passes: the
+    way from its last place to where it would be if it had flown on as it did.
+
     A neighbour of which something is not known stops the robot.
     """
     if not _plausible(position_m, velocity_m_s, wanted_m_s):
         return np.zeros(3)
-    if not all(map(_is_known, neighbours)):
+    if not all(map(_is_known, (*neighbours, *silent))):
         return np.zeros(3)
+    # Whose way has to be left, and how far: by where the vehicle comes to rest.
+    rest_m = position_m[:2] + velocity_m_s[:2] * limits.lag_s
+    silence = separation.silence
+    left = [
+        (_nearest_on_way(robot, silence, rest_m) - rest_m, silence.passing_m)
+        for robot in silent
+        if position_m[2] < highest_m(robot, silence) + separation.passing_height_m
+    ]
     ways: list[_Way] = []
     for neighbour in neighbours:
         offset_m = np.array(_extrapolated(neighbour)) - position_m
         up_m = float(offset_m[2])
-        passes = _passes(up_m, neighbour.velocity_m_s[2], separation, limits)
-        if abs(up_m) >= separation.level_m and not passes:
-            continue
-        if passes:
-            offset_m[:2] -= velocity_m_s[:2] * limits.lag_s
-        apart_m = math.hypot(offset_m[0], offset_m[1])
-        if apart_m == 0.0:
-            return np.zeros(3)  # Every way may be the wrong one.
-        direction = offset_m[:2] / apart_m
-        if passes:
-            cap = _speed_to(apart_m - separation.passing_m, 0.0, limits)
-            at_most = _speed_to(max(apart_m - separation.level_m, 0.0), 0.0, limits)
-        else:
+        if _passes(up_m, neighbour.velocity_m_s[2], separation, limits):
+            left.append((offset_m[:2] - velocity_m_s[:2] * limits.lag_s, separation.passing_m))
+        elif abs(up_m) < separation.level_m:
+            apart_m = math.hypot(offset_m[0], offset_m[1])
+            if apart_m == 0.0:
+                return np.zeros(3)  # Every way may be the wrong one.
+            direction = offset_m[:2] / apart_m
             # Squares of far smaller numbers than a separation may vanish: never below 0.
             needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
             cap = _speed_to((apart_m - needed_m) / 2.0, float(direction @ velocity_m_s[:2]), limits)
-            at_most = 0.0
-        ways.append(_Way(direction, cap, at_most if cap < 0.0 else cap))
+            ways.append(_Way(direction, cap, max(cap, 0.0)))
+    for from_rest_m, passing_m in left:
+        apart_m = math.hypot(*from_rest_m)
+        if apart_m == 0.0:
+            return np.zeros(3)
+        cap = _speed_to(apart_m - passing_m, 0.0, limits)
+        at_most = _speed_to(max(apart_m - separation.level_m, 0.0), 0.0, limits)
+        ways.append(_Way(from_rest_m / apart_m, cap, at_most if cap < 0.0 else cap))
     horizontal = wanted_m_s[:2]
     if all(float(way.direction @ horizontal) <= way.cap for way in ways):
         return wanted_m_s
@@ -301,6 +333,15 @@ def _extrapolated(neighbour: Neighbour) -> list[float]:
         place_m + speed_m_s * neighbour.age_s
         for place_m, speed_m_s in zip(neighbour.position_m, neighbour.velocity_m_s, strict=True)
     ]
+
+
+def _nearest_on_way(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
+    """The point, (2,), nearest to a place of all where it may have stopped, if it flew straight."""
+    last_m = np.array(silent.position_m[:2])
+    way_m = np.array(silent.velocity_m_s[:2]) * min(silent.age_s, limits.flies_on_s)
+    square = float(way_m @ way_m)
+    share = float((place_m - last_m) @ way_m) / square if square > 0.0 else 0.0
+    return last_m + way_m * min(max(share, 0.0), 1.0)
 
 
 def _is_known(neighbour: Neighbour) -> bool:

@@ -20,7 +20,7 @@ from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
 from edge.flight.margins import ErrorBudget
 from edge.flight.reach import Reach
-from edge.flight.safety import Closest, MotionLimits, SeparationLimits
+from edge.flight.safety import Closest, MotionLimits, SeparationLimits, SilenceLimits
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
     MAX_SLOT,
@@ -147,12 +147,14 @@ class FlightInputs:
     `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
     above sea level, less what that jumped in flight; None when the position is lost or old, or
     there is no mission origin. `policy_velocity_m_s` (2,) is None when the policy has no fresh
-    answer. `closest` is the nearest neighbour. `busy_neighbours` say of themselves that they arm or
-    take off. `safety_form` is what a ground asks whose states are not understood.
-    `failed_checks` are preflight's; None before the first. `not_taken` is what of the
+    answer. `neighbours` are heard, and `closest` is the nearest of them. `busy_neighbours` say of
+    themselves that they arm or take off. `safety_form` is what a ground asks whose states are not
+    understood. `failed_checks` are preflight's; None before the first. `not_taken` is what of the
     ground's state the robot does not fly by. `order` is new in this tick; of one that is not
     understood there is the form. `energy` is None when the battery is not known. `lands_beside_m`
     (2,) is where it comes down since another robot stands at its landing point; None: there.
+    `silent` fell silent in flight and may still be in the air: as they last told, and as high as
+    they were to climb.
     """
 
     now_s: float
@@ -172,6 +174,7 @@ class FlightInputs:
     uptime_s: float
     energy: Energy | None
     lands_beside_m: tuple[float, float] | None = None
+    silent: tuple[Neighbour, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,9 +229,16 @@ class Robot:
 
     @property
     def separation(self) -> SeparationLimits:
-        """How far it stays from the others in flight, whose estimates err as its own does."""
-        level_m, errors = self.parameters.min_separation_m, self.errors
-        return SeparationLimits(level_m, max(errors.passing_m, level_m), errors.passing_height_m)
+        """How far it stays from the others, who err as it does and fly by the same parameters."""
+        p, errors = self.parameters, self.errors
+        passing_m = max(errors.passing_m, p.min_separation_m)
+        silence = SilenceLimits(
+            # Nobody tells where the wind carries it.
+            passing_m=passing_m + errors.wind_m,
+            flies_on_s=p.ground_timeout_s,
+            hovers_s=max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s),
+        )
+        return SeparationLimits(p.min_separation_m, passing_m, errors.passing_height_m, silence)
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place that the ground gives it, or else its own."""

@@ -14,7 +14,7 @@ from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
 from edge.flight.landing import Point, place_to_land, standing_robots
 from edge.flight.record import Given, made
-from edge.flight.safety import Closest, nearest
+from edge.flight.safety import Closest, highest_m, nearest
 from edge.flight.state import (
     FlightInputs,
     FlightMemory,
@@ -102,6 +102,8 @@ class FlightControl:
         self.revoked: frozenset[int] = frozenset()
         # By robot id: the last that was heard of it in this frame, and when that was so.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
+        # The same of beacons, and of who flies.
+        self._last_in_air: dict[int, tuple[Neighbour, float]] = {}
         # The last beacon of each, in this frame: who stands somewhere may have been switched off.
         self._last_beacons: dict[int, Beacon] = {}
         self._lands_beside_m: Point | None = None
@@ -150,6 +152,7 @@ class FlightControl:
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
             lands_beside_m=self._look_where_to_land(),
+            silent=self._silent(heard, now_s),
         )
         self.energy = inputs.energy
         before, robot = self.flight, self.assignment.robot
@@ -324,6 +327,7 @@ class FlightControl:
             frame = origin.frame()
             self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
             self._last_places.clear()
+            self._last_in_air.clear()
             self._last_beacons.clear()
             self._pac.forget()
         if sensor is not None:
@@ -367,6 +371,24 @@ class FlightControl:
             if now_s - at_s <= _REVOKED_STAYS_S:
                 stay.append(Neighbour(robot_id, last.position_m, (0.0, 0.0, 0.0), 0.0))
         return tuple(stay)
+
+    def _silent(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
+        """Who flew when it last told its place, and tells none now: it may come down there."""
+        for beacon, heard_at_s in self.peers:
+            if beacon.armed is False:
+                self._last_in_air.pop(beacon.robot_id, None)
+            elif beacon.armed and beacon.frame_id == self._pac.frame_id:
+                told = _as_high_as_it_climbs(beacon)
+                if told is not None:
+                    self._last_in_air[beacon.robot_id] = told, heard_at_s
+        telling = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
+        silence = self.assignment.robot.separation.silence
+        silent = (
+            told._replace(age_s=now_s - at_s)
+            for robot_id, (told, at_s) in sorted(self._last_in_air.items())
+            if robot_id not in telling
+        )
+        return tuple(each for each in silent if highest_m(each, silence) > 0.0)
 
     def _look_where_to_land(self) -> Point | None:
         frame_id, robot = self._pac.frame_id, self.assignment.robot
@@ -446,3 +468,13 @@ class FlightControl:
             given = (answer for answer in self.flight.answers if answer.order_id == order_id)
             record = {**asdict(inputs.order), "answer": next(given, None)}
             self._recorder.record("order", self._unix_clock_s(), record)
+
+
+def _as_high_as_it_climbs(beacon: Beacon) -> Neighbour | None:
+    """Where it is, at its own height if it is to climb there; None if it does not tell."""
+    if beacon.position_m is None or beacon.velocity_m_s is None:
+        return None
+    x_m, y_m, height = beacon.position_m
+    if beacon.state in (FlightState.TAKEOFF, FlightState.RETURN):
+        height = max(height, beacon.slot_height_m)
+    return Neighbour(beacon.robot_id, (x_m, y_m, height), beacon.velocity_m_s, 0.0)

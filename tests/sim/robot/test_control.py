@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F32
 from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
 from edge.core.position import PositionQuality
 from edge.core.vehicle import (
     Action,
@@ -35,6 +36,7 @@ from edge.messages.beacon import Beacon, HeardBeacon
 from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode
 from edge.messages.mission import (
+    ON_GROUND,
     FlightState,
     GroundState,
     Order,
@@ -263,6 +265,13 @@ class Flown:
         at_s = self.now_s - age_s
         self.control.peers = tuple(HeardBeacon(beacon, at_s) for beacon in beacons)
 
+    def silent(self) -> tuple[Neighbour, ...]:
+        """Whom the last tick took for silent."""
+        topic, message = self.records[-1]
+        assert topic == "flight"
+        silent: tuple[Neighbour, ...] = message["given"].inputs.silent
+        return silent
+
     def odometry(self) -> Vector:
         odometry = self.navigation.odometry()
         assert odometry is not None
@@ -274,6 +283,7 @@ def peer(robot_id: int, state: FlightState, position_m: Vector = (100.0, 0.0, 9.
         NEIGHBOUR,
         robot_id=robot_id,
         state=state,
+        armed=state not in ON_GROUND,
         position_m=position_m,
         frame_id=ORIGIN.frame().frame_id,
     )
@@ -612,11 +622,65 @@ def test_a_revoked_robot_is_kept_away_from_where_it_was_last(flown: Flown) -> No
     # It may have been a lie: the mission begins, and nothing flies there.
     flown.explore("a")
     assert math.dist(flown.odometry()[:2], (x_m, y_m)) < 0.3
+    # Once they would be down, it still is at their height, and only there.
+    for _ in range(900):
+        flown.tick()
+    assert math.dist(flown.odometry()[:2], (x_m, y_m)) < 0.6
     # They have new cards, and are silent.
     flown.control.revoked = frozenset()
     for _ in range(60):
         flown.tick()
     assert math.dist(flown.odometry()[:2], (x_m, y_m)) > 1.0
+
+
+def test_who_fell_silent_in_flight_may_come_down_where_it_was(flown: Flown) -> None:
+    flown.take_off()
+    flown.explore("a")
+    x_m, y_m, _ = flown.odometry()
+    flown.peers(peer(5, FlightState.MISSION, (x_m, y_m + 1.0, 14.0)))
+    flown.tick()
+    flown.peers()
+
+    for _ in range(200):
+        flown.tick()
+    assert math.dist(flown.odometry()[:2], (x_m, y_m + 1.0)) > 7.0
+    # It is heard again, and is down.
+    flown.peers(peer(5, FlightState.LANDED, (x_m, y_m + 1.0, 0.0)))
+    flown.tick()
+    flown.peers()
+    flown.tick()
+    assert flown.silent() == ()
+
+
+@pytest.mark.parametrize(
+    ("state", "height_m", "at_most_m"),
+    [
+        (FlightState.MISSION, 9.0, 9.0),
+        (FlightState.LAND, 9.0, 9.0),
+        (FlightState.TAKEOFF, 2.0, NEIGHBOUR.slot_height_m),
+        (FlightState.PREFLIGHT, 0.0, None),
+    ],
+)
+def test_who_flies_and_tells_no_place_is_taken_to_be_where_it_last_was(
+    flown: Flown, state: FlightState, height_m: float, at_most_m: float | None
+) -> None:
+    told = peer(5, state, (50.0, 0.0, height_m))
+    no_place = dataclasses.replace(told, position_m=None)
+    restarted = dataclasses.replace(told, frame_id=0)
+    flown.until(FlightState.PREFLIGHT)
+    flown.peers(told)
+    flown.tick()
+    assert flown.silent() == ()
+    expected = [] if at_most_m is None else [(50.0, 0.0, at_most_m)]
+    for beacons in ((no_place,), (restarted,), ()):
+        flown.peers(*beacons)
+        flown.tick()
+        assert [robot.position_m for robot in flown.silent()] == expected
+    # At the latest it comes down after 60 s, at half a metre a second.
+    for wait_s, still in ((59.0 + 2.0 * (at_most_m or 0.0), expected), (3.0, [])):
+        for _ in range(round(10.0 * wait_s)):
+            flown.tick()
+        assert [robot.position_m for robot in flown.silent()] == still
 
 
 @pytest.mark.parametrize("on_stop", [Action.HOLD, Action.LAND])

@@ -1,7 +1,7 @@
 """Safety: what is commanded keeps a lagging vehicle inside its fence and apart from others."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from edge.flight.safety import (
     Closest,
     MotionLimits,
     SeparationLimits,
+    SilenceLimits,
     approach_speed,
     brake,
     clear_height_m,
@@ -31,10 +32,11 @@ SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)
 LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
 FIELD_LIMITS = MotionLimits(1.25, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
-FIELD_SEPARATION = SeparationLimits(level_m=1.5, passing_m=6.5, passing_height_m=3.5)
+SILENCE = SilenceLimits(passing_m=7.25, flies_on_s=3.0, hovers_s=60.0)
+FIELD_SEPARATION = SeparationLimits(1.5, passing_m=6.5, passing_height_m=3.5, silence=SILENCE)
 CONTROL_S, STEP_S = 0.1, 0.02
 AT_REST = np.zeros(3)
-LEVEL_2, LEVEL_3 = SeparationLimits(2.0, 6.5, 3.5), SeparationLimits(3.0, 6.5, 3.5)
+LEVEL_2, LEVEL_3 = FIELD_SEPARATION._replace(level_m=2.0), FIELD_SEPARATION._replace(level_m=3.0)
 
 
 def number(low: float, high: float) -> st.SearchStrategy[float]:
@@ -317,21 +319,29 @@ def neighbour(robot_id: int, *position_m: float, **at: object) -> Neighbour:
 
 def test_the_way_towards_a_neighbour_is_slowed_and_no_other() -> None:
     wanted = np.array([2.0, 1.0, 0.5])
-    command = brake(AT_REST, AT_REST, wanted, [neighbour(7, 3.0, 0.0, 0.0)], LEVEL_3, LIMITS, None)
+    command = brake(
+        AT_REST, AT_REST, wanted, [neighbour(7, 3.0, 0.0, 0.0)], (), LEVEL_3, LIMITS, None
+    )
     np.testing.assert_allclose(command, [0.0, 1.0, 0.5], atol=1e-9)
-    away = brake(AT_REST, AT_REST, -wanted, [neighbour(7, 1.0, 0.0, 0.0)], LEVEL_3, LIMITS, None)
+    away = brake(
+        AT_REST, AT_REST, -wanted, [neighbour(7, 1.0, 0.0, 0.0)], (), LEVEL_3, LIMITS, None
+    )
     np.testing.assert_array_equal(away, -wanted)
 
 
 def test_robots_cross_in_their_height_slots() -> None:
     wanted = np.array([2.0, 0.0, 0.0])
     above = neighbour(2, 0.5, 0.0, 2.0)
-    command = brake(AT_REST, AT_REST, wanted, [above], LEVEL_2, LIMITS, None)
+    command = brake(AT_REST, AT_REST, wanted, [above], (), LEVEL_2, LIMITS, None)
     np.testing.assert_array_equal(command, wanted)
     # Nearer in height, it needs as much horizontally as is missing: 1.32 m of a sphere.
-    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.33, 0.0, 1.5)], LEVEL_2, LIMITS, None)
+    command = brake(
+        AT_REST, AT_REST, wanted, [neighbour(2, 1.33, 0.0, 1.5)], (), LEVEL_2, LIMITS, None
+    )
     assert 0.0 <= command[0] < 0.01
-    command = brake(AT_REST, AT_REST, wanted, [neighbour(2, 1.3, 0.0, 1.5)], LEVEL_2, LIMITS, None)
+    command = brake(
+        AT_REST, AT_REST, wanted, [neighbour(2, 1.3, 0.0, 1.5)], (), LEVEL_2, LIMITS, None
+    )
     assert -0.02 < command[0] < 0.0
 
 
@@ -351,7 +361,7 @@ def test_who_waits_for_a_neighbour_does_not_creep_up_to_it_as_estimates_wander(
         errors_m[:, :2] += wander_m * math.sqrt(2.0 * tick_s / 5.0) * rng.normal(size=(2, 2))
         seen_m = position_m + errors_m[0]
         other = neighbour(2, *errors_m[1].tolist())
-        command = brake(seen_m, velocity_m_s, -seen_m, [other], separation, LIMITS, None)
+        command = brake(seen_m, velocity_m_s, -seen_m, [other], (), separation, LIMITS, None)
         velocity_m_s = velocity_m_s + (command - velocity_m_s) * tick_s / 0.5
         position_m = position_m + velocity_m_s * tick_s
         distances_m.append(math.hypot(*position_m[:2]))
@@ -382,9 +392,58 @@ def test_the_way_under_who_comes_down_is_left_in_time(
     assert min(distances_m) > least_m
 
 
-def passing(vehicle: Vehicle, wanted_m_s: F64, *others: Neighbour) -> F64:
-    at_m, velocity_m_s = vehicle.position_m, vehicle.velocity_m_s
-    return brake(at_m, velocity_m_s, wanted_m_s, others, FIELD_SEPARATION, FIELD_LIMITS, None)
+def passing(
+    vehicle: Vehicle, wanted_m_s: F64, *others: Neighbour, silent: Sequence[Neighbour] = ()
+) -> F64:
+    at_m, velocity_m_s, separation = vehicle.position_m, vehicle.velocity_m_s, FIELD_SEPARATION
+    return brake(at_m, velocity_m_s, wanted_m_s, others, silent, separation, FIELD_LIMITS, None)
+
+
+@pytest.mark.parametrize("bearing_rad", [0.05, 0.7, 1.5, 3.0, 4.5])
+@pytest.mark.parametrize("start_m", [0.5, 3.0, 10.0])
+def test_nobody_flies_below_where_a_silent_robot_may_have_stopped(
+    start_m: float, bearing_rad: float
+) -> None:
+    way_m_s, since_s = np.array([1.25, 0.0]), 1.5
+    start = start_m * np.array([math.cos(bearing_rad), math.sin(bearing_rad)])
+    vehicle = Vehicle(
+        np.array([*start, 5.0]), FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2
+    )
+    distances_m = []
+    for tick in range(400):
+        age_s = since_s + tick * CONTROL_S
+        silent = neighbour(2, 0.0, 0.0, 14.0, velocity_m_s=(*way_m_s, 0.0), age_s=age_s)
+        # The policy wants to be right there.
+        wanted = limit_speed(way_m_s - vehicle.position_m[:2], FIELD_LIMITS.max_speed_m_s)
+        vehicle.fly(passing(vehicle, np.append(wanted, 0.0), silent=[silent]), AT_REST)
+        stops_m = np.linspace(0.0, min(age_s, SILENCE.flies_on_s), 20)[:, None] * way_m_s
+        distances_m.append(np.hypot(*(stops_m - vehicle.position_m[:2]).T).min())
+    # It left, whichever way it began, and did not come back.
+    assert min(distances_m[120:]) > SILENCE.passing_m - 0.3
+
+
+@pytest.mark.parametrize(
+    ("up_m", "age_s", "may_come_down"),
+    [
+        (9.0, 2.0, True),
+        (-3.0, 2.0, True),  # In truth it may still be at this height.
+        (-4.5, 2.0, False),
+        (9.0, 80.0, True),
+        (9.0, 90.0, False),  # It came by, after a minute at the latest.
+    ],
+)
+def test_a_silent_robot_is_left_its_way_down_until_it_must_have_passed(
+    up_m: float, age_s: float, may_come_down: bool
+) -> None:
+    still = Vehicle(
+        np.array([0.0, 0.0, 5.0]), FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2
+    )
+    wanted = np.array([1.0, 0.0, 0.0])
+    silent = [neighbour(2, 4.0, 0.0, 5.0 + up_m, age_s=age_s)]
+    assert (passing(still, wanted, silent=silent)[0] < -0.5) == may_come_down
+    assert passing(still, wanted, silent=[])[0] == 1.0
+    unknown = neighbour(2, 4.0, 0.0, math.nan, age_s=age_s)
+    assert not passing(still, wanted, silent=[unknown]).any()
 
 
 def test_of_two_that_come_down_the_nearer_one_is_left() -> None:
@@ -430,7 +489,7 @@ def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
     data: st.DataObject,
 ) -> None:
     limits, level_m = data.draw(motion_limits), data.draw(number(1.0, 4.0))
-    separation = SeparationLimits(level_m, 6.5, 3.5)
+    separation = FIELD_SEPARATION._replace(level_m=level_m)
     fence = Fence(((-16.0, -12.0), (16.0, -12.0), (0.0, 24.0)), 1.0, 3.0, 25.0)
     corners = ((-11.0, -10.0), (11.0, -10.0), (0.0, 16.0), (0.0, 0.0))
     starts = data.draw(st.permutations(corners))[: data.draw(st.integers(2, 4))]
@@ -455,7 +514,7 @@ def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(
             )
             others = [other for other in heard if other.robot_id != own]
             closest = nearest(position_m.tolist(), others)
-            command = brake(position_m, velocity_m_s, inside, others, separation, limits, fence)
+            command = brake(position_m, velocity_m_s, inside, others, (), separation, limits, fence)
             vehicle.fly(command, AT_REST)
             assert not recovering
             assert fence.distance_m(*vehicle.position_m[:2]) > 0.5 * fence.buffer_m
@@ -468,9 +527,9 @@ def test_giving_way_to_a_neighbour_leads_over_no_edge() -> None:
     at_the_buffer = np.array([2.0, 16.0, 10.0])
     ahead = neighbour(3, 3.0, 17.5, 10.0)
     wanted = np.array([0.0, 1.0, 0.0])
-    free = brake(at_the_buffer, AT_REST, wanted, [ahead], LEVEL_2, LIMITS, None)
+    free = brake(at_the_buffer, AT_REST, wanted, [ahead], (), LEVEL_2, LIMITS, None)
     assert free[0] < -0.1
-    command = brake(at_the_buffer, AT_REST, wanted, [ahead], LEVEL_2, LIMITS, FENCE)
+    command = brake(at_the_buffer, AT_REST, wanted, [ahead], (), LEVEL_2, LIMITS, FENCE)
     assert command[0] > -1e-6
     assert command @ (1.0, 1.5, 0.0) < 1e-6
 
@@ -511,7 +570,7 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
         neighbour(1, *AT_REST, age_s=d),
         neighbour(1, *a, velocity_m_s=tuple(b), age_s=0.1),
     ):
-        command = brake(a, b, c, [other], LEVEL_2, LIMITS, FENCE)
+        command = brake(a, b, c, [other], (), LEVEL_2, LIMITS, FENCE)
         closest = nearest((0.0, 0.0, 0.0), [other])
         assert np.isfinite(command).all()
         assert usable or not command.any()
@@ -527,7 +586,7 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
 def test_an_unknown_neighbour_stops_the_robot_and_hides_no_other() -> None:
     lost = neighbour(1, math.nan, 0.0, 0.0)
     others = [lost, neighbour(2, 9.0, 0.0, 0.0)]
-    command = brake(AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), others, LEVEL_2, LIMITS, None)
+    command = brake(AT_REST, AT_REST, np.array([1.0, 0.0, 0.0]), others, (), LEVEL_2, LIMITS, None)
     assert not command.any()
     assert nearest((0.0, 0.0, 0.0), others) == Closest(2, 9.0)
 
