@@ -22,7 +22,8 @@ _LONGEST_TRANSIT_S = 5.0
 class Neighbour(NamedTuple):
     """Another robot: its position and velocity in the mission frame, as they were `age_s` ago.
 
-    And what it told of its surroundings in the mission `trial`, if robots share maps.
+    And what it told of its surroundings in the mission `trial`, if robots share maps. `is_piloted`:
+    somebody else than its program flies it, so that it looks out for nobody.
     """
 
     robot_id: int
@@ -31,6 +32,7 @@ class Neighbour(NamedTuple):
     age_s: float
     trial: int = 0
     shared: SharedMap | None = None
+    is_piloted: bool = False
 
 
 class _Received(NamedTuple):

@@ -58,13 +58,11 @@ class MotionLimits:
 
 
 class SilenceLimits(NamedTuple):
-    """What a robot that fell silent in flight may do, and how far to stay from where it may be.
+    """What a robot that fell silent in flight may do.
 
     It flies on for at most `flies_on_s`, and comes down at any time, but after at most `hovers_s`.
-    `passing_m` is in the plane, m.
     """
 
-    passing_m: float
     flies_on_s: float
     hovers_s: float
 
@@ -74,12 +72,15 @@ class SeparationLimits(NamedTuple):
 
     `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
     down through the robot's height, since it keeps to its place and looks for nobody; it has not
-    passed before it is `passing_height_m` away in height. `silence`: of who fell silent.
+    passed before it is `passing_height_m` away in height. `unforeseen_m`, in the plane: from one of
+    which nobody knows what it does next, since it is piloted at the robot's height, or fell silent
+    in flight; `silence` is what that one may do.
     """
 
     level_m: float
     passing_m: float
     passing_height_m: float
+    unforeseen_m: float
     silence: SilenceLimits
 
 
@@ -232,7 +233,8 @@ def brake(
     `velocity_m_s` is the robot's own, as estimated. Neighbours are taken to have flown on as they
     did. One that is `level_m` or more above or below brakes nothing, since robots cross in their
     height slots, unless it climbs or comes down and passes before the robot could be out of its
-    way. Towards another one the robot may close half the slack: that one does the same. Away from
+    way, or somebody flies it at about this height. Towards another one the robot may close half the
+    slack, since that one does the same, and all of it towards one that somebody flies. Away from
     it, it may always fly, and from one that is too near it has to, by half of what is missing: else
     each error of an estimate would let them close in, and none part them. Who passes does nothing
     of the kind: the robot leaves all of its way, and by where the vehicle comes to rest, so that it
@@ -249,36 +251,9 @@ def brake(
         return np.zeros(3)
     if not all(map(_is_known, (*neighbours, *silent))):
         return np.zeros(3)
-    # Whose way has to be left, and how far: by where the vehicle comes to rest.
-    rest_m = position_m[:2] + velocity_m_s[:2] * limits.lag_s
-    silence = separation.silence
-    left = [
-        (_nearest_on_way(robot, silence, rest_m) - rest_m, silence.passing_m)
-        for robot in silent
-        if position_m[2] < highest_m(robot, silence) + separation.passing_height_m
-    ]
-    ways: list[_Way] = []
-    for neighbour in neighbours:
-        offset_m = np.array(_extrapolated(neighbour)) - position_m
-        up_m = float(offset_m[2])
-        if _passes(up_m, neighbour.velocity_m_s[2], separation, limits):
-            left.append((offset_m[:2] - velocity_m_s[:2] * limits.lag_s, separation.passing_m))
-        elif abs(up_m) < separation.level_m:
-            apart_m = math.hypot(offset_m[0], offset_m[1])
-            if apart_m == 0.0:
-                return np.zeros(3)  # Every way may be the wrong one.
-            direction = offset_m[:2] / apart_m
-            # Squares of far smaller numbers than a separation may vanish: never below 0.
-            needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
-            cap = _speed_to((apart_m - needed_m) / 2.0, float(direction @ velocity_m_s[:2]), limits)
-            ways.append(_Way(direction, cap, max(cap, 0.0)))
-    for from_rest_m, passing_m in left:
-        apart_m = math.hypot(*from_rest_m)
-        if apart_m == 0.0:
-            return np.zeros(3)
-        cap = _speed_to(apart_m - passing_m, 0.0, limits)
-        at_most = _speed_to(max(apart_m - separation.level_m, 0.0), 0.0, limits)
-        ways.append(_Way(from_rest_m / apart_m, cap, at_most if cap < 0.0 else cap))
+    ways = _ways(position_m, velocity_m_s, neighbours, silent, separation, limits)
+    if ways is None:
+        return np.zeros(3)  # Every way may be the wrong one.
     horizontal = wanted_m_s[:2]
     if all(float(way.direction @ horizontal) <= way.cap for way in ways):
         return wanted_m_s
@@ -306,6 +281,48 @@ class _Way(NamedTuple):
     direction: F64
     cap: float
     at_most: float
+
+
+def _ways(
+    position_m: F64,
+    velocity_m_s: F64,
+    neighbours: Sequence[Neighbour],
+    silent: Sequence[Neighbour],
+    separation: SeparationLimits,
+    limits: MotionLimits,
+) -> list[_Way] | None:
+    """To all who limit the robot; None if one of them is just here."""
+    slowed: list[tuple[F64, float]] = []  # from the robot, and the slack to use up
+    left: list[tuple[F64, float]] = []  # from where its vehicle comes to rest, and how far to stay
+    rest_m = position_m[:2] + velocity_m_s[:2] * limits.lag_s
+    for neighbour in neighbours:
+        place_m = np.array(_extrapolated(neighbour))
+        from_here_m, up_m = place_m[:2] - position_m[:2], float(place_m[2] - position_m[2])
+        if _passes(up_m, neighbour.velocity_m_s[2], separation, limits):
+            left.append((place_m[:2] - rest_m, separation.passing_m))
+        elif neighbour.is_piloted and abs(up_m) < separation.passing_height_m:
+            slowed.append((from_here_m, math.hypot(*from_here_m) - separation.unforeseen_m))
+        elif abs(up_m) < separation.level_m:
+            # Squares of far smaller numbers than a separation may vanish: never below 0.
+            needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
+            slowed.append((from_here_m, (math.hypot(*from_here_m) - needed_m) / 2.0))
+    for robot in silent:
+        if position_m[2] < highest_m(robot, separation.silence) + separation.passing_height_m:
+            stopped_m = _nearest_on_way(robot, separation.silence, rest_m)
+            left.append((stopped_m - rest_m, separation.unforeseen_m))
+    if not all(offset_m.any() for offset_m, _ in (*slowed, *left)):
+        return None
+    ways = []
+    for offset_m, slack_m in slowed:
+        direction = offset_m / math.hypot(*offset_m)
+        cap = _speed_to(slack_m, float(direction @ velocity_m_s[:2]), limits)
+        ways.append(_Way(direction, cap, max(cap, 0.0)))
+    for offset_m, apart_m in left:
+        away_m = math.hypot(*offset_m)
+        cap = _speed_to(away_m - apart_m, 0.0, limits)
+        at_most = _speed_to(max(away_m - separation.level_m, 0.0), 0.0, limits)
+        ways.append(_Way(offset_m / away_m, cap, at_most if cap < 0.0 else cap))
+    return ways
 
 
 def _passes(

@@ -232,13 +232,15 @@ class Robot:
         """How far it stays from the others, who err as it does and fly by the same parameters."""
         p, errors = self.parameters, self.errors
         passing_m = max(errors.passing_m, p.min_separation_m)
-        silence = SilenceLimits(
-            # Nobody tells where the wind carries it.
-            passing_m=passing_m + errors.wind_m,
-            flies_on_s=p.ground_timeout_s,
-            hovers_s=max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s),
+        lands_after_s = max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s)
+        return SeparationLimits(
+            level_m=p.min_separation_m,
+            passing_m=passing_m,
+            passing_height_m=errors.passing_height_m,
+            # Nobody tells where the wind, or a pilot, carries it.
+            unforeseen_m=passing_m + errors.wind_m,
+            silence=SilenceLimits(flies_on_s=p.ground_timeout_s, hovers_s=lands_after_s),
         )
-        return SeparationLimits(p.min_separation_m, passing_m, errors.passing_height_m, silence)
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:
         """Fence and place that the ground gives it, or else its own."""

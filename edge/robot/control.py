@@ -358,7 +358,13 @@ class FlightControl:
                 told.append(
                     Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
                 )
-        return (*heard, *told)
+        piloted = {
+            peer.beacon.robot_id for peer in self.peers if peer.beacon.state is FlightState.PILOT
+        }
+        return tuple(
+            neighbour._replace(is_piloted=neighbour.robot_id in piloted)
+            for neighbour in (*heard, *told)
+        )
 
     def _revoked_places(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
         """Who is not listened to any more, where it was: it may still hover there."""

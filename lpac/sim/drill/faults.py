@@ -772,7 +772,7 @@ _PEOPLE = (
     ),
     Fault(
         name="somebody-over-the-pad", what="a pilot hovers above another's pad, at its height",
-        promise="the one that comes home keeps 1.5 m away, and waits",
+        promise="the one that comes home keeps 1 m away, and waits",
         settings=(_RC,),
         does=(
             *(Do(float(t), PilotFliesOver()) for t in range(80)),

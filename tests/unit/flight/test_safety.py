@@ -32,8 +32,10 @@ SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)
 LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
 FIELD_LIMITS = MotionLimits(1.25, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
-SILENCE = SilenceLimits(passing_m=7.25, flies_on_s=3.0, hovers_s=60.0)
-FIELD_SEPARATION = SeparationLimits(1.5, passing_m=6.5, passing_height_m=3.5, silence=SILENCE)
+SILENCE = SilenceLimits(flies_on_s=3.0, hovers_s=60.0)
+FIELD_SEPARATION = SeparationLimits(
+    level_m=1.5, passing_m=6.5, passing_height_m=3.5, unforeseen_m=7.25, silence=SILENCE
+)
 CONTROL_S, STEP_S = 0.1, 0.02
 AT_REST = np.zeros(3)
 LEVEL_2, LEVEL_3 = FIELD_SEPARATION._replace(level_m=2.0), FIELD_SEPARATION._replace(level_m=3.0)
@@ -419,7 +421,31 @@ def test_nobody_flies_below_where_a_silent_robot_may_have_stopped(
         stops_m = np.linspace(0.0, min(age_s, SILENCE.flies_on_s), 20)[:, None] * way_m_s
         distances_m.append(np.hypot(*(stops_m - vehicle.position_m[:2]).T).min())
     # It left, whichever way it began, and did not come back.
-    assert min(distances_m[120:]) > SILENCE.passing_m - 0.3
+    assert min(distances_m[120:]) > FIELD_SEPARATION.unforeseen_m - 0.3
+
+
+@pytest.mark.parametrize(
+    ("up_m", "is_piloted", "kept_m"), [(0.0, True, 7.25), (3.0, True, 7.25), (0.0, False, 1.5)]
+)
+def test_who_is_piloted_at_ones_height_is_left_more_room(
+    up_m: float, is_piloted: bool, kept_m: float
+) -> None:
+    vehicle = Vehicle(
+        np.array([12.0, 0.0, 5.0]), FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2
+    )
+    other = neighbour(2, 0.0, 0.0, 5.0 + up_m, is_piloted=is_piloted)
+    distances_m = []
+    for _ in range(600):
+        wanted = limit_speed(-vehicle.position_m[:2], FIELD_LIMITS.max_speed_m_s)
+        vehicle.fly(passing(vehicle, np.append(wanted, 0.0), other), AT_REST)
+        distances_m.append(math.hypot(*vehicle.position_m[:2]))
+    assert min(distances_m) == pytest.approx(kept_m, abs=0.1)
+
+
+def test_who_is_piloted_far_above_brakes_nobody() -> None:
+    still = Vehicle(AT_REST, FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2)
+    above = neighbour(2, 1.0, 0.0, 4.5, is_piloted=True)
+    assert passing(still, np.array([1.0, 0.0, 0.0]), above)[0] == 1.0
 
 
 @pytest.mark.parametrize(
