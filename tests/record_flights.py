@@ -321,6 +321,23 @@ def _comes_down_above(f: _Flight) -> None:
     f.run(10.0)
 
 
+def _falls_silent(f: _Flight) -> None:
+    """Robot 1 is heard no more where robot 0 flies, and where it lands."""
+    f.fly()
+    other = f.fleet.vehicles[1].vehicle
+    place_m = f.vehicle.estimated_position_m + np.array([2.0, 1.0, 0.0])
+    x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
+    other.position_m = np.array([x_m, y_m, other.position_m[2]])
+    f.run(1.0)
+    f.begin()
+    f.fleet.radio.air = replace(
+        f.fleet.radio.air, partition=(frozenset({GROUND, 0}), frozenset({1}))
+    )
+    f.run(8.0)
+    f.do(SafetyCommand("return", robots=("r0",)))
+    f.until(_S.LAND)
+
+
 def _landing_point_taken(f: _Flight) -> None:
     """Robot 1 has come down where robot 0 lands."""
     f.fly()
@@ -538,6 +555,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     ),
     "near_neighbour": (_near_neighbour, _PILOTED),
     "comes_down_above": (_comes_down_above, {}),
+    "falls_silent": (_falls_silent, {}),
     "landing_point_taken": (_landing_point_taken, {}),
     "offboard_refused": (_offboard_refused, {}),
     "arming_refused": (_arming_refused, {}),

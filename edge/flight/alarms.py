@@ -68,7 +68,7 @@ def lands_beside(t: Tick) -> str | None:
     if beside_m is None:
         return None
     away_m = math.dist(beside_m, t.robot.parameters.landing_point_m)
-    return f"somebody stands at its landing point: lands {away_m:.0f} m beside it"
+    return f"somebody stands or fell silent at its landing point: lands {away_m:.0f} m beside it"
 
 
 def battery_low(t: Tick) -> str | None:

@@ -49,7 +49,8 @@ class MissionPosition(NamedTuple):
 
 MissionSetpoint = MissionVelocity | MissionPosition
 
-_STOP = MissionVelocity((0.0, 0.0, 0.0))
+_NO_SPEED_M_S = (0.0, 0.0, 0.0)
+_STOP = MissionVelocity(_NO_SPEED_M_S)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +87,9 @@ def guide(
         highest_m = math.inf
         if state is FlightState.TAKEOFF:
             separation_m = robot.parameters.min_separation_m
-            clear_m = clear_height_m(position_m, inputs.neighbours, separation_m)
+            # Who fell silent may still hover where it was.
+            silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
+            clear_m = clear_height_m(position_m, (*inputs.neighbours, *silent), separation_m)
             highest_m = max(height, clear_m)
         return _towards(flight.target_m, highest_m, position_m, limits), Guidance()
     wanted_m_s = np.zeros(3)
@@ -107,7 +110,7 @@ def guide(
         velocity_m_s,
         inside_m_s,
         inputs.neighbours,
-        inputs.silent,
+        inputs.fell_silent,
         robot.separation,
         limits,
         robot.fence,

@@ -11,7 +11,9 @@ import numpy as np
 
 from edge.core import F64
 from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
 from edge.flight.margins import ErrorBudget, places_apart
+from edge.flight.silence import SilenceLimits, nearest_on_way_m, way_m
 from edge.messages.beacon import Beacon
 
 Point = tuple[float, float]
@@ -42,6 +44,21 @@ def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
         StandingRobot(beacon.robot_id, beacon.position_m[:2], beacon.landing_point_m)
         for beacon in beacons
         if beacon.armed is False and beacon.position_m is not None
+    ]
+
+
+def may_stand(
+    silent: Neighbour, its_landing_point_m: Point, near_m: Point, limits: SilenceLimits
+) -> list[StandingRobot]:
+    """Who fell silent in flight, as if it had landed on its way: it is down some time, unheard.
+
+    At the ends of its way, as far as that may lead, and where that is nearest to a place.
+    """
+    stopped = silent._replace(age_s=max(silent.age_s, limits.flies_on_s))
+    places_m = (*way_m(stopped, limits), nearest_on_way_m(stopped, limits, np.array(near_m)))
+    return [
+        StandingRobot(silent.robot_id, (x_m, y_m), its_landing_point_m)
+        for x_m, y_m in (place_m.tolist() for place_m in places_m)
     ]
 
 

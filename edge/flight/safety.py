@@ -20,6 +20,7 @@ import numpy as np
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
+from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m
 
 _ABSURD = 1e6
 # A slack is used up no faster than in this time: five control periods, which leaves room for the
@@ -55,16 +56,6 @@ class MotionLimits:
                 raise ValueError(f"{name} = {value}: must be finite and above 0")
         if not 0.0 <= self.lag_s < math.inf:
             raise ValueError(f"lag_s = {self.lag_s}: must be finite and at least 0")
-
-
-class SilenceLimits(NamedTuple):
-    """What a robot that fell silent in flight may do.
-
-    It flies on for at most `flies_on_s`, and comes down at any time, but after at most `hovers_s`.
-    """
-
-    flies_on_s: float
-    hovers_s: float
 
 
 class SeparationLimits(NamedTuple):
@@ -118,12 +109,6 @@ def clear_height_m(
         if apart_m < 2.0 * min_separation_m and height_m > position_m[2]:
             heights_m.append(height_m - min_separation_m)
     return min(heights_m)
-
-
-def highest_m(silent: Neighbour, limits: SilenceLimits) -> float:
-    """How high a robot that fell silent in flight may still be, m; 0 or less: it is down."""
-    falls_s = max(silent.age_s - limits.hovers_s, 0.0)
-    return silent.position_m[2] - _PASSING_M_S * falls_s
 
 
 def limit_speed(velocity: F64, max_speed: float) -> F64:
@@ -272,6 +257,19 @@ def brake(
     return np.array([*horizontal, wanted_m_s[2]])
 
 
+class _Near(NamedTuple):
+    """Who limits the robot: its place from here, (2,), or from where the vehicle comes to rest.
+
+    `slack_m` may be flown towards it, below 0 away from it; and no more than `at_most_m`, 0 or
+    more, if others have to be left more than this one.
+    """
+
+    offset_m: F64
+    slack_m: float
+    at_most_m: float
+    from_rest: bool
+
+
 class _Way(NamedTuple):
     """The way to a neighbour, (2,), and how fast to be told to fly it, m/s: away if below 0.
 
@@ -292,37 +290,46 @@ def _ways(
     limits: MotionLimits,
 ) -> list[_Way] | None:
     """To all who limit the robot; None if one of them is just here."""
-    slowed: list[tuple[F64, float]] = []  # from the robot, and the slack to use up
-    left: list[tuple[F64, float]] = []  # from where its vehicle comes to rest, and how far to stay
     rest_m = position_m[:2] + velocity_m_s[:2] * limits.lag_s
+    near: list[_Near] = []
     for neighbour in neighbours:
         place_m = np.array(_extrapolated(neighbour))
-        from_here_m, up_m = place_m[:2] - position_m[:2], float(place_m[2] - position_m[2])
+        here_m, up_m = place_m[:2] - position_m[:2], float(place_m[2] - position_m[2])
+        least_m = separation.unforeseen_m if neighbour.is_piloted else separation.passing_m
         if _passes(up_m, neighbour.velocity_m_s[2], separation, limits):
-            left.append((place_m[:2] - rest_m, separation.passing_m))
+            near.append(_to_leave(place_m[:2] - rest_m, least_m, separation, from_rest=True))
         elif neighbour.is_piloted and abs(up_m) < separation.passing_height_m:
-            slowed.append((from_here_m, math.hypot(*from_here_m) - separation.unforeseen_m))
+            near.append(_to_leave(here_m, least_m, separation, from_rest=False))
         elif abs(up_m) < separation.level_m:
             # Squares of far smaller numbers than a separation may vanish: never below 0.
             needed_m = math.sqrt(max(separation.level_m**2 - up_m * up_m, 0.0))
-            slowed.append((from_here_m, (math.hypot(*from_here_m) - needed_m) / 2.0))
+            slack_m = (math.hypot(*here_m) - needed_m) / 2.0
+            near.append(_Near(here_m, slack_m, max(slack_m, 0.0), from_rest=False))
     for robot in silent:
-        if position_m[2] < highest_m(robot, separation.silence) + separation.passing_height_m:
-            stopped_m = _nearest_on_way(robot, separation.silence, rest_m)
-            left.append((stopped_m - rest_m, separation.unforeseen_m))
-    if not all(offset_m.any() for offset_m, _ in (*slowed, *left)):
+        highest_m = highest_still_m(robot, separation.silence)
+        if position_m[2] < highest_m + separation.passing_height_m:
+            stopped_m = nearest_on_way_m(robot, separation.silence, rest_m)
+            least_m = separation.unforeseen_m
+            near.append(_to_leave(stopped_m - rest_m, least_m, separation, from_rest=True))
+    if not all(each.offset_m.any() for each in near):
         return None
     ways = []
-    for offset_m, slack_m in slowed:
+    for offset_m, slack_m, at_most_m, from_rest in near:
         direction = offset_m / math.hypot(*offset_m)
-        cap = _speed_to(slack_m, float(direction @ velocity_m_s[:2]), limits)
-        ways.append(_Way(direction, cap, max(cap, 0.0)))
-    for offset_m, apart_m in left:
-        away_m = math.hypot(*offset_m)
-        cap = _speed_to(away_m - apart_m, 0.0, limits)
-        at_most = _speed_to(max(away_m - separation.level_m, 0.0), 0.0, limits)
-        ways.append(_Way(offset_m / away_m, cap, at_most if cap < 0.0 else cap))
+        speed_m_s = 0.0 if from_rest else float(direction @ velocity_m_s[:2])
+        cap = _speed_to(slack_m, speed_m_s, limits)
+        ways.append(_Way(direction, cap, _speed_to(at_most_m, speed_m_s, limits)))
     return ways
+
+
+def _to_leave(
+    offset_m: F64, least_m: float, separation: SeparationLimits, *, from_rest: bool
+) -> _Near:
+    """One that does nothing for the distance of `least_m` itself."""
+    apart_m = math.hypot(*offset_m)
+    slack_m = apart_m - least_m
+    at_most_m = slack_m if slack_m >= 0.0 else max(apart_m - separation.level_m, 0.0)
+    return _Near(offset_m, slack_m, at_most_m, from_rest)
 
 
 def _passes(
@@ -350,15 +357,6 @@ def _extrapolated(neighbour: Neighbour) -> list[float]:
         place_m + speed_m_s * neighbour.age_s
         for place_m, speed_m_s in zip(neighbour.position_m, neighbour.velocity_m_s, strict=True)
     ]
-
-
-def _nearest_on_way(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
-    """The point, (2,), nearest to a place of all where it may have stopped, if it flew straight."""
-    last_m = np.array(silent.position_m[:2])
-    way_m = np.array(silent.velocity_m_s[:2]) * min(silent.age_s, limits.flies_on_s)
-    square = float(way_m @ way_m)
-    share = float((place_m - last_m) @ way_m) / square if square > 0.0 else 0.0
-    return last_m + way_m * min(max(share, 0.0), 1.0)
 
 
 def _is_known(neighbour: Neighbour) -> bool:

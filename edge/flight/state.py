@@ -20,7 +20,8 @@ from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
 from edge.flight.margins import ErrorBudget
 from edge.flight.reach import Reach
-from edge.flight.safety import Closest, MotionLimits, SeparationLimits, SilenceLimits
+from edge.flight.safety import Closest, MotionLimits, SeparationLimits, stopping_m
+from edge.flight.silence import SilenceLimits
 from edge.messages.codes import FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
     MAX_SLOT,
@@ -38,6 +39,8 @@ OFFBOARD_TIMEOUT_S = 4.0
 # What was true before a lapse or a command is told no later: PX4 tells its mode at 1 Hz.
 STALE_TELEMETRY_S = 2.0
 _LAPSE_SHARE = 0.9
+# From when a vehicle is to land to when it comes down, at the latest.
+_LANDS_WITHIN_S = 6.0
 _STARTED = Reason(ReasonCode.PROGRAM_STARTED, "program started")
 
 # Who has it land: the ground, a return that came home, or what cannot wait.
@@ -153,8 +156,7 @@ class FlightInputs:
     ground's state the robot does not fly by. `order` is new in this tick; of one that is not
     understood there is the form. `energy` is None when the battery is not known. `lands_beside_m`
     (2,) is where it comes down since another robot stands at its landing point; None: there.
-    `silent` fell silent in flight and may still be in the air: as they last told, and as high as
-    they were to climb.
+    `fell_silent` are those who did so in flight and may still be in the air, as of their last word.
     """
 
     now_s: float
@@ -174,7 +176,7 @@ class FlightInputs:
     uptime_s: float
     energy: Energy | None
     lands_beside_m: tuple[float, float] | None = None
-    silent: tuple[Neighbour, ...] = ()
+    fell_silent: tuple[Neighbour, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,8 +232,10 @@ class Robot:
     @property
     def separation(self) -> SeparationLimits:
         """How far it stays from the others, who err as it does and fly by the same parameters."""
-        p, errors = self.parameters, self.errors
+        p, errors, limits = self.parameters, self.errors, self.limits
         passing_m = max(errors.passing_m, p.min_separation_m)
+        # By where it flies after that, at its greatest speed, when it is to hold.
+        stops_s = stopping_m(limits.max_speed_m_s, limits) / limits.max_speed_m_s
         lands_after_s = max(p.hover_land_s, p.ground_timeout_s + p.ground_lost_land_s)
         return SeparationLimits(
             level_m=p.min_separation_m,
@@ -239,7 +243,12 @@ class Robot:
             passing_height_m=errors.passing_height_m,
             # Nobody tells where the wind, or a pilot, carries it.
             unforeseen_m=passing_m + errors.wind_m,
-            silence=SilenceLimits(flies_on_s=p.ground_timeout_s, hovers_s=lands_after_s),
+            silence=SilenceLimits(
+                max_speed_m_s=limits.max_speed_m_s,
+                ceiling_m=self.fence.ceiling_m + errors.height_m,
+                flies_on_s=p.ground_timeout_s + stops_s,
+                hovers_s=lands_after_s + _LANDS_WITHIN_S,
+            ),
         )
 
     def told(self, ground: GroundState) -> tuple[Fence, Place]:

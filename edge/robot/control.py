@@ -12,9 +12,10 @@ from edge.core.ports import Camera, Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
-from edge.flight.landing import Point, place_to_land, standing_robots
+from edge.flight.landing import Point, may_stand, place_to_land, standing_robots
 from edge.flight.record import Given, made
-from edge.flight.safety import Closest, highest_m, nearest
+from edge.flight.safety import Closest, nearest
+from edge.flight.silence import highest_still_m, last_word
 from edge.flight.state import (
     FlightInputs,
     FlightMemory,
@@ -102,8 +103,8 @@ class FlightControl:
         self.revoked: frozenset[int] = frozenset()
         # By robot id: the last that was heard of it in this frame, and when that was so.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
-        # The same of beacons, and of who flies.
-        self._last_in_air: dict[int, tuple[Neighbour, float]] = {}
+        # The same of beacons that tell a place, and of who flies.
+        self._last_words: dict[int, tuple[Neighbour, float]] = {}
         # The last beacon of each, in this frame: who stands somewhere may have been switched off.
         self._last_beacons: dict[int, Beacon] = {}
         self._lands_beside_m: Point | None = None
@@ -131,6 +132,7 @@ class FlightControl:
         self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
         heard = self._neighbours(now_s)
+        silent, separation = self._silent(heard, now_s), self.assignment.robot.separation
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
@@ -151,8 +153,10 @@ class FlightControl:
             order=self._inbox.order(now_s),
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
-            lands_beside_m=self._look_where_to_land(),
-            silent=self._silent(heard, now_s),
+            lands_beside_m=self._look_where_to_land(silent),
+            fell_silent=tuple(
+                each for each in silent if highest_still_m(each, separation.silence) > 0.0
+            ),
         )
         self.energy = inputs.energy
         before, robot = self.flight, self.assignment.robot
@@ -327,7 +331,7 @@ class FlightControl:
             frame = origin.frame()
             self._navigation.frame, self._pac.frame_id = frame, frame.frame_id
             self._last_places.clear()
-            self._last_in_air.clear()
+            self._last_words.clear()
             self._last_beacons.clear()
             self._pac.forget()
         if sensor is not None:
@@ -379,35 +383,42 @@ class FlightControl:
         return tuple(stay)
 
     def _silent(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
-        """Who flew when it last told its place, and tells none now: it may come down there."""
-        for beacon, heard_at_s in self.peers:
-            if beacon.armed is False:
-                self._last_in_air.pop(beacon.robot_id, None)
-            elif beacon.armed and beacon.frame_id == self._pac.frame_id:
-                told = _as_high_as_it_climbs(beacon)
-                if told is not None:
-                    self._last_in_air[beacon.robot_id] = told, heard_at_s
-        telling = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
-        silence = self.assignment.robot.separation.silence
-        silent = (
-            told._replace(age_s=now_s - at_s)
-            for robot_id, (told, at_s) in sorted(self._last_in_air.items())
-            if robot_id not in telling
-        )
-        return tuple(each for each in silent if highest_m(each, silence) > 0.0)
+        """Who flew when it last told its place, and tells none now: it may come down there.
 
-    def _look_where_to_land(self) -> Point | None:
+        Who is not listened to any more is none of these: its last word may have been a lie.
+        """
+        silence = self.assignment.robot.separation.silence
+        for beacon, heard_at_s in self.peers:
+            told = last_word(beacon, silence)
+            if beacon.armed is False:
+                self._last_words.pop(beacon.robot_id, None)
+            elif told is not None and beacon.frame_id == self._pac.frame_id:
+                self._last_words[beacon.robot_id] = told, heard_at_s
+        others = {self.assignment.robot.robot_id, *(n.robot_id for n in heard), *self.revoked}
+        return tuple(
+            told._replace(age_s=now_s - at_s)
+            for robot_id, (told, at_s) in sorted(self._last_words.items())
+            if robot_id not in others
+        )
+
+    def _look_where_to_land(self, silent: tuple[Neighbour, ...]) -> Point | None:
+        """`silent` stand where they may have stopped: they are down some time, unheard."""
         frame_id, robot = self._pac.frame_id, self.assignment.robot
         for beacon, _ in self.peers:
             if beacon.frame_id == frame_id and beacon.robot_id != robot.robot_id:
                 self._last_beacons[beacon.robot_id] = beacon
-        others = self._last_beacons.values()
-        x_m, y_m = robot.parameters.landing_point_m
+        others, landing_m = self._last_beacons, robot.parameters.landing_point_m
+        near_m, silence = (landing_m[0], landing_m[1]), robot.separation.silence
+        unheard = [
+            standing
+            for each in silent
+            for standing in may_stand(each, others[each.robot_id].landing_point_m, near_m, silence)
+        ]
         self._lands_beside_m = place_to_land(
-            (x_m, y_m),
+            near_m,
             self._lands_beside_m,
-            standing_robots(others),
-            [beacon.landing_point_m for beacon in others],
+            [*standing_robots(others.values()), *unheard],
+            [beacon.landing_point_m for beacon in others.values()],
             robot.fence,
             robot.errors,
         )
@@ -474,13 +485,3 @@ class FlightControl:
             given = (answer for answer in self.flight.answers if answer.order_id == order_id)
             record = {**asdict(inputs.order), "answer": next(given, None)}
             self._recorder.record("order", self._unix_clock_s(), record)
-
-
-def _as_high_as_it_climbs(beacon: Beacon) -> Neighbour | None:
-    """Where it is, at its own height if it is to climb there; None if it does not tell."""
-    if beacon.position_m is None or beacon.velocity_m_s is None:
-        return None
-    x_m, y_m, height = beacon.position_m
-    if beacon.state in (FlightState.TAKEOFF, FlightState.RETURN):
-        height = max(height, beacon.slot_height_m)
-    return Neighbour(beacon.robot_id, (x_m, y_m, height), beacon.velocity_m_s, 0.0)

@@ -269,7 +269,7 @@ class Flown:
         """Whom the last tick took for silent."""
         topic, message = self.records[-1]
         assert topic == "flight"
-        silent: tuple[Neighbour, ...] = message["given"].inputs.silent
+        silent: tuple[Neighbour, ...] = message["given"].inputs.fell_silent
         return silent
 
     def odometry(self) -> Vector:
@@ -633,11 +633,10 @@ def test_a_revoked_robot_is_kept_away_from_where_it_was_last(flown: Flown) -> No
     # It may have been a lie: the mission begins, and nothing flies there.
     flown.explore("a")
     assert math.dist(flown.odometry()[:2], (x_m, y_m)) < 0.3
-    # Once they would be down, it still is at their height, and only there.
     for _ in range(900):
         flown.tick()
     assert math.dist(flown.odometry()[:2], (x_m, y_m)) < 0.6
-    # They have new cards, and are silent.
+    # They have new cards, and are silent for so long that they must be down.
     flown.control.revoked = frozenset()
     for _ in range(60):
         flown.tick()
@@ -661,6 +660,36 @@ def test_who_fell_silent_in_flight_may_come_down_where_it_was(flown: Flown) -> N
     flown.peers()
     flown.tick()
     assert flown.silent() == ()
+
+
+def test_it_lands_beside_where_who_fell_silent_may_have_come_down(flown: Flown) -> None:
+    flown.take_off()
+    x_m, y_m = flown.control.assignment.robot.parameters.landing_point_m
+    flown.peers(peer(5, FlightState.MISSION, (x_m + 1.0, y_m, 14.0)))
+    flown.tick()
+    flown.peers()
+    # Long after it must be down.
+    for _ in range(1200):
+        flown.tick()
+    assert flown.silent() == ()
+    flown.say(safety_action="return")
+    flown.until(FlightState.LAND)
+    assert ReasonCode.LANDS_BESIDE in codes(flown.control.alarms)
+    assert math.dist(flown.odometry()[:2], (x_m + 1.0, y_m)) > 7.0
+
+
+def test_it_does_not_climb_past_one_that_fell_silent_above_it(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+    x_m, y_m, _ = flown.odometry()
+    flown.peers(peer(5, FlightState.HOLD, (x_m, y_m + 1.0, 4.5)))
+    flown.tick()
+    flown.peers()
+    assert flown.order("takeoff").accepted
+    flown.until(FlightState.LAND)
+    heights_m = [
+        message["height_m"] or 0.0 for topic, message in flown.records if topic == "control"
+    ]
+    assert 2.0 < max(heights_m) < 3.5
 
 
 @pytest.mark.parametrize(
@@ -687,8 +716,8 @@ def test_who_flies_and_tells_no_place_is_taken_to_be_where_it_last_was(
         flown.peers(*beacons)
         flown.tick()
         assert [robot.position_m for robot in flown.silent()] == expected
-    # At the latest it comes down after 60 s, at half a metre a second.
-    for wait_s, still in ((59.0 + 2.0 * (at_most_m or 0.0), expected), (3.0, [])):
+    # At the latest it comes down after a minute, at half a metre a second.
+    for wait_s, still in ((65.0 + 2.0 * (at_most_m or 0.0), expected), (3.0, [])):
         for _ in range(round(10.0 * wait_s)):
             flown.tick()
         assert [robot.position_m for robot in flown.silent()] == still

@@ -110,6 +110,10 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
         lambda patch: patch.setattr(safety, "_PASSING_M_S", math.inf),
         ("comes_down_above",),
     ),
+    "nobody remembers who fell silent": (
+        lambda patch: patch.setattr(safety, "highest_still_m", lambda *_: -math.inf),
+        ("falls_silent",),
+    ),
     "no fence": (
         lambda patch: patch.setattr(
             guidance, "keep_inside", lambda *given: (given[3], given[-1])

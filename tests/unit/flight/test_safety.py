@@ -16,7 +16,6 @@ from edge.flight.safety import (
     Closest,
     MotionLimits,
     SeparationLimits,
-    SilenceLimits,
     approach_speed,
     brake,
     clear_height_m,
@@ -27,12 +26,13 @@ from edge.flight.safety import (
     limit_speed,
     nearest,
 )
+from edge.flight.silence import SilenceLimits
 
 SQUARE = ((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0))
 FENCE = Fence(SQUARE, buffer_m=2.0, floor_m=3.0, ceiling_m=25.0)
 LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
 FIELD_LIMITS = MotionLimits(1.25, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
-SILENCE = SilenceLimits(flies_on_s=3.0, hovers_s=60.0)
+SILENCE = SilenceLimits(max_speed_m_s=1.25, ceiling_m=34.5, flies_on_s=3.0, hovers_s=60.0)
 FIELD_SEPARATION = SeparationLimits(
     level_m=1.5, passing_m=6.5, passing_height_m=3.5, unforeseen_m=7.25, silence=SILENCE
 )
@@ -442,6 +442,29 @@ def test_who_is_piloted_at_ones_height_is_left_more_room(
     assert min(distances_m) == pytest.approx(kept_m, abs=0.1)
 
 
+@pytest.mark.parametrize("climb_m_s", [0.0, 0.3, -0.6, 1.0])
+def test_who_is_piloted_is_left_as_much_room_when_it_climbs_or_comes_down(climb_m_s: float) -> None:
+    still = Vehicle(AT_REST, FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2)
+    other = neighbour(2, 7.0, 0.0, 0.0, velocity_m_s=(0.0, 0.0, climb_m_s), is_piloted=True)
+    assert -0.5 < passing(still, np.array([0.2, 0.0, 0.0]), other)[0] < 0.0
+
+
+@pytest.mark.parametrize(
+    ("near", "silent"),
+    [
+        (neighbour(3, -1.0, 0.0, 3.0, velocity_m_s=(0.0, 0.0, -0.7)), ()),
+        (None, (neighbour(3, -1.0, 0.0, 3.0, age_s=5.0),)),
+    ],
+)
+def test_who_is_near_is_left_towards_one_that_is_piloted_further_off(
+    near: Neighbour | None, silent: tuple[Neighbour, ...]
+) -> None:
+    still = Vehicle(AT_REST, FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2)
+    piloted = neighbour(2, 6.0, 0.0, 0.0, is_piloted=True)
+    others = [piloted] if near is None else [piloted, near]
+    assert passing(still, AT_REST, *others, silent=silent)[0] > 0.05
+
+
 def test_who_is_piloted_far_above_brakes_nobody() -> None:
     still = Vehicle(AT_REST, FIELD_LIMITS.lag_s, FIELD_LIMITS.max_acceleration_m_s2)
     above = neighbour(2, 1.0, 0.0, 4.5, is_piloted=True)
@@ -596,7 +619,7 @@ def test_rubbish_in_gives_a_finite_command(a: F64, b: F64, c: F64, d: float) -> 
         neighbour(1, *AT_REST, age_s=d),
         neighbour(1, *a, velocity_m_s=tuple(b), age_s=0.1),
     ):
-        command = brake(a, b, c, [other], (), LEVEL_2, LIMITS, FENCE)
+        command = brake(a, b, c, [other], [other], LEVEL_2, LIMITS, FENCE)
         closest = nearest((0.0, 0.0, 0.0), [other])
         assert np.isfinite(command).all()
         assert usable or not command.any()

@@ -1,0 +1,71 @@
+"""Who fell silent in flight, and where it may be by now. Mission frame, m and s; pure.
+
+Nobody knows whether it flies on, hovers or comes down: its program may have died, its radio, or its
+position.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from edge.core import F64
+from edge.core.mailbox import Neighbour
+from edge.messages.beacon import Beacon
+from edge.messages.mission import FlightState
+
+# Slower than any landing of PX4's, whose last metres take 0.7 m/s.
+_COMES_DOWN_M_S = 0.5
+_CLIMBS = (FlightState.TAKEOFF, FlightState.RETURN)
+
+
+class SilenceLimits(NamedTuple):
+    """What a robot that fell silent in flight may do, as long as nobody else flies it.
+
+    It is no faster than `max_speed_m_s` and no higher than `ceiling_m`, whatever it told. It flies
+    on for at most `flies_on_s`, and comes down at any time, but after at most `hovers_s`.
+    """
+
+    max_speed_m_s: float
+    ceiling_m: float
+    flies_on_s: float
+    hovers_s: float
+
+
+def last_word(beacon: Beacon, limits: SilenceLimits) -> Neighbour | None:
+    """Where it flies, at its own height if it is to climb there; None if it tells no place."""
+    if not beacon.armed or beacon.position_m is None or beacon.velocity_m_s is None:
+        return None
+    x_m, y_m, height_m = beacon.position_m
+    if beacon.state in _CLIMBS:
+        height_m = max(height_m, beacon.slot_height_m)
+    vx_m_s, vy_m_s, _ = beacon.velocity_m_s
+    share = min(1.0, limits.max_speed_m_s / max(math.hypot(vx_m_s, vy_m_s), 1e-9))
+    return Neighbour(
+        beacon.robot_id,
+        (x_m, y_m, min(height_m, limits.ceiling_m)),
+        (share * vx_m_s, share * vy_m_s, 0.0),
+        0.0,
+    )
+
+
+def highest_still_m(silent: Neighbour, limits: SilenceLimits) -> float:
+    """How high it may still be; 0 or less: it is down."""
+    comes_down_s = max(silent.age_s - limits.hovers_s, 0.0)
+    return silent.position_m[2] - _COMES_DOWN_M_S * comes_down_s
+
+
+def way_m(silent: Neighbour, limits: SilenceLimits) -> tuple[F64, F64]:
+    """The first and the last place, (2,), where it may have stopped, if it flew straight on."""
+    last_heard_m = np.array(silent.position_m[:2])
+    on_s = min(silent.age_s, limits.flies_on_s)
+    return last_heard_m, last_heard_m + np.array(silent.velocity_m_s[:2]) * on_s
+
+
+def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
+    """Of all those places, and those between them, the one that is nearest to a place, (2,)."""
+    first_m, last_m = way_m(silent, limits)
+    along_m = last_m - first_m
+    square = float(along_m @ along_m)
+    share = float((place_m - first_m) @ along_m) / square if square > 0.0 else 0.0
+    return first_m + along_m * min(max(share, 0.0), 1.0)
