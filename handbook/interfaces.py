@@ -4,11 +4,12 @@ import ast
 import dataclasses
 import inspect
 import textwrap
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
 from edge.core import ports, vehicle
-from edge.core.perception import PerceptionParameters
+from edge.core.perception import PerceptionParameters, window_corner
 from edge.messages import topics
 from edge.policy import bundle, family
 from handbook.markdown import code
@@ -20,19 +21,22 @@ _ROOT = Path(__file__).resolve().parent.parent
 # What docs/extending.md speaks of, by the kind of package that needs it.
 _INTERFACES = {
     "A sensor": (
-        ports.SensorDriver, ports.SensorSetting, ports.Sensor, ports.Camera, PerceptionParameters,
+        ports.SensorDriver, ports.SensorSetting, ports.Sensor, ports.Camera, ports.Look,
+        PerceptionParameters, window_corner,
     ),
     "A policy": (
         family.PolicyFamily, family.Policy, family.Agent, family.Observation, family.Perceived,
-        family.PolicyStep, family.GoldenCheck, bundle.Manifest, bundle.make_bundle,
-        bundle.write_bundle,
+        family.PolicyStep, family.GoldenCheck, bundle.Manifest, bundle.Training,
+        bundle.BundleError, bundle.make_bundle, bundle.write_bundle,
     ),
     "A network that `lpac train` trains": (
         learnable.LearnableFamily, learnable.Learnable, learnable.TrainableModule,
     ),
     "A vehicle": (
         ports.VehicleDriver, ports.VehicleSetting, ports.OpenVehicle, ports.Vehicle,
-        ports.VehicleSetup, ports.Watchdog, vehicle.VehicleState,
+        ports.VehicleSetup, ports.Watchdog, vehicle.VehicleState, vehicle.Velocity,
+        vehicle.Position, vehicle.Action, vehicle.ActionResult, vehicle.Mode, vehicle.Gps,
+        vehicle.EstimatorStatus, vehicle.GlobalOrigin,
     ),
     "A radio": (topics.LinkDriver, topics.LinkSetting, topics.Link, topics.Topic),
 }  # fmt: skip
@@ -96,7 +100,9 @@ def _methods(cls: type) -> list[tuple[str, Any]]:
 
 
 def _class(cls: type) -> str:
-    """Its fields, or how it is made; nothing for a protocol."""
+    """Its fields or values, or how it is made; nothing for a protocol."""
+    if issubclass(cls, Enum):
+        return "```python\n" + "\n".join(f"{it.name} = {it.value!r}" for it in cls) + "\n```"
     definition = _definition(cls)
     assert isinstance(definition, ast.ClassDef)
     fields = [ast.unparse(line) for line in definition.body if isinstance(line, ast.AnnAssign)]

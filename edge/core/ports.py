@@ -83,7 +83,14 @@ class SensorDriver(Protocol):
     """A type of sensor. What it opens is closed when the robot's program ends."""
 
     def __call__(self, setting: SensorSetting) -> AbstractContextManager[SensorOver]:
-        """Raises ValueError or OSError, one line, for a sensor that cannot be used."""
+        """What it opens is a `SensorOver`: a callable that makes the sensor.
+
+        It is called with a world file's text and what to call that file in a ValueError for one
+        that cannot be used. A sensor that looks at the real world needs neither. It is told where
+        the robot is, and nothing of its heading, its speed or which robot it is.
+
+        Raises ValueError or OSError, one line, for a sensor that cannot be used.
+        """
 
 
 class Odometry(NamedTuple):
@@ -110,7 +117,7 @@ class Vehicle(Protocol):
         """The newest of everything. Called from any thread."""
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
-        """Send it once, and return what was really sent; None if nothing was.
+        """Send it, a `Velocity` or a `Position`, once; what was really sent, None if nothing was.
 
         Nothing sends it again: when the calls stop, the autopilot's own failsafe sees the silence.
         Called from the control thread alone.
@@ -130,7 +137,11 @@ class VehicleSetup(Protocol):
     """
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
-        """PX4's parameters; None for one that it does not have."""
+        """PX4's parameters, of which `lpac robot check` says what they must be.
+
+        None for one that PX4 does not have, which is refused: a vehicle that is no PX4 answers 0 at
+        first, keeps what is set, and has to do what the parameters promise.
+        """
 
     def set_parameter(self, name: str, value: int | float) -> None:
         """Set one."""

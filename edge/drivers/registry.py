@@ -11,14 +11,17 @@ The groups are `lpac_edge.policies` (`edge.policy.family.PolicyFamily`), `lpac_e
 `lpac_edge.learnable` (`lpac.train.family.LearnableFamily`).
 """
 
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from edge.core.ports import (
+    Camera,
     OpenVehicle,
+    Sensor,
     SensorDriver,
     SensorOver,
     SensorSetting,
@@ -33,6 +36,8 @@ from edge.policy.family import Policy, PolicyFamily, VerifiedPolicy, verified
 _POLICIES, _SENSORS = "lpac_edge.policies", "lpac_edge.sensors"
 _VEHICLES, _LINKS = "lpac_edge.vehicles", "lpac_edge.links"
 _LEARNABLE = "lpac_edge.learnable"
+_ID_BYTES = 32
+_T = TypeVar("_T")
 # What every installation has, and no package can replace.
 _BUILT_IN = {
     (entry.group, entry.name): entry
@@ -48,8 +53,16 @@ _BUILT_IN = {
 
 def load_policy(bundle: Bundle) -> Policy:
     """The bundle's policy. Raises ConfigError for an unknown family; BundleError."""
-    family: PolicyFamily = _load(_POLICIES, bundle.manifest.family, "policy: family")
-    return family(bundle)
+    key, name = "policy: family", bundle.manifest.family
+    family: PolicyFamily = _load(_POLICIES, name, key)
+    with _as_one_line(_POLICIES, name, key):
+        policy = family(bundle)
+        _require(policy, "a policy", "agent", "verify")
+        if not (isinstance(policy.bundle_id, bytes) and len(policy.bundle_id) == _ID_BYTES):
+            raise TypeError(f"bundle_id = {policy.bundle_id!r}: must be {_ID_BYTES} bytes")
+        if not (isinstance(policy.message_size, int) and policy.message_size >= 0):
+            raise TypeError(f"message_size = {policy.message_size!r}: must be 0 or more")
+    return policy
 
 
 def load_verified_policy(path: Path) -> VerifiedPolicy:
@@ -57,7 +70,10 @@ def load_verified_policy(path: Path) -> VerifiedPolicy:
     bundle = load_bundle(path)
     if bundle.manifest.perception is None:
         raise BundleError(f"{path}: the bundle has no perception: it cannot fly")
-    return verified(load_policy(bundle))
+    policy = load_policy(bundle)
+    with _as_one_line(_POLICIES, bundle.manifest.family, "policy: family"):
+        _require(policy.agent(), "an agent", "observe", "step", "reset")
+        return verified(policy)
 
 
 def load_learnable(family: str) -> Any:
@@ -75,19 +91,91 @@ def open_sensor(
     setting = SensorSetting(
         manifest.perception, training.idf_truncation, training.idf_norm, options
     )
-    return driver(setting)
+    return _opened(_SENSORS, type_, "sensor: type", partial(driver, setting), _sensor_over)
 
 
 def open_vehicle(type_: str, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
     """What [autopilot] says. Raises ConfigError for an unknown type."""
     driver: VehicleDriver = _load(_VEHICLES, type_, "autopilot: type")
-    return driver(setting)
+    return _opened(_VEHICLES, type_, "autopilot: type", partial(driver, setting), _vehicle)
 
 
 def open_link(type_: str, setting: LinkSetting) -> AbstractContextManager[Link]:
     """What [link] says. Raises ConfigError for an unknown type."""
     driver: LinkDriver = _load(_LINKS, type_, "link: type")
-    return driver(setting)
+    return _opened(_LINKS, type_, "link: type", partial(driver, setting), _link)
+
+
+def _sensor_over(opened: SensorOver) -> SensorOver:
+    if not callable(opened):
+        raise TypeError(
+            "what it opens must be a SensorOver, which makes a sensor of a world's text"
+        )
+
+    def over(text: str, source: str) -> Sensor | Camera:
+        sensor = opened(text, source)
+        if not isinstance(sensor, Camera):
+            try:
+                _require(sensor, "a sensor", "view")
+            except TypeError as error:
+                raise ConfigError(f"sensor: {error}, or look, as a camera") from None
+        return sensor
+
+    return over
+
+
+def _vehicle(opened: OpenVehicle) -> OpenVehicle:
+    if not isinstance(opened, OpenVehicle):
+        raise TypeError(f"what it opens must be an OpenVehicle, not a {type(opened).__name__}")
+    _require(opened.vehicle, "a vehicle", "state", "send", "command")
+    _require(opened.setup, "a vehicle's setup", "read_parameters", "set_parameter", "upload_fence")
+    return opened
+
+
+def _link(opened: Link) -> Link:
+    _require(opened, "a link", "publish", "is_claimed", "peers", "refused")
+    return opened
+
+
+def _opened(
+    group: str,
+    name: str,
+    key: str,
+    driver: Callable[[], AbstractContextManager[_T]],
+    checked: Callable[[_T], _T],
+) -> AbstractContextManager[_T]:
+    with _as_one_line(group, name, key):
+        context = driver()
+
+    @contextmanager
+    def entered() -> Iterator[_T]:
+        with ExitStack() as stack:
+            with _as_one_line(group, name, key):
+                opened = checked(stack.enter_context(context))
+            yield opened
+
+    return entered()
+
+
+@contextmanager
+def _as_one_line(group: str, name: str, key: str) -> Iterator[None]:
+    """Whatever a package does wrong reaches a person as one line that names it."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except OSError as error:
+        if (group, name) in _BUILT_IN:
+            raise
+        raise OSError(f"{key} = {name!r}: {error}") from error
+    except Exception as error:
+        raise ConfigError(f"{key} = {name!r}: {type(error).__name__}: {error}") from error
+
+
+def _require(thing: object, what: str, *methods: str) -> None:
+    missing = [name for name in methods if not callable(getattr(thing, name, None))]
+    if missing:
+        raise TypeError(f"{what} must have {', '.join(methods)}: has no {', '.join(missing)}")
 
 
 def _load(group: str, name: str, key: str) -> Any:
@@ -99,8 +187,8 @@ def _load(group: str, name: str, key: str) -> Any:
             built_in = {known for its, known in _BUILT_IN if its == group}
             known = ", ".join(repr(each) for each in sorted(built_in | found.names))
             raise ConfigError(
-                f"{key} = {name!r}: is not installed here (entry points {group!r}); known are "
-                f"{known}"
+                f"{key} = {name!r}: is not installed here (entry points {group!r}): install the "
+                f"package that has it; known are {known}"
             )
         entry = found[name]
     try:

@@ -32,6 +32,7 @@ class CheckCode(_Code):
     GROUND_NOT_HEARD = "ground_not_heard"
     GROUND_SILENT = "ground_silent"
     CARD_NOT_GOOD = "card_not_good"
+    NO_FRESH_ANSWER = "no_fresh_answer"
     # The vehicle.
     AUTOPILOT_NOT_CONNECTED = "autopilot_not_connected"
     OTHER_AUTOPILOT = "other_autopilot"

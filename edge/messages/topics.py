@@ -121,9 +121,11 @@ class Group(NamedTuple):
 class LinkSetting(NamedTuple):
     """What robot.toml says of the radio: see `edge.robot.config.LinkConfig`.
 
-    With `robot_id` None it only listens. `subscriptions` maps topics to callbacks. With `tls` only
-    members of the fleet are let in; without, whoever reaches it. With `group` robots tell each
-    other there what they have to say.
+    With `robot_id` None it only listens. `subscriptions` maps topics to callbacks, which are called
+    from any thread with the key below `lpac/<fleet>/`, such as robot/3/message, and the data; they
+    only store. What is larger or more often than its topic allows is for the link to drop
+    (`edge.messages.admission`). With `tls` only members of the fleet are let in; without, whoever
+    reaches it. With `group` robots tell each other there what they have to say.
     """
 
     fleet: str

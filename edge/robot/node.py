@@ -9,6 +9,7 @@ import itertools
 import math
 from collections.abc import Mapping
 
+from edge.core import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
 from edge.core.vehicle import Action
 from edge.flight.state import flown_s
@@ -141,6 +142,7 @@ class RobotNode:
         self._message_at_s = -math.inf
         # How many the policy had, and their bytes.
         self._sent = (0, 0)
+        self._told_problems: set[str] = set()
         self._explored_due_s = -math.inf
 
     # What comes
@@ -211,6 +213,7 @@ class RobotNode:
         """Look at the world; the rate of perception."""
         now_s = self._ports.clock.monotonic_s()
         tick = self._pac.perceive(now_s)
+        self._tell_once(self._pac.problem)
         if now_s >= self._explored_due_s:
             self._explored_due_s = now_s + _EXPLORED_PERIOD_S
             self._publish(EXPLORED, explored_to_bytes(self._pac.explored()))
@@ -224,11 +227,17 @@ class RobotNode:
     def policy_step(self) -> None:
         """Hear the neighbours, decide where to fly, tell the neighbours; the policy's rate."""
         tick = self._pac.infer(self._ports.clock.monotonic_s())
+        self._tell_once(self._pac.problem)
         if tick is None:
             return
         self._publish_message(tick.message)
         record = {field.name: getattr(tick, field.name) for field in dataclasses.fields(tick)}
         self._ports.recorder.record("policy", self._ports.clock.unix_s(), record)
+
+    def _tell_once(self, problem: str) -> None:
+        if problem and problem not in self._told_problems:
+            self._told_problems.add(problem)
+            log.warning("what sensor or policy gives is not used", why=problem)
 
     def _publish_message(self, of_policy: bytes = b"") -> None:
         """To the neighbours: a beacon, and behind it what the policy says, if it does."""
@@ -295,6 +304,8 @@ class RobotNode:
             card_problem=self._guard.card_problem(unix_now_s),
             ground_age_s=control.ground_age_s(now_s),
             time_uncertainty_s=None if time is None else time.uncertainty_s,
+            answer_age_s=self._pac.action_age_s(now_s),
+            answer_problem=self._pac.problem,
         )
 
     def _checks_are_due(self, now_s: float) -> bool:

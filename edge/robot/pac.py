@@ -153,6 +153,7 @@ class Pac:
         self._action: _Timed | None = None
         self.clock = FleetClock()
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
+        self._sensor_problem = self._policy_problem = ""
         # Replaced whole when the ground sets another origin or another world, which it does while
         # nobody flies.
         self.frame_id = 0
@@ -253,7 +254,11 @@ class Pac:
             self._reset_agent = False
             self._agent.reset()
         velocity, payload = self._agent.step(features.value, payloads, degree)
-        if not (_is_finite(velocity, 2) and _is_finite(payload, self._policy.message_size)):
+        size = self._policy.message_size
+        self._policy_problem = _problem_of("velocity", velocity, (2,)) or _problem_of(
+            "payload", payload, (size,)
+        )
+        if self._policy_problem:
             return None
         self._action = _Timed(velocity, now_s)
         self._sequence += 1
@@ -292,6 +297,18 @@ class Pac:
         )
         return limit_speed(velocity_m_s, self._parameters.max_speed_m_s)
 
+    @property
+    def problem(self) -> str:
+        """What is wrong with what the sensor, or the policy, gave last; "" if nothing is."""
+        if self._sensor_problem:
+            return f"sensor: {self._sensor_problem}"
+        return f"policy: {self._policy_problem}" if self._policy_problem else ""
+
+    def action_age_s(self, now_s: float) -> float | None:
+        """The age of the policy's newest answer, s; None if there is none."""
+        action = self._action
+        return None if action is None else now_s - action.time_s
+
     def feature_age_s(self, now_s: float) -> float | None:
         """The age of the newest features, s; None if there are none."""
         features = self._features
@@ -306,25 +323,22 @@ class Pac:
 
     def _look(self, own: F64, height_m: float) -> tuple[F32, Bools | None] | None:
         """What the sensor shows, and where it saw, if that is not everywhere; None without that."""
-        seen = None
+        shown: tuple[F32, Bools | None] | None
         if isinstance(self.sensor, Camera):
-            height = height_m * self._parameters.scale.env_scale
-            look = self.sensor.look(own, height)
-            if look is None:
-                return None
-            view, seen = look
-            if seen.shape != view.shape or seen.dtype != np.bool_:
-                return None
+            shown = self.sensor.look(own, height_m * self._parameters.scale.env_scale)
         else:
-            shown = self.sensor.view(own)
-            if shown is None:
-                return None
-            view = shown
-        return (view, seen) if self._is_valid(view) else None
-
-    def _is_valid(self, view: F32) -> bool:
-        """Whether it may go into the map: one cell that is not finite would stay in it."""
-        return view.shape == (self._perception.sensor_size,) * 2 and bool(np.isfinite(view).all())
+            view = self.sensor.view(own)
+            shown = None if view is None else (view, None)
+        if shown is None:
+            self._sensor_problem = "it shows nothing"
+            return None
+        view, seen = shown
+        # One cell that is not finite would stay in the map.
+        problem = _problem_of("view", view, (self._perception.sensor_size,) * 2)
+        if seen is not None and (seen.shape != view.shape or seen.dtype != np.bool_):
+            problem = problem or f"seen is {seen.dtype} {seen.shape}: must be bool, as the view"
+        self._sensor_problem = problem
+        return None if problem else shown
 
     def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
         """(n,): which of the positions are within communication range of `own`, in model units."""
@@ -341,6 +355,8 @@ class Pac:
         return now_s - timed.time_s > self._parameters.max_input_age_s
 
 
-def _is_finite(values: F32, size: int) -> bool:
-    """Whether it is (size,), all of it finite."""
-    return values.shape == (size,) and bool(np.isfinite(values).all())
+def _problem_of(name: str, values: F32, shape: tuple[int, ...]) -> str:
+    """Why it is not used; "" if it has that shape and is finite."""
+    if values.shape != shape:
+        return f"{name} has shape {values.shape}: must be {shape}"
+    return "" if np.isfinite(values).all() else f"{name} has values that are not finite"

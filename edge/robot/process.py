@@ -50,6 +50,8 @@ from edge.robot.pac import message_bytes
 
 # Of preflight checks, status, systemd's news, and writing the flight log.
 _PERIOD_S = 0.25
+# The ground tells its time to those who speak, and only a robot's own program perceives.
+_ONLY_OF_A_ROBOT = (CheckCode.TIME_NOT_KNOWN, CheckCode.NO_FRESH_ANSWER)
 # Of how the loops keep time, which is told of a whole minute.
 _LOOPS_PERIOD_S = 1.0
 # A control loop without a tick for longer hangs: the vehicle was told to hold before that.
@@ -394,8 +396,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             node.preflight_step()
             failed = node.failed_checks
             if failed is not None:
-                # The ground tells its time to those who speak.
-                failed = tuple(c for c in failed if c.code is not CheckCode.TIME_NOT_KNOWN)
+                failed = tuple(c for c in failed if c.code not in _ONLY_OF_A_ROBOT)
             if failed == () or (failed is not None and time.monotonic() > until_s):
                 readiness = node.readiness
                 version = in_words(vehicle.state().version)

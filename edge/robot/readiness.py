@@ -115,6 +115,8 @@ class Readiness:
         card_problem: CardProblem | None,
         ground_age_s: float,
         time_uncertainty_s: float | None,
+        answer_age_s: float | None,
+        answer_problem: str,
     ) -> Checks:
         """All checks, now. `ground_age_s` is infinite if the ground was never heard."""
         config = self._config
@@ -145,6 +147,8 @@ class Readiness:
             rc=config.failsafe.rc,
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             time_uncertainty_s=time_uncertainty_s,
+            answer_age_s=answer_age_s,
+            answer_problem=answer_problem,
         )
         failed = failed_checks(inputs, config.preflight)
         if not watchdog_alive:

@@ -93,7 +93,10 @@ def verify(path: BundlePath, as_json: AsJson = False) -> None:
         typer.echo(json.dumps(report, indent=2))
     elif not failed:
         name = f"{bundle.manifest.name} {bundle.id[:12]}"
-        typer.echo(f"{name}: this machine computes the golden outputs")
+        found = "this machine computes the golden outputs"
+        if not checks:
+            found = "has no golden outputs: nothing was compared"
+        typer.echo(f"{name}: {found}")
     if failed:
         raise ValueError(
             f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of torch's golden outputs"

@@ -83,10 +83,10 @@ def replay(
     if problems:
         raise ValueError("; ".join(problems))
     if not as_json and policy_bundle is not None:
-        typer.echo(
-            f"{policy_bundle.manifest.name} {policy_bundle.id[:12]}: "
-            "computes what it computed in flight"
-        )
+        found = "computes what it computed in flight"
+        if not comparisons:
+            found = "is not run again: only policies of the family lpac are"
+        typer.echo(f"{policy_bundle.manifest.name} {policy_bundle.id[:12]}: {found}")
     if not as_json and flown:
         passed = sum(flight.passed_over for flight in flights.values())
         but = f", but for {passed:,} ticks that were passed over" if passed else ""
@@ -117,6 +117,9 @@ def _policy(
                 f"{path}: flew with bundle {flown.bundle_id[:12]}, "
                 f"and {bundle_path} is {bundle.id[:12]}"
             )
+    if bundle.manifest.family != "lpac":
+        # What such an agent remembers from step to step is not in the log.
+        return bundle, ()
     messages = chain.from_iterable(read(path, "perception", "policy") for path in metadata)
     return bundle, run_again(LpacPolicy(bundle), messages)
 

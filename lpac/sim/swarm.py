@@ -206,8 +206,12 @@ class ClockedPac(Pac):
         """See `Pac.infer`."""
         self._tell_time(now_s)
         tick = super().infer(now_s)
+        if self.problem:
+            raise ValueError(f"robot {self._robot_id}: {self.problem}")
         for payload in tick.payloads if tick else ():
-            self.largest_payload = max(self.largest_payload, float(np.abs(payload).max()))
+            self.largest_payload = max(
+                self.largest_payload, float(np.abs(payload).max(initial=0.0))
+            )
         return tick
 
     def receive(self, data: bytes, now_s: float, *, sender: int | None = None) -> Rejection | None:

@@ -205,6 +205,11 @@ class SimulatedRobots:
         such a folder of an earlier flight, whose policies' steps are then taken. Raises what
         `Layout` does, and RecordingError.
         """
+        for table in ("autopilot", "link"):
+            if table in (settings or {}):
+                raise ValueError(
+                    f"settings: {table}: simulated robots have their own: leave it out"
+                )
         self.layout = layout = Layout(scenario, bundle)
         self.folder = folder
         self.fleet_toml = folder / "fleet.toml"

@@ -52,7 +52,9 @@ def test_what_the_radio_loses_is_counted_as_lost_whatever_comes_twice_or_overtak
     found = listened(field, 120.0)
     share = sum(pair.received for pair in found) / sum(pair.sent for pair in found)
     assert share == pytest.approx(0.7, abs=0.04)
-    assert all(pair.sent == pytest.approx(2.0 * 118.0, rel=0.05) for pair in found)
+    # Two a second, from the first status that tells of them to the last: one in 2 s does, and the
+    # radio loses those, too.
+    assert all(2.0 * 110.0 < pair.sent <= 2.0 * 120.0 for pair in found)
 
 
 def test_who_is_cut_off_is_heard_by_nobody() -> None:

@@ -86,6 +86,8 @@ READY = PreflightInputs(
     rc="none",
     ground_age_s=0.4,
     time_uncertainty_s=0.05,
+    answer_age_s=0.3,
+    answer_problem="",
 )
 
 # What is wrong with the inputs, and the one line that says so.
@@ -99,6 +101,12 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
     ({"ground_age_s": 3.1}, _C.GROUND_SILENT, "ground was last heard 3.1 s ago: check the radio"),
     ({"time_uncertainty_s": None}, _C.TIME_NOT_KNOWN, "the ground's time is not known yet: wait"),
     ({"time_uncertainty_s": 0.3}, _C.TIME_NOT_KNOWN, "the ground's time is known to 0.3 s only"),
+    ({"answer_age_s": None}, _C.NO_FRESH_ANSWER, "the policy has no fresh answer: wait; if this"),
+    (
+        {"answer_age_s": 2.1, "answer_problem": "sensor: it shows nothing"},
+        _C.NO_FRESH_ANSWER,
+        "the policy has no fresh answer: sensor: it shows nothing",
+    ),
     (
         {"system_id": 9},
         _C.SYSTEM_ID_WRONG,
@@ -280,7 +288,7 @@ def test_what_settles_under_open_sky_is_marked() -> None:
     assert settling == {
         _C.FAILSAFE_NOT_READ, _C.FENCE_NOT_UPLOADED, _C.POSITION_NOT_KNOWN, _C.POSITION_NOT_GOOD,
         _C.ESTIMATOR_ORIGIN_NOT_KNOWN, _C.HEADING_NOT_KNOWN, _C.GPS_NO_FIX,
-        _C.GPS_FEW_SATELLITES, _C.GPS_IMPRECISE, _C.TIME_NOT_KNOWN,
+        _C.GPS_FEW_SATELLITES, _C.GPS_IMPRECISE, _C.TIME_NOT_KNOWN, _C.NO_FRESH_ANSWER,
     }  # fmt: skip
 
 

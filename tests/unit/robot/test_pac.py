@@ -112,18 +112,27 @@ def test_a_position_that_is_not_a_number_is_none(shipped_policy: LpacPolicy) -> 
 
 
 @pytest.mark.parametrize(
-    "view",
-    [np.full((64, 64), np.nan, np.float32), np.zeros((32, 32), np.float32)],
-    ids=["not finite", "wrong size"],
+    ("view", "problem"),
+    [
+        (np.full((64, 64), np.nan, np.float32), "sensor: view has values that are not finite"),
+        (np.zeros((32, 32), np.float32), "sensor: view has shape (32, 32): must be (64, 64)"),
+        (None, "sensor: it shows nothing"),
+    ],
+    ids=["not finite", "wrong size", "none"],
 )
-def test_a_bad_view_does_not_enter_the_map(shipped_policy: LpacPolicy, view: F32) -> None:
+def test_a_bad_view_does_not_enter_the_map(
+    shipped_policy: LpacPolicy, view: F32 | None, problem: str
+) -> None:
     world = World(seen=view)
     robot = make_robot(shipped_policy, world)
     robot.perceive(0.0)
     assert robot.infer(0.0) is None
+    assert (robot.problem, robot.action_age_s(0.1)) == (problem, None)
     world.seen = np.zeros((64, 64), np.float32)
     robot.perceive(0.2)
     assert robot.infer(0.2) is not None
+    assert robot.problem == ""
+    assert robot.action_age_s(0.3) == pytest.approx(0.1)
 
 
 def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
