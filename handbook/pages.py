@@ -4,6 +4,7 @@ Pages are written to be read in the repository: their links are paths there. On 
 the root, README.md the front page, and a file of code that a page links to is a page of its own.
 """
 
+import json
 import posixpath
 import re
 import shutil
@@ -31,7 +32,7 @@ _CODE_BLOCK = re.compile(r"^(`{3,}|~{3,}).*?^\1", re.S | re.M)
 _LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\]]*\])*\])\(([^()\s]+)\)")
 _STYLE = "site.css"
 # What a browser shows or saves as it is.
-_COPIED = (".png", ".svg", ".ipynb", ".html")
+_COPIED = (".png", ".svg", ".html")
 # Code is read after a link, and would bury the pages in what a search finds.
 _UNSEARCHED = "---\nsearch:\n  exclude: true\n---\n\n"
 
@@ -109,7 +110,17 @@ def page_text(path: str) -> str:
     text = (ROOT / path).read_text()
     if path.endswith(".md"):
         return text
+    if path.endswith(".ipynb"):
+        return _notebook(text)
     return _UNSEARCHED + f"# {path}\n\n````text\n{text}````\n"
+
+
+def _notebook(text: str) -> str:
+    """Its words and its code; what comes out is there once somebody has run it."""
+    cells = ((cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"])
+    return "\n\n".join(
+        source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells
+    )
 
 
 def _with_links_of_the_site(text: str, page: str) -> str:

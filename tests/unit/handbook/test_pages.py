@@ -133,3 +133,9 @@ def test_interfaces_tell_calls_as_the_source_has_them() -> None:
         r"`([A-Z]\w+(?:Driver|Family))`", (ROOT / "docs/extending.md").read_text()
     ):
         assert f"### {name}\n" in text, name
+
+
+def test_a_notebook_is_a_page_of_its_cells() -> None:
+    text = pages.page_text("examples/first_flight.ipynb")
+    assert text.startswith("# A first flight\n")
+    assert "```python\nimport matplotlib.pyplot as plt\n" in text
