@@ -35,6 +35,7 @@ class Robot:
 
     def __init__(self, group: Group, robot_id: int, at: str | None = None) -> None:
         self.heard: dict[str, bytes] = {}
+        self.all_heard: list[bytes] = []
         signer = Signer(robot_id.to_bytes(32, "little"))
         name = f"r{robot_id}"
         card = Card("test", Role.ROBOT, name, signer.public_key, 1, 2e9, robot_id)
@@ -56,6 +57,7 @@ class Robot:
 
     def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
         self.heard[speaker.name] = data
+        self.all_heard.append(data)
 
 
 def eventually_hear(sender: Robot, data: bytes, *receivers: Robot) -> None:
@@ -192,6 +194,22 @@ def test_who_has_the_former_key_is_heard_and_hears_nothing_new(group: Group) -> 
         eventually_hear(third, b"still here", first, second)
         eventually_hear(first, b"with the new key", second)
         assert not third.heard and third.radio.refused() > 0
+
+
+def test_what_many_say_is_heard_as_well_when_it_is_taken_together(
+    group: Group, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few say it here, and count as many."""
+    monkeypatch.setattr(multicast, "_MANY_HZ", 1.0)
+    monkeypatch.setattr(multicast, "_COUNTS_FOR_S", 0.1)
+    said = [b"%d" % i for i in range(60)]
+    with Robot(group, 1) as first, Robot(group, 2) as second:
+        eventually_hear(first, b"here", second)
+        for data in said:
+            first.link.publish(MESSAGE, data)
+            time.sleep(0.01)
+        eventually(lambda: second.heard["r1"] == said[-1])
+    assert second.all_heard[-len(said) :] == said
 
 
 def test_without_a_network_it_opens_and_waits_for_one(group: Group) -> None:
