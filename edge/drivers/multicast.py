@@ -153,10 +153,11 @@ class MulticastLink:
                 self._closed.wait(_TOGETHER_S)
             with suppress(TimeoutError):
                 fragment = open_datagram(receiver.recv(2048), self._keys)
-                came += 1
                 if fragment is None:
                     self._strangers += 1
-                elif fragment.sender != self._robot_id or not self._is_own(fragment.number):
+                    continue
+                came += 1
+                if fragment.sender != self._robot_id or not self._is_own(fragment.number):
                     heard_at_s = time.monotonic()
                     self._take(fragment, heard_at_s)
             counted_s = time.monotonic() - counts_since_s

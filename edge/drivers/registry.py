@@ -91,7 +91,9 @@ def open_sensor(
     setting = SensorSetting(
         manifest.perception, training.idf_truncation, training.idf_norm, options
     )
-    return _opened(_SENSORS, type_, "sensor: type", partial(driver, setting), _sensor_over)
+    return _opened(
+        _SENSORS, type_, "sensor: type", partial(driver, setting), partial(_sensor_over, type_)
+    )
 
 
 def open_vehicle(type_: str, setting: VehicleSetting) -> AbstractContextManager[OpenVehicle]:
@@ -106,19 +108,17 @@ def open_link(type_: str, setting: LinkSetting) -> AbstractContextManager[Link]:
     return _opened(_LINKS, type_, "link: type", partial(driver, setting), _link)
 
 
-def _sensor_over(opened: SensorOver) -> SensorOver:
+def _sensor_over(type_: str, opened: SensorOver) -> SensorOver:
     if not callable(opened):
         raise TypeError(
             "what it opens must be a SensorOver, which makes a sensor of a world's text"
         )
 
     def over(text: str, source: str) -> Sensor | Camera:
-        sensor = opened(text, source)
-        if not isinstance(sensor, Camera):
-            try:
-                _require(sensor, "a sensor", "view")
-            except TypeError as error:
-                raise ConfigError(f"sensor: {error}, or look, as a camera") from None
+        with _as_one_line(_SENSORS, type_, "sensor: type"):
+            sensor = opened(text, source)
+            if not isinstance(sensor, Camera):
+                _require(sensor, "a sensor without look", "view")
         return sensor
 
     return over

@@ -13,15 +13,16 @@ from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
 from edge.flight.margins import ErrorBudget, places_apart
-from edge.flight.silence import SilenceLimits, nearest_on_way_m, way_m
+from edge.flight.silence import SilenceLimits, stops_m
 from edge.messages.beacon import Beacon
+from edge.messages.mission import FlightState
 
 Point = tuple[float, float]
 
 # Who stands that near to its own landing point has landed on it: errors walk, and gusts blow.
 _ON_ITS_OWN_M = 2.0
 # A place that was chosen is kept though who stands there seems to move a little.
-_KEPT_M = 2.0
+_KEPT_M, _KEPT_SHARE = 2.0, 0.25
 _GRID_M = 2.0
 
 
@@ -39,26 +40,26 @@ class StandingRobot(NamedTuple):
 
 
 def standing_robots(beacons: Iterable[Beacon]) -> list[StandingRobot]:
-    """Those who say that they are on the ground, and where; all of one frame."""
+    """Those who say that they are on the ground, or come down to it, and where; of one frame."""
     return [
         StandingRobot(beacon.robot_id, beacon.position_m[:2], beacon.landing_point_m)
         for beacon in beacons
-        if beacon.armed is False and beacon.position_m is not None
+        if (beacon.armed is False or beacon.state is FlightState.LAND)
+        and beacon.position_m is not None
     ]
 
 
 def may_stand(
-    silent: Neighbour, its_landing_point_m: Point, near_m: Point, limits: SilenceLimits
+    silent: Neighbour, its_landing_point_m: Point, limits: SilenceLimits
 ) -> list[StandingRobot]:
-    """Who fell silent in flight, as if it had landed on its way: it is down some time, unheard.
+    """Who fell silent in flight, as if it had landed on its way, everywhere that may lead.
 
-    At the ends of its way, as far as that may lead, and where that is nearest to a place.
+    It is down some time, unheard.
     """
     stopped = silent._replace(age_s=max(silent.age_s, limits.flies_on_s))
-    places_m = (*way_m(stopped, limits), nearest_on_way_m(stopped, limits, np.array(near_m)))
     return [
         StandingRobot(silent.robot_id, (x_m, y_m), its_landing_point_m)
-        for x_m, y_m in (place_m.tolist() for place_m in places_m)
+        for x_m, y_m in stops_m(stopped, limits).tolist()
     ]
 
 
@@ -75,23 +76,23 @@ def place_to_land(
     landing_point_m: Point,
     before_m: Point | None,
     standing: Sequence[StandingRobot],
-    landing_points_m: Sequence[Point],
+    others_m: Sequence[Point],
     fence: Fence,
     errors: ErrorBudget,
 ) -> Point | None:
     """The nearest place inside the fence that is free, or as free as any; None: the landing point.
 
-    Free is what is as far from who stands, and from the others' `landing_points_m`, as landing
-    points must be from each other. `before_m` is what was chosen last, and is kept while it is
-    free.
+    Free is what is as far from who stands, and from `others_m`, as landing points must be from each
+    other: those are the others' landing points, and where those are who return and go first.
+    `before_m` is what was chosen last, and is kept while it is free.
     """
     if not in_the_way(landing_point_m, standing, errors):
         return None
     apart_m = places_apart(errors.position_m, errors.position_m).least_m
-    taken_m = np.array([*(each.place_m for each in standing), *landing_points_m])
+    taken_m = np.array([*(each.place_m for each in standing), *others_m])
     if before_m is not None:
         kept_m = float(np.hypot(*(taken_m - before_m).T).min())
-        if kept_m >= apart_m - _KEPT_M:
+        if kept_m >= apart_m - min(_KEPT_M, _KEPT_SHARE * apart_m):
             return before_m
     corners = np.array(fence.vertices_m)
     grid = np.stack(

@@ -17,8 +17,6 @@ from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 
 _FIX_3D = 3
-# Many periods of the policy: what is later than that is late at take-off, too.
-_MAX_ANSWER_AGE_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +61,9 @@ class PreflightInputs:
     robots that were heard lately, `not_understood` those who said what cannot be read, `unheard`
     those that the ground hears and this one does not.
     `ground_age_s` is how long ago the ground was heard, None if never; the fleet's time is known to
-    `time_uncertainty_s`, None if it is not. `answer_age_s` is that of the policy's newest answer,
-    None if there is none; `answer_problem` is what is wrong with what the sensor, or the policy,
-    gave last, "" if that is not known.
+    `time_uncertainty_s`, None if it is not. `has_answer`: the policy gave one lately.
+    `answer_problem` is what is wrong with what the sensor, or the policy, gave last, "" if that is
+    not known.
     """
 
     now_s: float
@@ -93,7 +91,7 @@ class PreflightInputs:
     rc: RemoteControl
     ground_age_s: float | None
     time_uncertainty_s: float | None
-    answer_age_s: float | None
+    has_answer: bool
     answer_problem: str
 
 
@@ -129,8 +127,7 @@ def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[Faile
         text = f"the ground's time is {known}: wait, or check the radio"
         yield FailedCheck(CheckCode.TIME_NOT_KNOWN, text, True)
     # Without a position there is nothing to look at.
-    is_fresh = inputs.answer_age_s is not None and inputs.answer_age_s <= _MAX_ANSWER_AGE_S
-    if inputs.position_m is not None and not is_fresh:
+    if inputs.position_m is not None and not inputs.has_answer:
         why = inputs.answer_problem or "wait; if this stays, this robot's log says why"
         text = f"the policy has no fresh answer: {why}"
         yield FailedCheck(CheckCode.NO_FRESH_ANSWER, text, not inputs.answer_problem)
@@ -400,7 +397,8 @@ def _in_the_way(inputs: PreflightInputs, others: Sequence[Beacon]) -> Iterator[F
         yield FailedCheck(
             CheckCode.LANDING_POINT_TAKEN,
             f"robot {other.robot_id} stands less than {least_m:.3g} m from this robot's landing "
-            "point, and not at its own: carry it there, or change the places on the ground",
+            "point, or comes down there, and not at its own: carry it there, or change the places "
+            "on the ground",
         )
 
 

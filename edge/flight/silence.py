@@ -16,7 +16,8 @@ from edge.messages.mission import FlightState
 
 # Slower than any landing of PX4's, whose last metres take 0.7 m/s.
 _COMES_DOWN_M_S = 0.5
-_CLIMBS = (FlightState.TAKEOFF, FlightState.RETURN)
+_APART_M = 2.0
+_CLIMBS = (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN)
 
 
 class SilenceLimits(NamedTuple):
@@ -55,17 +56,22 @@ def highest_still_m(silent: Neighbour, limits: SilenceLimits) -> float:
     return silent.position_m[2] - _COMES_DOWN_M_S * comes_down_s
 
 
-def way_m(silent: Neighbour, limits: SilenceLimits) -> tuple[F64, F64]:
-    """The first and the last place, (2,), where it may have stopped, if it flew straight on."""
-    last_heard_m = np.array(silent.position_m[:2])
-    on_s = min(silent.age_s, limits.flies_on_s)
-    return last_heard_m, last_heard_m + np.array(silent.velocity_m_s[:2]) * on_s
+def stops_m(silent: Neighbour, limits: SilenceLimits) -> F64:
+    """(n, 2): where it may have stopped, if it flew straight on; at most 2 m from each other."""
+    first_m, along_m = _way_m(silent, limits)
+    count = math.ceil(math.hypot(*along_m) / _APART_M) + 1
+    return first_m + np.linspace(0.0, 1.0, count)[:, None] * along_m
 
 
 def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> F64:
-    """Of all those places, and those between them, the one that is nearest to a place, (2,)."""
-    first_m, last_m = way_m(silent, limits)
-    along_m = last_m - first_m
+    """Of all places where it may have stopped, the one that is nearest to a place, (2,)."""
+    first_m, along_m = _way_m(silent, limits)
     square = float(along_m @ along_m)
     share = float((place_m - first_m) @ along_m) / square if square > 0.0 else 0.0
     return first_m + along_m * min(max(share, 0.0), 1.0)
+
+
+def _way_m(silent: Neighbour, limits: SilenceLimits) -> tuple[F64, F64]:
+    """Where it begins, and where it leads from there, (2,) each."""
+    on_s = min(silent.age_s, limits.flies_on_s)
+    return np.array(silent.position_m[:2]), np.array(silent.velocity_m_s[:2]) * on_s

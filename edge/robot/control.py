@@ -40,8 +40,10 @@ from edge.robot.navigation import Navigation
 from edge.robot.pac import Pac
 from edge.robot.readiness import Assignment, Checks
 
-# Beacons come at the policy's rate, or four times a second without it.
+# Beacons come at the policy's rate, or a little less often without it.
 _MAX_BEACON_AGE_S = 1.5
+# Beacons that a bad radio loses make nobody look for another landing point.
+_SILENT_FOR_GOOD_S = 3.0
 # Checks that are older say nothing about now.
 _MAX_CHECKS_AGE_S = 5.0
 # Longer than any drone stays in the air.
@@ -131,8 +133,10 @@ class FlightControl:
             self._take_up(ground, vehicle)
         self._navigation.look(vehicle, now_s)
         odometry = self._navigation.estimate(vehicle)
-        heard = self._neighbours(now_s)
-        silent, separation = self._silent(heard, now_s), self.assignment.robot.separation
+        # Another thread replaces them meanwhile.
+        peers = self.peers
+        heard = self._neighbours(peers, now_s)
+        silent, separation = self._silent(peers, heard, now_s), self.assignment.robot.separation
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
@@ -143,7 +147,7 @@ class FlightControl:
             # A thief's last word brakes, but keeps nobody from a mission.
             closest=self._closest(odometry, heard),
             busy_neighbours=tuple(
-                peer.beacon.robot_id for peer in self.peers if peer.beacon.state in _BUSY
+                peer.beacon.robot_id for peer in peers if peer.beacon.state in _BUSY
             ),
             ground=ground,
             ground_age_s=ground_age_s,
@@ -153,7 +157,7 @@ class FlightControl:
             order=self._inbox.order(now_s),
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
-            lands_beside_m=self._look_where_to_land(silent),
+            lands_beside_m=self._look_where_to_land(peers, silent),
             fell_silent=tuple(
                 each for each in silent if highest_still_m(each, separation.silence) > 0.0
             ),
@@ -345,7 +349,7 @@ class FlightControl:
             world=world_id,
         )
 
-    def _neighbours(self, now_s: float) -> tuple[Neighbour, ...]:
+    def _neighbours(self, peers: tuple[HeardBeacon, ...], now_s: float) -> tuple[Neighbour, ...]:
         """Whom to keep away from: also robots that are silent since their policy or sensor failed.
 
         They still tell their place in their beacons.
@@ -353,7 +357,7 @@ class FlightControl:
         heard = self._pac.mailbox.neighbours(now_s)
         known = {self.assignment.robot.robot_id, *(neighbour.robot_id for neighbour in heard)}
         told = []
-        for beacon, heard_at_s in self.peers:
+        for beacon, heard_at_s in peers:
             age_s = now_s - heard_at_s
             comparable = beacon.frame_id == self._pac.frame_id and age_s <= _MAX_BEACON_AGE_S
             if beacon.robot_id in known or not comparable:
@@ -362,9 +366,7 @@ class FlightControl:
                 told.append(
                     Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
                 )
-        piloted = {
-            peer.beacon.robot_id for peer in self.peers if peer.beacon.state is FlightState.PILOT
-        }
+        piloted = {peer.beacon.robot_id for peer in peers if peer.beacon.state is FlightState.PILOT}
         return tuple(
             neighbour._replace(is_piloted=neighbour.robot_id in piloted)
             for neighbour in (*heard, *told)
@@ -382,13 +384,15 @@ class FlightControl:
                 stay.append(Neighbour(robot_id, last.position_m, (0.0, 0.0, 0.0), 0.0))
         return tuple(stay)
 
-    def _silent(self, heard: tuple[Neighbour, ...], now_s: float) -> tuple[Neighbour, ...]:
+    def _silent(
+        self, peers: tuple[HeardBeacon, ...], heard: tuple[Neighbour, ...], now_s: float
+    ) -> tuple[Neighbour, ...]:
         """Who flew when it last told its place, and tells none now: it may come down there.
 
         Who is not listened to any more is none of these: its last word may have been a lie.
         """
         silence = self.assignment.robot.separation.silence
-        for beacon, heard_at_s in self.peers:
+        for beacon, heard_at_s in peers:
             told = last_word(beacon, silence)
             if beacon.armed is False:
                 self._last_words.pop(beacon.robot_id, None)
@@ -401,24 +405,36 @@ class FlightControl:
             if robot_id not in others
         )
 
-    def _look_where_to_land(self, silent: tuple[Neighbour, ...]) -> Point | None:
-        """`silent` stand where they may have stopped: they are down some time, unheard."""
+    def _look_where_to_land(
+        self, peers: tuple[HeardBeacon, ...], silent: tuple[Neighbour, ...]
+    ) -> Point | None:
         frame_id, robot = self._pac.frame_id, self.assignment.robot
-        for beacon, _ in self.peers:
+        for beacon, _ in peers:
             if beacon.frame_id == frame_id and beacon.robot_id != robot.robot_id:
                 self._last_beacons[beacon.robot_id] = beacon
-        others, landing_m = self._last_beacons, robot.parameters.landing_point_m
-        near_m, silence = (landing_m[0], landing_m[1]), robot.separation.silence
+        others, parameters = self._last_beacons, robot.parameters
         unheard = [
             standing
             for each in silent
-            for standing in may_stand(each, others[each.robot_id].landing_point_m, near_m, silence)
+            if each.age_s > _SILENT_FOR_GOOD_S
+            for standing in may_stand(
+                each, others[each.robot_id].landing_point_m, robot.separation.silence
+            )
         ]
+        # Of two who look for a place, the lower one is first.
+        return_first = [
+            beacon.position_m[:2]
+            for beacon in others.values()
+            if beacon.state is FlightState.RETURN
+            and beacon.position_m is not None
+            and beacon.slot_height_m < parameters.slot_height_m
+        ]
+        x_m, y_m = parameters.landing_point_m
         self._lands_beside_m = place_to_land(
-            near_m,
+            (x_m, y_m),
             self._lands_beside_m,
             [*standing_robots(others.values()), *unheard],
-            [beacon.landing_point_m for beacon in others.values()],
+            [*(beacon.landing_point_m for beacon in others.values()), *return_first],
             robot.fence,
             robot.errors,
         )

@@ -300,9 +300,11 @@ class Pac:
     @property
     def problem(self) -> str:
         """What is wrong with what the sensor, or the policy, gave last; "" if nothing is."""
-        if self._sensor_problem:
-            return f"sensor: {self._sensor_problem}"
-        return f"policy: {self._policy_problem}" if self._policy_problem else ""
+        # Each belongs to another thread.
+        of_sensor, of_policy = self._sensor_problem, self._policy_problem
+        if of_sensor:
+            return f"sensor: {of_sensor}"
+        return f"policy: {of_policy}" if of_policy else ""
 
     def action_age_s(self, now_s: float) -> float | None:
         """The age of the policy's newest answer, s; None if there is none."""

@@ -26,6 +26,8 @@ from edge.robot.config import RobotConfig
 _READ_AGAIN_S = 5.0
 _TRY_AGAIN_S = 3.0
 
+_MAX_ANSWER_AGE_S = 2.0
+
 
 class Assignment(NamedTuple):
     """What a robot flies by, as the ground sets it: where, its fence and place, and its world."""
@@ -64,6 +66,8 @@ class Readiness:
         self._setup = setup
         self._bundle_id = bundle_id
         self._bundle_problem = bundle_problem
+        # What is later than many periods of the policy is late in flight, too.
+        self._max_answer_age_s = max(_MAX_ANSWER_AGE_S, config.policy.max_input_age_s)
         self._requirements: tuple[Requirement, ...] = ()
         # What they were made for; all else that they follow from is configured.
         self._ceiling_m: float | None = None
@@ -147,7 +151,7 @@ class Readiness:
             rc=config.failsafe.rc,
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             time_uncertainty_s=time_uncertainty_s,
-            answer_age_s=answer_age_s,
+            has_answer=answer_age_s is not None and answer_age_s <= self._max_answer_age_s,
             answer_problem=answer_problem,
         )
         failed = failed_checks(inputs, config.preflight)

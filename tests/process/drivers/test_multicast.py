@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from threading import Event, Thread
 from typing import Self
 
+import numpy as np
 import pytest
 
 from edge.drivers import multicast
@@ -36,6 +37,7 @@ class Robot:
     def __init__(self, group: Group, robot_id: int, at: str | None = None) -> None:
         self.heard: dict[str, bytes] = {}
         self.all_heard: list[bytes] = []
+        self.heard_at_s: list[float] = []
         signer = Signer(robot_id.to_bytes(32, "little"))
         name = f"r{robot_id}"
         card = Card("test", Role.ROBOT, name, signer.public_key, 1, 2e9, robot_id)
@@ -58,6 +60,7 @@ class Robot:
     def _hear(self, key: str, data: bytes, speaker: Speaker) -> None:
         self.heard[speaker.name] = data
         self.all_heard.append(data)
+        self.heard_at_s.append(time.monotonic())
 
 
 def eventually_hear(sender: Robot, data: bytes, *receivers: Robot) -> None:
@@ -210,6 +213,9 @@ def test_what_many_say_is_heard_as_well_when_it_is_taken_together(
             time.sleep(0.01)
         eventually(lambda: second.heard["r1"] == said[-1])
     assert second.all_heard[-len(said) :] == said
+    # Most of them came with another one.
+    pauses_s = np.diff(second.heard_at_s[-len(said) :])
+    assert np.median(pauses_s) < 0.005
 
 
 def test_without_a_network_it_opens_and_waits_for_one(group: Group) -> None:

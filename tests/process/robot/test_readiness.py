@@ -61,6 +61,8 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "card_problem": None,
         "ground_age_s": 0.1,
         "time_uncertainty_s": 0.01,
+        "answer_age_s": 0.3,
+        "answer_problem": "",
     }
     return asked.checks(now_s, **known | facts)
 

@@ -272,6 +272,11 @@ class Flown:
         silent: tuple[Neighbour, ...] = message["given"].inputs.fell_silent
         return silent
 
+    def lands_beside_m(self) -> tuple[float, float] | None:
+        """Where the last tick was to land, if not at its landing point."""
+        beside_m: tuple[float, float] | None = self.records[-1][1]["given"].inputs.lands_beside_m
+        return beside_m
+
     def odometry(self) -> Vector:
         odometry = self.navigation.odometry()
         assert odometry is not None
@@ -690,6 +695,26 @@ def test_it_does_not_climb_past_one_that_fell_silent_above_it(flown: Flown) -> N
         message["height_m"] or 0.0 for topic, message in flown.records if topic == "control"
     ]
     assert 2.0 < max(heights_m) < 3.5
+
+
+def test_who_flies_lower_has_the_first_choice_of_a_place_beside(flown: Flown) -> None:
+    flown.take_off()
+    x_m, y_m = flown.control.assignment.robot.parameters.landing_point_m
+    stands = peer(5, FlightState.LANDED, (x_m + 1.0, y_m, 0.0))
+    flown.peers(stands)
+    flown.tick()
+    first_m = flown.lands_beside_m()
+    assert first_m is not None
+    # Robots of lower and of greater heights return to just there.
+    for slot_height_m, gives_way in ((4.9, True), (9.5, False)):
+        flown.control._lands_beside_m = None
+        other = peer(6, FlightState.RETURN, (*first_m, slot_height_m))
+        other = dataclasses.replace(other, slot_height_m=slot_height_m, landing_point_m=(90.0, 0.0))
+        flown.peers(stands, other)
+        flown.tick()
+        place_m = flown.lands_beside_m()
+        assert place_m is not None
+        assert (math.dist(place_m, first_m) >= 6.0) == gives_way
 
 
 @pytest.mark.parametrize(

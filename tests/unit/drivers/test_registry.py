@@ -95,7 +95,7 @@ def test_a_package_adds_types(shipped_bundle: Bundle) -> None:
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("no_context", "TypeError: 'builtins.generator' object does not support the context"),
+        ("no_context", "TypeError: "),
         ("opened", "TypeError: "),
         ("raises", "KeyError: 'hops'"),
         ("no_device", "no /dev/video7"),
@@ -145,7 +145,10 @@ def test_what_a_family_does_wrong_is_one_line(
 def test_a_sensor_that_shows_nothing_is_named(shipped_bundle: Bundle) -> None:
     with (
         open_sensor("blind", {}, shipped_bundle.manifest) as over,
-        pytest.raises(ConfigError, match=r"^sensor: a sensor must have view: has no view, or look"),
+        pytest.raises(
+            ConfigError,
+            match=r"^sensor: type = 'blind': TypeError: a sensor without look must have view: has",
+        ),
     ):
         over("", "")
 

@@ -86,7 +86,7 @@ READY = PreflightInputs(
     rc="none",
     ground_age_s=0.4,
     time_uncertainty_s=0.05,
-    answer_age_s=0.3,
+    has_answer=True,
     answer_problem="",
 )
 
@@ -101,9 +101,9 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
     ({"ground_age_s": 3.1}, _C.GROUND_SILENT, "ground was last heard 3.1 s ago: check the radio"),
     ({"time_uncertainty_s": None}, _C.TIME_NOT_KNOWN, "the ground's time is not known yet: wait"),
     ({"time_uncertainty_s": 0.3}, _C.TIME_NOT_KNOWN, "the ground's time is known to 0.3 s only"),
-    ({"answer_age_s": None}, _C.NO_FRESH_ANSWER, "the policy has no fresh answer: wait; if this"),
+    ({"has_answer": False}, _C.NO_FRESH_ANSWER, "the policy has no fresh answer: wait; if this"),
     (
-        {"answer_age_s": 2.1, "answer_problem": "sensor: it shows nothing"},
+        {"has_answer": False, "answer_problem": "sensor: it shows nothing"},
         _C.NO_FRESH_ANSWER,
         "the policy has no fresh answer: sensor: it shows nothing",
     ),

@@ -1,5 +1,6 @@
 """Who fell silent in flight: where it may be, and until when."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,8 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from edge.flight.landing import may_stand
+from edge.core.fence import Fence
+from edge.flight.landing import may_stand, place_to_land, standing_robots
+from edge.flight.margins import ErrorBudget
 from edge.flight.silence import SilenceLimits, highest_still_m, last_word, nearest_on_way_m
+from edge.messages.beacon import Beacon
 from edge.messages.mission import FlightState
 from tests.unit.flight.test_preflight import NEIGHBOUR
 
@@ -24,8 +28,9 @@ def test_it_is_where_it_said_and_as_high_as_it_was_to_climb() -> None:
     said = last_word(FLYING, LIMITS)
     assert said is not None
     assert (said.position_m, said.velocity_m_s) == ((3.0, 4.0, 9.0), (1.0, 0.0, 0.0))
-    climbs = last_word(replace(FLYING, state=FlightState.TAKEOFF, slot_height_m=14.0), LIMITS)
-    assert climbs is not None and climbs.position_m == (3.0, 4.0, 14.0)
+    for state in (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN):
+        climbs = last_word(replace(FLYING, state=state, slot_height_m=14.0), LIMITS)
+        assert climbs is not None and climbs.position_m == (3.0, 4.0, 14.0)
 
 
 @pytest.mark.parametrize(
@@ -66,11 +71,48 @@ def test_it_may_have_stopped_anywhere_on_its_way(x_m: float, y_m: float, age_s: 
     )
 
 
-def test_in_the_end_it_stands_there() -> None:
-    said = last_word(FLYING, LIMITS)
+@given(st.floats(0.5, 4.0), coordinates, coordinates)
+def test_in_the_end_it_stands_on_its_way(speed_m_s: float, x_m: float, y_m: float) -> None:
+    limits = LIMITS._replace(max_speed_m_s=speed_m_s)
+    said = last_word(replace(FLYING, velocity_m_s=(speed_m_s, 0.0, 0.0)), limits)
     assert said is not None
-    stands = may_stand(said._replace(age_s=90.0), (3.0, 3.0), (5.0, 9.0), LIMITS)
-    assert {each.robot_id for each in stands} == {2}
-    assert [each.place_m for each in stands] == [(3.0, 4.0), (7.6, 4.0), (5.0, 4.0)]
-    # Whether it has landed on its own is not known: its landing point is within 2 m of one.
-    assert [each.is_on_its_own for each in stands] == [True, False, False]
+    # Where it leads is taken from the first moment on, so that a place that is chosen stays.
+    stands = may_stand(said._replace(age_s=0.1), (3.0, 3.0), limits)
+    ends_m = [stands[0].place_m, stands[-1].place_m]
+    assert ends_m[0] == (3.0, 4.0)
+    assert ends_m[1] == pytest.approx((3.0 + speed_m_s * limits.flies_on_s, 4.0))
+    # Who is 8 m from all of them is out of the brake's way, 7.25 m from the line.
+    near_m = nearest_on_way_m(said._replace(age_s=90.0), limits, np.array([x_m, y_m]))
+    to_line_m = float(np.hypot(*(near_m - (x_m, y_m))))
+    to_places_m = min(np.hypot(*(np.array(each.place_m) - (x_m, y_m))) for each in stands)
+    assert to_line_m**2 >= to_places_m**2 - 1.0 - 1e-6
+
+
+PADS_M = [(31.0, 21.0), (31.6, 30.4), (4.0, 4.0), (4.0, 14.0)]
+FENCE = Fence(((-2.0, -2.0), (34.0, -2.0), (34.0, 34.0), (-2.0, 34.0)), 1.5, 2.0, 30.0)
+
+
+def beside(pad_m: tuple[float, float], *others: Beacon) -> tuple[float, float] | None:
+    """Where it lands while one that fell silent may stand at its pad."""
+    said = last_word(
+        replace(FLYING, position_m=(27.0, 26.7, 14.0), velocity_m_s=(0.8, 0.0, 0.0)), LIMITS
+    )
+    assert said is not None
+    return place_to_land(
+        pad_m,
+        None,
+        [*may_stand(said, (16.0, 8.0), LIMITS), *standing_robots(others)],
+        PADS_M,
+        FENCE,
+        ErrorBudget(),
+    )
+
+
+def test_who_comes_later_lands_beside_who_landed_beside() -> None:
+    place_m = beside(PADS_M[0])
+    assert place_m is not None
+    lands = replace(
+        FLYING, state=FlightState.LAND, position_m=(*place_m, 4.0), landing_point_m=PADS_M[1]
+    )
+    other_m = beside(PADS_M[0], lands)
+    assert other_m is not None and math.dist(other_m, place_m) >= 8.0
