@@ -123,8 +123,8 @@ def test_the_fog_hides_what_is_far(installed: Path) -> None:
     [
         (
             "--bundle lloyd --sensor haze",
-            "sensor: type = 'haze': is not installed here (entry points 'lpac_edge.sensors'); "
-            "known are 'fog', 'world'",
+            "sensor: type = 'haze': is not installed here (entry points 'lpac_edge.sensors'): "
+            "install the package that has it; known are 'fog', 'world'",
         ),
     ],
 )
