@@ -623,6 +623,8 @@ def test_hold_is_the_operators_also_while_the_script_starts_a_robot(
     assert process.returncode == 1
     assert "mission (steps[2]): alice commands hold: the fleet is theirs" in err
     assert "told to hold" not in err
+    # It thinks again, for the tests that follow.
+    field.robots[2].program.loops["policy"].hang(0.0)
 
 
 def test_script_says_what_is_missing(field: Field) -> None:
