@@ -71,6 +71,7 @@ def cnn_of(checkpoint: Path) -> Cnn:
     return cnn
 
 
+@pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
 def test_the_authors_taps_with_a_cnn_are_a_whole_policy(tmp_path: Path) -> None:
     parameters, whole = POLICIES / f"{NAME}.toml", POLICIES / f"{NAME}.pt"
     bundle = export_bundle(AUTHORS_TAPS, parameters, cnn=whole)
