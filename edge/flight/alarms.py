@@ -91,6 +91,13 @@ def ground_lost(t: Tick) -> str | None:
     return reason_if(not t.ground_heard, "ground lost")
 
 
+def policy_stale(t: Tick) -> str | None:
+    if t.inputs.policy_velocity_m_s is not None:
+        return None
+    why = t.inputs.policy_problem
+    return "the policy has no fresh answer" + (f": {why}" if why else "")
+
+
 ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.FAILSAFE: failsafe,
     ReasonCode.HOVERS_ALONE: hovers_alone,

@@ -9,6 +9,7 @@ from typing import Literal
 
 from edge.flight.alarms import (
     failsafe,
+    policy_stale,
     position_doubtful,
     position_lost,
     remote_control_lost,
@@ -113,8 +114,8 @@ def _not_in_place(t: Tick) -> Refusal | None:
 def _cannot_start(t: Tick) -> Refusal | None:
     if not t.flight.reached:
         return Refusal(RefusalCode.NOT_IN_OFFBOARD, "the autopilot is not in offboard yet")
-    if t.inputs.policy_velocity_m_s is None:
-        return Refusal(RefusalCode.POLICY_STALE, "the policy has no fresh answer")
+    if stale := policy_stale(t):
+        return Refusal(RefusalCode.POLICY_STALE, stale)
     if t.inputs.not_taken:
         return Refusal(RefusalCode.NOT_TAKEN_UP, texts(t.inputs.not_taken))
     if t.robot.on_remote_control_lost in ("hold", "land") and (lost := remote_control_lost(t)):

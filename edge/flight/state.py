@@ -150,13 +150,14 @@ class FlightInputs:
     `position` is what the position is worth. `odometry` is in the mission frame, its z the altitude
     above sea level, less what that jumped in flight; None when the position is lost or old, or
     there is no mission origin. `policy_velocity_m_s` (2,) is None when the policy has no fresh
-    answer. `neighbours` are heard, and `closest` is the nearest of them. `busy_neighbours` say of
-    themselves that they arm or take off. `safety_form` is what a ground asks whose states are not
-    understood. `failed_checks` are preflight's; None before the first. `not_taken` is what of the
-    ground's state the robot does not fly by. `order` is new in this tick; of one that is not
-    understood there is the form. `energy` is None when the battery is not known. `lands_beside_m`
-    (2,) is where it comes down since another robot stands at its landing point; None: there.
-    `fell_silent` are those who did so in flight and may still be in the air, as of their last word.
+    answer; `policy_problem` is what is known of why, or "". `neighbours` are heard, and `closest`
+    is the nearest of them. `busy_neighbours` say of themselves that they arm or take off.
+    `safety_form` is what a ground asks whose states are not understood. `failed_checks` are
+    preflight's; None before the first. `not_taken` is what of the ground's state the robot does not
+    fly by. `order` is new in this tick; of one that is not understood there is the form. `energy`
+    is None when the battery is not known. `lands_beside_m` (2,) is where it comes down since
+    another robot stands at its landing point; None: there. `fell_silent` are those who did so in
+    flight and may still be in the air, as of their last word.
     """
 
     now_s: float
@@ -177,6 +178,7 @@ class FlightInputs:
     energy: Energy | None
     lands_beside_m: tuple[float, float] | None = None
     fell_silent: tuple[Neighbour, ...] = ()
+    policy_problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from edge.flight.alarms import (
     battery_low,
     failsafe,
     ground_lost,
+    policy_stale,
     position_doubtful,
     position_lost,
     reason_if,
@@ -220,10 +221,6 @@ def _left_alone(t: Tick) -> str | None:
     return reason_if(t.inputs.now_s - since_s > limit_s, f"nobody answered for {limit_s:g} s")
 
 
-def _policy_stale(t: Tick) -> str | None:
-    return reason_if(t.inputs.policy_velocity_m_s is None, "the policy has no fresh answer")
-
-
 def _found(t: Tick) -> str | None:
     vehicle = t.inputs.vehicle
     found = vehicle.connected and vehicle.armed is False and t.knows_place
@@ -396,7 +393,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.HOLD,), _S.RETURN, _R.BATTERY_LOW, "the same, and the ground commands nothing",
                _battery_low_in_hold, alarm=True),
     Transition((_S.MISSION,), _S.HOLD, _R.POLICY_STALE, "the policy has no fresh answer",
-               _policy_stale, alarm=True),
+               policy_stale, alarm=True),
     # The way of a flight.
     Transition((_S.INIT,), _S.IDLE, _R.FOUND, "autopilot, position and estimator origin are known",
                _found),

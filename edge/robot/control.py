@@ -143,6 +143,7 @@ class FlightControl:
             position=self._navigation.position,
             odometry=odometry,
             policy_velocity_m_s=self._pac.control(now_s),
+            policy_problem=self._pac.problem,
             neighbours=(*heard, *self._revoked_places(heard, now_s)),
             # A thief's last word brakes, but keeps nobody from a mission.
             closest=self._closest(odometry, heard),

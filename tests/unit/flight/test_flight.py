@@ -152,6 +152,7 @@ class World:
         self.ground_on = True
         self.ground_at_s = -math.inf
         self.policy_m_s: np.ndarray | None = np.array([1.0, 0.0])
+        self.policy_problem = ""
         self.closest: Closest | None = None
         self.busy: tuple[int, ...] = ()
         self.failed_checks: tuple[FailedCheck, ...] | None = ()
@@ -404,6 +405,7 @@ class World:
             position=self.position,
             odometry=odometry,
             policy_velocity_m_s=self.policy_m_s,
+            policy_problem=self.policy_problem,
             neighbours=(),
             closest=self.closest,
             busy_neighbours=self.busy,
@@ -652,7 +654,10 @@ def test_start_is_refused_until_the_robot_and_the_others_are_in_place(world: Wor
     world.policy_m_s = None
     assert world.refuse("start") is RefusalCode.POLICY_STALE
     world.reads(world.said, "the policy has no fresh answer")
-    world.policy_m_s = np.zeros(2)
+    world.policy_problem = "sensor: it shows nothing"
+    assert world.refuse("start") is RefusalCode.POLICY_STALE
+    world.reads(world.said, "the policy has no fresh answer: sensor: it shows nothing")
+    world.policy_m_s, world.policy_problem = np.zeros(2), ""
     world.closest = Closest(4, 1.2)
     assert world.refuse("start") is RefusalCode.TOO_CLOSE
     world.closest = None
