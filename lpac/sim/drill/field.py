@@ -49,10 +49,8 @@ class FaultyVehicle(Protocol):
 class FaultyFleet(ABC):
     """A fleet that faults are done to; `orders` are all that were given, `layout` what it is.
 
-    It is a `Surroundings` of its vehicles. `wanders_m_s` is theirs, as in `FlightTruth`.
+    It is a `Surroundings` of its vehicles.
     """
-
-    wanders_m_s = 0.0
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -144,7 +142,7 @@ class FaultyFleet(ABC):
         return FlightTruth(
             self.vehicle_truths(), timeline.hit, timeline.fault_s, timeline.calm_s, timeline.marks,
             tuple(self.orders), layout.fence, layout.pads_m, layout.scenario.budget.drone_m,
-            self.late_s(), self.wanders_m_s, self.unix_now_s() - self.now_s(),
+            self.late_s(), self.unix_now_s() - self.now_s(),
         )  # fmt: skip
 
     # Where vehicles are

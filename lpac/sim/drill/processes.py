@@ -365,9 +365,6 @@ class MavlinkField(ProcessField):
 class Px4Field(ProcessField):
     """On real PX4s, whose vehicles are PX4's own model; times count from its making."""
 
-    # Up to 0.63 m/s was seen in PX4's own hold, where a simulated vehicle's bound is 0.5.
-    wanders_m_s = 0.2
-
     def __init__(self, fleet: Fleet, ground: GroundProgram, px4s: RealVehicles) -> None:
         super().__init__(fleet, ground, px4s.stepped)
         self._px4s = px4s

@@ -38,7 +38,8 @@ class VehicleTruth:
     """One vehicle: `time_s` (T,) ascending, `position_m` and `velocity_m_s` (T, 3).
 
     `mode` (T,) has `Px4Mode`s' numbers, `setpoint_at_s` (T,) when the last setpoint had come,
-    `is_velocity` (T,) whether that was one, as in a mission.
+    `is_velocity` (T,) whether that was one, as in a mission. `velocity_error_m_s` (T,) is as in
+    `Truth`.
     """
 
     time_s: F64
@@ -49,6 +50,7 @@ class VehicleTruth:
     landed: Bools
     setpoint_at_s: F64
     is_velocity: Bools
+    velocity_error_m_s: F64
 
     @property
     def airborne(self) -> Bools:
@@ -73,6 +75,7 @@ class VehicleTruth:
         return VehicleTruth(
             self.time_s[part], self.position_m[part], self.velocity_m_s[part], self.mode[part],
             self.armed[part], self.landed[part], self.setpoint_at_s[part], self.is_velocity[part],
+            self.velocity_error_m_s[part],
         )  # fmt: skip
 
 
@@ -82,9 +85,8 @@ class FlightTruth:
 
     `fault_s` is when it began, `calm_s` when the operator began to bring all home. `marks` tell of
     further times by their names. `pads_m` (N, 2) is where they really stood at first. `late_s` is
-    how far the machine that flew it was behind real time; 0 on a simulated clock. `wanders_m_s` is
-    how much faster than a simulated one a vehicle at rest may be, after an estimate that wanders.
-    `unix_s` is Unix time when the vehicles' clock was 0.
+    how far the machine that flew it was behind real time; 0 on a simulated clock. `unix_s` is Unix
+    time when the vehicles' clock was 0.
     """
 
     vehicles: tuple[VehicleTruth, ...]
@@ -97,7 +99,6 @@ class FlightTruth:
     pads_m: F64
     drone_m: float
     late_s: float = 0.0
-    wanders_m_s: float = 0.0
     unix_s: float = 0.0
 
     @property
@@ -138,4 +139,5 @@ def vehicle_truth(entries: Sequence[Truth], to_mission: LocalTransform) -> Vehic
         landed=of(lambda entry: entry.landed, np.bool_),
         setpoint_at_s=of(lambda entry: entry.setpoint_at_s, np.float64),
         is_velocity=of(lambda entry: entry.follows == "velocity", np.bool_),
+        velocity_error_m_s=of(lambda entry: entry.velocity_error_m_s, np.float64),
     )

@@ -149,7 +149,8 @@ class Truth:
     """What is really so at one time: world frame, m and m/s.
 
     `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
-    asked for.
+    asked for. `velocity_error_m_s` is how wrong a real PX4's estimate of the horizontal velocity
+    is; 0 where that is not noted.
     """
 
     time_s: float
@@ -160,6 +161,7 @@ class Truth:
     landed: bool
     setpoint_at_s: float = -math.inf
     follows: Literal["position", "velocity"] | None = None
+    velocity_error_m_s: float = 0.0
 
 
 class Px4Vehicle:

@@ -255,9 +255,10 @@ class Px4Build:
         statuses = np.maximum(np.searchsorted(truth.status_s, truth.time_s, "right") - 1, 0)
         lasts = np.searchsorted(setpoints.time_s, truth.time_s, "right") - 1
         entries = []
-        for at_s, place_m, velocity_m_s, status, last in zip(
+        for at_s, place_m, velocity_m_s, error_m_s, status, last in zip(
             instance.to_monotonic_s(truth.time_s).tolist(), truth.position_m.tolist(),
-            truth.velocity_m_s.tolist(), statuses.tolist(), lasts.tolist(), strict=True,
+            truth.velocity_m_s.tolist(), truth.velocity_error_m_s.tolist(), statuses.tolist(),
+            lasts.tolist(), strict=True,
         ):  # fmt: skip
             heard = last >= 0
             entries.append(
@@ -268,6 +269,7 @@ class Px4Build:
                     setpoint_at_s=setpoints_s[last] if heard else -math.inf,
                     follows=("velocity" if setpoints.is_velocity[last] else "position")
                     if heard else None,
+                    velocity_error_m_s=error_m_s,
                 )
             )  # fmt: skip
         return entries

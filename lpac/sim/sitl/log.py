@@ -15,7 +15,7 @@ from lpac.sim.px4.world import WorldOrigin
 _PLACE, _ATTITUDE, _STATUS = (
     "vehicle_local_position_groundtruth", "vehicle_attitude_groundtruth", "vehicle_status",
 )  # fmt: skip
-_SETPOINT = "offboard_control_mode"
+_ESTIMATE, _SETPOINT = "vehicle_local_position", "offboard_control_mode"
 _ARMED = 2
 
 
@@ -24,14 +24,16 @@ class Px4Truth:
     """What was so; times are PX4's own, s since it started, ascending.
 
     `position_m` and `velocity_m_s` (T, 3) are north, east, down in the world, heights from where
-    the vehicle stood; `heading_rad` (T,) clockwise from north. `status_s` (S,) are the times from
-    which on `navigation_state` and `armed` (S,) held.
+    the vehicle stood; `heading_rad` (T,) clockwise from north. `velocity_error_m_s` (T,) is how
+    wrong PX4's estimate of the horizontal velocity was. `status_s` (S,) are the times from which on
+    `navigation_state` and `armed` (S,) held.
     """
 
     time_s: F64
     position_m: F64
     velocity_m_s: F64
     heading_rad: F64
+    velocity_error_m_s: F64
     status_s: F64
     navigation_state: npt.NDArray[np.int64]
     armed: npt.NDArray[np.bool_]
@@ -49,7 +51,7 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
 
     A log that ends in the middle, as of a PX4 that was killed, is read as far as it goes.
     """
-    logs = [read_topics(path, (_PLACE, _ATTITUDE, _STATUS)) for path in paths]
+    logs = [read_topics(path, (_PLACE, _ATTITUDE, _ESTIMATE, _STATUS)) for path in paths]
     places = [topics[_PLACE] for topics in logs if _PLACE in topics]
     if not places:
         return None
@@ -71,11 +73,13 @@ def read_truth(paths: Sequence[Path], world: WorldOrigin) -> Px4Truth | None:
     status_s = _joined([s["timestamp"] for s in statuses]) * 1e-6
     status_order = np.argsort(status_s, kind="stable")
     attitudes = [topics[_ATTITUDE] for topics in logs if _ATTITUDE in topics]
+    estimates = [topics[_ESTIMATE] for topics in logs if _ESTIMATE in topics]
     return Px4Truth(
         time_s=time_s[order],
         position_m=position_m[order],
         velocity_m_s=velocity_m_s[order],
         heading_rad=_headings_rad(attitudes, time_s[order]),
+        velocity_error_m_s=_velocity_errors_m_s(estimates, time_s[order], velocity_m_s[order]),
         status_s=status_s[status_order],
         navigation_state=_joined([s["nav_state"] for s in statuses])[status_order].astype(np.int64),
         armed=_joined([s["arming_state"] for s in statuses])[status_order] == _ARMED,
@@ -103,3 +107,16 @@ def _headings_rad(attitudes: Sequence[Topic], time_s: F64) -> F64:
     w, x, y, z = (_joined([a[f"q[{i}]"] for a in attitudes]) for i in range(4))
     headings_rad = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
     return np.interp(time_s, at_s, headings_rad)
+
+
+def _velocity_errors_m_s(estimates: Sequence[Topic], time_s: F64, velocity_m_s: F64) -> F64:
+    """At these times; 0 where nothing is known."""
+    at_s = _joined([estimate["timestamp"] for estimate in estimates]) * 1e-6
+    if len(at_s) == 0:
+        return np.zeros(len(time_s))
+    estimated_m_s = [
+        np.interp(time_s, at_s, _joined([estimate[axis] for estimate in estimates]))
+        for axis in ("vx", "vy")
+    ]
+    errors_m_s: F64 = np.hypot(*(np.array(estimated_m_s) - velocity_m_s[:, :2].T))
+    return errors_m_s

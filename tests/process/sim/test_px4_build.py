@@ -262,12 +262,16 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
         + message("F", b"offboard_control_mode:uint64_t timestamp;uint8_t position;"
                   b"uint8_t velocity;")
         + message("F", b"vehicle_status:uint64_t timestamp;uint8_t nav_state;uint8_t arming_state;")
+        + message("F", b"vehicle_local_position:uint64_t timestamp;float vx;float vy;")
         + message("A", struct.pack("<BH", 0, 0) + b"vehicle_local_position_groundtruth")
         + message("A", struct.pack("<BH", 0, 1) + b"vehicle_status")
         + message("A", struct.pack("<BH", 0, 2) + b"offboard_control_mode")
+        + message("A", struct.pack("<BH", 0, 3) + b"vehicle_local_position")
         + message("D", struct.pack("<HQBB", 2, 1_200_000, 0, 1))
         + message("D", struct.pack("<HQBB", 2, 1_100_000, 1, 0))
         + message("D", struct.pack("<HQBB", 1, 500_000, 4, 1))
+        + message("D", struct.pack("<HQff", 3, 0, 0.5, 0.0))
+        + message("D", struct.pack("<HQff", 3, 2_000_000, 0.9, 0.3))
         + b"".join(
             message("D", struct.pack("<HQdd6f", 0, 1_000_000 * i, latitude, longitude,
                                      1.0 * i, 0.0, -2.0 * i, 0.5, 0.0, -1.0))
@@ -282,6 +286,7 @@ def test_a_log_tells_where_the_vehicle_really_was(tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.time_s, [0.0, 1.0, 2.0])
     np.testing.assert_allclose(truth.position_m, [[3, -4, 0], [4, -4, -2], [5, -4, -4]], atol=0.01)
     np.testing.assert_allclose(truth.velocity_m_s, [[0.5, 0.0, -1.0]] * 3)
+    np.testing.assert_allclose(truth.velocity_error_m_s, [0.0, 0.25, 0.5], atol=1e-6)
     assert truth.status_s.tolist() == [0.5, 1.5]
     assert truth.navigation_state.tolist() == [4, 14] and truth.armed.tolist() == [False, True]
     setpoints = read_setpoints([log])

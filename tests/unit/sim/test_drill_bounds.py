@@ -70,6 +70,7 @@ def a_vehicle(pad_m: tuple[float, float], height_m: float) -> VehicleTruth:
         landed=z_m <= 0.0,
         setpoint_at_s=np.where(armed, np.minimum(np.floor(t * 10.0) / 10.0, LAND_S), -math.inf),
         is_velocity=(t >= 10.0) & (t < LAND_S),
+        velocity_error_m_s=np.zeros_like(t),
     )
 
 
@@ -102,6 +103,7 @@ FLOWN_M, BESIDE_M = FIRST.position_m, WELL.vehicles[1].position_m
 AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
 STANDS = replace(WELL, vehicles=(AT_REST, WELL.vehicles[1]))
 STANDS_STILL = changed(WELL, position_m=after(FAULT_S, (5.0, 5.0, 5.0), FLOWN_M))
+DRIFTS_M_S = after(25.0, (0.9, 0.0, 0.0), FLOWN_M * 0.0, 26.0)
 PILOTED = after(25.0, Px4Mode.POSCTL, FIRST.mode, 30.0)
 SILENT_S = np.minimum(FIRST.setpoint_at_s, FAULT_S)
 
@@ -185,6 +187,12 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
     (Down(30.5), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed, 55.0))),
     (Down(30.5), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed))),
     (Stands(1.0, 10.0), STANDS, changed(WELL, velocity_m_s=after(25.0, 0.9, FLOWN_M * 0.0, 26.0))),
+    (
+        # As fast as the estimate is wrong, it stands; faster, it does not.
+        Stands(1.0, 10.0),
+        changed(STANDS, velocity_m_s=DRIFTS_M_S, velocity_error_m_s=np.full_like(TIMES_S, 0.5)),
+        changed(STANDS, velocity_m_s=DRIFTS_M_S, velocity_error_m_s=np.full_like(TIMES_S, 0.3)),
+    ),
     (StraightDown(3.0), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
     (LandsAtPad(4.5), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
     (

@@ -53,6 +53,7 @@ def never_down(late_s: float) -> FlightTruth:
         landed=np.zeros(count, np.bool_),
         setpoint_at_s=np.full(count, -math.inf),
         is_velocity=np.zeros(count, np.bool_),
+        velocity_error_m_s=np.zeros(count),
     )
     return FlightTruth(
         (vehicle,), (), 0.0, 0.0, {}, (), fence_around(32.0, 1, ERRORS), np.zeros((1, 2)), 0.5,
