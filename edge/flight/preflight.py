@@ -4,7 +4,10 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.px4_version import OLDEST, is_too_old
 from edge.core.vehicle import Gps, VehicleState
@@ -12,6 +15,8 @@ from edge.flight.failsafe import RemoteControl
 from edge.flight.landing import in_the_way, standing_robots
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
+from edge.flight.safety import SeparationLimits
+from edge.flight.silence import highest_still_m, nearest_on_way_m
 from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
@@ -59,7 +64,8 @@ class PreflightInputs:
     point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
     `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
     robots that were heard lately, `not_understood` those who said what cannot be read, `unheard`
-    those that the ground hears and this one does not.
+    those that the ground hears and this one does not, `fell_silent` those who did so in flight and
+    may still be in the air, as of their last word; how far to stay from them is in `separation`.
     `ground_age_s` is how long ago the ground was heard, None if never; the fleet's time is known to
     `time_uncertainty_s`, None if it is not. `has_answer`: the policy gave one lately.
     `answer_problem` is what is wrong with what the sensor, or the policy, gave last, "" if that is
@@ -88,6 +94,8 @@ class PreflightInputs:
     neighbours: Sequence[HeardBeacon]
     not_understood: Sequence[str]
     unheard: Sequence[int]
+    fell_silent: Sequence[Neighbour]
+    separation: SeparationLimits
     rc: RemoteControl
     ground_age_s: float | None
     time_uncertainty_s: float | None
@@ -364,7 +372,25 @@ def _fleet(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedC
         yield from _apart(inputs, beacon, other)
     yield from _in_the_way(inputs, [heard.beacon for heard in others])
     if not inputs.vehicle.armed:
+        yield from _may_come_down(inputs)
         yield from _too_late(inputs.errors, [heard.beacon for heard in others])
+
+
+def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
+    """Whether somebody fell silent in flight who may come down where this robot stands."""
+    if inputs.position_m is None:
+        return
+    place_m, limits = np.array(inputs.position_m[:2]), inputs.separation.silence
+    for silent in inputs.fell_silent:
+        near_m = nearest_on_way_m(silent, limits, place_m)
+        apart_m = float(np.hypot(*(near_m - place_m)))
+        if apart_m < inputs.separation.unforeseen_m and highest_still_m(silent, limits) > 0.0:
+            yield FailedCheck(
+                CheckCode.SILENT_NEAR,
+                f"robot {silent.robot_id} fell silent in flight, and may come down here: wait "
+                "until it is heard or surely down",
+                True,
+            )
 
 
 def _too_late(errors: ErrorBudget, others: Sequence[Beacon]) -> Iterator[FailedCheck]:

@@ -76,6 +76,7 @@ class CheckCode(_Code):
     HEIGHTS_TOO_NEAR = "heights_too_near"
     LANDINGS_TOO_NEAR = "landings_too_near"
     LANDING_POINT_TAKEN = "landing_point_taken"
+    SILENT_NEAR = "silent_near"
     TAKEOFFS_TOO_FAR_APART = "takeoffs_too_far_apart"
     # What of the ground's state it does not take up: in flight, or because it cannot.
     KEEPS_ORIGIN = "keeps_origin"

@@ -65,7 +65,8 @@ class FlightControl:
     Another thread sets `checks`, `peers` (the other robots' beacons), `revoked` (robots that nobody
     listens to any more), and `world` for the `wanted_world_id`, whole. `obeyed_sequence` and
     `operator` are the last ground state's. `assignment` is what is flown by, `not_taken` what of
-    the ground's state it is not. `energy` is how long the battery lasts, and the way home takes.
+    the ground's state it is not. `fell_silent` is as in `FlightInputs`. `energy` is how long the
+    battery lasts, and the way home takes.
     """
 
     def __init__(
@@ -103,6 +104,7 @@ class FlightControl:
         self.checks: Checks | None = None
         self.peers: tuple[HeardBeacon, ...] = ()
         self.revoked: frozenset[int] = frozenset()
+        self.fell_silent: tuple[Neighbour, ...] = ()
         # By robot id: the last that was heard of it in this frame, and when that was so.
         self._last_places: dict[int, tuple[Neighbour, float]] = {}
         # The same of beacons that tell a place, and of who flies.
@@ -137,6 +139,9 @@ class FlightControl:
         peers = self.peers
         heard = self._neighbours(peers, now_s)
         silent, separation = self._silent(peers, heard, now_s), self.assignment.robot.separation
+        self.fell_silent = tuple(
+            each for each in silent if highest_still_m(each, separation.silence) > 0.0
+        )
         inputs = FlightInputs(
             now_s=now_s,
             vehicle=vehicle,
@@ -159,9 +164,7 @@ class FlightControl:
             uptime_s=now_s - self._started_s,
             energy=self._energy(now_s, vehicle, odometry),
             lands_beside_m=self._look_where_to_land(peers, silent),
-            fell_silent=tuple(
-                each for each in silent if highest_still_m(each, separation.silence) > 0.0
-            ),
+            fell_silent=self.fell_silent,
         )
         self.energy = inputs.energy
         before, robot = self.flight, self.assignment.robot

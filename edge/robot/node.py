@@ -299,6 +299,7 @@ class RobotNode:
             peers=peers,
             not_understood=self._inbox.not_understood,
             unheard=self._inbox.unheard,
+            fell_silent=control.fell_silent,
             duplicate=self._is_duplicate(),
             watchdog_alive=self._ports.watchdog.alive(),
             card_problem=self._guard.card_problem(unix_now_s),

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from edge.core import log
 from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement
 from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
@@ -114,6 +115,7 @@ class Readiness:
         peers: Sequence[HeardBeacon],
         not_understood: Sequence[str],
         unheard: Sequence[int],
+        fell_silent: Sequence[Neighbour],
         duplicate: bool,
         watchdog_alive: bool,
         card_problem: CardProblem | None,
@@ -148,6 +150,8 @@ class Readiness:
             neighbours=peers,
             not_understood=not_understood,
             unheard=unheard,
+            fell_silent=fell_silent,
+            separation=robot.separation,
             rc=config.failsafe.rc,
             ground_age_s=ground_age_s if math.isfinite(ground_age_s) else None,
             time_uncertainty_s=time_uncertainty_s,

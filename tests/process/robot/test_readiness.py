@@ -56,6 +56,7 @@ def checked(asked: Readiness, origin: Origin | None = ORIGIN, **facts: Any) -> C
         "peers": (),
         "not_understood": (),
         "unheard": (),
+        "fell_silent": (),
         "duplicate": False,
         "watchdog_alive": True,
         "card_problem": None,

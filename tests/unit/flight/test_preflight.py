@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from edge.core.fence import Fence
+from edge.core.mailbox import Neighbour
 from edge.core.position import PositionCause, PositionJudgement, PositionQuality
 from edge.core.px4_version import in_words
 from edge.core.schema import ConfigError, from_mapping
@@ -18,6 +19,8 @@ from edge.flight.preflight import (
     failed_checks,
 )
 from edge.flight.reach import Reach
+from edge.flight.safety import SeparationLimits
+from edge.flight.silence import SilenceLimits
 from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode
 from edge.messages.mission import FlightState, Origin
@@ -83,6 +86,14 @@ READY = PreflightInputs(
     neighbours=(HeardBeacon(NEIGHBOUR, 99.8),),
     not_understood=(),
     unheard=(),
+    fell_silent=(),
+    separation=SeparationLimits(
+        level_m=1.5,
+        passing_m=6.5,
+        passing_height_m=3.5,
+        unforeseen_m=7.25,
+        silence=SilenceLimits(max_speed_m_s=2.0, ceiling_m=25.0, flies_on_s=4.6, hovers_s=66.0),
+    ),
     rc="none",
     ground_age_s=0.4,
     time_uncertainty_s=0.05,
@@ -371,6 +382,31 @@ def lines(
     failed = failed_checks(inputs, LIMITS)
     assert {each.code for each in failed} <= {_C.LANDINGS_TOO_NEAR}
     return [each.text for each in failed]
+
+
+# It flew on towards the robot, from 16 m away, and stopped 9.2 m nearer.
+SILENT = Neighbour(3, (24.0, 8.0, 9.5), (-2.0, 0.0, 0.0), 10.0)
+
+
+def test_nobody_takes_off_where_somebody_may_come_down_who_fell_silent() -> None:
+    (failed,) = failed_checks(dataclasses.replace(READY, fell_silent=(SILENT,)), LIMITS)
+    assert failed.code is _C.SILENT_NEAR and failed.settles_by_itself
+    assert failed.text.startswith("robot 3 fell silent in flight, and may come down here: wait")
+
+
+@pytest.mark.parametrize(
+    ("silent", "armed"),
+    [
+        # It stops too far away; it must be down; the robot flies itself.
+        (SILENT._replace(velocity_m_s=(2.0, 0.0, 0.0)), False),
+        (SILENT._replace(age_s=66.0 + 9.5 / 0.5), False),
+        (SILENT, True),
+    ],
+)
+def test_nobody_waits_for_who_cannot_come_down_here(silent: Neighbour, armed: bool) -> None:
+    vehicle = dataclasses.replace(VEHICLE, armed=armed)
+    inputs = dataclasses.replace(READY, fell_silent=(silent,), vehicle=vehicle)
+    assert _C.SILENT_NEAR not in {check.code for check in failed_checks(inputs, LIMITS)}
 
 
 def test_a_receiver_that_reports_worse_than_the_budget_wants_more_room() -> None:
