@@ -279,13 +279,12 @@ def _show(outcomes: list["FlightOutcome"], options: str) -> None:
 
 def _list(faults: list["Fault"]) -> None:
     print_table(
-        ("fault", "what happens", "promise", "not covered", "flown by"),
+        ("fault", "what happens", "promise", "flown by"),
         [
             (
                 fault.name,
                 fault.what,
-                fault.promise,
-                fault.uncovered,
+                fault.promise + (f" (not covered: {fault.uncovered})" if fault.uncovered else ""),
                 ", ".join(vehicle for vehicle in DrillVehicle if _flies(vehicle, fault)),
             )
             for fault in faults

@@ -15,13 +15,17 @@ GOOD, BAD, NOTABLE, FAINT = "green", "red", "yellow", "dim"
 def print_table(
     headings: Sequence[str], rows: Sequence[Sequence["str | Text"]], right: Sequence[str] = ()
 ) -> None:
-    """A table on stdout; the headings in `right` are those of columns of numbers."""
+    """A table on stdout; the headings in `right` are those of columns of numbers.
+
+    A first column of names of one word is for people to type again: they are never broken.
+    """
     from rich.console import Console
 
     console = Console(highlight=False)
     table = new_table(narrow=console.width < 100)
     for heading in headings:
         table.add_column(heading, justify="right" if heading in right else "left", overflow="fold")
+    table.columns[0].no_wrap = not any(" " in str(row[0]) for row in rows)
     for row in rows:
         table.add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in row))
     console.print(table)
