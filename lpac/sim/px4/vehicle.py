@@ -67,6 +67,8 @@ LANDED_AFTER_S = 1.0
 IN_AIR_AFTER_S = 0.9
 STOPPED_M_S = 0.15
 ARRIVED_M = 0.3
+# Above so much the velocity's estimate errs as in flight.
+_ERRS_FROM_M = 1.0
 SLOW_DESCENT_BELOW_M = 5.0
 TRUTH_PERIOD_S = 0.04
 # Four cells: empty, and from there to full. What motors take, and all else.
@@ -149,8 +151,7 @@ class Truth:
     """What is really so at one time: world frame, m and m/s.
 
     `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
-    asked for. `velocity_error_m_s` is how wrong a real PX4's estimate of the horizontal velocity
-    is; 0 where that is not noted.
+    asked for. `velocity_error_m_s` is how wrong its estimate of the horizontal velocity is.
     """
 
     time_s: float
@@ -205,7 +206,7 @@ class Px4Vehicle:
             [*draw_bias_m(share, bearing_rad), self._rng.uniform(-1.5, 1.5)]
         )
         self._errors = errors
-        self._walk_m: F64 = np.zeros(3)
+        self._walk_m = self._velocity_error_m_s = np.zeros(3)
         self._compass_rad = self.compass_jump_rad = self.motor_loss = 0.0
         self.parameters: dict[str, int | float] = dict(PARAMETERS)
         self.fence: tuple[FencePolygon, ...] = ()
@@ -271,7 +272,9 @@ class Px4Vehicle:
     @property
     def estimated_velocity_m_s(self) -> F64:
         """(3,), world frame: how fast the vehicle takes itself to be."""
-        return self.velocity_m_s if self._frozen is None else self._frozen[1]
+        if self._frozen is not None:
+            return self._frozen[1]
+        return self.velocity_m_s + self._velocity_error_m_s
 
     @property
     def estimated_heading_rad(self) -> float:
@@ -509,7 +512,7 @@ class Px4Vehicle:
         if not self.estimate_frozen:
             self._frozen = None
         elif self._frozen is None:
-            self._frozen = self.estimated_position_m, self.velocity_m_s
+            self._frozen = self.estimated_position_m, self.estimated_velocity_m_s
         self.time_s += dt_s
         self._watch_sensors()
         self._estimate(dt_s)
@@ -519,6 +522,9 @@ class Px4Vehicle:
             self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m
             self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
             self.air_m_s = self.air_m_s + self._errors.wind_m_s(self.time_s)
+            # Who stands on the ground is known to.
+            lifted = min(max(-float(self.position_m[2]) / _ERRS_FROM_M, 0.0), 1.0)
+            self._velocity_error_m_s = lifted * self._errors.velocity_m_s(self.time_s)
         if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
             self.home_m = self.estimated_position_m
         if self.armed:
@@ -788,7 +794,7 @@ class Px4Vehicle:
         if on_ground and to_down >= 0.0:
             to_north = to_east = to_down = 0.0
         parameters = self.parameters
-        v_north, v_east, v_down = self.velocity_m_s.tolist()
+        v_north, v_east, v_down = (self.velocity_m_s + self._velocity_error_m_s).tolist()
         north, east = _shorten(
             (to_north - v_north) / lag_s, (to_east - v_east) / lag_s, parameters["MPC_ACC_HOR"]
         )
@@ -908,7 +914,8 @@ class Px4Vehicle:
     def _hold(self) -> _Vector:
         """Brake, then stay where the vehicle came to rest."""
         if self._hold_m is None:
-            if math.hypot(*self.velocity_m_s.tolist()) > STOPPED_M_S:
+            north, east, _ = (self.velocity_m_s + self._velocity_error_m_s).tolist()
+            if math.hypot(north, east) > STOPPED_M_S:
                 return _STILL
             self._hold_m = self.estimated_position_m
         return self._toward(self._hold_m)
@@ -996,6 +1003,7 @@ class Px4Vehicle:
                 self.landed,
                 self._setpoint_at_s,
                 self._follows(),
+                math.hypot(*self._velocity_error_m_s[:2].tolist()),
             )
         )
 

@@ -134,7 +134,7 @@ def test_gusts_and_a_wrong_compass_move_a_vehicle_that_holds_by_less_than_a_metr
     assert 0.1 < away_m < 1.0
 
 
-def test_gusts_disturb_a_velocity_that_is_followed() -> None:
+def test_gusts_and_its_estimate_disturb_a_velocity_that_is_followed() -> None:
     vehicle = flying(Errors(2, 2))
     setpoint = Px4Setpoint(np.full(3, math.nan), np.array([0.5, 0.0, 0.0]))
     vehicle.offboard(setpoint)
@@ -144,10 +144,40 @@ def test_gusts_disturb_a_velocity_that_is_followed() -> None:
         if step % 5 == 0:
             vehicle.offboard(setpoint)
         vehicle.step(STEP_S)
-        off_m_s.append(float(np.hypot(*(vehicle.velocity_m_s - setpoint.velocity_m_s)[:2])))
+        off = vehicle.estimated_velocity_m_s - setpoint.velocity_m_s
+        off_m_s.append(float(np.hypot(*off[:2])))
     settled = off_m_s[500:]
-    assert np.median(settled) < 0.15
+    # It follows a wandering estimate with a lag.
+    assert np.median(settled) < 0.25
     assert 0.1 < max(settled) < 0.7
+
+
+def test_a_velocity_is_estimated_as_badly_as_by_a_real_px4_in_its_own_simulation() -> None:
+    """Of one the error was 0.1 to 0.5 m/s rms in flight, at most 0.9 m/s; below 0.1 m/s before."""
+    errors_m_s = []
+    for seed in range(20):
+        vehicle = flying(Errors(seed, seed))
+        vehicle.set_mode(Px4Mode.HOLD)
+        before = len(vehicle.truth)
+        fly(vehicle, 40.0)
+        errors_m_s.append([entry.velocity_error_m_s for entry in vehicle.truth[before:]])
+    rms_m_s = np.sqrt(np.mean(np.square(errors_m_s), axis=1))
+    assert 0.1 < rms_m_s.min() < rms_m_s.max() < 0.5
+    assert 0.5 < np.max(errors_m_s) < 0.9
+    standing = Px4Vehicle(seed=1, ready_after_s=0.0, errors=Errors(1, 1))
+    fly(standing, 10.0)
+    assert not standing.estimated_velocity_m_s.any()
+
+
+def test_who_lands_keeps_to_its_place_though_its_velocity_is_wrong() -> None:
+    for seed in range(10):
+        vehicle = flying(Errors(seed, seed))
+        vehicle.set_mode(Px4Mode.LAND)
+        fly(vehicle, 3.0)
+        began_m = vehicle.estimated_position_m
+        fly(vehicle, 25.0)
+        off_m = (vehicle.estimated_position_m - began_m)[:2]
+        assert vehicle.landed and np.hypot(*off_m) < 1.5, seed
 
 
 def test_a_voltage_sags_under_load_and_pulls_the_charge_with_it() -> None:

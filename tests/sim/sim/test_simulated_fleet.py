@@ -131,6 +131,7 @@ def test_a_fleet_flies_its_mission_and_lands_on_its_pads(tmp_path: Path) -> None
     ground.carry_out(_pass(10.0))
     assert np.linalg.norm(fleet.true_positions_m() - before_m, axis=1).max() > 2.0
     assert ground.command(SafetyCommand("return", wait=True)).done
+    ground.carry_out(_pass(0.5))  # The snapshot comes after the answer.
     assert states(fleet) == {FlightState.LANDED}
     for each, landing_m in zip(fleet.vehicles, fleet.layout.pads_m, strict=True):
         assert each.vehicle.landed and not each.vehicle.armed
