@@ -795,7 +795,7 @@ _PEOPLE = (
         ),
         watched_s=32.0,
         # Later it may be back inside, and fly on.
-        bounds=(MissionEnds(0.0, 1.8, after="start"), FliesOn(20.0)),
+        bounds=(MissionEnds(0.0, 1.2, after="start"), FliesOn(20.0)),
     ),
 )  # fmt: skip
 
