@@ -28,8 +28,10 @@ from edge.flight.safety import (
 from edge.flight.state import FlightInputs, FlightMemory, Robot, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
 
-# PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P).
-_HOLD_LEASH_M = 0.5
+# PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P). That
+# must be more than what its estimated velocity is wrong by, with which the vehicle drifts: up to
+# 0.94 m/s in PX4's own simulation.
+_HOLD_LEASH_M = 1.0
 _AHEAD_S = 1.0
 # RETURN flies nowhere before it is this near its own height.
 _AT_OWN_HEIGHT_M = 1.0

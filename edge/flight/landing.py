@@ -13,7 +13,7 @@ from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
 from edge.flight.margins import ErrorBudget, places_apart
-from edge.flight.silence import SilenceLimits, stops_m
+from edge.flight.silence import SilenceLimits, stops_m, strays_m
 from edge.messages.beacon import Beacon
 from edge.messages.mission import FlightState
 
@@ -27,11 +27,19 @@ _GRID_M = 2.0
 
 
 class StandingRobot(NamedTuple):
-    """Another robot on the ground, motors off: where it is, and where it lands itself."""
+    """Another robot on the ground, motors off: where it is, and where it lands itself.
+
+    It may be `strays_m` beside that place.
+    """
 
     robot_id: int
     place_m: Point
     landing_point_m: Point
+    strays_m: float = 0.0
+
+    def away_m(self, place_m: Point) -> float:
+        """How far it is from a place, at least."""
+        return math.dist(self.place_m, place_m) - self.strays_m
 
     @property
     def is_on_its_own(self) -> bool:
@@ -58,7 +66,7 @@ def may_stand(
     """
     stopped = silent._replace(age_s=max(silent.age_s, limits.flies_on_s))
     return [
-        StandingRobot(silent.robot_id, (x_m, y_m), its_landing_point_m)
+        StandingRobot(silent.robot_id, (x_m, y_m), its_landing_point_m, strays_m(stopped, limits))
         for x_m, y_m in stops_m(stopped, limits).tolist()
     ]
 
@@ -68,7 +76,7 @@ def in_the_way(
 ) -> list[tuple[StandingRobot, float]]:
     """Who stands where that landing point is, though not on its own; and how far from it, m."""
     apart = places_apart(errors.position_m, errors.position_m)
-    away = [(each, math.dist(each.place_m, landing_point_m)) for each in standing]
+    away = [(each, each.away_m(landing_point_m)) for each in standing]
     return [(each, m) for each, m in away if not each.is_on_its_own and not apart.holds(m)]
 
 
@@ -90,8 +98,9 @@ def place_to_land(
         return None
     apart_m = places_apart(errors.position_m, errors.position_m).least_m
     taken_m = np.array([*(each.place_m for each in standing), *others_m])
+    strayed_m = np.array([*(each.strays_m for each in standing), *(0.0 for _ in others_m)])
     if before_m is not None:
-        kept_m = float(np.hypot(*(taken_m - before_m).T).min())
+        kept_m = float((np.hypot(*(taken_m - before_m).T) - strayed_m).min())
         if kept_m >= apart_m - min(_KEPT_M, _KEPT_SHARE * apart_m):
             return before_m
     corners = np.array(fence.vertices_m)
@@ -102,7 +111,7 @@ def place_to_land(
     places_m = grid[(grid @ edges.inward.T - edges.offsets_m).min(axis=1) >= fence.buffer_m]
     if not len(places_m):
         return None
-    clear_m = np.linalg.norm(places_m[:, None] - taken_m, axis=-1).min(axis=1)
+    clear_m = (np.linalg.norm(places_m[:, None] - taken_m, axis=-1) - strayed_m).min(axis=1)
     away_m = np.hypot(*(places_m - landing_point_m).T)
     best = np.lexsort((away_m, -np.minimum(clear_m, apart_m)))[0]
     x_m, y_m = places_m[best].tolist()

@@ -16,7 +16,7 @@ from edge.flight.landing import in_the_way, standing_robots
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import SeparationLimits
-from edge.flight.silence import highest_still_m, nearest_on_way_m
+from edge.flight.silence import highest_still_m, nearest_on_way_m, strays_m
 from edge.messages.beacon import Beacon, HeardBeacon, tag
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
@@ -384,7 +384,8 @@ def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     for silent in inputs.fell_silent:
         near_m = nearest_on_way_m(silent, limits, place_m)
         apart_m = float(np.hypot(*(near_m - place_m)))
-        if apart_m < inputs.separation.unforeseen_m and highest_still_m(silent, limits) > 0.0:
+        least_m = inputs.separation.silent_m + strays_m(silent, limits)
+        if apart_m < least_m and highest_still_m(silent, limits) > 0.0:
             yield FailedCheck(
                 CheckCode.SILENT_NEAR,
                 f"robot {silent.robot_id} fell silent in flight, and may come down here: wait "

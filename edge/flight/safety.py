@@ -20,7 +20,7 @@ import numpy as np
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
-from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m
+from edge.flight.silence import SilenceLimits, highest_still_m, nearest_on_way_m, strays_m
 
 _ABSURD = 1e6
 # A slack is used up no faster than in this time: five control periods, which leaves room for the
@@ -63,15 +63,16 @@ class SeparationLimits(NamedTuple):
 
     `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
     down through the robot's height, since it keeps to its place and looks for nobody; it has not
-    passed before it is `passing_height_m` away in height. `unforeseen_m`, in the plane: from one of
-    which nobody knows what it does next, since it is piloted at the robot's height, or fell silent
-    in flight; `silence` is what that one may do.
+    passed before it is `passing_height_m` away in height. `piloted_m`, in the plane: from one that
+    somebody flies at the robot's height. `silent_m`, in the plane: from where one may have stopped
+    that fell silent in flight, whom `silence` takes to fly on for a while.
     """
 
     level_m: float
     passing_m: float
     passing_height_m: float
-    unforeseen_m: float
+    piloted_m: float
+    silent_m: float
     silence: SilenceLimits
 
 
@@ -295,7 +296,7 @@ def _ways(
     for neighbour in neighbours:
         place_m = np.array(_extrapolated(neighbour))
         here_m, up_m = place_m[:2] - position_m[:2], float(place_m[2] - position_m[2])
-        least_m = separation.unforeseen_m if neighbour.is_piloted else separation.passing_m
+        least_m = separation.piloted_m if neighbour.is_piloted else separation.passing_m
         if _passes(up_m, neighbour.velocity_m_s[2], separation, limits):
             near.append(_to_leave(place_m[:2] - rest_m, least_m, separation, from_rest=True))
         elif neighbour.is_piloted and abs(up_m) < separation.passing_height_m:
@@ -309,7 +310,7 @@ def _ways(
         highest_m = highest_still_m(robot, separation.silence)
         if position_m[2] < highest_m + separation.passing_height_m:
             stopped_m = nearest_on_way_m(robot, separation.silence, rest_m)
-            least_m = separation.unforeseen_m
+            least_m = separation.silent_m + strays_m(robot, separation.silence)
             near.append(_to_leave(stopped_m - rest_m, least_m, separation, from_rest=True))
     if not all(each.offset_m.any() for each in near):
         return None

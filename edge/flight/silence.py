@@ -17,6 +17,9 @@ from edge.messages.mission import FlightState
 # Slower than any landing of PX4's, whose last metres take 0.7 m/s.
 _COMES_DOWN_M_S = 0.5
 _APART_M = 2.0
+# On a mission it may turn: of 48 simulated robots nine in ten stopped within 2.2 m of the way that
+# they were taken to fly on, of up to 5.9 m, and all within 3.0 m.
+_STRAYS_SHARE = 0.5
 _CLIMBS = (FlightState.ARMING, FlightState.TAKEOFF, FlightState.RETURN)
 
 
@@ -69,6 +72,12 @@ def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> 
     square = float(along_m @ along_m)
     share = float((place_m - first_m) @ along_m) / square if square > 0.0 else 0.0
     return first_m + along_m * min(max(share, 0.0), 1.0)
+
+
+def strays_m(silent: Neighbour, limits: SilenceLimits) -> float:
+    """How far beside that way it may have stopped."""
+    _, along_m = _way_m(silent, limits)
+    return _STRAYS_SHARE * math.hypot(*along_m)
 
 
 def _way_m(silent: Neighbour, limits: SilenceLimits) -> tuple[F64, F64]:

@@ -18,7 +18,7 @@ from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
-from edge.flight.margins import ErrorBudget
+from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import Closest, MotionLimits, SeparationLimits, stopping_m
 from edge.flight.silence import SilenceLimits
@@ -243,8 +243,12 @@ class Robot:
             level_m=p.min_separation_m,
             passing_m=passing_m,
             passing_height_m=errors.passing_height_m,
-            # Nobody tells where the wind, or a pilot, carries it.
-            unforeseen_m=passing_m + errors.wind_m,
+            # Nobody tells where a pilot carries it next.
+            piloted_m=passing_m + errors.wind_m,
+            # As from who stands on the ground: both may be off the place where they are to be.
+            silent_m=max(
+                places_apart(errors.position_m, errors.position_m).least_m, p.min_separation_m
+            ),
             silence=SilenceLimits(
                 max_speed_m_s=limits.max_speed_m_s,
                 ceiling_m=self.fence.ceiling_m + errors.height_m,

@@ -156,10 +156,10 @@ def test_hold_comes_back_slowly_when_the_estimate_jumps() -> None:
     state = flight(FlightState.HOLD, AT_SLOT)
     here_m = np.array([23.0, 16.0, SLOT_M + 4.0])
     sent_m = position(state, inputs((23.0, 16.0, SLOT_M + 4.0)))
-    assert sent_m - here_m == pytest.approx([-0.5, 0.0, -1.0])
+    assert sent_m - here_m == pytest.approx([-1.0, 0.0, -1.0])
     vehicle = Vehicle((23.0, 16.0, SLOT_M))
     vehicle.fly(state, 30.0)
-    assert np.abs(np.diff(vehicle.path_m, axis=0)).max() < 0.6 * TICK_S
+    assert np.abs(np.diff(vehicle.path_m, axis=0)).max() < 1.1 * TICK_S
     assert vehicle.position_m == pytest.approx(AT_SLOT, abs=0.1)
 
 

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from edge.core.fence import Fence
 from edge.flight.landing import may_stand, place_to_land, standing_robots
 from edge.flight.margins import ErrorBudget
-from edge.flight.silence import SilenceLimits, highest_still_m, last_word, nearest_on_way_m
+from edge.flight.silence import (
+    SilenceLimits,
+    highest_still_m,
+    last_word,
+    nearest_on_way_m,
+    strays_m,
+)
 from edge.messages.beacon import Beacon
 from edge.messages.mission import FlightState
 from tests.unit.flight.test_preflight import NEIGHBOUR
@@ -81,11 +87,25 @@ def test_in_the_end_it_stands_on_its_way(speed_m_s: float, x_m: float, y_m: floa
     ends_m = [stands[0].place_m, stands[-1].place_m]
     assert ends_m[0] == (3.0, 4.0)
     assert ends_m[1] == pytest.approx((3.0 + speed_m_s * limits.flies_on_s, 4.0))
-    # Who is 8 m from all of them is out of the brake's way, 7.25 m from the line.
+    # Who is 8 m from all of them is nearly as far from the line, which the brake keeps it from.
     near_m = nearest_on_way_m(said._replace(age_s=90.0), limits, np.array([x_m, y_m]))
     to_line_m = float(np.hypot(*(near_m - (x_m, y_m))))
     to_places_m = min(np.hypot(*(np.array(each.place_m) - (x_m, y_m))) for each in stands)
     assert to_line_m**2 >= to_places_m**2 - 1.0 - 1e-6
+
+
+def test_who_flew_may_have_turned_and_who_hovered_may_not() -> None:
+    said = last_word(FLYING, LIMITS)
+    assert said is not None
+    strayed_m = [strays_m(said._replace(age_s=age_s), LIMITS) for age_s in (0.0, 1.0, 90.0)]
+    assert strayed_m == pytest.approx([0.0, 0.5, 0.5 * LIMITS.flies_on_s])
+    hovers = said._replace(velocity_m_s=(0.0, 0.0, 0.0), age_s=90.0)
+    assert strays_m(hovers, LIMITS) == 0.0
+    (stands,) = may_stand(hovers, (16.0, 8.0), LIMITS)
+    assert stands.away_m((3.0, 14.0)) == 10.0
+    assert may_stand(said, (16.0, 8.0), LIMITS)[0].away_m((3.0, 14.0)) == pytest.approx(
+        10.0 - 0.5 * LIMITS.flies_on_s
+    )
 
 
 PADS_M = [(31.0, 21.0), (31.6, 30.4), (4.0, 4.0), (4.0, 14.0)]
