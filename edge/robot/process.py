@@ -11,7 +11,6 @@ import gc
 import math
 import secrets
 import sys
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
@@ -35,6 +34,7 @@ from edge.drivers.identity_folder import (
 from edge.drivers.logs import log_to
 from edge.drivers.process_lock import ProcessLock
 from edge.drivers.registry import load_verified_policy, open_link, open_sensor, open_vehicle
+from edge.drivers.stop import Stop
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.identity.group import MOST_BYTES, MOST_FRAGMENTS, frames, key_of_open_fleet
 from edge.identity.guard import Unguarded
@@ -87,7 +87,7 @@ def _load(config: RobotConfig, parts: ExitStack) -> tuple[VerifiedPolicy, Sensor
     return policy, sensor_over, world
 
 
-def run(config: RobotConfig, stop: threading.Event) -> None:
+def run(config: RobotConfig, stop: Stop) -> None:
     """Fly one robot until `stop` is set. Called from the main thread.
 
     Raises ValueError or OSError, in one line, for what keeps the program from starting.

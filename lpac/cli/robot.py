@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import signal
-import threading
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -40,17 +39,18 @@ def run(config: ConfigPath = Path("robot.toml")) -> None:
     # A terminal that the Wi-Fi takes away must not end a flight; the ground does that.
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
 
+    from edge.drivers.stop import Stop
     from edge.robot.config import load_config
     from edge.robot.process import run as run_robot
 
     loaded = load_config(config)
-    stop = threading.Event()
+    stop = Stop()
 
     def on_signal(*_: object) -> None:
         if not stop.is_set():
-            stop.set()
             # Whatever hangs, the program ends; PX4 then lands a vehicle that it was flying.
             signal.setitimer(signal.ITIMER_REAL, _END_WITHIN_S)
+            stop.set()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, on_signal)

@@ -1,16 +1,16 @@
 """The router of a fleet whose robots are its clients: a process that outlives `lpac ground`."""
 
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
 from edge.core.schema import ConfigError
+from edge.drivers.stop import Stop
 from edge.drivers.zenoh_link import ZenohRouter
 from lpac.fleet.settings import load_fleet
 from lpac.ground.station.config import load_own_identity
 
 
-def serve_router(path: Path, stop: threading.Event, on_listening: Callable[[str], None]) -> None:
+def serve_router(path: Path, stop: Stop, on_listening: Callable[[str], None]) -> None:
     """Pass on what members say until `stop` is set; `on_listening` is told the endpoint.
 
     `path` is the fleet's description. Raises ConfigError, LinkError or OSError, in one line.

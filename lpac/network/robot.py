@@ -23,8 +23,8 @@ import struct
 import sys
 import time
 from collections.abc import Sequence
-from threading import Event
 
+from edge.drivers.stop import Stop
 from edge.messages.topics import MESSAGE
 from lpac.network.middleware import MIDDLEWARES
 from lpac.radio.airtime import MESSAGE_BYTES
@@ -82,7 +82,7 @@ class _Program:
             _say("failed", "its program has ended by itself, with", ended[1])
 
     def _run(self, middleware: str, robots: int, start: int, parent: int) -> None:
-        stopped = Event()
+        stopped = Stop()
         signal.signal(signal.SIGTERM, lambda *_: stopped.set())
 
         def receive(data: bytes) -> None:

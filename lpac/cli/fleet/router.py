@@ -1,7 +1,6 @@
 """`lpac fleet router`: what the robots of a fleet meet at, where its radio has one."""
 
 import signal
-import threading
 
 import typer
 
@@ -14,9 +13,10 @@ def router(fleet: Fleet = DEFAULT_FLEET) -> None:
     For `transport = "router"` in [radio]: on the computer that has the address named there, on a
     wire to the access point. `lpac ground` may come and go meanwhile.
     """
+    from edge.drivers.stop import Stop
     from lpac.ground.router import serve_router
 
-    stop = threading.Event()
+    stop = Stop()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     serve_router(fleet, stop, lambda at: typer.echo(f"router at {at}: Ctrl-C ends it"))

@@ -788,7 +788,7 @@ _PEOPLE = (
         name="start-outside", what="who holds finds itself beyond the fence; resume is ordered",
         promise="start is refused outside: it is flown back first",
         does=(
-            *_once(OperatorOrders("hold")), Do(4.0, EstimateJumpsOut(3.0)),
+            *_once(OperatorOrders("hold")), Do(4.0, EstimateJumpsOut(4.5)),
             Do(8.5, OperatorOrders("resume"), mark="start"),
             # Who errs by that much comes down anywhere, which no margin covers.
             Do(20.0, EstimateIsRight()),
