@@ -28,6 +28,9 @@ PILOT_NOTICED_S = 1.1
 _REJOIN_S = 4.0
 # What holds its place in gusts of 8 m/s does not go faster.
 AT_REST_M_S = 0.5
+# Who lands beside another one lands so far away; by its own estimate and the other's, which may err
+# by 6 m from each other, the other one lies nearer to its pad than that.
+_BESIDE_M, _NEAR_PAD_M = 8.0, 14.0
 _STEP_S = 0.06
 # How long an operator's order may take to start a motor, once it is answered.
 _ARMED_AFTER_S = 1.0
@@ -323,16 +326,30 @@ class StraightDown:
 
 @dataclass(frozen=True, slots=True)
 class LandsAtPad:
-    """It lands within so many metres of the pad it stood on."""
+    """It lands within so many metres of the pad it stood on.
+
+    Where somebody lies near that came down elsewhere than on its own, it may land beside.
+    """
 
     within_m: float
     whose: Whose = "hit"
 
     def figure(self, flight: FlightTruth) -> Figure:
         farthest_m = 0.0
+        places_m = [vehicle.position_m[-1, :2] for vehicle in flight.vehicles]
+        strays_m = [
+            place_m
+            for place_m, pad_m in zip(places_m, flight.pads_m, strict=False)
+            if math.dist(place_m, pad_m) > self.within_m
+        ]
         for robot in _robots(flight, self.whose):
-            place_m = flight.vehicles[robot].position_m[-1, :2]
-            farthest_m = max(farthest_m, math.dist(place_m, flight.pads_m[robot]))
+            place_m, pad_m = places_m[robot], flight.pads_m[robot]
+            away_m = math.dist(place_m, pad_m)
+            is_beside = any(
+                place_m is not stray_m and math.dist(stray_m, pad_m) < _NEAR_PAD_M
+                for stray_m in strays_m
+            )
+            farthest_m = max(farthest_m, away_m - _BESIDE_M if is_beside else away_m)
         return Figure("from its pad", farthest_m, self.within_m, "m")
 
 

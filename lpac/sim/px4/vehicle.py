@@ -65,7 +65,7 @@ VERTICAL_DRIFT_TIME_S = 20.0
 YAW_RATE_RAD_S = 1.0
 LANDED_AFTER_S = 1.0
 IN_AIR_AFTER_S = 0.9
-STOPPED_M_S = 0.15
+STOPPED_M_S = 0.5
 ARRIVED_M = 0.3
 # Above so much the velocity's estimate errs as in flight.
 _ERRS_FROM_M = 1.0

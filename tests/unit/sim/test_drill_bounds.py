@@ -102,6 +102,17 @@ FIRST = WELL.vehicles[0]
 FLOWN_M, BESIDE_M = FIRST.position_m, WELL.vehicles[1].position_m
 AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
 STANDS = replace(WELL, vehicles=(AT_REST, WELL.vehicles[1]))
+# The second lands 8.5 m from its pad.
+BESIDE = replace(
+    WELL,
+    vehicles=(
+        FIRST,
+        replace(
+            WELL.vehicles[1],
+            position_m=after(45.0, (15.0, 23.5, 0.0), WELL.vehicles[1].position_m),
+        ),
+    ),
+)
 STANDS_STILL = changed(WELL, position_m=after(FAULT_S, (5.0, 5.0, 5.0), FLOWN_M))
 DRIFTS_M_S = after(25.0, (0.9, 0.0, 0.0), FLOWN_M * 0.0, 26.0)
 PILOTED = after(25.0, Px4Mode.POSCTL, FIRST.mode, 30.0)
@@ -195,6 +206,12 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
     ),
     (StraightDown(3.0), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
     (LandsAtPad(4.5), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
+    (
+        # Beside the first, which lies 6 m from its pad, and by its own pad's side without a reason.
+        LandsAtPad(4.5, "others"),
+        changed(BESIDE, position_m=after(45.0, (11.0, 11.0, 0.0), FLOWN_M)),
+        BESIDE,
+    ),
     (
         FliesOn(15.0, whose="hit"),
         WELL,
