@@ -114,6 +114,14 @@ class _Flight:
         self.run(4.0)
         self.begin()
 
+    def beside(self, offset_m: tuple[float, float]) -> Px4Vehicle:
+        """Robot 1's vehicle, put so far from robot 0 in the plane, as both estimate it."""
+        other = self.fleet.vehicles[1].vehicle
+        place_m = self.vehicle.estimated_position_m + np.array([*offset_m, 0.0])
+        x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
+        other.position_m = np.array([x_m, y_m, other.position_m[2]])
+        return other
+
     def cut(self, apart: bool) -> None:
         """The ground hears no robot, and none hears it; or all of that again."""
         groups = (frozenset({GROUND}), frozenset({0, 1})) if apart else ()
@@ -265,6 +273,14 @@ def _ground_lost_for_a_while(f: _Flight) -> None:
     f.run(3.0)
 
 
+def _ground_lost_below_another(f: _Flight) -> None:
+    f.fly()
+    f.beside((2.0, 1.0))
+    f.begin()
+    f.cut(True)
+    f.until(_S.LAND)
+
+
 def _pilot_takes_over(f: _Flight) -> None:
     f.fly()
     f.vehicle.pilot(Px4Mode.POSCTL, (1.0, 0.0, 0.0))
@@ -303,19 +319,14 @@ def _near_neighbour(f: _Flight) -> None:
     other.move_sticks(())
     f.begin()
     for away_m in (3.5, 0.9):
-        place_m = f.vehicle.estimated_position_m + np.array([away_m, 0.0, 0.0])
-        x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
-        other.position_m = np.array([x_m, y_m, other.position_m[2]])
+        f.beside((away_m, 0.0))
         f.run(3.0)
 
 
 def _comes_down_above(f: _Flight) -> None:
     """Somebody's ground station lands robot 1 through the height of robot 0, near by."""
     f.fly()
-    other = f.fleet.vehicles[1].vehicle
-    place_m = f.vehicle.estimated_position_m + np.array([3.0, 1.0, 0.0])
-    x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
-    other.position_m = np.array([x_m, y_m, other.position_m[2]])
+    other = f.beside((3.0, 1.0))
     f.begin()
     other.set_mode(Px4Mode.LAND)
     f.run(10.0)
@@ -324,10 +335,7 @@ def _comes_down_above(f: _Flight) -> None:
 def _falls_silent(f: _Flight) -> None:
     """Robot 1 is heard no more where robot 0 flies, and where it lands."""
     f.fly()
-    other = f.fleet.vehicles[1].vehicle
-    place_m = f.vehicle.estimated_position_m + np.array([2.0, 1.0, 0.0])
-    x_m, y_m, _ = other.position_m + place_m - other.estimated_position_m
-    other.position_m = np.array([x_m, y_m, other.position_m[2]])
+    f.beside((2.0, 1.0))
     f.run(1.0)
     f.begin()
     f.fleet.radio.air = replace(
@@ -543,6 +551,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "battery_not_told": (_battery_not_told, {}),
     "ground_lost": (_ground_lost, {}),
     "ground_lost_for_a_while": (_ground_lost_for_a_while, {}),
+    "ground_lost_below_another": (_ground_lost_below_another, {}),
     "pilot_takes_over": (_pilot_takes_over, _PILOTED),
     "somebody_lands_it": (_somebody_lands_it, {}),
     "somebody_holds_it": (_somebody_holds_it, {}),

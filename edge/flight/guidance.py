@@ -24,8 +24,9 @@ from edge.flight.safety import (
     keep_inside,
     leash,
     limit_acceleration,
+    part,
 )
-from edge.flight.state import FlightInputs, FlightMemory, Robot, height_m, is_silent
+from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
 
 # PX4 flies towards a position with about 0.95 of the distance per second (MPC_XY_P, MPC_Z_P). That
@@ -93,7 +94,10 @@ def guide(
             silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
             clear_m = clear_height_m(position_m, (*inputs.neighbours, *silent), separation_m)
             highest_m = max(height, clear_m)
-        return _towards(flight.target_m, highest_m, position_m, limits), Guidance()
+        held = _towards(flight.target_m, highest_m, position_m, limits)
+        if state is FlightState.HOLD and not Tick(robot, flight, inputs).ground_heard:
+            held = _apart(robot, inputs, position_m, held)
+        return held, Guidance()
     wanted_m_s = np.zeros(3)
     if state is FlightState.RETURN:
         wanted_m_s[:2] = _homewards(robot, inputs, position_m)
@@ -147,6 +151,25 @@ def _towards(
     wanted_m = min(target_m[2], highest_m)
     climb_m = hold_height(height, wanted_m, limits.max_climb_m_s) * _AHEAD_S
     return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
+
+
+def _apart(
+    robot: Robot, inputs: FlightInputs, position_m: F64, held: MissionSetpoint
+) -> MissionSetpoint:
+    """The same, but away from who would come down just here when the ground stays lost."""
+    if inputs.odometry is None or isinstance(held, MissionVelocity):
+        return held
+    wanted_m_s = (np.array(held.position_m) - position_m) / _AHEAD_S
+    velocity_m_s = part(
+        position_m,
+        np.array(inputs.odometry.velocity_m_s),
+        wanted_m_s,
+        inputs.neighbours,
+        robot.separation,
+        robot.limits,
+        robot.fence,
+    )
+    return MissionPosition(_vector(position_m + velocity_m_s * _AHEAD_S))
 
 
 def _homewards(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:

@@ -384,7 +384,7 @@ def _may_come_down(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     for silent in inputs.fell_silent:
         near_m = nearest_on_way_m(silent, limits, place_m)
         apart_m = float(np.hypot(*(near_m - place_m)))
-        least_m = inputs.separation.silent_m + strays_m(silent, limits)
+        least_m = inputs.separation.landed_m + strays_m(silent, limits)
         if apart_m < least_m and highest_still_m(silent, limits) > 0.0:
             yield FailedCheck(
                 CheckCode.SILENT_NEAR,

@@ -64,15 +64,15 @@ class SeparationLimits(NamedTuple):
     `level_m`: from each, by 3-D distance. `passing_m`, in the plane: from one that climbs or comes
     down through the robot's height, since it keeps to its place and looks for nobody; it has not
     passed before it is `passing_height_m` away in height. `piloted_m`, in the plane: from one that
-    somebody flies at the robot's height. `silent_m`, in the plane: from where one may have stopped
-    that fell silent in flight, whom `silence` takes to fly on for a while.
+    somebody flies at its height. `landed_m`, in the plane: from where another one comes down,
+    or may come down since it fell silent in flight; `silence` takes it to fly on for a while.
     """
 
     level_m: float
     passing_m: float
     passing_height_m: float
     piloted_m: float
-    silent_m: float
+    landed_m: float
     silence: SilenceLimits
 
 
@@ -258,6 +258,33 @@ def brake(
     return np.array([*horizontal, wanted_m_s[2]])
 
 
+def part(
+    position_m: F64,
+    velocity_m_s: F64,
+    wanted_m_s: F64,
+    neighbours: Sequence[Neighbour],
+    separation: SeparationLimits,
+    limits: MotionLimits,
+    fence: Fence,
+) -> F64:
+    """What to fly instead of `wanted_m_s` so that robots that are to land where they are part.
+
+    As `brake`, but whatever the others' heights are, and to `landed_m` from each: nobody can leave
+    when all come down. Neighbours of which something is not known are left out: nothing may keep
+    the robot from holding its place.
+    """
+    level = [
+        each._replace(
+            position_m=(*each.position_m[:2], float(position_m[2])),
+            velocity_m_s=(*each.velocity_m_s[:2], 0.0),
+        )
+        for each in neighbours
+        if _is_known(each)
+    ]
+    separation = separation._replace(level_m=separation.landed_m)
+    return brake(position_m, velocity_m_s, wanted_m_s, level, (), separation, limits, fence)
+
+
 class _Near(NamedTuple):
     """Who limits the robot: its place from here, (2,), or from where the vehicle comes to rest.
 
@@ -310,7 +337,7 @@ def _ways(
         highest_m = highest_still_m(robot, separation.silence)
         if position_m[2] < highest_m + separation.passing_height_m:
             stopped_m = nearest_on_way_m(robot, separation.silence, rest_m)
-            least_m = separation.silent_m + strays_m(robot, separation.silence)
+            least_m = separation.landed_m + strays_m(robot, separation.silence)
             near.append(_to_leave(stopped_m - rest_m, least_m, separation, from_rest=True))
     if not all(each.offset_m.any() for each in near):
         return None

@@ -246,7 +246,7 @@ class Robot:
             # Nobody tells where a pilot carries it next.
             piloted_m=passing_m + errors.wind_m,
             # As from who stands on the ground: both may be off the place where they are to be.
-            silent_m=max(
+            landed_m=max(
                 places_apart(errors.position_m, errors.position_m).least_m, p.min_separation_m
             ),
             silence=SilenceLimits(

@@ -28,9 +28,10 @@ PILOT_NOTICED_S = 1.1
 _REJOIN_S = 4.0
 # What holds its place in gusts of 8 m/s does not go faster.
 AT_REST_M_S = 0.5
-# Who lands beside another one lands so far away; by its own estimate and the other's, which may err
-# by 6 m from each other, the other one lies nearer to its pad than that.
-_BESIDE_M, _NEAR_PAD_M = 8.0, 14.0
+# Who lands beside another one lands so far away, by its own estimate and the other's, which may err
+# by 6 m from each other.
+_BESIDE_M, _ESTIMATES_ERR_M = 8.0, 6.0
+_NEAR_M = _BESIDE_M + _ESTIMATES_ERR_M
 _STEP_S = 0.06
 # How long an operator's order may take to start a motor, once it is answered.
 _ARMED_AFTER_S = 1.0
@@ -284,7 +285,8 @@ class Down:
 class Stands:
     """From then on, and until then, it is not faster than what holds its place in wind.
 
-    That is, by its own estimate, which nobody tells that it wanders.
+    That is, by its own estimate, which nobody tells that it wanders. Who `may_part` may leave
+    somebody who is near.
     """
 
     from_s: float
@@ -292,12 +294,15 @@ class Stands:
     whose: Whose = "hit"
     speed_m_s: float = AT_REST_M_S
     after: str = ""
+    may_part: bool = False
 
     def figure(self, flight: FlightTruth) -> Figure:
         since_s, fastest_m_s = _since_s(flight, self.after), 0.0
         for vehicle in _of(flight, self.whose):
             part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
             moving = part.airborne & part.armed & ~part.is_in(*LANDING)
+            if self.may_part:
+                moving &= _alone_m(flight, vehicle, part.time_s) > _NEAR_M
             speeds_m_s = np.hypot(*part.velocity_m_s[moving, :2].T)
             speeds_m_s -= part.velocity_error_m_s[moving]
             fastest_m_s = max(fastest_m_s, float(speeds_m_s.max(initial=0.0)))
@@ -325,6 +330,24 @@ class StraightDown:
 
 
 @dataclass(frozen=True, slots=True)
+class LandApart:
+    """They come down as far from each other as robots that looked."""
+
+    whose: Whose = "all"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        landed = [v for v in _of(flight, self.whose) if v.is_in(*LANDING).any()]
+        least_m = min(
+            (
+                math.dist(one.position_m[-1, :2], other.position_m[-1, :2])
+                for one, other in combinations(landed, 2)
+            ),
+            default=math.inf,
+        )
+        return Figure("landed apart", least_m, _BESIDE_M - _ESTIMATES_ERR_M, "m", at_least=True)
+
+
+@dataclass(frozen=True, slots=True)
 class LandsAtPad:
     """It lands within so many metres of the pad it stood on.
 
@@ -346,7 +369,7 @@ class LandsAtPad:
             place_m, pad_m = places_m[robot], flight.pads_m[robot]
             away_m = math.dist(place_m, pad_m)
             is_beside = any(
-                place_m is not stray_m and math.dist(stray_m, pad_m) < _NEAR_PAD_M
+                place_m is not stray_m and math.dist(stray_m, pad_m) < _NEAR_M
                 for stray_m in strays_m
             )
             farthest_m = max(farthest_m, away_m - _BESIDE_M if is_beside else away_m)
@@ -614,6 +637,23 @@ def _spans_s(vehicle: VehicleTruth, holds: Bools) -> list[tuple[float, float]]:
     begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1) - 1
     times_s = vehicle.time_s
     return [(float(times_s[b]), float(times_s[e])) for b, e in zip(begins, ends, strict=True)]
+
+
+def _alone_m(flight: FlightTruth, vehicle: VehicleTruth, times_s: F64) -> F64:
+    """(T,): how far the nearest other vehicle is at each time, in the plane."""
+
+    def place_m(of: VehicleTruth) -> F64:
+        axes = [np.interp(times_s, of.time_s, of.position_m[:, axis]) for axis in range(2)]
+        return np.stack(axes, axis=1)
+
+    own_m = place_m(vehicle)
+    away_m = [
+        np.linalg.norm(place_m(other) - own_m, axis=1)
+        for other in flight.vehicles
+        if other is not vehicle
+    ]
+    nearest_m: F64 = np.min([np.full(len(times_s), np.inf), *away_m], axis=0)
+    return nearest_m
 
 
 def _distances_m(one: VehicleTruth, other: VehicleTruth) -> F64:

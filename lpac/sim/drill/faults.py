@@ -19,6 +19,7 @@ from lpac.sim.drill.bounds import (
     Holds,
     KeepsAway,
     KeepsHeight,
+    LandApart,
     Lands,
     LandsAtPad,
     MissionEnds,
@@ -110,6 +111,8 @@ _HOME_S = 35.0 + _LANDING_S
 # begun to land.
 _BRAKED = Stands(2.0, 5.0, speed_m_s=0.8)
 _BRAKED_LATER = Stands(2.6, 6.0, speed_m_s=0.8)
+# Without a ground they stand, but part before they come down where they are.
+_WAIT = Stands(7.0, 12.5, "all", may_part=True)
 # Its receiver's error walks by up to 0.8 m between takeoff and landing, and gusts carry it.
 _AT_PAD_M = 3.0
 
@@ -311,8 +314,8 @@ _RADIO = (
         does=(*_once(RadioCut("from the ground")), Do(10.0, RadioCut("none"))), hits=0,
         watched_s=25.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 25.0, "all"), NotLandedBefore(25.0, "all"),
-            LandsAtPad(_AT_PAD_M, "all"),
+            MissionEnds(3.8, whose="all"), Stands(7.0, 25.0, "all", may_part=True),
+            NotLandedBefore(25.0, "all"), LandsAtPad(_AT_PAD_M, "all"),
         ),
     ),
     Fault(
@@ -320,8 +323,9 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(RadioCut("from the ground")), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
-            Lands(14.0, "all"), StraightDown(3.0, "all"), Down(14.0 + _LANDING_S, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            Lands(14.0, "all"), StraightDown(3.0, "all"), LandApart(),
+            Down(14.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(
@@ -350,9 +354,9 @@ _RADIO = (
         does=(*_once(RadioCut("in halves")), Do(20.0, RadioCut("none"))), hits=0, watched_s=40.0,
         bounds=(
             FliesOn(20.0, 0.95, "first half"), MissionEnds(3.8, 20.0, "second half"),
-            Stands(7.0, 12.5, "second half"), NotLandedBefore(12.5, "second half"),
-            Lands(14.0, "second half"),
-            Down(14.0 + _LANDING_S, "second half"),
+            Stands(7.0, 12.5, "second half", may_part=True),
+            NotLandedBefore(12.5, "second half"), Lands(14.0, "second half"),
+            LandApart("second half"), Down(14.0 + _LANDING_S, "second half"),
         ),
     ),
     Fault(
@@ -372,7 +376,7 @@ _RADIO = (
         promise="a late ground is a lost one: hold after 3 s; it still lands them",
         does=_once(RadioIs(delay_s=8.0)), hits=0, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"),
         ),
     ),
@@ -393,8 +397,8 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s; they stay down when it wakes",
         does=_once(GroundStops(60.0)), hits=0, watched_s=70.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
-            Lands(14.0, "all"), Down(14.0 + _LANDING_S, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            Lands(14.0, "all"), LandApart(), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(
@@ -402,8 +406,8 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(GroundDies()), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
-            Lands(14.0, "all"), Down(14.0 + _LANDING_S, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            Lands(14.0, "all"), LandApart(), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(
@@ -724,8 +728,8 @@ _PEOPLE = (
         hits=0, watched_s=40.0, home=False,
         bounds=(
             FliesOn(12.0, 0.95, "all"), MissionEnds(3.8, whose="all", after="gone"),
-            Stands(7.0, 12.5, "all", after="gone"), NotLandedBefore(24.5, "all"),
-            Lands(14.0, "all", "gone"), Down(26.0 + _LANDING_S, "all"),
+            Stands(7.0, 12.5, "all", after="gone", may_part=True), NotLandedBefore(24.5, "all"),
+            Lands(14.0, "all", "gone"), LandApart(), Down(26.0 + _LANDING_S, "all"),
         ),
     ),
     Fault(

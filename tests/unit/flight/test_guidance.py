@@ -98,12 +98,14 @@ class Vehicle:
         seconds: float,
         policy_m_s: F64 | None = None,
         neighbours: tuple[Neighbour, ...] = (),
+        ground_age_s: float = 0.0,
     ) -> None:
         memory = Guidance()
         for _ in range(round(seconds / TICK_S)):
             x, y, z = self.position_m.tolist()
             vx, vy, vz = self.velocity_m_s.tolist()
             given = inputs((x, y, z), (vx, vy, vz), policy_m_s, neighbours)
+            given = replace(given, ground_age_s=ground_age_s)
             sent, memory = guide(ROBOT, state, given, memory, TICK_S)
             assert sent is not None
             if isinstance(sent, MissionPosition):
@@ -161,6 +163,56 @@ def test_hold_comes_back_slowly_when_the_estimate_jumps() -> None:
     vehicle.fly(state, 30.0)
     assert np.abs(np.diff(vehicle.path_m, axis=0)).max() < 1.1 * TICK_S
     assert vehicle.position_m == pytest.approx(AT_SLOT, abs=0.1)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.integers(2, 4), st.integers(0, 2**32 - 1))
+def test_robots_that_lost_their_ground_part_before_they_come_down(robots: int, seed: int) -> None:
+    """However they hover over each other, at their own heights, in the middle of the field."""
+    rng = np.random.default_rng(seed)
+    heights_m = 5.0 + 4.5 * np.arange(robots)
+    starts_m = np.column_stack([rng.uniform(14.0, 18.0, (robots, 2)), heights_m])
+    fleet = [Vehicle((x, y, z)) for x, y, z in starts_m.tolist()]
+    for _ in range(100):
+        told = [
+            Neighbour(i, _vector(each.position_m), _vector(each.velocity_m_s), 0.0)
+            for i, each in enumerate(fleet)
+        ]
+        for i, each in enumerate(fleet):
+            target_m = _vector(starts_m[i])
+            others = (*told[:i], *told[i + 1 :])
+            each.fly(flight(FlightState.HOLD, target_m), TICK_S, None, others, ground_age_s=5.0)
+    places_m = np.array([each.position_m for each in fleet])
+    apart_m = [
+        math.dist(places_m[i, :2], places_m[j, :2]) for i in range(robots) for j in range(i)
+    ]
+    assert min(apart_m) > ROBOT.separation.landed_m - 0.75
+    assert places_m[:, 2] == pytest.approx(heights_m, abs=0.1)
+    speeds_m_s = [np.diff(each.path_m, axis=0) / TICK_S for each in fleet]
+    assert np.abs(speeds_m_s).max() <= ROBOT.limits.max_speed_m_s
+
+
+def test_who_lost_the_ground_leaves_who_stands_below_it_and_keeps_inside_the_fence() -> None:
+    vehicle = Vehicle((3.0, 16.0, SLOT_M))
+    below = Neighbour(2, (4.0, 16.0, 0.0), STILL, 0.2)
+    hold = flight(FlightState.HOLD, (3.0, 16.5, SLOT_M))
+    vehicle.fly(hold, 20.0, neighbours=(below,), ground_age_s=5.0)
+    assert math.dist(vehicle.position_m[:2], (4.0, 16.0)) > 7.5
+    assert ROBOT.fence.distance_m(*vehicle.position_m[:2].tolist()) > 1.5
+
+
+def test_nobody_leaves_its_place_while_the_ground_is_heard_or_by_what_is_no_measurement() -> None:
+    above = Neighbour(2, (16.0, 17.0, SLOT_M + 4.5), STILL, 0.2)
+    broken = Neighbour(4, (math.nan, 17.0, SLOT_M), STILL, 0.2)
+    hold = flight(FlightState.HOLD, AT_SLOT)
+    held = position(hold, inputs(neighbours=(above,)))
+    lost = replace(inputs(neighbours=(broken,)), ground_age_s=5.0)
+    np.testing.assert_allclose([held, position(hold, lost)], [AT_SLOT] * 2)
+
+
+def _vector(values: F64) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def test_return_flies_level_only_at_its_own_height() -> None:

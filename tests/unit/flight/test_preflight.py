@@ -92,7 +92,7 @@ READY = PreflightInputs(
         passing_m=6.5,
         passing_height_m=3.5,
         piloted_m=7.25,
-        silent_m=8.0,
+        landed_m=8.0,
         silence=SilenceLimits(max_speed_m_s=2.0, ceiling_m=25.0, flies_on_s=4.6, hovers_s=66.0),
     ),
     rc="none",

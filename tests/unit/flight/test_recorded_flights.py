@@ -106,6 +106,10 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
         lambda patch: patch.setattr(guidance, "brake", lambda *given: given[2]),
         ("near_neighbour",),
     ),
+    "nobody parts before they come down": (
+        lambda patch: patch.setattr(guidance, "part", lambda *given: given[2]),
+        ("ground_lost_below_another",),
+    ),
     "no way for who comes down": (
         lambda patch: patch.setattr(safety, "_PASSING_M_S", math.inf),
         ("comes_down_above",),

@@ -34,7 +34,7 @@ LIMITS = MotionLimits(max_speed_m_s=3.0, max_climb_m_s=1.0, max_acceleration_m_s
 FIELD_LIMITS = MotionLimits(1.25, max_climb_m_s=1.0, max_acceleration_m_s2=2.0, lag_s=1.3)
 SILENCE = SilenceLimits(max_speed_m_s=1.25, ceiling_m=34.5, flies_on_s=3.0, hovers_s=60.0)
 FIELD_SEPARATION = SeparationLimits(
-    level_m=1.5, passing_m=6.5, passing_height_m=3.5, piloted_m=7.25, silent_m=8.0, silence=SILENCE
+    level_m=1.5, passing_m=6.5, passing_height_m=3.5, piloted_m=7.25, landed_m=8.0, silence=SILENCE
 )
 CONTROL_S, STEP_S = 0.1, 0.02
 AT_REST = np.zeros(3)
@@ -422,7 +422,7 @@ def test_nobody_flies_below_where_a_silent_robot_may_have_stopped(
         distances_m.append(np.hypot(*(stops_m - vehicle.position_m[:2]).T).min())
     # It left, whichever way it began, and did not come back.
     strays_m = 0.5 * way_m_s[0] * SILENCE.flies_on_s
-    assert min(distances_m[120:]) > FIELD_SEPARATION.silent_m + strays_m - 0.3
+    assert min(distances_m[120:]) > FIELD_SEPARATION.landed_m + strays_m - 0.3
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from lpac.sim.drill.bounds import (
     InsideFence,
     KeepsAway,
     KeepsHeight,
+    LandApart,
     Lands,
     LandsAtPad,
     MissionEnds,
@@ -102,6 +103,10 @@ FIRST = WELL.vehicles[0]
 FLOWN_M, BESIDE_M = FIRST.position_m, WELL.vehicles[1].position_m
 AT_REST = replace(FIRST, velocity_m_s=np.zeros_like(FLOWN_M))
 STANDS = replace(WELL, vehicles=(AT_REST, WELL.vehicles[1]))
+NEAR = replace(
+    STANDS,
+    vehicles=(AT_REST, replace(WELL.vehicles[1], position_m=BESIDE_M - (8.0, 8.0, 0.0))),
+)
 # The second lands 8.5 m from its pad.
 BESIDE = replace(
     WELL,
@@ -204,6 +209,13 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
         changed(STANDS, velocity_m_s=DRIFTS_M_S, velocity_error_m_s=np.full_like(TIMES_S, 0.5)),
         changed(STANDS, velocity_m_s=DRIFTS_M_S, velocity_error_m_s=np.full_like(TIMES_S, 0.3)),
     ),
+    (
+        # It leaves the other one, which is near; with nobody near it stands.
+        Stands(1.0, 10.0, may_part=True),
+        changed(NEAR, velocity_m_s=DRIFTS_M_S),
+        changed(STANDS, velocity_m_s=DRIFTS_M_S),
+    ),
+    (LandApart(), WELL, changed(WELL, position_m=after(45.0, (19.0, 13.5, 0.0), FLOWN_M))),
     (StraightDown(3.0), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
     (LandsAtPad(4.5), WELL, changed(WELL, position_m=after(45.0, (14.0, 5.0, 0.0), FLOWN_M))),
     (
