@@ -3,7 +3,8 @@
 Heights are above the robot's own takeoff point. HOLD, TAKEOFF and RETURN are flown as positions a
 short way ahead of the estimate, which PX4 stops at much sooner than at a velocity of 0, and which
 never lets the vehicle dash when the estimate jumps. MISSION is flown as a velocity. Neighbours and
-the fence limit RETURN and MISSION. While the position is in doubt, all of them stand still.
+the fence limit MISSION and RETURN; in HOLD it makes room for neighbours, and comes back. While the
+position is in doubt, all of them stand still.
 """
 
 import math
@@ -24,7 +25,7 @@ from edge.flight.safety import (
     keep_inside,
     leash,
     limit_acceleration,
-    part,
+    make_room,
 )
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
@@ -86,18 +87,14 @@ def guide(
         return _STOP, Guidance()
     if inputs.position.quality is not PositionQuality.GOOD:
         return _stay(robot, flight, height), Guidance()
-    if state in (FlightState.TAKEOFF, FlightState.HOLD):
-        highest_m = math.inf
-        if state is FlightState.TAKEOFF:
-            separation_m = robot.parameters.min_separation_m
-            # Who fell silent may still hover where it was.
-            silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
-            clear_m = clear_height_m(position_m, (*inputs.neighbours, *silent), separation_m)
-            highest_m = max(height, clear_m)
-        held = _towards(flight.target_m, highest_m, position_m, limits)
-        if state is FlightState.HOLD and not Tick(robot, flight, inputs).ground_heard:
-            held = _apart(robot, inputs, position_m, held)
-        return held, Guidance()
+    if state is FlightState.HOLD:
+        return _hold(robot, flight, inputs, position_m), Guidance()
+    if state is FlightState.TAKEOFF:
+        # Who fell silent may still hover where it was.
+        silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
+        separation_m = robot.parameters.min_separation_m
+        clear_m = clear_height_m(position_m, (*inputs.neighbours, *silent), separation_m)
+        return _towards(flight.target_m, max(height, clear_m), position_m, limits), Guidance()
     wanted_m_s = np.zeros(3)
     if state is FlightState.RETURN:
         wanted_m_s[:2] = _homewards(robot, inputs, position_m)
@@ -153,21 +150,21 @@ def _towards(
     return MissionPosition(_vector(np.array([*place_m, height + climb_m])))
 
 
-def _apart(
-    robot: Robot, inputs: FlightInputs, position_m: F64, held: MissionSetpoint
+def _hold(
+    robot: Robot, flight: FlightMemory, inputs: FlightInputs, position_m: F64
 ) -> MissionSetpoint:
-    """The same, but away from who would come down just here when the ground stays lost."""
-    if inputs.odometry is None or isinstance(held, MissionVelocity):
-        return held
-    wanted_m_s = (np.array(held.position_m) - position_m) / _AHEAD_S
-    velocity_m_s = part(
+    place = _towards(flight.target_m, math.inf, position_m, robot.limits)
+    if inputs.odometry is None or isinstance(place, MissionVelocity):
+        return place
+    velocity_m_s = make_room(
         position_m,
         np.array(inputs.odometry.velocity_m_s),
-        wanted_m_s,
+        (np.array(place.position_m) - position_m) / _AHEAD_S,
         inputs.neighbours,
         robot.separation,
         robot.limits,
         robot.fence,
+        lands=not Tick(robot, flight, inputs).ground_heard,
     )
     return MissionPosition(_vector(position_m + velocity_m_s * _AHEAD_S))
 

@@ -4,7 +4,7 @@ Mission frame: x right, y forward, z up, m, heights above the robot's own takeof
 and velocities are (3,) float64 unless said otherwise.
 
 What is commanded passes `limit_speed` and `limit_acceleration` first, then `keep_inside`, and
-`brake` last, which keeps to the fence too: nothing may soften a stop.
+`brake` last (in HOLD `make_room`), which keeps to the fence too: nothing may soften a stop.
 
 Nothing here raises in flight. A number that is not finite, or beyond 1000 km, is no measurement:
 where one comes in, a velocity goes out as 0, and a point as None.
@@ -258,31 +258,36 @@ def brake(
     return np.array([*horizontal, wanted_m_s[2]])
 
 
-def part(
+def make_room(
     position_m: F64,
     velocity_m_s: F64,
     wanted_m_s: F64,
-    neighbours: Sequence[Neighbour],
+    neighbours: Iterable[Neighbour],
     separation: SeparationLimits,
     limits: MotionLimits,
     fence: Fence,
+    *,
+    lands: bool,
 ) -> F64:
-    """What to fly instead of `wanted_m_s` so that robots that are to land where they are part.
+    """What who holds its place flies of `wanted_m_s`: as `brake`, but it looks at less.
 
-    As `brake`, but whatever the others' heights are, and to `landed_m` from each: nobody can leave
-    when all come down. Neighbours of which something is not known are left out: nothing may keep
-    the robot from holding its place.
+    Neighbours of which something is not known do not keep it from its place, and it leaves nobody
+    who is silent: others, who may not hear it either, take it to stand. Who is to come down where
+    it is, as they may be too, `lands`: it parts from all, whatever their heights are, by `landed_m`
+    in the plane.
     """
-    level = [
-        each._replace(
-            position_m=(*each.position_m[:2], float(position_m[2])),
-            velocity_m_s=(*each.velocity_m_s[:2], 0.0),
-        )
-        for each in neighbours
-        if _is_known(each)
-    ]
-    separation = separation._replace(level_m=separation.landed_m)
-    return brake(position_m, velocity_m_s, wanted_m_s, level, (), separation, limits, fence)
+    known = [each for each in neighbours if _is_known(each)]
+    if lands:
+        separation = separation._replace(level_m=separation.landed_m)
+        height_m = float(position_m[2])
+        known = [
+            each._replace(
+                position_m=(*each.position_m[:2], height_m),
+                velocity_m_s=(*each.velocity_m_s[:2], 0.0),
+            )
+            for each in known
+        ]
+    return brake(position_m, velocity_m_s, wanted_m_s, known, (), separation, limits, fence)
 
 
 class _Near(NamedTuple):

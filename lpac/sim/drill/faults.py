@@ -810,7 +810,7 @@ _PAIRS = (
         promise="the landing comes before the hold",
         does=(*_once(Drain(0.145)), Do(5.0, OperatorOrders("hold"), "all")),
         bounds=(
-            Lands(3.5), Down(_LANDING_S), Stands(9.0, 20.0, "others"),
+            Lands(3.5), Down(_LANDING_S), Stands(9.0, 20.0, "others", may_part=True),
             NotLandedBefore(20.0, "others"),
         ),
     ),

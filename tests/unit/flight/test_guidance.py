@@ -183,9 +183,7 @@ def test_robots_that_lost_their_ground_part_before_they_come_down(robots: int, s
             others = (*told[:i], *told[i + 1 :])
             each.fly(flight(FlightState.HOLD, target_m), TICK_S, None, others, ground_age_s=5.0)
     places_m = np.array([each.position_m for each in fleet])
-    apart_m = [
-        math.dist(places_m[i, :2], places_m[j, :2]) for i in range(robots) for j in range(i)
-    ]
+    apart_m = [math.dist(places_m[i, :2], places_m[j, :2]) for i in range(robots) for j in range(i)]
     assert min(apart_m) > ROBOT.separation.landed_m - 0.75
     assert places_m[:, 2] == pytest.approx(heights_m, abs=0.1)
     speeds_m_s = [np.diff(each.path_m, axis=0) / TICK_S for each in fleet]
@@ -208,6 +206,19 @@ def test_nobody_leaves_its_place_while_the_ground_is_heard_or_by_what_is_no_meas
     held = position(hold, inputs(neighbours=(above,)))
     lost = replace(inputs(neighbours=(broken,)), ground_age_s=5.0)
     np.testing.assert_allclose([held, position(hold, lost)], [AT_SLOT] * 2)
+
+
+def test_who_holds_makes_way_for_one_that_comes_down_through_its_height_and_comes_back() -> None:
+    vehicle, hold = Vehicle(AT_SLOT), flight(FlightState.HOLD, AT_SLOT)
+    height_m, apart_m = SLOT_M + 9.0, []
+    while height_m > 0.0:
+        other = Neighbour(2, (16.5, 16.0, height_m), (0.0, 0.0, -1.5), 0.0)
+        vehicle.fly(hold, TICK_S, neighbours=(other,))
+        height_m -= 1.5 * TICK_S
+        apart_m.append(math.dist(vehicle.position_m, (16.5, 16.0, height_m)))
+    assert min(apart_m) > 4.0
+    vehicle.fly(hold, 20.0)
+    assert vehicle.position_m == pytest.approx(AT_SLOT, abs=0.2)
 
 
 def _vector(values: F64) -> Vector:

@@ -107,7 +107,7 @@ MUTATIONS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], tuple[str, ...]
         ("near_neighbour",),
     ),
     "nobody parts before they come down": (
-        lambda patch: patch.setattr(guidance, "part", lambda *given: given[2]),
+        lambda patch: patch.setattr(guidance, "make_room", lambda *given, **_: given[2]),
         ("ground_lost_below_another",),
     ),
     "no way for who comes down": (
