@@ -21,6 +21,8 @@ SOURCE = HERE.parents[1]
 DEBIAN_LOCK = HERE / "debian.lock"
 WHEELS_LOCK = HERE / "requirements.lock"
 BUILD_LOCK = HERE / "build.lock"
+# Wheels of the user's: sensors, policies, vehicles, radios, and what they need.
+PACKAGES = HERE / "packages"
 # Where BuildKit and buildah put the Dockerfile's secret.
 CERTIFICATES = Path("/run/secrets/certificates")
 # Debian's architecture -> the wheels', and the glibcs of theirs that the tree's (2.36) serves.
@@ -109,7 +111,7 @@ def fetch(architecture: str, folder: Path) -> None:
 
 
 def assemble(architecture: str, fetched: Path, root: Path) -> None:
-    """The tree of what was fetched, and of edge and the command, in the new folder `root`."""
+    """The tree of what was fetched, of edge and the command, and of the user's own packages."""
     root.mkdir()
     locked = read_debian_lock(DEBIAN_LOCK, architecture)
     for deb in sorted((fetched / "debian").iterdir()):
@@ -120,8 +122,19 @@ def assemble(architecture: str, fetched: Path, root: Path) -> None:
          environment={"PYTHONPATH": str(fetched / "hatchling"), "SOURCE_DATE_EPOCH": "315532800"},
     )  # fmt: skip
     wheels = sorted((fetched / "wheels").iterdir())
-    _pip("install", "--quiet", "--no-index", "--no-deps", "--no-compile", "--only-binary=:all:",
-         *_target(architecture), "--target", root / SITE, *wheels, *own.iterdir())  # fmt: skip
+    packages = sorted(PACKAGES.glob("*.whl"))
+    install = ("install", "--quiet", "--no-index", "--only-binary=:all:", *_target(architecture),
+               "--target", root / SITE)  # fmt: skip
+    if packages:
+        found = [f"--find-links={folder}" for folder in (fetched / "wheels", own)]
+        try:
+            _pip(*install, "--dry-run", *found, *packages)
+        except BuildError:
+            raise BuildError(
+                f"the wheels of deploy/docker/packages do not fit: see above; each must be for "
+                f"Python 3.11 on {architecture}, and what they need must be there too"
+            ) from None
+    _pip(*install, "--no-deps", "--no-compile", *wheels, *own.iterdir(), *packages)
 
     for pattern in LEFT_OUT:
         for path in list(root.glob(pattern)):
@@ -137,7 +150,9 @@ def assemble(architecture: str, fetched: Path, root: Path) -> None:
     versions = {
         "architecture": architecture,
         "debian": {n: {"version": v, "sha256": s} for n, (v, s) in locked.items()},
-        "wheels": {path.name: {"sha256": _sha256(path)} for path in [*wheels, *own.iterdir()]},
+        "wheels": {
+            path.name: {"sha256": _sha256(path)} for path in [*wheels, *own.iterdir(), *packages]
+        },
     }
     (root / "usr/share/lpac").mkdir()
     (root / "usr/share/lpac/versions.json").write_text(json.dumps(versions, indent=1) + "\n")

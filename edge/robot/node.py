@@ -271,6 +271,15 @@ class RobotNode:
             self._sent = count + 1, total_bytes + len(data)
         self._publish(MESSAGE, data)
 
+    def try_sensor(self) -> str:
+        """What is wrong with a reading at its own height above where it lands; "" if nothing is.
+
+        For a robot that is only checked: its loops do not run.
+        """
+        flight = self._control.assignment.robot.parameters
+        x_m, y_m = flight.landing_point_m
+        return self._pac.try_sensor((x_m, y_m, flight.slot_height_m))
+
     def preflight_step(self) -> None:
         """Prepare and check the vehicle, a few times a second; it may wait for the vehicle.
 

@@ -306,6 +306,18 @@ class Pac:
             return f"sensor: {of_sensor}"
         return f"policy: {of_policy}" if of_policy else ""
 
+    def try_sensor(self, position_m: Position) -> str:
+        """What is wrong with a reading from there, mission frame; "" if nothing is.
+
+        For a robot that is only checked: nothing may perceive meanwhile.
+        """
+        (own,) = self._to_model([position_m])
+        try:
+            self._look(own, position_m[2])
+        except Exception as error:  # a sensor may be anybody's
+            return f"{type(error).__name__}: {error}"
+        return self._sensor_problem
+
     def action_age_s(self, now_s: float) -> float | None:
         """The age of the policy's newest answer, s; None if there is none."""
         action = self._action

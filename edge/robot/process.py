@@ -397,6 +397,10 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             failed = node.failed_checks
             if failed is not None:
                 failed = tuple(c for c in failed if c.code not in _ONLY_OF_A_ROBOT)
+                problem = node.try_sensor()
+                if problem:
+                    text = f"sensor {config.sensor.type}: {problem}"
+                    failed += (FailedCheck(CheckCode.NO_FRESH_ANSWER, text),)
             if failed == () or (failed is not None and time.monotonic() > until_s):
                 readiness = node.readiness
                 version = in_words(vehicle.state().version)

@@ -51,7 +51,8 @@ _ELSEWHERE = {
     "policy.world": "it is `world` at the top of the file",
     "autopilot.system_id": "it is `system_id` in [robots.NAME]",
     "identity": "it follows from `keys` at the top of the file",
-    "link": "it follows from [radio], and `address` and `zenoh_port` in [robots.NAME]",
+    "link": "it follows from [radio], and `address` and `zenoh_port` in [robots.NAME]; a radio of "
+    "your own is `type` and `options` in [radio]",
     "flight.slot": "it is `height` in [[slots]]",
     "flight.landing_point_m": "it is `landing_point_m` in [[slots]]",
     "log.folder": "robots log to /var/lib/lpac/logs",
@@ -80,12 +81,15 @@ class RadioConfig:
     "mesh": each is connected to each, and says it to them one by one. "router": all are connected
     to a router, at `router` (IPv4 address and port), which `lpac fleet router` is. "multicast":
     robots tell each other all at once, in `group` (multicast address and port), and the ground by
-    way of the router.
+    way of the router. `type` and `options` are robot.toml's `link.type` and `link.options`: a radio
+    of your own, which is told all of this too.
     """
 
     transport: Transport = "mesh"
     router: str = ""
     group: str = "239.255.76.80:7450"
+    type: str = "zenoh"
+    options: dict[str, object] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.router and not _is_endpoint(self.router):
@@ -156,20 +160,16 @@ class RobotHost:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where a robot finds bundle and world and who it is, keeps its logs, and the address it
-    listens on."""
+    """Where a robot finds bundle and world and who it is, and keeps its logs."""
 
     bundle: str
     world: str
     identity: str
     logs: str
-    listen: str
 
 
 # A release lies at /release in the sandbox of the robot's unit.
-IN_RELEASE = Places(
-    "bundle", "world.env", "/var/lib/lpac/identity", "/var/lib/lpac/logs", "0.0.0.0"
-)
+IN_RELEASE = Places("bundle", "world.env", "/var/lib/lpac/identity", "/var/lib/lpac/logs")
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,10 +531,9 @@ def _robot_mapping(
 ) -> dict[str, Any]:
     """The robot's robot.toml, in that slot."""
     earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
-    # A fleet that is all on this computer needs no keys, and nobody else reaches it.
-    listen = places.listen if config.keys or config.insecure else "127.0.0.1"
+    # On no other network that its computer is in.
     link: dict[str, Any] = {
-        "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
+        "listen": [config.endpoint(robot)],
         "connect": [
             config.endpoint(other) for other in sorted(earlier, key=lambda other: other.robot_id)
         ],
@@ -543,6 +542,8 @@ def _robot_mapping(
         link = {"mode": "client", "connect": [config.router]}
     if config.radio.transport == "multicast":
         link |= {"group": config.radio.group, "interface": robot.address}
+    if config.radio.type != "zenoh":
+        link |= {"type": config.radio.type, "options": config.radio.options}
     own = {
         "fleet": config.fleet,
         "robot_id": robot.robot_id,

@@ -6,6 +6,7 @@ import re
 import shutil
 import stat
 import subprocess
+import sys
 import tarfile
 import tomllib
 from collections.abc import Iterator
@@ -141,8 +142,10 @@ def test_it_runs_without_a_user_and_a_place_to_write(
     assert line.startswith("lpac: /release/robot.toml: cannot be read")
 
 
-def run_inside(tree: Path, release: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = inside(tree, release, "/usr/bin/lpac", *arguments)
+def run_inside(
+    tree: Path, release: Path, *arguments: str, program: str = "/usr/bin/lpac"
+) -> subprocess.CompletedProcess[str]:
+    command = inside(tree, release, program, *arguments)
     return subprocess.run(command, capture_output=True, text=True, timeout=300.0, check=False)
 
 
@@ -194,6 +197,43 @@ def test_two_builds_are_equal(builder: Builder) -> None:
     assert result.returncode == 0, result.stderr
     first, second = (contents(builder.files / name) for name in ("root_fs", "again"))
     assert first == second
+
+
+def test_a_package_of_ones_own_is_on_the_robot(builder: Builder, tmp_path: Path) -> None:
+    """As docs/extending.md says; and what it needs has to be there too."""
+    packages = builder.files / "src/deploy/docker/packages"
+    pip = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir"]
+    needs_more = tmp_path / "lora"
+    needs_more.mkdir()
+    (needs_more / "lora.py").write_text("")
+    (needs_more / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["hatchling"]\nbuild-backend = "hatchling.build"\n'
+        '[project]\nname = "lora"\nversion = "1"\ndependencies = ["spidev>=3"]\n'
+    )
+    try:
+        subprocess.run([*pip, packages, ROOT / "examples" / "camera"], check=True)
+        result = builder.build_root("assemble", "amd64", "/fetched", "/with_camera")
+        assert result.returncode == 0, result.stderr
+        subprocess.run([*pip, packages, needs_more], check=True)
+        refused = builder.build_root("assemble", "amd64", "/fetched", "/with_lora")
+    finally:
+        for wheel in packages.glob("*.whl"):
+            wheel.unlink()
+    tree = builder.files / "with_camera"
+    versions = json.loads((tree / "usr/share/lpac/versions.json").read_text())
+    assert any(name.startswith("lpac_camera-") for name in versions["wheels"])
+    opens = """
+from edge.drivers.registry import open_sensor
+from edge.policy.bundle import load_bundle
+from pathlib import Path
+with open_sensor("camera", {}, load_bundle(Path("/release")).manifest) as over:
+    print(type(over("CircularBND 10 10 5 1", "world")).__name__)
+"""
+    said = run_inside(tree, SHIPPED, "-c", opens, program="/usr/bin/python3.11")
+    assert (said.stdout, said.stderr) == ("RenderedCamera\n", "")
+    assert refused.returncode == 1
+    assert "spidev" in refused.stderr
+    assert "image: the wheels of deploy/docker/packages do not fit" in refused.stderr
 
 
 def contents(tree: Path) -> dict[str, tuple[object, ...]]:

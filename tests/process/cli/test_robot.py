@@ -4,11 +4,15 @@ import json
 import os
 import socket
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from edge.core import F32, F64
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode
+from edge.robot import process
+from edge.robot.config import load_config
 from lpac.sim.px4.link import Px4Link
 from tests.robot_rig import (
     SYSTEM_ID,
@@ -83,6 +87,17 @@ def test_check_passes_a_good_vehicle_and_says_what_it_set(tmp_path: Path) -> Non
         assert (report["failed"], report["changes"]) == ([], [])
         assert report["explanations"]
     assert not any(truth.armed for truth in vehicle.truth)
+
+
+def test_check_tries_the_sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Blind:
+        def view(self, position: F64) -> F32 | None:
+            return None
+
+    monkeypatch.setattr(process, "open_sensor", lambda *_: nullcontext(lambda *_: Blind()))
+    with rig(tmp_path, new_vehicle()) as made:
+        report = process.check(load_config(made.config_path), 0.0)
+    assert "sensor world: it shows nothing" in [each.text for each in report.failed]
 
 
 def test_check_without_a_ground_or_on_a_wrong_vehicle(tmp_path: Path) -> None:

@@ -125,6 +125,7 @@ def test_a_bad_view_does_not_enter_the_map(
 ) -> None:
     world = World(seen=view)
     robot = make_robot(shipped_policy, world)
+    assert f"sensor: {robot.try_sensor((1.0, 1.0, 5.0))}" == problem
     robot.perceive(0.0)
     assert robot.infer(0.0) is None
     assert (robot.problem, robot.action_age_s(0.1)) == (problem, None)
@@ -133,6 +134,19 @@ def test_a_bad_view_does_not_enter_the_map(
     assert robot.infer(0.2) is not None
     assert robot.problem == ""
     assert robot.action_age_s(0.3) == pytest.approx(0.1)
+
+
+def test_a_sensor_that_raises_is_tried_without_harm(
+    shipped_policy: LpacPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = make_robot(shipped_policy, World(seen=np.zeros((64, 64), np.float32)))
+    assert robot.try_sensor((1.0, 1.0, 5.0)) == ""
+
+    def unplugged(_: F64) -> F32:
+        raise OSError("no /dev/video7")
+
+    monkeypatch.setattr(robot.sensor, "view", unplugged)
+    assert robot.try_sensor((1.0, 1.0, 5.0)) == "OSError: no /dev/video7"
 
 
 def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
