@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
+from edge.core.mailbox import Neighbour
 from edge.core.position import PositionQuality
 from edge.core.vehicle import Vector
 from edge.flight.safety import (
@@ -27,6 +28,7 @@ from edge.flight.safety import (
     limit_acceleration,
     make_room,
 )
+from edge.flight.silence import parted
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
 
@@ -154,17 +156,25 @@ def _hold(
     robot: Robot, flight: FlightMemory, inputs: FlightInputs, position_m: F64
 ) -> MissionSetpoint:
     place = _towards(flight.target_m, math.inf, position_m, robot.limits)
-    if inputs.odometry is None or isinstance(place, MissionVelocity):
+    if inputs.odometry is None or flight.target_m is None or isinstance(place, MissionVelocity):
         return place
+    lands, separation = not Tick(robot, flight, inputs).ground_heard, robot.separation
+    unheard: list[Neighbour] = []
+    if lands:
+        x_m, y_m, _ = flight.target_m
+        unheard = [
+            parted(each, separation.silence, (x_m, y_m), separation.landed_m)
+            for each in inputs.fell_silent
+        ]
     velocity_m_s = make_room(
         position_m,
         np.array(inputs.odometry.velocity_m_s),
         (np.array(place.position_m) - position_m) / _AHEAD_S,
-        inputs.neighbours,
-        robot.separation,
+        (*inputs.neighbours, *unheard),
+        separation,
         robot.limits,
         robot.fence,
-        lands=not Tick(robot, flight, inputs).ground_heard,
+        lands=lands,
     )
     return MissionPosition(_vector(position_m + velocity_m_s * _AHEAD_S))
 

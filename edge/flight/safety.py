@@ -271,10 +271,10 @@ def make_room(
 ) -> F64:
     """What who holds its place flies of `wanted_m_s`: as `brake`, but it looks at less.
 
-    Neighbours of which something is not known do not keep it from its place, and it leaves nobody
-    who is silent: others, who may not hear it either, take it to stand. Who is to come down where
-    it is, as they may be too, `lands`: it parts from all, whatever their heights are, by `landed_m`
-    in the plane.
+    Neighbours of which something is not known do not keep it from its place; nor do those who are
+    silent, who may not hear it either, and take it to stand there. Who is to come down where it is,
+    as they may be too, `lands`: it parts from all neighbours, whatever their heights are, by
+    `landed_m` in the plane.
     """
     known = [each for each in neighbours if _is_known(each)]
     if lands:

@@ -333,7 +333,7 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(RadioCut("all")), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"), StraightDown(3.0, "all"), Down(14.0 + _LANDING_S, "all"),
         ),
     ),

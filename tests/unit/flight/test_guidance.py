@@ -99,13 +99,14 @@ class Vehicle:
         policy_m_s: F64 | None = None,
         neighbours: tuple[Neighbour, ...] = (),
         ground_age_s: float = 0.0,
+        fell_silent: tuple[Neighbour, ...] = (),
     ) -> None:
         memory = Guidance()
         for _ in range(round(seconds / TICK_S)):
             x, y, z = self.position_m.tolist()
             vx, vy, vz = self.velocity_m_s.tolist()
             given = inputs((x, y, z), (vx, vy, vz), policy_m_s, neighbours)
-            given = replace(given, ground_age_s=ground_age_s)
+            given = replace(given, ground_age_s=ground_age_s, fell_silent=fell_silent)
             sent, memory = guide(ROBOT, state, given, memory, TICK_S)
             assert sent is not None
             if isinstance(sent, MissionPosition):
@@ -197,6 +198,24 @@ def test_who_lost_the_ground_leaves_who_stands_below_it_and_keeps_inside_the_fen
     vehicle.fly(hold, 20.0, neighbours=(below,), ground_age_s=5.0)
     assert math.dist(vehicle.position_m[:2], (4.0, 16.0)) > 7.5
     assert ROBOT.fence.distance_m(*vehicle.position_m[:2].tolist()) > 1.5
+
+
+def test_who_hears_nobody_leaves_half_the_room_to_where_another_one_may_have_stopped() -> None:
+    """An access point that is gone: the other one does the same, and nobody hears it."""
+    here_m, there_m = (16.0, 16.0, SLOT_M), (17.0, 16.0, SLOT_M + 4.5)
+    places_m = []
+    for own_m, others_m in ((here_m, there_m), (there_m, here_m)):
+        vehicle, hold = Vehicle(own_m), flight(FlightState.HOLD, own_m)
+        silent = (Neighbour(2, others_m, STILL, 4.0),)
+        vehicle.fly(hold, 10.0, fell_silent=silent, ground_age_s=5.0)
+        half_m = (ROBOT.separation.landed_m - 1.0) / 2.0
+        assert math.dist(vehicle.position_m[:2], own_m[:2]) == pytest.approx(half_m, abs=0.5)
+        places_m.append(vehicle.position_m)
+    apart_m = math.dist(places_m[0][:2], places_m[1][:2])
+    assert apart_m == pytest.approx(ROBOT.separation.landed_m, abs=0.75)
+    # While the ground is heard they hold, and who flies on makes way.
+    given = replace(inputs(here_m), fell_silent=(Neighbour(2, there_m, STILL, 4.0),))
+    np.testing.assert_allclose(position(flight(FlightState.HOLD, here_m), given), here_m)
 
 
 def test_nobody_leaves_its_place_while_the_ground_is_heard_or_by_what_is_no_measurement() -> None:
