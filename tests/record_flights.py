@@ -275,9 +275,10 @@ def _ground_lost_for_a_while(f: _Flight) -> None:
 
 def _ground_lost_below_another(f: _Flight) -> None:
     f.fly()
-    f.beside((2.0, 1.0))
-    f.begin()
     f.cut(True)
+    f.until(_S.HOLD)
+    f.begin()
+    f.beside((0.8, 0.4))
     f.until(_S.LAND)
 
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from edge.core import F64
-from edge.core.mailbox import Neighbour
 from edge.core.position import PositionQuality
 from edge.core.vehicle import Vector
 from edge.flight.safety import (
@@ -28,7 +27,6 @@ from edge.flight.safety import (
     limit_acceleration,
     make_room,
 )
-from edge.flight.silence import parted
 from edge.flight.state import FlightInputs, FlightMemory, Robot, Tick, height_m, is_silent
 from edge.messages.mission import STEERED, FlightState
 
@@ -39,6 +37,8 @@ _HOLD_LEASH_M = 1.0
 _AHEAD_S = 1.0
 # RETURN flies nowhere before it is this near its own height.
 _AT_OWN_HEIGHT_M = 1.0
+_BACK_INSIDE_SHARE = 0.25
+_LONGEST_TICK_S = 0.5
 
 
 class MissionVelocity(NamedTuple):
@@ -59,12 +59,21 @@ _NO_SPEED_M_S = (0.0, 0.0, 0.0)
 _STOP = MissionVelocity(_NO_SPEED_M_S)
 
 
+class Parted(NamedTuple):
+    """Where HOLD stays instead of at its target, since it parted from others."""
+
+    from_m: Vector
+    to_m: Vector
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Guidance:
-    """What guidance remembers: the last commanded velocity (3,), and a recovery to the fence."""
+    """What guidance remembers: the last commanded velocity (3,), a recovery to the fence, and where
+    HOLD has parted to."""
 
     velocity_m_s: F64 = field(default_factory=lambda: np.zeros(3))
     recovering: bool = False
+    parted: Parted | None = None
 
 
 def guide(
@@ -90,7 +99,7 @@ def guide(
     if inputs.position.quality is not PositionQuality.GOOD:
         return _stay(robot, flight, height), Guidance()
     if state is FlightState.HOLD:
-        return _hold(robot, flight, inputs, position_m), Guidance()
+        return _hold(robot, flight, inputs, guidance, position_m, dt_s)
     if state is FlightState.TAKEOFF:
         # Who fell silent may still hover where it was.
         silent = (each._replace(velocity_m_s=_NO_SPEED_M_S) for each in inputs.fell_silent)
@@ -153,30 +162,56 @@ def _towards(
 
 
 def _hold(
-    robot: Robot, flight: FlightMemory, inputs: FlightInputs, position_m: F64
-) -> MissionSetpoint:
-    place = _towards(flight.target_m, math.inf, position_m, robot.limits)
-    if inputs.odometry is None or flight.target_m is None or isinstance(place, MissionVelocity):
-        return place
-    lands, separation = not Tick(robot, flight, inputs).ground_heard, robot.separation
-    unheard: list[Neighbour] = []
-    if lands:
-        x_m, y_m, _ = flight.target_m
-        unheard = [
-            parted(each, separation.silence, (x_m, y_m), separation.landed_m)
-            for each in inputs.fell_silent
-        ]
+    robot: Robot,
+    flight: FlightMemory,
+    inputs: FlightInputs,
+    guidance: Guidance,
+    position_m: F64,
+    dt_s: float,
+) -> tuple[MissionSetpoint, Guidance]:
+    """At its target, or where it has got to since it parted from others; room for others."""
+    target_m, parted, fence, limits = flight.target_m, guidance.parted, robot.fence, robot.limits
+    if parted is not None and parted.from_m != target_m:
+        parted = None
+    stays_m = target_m if parted is None else parted.to_m
+    place = _towards(stays_m, math.inf, position_m, limits)
+    if (
+        inputs.odometry is None
+        or target_m is None
+        or stays_m is None
+        or isinstance(place, MissionVelocity)
+    ):
+        return place, Guidance()
+    # Who was carried outside comes back first.
+    inside = fence.distance_m(*position_m[:2].tolist()) >= _BACK_INSIDE_SHARE * fence.buffer_m
+    lands = inside and not Tick(robot, flight, inputs).ground_heard
+    wanted_m_s = (np.array(place.position_m) - position_m) / _AHEAD_S
     velocity_m_s = make_room(
         position_m,
         np.array(inputs.odometry.velocity_m_s),
-        (np.array(place.position_m) - position_m) / _AHEAD_S,
-        (*inputs.neighbours, *unheard),
-        separation,
-        robot.limits,
-        robot.fence,
+        wanted_m_s,
+        inputs.neighbours,
+        robot.separation,
+        limits,
+        fence,
         lands=lands,
     )
-    return MissionPosition(_vector(position_m + velocity_m_s * _AHEAD_S))
+    pushed_m_s = (velocity_m_s - wanted_m_s)[:2]
+    if not pushed_m_s.any():
+        return place, Guidance(parted=parted)
+    # However many push it, and whatever they tell, it goes no further than this.
+    around_m, farthest_m = np.array(target_m[:2]), robot.separation.landed_m
+    ahead_m = leash((position_m + velocity_m_s * _AHEAD_S)[:2], around_m, farthest_m)
+    goal_m = None if ahead_m is None else leash(ahead_m, position_m[:2], limits.max_speed_m_s)
+    pushed_m = pushed_m_s * min(dt_s, _LONGEST_TICK_S)
+    left_m = leash(np.array(stays_m[:2]) + pushed_m, around_m, farthest_m) if lands else None
+    if goal_m is None:
+        return _STOP, Guidance()
+    if left_m is not None:
+        # It does not come back over somebody whom it hears no more.
+        parted = Parted(target_m, (*left_m.tolist(), target_m[2]))
+    goal = MissionPosition((*goal_m.tolist(), place.position_m[2]))
+    return goal, Guidance(parted=parted)
 
 
 def _homewards(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:

@@ -3,8 +3,9 @@
 Mission frame: x right, y forward, z up, m, heights above the robot's own takeoff point. Positions
 and velocities are (3,) float64 unless said otherwise.
 
-What is commanded passes `limit_speed` and `limit_acceleration` first, then `keep_inside`, and
-`brake` last (in HOLD `make_room`), which keeps to the fence too: nothing may soften a stop.
+What MISSION and RETURN command passes `limit_speed` and `limit_acceleration` first, then
+`keep_inside`, and `brake` last, which keeps to the fence too: nothing may soften a stop. What HOLD
+commands passes `make_room` alone.
 
 Nothing here raises in flight. A number that is not finite, or beyond 1000 km, is no measurement:
 where one comes in, a velocity goes out as 0, and a point as None.
@@ -237,25 +238,8 @@ def brake(
         return np.zeros(3)
     if not all(map(_is_known, (*neighbours, *silent))):
         return np.zeros(3)
-    ways = _ways(position_m, velocity_m_s, neighbours, silent, separation, limits)
-    if ways is None:
-        return np.zeros(3)  # Every way may be the wrong one.
-    horizontal = wanted_m_s[:2]
-    if all(float(way.direction @ horizontal) <= way.cap for way in ways):
-        return wanted_m_s
-    # Whom it has to leave most has the last word.
-    for way in sorted(ways, key=lambda way: -way.cap):
-        if way.cap < 0.0:
-            excess = max(float(way.direction @ horizontal) - way.cap, 0.0)
-            horizontal = horizontal - way.direction * excess
-    horizontal = limit_speed(horizontal, limits.max_speed_m_s)
-    directions = [way.direction for way in ways]
-    caps = [way.at_most for way in ways]
-    if fence is not None:
-        directions += list(-fence.edges().inward)
-        caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
-    horizontal = _limit_towards(horizontal, directions, caps)
-    return np.array([*horizontal, wanted_m_s[2]])
+    near = _who_is_near(position_m, velocity_m_s, neighbours, silent, separation, limits)
+    return _kept_apart(near, position_m, velocity_m_s, wanted_m_s, limits, fence)
 
 
 def make_room(
@@ -273,21 +257,21 @@ def make_room(
 
     Neighbours of which something is not known do not keep it from its place; nor do those who are
     silent, who may not hear it either, and take it to stand there. Who is to come down where it is,
-    as they may be too, `lands`: it parts from all neighbours, whatever their heights are, by
-    `landed_m` in the plane.
+    as they may be too, `lands`: it parts from each neighbour, whatever its height is, by `landed_m`
+    in the plane, of which each flies half.
     """
     known = [each for each in neighbours if _is_known(each)]
-    if lands:
-        separation = separation._replace(level_m=separation.landed_m)
-        height_m = float(position_m[2])
-        known = [
-            each._replace(
-                position_m=(*each.position_m[:2], height_m),
-                velocity_m_s=(*each.velocity_m_s[:2], 0.0),
-            )
-            for each in known
-        ]
-    return brake(position_m, velocity_m_s, wanted_m_s, known, (), separation, limits, fence)
+    if not lands:
+        return brake(position_m, velocity_m_s, wanted_m_s, known, (), separation, limits, fence)
+    near = []
+    for neighbour in known:
+        offset_m = np.array(_extrapolated(neighbour)[:2]) - position_m[:2]
+        apart_m = math.hypot(*offset_m)
+        # In a crowd one is left towards another, which leaves in turn.
+        at_most_m = max(apart_m - separation.level_m, 0.0) / 2.0
+        slack_m = (apart_m - separation.landed_m) / 2.0
+        near.append(_Near(offset_m, slack_m, max(slack_m, at_most_m), from_rest=False))
+    return _kept_apart(near, position_m, velocity_m_s, wanted_m_s, limits, fence)
 
 
 class _Near(NamedTuple):
@@ -314,15 +298,14 @@ class _Way(NamedTuple):
     at_most: float
 
 
-def _ways(
+def _who_is_near(
     position_m: F64,
     velocity_m_s: F64,
     neighbours: Sequence[Neighbour],
     silent: Sequence[Neighbour],
     separation: SeparationLimits,
     limits: MotionLimits,
-) -> list[_Way] | None:
-    """To all who limit the robot; None if one of them is just here."""
+) -> list[_Near]:
     rest_m = position_m[:2] + velocity_m_s[:2] * limits.lag_s
     near: list[_Near] = []
     for neighbour in neighbours:
@@ -344,15 +327,42 @@ def _ways(
             stopped_m = nearest_on_way_m(robot, separation.silence, rest_m)
             least_m = separation.landed_m + strays_m(robot, separation.silence)
             near.append(_to_leave(stopped_m - rest_m, least_m, separation, from_rest=True))
+    return near
+
+
+def _kept_apart(
+    near: Sequence[_Near],
+    position_m: F64,
+    velocity_m_s: F64,
+    wanted_m_s: F64,
+    limits: MotionLimits,
+    fence: Fence | None,
+) -> F64:
+    """What may be flown of `wanted_m_s` towards, and away from, all who are near."""
     if not all(each.offset_m.any() for each in near):
-        return None
+        return np.zeros(3)  # One is just here: every way may be the wrong one.
     ways = []
     for offset_m, slack_m, at_most_m, from_rest in near:
         direction = offset_m / math.hypot(*offset_m)
         speed_m_s = 0.0 if from_rest else float(direction @ velocity_m_s[:2])
         cap = _speed_to(slack_m, speed_m_s, limits)
         ways.append(_Way(direction, cap, _speed_to(at_most_m, speed_m_s, limits)))
-    return ways
+    horizontal = wanted_m_s[:2]
+    if all(float(way.direction @ horizontal) <= way.cap for way in ways):
+        return wanted_m_s
+    # Whom it has to leave most has the last word.
+    for way in sorted(ways, key=lambda way: -way.cap):
+        if way.cap < 0.0:
+            excess = max(float(way.direction @ horizontal) - way.cap, 0.0)
+            horizontal = horizontal - way.direction * excess
+    horizontal = limit_speed(horizontal, limits.max_speed_m_s)
+    directions = [way.direction for way in ways]
+    caps = [way.at_most for way in ways]
+    if fence is not None:
+        directions += list(-fence.edges().inward)
+        caps += _caps_at_edges(fence, position_m, velocity_m_s, limits)
+    horizontal = _limit_towards(horizontal, directions, caps)
+    return np.array([*horizontal, wanted_m_s[2]])
 
 
 def _to_leave(

@@ -74,21 +74,6 @@ def nearest_on_way_m(silent: Neighbour, limits: SilenceLimits, place_m: F64) -> 
     return first_m + along_m * min(max(share, 0.0), 1.0)
 
 
-def parted(
-    silent: Neighbour, limits: SilenceLimits, place_m: tuple[float, float], apart_m: float
-) -> Neighbour:
-    """It stands still, as near to a place as it may have stopped, and then left it, as who holds
-    that place leaves it: each by half of what is missing to `apart_m`.
-    """
-    stopped_m = nearest_on_way_m(silent, limits, np.array(place_m))
-    away_m = stopped_m - place_m
-    distance_m = max(math.hypot(*away_m), 1e-6)
-    left_m = max(apart_m - distance_m, 0.0) / 2.0
-    x_m, y_m = (stopped_m + away_m * (left_m / distance_m)).tolist()
-    height_m = silent.position_m[2]
-    return silent._replace(position_m=(x_m, y_m, height_m), velocity_m_s=(0.0, 0.0, 0.0))
-
-
 def strays_m(silent: Neighbour, limits: SilenceLimits) -> float:
     """How far beside that way it may have stopped."""
     _, along_m = _way_m(silent, limits)

@@ -310,6 +310,26 @@ class Stands:
 
 
 @dataclass(frozen=True, slots=True)
+class StaysNear:
+    """From then on, and until then, it stays that near to where it was, in the plane."""
+
+    from_s: float
+    until_s: float
+    within_m: float
+    whose: Whose = "hit"
+    after: str = ""
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        since_s, farthest_m = _since_s(flight, self.after), 0.0
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(since_s + self.from_s, since_s + self.until_s)
+            if len(part.time_s):
+                offsets_m = part.position_m[:, :2] - part.position_m[0, :2]
+                farthest_m = max(farthest_m, float(np.hypot(*offsets_m.T).max()))
+        return Figure("from where it held", farthest_m, self.within_m, "m")
+
+
+@dataclass(frozen=True, slots=True)
 class StraightDown:
     """From where it began to land it comes down within so many metres."""
 

@@ -30,6 +30,7 @@ from lpac.sim.drill.bounds import (
     SentNothing,
     Stands,
     StaysDown,
+    StaysNear,
     StraightDown,
     TakesOff,
     Whose,
@@ -113,6 +114,9 @@ _BRAKED = Stands(2.0, 5.0, speed_m_s=0.8)
 _BRAKED_LATER = Stands(2.6, 6.0, speed_m_s=0.8)
 # Without a ground they stand, but part before they come down where they are.
 _WAIT = Stands(7.0, 12.5, "all", may_part=True)
+# By no more than landing points lie apart; before that they stop, and gusts carry them.
+_PARTS_M = 8.0 + 3.0
+_PART = StaysNear(3.8, 12.5, _PARTS_M, "all")
 # Its receiver's error walks by up to 0.8 m between takeoff and landing, and gusts carry it.
 _AT_PAD_M = 3.0
 
@@ -315,6 +319,7 @@ _RADIO = (
         watched_s=25.0,
         bounds=(
             MissionEnds(3.8, whose="all"), Stands(7.0, 25.0, "all", may_part=True),
+            StaysNear(3.8, 25.0, _PARTS_M, "all"),
             NotLandedBefore(25.0, "all"), LandsAtPad(_AT_PAD_M, "all"),
         ),
     ),
@@ -323,7 +328,7 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(RadioCut("from the ground")), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, _PART, NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"), StraightDown(3.0, "all"), LandApart(),
             Down(14.0 + _LANDING_S, "all"),
         ),
@@ -333,7 +338,7 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(RadioCut("all")), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), Stands(7.0, 12.5, "all"), NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"), StraightDown(3.0, "all"), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
@@ -355,6 +360,7 @@ _RADIO = (
         bounds=(
             FliesOn(20.0, 0.95, "first half"), MissionEnds(3.8, 20.0, "second half"),
             Stands(7.0, 12.5, "second half", may_part=True),
+            StaysNear(3.8, 12.5, _PARTS_M, "second half"),
             NotLandedBefore(12.5, "second half"), Lands(14.0, "second half"),
             LandApart("second half"), Down(14.0 + _LANDING_S, "second half"),
         ),
@@ -376,7 +382,7 @@ _RADIO = (
         promise="a late ground is a lost one: hold after 3 s; it still lands them",
         does=_once(RadioIs(delay_s=8.0)), hits=0, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, _PART, NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"),
         ),
     ),
@@ -397,7 +403,7 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s; they stay down when it wakes",
         does=_once(GroundStops(60.0)), hits=0, watched_s=70.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, _PART, NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"), LandApart(), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
@@ -406,7 +412,7 @@ _RADIO = (
         promise="hold after 3 s, land where they are after 13 s",
         does=_once(GroundDies()), hits=0, home=False, watched_s=30.0,
         bounds=(
-            MissionEnds(3.8, whose="all"), _WAIT, NotLandedBefore(12.5, "all"),
+            MissionEnds(3.8, whose="all"), _WAIT, _PART, NotLandedBefore(12.5, "all"),
             Lands(14.0, "all"), LandApart(), Down(14.0 + _LANDING_S, "all"),
         ),
     ),
@@ -728,7 +734,8 @@ _PEOPLE = (
         hits=0, watched_s=40.0, home=False,
         bounds=(
             FliesOn(12.0, 0.95, "all"), MissionEnds(3.8, whose="all", after="gone"),
-            Stands(7.0, 12.5, "all", after="gone", may_part=True), NotLandedBefore(24.5, "all"),
+            Stands(7.0, 12.5, "all", after="gone", may_part=True),
+            StaysNear(3.8, 12.5, _PARTS_M, "all", after="gone"), NotLandedBefore(24.5, "all"),
             Lands(14.0, "all", "gone"), LandApart(), Down(26.0 + _LANDING_S, "all"),
         ),
     ),
@@ -811,6 +818,7 @@ _PAIRS = (
         does=(*_once(Drain(0.145)), Do(5.0, OperatorOrders("hold"), "all")),
         bounds=(
             Lands(3.5), Down(_LANDING_S), Stands(9.0, 20.0, "others", may_part=True),
+            StaysNear(6.0, 20.0, _PARTS_M, "others"),
             NotLandedBefore(20.0, "others"),
         ),
     ),
