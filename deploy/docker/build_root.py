@@ -125,16 +125,19 @@ def assemble(architecture: str, fetched: Path, root: Path) -> None:
     packages = sorted(PACKAGES.glob("*.whl"))
     install = ("install", "--quiet", "--no-index", "--only-binary=:all:", *_target(architecture),
                "--target", root / SITE)  # fmt: skip
-    if packages:
-        found = [f"--find-links={folder}" for folder in (fetched / "wheels", own)]
-        try:
+    found = [f"--find-links={folder}" for folder in (fetched / "wheels", own)]
+    try:
+        if packages:
             _pip(*install, "--dry-run", *found, *packages)
-        except BuildError:
-            raise BuildError(
-                f"the wheels of deploy/docker/packages do not fit: see above; each must be for "
-                f"Python 3.11 on {architecture}, and what they need must be there too"
-            ) from None
-    _pip(*install, "--no-deps", "--no-compile", *wheels, *own.iterdir(), *packages)
+        _pip(*install, "--no-deps", "--no-compile", *wheels, *own.iterdir(), *packages)
+    except BuildError:
+        if not packages:
+            raise
+        raise BuildError(
+            "the wheels of deploy/docker/packages do not fit: see above; each must be for Python "
+            f"3.11 on {architecture}, and no other version of what the image has; what they need "
+            "must be there too"
+        ) from None
 
     for pattern in LEFT_OUT:
         for path in list(root.glob(pattern)):

@@ -101,6 +101,10 @@ class RadioConfig:
             must = "must be left out" if self.router else "must be where the router is"
             raise ValueError(f"transport = {self.transport!r}: router = {self.router!r}: {must}")
         require_group("group", self.group)
+        if not self.type:
+            raise ValueError("type = '': must be 'zenoh', or the name of a radio of your own")
+        if self.options and self.type == "zenoh":
+            raise ValueError(f"options = {self.options}: type = 'zenoh' takes none")
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,16 +164,22 @@ class RobotHost:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where a robot finds bundle and world and who it is, and keeps its logs."""
+    """Where a robot finds bundle and world and who it is, keeps its logs, and the address it
+    listens on."""
 
     bundle: str
     world: str
     identity: str
     logs: str
+    listen: str
 
 
 # A release lies at /release in the sandbox of the robot's unit.
-IN_RELEASE = Places("bundle", "world.env", "/var/lib/lpac/identity", "/var/lib/lpac/logs")
+# At power-up, or while the access point is away, it may not have its own address yet: it listens on
+# whatever it has.
+IN_RELEASE = Places(
+    "bundle", "world.env", "/var/lib/lpac/identity", "/var/lib/lpac/logs", "0.0.0.0"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,9 +541,10 @@ def _robot_mapping(
 ) -> dict[str, Any]:
     """The robot's robot.toml, in that slot."""
     earlier = (other for other in config.robots.values() if other.robot_id < robot.robot_id)
-    # On no other network that its computer is in.
+    # A fleet that is all on this computer needs no keys, and nobody else reaches it.
+    listen = places.listen if config.keys or config.insecure else "127.0.0.1"
     link: dict[str, Any] = {
-        "listen": [config.endpoint(robot)],
+        "listen": [f"{config.scheme}/{listen}:{robot.zenoh_port}"],
         "connect": [
             config.endpoint(other) for other in sorted(earlier, key=lambda other: other.robot_id)
         ],

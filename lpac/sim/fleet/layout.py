@@ -190,7 +190,7 @@ class Layout:
                 ],
             },
         )
-        places = Places(str(self.bundle_path), "../../world.env", "identity", "logs")
+        places = Places(str(self.bundle_path), "../../world.env", "identity", "logs", "127.0.0.1")
         for robot_id, name in enumerate(robots):
             write_robot(folder / "robots" / str(robot_id) / "robot.toml", config, name, places)
         for slot in range(len(robots) - spares, len(robots)):

@@ -148,8 +148,8 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
     assert first.autopilot.url == "udpin://10.0.0.1:9"
     assert (config.robots["r1"].mavlink_port, config.robots["r3"].mavlink_port) == (9, 14551)
     assert third.autopilot.url == "udpin://127.0.0.1:14551"
-    assert (first.link.listen, first.link.connect) == (("tls/10.0.0.1:7",), ())
-    assert third.link.listen == ("tls/192.168.8.13:7447",)
+    assert (first.link.listen, first.link.connect) == (("tls/0.0.0.0:7",), ())
+    assert third.link.listen == ("tls/0.0.0.0:7447",)
     assert third.link.connect == ("tls/10.0.0.1:7", "tls/192.168.8.12:7447")
     assert (third.flight.slot, third.flight.landing_point_m) == (2, (20.0, 4.0))
     assert third.policy.bundle == str(tmp_path / "bundle")
@@ -189,6 +189,18 @@ def test_a_radio_of_ones_own_is_told_what_the_built_in_one_is(tmp_path: Path) ->
     link = rendered(load_fleet(fleet_file(tmp_path, text)), "r3", tmp_path).link
     assert (link.type, link.options) == ("lora", {"channel": 7})
     assert (link.mode, link.connect) == ("client", ("tls/192.168.8.2:7447",))
+
+
+@pytest.mark.parametrize(
+    ("lines", "told"),
+    [
+        ("options = {channel = 7}", "type = 'zenoh' takes none"),
+        ('type = ""', "type = '': must be 'zenoh', or the name of a radio of your own"),
+    ],
+)
+def test_what_says_nothing_of_a_radio_is_refused(tmp_path: Path, lines: str, told: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        load_fleet(fleet_file(tmp_path, example("# [radio]", f"[radio]\n{lines}\n")))
 
 
 def with_router(place: str) -> str:
@@ -552,13 +564,13 @@ def test_a_file_that_would_be_wrong_is_not_written(tmp_path: Path) -> None:
 
 def test_a_robot_may_have_its_files_elsewhere(tmp_path: Path) -> None:
     config = load_fleet(EXAMPLE)
-    places = Places("/policy", "field.env", "who", "kept")
+    places = Places("/policy", "field.env", "who", "kept", "127.0.0.1")
     write_robot(tmp_path / "r2" / "robot.toml", config, "r2", places)
     robot = load_config(tmp_path / "r2" / "robot.toml")
     assert (robot.policy.bundle, robot.policy.world, robot.log.folder) == (
         "/policy", str(tmp_path / "r2" / "field.env"), str(tmp_path / "r2" / "kept"),
     )  # fmt: skip
-    assert robot.link.listen == ("tls/192.168.8.12:7447",)
+    assert robot.link.listen == ("tls/127.0.0.1:7447",)
     assert robot.link.connect == config.robot_config("r2").link.connect
 
 
