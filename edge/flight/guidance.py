@@ -37,7 +37,10 @@ _HOLD_LEASH_M = 1.0
 _AHEAD_S = 1.0
 # RETURN flies nowhere before it is this near its own height.
 _AT_OWN_HEIGHT_M = 1.0
+# Who was carried out of the fence parts from others once it is so far inside, of the buffer: half of
+# it is where HOLD then stays.
 _BACK_INSIDE_SHARE = 0.25
+# After a longer one than this nobody knows how far it has moved.
 _LONGEST_TICK_S = 0.5
 
 
@@ -182,7 +185,6 @@ def _hold(
         or isinstance(place, MissionVelocity)
     ):
         return place, Guidance()
-    # Who was carried outside comes back first.
     inside = fence.distance_m(*position_m[:2].tolist()) >= _BACK_INSIDE_SHARE * fence.buffer_m
     lands = inside and not Tick(robot, flight, inputs).ground_heard
     wanted_m_s = (np.array(place.position_m) - position_m) / _AHEAD_S
