@@ -99,8 +99,8 @@ def evaluate(
     whole: Annotated[
         bool,
         typer.Option(
-            help="Also as the field is flown: whole robots on simulated vehicles, and points from "
-            "the same pads."
+            help="Also as the field is flown: whole robots on simulated vehicles, at most 30, and "
+            "points from the same pads."
         ),
     ] = False,
     baselines: Annotated[
@@ -206,7 +206,7 @@ def _evaluation(
         if name not in SET_UPS:
             raise ValueError(f"--set-up {name}: must be one of {', '.join(SET_UPS)}")
     if transfer and any("robot" in change for change in changes):
-        raise ValueError("--whole flies over the field alone: not with --transfer")
+        raise ValueError("--transfer has teams that do not fly whole: choose others with --set-up")
     if transfer and set_ups:
         raise ValueError("--transfer flies all set-ups: --set-up does nothing beside it")
     names = _names(given)

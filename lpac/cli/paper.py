@@ -44,6 +44,10 @@ _VEHICLES = {
     VehicleKind.PX4: "real PX4s that run as software, a program for each robot",
 }
 _QUICKLY = {False: "", True: " --quick"}
+# Of `transfer`: whether whole robots fly, and whether it is the quick one.
+_TRANSFER_WORLDS = {
+    (False, False): 20, (False, True): 2, (True, False): 4, (True, True): 1,
+}  # fmt: skip
 # They take hours.
 _TOO_LARGE = ("n300", "n1000")
 # Robots, repetitions, s.
@@ -574,8 +578,16 @@ def transfer(
     ] = None,
     worlds: Annotated[
         int | None,
-        typer.Option("--worlds", "-k", help="Of the validation set: 20, or 2 with --quick."),
+        typer.Option(
+            "--worlds",
+            "-k",
+            help="Of the validation set: 20, or 2 with --quick; of whole robots 4, or 1.",
+        ),
     ] = None,
+    vehicle: Annotated[
+        PaperVehicle,
+        typer.Option(help="Points, or also whole robots, where no more than 30 of them fly."),
+    ] = PaperVehicle.POINT,
     quick: Quick = False,
     ray: Ray = None,
     as_json: AsJson = False,
@@ -584,23 +596,29 @@ def transfer(
     """Other numbers of robots, features and ranges: `lpac evaluate` in the paper's set-ups."""
     from lpac.cli.evaluate import evaluate
     from lpac.evaluate.worlds import SET_UPS
-    from lpac.paper.report import write_transfer
+    from lpac.paper.report import EXACT_POINTS, WHOLE_TRANSFERRED, write_transfer
+    from lpac.sim.fleet.layout import MAX_ROBOTS
 
     folder, flown = out or _OUT / "transfer", bundles or [DEFAULT_BUNDLE]
-    count = worlds if worlds is not None else 2 if quick else 20
-    made_by = _made_by(f"transfer -k {count}{_QUICKLY[quick]}", flown)
+    names = _QUICK_SET_UPS if quick else [name for name in SET_UPS if name not in _TOO_LARGE]
+    command, how, whole = "transfer", EXACT_POINTS, vehicle is PaperVehicle.SIMULATED
+    count = worlds if worlds is not None else _TRANSFER_WORLDS[whole, quick]
+    if whole:
+        names = [name for name in names if SET_UPS[name].robots <= MAX_ROBOTS]
+        command += f" --vehicle {vehicle.value}"
+        how = WHOLE_TRANSFERRED.format(vehicles=_VEHICLES[VehicleKind.SIMULATED])
+    made_by = _made_by(f"{command} -k {count}{_QUICKLY[quick]}", flown)
     evaluate(
         methods=[str(bundle) for bundle in flown],
-        set_ups=[*_QUICK_SET_UPS]
-        if quick
-        else [name for name in SET_UPS if name not in _TOO_LARGE],
+        set_ups=[*names],
         worlds=count,
+        whole=whole,
         baselines=["clairvoyant-cvt"],
         ray=ray,
         as_json=as_json,
         out=folder,
     )
-    write_transfer(json.loads((folder / "evaluation.json").read_text()), folder, made_by)
+    write_transfer(json.loads((folder / "evaluation.json").read_text()), folder, made_by, how)
 
 
 @app.command()

@@ -43,6 +43,7 @@ from lpac.evaluate.worlds import SET_UPS, WorldSet
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName
 from lpac.sim.failure import NONE_LOST, LostRobots
+from lpac.sim.fleet.layout import MAX_ROBOTS
 
 FAILS_ABOVE = 1.5
 _RISEN = 1.05
@@ -106,9 +107,7 @@ class Condition(NamedTuple):
         if self.payload != "float16":
             words.append(f"payloads in {self.payload}")
         if self.robot != "point":
-            words.append("from pads, with receivers' errors")
-        if self.robot == "whole":
-            words.append("whole robots")
+            words.append("whole robots" if self.robot == "whole" else "points from pads, GPS off")
         return ", ".join(words)
 
 
@@ -142,8 +141,8 @@ class Evaluation:
                     raise ValueError(
                         f"{name} = {getattr(condition, name)}: must be at least 0 and finite"
                     )
-            if condition.robot != "point" and condition.set_up != "field":
-                raise ValueError(f"{condition.set_up}: whole robots fly over the field alone")
+            if condition.robot != "point" and SET_UPS[condition.set_up].robots > MAX_ROBOTS:
+                raise ValueError(f"{condition.set_up}: of whole robots {MAX_ROBOTS} fly at most")
             if lost.robots and not 0.0 < lost.at_s < self.duration_s:
                 raise ValueError(f"robots lost at {lost.at_s:g} s: must be in flight")
             if lost.robots >= SET_UPS[condition.set_up].robots:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 import edge
 from edge.core.wire import PayloadType
-from edge.policy.bundle import Bundle, BundleError, load_bundle
+from edge.policy.bundle import Bundle, BundleError, load_bundle, make_bundle, write_bundle
 from lpac import analysis, evaluate, radio, sim
 from lpac.analysis.coverage import Coverage
 from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
@@ -182,7 +182,8 @@ def _scenario(flight: EvaluationFlight) -> Scenario:
     starts_m = FIELD_SCALE.position_to_mission_m(np.array(world.starts)).tolist()
     errors_m = draw_position_errors_m(world.seed, flight.position_error_m, set_up.robots)
     if flight.robot != "point":
-        layout = Layout(fleet_of(flight), Path(flight.bundle))
+        with TemporaryDirectory() as folder:
+            layout = Layout(fleet_of(flight), bundle_for(flight, Path(folder)))
         starts_m = layout.pads_m.tolist()
         # What a vehicle takes its pad to be is off by its receiver's bias.
         errors_m = errors_m + layout.landing_points_m - layout.pads_m
@@ -230,6 +231,26 @@ def fleet_of(flight: EvaluationFlight) -> FleetScenario:
     )
 
 
+def bundle_for(flight: EvaluationFlight, folder: Path) -> Path:
+    """The bundle that whole robots fly in its set-up: of its world's size, and its range.
+
+    A new one, in the folder, where the flight's own has others. Raises BundleError.
+    """
+    bundle, set_up = _loaded(flight.bundle), SET_UPS[flight.set_up]
+    trained = bundle.manifest.perception
+    assert trained is not None  # `task_of` has seen to it
+    perception = replace(
+        trained, world_size=set_up.world_size, communication_range=set_up.communication_range
+    )
+    if perception == trained:
+        return Path(flight.bundle)
+    files = {name: bundle.files[name] for name in bundle.manifest.files}
+    write_bundle(
+        make_bundle(replace(bundle.manifest, perception=perception), files), folder / "own"
+    )
+    return folder / "own"
+
+
 def settings_of(flight: EvaluationFlight) -> Settings:
     """What whole robots' configuration has of it."""
     return {
@@ -254,7 +275,7 @@ def _whole(flight: EvaluationFlight) -> FlownCost:
         air = Air(loss=flight.loss, delay_s=max(flight.delay_s, Air().delay_s))
     with TemporaryDirectory() as folder:
         flown = fly_simulated(
-            fleet_of(flight), Path(folder), Path(flight.bundle),
+            fleet_of(flight), Path(folder, "fleet"), bundle_for(flight, Path(folder)),
             settings=settings_of(flight), air=air,
         )  # fmt: skip
     return whole_cost(flight, flown)

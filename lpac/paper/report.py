@@ -13,6 +13,7 @@ from lpac.paper import experiments
 from lpac.paper.experiments import PerturbedFlight, curves_csv, curves_json
 from lpac.paper.figures import costs_by_world, perturbation
 from lpac.paper.files import table, write_csv, write_experiment
+from lpac.sim.fleet.layout import MAX_ROBOTS
 
 _LEAST_M, _MOST_M = experiments.GPS_ERROR_M
 # How it was flown, for the reports.
@@ -33,6 +34,11 @@ WHOLE_BESIDE_POINTS = f"{WHOLE} What they are held against are points from the s
 WHOLE_IN_TRUTH = (
     f"{WHOLE} Costs are of where the vehicles truly were, and messages are late from the mission's "
     "start on."
+)
+WHOLE_TRANSFERRED = (
+    f"{WHOLE} They do so in set-ups of up to {MAX_ROBOTS} robots, beside points from the same pads "
+    "with the same receivers' errors, and points from anywhere without. Costs are of where they "
+    "truly were. Lloyd's algorithm has the same starts as whole robots."
 )
 TAKEN_POINTS = (
     f"{POINTS} A robot that is taken is gone: it says and hears nothing and does not count; it is "
@@ -217,7 +223,10 @@ stayed within 5 % of what it came to when the next thing happened, or the flight
 
 
 def write_transfer(
-    told: Mapping[str, Any], folder: Path, made_by: Mapping[str, str]
+    told: Mapping[str, Any],
+    folder: Path,
+    made_by: Mapping[str, str],
+    flown: str = EXACT_POINTS,
 ) -> dict[str, Any]:
     """Beside what `lpac evaluate` wrote, whose JSON is `told`; gives all JSON. Raises OSError."""
     policies = [method["name"] for method in told["methods"] if method["bundles"]]
@@ -238,7 +247,7 @@ def write_transfer(
 
 The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells with 10 robots in
 512 x 512; its other paper has more and fewer robots, features and ranges.
-{EXACT_POINTS}
+{flown}
 
 ![mean cost over clairvoyant Lloyd's](conditions.png)
 
@@ -248,7 +257,7 @@ Mean cost after {told["duration_s"]:g} s over that at the start, in the first {t
 worlds of the {told["world_set"]} set, and in brackets what it is times that of Lloyd's algorithm
 that knows the world, with the 95 % interval. A folder for each set-up has its curves.
 """
-    return write_experiment("transfer", told, rows_csv, text, folder, EXACT_POINTS, made_by)
+    return write_experiment("transfer", told, rows_csv, text, folder, flown, made_by)
 
 
 _TRANSFER_COLUMNS: list[object] = [
