@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edge.policy.bundle import Bundle
+from edge.policy.bundle import Bundle, load_bundle
 from lpac.evaluate.flights import (
     LLOYD,
     POLICY,
     EvaluationFlight,
     FlownCost,
     KeptFlights,
+    bundle_for,
     costs_of,
     fly_group,
 )
-from lpac.evaluate.worlds import FIELD, draw_world
+from lpac.evaluate.worlds import FIELD, SET_UPS, draw_world
 from lpac.radio.airtime import Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.cores import Outcome, in_this_process
@@ -69,16 +70,29 @@ def test_who_is_lost_does_not_count(flight: EvaluationFlight) -> None:
     assert flown.positions_m.shape[1] == 8
 
 
-def test_whole_robots_begin_where_points_from_pads_do(flight: EvaluationFlight) -> None:
-    point = dataclasses.replace(flight, robot="point-from-pad")
+@pytest.mark.parametrize("set_up", ["field", "n3"])
+def test_whole_robots_begin_where_points_from_pads_do(
+    flight: EvaluationFlight, set_up: str
+) -> None:
+    point = dataclasses.replace(flight, robot="point-from-pad", set_up=set_up)
     [(_, of_point)] = costs_of((point,))
-    [(_, of_whole)] = costs_of((dataclasses.replace(flight, robot="whole"),))
+    [(_, of_whole)] = costs_of((dataclasses.replace(point, robot="whole"),))
     assert of_whole.time_s == of_point.time_s == (0.0, 1.0)
     # They hold above their pads, in wind.
     assert of_whole.cost[0] == pytest.approx(of_point.cost[0], rel=0.05)
     assert of_whole.cost != of_point.cost
     [(_, flown)] = fly_group((point,))
-    assert flown.features == draw_world("training", 3, FIELD).features
+    assert flown.features == draw_world("training", 3, SET_UPS[set_up]).features
+
+
+def test_whole_robots_fly_a_bundle_of_their_set_ups_world_and_range(
+    flight: EvaluationFlight, tmp_path: Path
+) -> None:
+    assert bundle_for(flight, tmp_path) == SHIPPED
+    other = dataclasses.replace(flight, set_up="n3")
+    perception = load_bundle(bundle_for(other, tmp_path)).manifest.perception
+    assert perception is not None
+    assert perception.world_size == SET_UPS["n3"].world_size < FIELD.world_size
 
 
 def test_the_best_of_ten_is_no_more_than_clairvoyants(flight: EvaluationFlight) -> None:
