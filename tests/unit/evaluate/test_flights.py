@@ -70,16 +70,16 @@ def test_who_is_lost_does_not_count(flight: EvaluationFlight) -> None:
     assert flown.positions_m.shape[1] == 8
 
 
-@pytest.mark.parametrize("set_up", ["field", "n3"])
+@pytest.mark.parametrize(("set_up", "off"), [("field", 0.05), ("n3", 0.1)])
 def test_whole_robots_begin_where_points_from_pads_do(
-    flight: EvaluationFlight, set_up: str
+    flight: EvaluationFlight, set_up: str, off: float
 ) -> None:
     point = dataclasses.replace(flight, robot="point-from-pad", set_up=set_up)
     [(_, of_point)] = costs_of((point,))
     [(_, of_whole)] = costs_of((dataclasses.replace(point, robot="whole"),))
     assert of_whole.time_s == of_point.time_s == (0.0, 1.0)
-    # They hold above their pads, in wind.
-    assert of_whole.cost[0] == pytest.approx(of_point.cost[0], rel=0.05)
+    # They hold above their pads, in wind; of few, each counts for more.
+    assert of_whole.cost[0] == pytest.approx(of_point.cost[0], rel=off)
     assert of_whole.cost != of_point.cost
     [(_, flown)] = fly_group((point,))
     assert flown.features == draw_world("training", 3, SET_UPS[set_up]).features
