@@ -37,8 +37,8 @@ _HOLD_LEASH_M = 1.0
 _AHEAD_S = 1.0
 # RETURN flies nowhere before it is this near its own height.
 _AT_OWN_HEIGHT_M = 1.0
-# Who was carried out of the fence parts from others once it is so far inside, of the buffer: half of
-# it is where HOLD then stays.
+# Who was carried out of the fence parts from others once it is so far inside, as a share of the
+# buffer. HOLD then stays at half of it.
 _BACK_INSIDE_SHARE = 0.25
 # After a longer one than this nobody knows how far it has moved.
 _LONGEST_TICK_S = 0.5
