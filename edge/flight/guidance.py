@@ -37,8 +37,8 @@ _HOLD_LEASH_M = 1.0
 _AHEAD_S = 1.0
 # RETURN flies nowhere before it is this near its own height.
 _AT_OWN_HEIGHT_M = 1.0
-# Who was carried out of the fence parts from others once it is so far inside, as a share of the
-# buffer. HOLD then stays at half of it.
+# Who was carried out of the fence parts from others only when it is so far inside again, as a share
+# of the buffer. HOLD then stays at half of it.
 _BACK_INSIDE_SHARE = 0.25
 # After a longer one than this nobody knows how far it has moved.
 _LONGEST_TICK_S = 0.5
@@ -94,11 +94,12 @@ def guide(
     if state not in (FlightState.ARMING, *STEERED) or is_silent(flight, inputs.now_s):
         return None, Guidance()
     height = height_m(flight, inputs.odometry)
+    nowhere = Guidance(parted=guidance.parted)
     if state is FlightState.ARMING or inputs.odometry is None or height is None:
-        return _STOP, Guidance()
+        return _STOP, nowhere
     position_m = np.array([*inputs.odometry.position_m[:2], height])
     if not np.isfinite(position_m).all():
-        return _STOP, Guidance()
+        return _STOP, nowhere
     if inputs.position.quality is not PositionQuality.GOOD:
         return _stay(robot, flight, height), Guidance()
     if state is FlightState.HOLD:
@@ -185,8 +186,10 @@ def _hold(
         or isinstance(place, MissionVelocity)
     ):
         return place, Guidance()
-    inside = fence.distance_m(*position_m[:2].tolist()) >= _BACK_INSIDE_SHARE * fence.buffer_m
-    lands = inside and not Tick(robot, flight, inputs).ground_heard
+    depth_m = fence.distance_m(*position_m[:2].tolist())
+    back_inside_m = _BACK_INSIDE_SHARE * fence.buffer_m
+    recovering = depth_m < 0.0 or (guidance.recovering and depth_m < back_inside_m)
+    lands = not recovering and not Tick(robot, flight, inputs).ground_heard
     wanted_m_s = (np.array(place.position_m) - position_m) / _AHEAD_S
     velocity_m_s = make_room(
         position_m,
@@ -200,9 +203,11 @@ def _hold(
     )
     pushed_m_s = (velocity_m_s - wanted_m_s)[:2]
     if not pushed_m_s.any():
-        return place, Guidance(parted=parted)
-    # However many push it, and whatever they tell, it goes no further than this.
-    around_m, farthest_m = np.array(target_m[:2]), robot.separation.landed_m
+        return place, Guidance(recovering=recovering, parted=parted)
+    # However many push it, and whatever they tell, it goes no further than this. Who is further
+    # away does not dash back through them.
+    around_m = np.array(target_m[:2])
+    farthest_m = max(robot.separation.landed_m, math.dist(target_m[:2], position_m[:2].tolist()))
     ahead_m = leash((position_m + velocity_m_s * _AHEAD_S)[:2], around_m, farthest_m)
     goal_m = None if ahead_m is None else leash(ahead_m, position_m[:2], limits.max_speed_m_s)
     pushed_m = pushed_m_s * min(dt_s, _LONGEST_TICK_S)
@@ -211,9 +216,11 @@ def _hold(
         return _STOP, Guidance()
     if left_m is not None:
         # It does not come back over somebody whom it hears no more.
-        parted = Parted(target_m, (*left_m.tolist(), target_m[2]))
+        x_m, y_m = left_m.tolist()
+        x_m, y_m = fence.moved_inside_m(x_m, y_m, fence.buffer_m)
+        parted = Parted(target_m, (x_m, y_m, target_m[2]))
     goal = MissionPosition((*goal_m.tolist(), place.position_m[2]))
-    return goal, Guidance(parted=parted)
+    return goal, Guidance(recovering=recovering, parted=parted)
 
 
 def _homewards(robot: Robot, inputs: FlightInputs, position_m: F64) -> F64:

@@ -263,7 +263,7 @@ def make_room(
     known = [each for each in neighbours if _is_known(each)]
     if not lands:
         return brake(position_m, velocity_m_s, wanted_m_s, known, (), separation, limits, fence)
-    near = []
+    near = _who_is_near(position_m, velocity_m_s, known, (), separation, limits)
     for neighbour in known:
         offset_m = np.array(_extrapolated(neighbour)[:2]) - position_m[:2]
         apart_m = math.hypot(*offset_m)

@@ -231,6 +231,43 @@ def test_who_is_between_two_others_parts_from_both() -> None:
     assert least_apart_m(hold_over_each_other(line_m, 12.0)) > 7.0
 
 
+@pytest.mark.parametrize("ground_age_s", [0.1, 5.0])
+@pytest.mark.parametrize("is_piloted", [True, False])
+def test_who_was_carried_far_from_its_place_flies_through_nobody_on_its_way_back(
+    is_piloted: bool, ground_age_s: float
+) -> None:
+    vehicle, hold = Vehicle((27.0, 16.0, SLOT_M)), flight(FlightState.HOLD, AT_SLOT)
+    other = Neighbour(2, (25.0, 16.0, SLOT_M), STILL, 0.0, is_piloted=is_piloted)
+    vehicle.fly(hold, 20.0, neighbours=(other,), ground_age_s=ground_age_s)
+    apart_m = np.linalg.norm(np.array(vehicle.path_m) - other.position_m, axis=1)
+    least_m = 1.9 if is_piloted else ROBOT.separation.level_m - 0.1
+    assert apart_m.min() > least_m
+
+
+@pytest.mark.parametrize("climb_m_s", [0.0, -1.5])
+def test_who_parts_leaves_a_pilot_and_who_comes_down_as_much_room_as_before(
+    climb_m_s: float,
+) -> None:
+    """Not less, to be further from one that is nearer."""
+    vehicle, hold = Vehicle(AT_SLOT), flight(FlightState.HOLD, AT_SLOT)
+    above, height_m, least_m = Vehicle((15.5, 16.0, SLOT_M + 4.5)), SLOT_M, math.inf
+    start_m = SLOT_M if climb_m_s == 0.0 else SLOT_M + 4.5
+    for tick in range(60):
+        height_m = start_m + climb_m_s * tick * TICK_S
+        third = Neighbour(
+            2, (23.25, 16.0, height_m), (0.0, 0.0, climb_m_s), 0.0, is_piloted=climb_m_s == 0.0
+        )
+        near = Neighbour(3, _vector(above.position_m), _vector(above.velocity_m_s), 0.0)
+        own = Neighbour(1, _vector(vehicle.position_m), _vector(vehicle.velocity_m_s), 0.0)
+        above_hold = flight(FlightState.HOLD, (15.5, 16.0, SLOT_M + 4.5))
+        above.fly(above_hold, TICK_S, neighbours=(own,), ground_age_s=5.0)
+        vehicle.fly(hold, TICK_S, neighbours=(third, near), ground_age_s=5.0)
+        if abs(height_m - vehicle.position_m[2]) < ROBOT.separation.passing_height_m:
+            least_m = min(least_m, math.dist(vehicle.position_m[:2], third.position_m[:2]))
+    kept_m = ROBOT.separation.piloted_m if climb_m_s == 0.0 else ROBOT.separation.passing_m
+    assert least_m > kept_m - 0.5
+
+
 PAIR_M = np.array([(16.0, 16.0, 5.0), (16.5, 16.2, 9.5)])
 
 
