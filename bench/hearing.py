@@ -235,6 +235,8 @@ def _robot(group: Group, members: SimulatedMembers, robot_id: int) -> Link:
 class _Sending:
     """The half of a multicast link that speaks."""
 
+    sends_again = False
+
     def __init__(self, group: Group, robot_id: int) -> None:
         self._place = group.address, group.port
         self._robot_id = robot_id

@@ -47,12 +47,9 @@ class Identity:
     revocations: bytes
     group_keys: tuple[bytes, ...]
 
-    def guard(self, clock_s: Callable[[], float], *, lossy: bool = False) -> SignedGuard:
-        """What the program speaks and hears through; `clock_s` is its monotonic clock.
-
-        `lossy`: by a link that sends nothing again.
-        """
-        return SignedGuard(self.membership, clock_s, self.revocations, lossy=lossy)
+    def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
+        """What the program speaks and hears through; `clock_s` is its monotonic clock."""
+        return SignedGuard(self.membership, clock_s, self.revocations)
 
     def exchange_revocations(self, guard: SignedGuard) -> None:
         """Tell the guard of a newer list on the disk, and the disk of a newer one that it heard.

@@ -53,6 +53,8 @@ class MulticastLink:
     Every method may be called from any thread. Close it, or use it as a context manager.
     """
 
+    sends_again = False
+
     def __init__(
         self,
         group: Group,

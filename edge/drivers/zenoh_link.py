@@ -84,6 +84,8 @@ class ZenohLink:
     interpreter does not exit while it is open.
     """
 
+    sends_again = True
+
     def __init__(
         self,
         *,
@@ -344,7 +346,10 @@ def _config(
     # Of two robots that find each other by scouting or gossip, the one of the greater id
     # connects: the same side as the configured endpoints make it.
     once = {"autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
-    retry = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
+    # A call to somebody out of reach is repeated by the kernel after 1 s, and given up after 2:
+    # whoever is back soon is called again within 1.1 s. One whose program is down refuses each
+    # call at once, and soon is called seldom.
+    retry = {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5}
     if mode == "peer":
         # Who calls nobody elsewhere need not be called from there.
         host = "127.0.0.1" if connect and all(map(is_loopback, connect)) else "0.0.0.0"

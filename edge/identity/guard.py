@@ -173,7 +173,7 @@ class SignedGuard:
     """The guard of a member. From any thread.
 
     Nobody needs a list of members: each shows its card, which the authority has signed, now and
-    then and when somebody new is heard; more often in the beginning if the link is `lossy`, and
+    then and when somebody new is heard; more often in the beginning over a link that
     sends nothing again. `revocations` is the newest signed list that is known.
     """
 
@@ -182,14 +182,11 @@ class SignedGuard:
         membership: Membership,
         clock_s: Callable[[], float],
         revocations: bytes = b"",
-        *,
-        lossy: bool = False,
     ) -> None:
         """Raises CardError for a card or a list that is not this fleet's."""
         self.card = membership.card
         self._membership = membership
         self._clock_s = clock_s
-        self._lossy = lossy
         self._lock = Lock()
         self._members: dict[tuple[Role, str], Card] = {self.card.member: self.card}
         self._cards: dict[bytes, Card] = {self.card.fingerprint: self.card}
@@ -233,7 +230,7 @@ class SignedGuard:
     def introduce(self) -> None:
         """See `Guard`."""
         if self._link is not None:
-            for topic, shown in self._to_show():
+            for topic, shown in self._to_show(again=self._link.sends_again):
                 self._link.publish(topic, shown)
 
     def card_problem(self, unix_s: float) -> CardProblem | None:
@@ -287,14 +284,17 @@ class SignedGuard:
             return f"robot/{self.card.robot_id}/{topic.name}"
         return f"ground/{topic.name}"
 
-    def _to_show(self) -> tuple[tuple[Topic, bytes], ...]:
-        """The own card, and from an operator the revocations, if it is time."""
+    def _to_show(self, *, again: bool) -> tuple[tuple[Topic, bytes], ...]:
+        """The own card, and from an operator the revocations, if it is time.
+
+        `again`: what is lost is sent again.
+        """
         now_s = self._clock_s()
         card = CARD if self.card.role is Role.ROBOT else GROUND_CARD
         with self._lock:
             if self._show_soon:
                 wait_s = _SHOWN_AT_MOST_EVERY_S
-            elif self._lossy and now_s < self._new_until_s - _NEW_FOR_S + _HASTE_S:
+            elif not again and now_s < self._new_until_s - _NEW_FOR_S + _HASTE_S:
                 wait_s = _SHOWN_IN_HASTE_EVERY_S
             elif now_s < self._new_until_s:
                 wait_s = _SHOWN_TO_NEW_EVERY_S
@@ -429,6 +429,11 @@ class _SigningLink:
     def refused(self) -> int:
         """How many messages it did not look at."""
         return self._link.refused()
+
+    @property
+    def sends_again(self) -> bool:
+        """Whether what is lost on its way is said once more."""
+        return self._link.sends_again
 
 
 def _is_of(card: Card, topic: Topic, key: str) -> bool:

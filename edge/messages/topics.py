@@ -72,6 +72,10 @@ def state_hz(robots: float) -> float:
 class Link(Protocol):
     """The radio. Called from any thread; nothing waits, and nothing raises."""
 
+    @property
+    def sends_again(self) -> bool:
+        """Whether it says once more what was lost on its way, as TCP does."""
+
     def publish(self, topic: Topic, data: bytes) -> None:
         """Send to whoever listens; it may be lost."""
 

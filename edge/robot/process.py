@@ -120,9 +120,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
             config,
             lambda folder: load_identity(folder, fleet=config.fleet, unix_s=clock.unix_s()),
         )
-        signed = None
-        if identity is not None:
-            signed = identity.guard(clock.monotonic_s, lossy=bool(config.link.group))
+        signed = None if identity is None else identity.guard(clock.monotonic_s)
         node = RobotNode(
             config,
             Ports(

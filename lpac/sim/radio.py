@@ -128,7 +128,9 @@ class Radio:
 
 
 class RadioLink:
-    """One program's link: a `Link`."""
+    """One program's link: a `Link`, whose cards are shown as in a mesh."""
+
+    sends_again = True
 
     def __init__(self, radio: Radio, station: int, subscriptions: Subscriptions) -> None:
         self.station = station

@@ -2,8 +2,9 @@
 
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from threading import Event, Thread
 from typing import Self
 
@@ -34,7 +35,14 @@ def group() -> Group:
 class Robot:
     """A member of the fleet in the group: what it hears of the others' messages, by their ids."""
 
-    def __init__(self, group: Group, robot_id: int, at: str | None = None) -> None:
+    def __init__(
+        self,
+        group: Group,
+        robot_id: int,
+        at: str | None = None,
+        *,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.heard: dict[str, bytes] = {}
         self.all_heard: list[bytes] = []
         self.heard_at_s: list[float] = []
@@ -42,7 +50,7 @@ class Robot:
         name = f"r{robot_id}"
         card = Card("test", Role.ROBOT, name, signer.public_key, 1, 2e9, robot_id)
         membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start=1)
-        self.guard = SignedGuard(membership, time.monotonic)
+        self.guard = SignedGuard(membership, clock_s)
         self.radio = zenoh_radio(
             LinkSetting(
                 "test", robot_id, "client", (), (at or endpoint(),), False, {},
@@ -113,6 +121,31 @@ def test_robots_hear_each_other_without_router_or_ground(group: Group) -> None:
             eventually_hear(third, b"3" * size, first, second)
         assert "r1" not in first.heard
         assert first.radio.peers() == 0
+
+
+def test_cards_are_shown_in_haste_since_nothing_lost_is_sent_again(group: Group) -> None:
+    now_s, messages, cards = 0.0, Inbox(), Inbox()
+    setting = LinkSetting(
+        "test", None, "client", (), (endpoint(),), False, {},
+        {MESSAGE: messages, CARD: cards}, None, group,
+    )  # fmt: skip
+    with zenoh_radio(setting), Robot(group, 1, clock_s=lambda: now_s) as robot:
+
+        def heard() -> bool:
+            robot.link.publish(MESSAGE, b"")
+            return messages.count > 0
+
+        eventually(heard)
+        # What was shown before anybody listened was lost.
+        before = cards.count
+
+        def shown(count: int) -> bool:
+            return cards.count == before + count
+
+        for count in (1, 2):
+            now_s = 0.5 * count
+            robot.link.publish(MESSAGE, b"")
+            eventually(partial(shown, count))
 
 
 def test_everything_else_goes_by_the_router(group: Group) -> None:

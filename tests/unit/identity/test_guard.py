@@ -46,10 +46,11 @@ class Member:
     """A guard, what it hears, and what it sends: by topic, as it goes over the air."""
 
     def __init__(
-        self, member: Membership, revocations: bytes = b"", *, lossy: bool = False
+        self, member: Membership, revocations: bytes = b"", *, sends_again: bool = True
     ) -> None:
         self.now_s = 0.0
-        self.guard = SignedGuard(member, lambda: self.now_s, revocations, lossy=lossy)
+        self.sends_again = sends_again
+        self.guard = SignedGuard(member, lambda: self.now_s, revocations)
         self.heard: list[tuple[str, bytes, Speaker]] = []
         topics: Mapping[Topic, ReceiveCallback] = self.guard.subscriptions(
             dict.fromkeys((MESSAGE, STATUS, STATE, ORDER), lambda *said: self.heard.append(said))
@@ -154,7 +155,7 @@ def test_cards_are_rare_once_all_know_all(one: Member, two: Member) -> None:
 
 
 def test_where_cards_get_lost_whoever_is_new_is_shown_them_again_at_once() -> None:
-    one, two = Member(membership(Role.ROBOT, "r1", 1), lossy=True), robot(2)
+    one, two = Member(membership(Role.ROBOT, "r1", 1), sends_again=False), robot(2)
     one.say(MESSAGE, b"")
     one.now_s = 60.0
     one.hear(two, two.say(MESSAGE, b"begun"))
