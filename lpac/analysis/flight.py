@@ -36,7 +36,7 @@ from edge.core.perception import part_in_world, window_corner
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import FlightState
 from lpac.analysis.coverage import Coverage
-from lpac.analysis.logs import LoggedStatus
+from lpac.analysis.logs import LoggedStatus, LoopRates
 from lpac.analysis.snapshot import FRESH_S
 from lpac.analysis.truth import TrueTrack
 
@@ -192,7 +192,8 @@ class FlightRecord:
     is 0. `from_s` and `to_s` are what is shown. `robots` are the mission's. `truth` is where
     vehicles were, by name: also others than the mission's, and beyond what is shown. Without a
     world `coverage` is None, and the costs are empty. A robot's sensor sees `sensor_size` cells of
-    the world. `clocks_known`: the robots' clocks are corrected by what a ground heard.
+    the world. `clocks_known`: the robots' clocks are corrected by what a ground heard. `rates` are
+    None if logs do not tell, and of robots that have not all the same.
     """
 
     name: str
@@ -211,6 +212,7 @@ class FlightRecord:
     lateness: Mapping[str, Mapping[str, LoopLateness]] = field(default_factory=dict)
     world_ids: tuple[str, ...] = ()
     clocks_known: bool = False
+    rates: LoopRates | None = None
 
     @cached_property
     def _counted(self) -> tuple[F64, F64]:

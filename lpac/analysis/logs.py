@@ -84,6 +84,13 @@ class Received:
     accepted: F64
 
 
+class LoopRates(NamedTuple):
+    """How often robots perceive; and decide, and speak."""
+
+    perception_hz: float
+    policy_hz: float
+
+
 class Ordered(NamedTuple):
     """An order that a robot answered."""
 
@@ -418,6 +425,15 @@ def configured_fence(metadata: FlightMetadata) -> Fence | None:
     """The fence of the robot's configuration; None if that cannot be read."""
     try:
         return from_mapping(Fence, json.loads(metadata.configuration)["fence"], "fence")
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def configured_rates(metadata: FlightMetadata) -> LoopRates | None:
+    """The rates of the robot's configuration; None if they cannot be read."""
+    try:
+        rates = json.loads(metadata.configuration)["rates"]
+        return LoopRates(*(float(rates[name]) for name in LoopRates._fields))
     except (ValueError, KeyError, TypeError):
         return None
 

@@ -25,7 +25,14 @@ from lpac.analysis.flight import (
     Messages,
     RobotRecord,
 )
-from lpac.analysis.logs import LoggedStatus, Logs, Received
+from lpac.analysis.logs import (
+    LoggedStatus,
+    Logs,
+    LoopRates,
+    Program,
+    Received,
+    configured_rates,
+)
 from lpac.analysis.mission_tracker import MissionTracker
 from lpac.analysis.truth import TrueTrack
 
@@ -141,7 +148,15 @@ def _record(
         lateness=_lateness(robots, duration_s),
         world_ids=tuple(sorted({said.world_id for robot in robots for said in robot.said})),
         clocks_known=clocks_known,
+        rates=_rates(logs, programs),
     )
+
+
+def _rates(logs: Logs, programs: set[Program]) -> LoopRates | None:
+    """Those of all of these programs; None if they differ, or one is not known."""
+    configured = {(m.robot_id, m.boot_nonce): configured_rates(m) for m in logs.metadata}
+    found = {configured.get(program) for program in programs}
+    return found.pop() if len(found) == 1 else None
 
 
 def _truth(logs: Logs, mission: Mission, from_s: float, to_s: float) -> dict[str, TrueTrack]:

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE, AsJson, Ray, pool
+from lpac.cli.options import (
+    DEFAULT_BUNDLE,
+    AsJson,
+    Px4,
+    Ray,
+    VehicleKind,
+    check_px4,
+    pool_for,
+)
 from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
 from lpac.cli.radio import WifiFile, calibration, link_line, transport_named, wifi_lines
 
@@ -96,13 +104,14 @@ def evaluate(
             "--loss or --transport so.",
         ),
     ] = None,
-    whole: Annotated[
-        bool,
+    vehicle: Annotated[
+        VehicleKind,
         typer.Option(
-            help="Also as the field is flown: whole robots on simulated vehicles, at most 30, and "
-            "points from the same pads."
+            help="Also as the field is flown: whole robots, at most 30, as `lpac sim` has them, "
+            "and points from the same pads."
         ),
-    ] = False,
+    ] = VehicleKind.POINT,
+    px4: Px4 = None,
     baselines: Annotated[
         list[str] | None,
         typer.Option(
@@ -125,6 +134,7 @@ def evaluate(
     from lpac.radio.modelled import ModelledRadio
     from lpac.sim.failure import LostRobots
 
+    check_px4(vehicle, px4)
     given = methods or [str(DEFAULT_BUNDLE)]
     if compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
@@ -149,12 +159,16 @@ def evaluate(
             for payload in _payload_types(payloads or [])
             for loss in ({}, *lossy)
         ),
-        *({"robot": robot} for robot in ("point-from-pad", "whole") if whole),
+        *(
+            {"robot": robot}
+            for robot in ("point-from-pad", vehicle.value)
+            if vehicle is not VehicleKind.POINT
+        ),
     ]
     evaluation = _evaluation(
-        given, world_set, worlds, duration, set_ups, changes, baselines, transfer=transfer
+        given, world_set, worlds, duration, set_ups, changes, baselines, px4, transfer=transfer
     )
-    cores = pool(ray)
+    cores = pool_for(vehicle, ray)
     results = _fly(evaluation, cores, out)
     told = to_json(evaluation, results, compared=compare)
     told["test_set_opened"] = _opened(evaluation)
@@ -188,6 +202,7 @@ def _evaluation(
     set_ups: list[str] | None,
     changes: Sequence[Mapping[str, Any]],
     baselines: list[str] | None,
+    px4: Path | None,
     *,
     transfer: bool,
 ) -> "Evaluation":
@@ -222,6 +237,7 @@ def _evaluation(
         worlds=worlds,
         duration_s=duration_s,
         sizes_from=DEFAULT_BUNDLE,
+        px4_build=px4,
     )
 
 

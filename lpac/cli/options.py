@@ -2,6 +2,7 @@
 
 import getpass
 import socket
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +22,10 @@ Robots = Annotated[
     str | None, typer.Option("--robots", help="Only these robots, such as r1,r3; else all.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Px4 = Annotated[
+    Path | None,
+    typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it."),
+]
 Ray = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
@@ -29,6 +34,26 @@ DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = SHIPPED_BUNDLE
 # The name of a lock has some hundred bytes.
 _LOCK_BYTES = 80
+
+
+class VehicleKind(StrEnum):
+    """What the robots fly."""
+
+    POINT = "point"
+    SIMULATED = "simulated"
+    MAVLINK = "mavlink"
+    PX4 = "px4"
+
+
+IN_REAL_TIME = (VehicleKind.MAVLINK, VehicleKind.PX4)
+
+
+def check_px4(vehicle: VehicleKind, px4: Path | None) -> None:
+    """Raises ValueError where PX4s fly and their build is not given, or the other way round."""
+    if vehicle is VehicleKind.PX4 and px4 is None:
+        raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+    if vehicle is not VehicleKind.PX4 and px4 is not None:
+        raise ValueError(f"--px4 does nothing with --vehicle {vehicle.value}")
 
 
 def open_fleet(path: Path, robots: str | None) -> tuple["FleetConfig", list["RobotHost"]]:
@@ -50,6 +75,17 @@ def pool(ray: str | None) -> "Pool":
     except ModuleNotFoundError:
         raise ValueError("--ray needs Ray: `pip install 'lpac-edge[ray]'`") from None
     return over_ray(ray)
+
+
+def pool_for(vehicle: VehicleKind, ray: str | None) -> "Pool":
+    """As `pool`; in real time flights go one after another, and nothing beside them."""
+    if vehicle not in IN_REAL_TIME:
+        return pool(ray)
+    if ray is not None:
+        raise ValueError(f"--ray does nothing with --vehicle {vehicle.value}: it flies here")
+    from lpac.sim.cores import in_this_process
+
+    return in_this_process
 
 
 def folder_lock(what: str, folder: Path) -> "ProcessLock":

@@ -4,7 +4,6 @@ import json
 import platform
 import shlex
 from contextlib import closing
-from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,15 +11,24 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE, AsJson, Ray, folder_lock, pool
+from lpac.cli.options import (
+    DEFAULT_BUNDLE,
+    AsJson,
+    Px4,
+    Ray,
+    VehicleKind,
+    check_px4,
+    folder_lock,
+    pool,
+    pool_for,
+)
 from lpac.cli.printing import print_table, progress_of
-from lpac.cli.sim import VehicleKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from edge.policy.bundle import Bundle as LoadedBundle
     from lpac.analysis.flight import FlightRecord
-    from lpac.evaluate.flights import RobotModel
     from lpac.paper.asynchrony import TimingResult
     from lpac.sim.cores import Pool
     from lpac.sim.experiment import Scenario, SimulatedFlight
@@ -32,8 +40,11 @@ app = new_app(
 
 _OUT = Path("out/paper")
 _E1_WORLDS, _E2_TRIALS, _WORLD = 3, 3, 0
-# Of `async`: points, and whole robots on the simulated clock.
-_WORLDS, _QUICK_WORLDS = {"point": 50, "whole": 8}, {"point": 4, "whole": 2}
+# Of `async`. A flight in real time takes two minutes.
+_WORLDS = {
+    VehicleKind.POINT: 50, VehicleKind.SIMULATED: 8, VehicleKind.MAVLINK: 1, VehicleKind.PX4: 1,
+}  # fmt: skip
+_QUICK_WORLDS = {**_WORLDS, VehicleKind.POINT: 4, VehicleKind.SIMULATED: 2}
 # Enough to see whether slower or faster is better.
 _QUICK_HZ = {"perception_hz": (1.0, 5.0), "policy_hz": (0.5, 2.5, 10.0)}
 _QUICK_DELAYS_S = (0.0, 0.8)
@@ -44,35 +55,25 @@ _VEHICLES = {
     VehicleKind.PX4: "real PX4s that run as software, a program for each robot",
 }
 _QUICKLY = {False: "", True: " --quick"}
-# Of `transfer`: whether whole robots fly, and whether it is the quick one.
-_TRANSFER_WORLDS = {
-    (False, False): 20, (False, True): 2, (True, False): 4, (True, True): 1,
-}  # fmt: skip
+_TRANSFER_WORLDS = {**_WORLDS, VehicleKind.POINT: 20, VehicleKind.SIMULATED: 4}
+_QUICK_TRANSFER_WORLDS = {**_WORLDS, VehicleKind.POINT: 2, VehicleKind.SIMULATED: 1}
 # They take hours.
 _TOO_LARGE = ("n300", "n1000")
 # Robots, repetitions, s.
 _QUICK_NETWORK = (3, 1, 8.0)
 
 
-class PaperVehicle(StrEnum):
-    """What flies in experiments of very many flights."""
-
-    POINT = "point"
-    SIMULATED = "simulated"
-
-
 Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
 FlownBundle = Annotated[
     Path | None,
     typer.Option(
-        help="Policy bundle, the shipped one if not given; with --logs the one that flew, by which "
-        "e1's baselines fly and e3 knows how far robots hear."
+        help="Policy bundle, the shipped one if not given; with --logs the one that flew, which "
+        "says what baselines see and how far robots hear."
     ),
 ]
 Vehicle = Annotated[
     VehicleKind, typer.Option(help="Points, or whole robots, as `lpac sim` has them.")
 ]
-Px4 = Annotated[Path | None, typer.Option(help="px4: PX4's build folder.")]
 Logs = Annotated[
     Path | None, typer.Option(help="Fly nothing: folder of logs of flights, as of a field day.")
 ]
@@ -235,11 +236,9 @@ def _check_options(
         raise ValueError(f"{given[0]} does nothing with --logs")
     if logs is not None and vehicle is not VehicleKind.POINT:
         raise ValueError("--vehicle does nothing with --logs")
-    if vehicle is VehicleKind.PX4 and px4 is None:
-        raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
-    if vehicle is not VehicleKind.PX4 and px4 is not None:
-        beside = "--logs" if logs is not None else f"--vehicle {vehicle.value}"
-        raise ValueError(f"--px4 does nothing with {beside}")
+    if logs is not None and px4 is not None:
+        raise ValueError("--px4 does nothing with --logs")
+    check_px4(vehicle, px4)
     if logs is None and (trial or world_file is not None):
         raise ValueError(f"--{'trial' if trial else 'world-file'} does nothing without --logs")
 
@@ -399,19 +398,31 @@ def _range_m(path: Path, flown: "Sequence[str] | None" = None) -> float:
 
     Raises ValueError if it is none of `flown`, ids of bundles.
     """
-    from edge.policy.bundle import load_bundle
     from lpac.sim.experiment import FIELD_SCALE
 
-    bundle = load_bundle(path)
+    bundle = _bundle_that_flew(path, flown, "which says how far robots hear each other")
     perception = bundle.manifest.perception
-    if perception is None:
+    assert perception is not None
+    return perception.communication_range / FIELD_SCALE.env_scale
+
+
+def _bundle_that_flew(path: Path, flown: "Sequence[str] | None", why: str) -> "LoadedBundle":
+    """Raises ValueError if others of `flown`, ids of bundles, flew, or it cannot fly."""
+    from edge.policy.bundle import load_bundle
+
+    bundle = load_bundle(path)
+    if bundle.manifest.perception is None:
         raise ValueError(f"{path}: has no perception: it cannot fly")
+    if flown is not None and len(flown) > 1:
+        raise ValueError(
+            f"{' and '.join(its[:16] for its in flown)} flew: choose missions of one bundle with "
+            "--trial"
+        )
     if flown is not None and bundle.id not in flown:
         raise ValueError(
-            f"{path}: is not what flew, {' and '.join(its[:16] for its in flown)}: give that with "
-            "--bundle, which says how far robots hear each other"
+            f"{path}: is not what flew, {flown[0][:16]}: give that with --bundle, {why}"
         )
-    return perception.communication_range / FIELD_SCALE.env_scale
+    return bundle
 
 
 def _at_least(least: int, value: int, option: str) -> None:
@@ -504,69 +515,97 @@ def _tell(told: dict[str, object], folder: Path, *, lines: "Sequence[str]", as_j
 @app.command("async")
 def asynchrony(
     *,
-    bundle: Bundle = DEFAULT_BUNDLE,
+    bundle: FlownBundle = None,
     worlds: Annotated[
         int | None,
         typer.Option(
             "--worlds",
             "-k",
-            help=f"The first so many of the validation set; {_WORLDS['point']} points, or "
-            f"{_WORLDS['whole']} whole robots' if not given, with --quick "
-            f"{_QUICK_WORLDS['point']} or {_QUICK_WORLDS['whole']}.",
+            help=f"The first so many of the validation set; {_WORLDS[VehicleKind.POINT]} of points "
+            f"if not given, {_WORLDS[VehicleKind.SIMULATED]} of whole robots on a simulated clock, "
+            "1 in real time.",
         ),
     ] = None,
-    vehicle: Annotated[
-        PaperVehicle, typer.Option(help="Points, or whole robots on a simulated clock.")
-    ] = PaperVehicle.POINT,
+    vehicle: Vehicle = VehicleKind.POINT,
+    px4: Px4 = None,
+    logs: Logs = None,
+    trial: Trial = None,
+    world_file: WorldFile = None,
     quick: Quick = False,
     ray: Ray = None,
     as_json: AsJson = False,
     out: Out = None,
 ) -> None:
     """Rates of perception and of messages, in step or not, and late messages: what they cost."""
-    from edge.policy.bundle import load_bundle
     from lpac.evaluate.evaluation import TrainedBundle
     from lpac.evaluate.flights import KeptFlights
-    from lpac.paper.asynchrony import AsynchronyPlan, results_of
+    from lpac.paper.asynchrony import AsynchronyPlan, Flown, results_of
     from lpac.paper.asynchrony import as_json as to_json
     from lpac.paper.asynchrony_report import write_report
     from lpac.paper.repeated import sizes_of
-    from lpac.paper.report import EXACT_POINTS, WHOLE_IN_TRUTH
+    from lpac.paper.report import EXACT_POINTS, LOGS_BY_RATES, WHOLE_IN_TRUTH
 
-    robot: RobotModel = "point" if vehicle is PaperVehicle.POINT else "whole"
-    count = worlds if worlds is not None else (_QUICK_WORLDS if quick else _WORLDS)[robot]
-    loaded = load_bundle(bundle)
-    plan = AsynchronyPlan(
-        bundle=TrainedBundle(str(bundle.resolve()), loaded.id),
-        message_bytes=sizes_of(loaded).of_two,
-        world_set="validation",
-        worlds=count,
-        robot=robot,
-        **({**_QUICK_HZ, "delays_s": _QUICK_DELAYS_S} if quick else {}),
-    )
-    folder = out or _OUT / "async"
-    with folder_lock("the experiment", folder):
-        flights, flown = plan.flights(), {}
-        with (
-            progress_of("flights") as progress,
-            closing(KeptFlights(folder).fly(flights, pool(ray))) as told,
-        ):
-            task = progress.add_task("", total=len(flights))
-            for flight, cost in told:
-                flown[flight] = cost
-                progress.update(task, advance=1)
-        results = results_of(plan, flown)
-        option = "" if robot == "point" else f" --vehicle {vehicle.value}"
-        made_by = _made_by(f"async -k {count}{option}{_QUICKLY[quick]}", [bundle])
+    given = {"--worlds": worlds, "--quick": quick or None, "--ray": ray}
+    _check_options(vehicle, px4, logs, trial, world_file, given)
+    folder, flown_by = out or _OUT / "async", bundle or DEFAULT_BUNDLE
+    if logs is not None:
+        trials = _logged(logs, trial, world_file, bundle)
+        loaded = _bundle_that_flew(flown_by, _flown_by(trials), "which says how much robots say")
+        results, count = _by_rates(trials)
+        flown = Flown(loaded.id, sizes_of(loaded).of_two, "logs", None, count)
+        made_by, how = (
+            _made_from_logs("async", logs, trial, world_file, bundle, trials),
+            LOGS_BY_RATES,
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+    else:
+        loaded = _bundle_that_flew(flown_by, None, "")
+        count = worlds if worlds is not None else (_QUICK_WORLDS if quick else _WORLDS)[vehicle]
+        plan = AsynchronyPlan(
+            bundle=TrainedBundle(str(flown_by.resolve()), loaded.id),
+            message_bytes=sizes_of(loaded).of_two,
+            world_set="validation",
+            worlds=count,
+            robot=vehicle.value,
+            px4_build="" if px4 is None else str(px4.resolve()),
+            **({**_QUICK_HZ, "delays_s": _QUICK_DELAYS_S} if quick else {}),
+        )
+        with folder_lock("the experiment", folder):
+            flights, costs = plan.flights(), {}
+            with (
+                progress_of("flights") as progress,
+                closing(KeptFlights(folder).fly(flights, pool_for(vehicle, ray))) as told,
+            ):
+                task = progress.add_task("", total=len(flights))
+                for flight, cost in told:
+                    costs[flight] = cost
+                    progress.update(task, advance=1)
+        results, flown = results_of(plan, costs), plan.flown
+        made_by = _made_by(f"async -k {count}{_option(vehicle)}{_QUICKLY[quick]}", [flown_by])
         how = EXACT_POINTS
-        if robot == "whole":
-            how = WHOLE_IN_TRUTH.format(vehicles=_VEHICLES[VehicleKind.SIMULATED])
-        write_report(plan, results, folder, made_by, how)
+        if vehicle is not VehicleKind.POINT:
+            how = WHOLE_IN_TRUTH.format(vehicles=_VEHICLES[vehicle])
+    write_report(flown, results, folder, made_by, how)
     if as_json:
-        typer.echo(json.dumps(to_json(plan, results), indent=2))
+        typer.echo(json.dumps(to_json(flown, results), indent=2))
         return
     _show(results)
-    typer.echo(f"\nsee {folder}: README.md, rates.png, staleness.png, async.csv, async.json")
+    typer.echo(f"\nsee {folder}: README.md, figures, async.csv, async.json")
+
+
+def _by_rates(trials: "Mapping[str, FlightRecord]") -> "tuple[list[TimingResult], int]":
+    """What the missions came to by their rates, and of how many; says which are left out."""
+    from lpac.paper.asynchrony import TIMES_S, is_comparable, results_of_logs
+
+    for name, record in trials.items():
+        if not is_comparable(record):
+            why = (
+                "its robots' rates differ, or their logs do not tell"
+                if record.rates is None
+                else f"it lasted {record.curve_time_s[-1]:.0f} s, less than {TIMES_S[-1]:g}"
+            )
+            typer.echo(f"note: {name} is left out: {why}", err=True)
+    return results_of_logs(trials), sum(map(is_comparable, trials.values()))
 
 
 @app.command()
@@ -574,20 +613,35 @@ def transfer(
     *,
     bundles: Annotated[
         list[Path] | None,
-        typer.Option("--bundle", help="Policy bundle; may be repeated. The shipped one if none."),
+        typer.Option(
+            "--bundle",
+            help="Policy bundle; may be repeated. The shipped one if none; with --logs the one "
+            "that flew.",
+        ),
     ] = None,
     worlds: Annotated[
         int | None,
         typer.Option(
             "--worlds",
             "-k",
-            help="Of the validation set: 20, or 2 with --quick; of whole robots 4, or 1.",
+            help="Of the validation set: 20, or 2 with --quick; of whole robots on a simulated "
+            "clock 4, or 1, and 1 in real time.",
         ),
     ] = None,
+    set_ups: Annotated[
+        list[str] | None,
+        typer.Option("--set-up", metavar="NAME", help="Only this one; may be repeated."),
+    ] = None,
     vehicle: Annotated[
-        PaperVehicle,
-        typer.Option(help="Points, or also whole robots, where no more than 30 of them fly."),
-    ] = PaperVehicle.POINT,
+        VehicleKind,
+        typer.Option(
+            help="Points, or also whole robots as `lpac sim` has them, where no more than 30 fly."
+        ),
+    ] = VehicleKind.POINT,
+    px4: Px4 = None,
+    logs: Logs = None,
+    trial: Trial = None,
+    world_file: WorldFile = None,
     quick: Quick = False,
     ray: Ray = None,
     as_json: AsJson = False,
@@ -595,30 +649,92 @@ def transfer(
 ) -> None:
     """Other numbers of robots, features and ranges: `lpac evaluate` in the paper's set-ups."""
     from lpac.cli.evaluate import evaluate
-    from lpac.evaluate.worlds import SET_UPS
     from lpac.paper.report import EXACT_POINTS, WHOLE_TRANSFERRED, write_transfer
-    from lpac.sim.fleet.layout import MAX_ROBOTS
 
+    given = {"--worlds": worlds, "--set-up": set_ups, "--quick": quick or None, "--ray": ray}
+    _check_options(vehicle, px4, logs, trial, world_file, given)
     folder, flown = out or _OUT / "transfer", bundles or [DEFAULT_BUNDLE]
-    names = _QUICK_SET_UPS if quick else [name for name in SET_UPS if name not in _TOO_LARGE]
-    command, how, whole = "transfer", EXACT_POINTS, vehicle is PaperVehicle.SIMULATED
-    count = worlds if worlds is not None else _TRANSFER_WORLDS[whole, quick]
-    if whole:
-        names = [name for name in names if SET_UPS[name].robots <= MAX_ROBOTS]
-        command += f" --vehicle {vehicle.value}"
-        how = WHOLE_TRANSFERRED.format(vehicles=_VEHICLES[VehicleKind.SIMULATED])
-    made_by = _made_by(f"{command} -k {count}{_QUICKLY[quick]}", flown)
+    if logs is not None:
+        _transfer_of_logs(logs, trial, world_file, bundles, folder, as_json=as_json)
+        return
+    names, by_vehicle = _set_ups(set_ups, vehicle, quick=quick), _TRANSFER_WORLDS
+    if quick:
+        by_vehicle = _QUICK_TRANSFER_WORLDS
+    count = worlds if worlds is not None else by_vehicle[vehicle]
+    chosen = "".join(f" --set-up {name}" for name in set_ups or ())
+    command = f"transfer{_option(vehicle)} -k {count}{chosen}{_QUICKLY[quick]}"
+    made_by, how = _made_by(command, flown), EXACT_POINTS
+    if vehicle is not VehicleKind.POINT:
+        how = WHOLE_TRANSFERRED.format(vehicles=_VEHICLES[vehicle])
     evaluate(
         methods=[str(bundle) for bundle in flown],
-        set_ups=[*names],
+        set_ups=names,
         worlds=count,
-        whole=whole,
+        vehicle=vehicle,
+        px4=px4,
         baselines=["clairvoyant-cvt"],
         ray=ray,
         as_json=as_json,
         out=folder,
     )
     write_transfer(json.loads((folder / "evaluation.json").read_text()), folder, made_by, how)
+
+
+def _set_ups(chosen: list[str] | None, vehicle: VehicleKind, *, quick: bool) -> list[str]:
+    """In which it flies: those that were chosen, or of the paper's what the vehicles can."""
+    from lpac.evaluate.worlds import SET_UPS
+    from lpac.sim.fleet.layout import MAX_ROBOTS
+
+    if chosen:
+        return chosen
+    names = [*_QUICK_SET_UPS] if quick else [name for name in SET_UPS if name not in _TOO_LARGE]
+    if vehicle is VehicleKind.POINT:
+        return names
+    return [name for name in names if SET_UPS[name].robots <= MAX_ROBOTS]
+
+
+def _transfer_of_logs(
+    logs: Path,
+    trial: "Sequence[str] | None",
+    world_file: Path | None,
+    bundles: "Sequence[Path] | None",
+    folder: Path,
+    *,
+    as_json: bool,
+) -> None:
+    from lpac.evaluate.evaluation import CLAIRVOYANT, TrainedBundle
+    from lpac.evaluate.report import write_results
+    from lpac.paper.experiments import beside
+    from lpac.paper.report import LOGS_BESIDE_POINTS, write_transfer
+    from lpac.paper.transfer import as_json as to_json
+    from lpac.paper.transfer import results_of_logs
+
+    if bundles and len(bundles) > 1:
+        raise ValueError("--logs: one bundle flew, so give --bundle once")
+    bundle = bundles[0] if bundles else None
+    trials, flown_by = _logged(logs, trial, world_file, bundle), bundle or DEFAULT_BUNDLE
+    loaded = _bundle_that_flew(flown_by, _flown_by(trials), "which says what baselines see")
+    scenarios = {name: beside(record) for name, record in trials.items()}
+    for name, of_trial in scenarios.items():
+        if not of_trial:
+            raise ValueError(f"{name}: nobody was in the air as it began: choose other missions")
+    flown = _fly([its[CLAIRVOYANT] for its in scenarios.values()], flown_by, pool(None))
+    clairvoyant = {name: one.record for name, one in zip(scenarios, flown, strict=True)}
+    trained = TrainedBundle(str(flown_by.resolve()), loaded.id)
+    results = results_of_logs(trials, clairvoyant, trained)
+    folder.mkdir(parents=True, exist_ok=True)
+    told = to_json(results, trained)
+    write_results(told, results, folder)
+    made_by = _made_from_logs("transfer", logs, trial, world_file, bundle, trials)
+    write_transfer(told, folder, made_by, LOGS_BESIDE_POINTS)
+    _tell(
+        told, folder, as_json=as_json,
+        lines=[
+            f"{condition.name}: {own.final.mean():.3f}, x "
+            f"{own.final.mean() / own.clairvoyant.mean():.2f} clairvoyant Lloyd's"
+            for condition, (own, _) in results.items()
+        ],
+    )  # fmt: skip
 
 
 @app.command()

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE
+from lpac.cli.options import DEFAULT_BUNDLE, Px4, VehicleKind, check_px4
 from lpac.cli.radio import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
@@ -75,15 +75,6 @@ class Scale(StrEnum):
 
     FIELD = "field"
     MODEL = "model"
-
-
-class VehicleKind(StrEnum):
-    """What the robots fly."""
-
-    POINT = "point"
-    SIMULATED = "simulated"
-    MAVLINK = "mavlink"
-    PX4 = "px4"
 
 
 @app.command()
@@ -193,9 +184,7 @@ def sim(
             "same flight on any type of CPU."
         ),
     ] = None,
-    px4: Annotated[
-        Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
-    ] = None,
+    px4: Px4 = None,
     secure: Annotated[
         bool,
         typer.Option(
@@ -238,8 +227,7 @@ def sim(
         from lpac.sim.fleet.layout import FleetScenario
 
         flown: Literal["mavlink", "px4"] = "px4" if vehicle is VehicleKind.PX4 else "mavlink"
-        if flown == "px4" and px4 is None:
-            raise ValueError("--vehicle px4 needs --px4 with PX4's build folder")
+        check_px4(vehicle, px4)
         fleet_scenario = FleetScenario(
             robots=_as_many_as_carried(bundle, flown) if count is None else count,
             seed=seed,

@@ -32,8 +32,10 @@ from lpac.analysis.statistics import (
     ratio_of_means,
 )
 from lpac.evaluate.flights import (
+    IN_REAL_TIME,
     LLOYD,
     POLICY,
+    WHOLE_ROBOTS,
     EvaluationFlight,
     Flier,
     FlownCost,
@@ -107,15 +109,24 @@ class Condition(NamedTuple):
         if self.payload != "float16":
             words.append(f"payloads in {self.payload}")
         if self.robot != "point":
-            words.append("whole robots" if self.robot == "whole" else "points from pads, GPS off")
+            words.append(_ROBOTS[self.robot])
         return ", ".join(words)
+
+
+_ROBOTS: dict[RobotModel, str] = {
+    "point-from-pad": "points from pads, GPS off",
+    "simulated": "whole robots",
+    "mavlink": "whole robots, as programs",
+    "px4": "whole robots, on PX4",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
     """Methods, the first `worlds` worlds of a set, and the conditions.
 
-    Baselines take their sizes from the bundle at `sizes_from`; `sizes` says which.
+    Baselines take their sizes from the bundle at `sizes_from`; `sizes` says which. `px4_build` is
+    where real PX4s are taken from.
     Raises ValueError that names what is impossible.
     """
 
@@ -126,6 +137,7 @@ class Evaluation:
     duration_s: float
     sizes_from: str
     sizes: str
+    px4_build: str = ""
 
     def __post_init__(self) -> None:
         if self.worlds < 1:
@@ -143,6 +155,8 @@ class Evaluation:
                     )
             if condition.robot != "point" and SET_UPS[condition.set_up].robots > MAX_ROBOTS:
                 raise ValueError(f"{condition.set_up}: of whole robots {MAX_ROBOTS} fly at most")
+            if condition.robot in IN_REAL_TIME and (loss or condition.radio):
+                raise ValueError("programs in real time lose what their own radio loses")
             if lost.robots and not 0.0 < lost.at_s < self.duration_s:
                 raise ValueError(f"robots lost at {lost.at_s:g} s: must be in flight")
             if lost.robots >= SET_UPS[condition.set_up].robots:
@@ -183,12 +197,14 @@ class Evaluation:
                 position_error_m=condition.position_error_m,
                 robot=condition.robot if method.trained else _AS_POINT[condition.robot],
                 payload=condition.payload if method.trained else "float16",
+                px4_build=self.px4_build if method.trained else "",
             )
 
 
 _AS_POINT: dict[RobotModel, RobotModel] = {
-    "point": "point", "point-from-pad": "point-from-pad", "whole": "point-from-pad",
-}  # fmt: skip
+    "point": "point",
+    **dict.fromkeys(("point-from-pad", *WHOLE_ROBOTS), "point-from-pad"),
+}
 _BEST_OF_TEN = Method(name=LLOYD, flier=LLOYD)
 
 
@@ -285,24 +301,31 @@ def as_json(
         ],
         "baselines_with": evaluation.sizes,
         "fails_above": FAILS_ABOVE,
-        "conditions": [
-            {
-                "name": condition.name,
-                "set_up": condition.set_up,
-                "loss": condition.loss,
-                "radio_model": _radio_json(condition),
-                "payload": condition.payload,
-                "lost_robots": condition.lost.robots,
-                "lost_at_s": condition.lost.at_s,
-                "lag_s": condition.lag_s,
-                "position_error_m": condition.position_error_m,
-                "robot": condition.robot,
-                "results": [_result_json(result, of_all) for result in of_all],
-                "compared": _verdict_json(verdict_of(of_all[0], of_all[1])) if compared else None,
-            }
-            for condition, of_all in results.items()
-        ],
+        "conditions": conditions_json(results, compared=compared),
     }
+
+
+def conditions_json(
+    results: Mapping[Condition, Sequence[MethodResult]], *, compared: bool = False
+) -> list[dict[str, Any]]:
+    """What each method came to under each condition; see `as_json`."""
+    return [
+        {
+            "name": condition.name,
+            "set_up": condition.set_up,
+            "loss": condition.loss,
+            "radio_model": _radio_json(condition),
+            "payload": condition.payload,
+            "lost_robots": condition.lost.robots,
+            "lost_at_s": condition.lost.at_s,
+            "lag_s": condition.lag_s,
+            "position_error_m": condition.position_error_m,
+            "robot": condition.robot,
+            "results": [_result_json(result, of_all) for result in of_all],
+            "compared": _verdict_json(verdict_of(of_all[0], of_all[1])) if compared else None,
+        }
+        for condition, of_all in results.items()
+    ]
 
 
 def _radio_json(condition: Condition) -> dict[str, Any] | None:

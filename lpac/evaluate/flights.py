@@ -33,7 +33,9 @@ from lpac.sim.experiment import (
 from lpac.sim.failure import NONE_LOST, LostRobots
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
+from lpac.sim.fleet.flight import fly as fly_fleet
 from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.processes import Fleet
 from lpac.sim.fleet.robots import Settings
 from lpac.sim.kept import KeptOutcomes, code_digest
 from lpac.sim.radio import Air
@@ -46,9 +48,13 @@ LLOYD: Literal["best-of-ten-lloyd"] = "best-of-ten-lloyd"
 POLICY: Literal["lpac"] = "lpac"
 Flier = Literal["lpac", "best-of-ten-lloyd"] | BaselineName
 # A point that follows its velocity; the same that begins where whole robots stand, wrong about its
-# place as their receivers are; and the whole robot: its program's loops and separation, on a
-# simulated vehicle, in wind.
-RobotModel = Literal["point", "point-from-pad", "whole"]
+# place as their receivers are; and whole robots, their programs' loops and separation, in wind: on
+# simulated vehicles and one simulated clock, as programs in real time on simulated vehicles, and on
+# real PX4s.
+RobotModel = Literal["point", "point-from-pad", "simulated", "mavlink", "px4"]
+WHOLE_ROBOTS: tuple[RobotModel, ...] = ("simulated", "mavlink", "px4")
+# These fly one after another, with nothing beside them.
+IN_REAL_TIME: tuple[RobotModel, ...] = ("mavlink", "px4")
 
 # Larger batches of the simulator are no faster.
 _ROBOTS_TOGETHER = 80
@@ -63,7 +69,8 @@ class EvaluationFlight:
     map; `flown_by` is its id, or says these sizes. `position_error_m` is the standard deviation,
     along each axis, of each robot's error in knowing its position. Baselines have no whole robots;
     these have moments and errors of their own, send what their policy was judged with, and lose
-    messages, or have them late, from the mission's start on. The rest is as `Scenario` has it.
+    messages, or have them late, from the mission's start on, but not in real time. `px4_build` is
+    where robots of the kind "px4" have theirs from. The rest is as `Scenario` has it.
     """
 
     flier: Flier
@@ -84,10 +91,11 @@ class EvaluationFlight:
     lag_s: float = 0.0
     position_error_m: float = 0.0
     robot: RobotModel = "point"
+    px4_build: str = ""
 
     @property
     def key(self) -> str:
-        """What tells it from all other flights, wherever the bundle lies."""
+        """What tells it from all other flights, wherever the bundle and PX4 lie."""
         return (
             f"{self.flier} {self.flown_by}: {self.world_set} {self.world} {self.set_up}, "
             f"{self.duration_s:g} s, loss {self.loss:g}, lost {self.lost.robots}@{self.lost.at_s:g}"
@@ -133,7 +141,7 @@ def groups_of(flights: Iterable[EvaluationFlight]) -> list[FlightGroup]:
     alike: dict[tuple[str, str], list[EvaluationFlight]] = {}
     groups: list[FlightGroup] = []
     for flight in flights:
-        if flight.flier != POLICY or flight.robot == "whole":
+        if flight.flier != POLICY or flight.robot in WHOLE_ROBOTS:
             groups.append((flight,))
             continue
         waiting = alike.setdefault((flight.bundle, flight.set_up), [])
@@ -145,10 +153,13 @@ def groups_of(flights: Iterable[EvaluationFlight]) -> list[FlightGroup]:
 
 
 def costs_of(group: FlightGroup) -> list[tuple[EvaluationFlight, FlownCost]]:
-    """Fly them, in whatever process this is. Raises BundleError, ValueError, OSError."""
+    """Fly them, in whatever process this is.
+
+    Raises BundleError, ValueError, OSError, and what `lpac sim` does of programs in real time.
+    """
     if group[0].flier == LLOYD:
         return [(flight, _best_of_ten(flight)) for flight in group]
-    if group[0].robot == "whole":
+    if group[0].robot in WHOLE_ROBOTS:
         return [(flight, _whole(flight)) for flight in group]
     return [
         (flight, FlownCost(tuple(flown.cost_time_s.tolist()), tuple(flown.cost.tolist())))
@@ -270,14 +281,20 @@ def _whole(flight: EvaluationFlight) -> FlownCost:
     _bundle(flight)
     if flight.clocks.synchronous:
         raise ValueError(f"{flight.key}: whole robots have moments of their own")
-    air = None
-    if flight.loss or flight.delay_s:
-        air = Air(loss=flight.loss, delay_s=max(flight.delay_s, Air().delay_s))
-    with TemporaryDirectory() as folder:
-        flown = fly_simulated(
-            fleet_of(flight), Path(folder, "fleet"), bundle_for(flight, Path(folder)),
-            settings=settings_of(flight), air=air,
-        )  # fmt: skip
+    is_hindered = bool(flight.loss or flight.delay_s)
+    if is_hindered and flight.robot in IN_REAL_TIME:
+        raise ValueError(f"{flight.key}: the radio of programs in real time is what it is")
+    with TemporaryDirectory() as own:
+        folder, bundle = Path(own, "fleet"), bundle_for(flight, Path(own))
+        scenario, settings = fleet_of(flight), settings_of(flight)
+        if flight.robot in IN_REAL_TIME:
+            px4_build = Path(flight.px4_build) if flight.px4_build else None
+            fleet = Fleet(scenario, folder, bundle, px4_build=px4_build, settings=settings)
+            return whole_cost(flight, fly_fleet(fleet))
+        air = None
+        if is_hindered:
+            air = Air(loss=flight.loss, delay_s=max(flight.delay_s, Air().delay_s))
+        flown = fly_simulated(scenario, folder, bundle, settings=settings, air=air)
     return whole_cost(flight, flown)
 
 

@@ -51,11 +51,13 @@ def make_evaluation(
     worlds: int = 20,
     duration_s: float = 60.0,
     sizes_from: Path | None = None,
+    px4_build: Path | None = None,
 ) -> Evaluation:
     """`methods`, and behind them the baselines that are not among them.
 
     ClairvoyantCVT is always one, since all are held against it. Baselines take the sizes of sensor
     and local map from the first bundle, or from the one at `sizes_from` if no policy flies.
+    `px4_build` is needed where a condition's robots are "px4".
 
     Raises BundleError; ValueError for bundles of different tasks, and names what is not known.
     """
@@ -86,6 +88,7 @@ def make_evaluation(
         duration_s=duration_s,
         sizes_from=str(path),
         sizes=sizes_of(first),
+        px4_build="" if px4_build is None else str(px4_build.resolve()),
     )
 
 

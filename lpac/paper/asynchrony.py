@@ -10,15 +10,18 @@ worlds
 
 With all robots at the same moments messages cross one hop from one moment to the next, as they do
 in the synchronous graph neural network, and what a robot says is never older than a period.
+
+The missions of a field day's logs are held against each other by the rates that they were flown at.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from edge.core import F64
+from lpac.analysis.flight import FlightRecord
 from lpac.analysis.statistics import (
     Interval95,
     bootstrap,
@@ -27,7 +30,13 @@ from lpac.analysis.statistics import (
     ratio_of_means,
 )
 from lpac.evaluate.evaluation import TrainedBundle
-from lpac.evaluate.flights import POLICY, EvaluationFlight, FlownCost, RobotModel
+from lpac.evaluate.flights import (
+    IN_REAL_TIME,
+    POLICY,
+    EvaluationFlight,
+    FlownCost,
+    RobotModel,
+)
 from lpac.evaluate.worlds import WorldSet
 from lpac.sim.ticks import Clocks
 
@@ -65,12 +74,30 @@ class Timing(NamedTuple):
 FIELD = Timing(5.0, 2.5)
 
 
+class Flown(NamedTuple):
+    """What flew, and over what: the first `worlds` of a set, or so many missions of logs.
+
+    `message_bytes` is the most that a robot says at a time.
+    """
+
+    bundle_id: str
+    message_bytes: int
+    robot: RobotModel | Literal["logs"]
+    world_set: WorldSet | None
+    worlds: int
+
+    def said_kb_s(self, policy_hz: float) -> float:
+        """What a robot says at most in a second, kB."""
+        return policy_hz * self.message_bytes / 1000.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AsynchronyPlan:
     """The timings, and the first `worlds` worlds of a set, over which all of them are flown.
 
     `message_bytes` is the most that a robot says at a time. Whole robots (`robot`) are never all at
-    the same moments.
+    the same moments, and in real time nothing is late but by its radio. `px4_build` is where real
+    PX4s are from.
     """
 
     bundle: TrainedBundle
@@ -81,14 +108,18 @@ class AsynchronyPlan:
     policy_hz: tuple[float, ...] = (0.5, 1.0, 2.5, 5.0, 10.0)
     delays_s: tuple[float, ...] = (0.0, 0.2, 0.4, 0.8, 1.6)
     robot: RobotModel = "point"
+    px4_build: str = ""
 
     def __post_init__(self) -> None:
         if self.worlds < 1:
             raise ValueError(f"worlds = {self.worlds}: must be at least 1")
 
-    def said_kb_s(self, policy_hz: float) -> float:
-        """What a robot says at most in a second, kB."""
-        return policy_hz * self.message_bytes / 1000.0
+    @property
+    def flown(self) -> Flown:
+        """For the report."""
+        return Flown(
+            self.bundle.bundle_id, self.message_bytes, self.robot, self.world_set, self.worlds
+        )
 
     @property
     def timings(self) -> list[Timing]:
@@ -99,7 +130,8 @@ class AsynchronyPlan:
             for perception_hz in self.perception_hz
             for policy_hz in self.policy_hz
         ]
-        late = [FIELD._replace(delay_s=delay_s) for delay_s in self.delays_s]
+        delays_s = () if self.robot in IN_REAL_TIME else self.delays_s
+        late = [FIELD._replace(delay_s=delay_s) for delay_s in delays_s]
         return list(dict.fromkeys([FIELD, *rates, *late]))
 
     def flights_of(self, timing: Timing) -> list[EvaluationFlight]:
@@ -122,6 +154,7 @@ class AsynchronyPlan:
                 max_input_age_s=max(_FIELD_INPUT_AGE_S, _PERIODS * slowest_s),
                 clocks=clocks,
                 robot=self.robot,
+                px4_build=self.px4_build,
             )
             for world in range(self.worlds)
         ]
@@ -135,11 +168,13 @@ class AsynchronyPlan:
 class TimingResult:
     """What a timing came to over K worlds: `costs` (K, 3) at `TIMES_S`, over those at the start.
 
-    `area` (K,) is the mean cost over the flight, `over_field` at each of the times the ratio of the
-    mean cost to that with the field's timing over the same worlds, with its paired interval.
+    `worlds` names them, or the missions. `area` (K,) is the mean cost over the flight, `over_field`
+    at each of the times the ratio of the mean cost to that with the field's timing, with its
+    interval: over the same worlds in pairs, and of missions over these and those, which may differ.
     """
 
     timing: Timing
+    worlds: tuple[str, ...]
     costs: F64
     area: F64
     over_field: tuple[Interval95, ...]
@@ -162,8 +197,56 @@ def results_of(
             paired_bootstrap(own[None], its[None], ratio_of_means, same_trainings=True)
             for own, its in zip(costs.T, in_field.T, strict=True)
         )
-        results.append(TimingResult(timing, costs, area, over_field))
+        results.append(
+            TimingResult(timing, tuple(map(str, range(plan.worlds))), costs, area, over_field)
+        )
     return results
+
+
+def results_of_logs(records: Mapping[str, FlightRecord]) -> list[TimingResult]:
+    """Of missions by name, by the rates that they were flown at; the field's first.
+
+    Those that are not in `is_comparable` are left out. Raises ValueError if none of the others has
+    the field's rates.
+    """
+    by_timing: dict[Timing, dict[str, FlightRecord]] = {FIELD: {}}
+    for name, record in records.items():
+        if record.rates is not None and is_comparable(record):
+            by_timing.setdefault(Timing(*record.rates), {})[name] = record
+    if not by_timing[FIELD]:
+        raise ValueError(
+            f"no mission of {TIMES_S[-1]:g} s was flown with perception at "
+            f"{FIELD.perception_hz:g} Hz and policy at {FIELD.policy_hz:g} Hz, with which the "
+            "others are compared"
+        )
+    in_field = _costs_of_logs(by_timing[FIELD].values())
+    results = []
+    for timing, its in by_timing.items():
+        costs = _costs_of_logs(its.values())
+        over_field = tuple(
+            # As many trainings of one world: each side's are drawn by themselves.
+            paired_bootstrap(own[:, None], theirs[:, None], ratio_of_means)
+            for own, theirs in zip(costs.T, in_field.T, strict=True)
+        )
+        area = np.array([_area(record) for record in its.values()])
+        results.append(TimingResult(timing, tuple(its), costs, area, over_field))
+    return results
+
+
+def is_comparable(record: FlightRecord) -> bool:
+    """Whether its rates are known, and it lasted as long as costs are looked at, or nearly."""
+    return record.rates is not None and bool(record.curve_time_s[-1] > TIMES_S[-1] - 1.0)
+
+
+def _costs_of_logs(records: Iterable[FlightRecord]) -> F64:
+    """(K, 3)."""
+    return np.array([np.interp(TIMES_S, r.curve_time_s, r.normalized) for r in records])
+
+
+def _area(record: FlightRecord) -> float:
+    times_s = np.linspace(0.0, TIMES_S[-1], 1 + int(TIMES_S[-1]))
+    curve = np.interp(times_s, record.curve_time_s, record.normalized)
+    return float(mean_over_time(times_s, curve))
 
 
 def _costs(
@@ -176,22 +259,23 @@ def _costs(
     return costs, mean_over_time(time_s, curves)
 
 
-def as_json(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> dict[str, Any]:
+def as_json(flown: Flown, results: Sequence[TimingResult]) -> dict[str, Any]:
     """All numbers, for scripts; intervals as [value, low, high]."""
     return {
-        "bundle_id": plan.bundle.bundle_id,
-        "world_set": plan.world_set,
-        "worlds": plan.worlds,
-        "robot": plan.robot,
+        "bundle_id": flown.bundle_id,
+        "world_set": flown.world_set,
+        "worlds": flown.worlds,
+        "robot": flown.robot,
         "times_s": list(TIMES_S),
         "timings": [
             {
                 **result.timing._asdict(),
                 "rounds_per_perception": result.timing.rounds,
-                "said_kb_s": plan.said_kb_s(result.timing.policy_hz),
+                "said_kb_s": flown.said_kb_s(result.timing.policy_hz),
                 "means": [list(mean) for mean in result.means],
                 "over_field": [list(ratio) for ratio in result.over_field],
                 "area": list(bootstrap(result.area[None])),
+                "over": list(result.worlds),
                 "by_world": result.costs.tolist(),
             }
             for result in results

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from lpac.analysis import style
 from lpac.analysis.style import CURVES, WIDTH_IN, tidy
-from lpac.paper.asynchrony import FIELD, TIMES_S, AsynchronyPlan, TimingResult, as_json
+from lpac.paper.asynchrony import FIELD, TIMES_S, Flown, TimingResult, as_json
 from lpac.paper.files import table, write_experiment
 from lpac.paper.report import EXACT_POINTS
 
@@ -16,21 +16,28 @@ _END = len(TIMES_S) - 1
 
 
 def write_report(
-    plan: AsynchronyPlan,
+    flown: Flown,
     results: Sequence[TimingResult],
     folder: Path,
     made_by: Mapping[str, str],
-    flown: str = EXACT_POINTS,
+    how: str = EXACT_POINTS,
 ) -> None:
-    """All of it; `made_by` says what made it: the command, versions. Raises OSError."""
-    style.save(_rates(plan, results), folder / "rates")
-    style.save(_staleness(results), folder / "staleness")
-    told, text = as_json(plan, results), _text(plan, results, flown)
-    write_experiment("async", told, _rows(plan, results), text, folder, flown, made_by)
+    """All of it; `how` says how it was flown, `made_by` what made it. Raises OSError."""
+    style.save(_rates(flown, results), folder / "rates")
+    if _late(results):
+        style.save(_staleness(results), folder / "staleness")
+    told, text = as_json(flown, results), _text(flown, results, how)
+    write_experiment("async", told, _rows(flown, results), text, folder, how, made_by)
 
 
-def _rows(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> list[list[object]]:
-    """A heading, and a row for each timing and world."""
+def _late(results: Sequence[TimingResult]) -> list[TimingResult]:
+    """At the field's rates, over how late messages are; none if none were."""
+    of_field = [r for r in results if r.timing._replace(delay_s=0.0) == FIELD]
+    return of_field if len(of_field) > 1 else []
+
+
+def _rows(flown: Flown, results: Sequence[TimingResult]) -> list[list[object]]:
+    """A heading, and a row for each timing and world, or mission."""
     times = [f"cost_at_{time_s:g}_s" for time_s in TIMES_S]
     rows: list[list[object]] = [
         ["perception_hz", "policy_hz", "synchronous", "delay_s", "rounds_per_perception",
@@ -39,31 +46,35 @@ def _rows(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> list[list[ob
     for result in results:
         perception_hz, policy_hz, synchronous, delay_s = result.timing
         of_timing = [perception_hz, policy_hz, int(synchronous), delay_s, result.timing.rounds,
-                     plan.said_kb_s(policy_hz)]  # fmt: skip
-        rows += [[*of_timing, world, *costs] for world, costs in enumerate(result.costs.tolist())]
+                     flown.said_kb_s(policy_hz)]  # fmt: skip
+        its = zip(result.worlds, result.costs.tolist(), strict=True)
+        rows += [[*of_timing, world, *costs] for world, costs in its]
     return rows
 
 
-def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
+def _rates(flown: Flown, results: Sequence[TimingResult]) -> Figure:
     """Cost over the policy's rate, a curve for each rate of perception; early, and at the end."""
     by_timing = {result.timing: result for result in results}
+    of_perception_hz = sorted({timing.perception_hz for timing in by_timing})
+    of_policy_hz = sorted({timing.policy_hz for timing in by_timing})
     with style.figure(WIDTH_IN, 2.8) as figure:
         for axes, at in zip(figure.subplots(1, 2), (0, _END), strict=True):
-            for (colour, _), perception_hz in zip(CURVES, plan.perception_hz, strict=False):
+            for (colour, _), perception_hz in zip(CURVES, of_perception_hz, strict=False):
                 for synchronous in (False, True):
                     timings = [
                         FIELD._replace(
                             perception_hz=perception_hz, policy_hz=hz, synchronous=synchronous
                         )
-                        for hz in plan.policy_hz
+                        for hz in of_policy_hz
                     ]
                     row = [by_timing[timing] for timing in timings if timing in by_timing]
                     if not row:
                         continue
                     label = None if synchronous else f"{perception_hz:g} Hz"
-                    _curve(axes, plan.policy_hz, row, at, colour, label, dashed=synchronous)
+                    x = [result.timing.policy_hz for result in row]
+                    _curve(axes, x, row, at, colour, label, dashed=synchronous)
             axes.set_xscale("log")
-            axes.set_xticks(plan.policy_hz, [f"{hz:g}" for hz in plan.policy_hz])
+            axes.set_xticks(of_policy_hz, [f"{hz:g}" for hz in of_policy_hz])
             axes.minorticks_off()
             axes.set(
                 xlabel="policy and exchange of messages, Hz",
@@ -73,11 +84,11 @@ def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
             # What these rates ask of the radio.
             above = axes.twiny()
             above.set(xscale="log", xlim=axes.get_xlim(), xlabel="said by a robot, kB/s at most")
-            said_kb_s = [plan.said_kb_s(hz) for hz in plan.policy_hz]
-            above.set_xticks(plan.policy_hz, [f"{kb_s:.2g}" for kb_s in said_kb_s])
+            said_kb_s = [flown.said_kb_s(hz) for hz in of_policy_hz]
+            above.set_xticks(of_policy_hz, [f"{kb_s:.2g}" for kb_s in said_kb_s])
             above.minorticks_off()
             above.spines[["right"]].set_visible(False)
-        if plan.robot == "point":
+        if _in_step(results):
             axes.plot(
                 [], [], ls=style.DASHED, color=style.INK, lw=1.0, label="all at the same moments"
             )
@@ -88,9 +99,14 @@ def _rates(plan: AsynchronyPlan, results: Sequence[TimingResult]) -> Figure:
         return figure
 
 
+def _in_step(results: Sequence[TimingResult]) -> bool:
+    """Whether some flew with all robots at the same moments."""
+    return any(result.timing.synchronous for result in results)
+
+
 def _staleness(results: Sequence[TimingResult]) -> Figure:
     """Cost over the mean delay of messages, at the rates of the field."""
-    late = [r for r in results if r.timing._replace(delay_s=0.0) == FIELD]
+    late = _late(results)
     delays_s = [result.timing.delay_s for result in late]
     with style.figure(WIDTH_IN / 2, 2.6) as figure:
         axes = figure.subplots()
@@ -120,45 +136,64 @@ def _curve(
     axes.axhline(1.0, color=style.FAINT, lw=0.8, zorder=0)
 
 
-def _text(plan: AsynchronyPlan, results: Sequence[TimingResult], flown: str) -> str:
+def _text(flown: Flown, results: Sequence[TimingResult], how: str) -> str:
     dashed = (
         " Full lines: each robot at its own moments; dashed: all at the same ones."
-        if plan.robot == "point"
+        if _in_step(results)
         else ""
     )
+    if flown.world_set is None:
+        over = f"{flown.worlds} missions, each over the world that its robots were given"
+        intervals = "the missions of each rate drawn by themselves"
+    else:
+        over = (
+            f"the first {flown.worlds} worlds of the {flown.world_set} set, in the set-up of the "
+            "field"
+        )
+        intervals = "by worlds in pairs"
     headings = ["perception, Hz", "policy, Hz", "rounds per perception", "said, kB/s", "moments",
                 "delay, s",
                 *(f"cost at {time_s:g} s" for time_s in TIMES_S),
                 "mean cost over the flight"]  # fmt: skip
-    return f"""# Rates and asynchrony
+    parts = [
+        f"""# Rates and asynchrony
 
 The paper runs perception, exchange of messages and control asynchronously, each at a rate of its
 own, and argues both for an exchange slower than perception (a longer window to hear everybody in)
-and for a faster one. It measures neither. Here the policy of bundle `{plan.bundle.bundle_id[:16]}`,
-trained at the rates of the field alone (perception 5 Hz, policy 2.5 Hz), flies over the first
-{plan.worlds} worlds of the {plan.world_set} set, in the set-up of the field. {flown}
+and for a faster one. It measures neither. Here the policy of bundle `{flown.bundle_id[:16]}`,
+trained at the rates of the field alone (perception 5 Hz, policy 2.5 Hz), flies over {over}. {how}
 
 ![cost over the rates](rates.png)
 
 *Cost over the policy's rate, in terms of that with the field's rates and own moments: above 1 is
-worse.{dashed} Bars are 95 % intervals of the ratio of means, by worlds in pairs.*
+worse.{dashed} Bars are 95 % intervals of the ratio of means, {intervals}.*
+""",
+        f"""{table(headings, [_row(flown, result) for result in results])}
 
-![cost over the delay of messages](staleness.png)
+Cost over that at the start, and in brackets the 95 % interval of its ratio to the cost with the
+field's timing, the first row (bootstrap, {intervals}). A robot speaks as often as its
+policy decides: *said* is what that asks of the radio, at most, since messages are compressed.
+""",
+    ]
+    if flown.world_set is not None:
+        parts.append(
+            """Messages, images and actions count for two of their periods, or as long as in the
+field if that is longer; late messages so much longer as they are late.
+"""
+        )
+    if _late(results):
+        parts.insert(
+            1,
+            """![cost over the delay of messages](staleness.png)
 
 *The same policy at the rates of the field, with messages that are late: each by half to one and a
 half of the mean delay; in terms of the cost without.*
-
-{table(headings, [_row(plan, result) for result in results])}
-
-Cost over that at the start, and in brackets the 95 % interval of its ratio to the cost with the
-field's timing, the first row (bootstrap over worlds in pairs). A robot speaks as often as its
-policy decides: *said* is what that asks of the radio, at most, since messages are compressed.
-Messages, images and actions count for two of their periods, or as long as in the field if that is
-longer; late messages so much longer as they are late.
-"""
+""",
+        )
+    return "\n".join(parts)
 
 
-def _row(plan: AsynchronyPlan, result: TimingResult) -> list[str]:
+def _row(flown: Flown, result: TimingResult) -> list[str]:
     timing = result.timing
     costs = [
         f"{mean:.3f} (x {low:.2f} to {high:.2f})"
@@ -168,7 +203,7 @@ def _row(plan: AsynchronyPlan, result: TimingResult) -> list[str]:
         f"{timing.perception_hz:g}",
         f"{timing.policy_hz:g}",
         f"{timing.rounds:.2g}",
-        f"{plan.said_kb_s(timing.policy_hz):.2g}",
+        f"{flown.said_kb_s(timing.policy_hz):.2g}",
         "the same" if timing.synchronous else "own",
         f"{timing.delay_s:g}",
         *costs,

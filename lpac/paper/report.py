@@ -32,8 +32,8 @@ WHOLE = (
 )
 WHOLE_BESIDE_POINTS = f"{WHOLE} What they are held against are points from the same pads."
 WHOLE_IN_TRUTH = (
-    f"{WHOLE} Costs are of where the vehicles truly were, and messages are late from the mission's "
-    "start on."
+    f"{WHOLE} Costs are of where the vehicles truly were, and messages, where they are, are late "
+    "from the mission's start on."
 )
 WHOLE_TRANSFERRED = (
     f"{WHOLE} They do so in set-ups of up to {MAX_ROBOTS} robots, beside points from the same pads "
@@ -53,6 +53,10 @@ TAKEN_WHOLE = (
     f"flies it out of the fence at its height, and back to where it was; {_PILOTED}"
 )
 LOGS = "From the logs of flights."
+LOGS_BY_RATES = (
+    f"{LOGS} The missions of each rate are held against those with the field's, over whatever "
+    "worlds and from wherever they began; costs are of where the robots took themselves to be."
+)
 LOGS_BESIDE_POINTS = (
     f"{LOGS} What they are held against are points from where the robots were as the mission began."
 )
@@ -243,19 +247,23 @@ def write_transfer(
             )
             for world, (cost, over) in enumerate(zip(*of_training, strict=True))
         ]  # fmt: skip
+    # One alone is no comparison.
+    several = len(told["conditions"]) > 1
+    picture = "\n![mean cost over clairvoyant Lloyd's](conditions.png)\n" if several else ""
+    worlds = f"in the first {told['worlds']} worlds of the {told['world_set']} set"
+    if told["world_set"] is None:
+        worlds = f"{told['worlds']} missions by the teams that flew them"
     text = f"""# Transfer to other teams and worlds
 
 The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells with 10 robots in
 512 x 512; its other paper has more and fewer robots, features and ranges.
 {flown}
-
-![mean cost over clairvoyant Lloyd's](conditions.png)
-
+{picture}
 {table(["", *policies], rows)}
 
-Mean cost after {told["duration_s"]:g} s over that at the start, in the first {told["worlds"]}
-worlds of the {told["world_set"]} set, and in brackets what it is times that of Lloyd's algorithm
-that knows the world, with the 95 % interval. A folder for each set-up has its curves.
+Mean cost after {told["duration_s"]:.0f} s over that at the start, {worlds}, and in brackets what
+it is times that of Lloyd's algorithm that knows the world, with the 95 % interval. A folder for
+each set-up has its curves.
 """
     return write_experiment("transfer", told, rows_csv, text, folder, flown, made_by)
 

@@ -17,6 +17,7 @@ from edge.policy.bundle import Bundle, BundleError
 from edge.robot.pac import PacParameters
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, RobotRecord
+from lpac.analysis.logs import LoopRates
 from lpac.radio.airtime import LinkQuality
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.baselines import BaselineName, BaselineSwarm, make_baseline
@@ -462,6 +463,7 @@ def _record(
         coverage=Coverage(importance, scenario.scale.env_scale),
         sensor_size=perception.sensor_size,
         cost_time_s=cost_times_s(scenario.duration_s),
+        rates=LoopRates(1.0 / scenario.clocks.perception_s, 1.0 / scenario.clocks.policy_s),
     )
 
 

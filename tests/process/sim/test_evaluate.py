@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
 from lpac.radio.records import RadioRecord, write_records
 from lpac.sim.cluster import over_ray
+from lpac.sim.ticks import Clocks
 from tests.process.cli.test_cli import error_line, lpac
 
 PLAIN = ("-k", 2, "--duration", 2, "--baseline", "decentralized-cvt-prior")
@@ -180,3 +182,24 @@ def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
         (("--ray", "127.0.0.1:1"), "no Ray cluster at 127.0.0.1:1"),
     ):
         assert text in error_line(lpac("evaluate", *arguments, "--out", tmp_path))
+
+
+@pytest.mark.real_time
+def test_a_program_for_each_robot_flies_what_whole_robots_do() -> None:
+    """Over the same world from the same pad, with its timing's rates."""
+    clocked = EvaluationFlight(
+        flier=POLICY,
+        bundle=str(DEFAULT_BUNDLE),
+        flown_by=load_bundle(DEFAULT_BUNDLE).id,
+        world_set="validation",
+        world=0,
+        set_up="n1",
+        duration_s=4.0,
+        clocks=Clocks(perception_s=0.4),
+        robot="simulated",
+    )
+    of_both = costs_of((clocked,)) + costs_of((replace(clocked, robot="mavlink"),))
+    (_, on_a_clock), (_, in_real_time) = of_both
+    assert on_a_clock.time_s == in_real_time.time_s == (0.0, 1.0, 2.0, 3.0, 4.0)
+    # Receivers err alike in both; who has taken off has drifted by some metres.
+    assert in_real_time.cost[0] == pytest.approx(on_a_clock.cost[0], rel=0.1)

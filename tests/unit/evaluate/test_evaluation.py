@@ -151,7 +151,10 @@ def test_what_is_claimed_of_a_method_needs_its_trainings() -> None:
         ({"worlds": 0}, "worlds = 0: must be at least 1"),
         ({"duration_s": float("inf")}, "duration = inf: must be positive and finite"),
         ({"conditions": (Condition("field", loss=1.5),)}, "loss = 1.5: must be from 0 to 1"),
-        ({"conditions": (Condition("n32", robot="whole"),)}, "n32: of whole robots 30 fly at most"),
+        (
+            {"conditions": (Condition("n32", robot="simulated"),)},
+            "n32: of whole robots 30 fly at most",
+        ),
         ({"conditions": (Condition("field", lag_s=-1.0),)}, "lag_s = -1.0: must be at least 0"),
         (
             {"conditions": (Condition("field", position_error_m=math.nan),)},

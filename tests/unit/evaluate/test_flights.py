@@ -76,7 +76,7 @@ def test_whole_robots_begin_where_points_from_pads_do(
 ) -> None:
     point = dataclasses.replace(flight, robot="point-from-pad", set_up=set_up)
     [(_, of_point)] = costs_of((point,))
-    [(_, of_whole)] = costs_of((dataclasses.replace(point, robot="whole"),))
+    [(_, of_whole)] = costs_of((dataclasses.replace(point, robot="simulated"),))
     assert of_whole.time_s == of_point.time_s == (0.0, 1.0)
     # They hold above their pads, in wind; of few, each counts for more.
     assert of_whole.cost[0] == pytest.approx(of_point.cost[0], rel=off)

@@ -4,15 +4,28 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from edge.policy.bundle import load_bundle
+from lpac.analysis.flight import FlightRecord
+from lpac.analysis.logs import LoopRates
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.evaluation import TrainedBundle
 from lpac.evaluate.flights import EvaluationFlight, FlownCost, costs_of, settings_of
-from lpac.paper.asynchrony import FIELD, TIMES_S, AsynchronyPlan, Timing, as_json, results_of
+from lpac.paper.asynchrony import (
+    FIELD,
+    TIMES_S,
+    AsynchronyPlan,
+    Flown,
+    Timing,
+    as_json,
+    results_of,
+    results_of_logs,
+)
 from lpac.paper.asynchrony_report import write_report
 
 SHIPPED_ID = load_bundle(DEFAULT_BUNDLE).id
@@ -60,17 +73,72 @@ def test_each_timing_is_flown_once_over_the_same_worlds() -> None:
 
 
 def test_whole_robots_are_never_all_at_the_same_moments(tmp_path: Path) -> None:
-    plan = replace(PLAN, robot="whole")
+    plan = replace(PLAN, robot="simulated")
     assert [t for t in PLAN.timings if not t.synchronous] == plan.timings
-    assert {flight.robot for flight in plan.flights()} == {"whole"}
-    write_report(plan, results_of(plan, flown(plan)), tmp_path, {"command": "..."}, "Whole robots.")
+    assert {flight.robot for flight in plan.flights()} == {"simulated"}
+    results = results_of(plan, flown(plan))
+    write_report(plan.flown, results, tmp_path, {"command": "..."}, "Whole robots.")
     text = (tmp_path / "README.md").read_text()
     assert "Whole robots." in text and "dashed" not in text
 
 
+def test_in_real_time_messages_are_as_late_as_their_radio_makes_them(tmp_path: Path) -> None:
+    plan = replace(PLAN, robot="px4", px4_build="build")
+    assert plan.timings == [t for t in PLAN.timings if not t.synchronous and not t.delay_s]
+    flights = plan.flights()
+    assert {(flight.robot, flight.px4_build) for flight in flights} == {("px4", "build")}
+    # Where it was built does not make it another flight.
+    assert [f.key for f in flights] == [f.key for f in replace(plan, px4_build="there").flights()]
+    write_report(plan.flown, results_of(plan, flown(plan)), tmp_path, {"command": "..."})
+    assert "staleness" not in (tmp_path / "README.md").read_text()
+    assert not (tmp_path / "staleness.png").exists()
+    [late] = replace(plan, worlds=1).flights_of(FIELD._replace(delay_s=0.4))
+    late = replace(late, bundle=str(DEFAULT_BUNDLE), flown_by=SHIPPED_ID)
+    with pytest.raises(ValueError, match="the radio of programs in real time is what it is"):
+        costs_of((late,))
+
+
+def mission(rates: LoopRates | None, end: float, duration_s: float = 60.0) -> FlightRecord:
+    """Its cost falls from 1 to `end` in half a minute."""
+    times_s = np.linspace(0.0, duration_s, 61)
+    falling = np.interp(times_s, (0.0, 30.0), (1.0, end))
+    its = SimpleNamespace(rates=rates, curve_time_s=times_s, normalized=falling)
+    return cast(FlightRecord, its)
+
+
+def test_missions_of_logs_are_held_against_those_at_the_fields_rates(tmp_path: Path) -> None:
+    field, slow = LoopRates(5.0, 2.5), LoopRates(5.0, 1.0)
+    missions = {
+        "slow-1": mission(slow, 0.6),
+        "field-1": mission(field, 0.2),
+        "field-2": mission(field, 0.4),
+        "short": mission(field, 0.9, duration_s=40.0),
+        "unknown": mission(None, 0.9),
+    }
+    results = results_of_logs(missions)
+    assert [(result.timing, result.worlds) for result in results] == [
+        (FIELD, ("field-1", "field-2")), (Timing(5.0, 1.0), ("slow-1",)),
+    ]  # fmt: skip
+    in_field, slowly = results
+    np.testing.assert_allclose(in_field.costs[:, -1], [0.2, 0.4])
+    np.testing.assert_allclose(slowly.costs, [[0.8, 0.6, 0.6]])
+    np.testing.assert_allclose(slowly.area, [0.7])
+    value, low, high = slowly.over_field[-1]
+    # There is one of these, and those with the field's rates come to 0.2 to 0.4.
+    assert (value, low, high) == pytest.approx((2.0, 1.5, 3.0))
+    flown = Flown("0123456789abcdef01", 2000, "logs", None, 3)
+    write_report(flown, results, tmp_path, {"command": "lpac paper async --logs day"}, "Logs.")
+    text = (tmp_path / "README.md").read_text()
+    assert "flies over 3 missions" in text and "in pairs" not in text and "Logs." in text
+    rows = csv.DictReader((tmp_path / "async.csv").read_text().splitlines())
+    assert [row["world"] for row in rows] == ["field-1", "field-2", "slow-1"]
+    with pytest.raises(ValueError, match="no mission of 60 s was flown with perception at 5 Hz"):
+        results_of_logs({"slow-1": missions["slow-1"], "short": missions["short"]})
+
+
 def test_whole_robots_have_the_rates_and_ages_of_a_timing() -> None:
     plan = replace(
-        PLAN, robot="whole", worlds=1, bundle=TrainedBundle(str(DEFAULT_BUNDLE), SHIPPED_ID)
+        PLAN, robot="simulated", worlds=1, bundle=TrainedBundle(str(DEFAULT_BUNDLE), SHIPPED_ID)
     )
     costs = {}
     for timing in (FIELD, Timing(5.0, 0.5)):
@@ -104,7 +172,7 @@ def test_results_are_held_against_the_fields() -> None:
 
 def test_the_report_has_every_flight_and_says_what_made_it(tmp_path: Path) -> None:
     results = results_of(PLAN, flown(PLAN))
-    write_report(PLAN, results, tmp_path, {"command": "lpac paper async --quick"})
+    write_report(PLAN.flown, results, tmp_path, {"command": "lpac paper async --quick"})
     rows = list(csv.DictReader((tmp_path / "async.csv").read_text().splitlines()))
     assert len(rows) == 27
     first = {name: float(value) for name, value in rows[0].items()}
@@ -114,7 +182,7 @@ def test_the_report_has_every_flight_and_says_what_made_it(tmp_path: Path) -> No
     told = json.loads((tmp_path / "async.json").read_text())
     assert told.pop("made_by") == {"command": "lpac paper async --quick"}
     assert told.pop("flown") in (tmp_path / "README.md").read_text()
-    assert told == json.loads(json.dumps(as_json(PLAN, results)))
+    assert told == json.loads(json.dumps(as_json(PLAN.flown, results)))
     assert told["times_s"] == list(TIMES_S)
     text = (tmp_path / "README.md").read_text()
     assert text.count("\n| ") == 2 + 9 and "`lpac paper async --quick`" in text

@@ -15,11 +15,10 @@ from edge.messages.mission import FlightState
 from edge.policy.bundle import load_bundle
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord
-from lpac.analysis.logs import LoggedStatus
+from lpac.analysis.logs import LoggedStatus, LoopRates
 from lpac.analysis.report import Examined, Wanted
-from lpac.cli.options import DEFAULT_BUNDLE
-from lpac.cli.paper import e1, e2, e3
-from lpac.cli.sim import VehicleKind
+from lpac.cli.options import DEFAULT_BUNDLE, VehicleKind
+from lpac.cli.paper import asynchrony, e1, e2, e3, transfer
 from lpac.evaluate.flights import BASELINES
 from lpac.paper.report import LOGS, write_network, write_transfer
 from lpac.sim.experiment import Scenario, fly
@@ -143,7 +142,8 @@ def test_of_a_day_with_two_policies_each_mission_is_looked_at_by_itself(
     ("command", "options"),
     [
         (e1, {"worlds": 3}), (e1, {"ray": "auto"}), (e2, {"trials": 3}), (e2, {"world": 0}),
-        (e3, {"world": 0}), (e3, {"ray": "auto"}),
+        (e3, {"world": 0}), (e3, {"ray": "auto"}), (asynchrony, {"worlds": 3}),
+        (asynchrony, {"quick": True}), (transfer, {"worlds": 3}), (transfer, {"quick": True}),
     ],
 )  # fmt: skip
 def test_what_chooses_flights_is_a_mistake_with_logs(
@@ -153,6 +153,47 @@ def test_what_chooses_flights_is_a_mistake_with_logs(
     with pytest.raises(ValueError, match=f"^--{name} does nothing with --logs$"):
         command(**options, logs=tmp_path, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_missions_are_put_together_by_their_rates(
+    mission: FlightRecord,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    """Of a minute each; one whose logs do not tell how often its robots decided is left out."""
+    minute_s = mission.cost_time_s * 12.0
+    robots = tuple(replace(robot, time_s=robot.time_s * 12.0) for robot in mission.robots)
+    record = replace(mission, duration_s=60.0, to_s=60.0, cost_time_s=minute_s, robots=robots)
+    rates = {"paper-1": LoopRates(5.0, 2.5), "paper-2": LoopRates(5.0, 1.0), "paper-3": None}
+    trials = tuple(replace(record, name=name, rates=its) for name, its in rates.items())
+    monkeypatch.setattr(lpac.analysis.report, "examine", lambda *_: Examined(trials, ()))
+    asynchrony(logs=Path("day 1"), out=tmp_path)
+    assert "paper-3 is left out: its robots' rates differ" in capsys.readouterr().err
+    told = json.loads((tmp_path / "async.json").read_text())
+    assert [(of["policy_hz"], of["over"]) for of in told["timings"]] == [
+        (2.5, ["paper-1"]), (1.0, ["paper-2"]),
+    ]  # fmt: skip
+    assert told["robot"] == "logs" and told["timings"][1]["over_field"][-1] == [1.0, 1.0, 1.0]
+    assert told["made_by"]["command"] == "lpac paper async --logs 'day 1'"
+
+
+@pytest.mark.usefixtures("day")
+def test_missions_are_put_together_by_their_teams(mission: FlightRecord, tmp_path: Path) -> None:
+    transfer(logs=Path("day 1"), trial=["paper-1"], out=tmp_path)
+    told = json.loads((tmp_path / "transfer.json").read_text())
+    [condition] = told["conditions"]
+    assert condition["name"] == "2 robots, 10 features" and told["duration_s"] == 5.0
+    policy, clairvoyant = condition["results"]
+    assert policy["final"]["mean"][0] == pytest.approx(mission.normalized[-1])
+    assert clairvoyant["over_clairvoyant"]["ratio_of_means"][0] == 1.0
+    over = policy["over_clairvoyant"]["ratio_of_means"][0]
+    assert over == pytest.approx(policy["final"]["mean"][0] / clairvoyant["final"]["mean"][0])
+    assert told["made_by"]["command"] == "lpac paper transfer --logs 'day 1' --trial paper-1"
+    assert "1 missions by the teams" in (tmp_path / "README.md").read_text()
+    assert (tmp_path / "2-robots-10-features" / "curves.png").exists()
+    with pytest.raises(ValueError, match="give --bundle once"):
+        transfer(logs=tmp_path, bundles=[DEFAULT_BUNDLE, DEFAULT_BUNDLE], out=tmp_path / "out")
 
 
 def test_neighbours_are_those_in_range_of_the_policy_that_flew(
@@ -184,9 +225,12 @@ def test_neighbours_are_those_in_range_of_the_policy_that_flew(
 def test_a_mistake_is_one_line_and_leaves_no_folder(
     options: dict[str, Any], problem: str, tmp_path: Path
 ) -> None:
-    for command in (e1, e2, e3):
+    for command in (e1, e2, e3, asynchrony, transfer):
+        its = dict(options)
+        if command is transfer and "bundle" in its:
+            its["bundles"] = [its.pop("bundle")]
         with pytest.raises((ValueError, OSError), match=problem):
-            command(**options, out=tmp_path / "out")
+            command(**its, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
