@@ -350,10 +350,11 @@ class _LogReader:
         for robot_statuses in logs.statuses.values():
             robot_statuses.sort(key=lambda said: said.time_s)
         self._sort_received(starts_s, ahead_s)
-        logs.orders = sorted(
+        orders = (
             order._replace(time_s=order.time_s - ahead_s.get(program, 0.0))
             for program, order in self._orders
         )
+        logs.orders = sorted(orders, key=lambda order: order.time_s)
         logs.events = sorted(self._events, key=lambda event: event.unix_time_s)
         logs.setups.sort(key=lambda told: told[0])
         for _, setup in logs.setups:

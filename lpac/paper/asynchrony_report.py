@@ -143,7 +143,8 @@ def _text(flown: Flown, results: Sequence[TimingResult], how: str) -> str:
         else ""
     )
     if flown.world_set is None:
-        over = f"{flown.worlds} missions, each over the world that its robots were given"
+        missions = "one mission" if flown.worlds == 1 else f"{flown.worlds} missions"
+        over = f"{missions}, over whatever worlds and from wherever they began"
         intervals = "the missions of each rate drawn by themselves"
     else:
         over = (

@@ -54,8 +54,8 @@ TAKEN_WHOLE = (
 )
 LOGS = "From the logs of flights."
 LOGS_BY_RATES = (
-    f"{LOGS} The missions of each rate are held against those with the field's, over whatever "
-    "worlds and from wherever they began; costs are of where the robots took themselves to be."
+    f"{LOGS} The missions of each rate are held against those with the field's; costs are of where "
+    "the robots took themselves to be."
 )
 LOGS_BESIDE_POINTS = (
     f"{LOGS} What they are held against are points from where the robots were as the mission began."
@@ -252,7 +252,7 @@ def write_transfer(
     picture = "\n![mean cost over clairvoyant Lloyd's](conditions.png)\n" if several else ""
     worlds = f"in the first {told['worlds']} worlds of the {told['world_set']} set"
     if told["world_set"] is None:
-        worlds = f"{told['worlds']} missions by the teams that flew them"
+        worlds = "of each team's missions"
     text = f"""# Transfer to other teams and worlds
 
 The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells with 10 robots in

@@ -105,6 +105,8 @@ class Writer:
         self.age_s = AGE_S
         # Other values of the ground's setup, and what becomes of each status in the files.
         self.setup: dict[str, Any] = {}
+        self.rates = [{"perception_hz": 5.0, "policy_hz": 2.5, "control_hz": 10.0}] * 3
+        self.refused = {2: "not ready: battery"}
         self.written: Callable[[dict[str, Any]], dict[str, Any]] = lambda status: status
         self.change: Callable[[RobotStatus, float], RobotStatus] = lambda status, _: status
 
@@ -130,10 +132,14 @@ class Writer:
 
     def robots(self, folder: Path) -> None:
         """As `lpac sim` leaves them: FOLDER/robots/<i>/logs."""
-        configuration = json.dumps(
-            {"policy": {"env_scale": SCALE, "world": "gone"}, "fence": dataclasses.asdict(FENCE)}
-        )
         for robot in range(3):
+            configuration = json.dumps(
+                {
+                    "policy": {"env_scale": SCALE, "world": "gone"},
+                    "fence": dataclasses.asdict(FENCE),
+                    "rates": self.rates[robot],
+                }
+            )
             metadata = FlightMetadata(
                 robot, self.nonce + robot, self.bundle_id, str(SHIPPED), configuration, "0"
             )
@@ -145,7 +151,7 @@ class Writer:
                     self._receive(log, robot, status.sequence, at_s)
                     log.flush()
                 order = Order("a", robot, self.nonce, "takeoff", 1.0, "ann", "")
-                answer = OrderResult("a", refusal("" if robot != 2 else "not ready: battery"))
+                answer = OrderResult("a", refusal(self.refused.get(robot, "")))
                 log.record(
                     "order", BEGAN_S + self.flights[0].begin_s - 4.0 + self.ahead_s[robot],
                     {**dataclasses.asdict(order), "answer": dataclasses.asdict(answer)},
@@ -210,6 +216,25 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def found(flown: Path) -> Examined:
     return examined(flown, times_s=(0.0, 5.0, 11.0))
+
+
+def test_a_mission_has_the_rates_that_all_of_its_robots_have(
+    found: Examined, tmp_path: Path
+) -> None:
+    assert [trial.rates for trial in found.trials] == [(5.0, 2.5), (5.0, 2.5)]
+    writer = Writer((FIRST,))
+    writer.rates[1] = {**writer.rates[1], "policy_hz": 1.0}
+    writer.robots(tmp_path)
+    [differing] = examined(tmp_path).trials
+    assert differing.rates is None
+
+
+def test_two_answers_at_the_same_moment_are_in_any_order(flown: Path, tmp_path: Path) -> None:
+    """As of two simulated flights, whose clocks are the same."""
+    other = Writer((FIRST,), ahead_s=(0.0, 3.0, -5000.0))
+    other.refused = {}
+    other.robots(tmp_path)
+    assert examined(flown, tmp_path).trials
 
 
 class Page(HTMLParser):

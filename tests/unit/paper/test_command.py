@@ -190,7 +190,7 @@ def test_missions_are_put_together_by_their_teams(mission: FlightRecord, tmp_pat
     over = policy["over_clairvoyant"]["ratio_of_means"][0]
     assert over == pytest.approx(policy["final"]["mean"][0] / clairvoyant["final"]["mean"][0])
     assert told["made_by"]["command"] == "lpac paper transfer --logs 'day 1' --trial paper-1"
-    assert "1 missions by the teams" in (tmp_path / "README.md").read_text()
+    assert "of each team's missions" in (tmp_path / "README.md").read_text()
     assert (tmp_path / "2-robots-10-features" / "curves.png").exists()
     with pytest.raises(ValueError, match="give --bundle once"):
         transfer(logs=tmp_path, bundles=[DEFAULT_BUNDLE, DEFAULT_BUNDLE], out=tmp_path / "out")
