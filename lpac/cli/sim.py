@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from lpac.sim.fleet.layout import FleetScenario
     from lpac.sim.fleet.listener import Statuses
     from lpac.sim.fleet.processes import Fleet
+    from lpac.sim.fleet.robots import Settings
     from lpac.sim.ticks import Clocks
 
 app = new_app()
@@ -129,11 +130,11 @@ def sim(
             "--range", help="point: how far robots are heard, in model units; else the bundle's."
         ),
     ] = None,
-    perception_hz: Annotated[float, typer.Option(help="point: how often a robot perceives.")] = 5.0,
+    perception_hz: Annotated[float, typer.Option(help="How often a robot perceives.")] = 5.0,
     policy_hz: Annotated[
-        float, typer.Option(help="point: how often its policy decides, and it speaks.")
+        float, typer.Option(help="How often its policy decides, and it speaks.")
     ] = 2.5,
-    control_hz: Annotated[float, typer.Option(help="point: how often it steers.")] = 10.0,
+    control_hz: Annotated[float, typer.Option(help="How often it steers.")] = 10.0,
     synchronous: Annotated[
         bool,
         typer.Option(
@@ -165,8 +166,16 @@ def sim(
     payload: Annotated[
         PayloadName, typer.Option(help="point: what messages carry.")
     ] = PayloadName.FLOAT16,
-    loss: Annotated[float, typer.Option(help="Probability that a message is lost.")] = 0.0,
-    delay: Annotated[float, typer.Option(help="Mean delay of a message, s.")] = 0.0,
+    loss: Annotated[
+        float,
+        typer.Option(
+            help="point, simulated: probability that a message is lost; of whole robots from the "
+            "mission's start on, as with --delay."
+        ),
+    ] = 0.0,
+    delay: Annotated[
+        float, typer.Option(help="point, simulated: mean delay of a message, s.")
+    ] = 0.0,
     max_message_age: Annotated[
         float, typer.Option(help="Older messages are not used, s; 0: each is used once.")
     ] = 0.8,
@@ -223,6 +232,8 @@ def sim(
         raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
     world_features = parse_world(_text(world), str(world)) if world else None
     _require_something_to_cover(world, world_features, features)
+    clocks = _clocks(perception_hz, policy_hz, control_hz, synchronous=synchronous)
+    max_input_age_s = max(_INPUT_AGE_S, 2.0 * clocks.perception_s, 2.0 * clocks.policy_s)
     if vehicle is not VehicleKind.POINT:
         from lpac.sim.fleet.layout import FleetScenario
 
@@ -240,8 +251,18 @@ def sim(
             transport="mesh" if transport is None else transport.value,
         )
 
+        settings: Settings = {
+            "rates": {
+                "perception_hz": perception_hz, "policy_hz": policy_hz, "control_hz": control_hz,
+            },
+            "policy": {
+                "max_message_age_s": max_message_age, "max_input_age_s": max_input_age_s,
+            },
+        }  # fmt: skip
         if vehicle is VehicleKind.SIMULATED:
-            _fly_on_clock(fleet_scenario, bundle, as_json, out, recorded)
+            _fly_on_clock(
+                fleet_scenario, bundle, as_json, out, recorded, settings, loss=loss, delay_s=delay
+            )
             return
 
         def prepared() -> int | None:
@@ -249,9 +270,9 @@ def sim(
             return None if count is None else _say_if_carried(count, bundle, flown)
 
         if not script:
-            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared)
+            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared, settings)
             return
-        _launch(fleet_scenario, bundle, px4, as_json, out, prepared)
+        _launch(fleet_scenario, bundle, px4, as_json, out, prepared, settings)
         return
     from edge.core.frames import ModelScale
     from lpac.radio.modelled import ModelledRadio
@@ -263,7 +284,6 @@ def sim(
     if transport and (loss or delay):
         both = f"--{'loss' if loss else 'delay'} and --transport"
         raise ValueError(f"{both}: the model itself says what is lost, and how late messages are")
-    clocks = _clocks(perception_hz, policy_hz, control_hz, synchronous=synchronous)
     model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
     scenario = Scenario(
         controller=controller.value,
@@ -278,7 +298,7 @@ def sim(
         delay_s=delay,
         radio=ModelledRadio(transport.value, found.wifi) if transport else None,
         max_message_age_s=max_message_age,
-        max_input_age_s=max(_INPUT_AGE_S, 2.0 * clocks.perception_s, 2.0 * clocks.policy_s),
+        max_input_age_s=max_input_age_s,
         payload=payload.value,
         world_size=world_size,
         communication_range=communication_range,
@@ -314,18 +334,14 @@ _ONLY_FOR = {
     "starts": (VehicleKind.POINT,),
     "world_size": (VehicleKind.POINT,),
     "communication_range": (VehicleKind.POINT,),
-    "perception_hz": (VehicleKind.POINT,),
-    "policy_hz": (VehicleKind.POINT,),
-    "control_hz": (VehicleKind.POINT,),
     "synchronous": (VehicleKind.POINT,),
     "lag": (VehicleKind.POINT,),
     "position_error": (VehicleKind.POINT,),
     "lost": (VehicleKind.POINT,),
     "away": (VehicleKind.POINT,),
     "payload": (VehicleKind.POINT,),
-    "loss": (VehicleKind.POINT,),
-    "delay": (VehicleKind.POINT,),
-    "max_message_age": (VehicleKind.POINT,),
+    "loss": (VehicleKind.POINT, VehicleKind.SIMULATED),
+    "delay": (VehicleKind.POINT, VehicleKind.SIMULATED),
     "errors": (VehicleKind.SIMULATED, VehicleKind.MAVLINK),
     "sensor": (VehicleKind.SIMULATED, VehicleKind.MAVLINK, VehicleKind.PX4),
     "recorded": (VehicleKind.SIMULATED,),
@@ -391,6 +407,7 @@ def _launch(
     as_json: bool,
     out: Path | None,
     prepared: Callable[[], int | None],
+    settings: "Settings",
 ) -> None:
     """Run a fleet of processes; exit code 1 if its flight did not end as it should.
 
@@ -402,7 +419,8 @@ def _launch(
     # Whoever stops this program means the fleet too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
-        fleet = Fleet(scenario, out or Path(nowhere), bundle, px4_build=px4, say=say)
+        folder = out or Path(nowhere)
+        fleet = Fleet(scenario, folder, bundle, px4_build=px4, say=say, settings=settings)
         fleet.carried = prepared()
         flight = fly(fleet, say, lambda step: show(step, fleet.heard.statuses()))
     _show_fleet_flight(flight, as_json, out)
@@ -414,14 +432,21 @@ def _fly_on_clock(
     as_json: bool,
     out: Path | None,
     recorded: Path | None,
+    settings: "Settings",
+    *,
+    loss: float,
+    delay_s: float,
 ) -> None:
     """Fly whole robots on one simulated clock; exit code 1 unless it ended as it should."""
     from lpac.sim.fleet.clocked import fly_simulated
+    from lpac.sim.radio import Air
 
+    air = Air(loss=loss, delay_s=max(delay_s, Air().delay_s)) if loss or delay_s else None
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (_, say):
         flight = fly_simulated(
-            scenario, out or Path(nowhere), bundle, say, logs=out is not None, recorded=recorded
-        )
+            scenario, out or Path(nowhere), bundle, say, logs=out is not None, recorded=recorded,
+            settings=settings, air=air,
+        )  # fmt: skip
     _show_fleet_flight(flight, as_json, out)
 
 
@@ -451,6 +476,7 @@ def _serve(
     px4: Path | None,
     out: Path,
     prepared: Callable[[], int | None],
+    settings: "Settings",
 ) -> None:
     """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
     from lpac.sim.fleet.processes import Fleet
@@ -458,7 +484,7 @@ def _serve(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _live() as (show, say):
-            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say)
+            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say, settings=settings)
             fleet.carried = prepared()
             with fleet:
                 while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):

@@ -227,6 +227,19 @@ def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
     assert text in error_line(lpac(*arguments))
 
 
+def test_whole_robots_have_rates_and_a_radio_too() -> None:
+    options: dict[str, list[Any]] = {
+        "as it is": [],
+        "rates": ["--policy-hz", 1],
+        "ages": ["--max-message-age", 0.01],
+        "loss": ["--loss", 1],
+    }
+    whole = ("sim", "--vehicle", "simulated", "-n", 3, "--duration", 12, "--json")
+    flights = {name: json.loads(lpac(*whole, *its).stdout) for name, its in options.items()}
+    costs = {name: json.dumps(flight["cost_curve"]) for name, flight in flights.items()}
+    assert len(set(costs.values())) == len(options), costs
+
+
 def test_sim_has_the_knobs_of_an_experiment(tmp_path: Path) -> None:
     """Each of them changes the flight, and starts are where the file says."""
     starts = tmp_path / "starts.txt"
