@@ -10,7 +10,7 @@ import math
 import select
 import socket
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from threading import Event, Lock, Thread
@@ -43,8 +43,6 @@ _CLOSE_TIMEOUT_S = 1.0
 # A thread that wakes for each datagram finds its caches cold: where more than so many come in a
 # second, as of thirty robots, it takes those of such a time together.
 _MANY_HZ, _COUNTS_FOR_S, _TOGETHER_S = 100.0, 1.0, 0.1
-# Own messages that may still come back.
-_OWN = 16
 
 
 class MulticastLink:
@@ -76,7 +74,7 @@ class MulticastLink:
         self._keys = tuple(map(GroupKey.of, group.keys))
         self._start = int(time.time() * 1e3)
         self._counts = itertools.count()
-        self._own: deque[MessageNumber] = deque(maxlen=_OWN)
+        self._own_start = -1  # Of this program, once it has spoken.
         self._assembly = Assembly(math.inf if group.is_secret else _FORGETS_AFTER_S)
         self._admission = Admission()
         self._lock = Lock()
@@ -99,8 +97,7 @@ class MulticastLink:
             self._zenoh.publish(topic, data)
             return
         number = number_in(data) or MessageNumber(self._start, next(self._counts))
-        with self._lock:
-            self._own.append(number)
+        self._own_start = number.start
         try:
             self._sender.setsockopt(
                 socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(self._group.interface)
@@ -159,7 +156,7 @@ class MulticastLink:
                     self._strangers += 1
                     continue
                 came += 1
-                if fragment.sender != self._robot_id or not self._is_own(fragment.number):
+                if not self._is_own(fragment):
                     heard_at_s = time.monotonic()
                     self._take(fragment, heard_at_s)
             counted_s = time.monotonic() - counts_since_s
@@ -185,9 +182,12 @@ class MulticastLink:
         if is_theirs is not False and is_number:
             self._assembly.heard(fragment, now_s)
 
-    def _is_own(self, number: MessageNumber) -> bool:
-        with self._lock:
-            return number in self._own
+    def _is_own(self, fragment: Fragment) -> bool:
+        """Whether it comes back, or a stranger says it again, even from before this program began.
+
+        Of two programs with one id the other hears this one, which began later.
+        """
+        return fragment.sender == self._robot_id and fragment.number.start <= self._own_start
 
     def _failed(self, what: str, error: Exception) -> None:
         with self._lock:

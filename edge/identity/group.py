@@ -30,6 +30,7 @@ A fragment:
 import hashlib
 import math
 import struct
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -101,8 +102,9 @@ def number_in(message: bytes) -> MessageNumber | None:
 
 
 class Fragment(NamedTuple):
-    """A part of a message, as a member sent it."""
+    """A part of a message, as a member sent it; `key` is the place of its key among those known."""
 
+    key: int
     topic: Topic
     sender: int
     number: MessageNumber
@@ -140,11 +142,11 @@ def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
     if not _HEAD.size + _TAG_BYTES + _FRAGMENT.size <= len(data) <= DATAGRAM_BYTES:
         return None
     magic, version, fingerprint, nonce = _HEAD.unpack_from(data)
-    secret = next((key.secret for key in keys if key.fingerprint == fingerprint), None)
-    if magic != _MAGIC or version != _VERSION or secret is None:
+    which = next((i for i, key in enumerate(keys) if key.fingerprint == fingerprint), None)
+    if magic != _MAGIC or version != _VERSION or which is None:
         return None
     try:
-        opened: bytes = crypto_secretbox_open(data[_HEAD.size :], nonce, secret)
+        opened: bytes = crypto_secretbox_open(data[_HEAD.size :], nonce, keys[which].secret)
     except CryptoError:
         return None
     topic, sender, start, sequence, place, of = _FRAGMENT.unpack_from(opened)
@@ -152,23 +154,30 @@ def open_datagram(data: bytes, keys: Sequence[GroupKey]) -> Fragment | None:
         return None
     number = MessageNumber(int.from_bytes(start, "little"), sequence)
     part = opened[_FRAGMENT.size :]
-    return Fragment(TOPICS_OF_GROUP[topic], sender, number, place, of, part)
+    return Fragment(which, TOPICS_OF_GROUP[topic], sender, number, place, of, part)
+
+
+# Pieces that say otherwise of their message are of another one: its number, of how many pieces it
+# is, and the key.
+_Pieces = tuple[MessageNumber, int, int]
 
 
 @dataclass(slots=True)
 class _Sender:
-    """What came of one sender's messages on one topic."""
+    """What came of one sender's messages on one topic; `key` is the newest that it spoke with."""
 
     newest: MessageNumber = _NOTHING
     newest_at_s: float = -math.inf
-    partial: dict[MessageNumber, dict[int, bytes]] = field(default_factory=dict)
+    key: int = sys.maxsize
+    partial: dict[_Pieces, dict[int, bytes]] = field(default_factory=dict)
 
 
 class Assembly:
     """Makes messages of fragments: all of them, or nothing. One thread at a time.
 
     What is not newer than what `heard` was told of is old, and dropped unseen: whatever a stranger
-    recorded and says again, and what came twice. Another member may claim any number: it counts
+    recorded and says again, and what came twice. So is what comes with a former key from a sender
+    who has the new one: it is who stole the former. Another member may claim any number: it counts
     once the message is known to be its sender's.
 
     `forget_after_s`: who was silent for longer may have started again with a clock that is behind.
@@ -184,13 +193,16 @@ class Assembly:
         """The message that the fragment completes, if it does. `now_s` is a monotonic clock's."""
         sender = self._sender(fragment)
         silent = now_s - sender.newest_at_s > self._forget_after_s
-        if fragment.number <= sender.newest and not silent:
+        if (fragment.number <= sender.newest and not silent) or fragment.key > sender.key:
             self.old += 1
             return None
-        parts = sender.partial.setdefault(fragment.number, {})
+        if fragment.of == 1:
+            return fragment.part
+        which = fragment.number, fragment.of, fragment.key
+        parts = sender.partial.setdefault(which, {})
         parts[fragment.place] = fragment.part
         if len(parts) == fragment.of:
-            del sender.partial[fragment.number]
+            del sender.partial[which]
             return b"".join(part for _, part in sorted(parts.items()))
         if len(sender.partial) > _MOST_PARTIAL:
             # The one that began first: its rest is lost.
@@ -201,7 +213,10 @@ class Assembly:
         """The message that this fragment completed was its sender's, and so is its number."""
         sender = self._sender(fragment)
         sender.newest, sender.newest_at_s = fragment.number, now_s
-        sender.partial = {n: p for n, p in sender.partial.items() if n > fragment.number}
+        sender.key = min(sender.key, fragment.key)
+        sender.partial = {
+            which: parts for which, parts in sender.partial.items() if which[0] > fragment.number
+        }
 
     def _sender(self, fragment: Fragment) -> _Sender:
         who, senders = (fragment.topic, fragment.sender), self._senders

@@ -213,6 +213,10 @@ class SignedGuard:
     def _authority(self) -> bytes:
         return self._membership.authority
 
+    @property
+    def _start(self) -> int:
+        return self._membership.start
+
     def subscriptions(self, hear: Mapping[Topic, Hear]) -> dict[Topic, ReceiveCallback]:
         """See `Guard`."""
         return {
@@ -275,7 +279,7 @@ class SignedGuard:
             payload,
             signer=self._membership.signer,
             address=Address(self._authority, self._own_key(topic)),
-            start=self._membership.start,
+            start=self._start,
             sequence=sequence,
         )
 
@@ -341,6 +345,10 @@ class SignedGuard:
         return envelope.payload, Speaker(card.role, card.name)
 
     def _is_news(self, key: str, envelope: Envelope) -> bool:
+        if envelope.fingerprint == self.card.fingerprint and envelope.start <= self._start:
+            # Its own word, said again. Another program with this key, if there is one and it began
+            # earlier, hears this one.
+            return False
         said, whose = (envelope.start, envelope.sequence), (envelope.fingerprint, key)
         with self._lock:
             before = self._heard.get(whose, (-1, -1))

@@ -41,6 +41,7 @@ class Robot:
         robot_id: int,
         at: str | None = None,
         *,
+        start: int = 1,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.heard: dict[str, bytes] = {}
@@ -49,7 +50,7 @@ class Robot:
         signer = Signer(robot_id.to_bytes(32, "little"))
         name = f"r{robot_id}"
         card = Card("test", Role.ROBOT, name, signer.public_key, 1, 2e9, robot_id)
-        membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start=1)
+        membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start)
         self.guard = SignedGuard(membership, clock_s)
         self.radio = zenoh_radio(
             LinkSetting(
@@ -198,6 +199,21 @@ def test_strangers_are_not_heard_whatever_they_say(group: Group) -> None:
         assert second.heard == heard
         eventually_hear(first, b"after", second)
         assert b"after" not in b"".join(recorded)
+
+
+def test_no_robot_hears_its_own_words_when_a_stranger_says_them_again(group: Group) -> None:
+    """It would take itself for another one with its id, and not take off."""
+    with recording(group) as recorded:
+        with Robot(group, 1) as former, Robot(group, 2) as second:
+            for number in range(20):
+                eventually_hear(former, b"before %d" % number, second)
+        with Robot(group, 1, start=2) as first, Robot(group, 2) as second, stranger() as someone:
+            for number in range(40):
+                eventually_hear(first, b"now %d" % number, second)
+            for data in list(recorded):
+                someone.sendto(data, (group.address, group.port))
+            eventually_hear(second, b"after all that", first)
+            assert "r1" not in first.heard and not first.guard.robots_said_twice()
 
 
 def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None:

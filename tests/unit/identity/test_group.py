@@ -113,6 +113,30 @@ def test_what_was_not_its_senders_makes_nothing_old() -> None:
     assert put_together(assembly, sent(b"m" * 2000, 1)) == [b"m" * 2000]
 
 
+def test_pieces_that_do_not_belong_to_a_message_do_not_spoil_it() -> None:
+    """Whoever has a key, the former one too, may put a piece before each message."""
+    assembly = Assembly()
+    number = MessageNumber(1, 2)
+    short, long, wrong = b"short", b"l" * 2000, b"w" * 3000
+    for genuine in (short, long):
+        for key in (KEY, FORMER):
+            pieces = datagrams(wrong, topic=MESSAGE, sender=7, number=number, key=key)
+            put_together(assembly, pieces[1:2])
+        [message] = put_together(assembly, sent(genuine, number.sequence))
+        assert message == genuine
+        number = number._replace(sequence=number.sequence + 1)
+
+
+def test_the_former_key_is_over_for_who_has_the_new_one() -> None:
+    assembly = Assembly()
+    assert put_together(assembly, sent(b"not yet", 1, key=FORMER)) == [b"not yet"]
+    assert put_together(assembly, sent(b"stolen", 2, key=FORMER), heard=False) == [b"stolen"]
+    assert put_together(assembly, sent(b"by now", 2)) == [b"by now"]
+    assert put_together(assembly, sent(b"stolen", 3, key=FORMER)) == []
+    # Of others nothing follows.
+    assert put_together(assembly, sent(b"not yet", 1, sender=8, key=FORMER)) == [b"not yet"]
+
+
 def test_a_member_with_a_thousand_names_deafens_nobody() -> None:
     assembly = Assembly()
     before = sent(b"before", 1)

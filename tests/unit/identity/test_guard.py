@@ -167,6 +167,20 @@ def test_where_cards_get_lost_whoever_is_new_is_shown_them_again_at_once() -> No
     assert shown_s == [0.0, 0.5, 1.0, 3.0, 5.0, 7.0, 9.0, 11.0]
 
 
+@pytest.mark.parametrize("start", [4, 5])
+def test_its_own_words_are_no_news_whoever_says_them_again(start: int) -> None:
+    """Also those from before its program began again, for as long as somebody goes on."""
+    one, former = robot(1, start=5), robot(1, start=start)
+    for second in range(20):
+        one.now_s = float(second)
+        ((_, said),) = former.say(MESSAGE, b"")[-1:]
+        assert not one.takes(MESSAGE, "robot/1/message", said)
+    assert not one.heard and not one.guard.robots_said_twice()
+    # Another program with its key that began later is heard.
+    ((_, said),) = robot(1, start=6).say(MESSAGE, b"another")[-1:]
+    assert one.takes(MESSAGE, "robot/1/message", said)
+
+
 @given(at=st.integers(0, 10_000), bit=st.integers(0, 7), payload=st.binary(max_size=300))
 def test_no_changed_message_is_heard(at: int, bit: int, payload: bytes) -> None:
     one, two = robot(1), robot(2)
