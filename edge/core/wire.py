@@ -105,11 +105,18 @@ class Rejection(StrEnum):
     STALE = "stale"
 
 
-def encode(message: AggregatedMessage, bundle_id: bytes, payload_type: PayloadType) -> bytes:
+def encode(
+    message: AggregatedMessage,
+    bundle_id: bytes,
+    payload_type: PayloadType,
+    *,
+    as_in_flight: bool = False,
+) -> bytes:
     """The bytes of `message`; `bundle_id` is the 32 bytes of the manifest's SHA-256.
 
     Numbers come out at the receivers as `rounded` says. If one is not finite, they refuse the
-    message.
+    message. `as_in_flight`: the payload is not compressed, so that a robot which has seen nothing
+    yet, and whose numbers are mostly 0, says about as much as it will in flight.
 
     Raises ValueError for another payload type, and struct.error if a number does not fit its field.
     """
@@ -121,13 +128,14 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_type: PayloadTy
         data = steps.tobytes() + counts.tobytes()
     else:
         data = _saturated(message.payload, _FLOATS[payload_type]).tobytes()
+    payload_size = len(data)
     if message.shared is not None:
         kind |= _WITH_MAP
         (x, y), codes = message.shared
         data += _MAP.pack(message.trial, x, y, len(codes)) + codes.tobytes()
     if len(data) >= _WORTH_IT:
-        deflate = zlib.compressobj(_EFFORT, wbits=-zlib.MAX_WBITS)
-        smaller = deflate.compress(data) + deflate.flush()
+        stored = payload_size if as_in_flight else 0
+        smaller = _deflated(data[:stored], data[stored:])
         if len(smaller) < len(data):
             kind, data = kind | _COMPRESSED, smaller
     base, time_s, uncertainty_s = message.sent or _NO_TIME
@@ -148,6 +156,13 @@ def encode(message: AggregatedMessage, bundle_id: bytes, payload_type: PayloadTy
         uncertainty_s,
     )
     return b"".join((fields, _CHECKSUM.pack(zlib.crc32(data, zlib.crc32(fields))), data))
+
+
+def _deflated(stored: bytes, compressed: bytes) -> bytes:
+    """One raw deflate stream of both, the first as it is."""
+    store, deflate = (zlib.compressobj(effort, wbits=-zlib.MAX_WBITS) for effort in (0, _EFFORT))
+    head = store.compress(stored) + store.flush(zlib.Z_SYNC_FLUSH) if stored else b""
+    return head + deflate.compress(compressed) + deflate.flush()
 
 
 def rounded(payload: F32, payload_type: PayloadType) -> F32:

@@ -19,6 +19,7 @@ from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
+    ON_GROUND,
     FlightState,
     LoopStatus,
     RadioCounts,
@@ -226,7 +227,8 @@ class RobotNode:
 
     def policy_step(self) -> None:
         """Hear the neighbours, decide where to fly, tell the neighbours; the policy's rate."""
-        tick = self._pac.infer(self._ports.clock.monotonic_s())
+        on_ground = self._control.flight.state in ON_GROUND
+        tick = self._pac.infer(self._ports.clock.monotonic_s(), on_ground=on_ground)
         self._tell_once(self._pac.problem)
         if tick is None:
             return

@@ -233,11 +233,13 @@ class Pac:
         """What it has seen, as `mission.explored_to_bytes` takes it; valid until it goes on."""
         return self._memory.explored
 
-    def infer(self, now_s: float) -> PolicyTick | None:
+    def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
 
         None when there is nothing to send: no fresh features, no position, or a result that is
         not finite. Then the action is left to grow old, and `control` stops the robot.
+
+        `on_ground`: what is sent is as large as in flight, so that a radio can be tried there.
         """
         features, odometry = self._features, self._finite_odometry()
         if features is None or odometry is None or self._is_old(features, now_s):
@@ -281,7 +283,9 @@ class Pac:
             payloads=payloads,
             degree=degree,
             velocity=velocity,
-            message=encode(message, self._policy.bundle_id, self._parameters.payload),
+            message=encode(
+                message, self._policy.bundle_id, self._parameters.payload, as_in_flight=on_ground
+            ),
         )
 
     def control(self, now_s: float) -> F64 | None:

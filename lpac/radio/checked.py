@@ -27,9 +27,9 @@ class Checked(NamedTuple):
 
     Of the fleet: what others of it say is on the air, too. `wifi` is of those whose radios were
     asked. Each message travels in an envelope of `overhead_bytes`. In flight it has `flight_bytes`,
-    sealed, if that is more: robots on the ground have seen little yet, and what they say of it is
-    compressed. `loaded`: something else was sent meanwhile, on purpose. `ground_wired`: the
-    ground's computer is not in the Wi-Fi itself.
+    sealed, if that is more: robots on the ground have no map to tell of. `loaded`: something else
+    was sent meanwhile, on purpose. `ground_wired`: the ground's computer is not in the Wi-Fi
+    itself.
     """
 
     robots: tuple[str, ...]

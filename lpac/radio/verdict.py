@@ -33,7 +33,8 @@ class Room(NamedTuple):
     """For how many robots in flight the model sees room on the channel, and what it was told.
 
     `ground_share` is what the `robots` that spoke ask for with messages of `ground_bytes`, as they
-    were, and `flight_share` with `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not.
+    were, and `flight_share` with `flight_bytes`. `rate_mbit_s` is assumed if `rate_told` is not,
+    and `multicast_rate_mbit_s`, at which an access point sends to all, always.
     `busy_share` is what radios counted, without gaps, where the model has `model_busy_share`; None:
     nobody told. The two shares and the room are scaled by that, as far as the model may err; what
     is more others take, `others_share` with gaps, and the room is what these leave.
@@ -45,6 +46,7 @@ class Room(NamedTuple):
     flight_share: float
     rate_mbit_s: float
     rate_told: bool
+    multicast_rate_mbit_s: float
     ground_bytes: float
     flight_bytes: float
     message_hz: float
@@ -227,6 +229,7 @@ def _room(checked: Checked) -> Room | None:
         flight_share=scale * airtime(checked.transport, wifi, flight).total,
         rate_mbit_s=rate_mbit_s,
         rate_told=bool(rates),
+        multicast_rate_mbit_s=wifi.multicast_rate_mbit_s,
         ground_bytes=traffic.message_bytes,
         flight_bytes=flight_bytes,
         message_hz=traffic.message_hz,

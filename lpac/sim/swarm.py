@@ -202,10 +202,10 @@ class ClockedPac(Pac):
     waits = False
     largest_payload = 0.0
 
-    def infer(self, now_s: float) -> PolicyTick | None:
+    def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
         """See `Pac.infer`."""
         self._tell_time(now_s)
-        tick = super().infer(now_s)
+        tick = super().infer(now_s, on_ground=on_ground)
         if self.problem:
             raise ValueError(f"robot {self._robot_id}: {self.problem}")
         for payload in tick.payloads if tick else ():

@@ -82,6 +82,9 @@ def radio(
     told = verdict(checked, found)
     if record is not None:
         write_records(record, checked.records(found))
+        if not computers:
+            note = "these robots are simulated on this computer: what is recorded is of no radio"
+            typer.echo(f"note: {note}", err=True)
     if out is not None:
         from lpac.radio.heat_map import draw
 
@@ -259,10 +262,13 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
     room = told.room
     assert room is not None
     assumed = "" if room.rate_told else ", which is assumed"
+    to_all = ""
+    if checked.transport == "multicast":
+        to_all = f" and {room.multicast_rate_mbit_s:g} Mbit/s to all, which is assumed"
     text = (
         f"room by the model of docs/scaling.md: {checked.transport} at {room.rate_mbit_s:.0f} "
-        f"Mbit/s{assumed}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
-        f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
+        f"Mbit/s{assumed}{to_all}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a "
+        f"second take {100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
         f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
     )
     if room.busy_share is not None:

@@ -190,6 +190,34 @@ def compressed(body: bytes, kind: int) -> bytes:
     return seal(good[:9] + bytes([kind | COMPRESSED]) + good[10:HEADER_SIZE] + packed)
 
 
+@TYPES
+def test_on_the_ground_a_message_is_as_large_as_in_flight(payload_type: PayloadType) -> None:
+    """Whatever its numbers are, which have few different bytes there; its map is compressed."""
+    codes: Codes = np.zeros((32, 32), np.uint8)
+    nothing = dataclasses.replace(
+        MESSAGE, payload=np.zeros(870, np.float32), shared=SharedMap((3, 4), codes)
+    )
+    something = np.random.default_rng(1).normal(size=870).astype(np.float32)
+    said = encode(nothing, BUNDLE_ID, payload_type, as_in_flight=True)
+    payload_size = {"float32": 3480, "float16": 1740, "int8": 870 + 2 * 14}[payload_type]
+    assert HEADER_SIZE + payload_size < len(said) < HEADER_SIZE + payload_size + 60
+    assert len(encode(nothing, BUNDLE_ID, payload_type)) < 200
+    for payload in (nothing.payload, something):
+        message = dataclasses.replace(nothing, payload=payload)
+        arrived, in_flight = (
+            decode(
+                encode(message, BUNDLE_ID, payload_type, as_in_flight=as_in_flight),
+                bundle_id=BUNDLE_ID, frame_id=FRAME_ID, own_robot_id=OWN_ID, message_size=870,
+                shared_side=32,
+            )
+            for as_in_flight in (True, False)
+        )  # fmt: skip
+        assert isinstance(arrived, AggregatedMessage) and isinstance(in_flight, AggregatedMessage)
+        np.testing.assert_array_equal(arrived.payload, in_flight.payload)
+        assert arrived.shared is not None
+        np.testing.assert_array_equal(arrived.shared.codes, codes)
+
+
 def test_what_is_compressed_is_as_large_as_it_may_be() -> None:
     five = MESSAGE.payload.tobytes()
     assert isinstance(receive(compressed(five, 1)), AggregatedMessage)
