@@ -95,7 +95,7 @@ clean: ## remove .venv and everything made
 # Stamps: .venv/EXTRA is newer than pyproject.toml when that extra is installed.
 .venv/%: pyproject.toml | .venv/bin/pip
 	@echo "installing what '$*' needs into .venv: this can take some minutes"
-	.venv/bin/pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	.venv/bin/pip install --disable-pip-version-check --editable '.[$*]'
 	@touch $@
 
 .venv/bin/pip:

@@ -40,8 +40,7 @@ field, general, *_ = results[conditions[0]]
 verdict = verdict_of(field, general)
 value, low, high = verdict.ratio
 print(f"\nfield over general: {value:.3f} (95 %: {low:.3f} to {high:.3f})")
-print(
-    {"a": "field is better", "b": "general is better", None: "the data do not tell"}[verdict.better]
-)
+better = {"a": "field is better", "b": "general is better", None: "two worlds do not tell"}
+print(better[verdict.better])
 cost_curves(conditions[0], results[conditions[0]]).savefig("compare_policies.png")
 print("see compare_policies.png")

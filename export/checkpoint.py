@@ -20,6 +20,7 @@ import torch
 
 from edge.core import F32
 from edge.core.aggregation import Geometry
+from edge.core.file_errors import in_words
 from edge.policy.lpac.images import MAP_CHANNELS
 
 # What a state dict does not hold: torch's default for batch norms, and CoverageControl's slope.
@@ -247,6 +248,12 @@ def _state_dict(path: Path, content: bytes) -> _Source:
         raise CheckpointError(f"{path}: {twice}: found with and without {_COMPILED}, expected once")
     tensors = {name: state[source] for name, source in source_names.items()}
     if not any(name.startswith("gnn_backbone.") for name in tensors):
+        inside = [found for name in tensors if (found := re.match(r"(.+\.)gnn_backbone\.", name))]
+        if inside:
+            raise CheckpointError(
+                f"{path}: its tensors' names begin with {inside[0][1]!r}, as if another module "
+                "held the network: save the state dict of the network alone"
+            )
         raise CheckpointError(
             f"{path}: found {len(state)} tensors ({', '.join([*state][:3])}, ...), expected those "
             "of an LPAC network, such as gnn_backbone.graph_conv_0.lins.0.weight"
@@ -299,7 +306,7 @@ def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror}") from None
+        raise CheckpointError(f"{path}: {in_words(error)}") from None
 
 
 def _load(content: bytes, path: Path) -> object:

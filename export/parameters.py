@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from edge.core.file_errors import in_words
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
@@ -29,14 +30,15 @@ class PolicyParameters:
 
 
 def read_parameters(path: Path) -> PolicyParameters:
-    """Read our parameter file, or a coverage_control_params.toml: that has [Environment.Maps].
+    """Read our parameter file, or of a configuration of `lpac train`, which has [network], what it
+    has of that; or a coverage_control_params.toml, which has [Environment.Maps].
 
     Raises ConfigError that names the file and the line or key.
     """
     try:
         document = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        raise ConfigError(f"{path}: {in_words(error)}") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not UTF-8 text, expected TOML") from None
     except tomllib.TOMLDecodeError as error:
@@ -44,6 +46,8 @@ def read_parameters(path: Path) -> PolicyParameters:
     environment = document.get("Environment")
     if isinstance(environment, Mapping) and "Maps" in environment:
         document = _from_coverage_control(_TableReader(document, path))
+    elif "network" in document:
+        document = {name: document[name] for name in ("perception", "training") if name in document}
     return from_mapping(PolicyParameters, document, str(path))
 
 

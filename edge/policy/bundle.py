@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from edge.core.file_errors import in_words
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
@@ -171,7 +172,7 @@ def write_bundle(bundle: Bundle, path: Path) -> None:
     try:
         _write(bundle, path.resolve())
     except OSError as error:
-        raise BundleError(f"{path}: cannot be written: {error.strerror}") from None
+        raise BundleError(f"{path}: cannot be written: {in_words(error)}") from None
 
 
 def _write(bundle: Bundle, path: Path) -> None:
@@ -234,7 +235,7 @@ def _read(path: Path) -> dict[str, bytes]:
         _bound(path, path.stat().st_size)
         content = path.read_bytes()
     except OSError as error:
-        raise BundleError(f"{path}: {error.strerror}") from None
+        raise BundleError(f"{path}: {in_words(error)}") from None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             _bound(path, sum(info.file_size for info in archive.infolist()))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from edge.core.fence import Fence
+from edge.core.file_errors import in_words
 from edge.core.frames import ModelScale
 from edge.core.position import PositionLimits
 from edge.core.schema import ConfigError, from_mapping
@@ -347,7 +348,7 @@ def load_config(path: Path) -> RobotConfig:
     try:
         mapping = tomllib.loads(path.read_text())
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
     folder = path.resolve().parent

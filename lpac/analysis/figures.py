@@ -1,4 +1,4 @@
-"""All figures of flights, from their records. Times are s from the mission's begin."""
+"""All figures of flights, from their records. Times are s from the mission's start."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

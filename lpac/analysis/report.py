@@ -74,18 +74,21 @@ _EVERYTHING = Wanted()
 
 
 def examine(
-    folders: Sequence[Path], wanted: Wanted = _EVERYTHING, progress: Progress = lambda *_: None
+    folders: Sequence[Path | str],
+    wanted: Wanted = _EVERYTHING,
+    progress: Progress = lambda *_: None,
 ) -> Examined:
     """What is in the logs below `folders`.
 
     `progress` gets what is being done, and the share of it. Raises ValueError if there are no logs,
     or no mission in them; OSError if something cannot be read.
     """
-    logs = read_logs(folders, progress)
+    paths = [Path(folder) for folder in folders]
+    logs = read_logs(paths, progress)
     missions = find_missions(logs)
     chosen = _choose(logs, missions, wanted)
     notes = list(logs.notes)
-    worlds = _Worlds(logs, folders, wanted, notes)
+    worlds = _Worlds(logs, paths, wanted, notes)
     fences = {m.robot_id: configured_fence(m) for m in logs.metadata}
     trials = []
     for index, mission in enumerate(chosen):

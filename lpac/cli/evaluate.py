@@ -354,7 +354,7 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
             ]
             print_table(("against", *policies), rows)
         if compared:
-            _show_verdict(condition["compared"], *told["methods"][:2])
+            _show_verdict(condition["compared"], *told["methods"][:2], worlds=told["worlds"])
         typer.echo()
     opened = told["test_set_opened"]
     if opened is not None:
@@ -397,7 +397,11 @@ def _against(policy: Mapping[str, Any], baseline: str) -> "Text":
     return styled(f"{text}, above it in {100.0 * above['share']:.3g} %", style)
 
 
-def _show_verdict(verdict: Mapping[str, Any], a: Mapping[str, Any], b: Mapping[str, Any]) -> None:
+def _show_verdict(
+    verdict: Mapping[str, Any], a: Mapping[str, Any], b: Mapping[str, Any], *, worlds: int
+) -> None:
+    from lpac.analysis.statistics import LEAST_WORLDS
+
     ratio, below = verdict["ratio"], verdict["a_below_b"]
     if verdict["better"] is None:
         said = f"the data do not tell whether {a['name']} or {b['name']} is better"
@@ -409,6 +413,8 @@ def _show_verdict(verdict: Mapping[str, Any], a: Mapping[str, Any], b: Mapping[s
         f"lower in {100.0 * below[0]:.3g} % of the worlds ({100.0 * below[1]:.3g} to "
         f"{100.0 * below[2]:.3g})"
     )
+    if worlds < LEAST_WORLDS:
+        typer.echo(f"fewer than {LEAST_WORLDS} worlds do not tell, whatever their interval is")
     if not verdict["of_methods"]:
         typer.echo(
             "that is said of these bundles; of the methods only with three trainings of each, "

@@ -1,6 +1,5 @@
 """The `lpac` command: `lpac NAME` is in `lpac.cli.NAME`, and is loaded when it is called."""
 
-import errno
 import importlib
 import os
 import sys
@@ -52,17 +51,6 @@ _EXTRAS = {
     "bench": ("bench",),
 }
 _INTERRUPTED = 130
-_FILE_ERRORS = {
-    errno.ENOENT: "there is no such file or folder",
-    errno.EISDIR: "is a folder; a file is needed",
-    errno.ENOTDIR: "a part of this path is a file; a folder is needed",
-    errno.EEXIST: "is there already, and is no folder",
-    errno.EACCES: "this user may not read or write it",
-    errno.EPERM: "this user may not read or write it",
-    errno.EROFS: "is on a disk that is read-only",
-    errno.ENOSPC: "the disk is full",
-    errno.ENAMETOOLONG: "is too long a name",
-}
 
 
 class _Lpac(CommandList):
@@ -150,10 +138,11 @@ def main() -> None:
 
 def _in_words(error: OSError) -> str:
     """What is wrong with which file; as it is, if it is no file's, or a person wrote it."""
-    words = _FILE_ERRORS.get(error.errno or 0)
-    if words is None or error.filename is None:
+    from edge.core.file_errors import in_words, is_known
+
+    if error.filename is None or not is_known(error):
         return str(error)
-    return f"{os.fsdecode(error.filename)}: {words}"
+    return f"{os.fsdecode(error.filename)}: {in_words(error)}"
 
 
 if __name__ == "__main__":

@@ -435,13 +435,20 @@ def _option(vehicle: VehicleKind) -> str:
 
 
 def _made_by(
-    command: str, bundles: "Sequence[Path]", seeds: "Mapping[str, int] | None" = None
+    command: str,
+    bundles: "Sequence[Path]",
+    seeds: "Mapping[str, int] | None" = None,
+    worlds: int | None = None,
 ) -> dict[str, str]:
-    """What made an experiment: its command, its policies, its scenarios' seeds, and versions."""
+    """What made an experiment: its command, its policies, what was drawn, and versions.
+
+    Of the first `worlds` of the validation set the seeds are those of their numbers.
+    """
     from edge.policy.bundle import load_bundle
 
     named = "".join(f" --bundle {path}" for path in bundles if path != DEFAULT_BUNDLE)
-    return _provenance(command + named, [load_bundle(path).id for path in bundles], seeds or {})
+    bundle_ids = [load_bundle(path).id for path in bundles]
+    return _provenance(command + named, bundle_ids, seeds or {}, worlds)
 
 
 def _made_from_logs(
@@ -469,7 +476,10 @@ def _flown_by(records: "Mapping[str, FlightRecord]") -> list[str]:
 
 
 def _provenance(
-    command: str, bundle_ids: "Sequence[str]", seeds: "Mapping[str, int]"
+    command: str,
+    bundle_ids: "Sequence[str]",
+    seeds: "Mapping[str, int]",
+    worlds: int | None = None,
 ) -> dict[str, str]:
     import edge
     import lpac
@@ -478,6 +488,7 @@ def _provenance(
     told = {
         "bundle": ", ".join(bundle_ids),
         "seeds": ", ".join(f"{name} {seed}" for name, seed in seeds.items()),
+        "worlds": f"0 to {worlds - 1} of the validation set, and their seeds" if worlds else "",
     }
     return {
         "command": f"lpac paper {command}",
@@ -581,7 +592,8 @@ def asynchrony(
                     costs[flight] = cost
                     progress.update(task, advance=1)
         results, flown = results_of(plan, costs), plan.flown
-        made_by = _made_by(f"async -k {count}{_option(vehicle)}{_QUICKLY[quick]}", [flown_by])
+        command = f"async -k {count}{_option(vehicle)}{_QUICKLY[quick]}"
+        made_by = _made_by(command, [flown_by], worlds=count)
         how = EXACT_POINTS
         if vehicle is not VehicleKind.POINT:
             how = WHOLE_IN_TRUTH.format(vehicles=_VEHICLES[vehicle])
@@ -663,7 +675,7 @@ def transfer(
     count = worlds if worlds is not None else by_vehicle[vehicle]
     chosen = "".join(f" --set-up {name}" for name in set_ups or ())
     command = f"transfer{_option(vehicle)} -k {count}{chosen}{_QUICKLY[quick]}"
-    made_by, how = _made_by(command, flown), EXACT_POINTS
+    made_by, how = _made_by(command, flown, worlds=count), EXACT_POINTS
     if vehicle is not VehicleKind.POINT:
         how = WHOLE_TRANSFERRED.format(vehicles=_VEHICLES[vehicle])
     evaluate(

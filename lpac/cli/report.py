@@ -27,7 +27,7 @@ def report(
     ] = None,
     times: Annotated[
         str | None,
-        typer.Option(help="When to take snapshots, s from the mission's begin, such as 0,20,60."),
+        typer.Option(help="When to take snapshots, s from the mission's start, such as 0,20,60."),
     ] = None,
     world: Annotated[
         Path | None, typer.Option(help="The world file, if it is not beside the logs.")

@@ -320,7 +320,9 @@ def sim(
     if as_json:
         typer.echo(json.dumps(flight.summary(), indent=2))
         return
-    typer.echo(f"{controller.value}, {count} robots, seed {seed}: {_result(flight, duration)}")
+    typer.echo(
+        f"{_flier(controller, bundle)}, {count} robots, seed {seed}: {_result(flight, duration)}"
+    )
     if transport:
         typer.echo(f"{transport.value}: {link_line(*scenario.link)}; it takes the Wi-Fi for")
         typer.echo("\n".join(wifi_lines(found)))
@@ -609,6 +611,13 @@ def fly_points(
             task = progress.add_task(name, total=scenario.duration_s)
             flights.append(fly(scenario, bundle, partial(_show, progress, task)))
     return flights
+
+
+def _flier(controller: Controller, bundle: Path) -> str:
+    """Whoever flew, by name: a policy's is its bundle's."""
+    from edge.policy.bundle import load_bundle
+
+    return load_bundle(bundle).manifest.name if controller is Controller.LPAC else controller.value
 
 
 def _result(flight: "SimulatedFlight", duration_s: float) -> str:

@@ -31,14 +31,16 @@ from lpac.sim.baselines import BaselineName
 from lpac.sim.cores import Pool, in_this_process
 
 
-def policy_method(name: str, *bundles: Path) -> Method:
+def policy_method(name: str, *bundles: Path | str) -> Method:
     """A policy, by the bundles of its trainings, which differ in their seed alone.
 
     Raises BundleError, ValueError without any.
     """
     if not bundles:
         raise ValueError(f"method {name!r} has no bundle")
-    trainings = tuple(TrainedBundle(str(p.resolve()), load_bundle(p).id) for p in bundles)
+    trainings = tuple(
+        TrainedBundle(str(Path(path).resolve()), load_bundle(path).id) for path in bundles
+    )
     return Method(name=name, flier=POLICY, trainings=trainings)
 
 

@@ -84,7 +84,9 @@ class DrawnWorld(NamedTuple):
 
 
 def draw_world(world_set: WorldSet, index: int, set_up: SetUp) -> DrawnWorld:
-    """World number `index`, from 0 on, of that set. Raises ValueError if `index` is below 0."""
+    """World number `index`, from 0 on, of that set. Raises ValueError if there is none."""
+    if world_set not in _SET_KEYS:
+        raise ValueError(f"world_set = {world_set!r}: must be one of {', '.join(_SET_KEYS)}")
     if index < 0:
         raise ValueError(f"world = {index}: must be at least 0")
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from edge.core.file_errors import in_words
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.margins import Margin, places_apart
 from edge.messages.topics import is_loopback
@@ -375,10 +376,10 @@ def read_fleet(path: Path) -> str:
         return path.read_bytes().decode()
     except FileNotFoundError as error:
         raise ConfigError(
-            f"{path}: cannot be read: {error.strerror}: give --fleet, or set LPAC_FLEET"
+            f"{path}: cannot be read: {in_words(error)}: give --fleet, or set LPAC_FLEET"
         ) from None
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
 

@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.core import F64
+from edge.core.file_errors import in_words
 from edge.drivers.flight_log import FlightLog, topic
 from edge.messages.mission import FlightState, GroundState, RobotStatus
 from lpac.analysis.coverage import Coverage, Whereabouts, in_air
@@ -109,7 +110,7 @@ class Recording:
         self._cost_at_s = 0.0
         self._whereabouts = Whereabouts()
         self._mission_tracker = MissionTracker()
-        # J at the begin of each trial's last mission.
+        # J at the start of each trial's last mission.
         self._initial: dict[str, float] = {}
         self.cost: Cost | None = None
         self.flying = False
@@ -224,7 +225,7 @@ def record(
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OSError(f"{directory}: cannot be made: {error.strerror}") from None
+        raise OSError(f"{directory}: cannot be made: {in_words(error)}") from None
     if not os.access(directory, os.W_OK | os.X_OK):
         raise OSError(f"{directory}: nothing can be written there")
     metadata = GroundMetadata(fleet, version("lpac-edge"))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+from edge.core.file_errors import in_words
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.world import parse_world
 from edge.messages.codes import texts
@@ -229,7 +230,7 @@ def load_script(path: Path, sites: Sites) -> Script:
     try:
         mapping = tomllib.loads(path.read_bytes().decode())
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except ValueError as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
     table = from_mapping(ScriptTable, mapping, str(path))
@@ -249,7 +250,7 @@ def read_world(path: Path) -> str:
     try:
         text = path.read_text("utf-8-sig")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: no text: {error}") from None
     if not parse_world(text, str(path)):

@@ -16,6 +16,7 @@ from typing import NamedTuple
 from geographiclib.geodesic import Geodesic
 
 from edge.core.fence import Fence
+from edge.core.file_errors import in_words
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.messages.mission import GroundState, Origin, Place, RobotStatus
@@ -444,7 +445,7 @@ class Sites:
             known = ", ".join(self.names()) or "none"
             raise ConfigError(f"{path}: there is no such site; known are {known}") from None
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+            raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
         except ValueError as error:
             raise ConfigError(f"{path}: no TOML: {error}") from None
         return from_mapping(SavedSite, mapping, str(path))

@@ -147,10 +147,8 @@ def _text(flown: Flown, results: Sequence[TimingResult], how: str) -> str:
         over = f"{missions}, over whatever worlds and from wherever they began"
         intervals = "the missions of each rate drawn by themselves"
     else:
-        over = (
-            f"the first {flown.worlds} worlds of the {flown.world_set} set, in the set-up of the "
-            "field"
-        )
+        first = "one world" if flown.worlds == 1 else f"the first {flown.worlds} worlds"
+        over = f"{first} of the {flown.world_set} set, in the set-up of the field"
         intervals = "by worlds in pairs"
     headings = ["perception, Hz", "policy, Hz", "rounds per perception", "said, kB/s", "moments",
                 "delay, s",
@@ -172,8 +170,9 @@ worse.{dashed} Bars are 95 % intervals of the ratio of means, {intervals}.*
         f"""{table(headings, [_row(flown, result) for result in results])}
 
 Cost over that at the start, and in brackets the 95 % interval of its ratio to the cost with the
-field's timing, the first row (bootstrap, {intervals}). A robot speaks as often as its
-policy decides: *said* is what that asks of the radio, at most, since messages are compressed.
+field's timing, the first row (bootstrap, {intervals}; the ratio alone of a single one). A robot
+speaks as often as its policy decides: *said* is what that asks of the radio, at most, since
+messages are compressed.
 """,
     ]
     if flown.world_set is not None:
@@ -196,9 +195,11 @@ half of the mean delay; in terms of the cost without.*
 
 def _row(flown: Flown, result: TimingResult) -> list[str]:
     timing = result.timing
+    # One world, or one mission, says nothing of others.
+    is_one = len(result.worlds) == 1
     costs = [
-        f"{mean:.3f} (x {low:.2f} to {high:.2f})"
-        for (mean, _, _), (_, low, high) in zip(result.means, result.over_field, strict=True)
+        f"{mean:.3f} (x {value:.2f})" if is_one else f"{mean:.3f} (x {low:.2f} to {high:.2f})"
+        for (mean, _, _), (value, low, high) in zip(result.means, result.over_field, strict=True)
     ]
     return [
         f"{timing.perception_hz:g}",

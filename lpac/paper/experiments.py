@@ -340,7 +340,7 @@ def _phase(
 def looked_at_from_s(trials: Mapping[str, FlightRecord]) -> dict[str, float]:
     """When E2 begins to look at each trial, by name; s, in the trial's own time.
 
-    That is the takeoff command, or for all trials the mission's begin, 0, if one of them has none,
+    That is the takeoff command, or for all trials the mission's start, 0, if one of them has none,
     as points have not, or had it earlier than E2 looks.
     """
     found_s = {name: _takeoff_s(record) for name, record in trials.items()}

@@ -171,7 +171,7 @@ def _looked_at_text(from_s: Mapping[str, float]) -> str:
             "another; until the mission begins, those on their pads count where they stand."
         )
     return (
-        "Times count from the mission's begin: points have no takeoff, and logs may not tell of "
+        "Times count from the mission's start: points have no takeoff, and logs may not tell of "
         f"it, or tell of one more than {experiments.E2_DURATION_S:g} s earlier."
     )
 
@@ -262,7 +262,8 @@ The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells wi
 {table(["", *policies], rows)}
 
 Mean cost after {told["duration_s"]:.0f} s over that at the start, {worlds}, and in brackets what
-it is times that of Lloyd's algorithm that knows the world, with the 95 % interval. A folder for
+it is times that of Lloyd's algorithm that knows the world, with the 95 % interval where several
+flights tell one. A folder for
 each set-up has its curves.
 """
     return write_experiment("transfer", told, rows_csv, text, folder, flown, made_by)
@@ -275,7 +276,10 @@ _TRANSFER_COLUMNS: list[object] = [
 
 def _transferred(result: Mapping[str, Any]) -> str:
     ratio, low, high = result["over_clairvoyant"]["ratio_of_means"]
-    return f"{result['final']['mean'][0]:.3f} (x {ratio:.2f}, {low:.2f} to {high:.2f})"
+    # One world says nothing of others.
+    several = len(result["by_world"]["final"][0]) > 1
+    interval = f", {low:.2f} to {high:.2f}" if several else ""
+    return f"{result['final']['mean'][0]:.3f} (x {ratio:.2f}{interval})"
 
 
 def write_network(

@@ -52,7 +52,7 @@ TOPOLOGIES = (
     Topology("mesh", "mesh", _WIRED),
     Topology("router on a laptop in the Wi-Fi", "router", Wifi(ground_wired=False)),
     Topology("router on a wire", "router", _WIRED),
-    Topology("router on a wire, by place", "router", _WIRED, NEIGHBOURS),
+    Topology("router on a wire, by place, at best", "router", _WIRED, NEIGHBOURS),
     Topology("multicast at 6 Mbit/s", "multicast", _WIRED),
     Topology("multicast at 24 Mbit/s", "multicast", Wifi(multicast_rate_mbit_s=24.0)),
 )

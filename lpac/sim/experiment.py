@@ -394,6 +394,8 @@ def fly(scenario: Scenario, bundle: Bundle, watch: Watch | None = None) -> Simul
     without it. Raises BundleError for a bundle without perception, ValueError for impossible link
     parameters, and for a flight that is stopped at its start.
     """
+    if not isinstance(bundle, Bundle):
+        raise ValueError(f"{bundle}: is no bundle in memory: load_bundle gives one of a path")
     prepared = prepare(scenario, bundle)
     perception, parameters = prepared.perception, prepared.parameters
     swarm: Swarm[ClockedPac] | BaselineSwarm

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from edge.core.file_errors import in_words
 from edge.core.frames import ModelScale
 from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
@@ -270,7 +271,7 @@ def read_toml(path: Path) -> str:
         text = path.read_text("utf-8")
         tomllib.loads(text)
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        raise ConfigError(f"{path}: {in_words(error)}") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not UTF-8 text, expected TOML") from None
     except tomllib.TOMLDecodeError as error:
@@ -299,7 +300,7 @@ def _initial(
     try:
         return network.initial(checkpoint.read_bytes(), str(checkpoint))
     except OSError as error:
-        raise ConfigError(f"{where} = {str(checkpoint)!r}: {error.strerror}") from None
+        raise ConfigError(f"{where} = {str(checkpoint)!r}: {in_words(error)}") from None
     except ValueError as error:
         raise ConfigError(f"{where}: {error}") from None
 

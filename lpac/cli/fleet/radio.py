@@ -269,7 +269,8 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
         f"room by the model of docs/scaling.md: {checked.transport} at {room.rate_mbit_s:.0f} "
         f"Mbit/s{assumed}{to_all}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a "
         f"second take {100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} "
-        f"bytes in flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
+        f"bytes in flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay "
+        "below 60 %"
     )
     if room.busy_share is not None:
         text += (

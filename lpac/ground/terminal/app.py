@@ -1,7 +1,7 @@
 """`lpac watch`: the fleet in a terminal.
 
 A client of the ground process like any other: it shows the pictures that it is told, and its keys
-send the same commands as anybody's. Who quits it changes nothing in the field.
+send the same commands as anybody's. Quitting it changes nothing in the field.
 """
 
 import asyncio

@@ -23,8 +23,8 @@ from lpac.sim.radio import Air
 
 def fly_simulated(
     scenario: FleetScenario,
-    folder: Path,
-    bundle: Path,
+    folder: Path | str,
+    bundle: Path | str,
     say: Say = lambda _: None,
     *,
     logs: bool = False,
@@ -54,7 +54,9 @@ def fly_simulated(
     # What ten robots say to their own logs is nothing for a person.
     before = log.listen(hand_on_errors)
     try:
-        return _fly(scenario, folder, bundle, say, logs, recorded, pilots, settings, air)
+        return _fly(
+            scenario, Path(folder), Path(bundle), say, logs, recorded, pilots, settings, air
+        )
     finally:
         log.listen(before)
 

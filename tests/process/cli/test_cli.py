@@ -214,7 +214,7 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
             "--lag does nothing with --vehicle mavlink",
         ),
         (["sim", "--bundle", f"{SHIPPED}.pt"], "is a torch checkpoint; `lpac export"),
-        (["sim", "--bundle", "absent"], "absent: No such file or directory"),
+        (["sim", "--bundle", "absent"], "absent: there is no such file or folder"),
         (["bundle", "verify", "README.md"], "neither a bundle directory nor its archive"),
         (["bundle", "info", "tests"], "manifest.json is missing"),
         (["bundle", "benchmark", str(SHIPPED), "--neighbours", "-1"], "must be from 0 to 1000"),

@@ -124,7 +124,7 @@ def test_another_place_for_the_bundle(
 ) -> None:
     log = write_log(tmp_path, shipped_bundle, flown, tmp_path / "on the robot")
     line = error_line(lpac("replay", log))
-    assert "on the robot: No such file or directory" in line and "give --bundle" in line
+    assert "on the robot: there is no such file or folder" in line and "give --bundle" in line
     assert lpac("replay", log, "--bundle", SHIPPED).returncode == 0
 
 

@@ -181,4 +181,4 @@ def test_a_configuration_that_is_not_there() -> None:
     for command in ("run", "check"):
         result = lpac_robot(command, "--config", "none.toml")
         assert result.returncode == 1
-        assert result.stderr == "lpac: none.toml: cannot be read: No such file or directory\n"
+        assert result.stderr == "lpac: none.toml: cannot be read: there is no such file or folder\n"

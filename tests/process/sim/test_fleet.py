@@ -307,7 +307,7 @@ def test_the_fleet_is_described_as_its_robots_are(tmp_path: Path, robots: int) -
         (["--wifi", "wifi.toml"], "--wifi does nothing with --vehicle mavlink"),
         (["--controller", "lpac"], "--controller does nothing with --vehicle mavlink"),
         (["--px4", "docs"], "--px4 does nothing with --vehicle mavlink"),
-        (["--bundle", "absent"], "absent: No such file or directory"),
+        (["--bundle", "absent"], "absent: there is no such file or folder"),
     ],
 )
 def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:

@@ -1,6 +1,7 @@
 """From a checkpoint to a bundle on disk: `lpac export`, and the policy that the project ships."""
 
 import hashlib
+import shutil
 from pathlib import Path
 
 import pytest
@@ -51,7 +52,9 @@ def test_a_parameter_file_of_another_world_is_refused_unless_it_is_forced(tmp_pa
     text = (POLICIES / f"{NAME}.toml").read_text()
     other = tmp_path / "other.toml"
     other.write_text(text.replace("world_size = 512", "world_size = 1024"))
-    for checkpoint in (POLICIES / f"{NAME}.pt", POLICIES / "field" / "field.pt"):
+    # Without the bundle beside it.
+    field = shutil.copy(POLICIES / "field" / "field.pt", tmp_path)
+    for checkpoint in (POLICIES / f"{NAME}.pt", Path(field)):
         share = outside_share(cnn_of(checkpoint))
         assert share is not None and 0.1 < share < 0.2
         export_bundle(checkpoint, POLICIES / f"{NAME}.toml")
@@ -72,6 +75,37 @@ def cnn_of(checkpoint: Path) -> Cnn:
 
 
 @pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [
+        ("max_speed = 1.0", r"max_speed = 1, the actions .* 3\.6 times as fast"),
+        ("max_speed = 100.0", "max_speed = 100, the actions"),
+    ],
+)
+def test_a_speed_that_its_actions_cannot_have_is_refused(
+    changed: str, why: str, tmp_path: Path
+) -> None:
+    checkpoint = Path(shutil.copy(POLICIES / f"{NAME}.pt", tmp_path))
+    other = tmp_path / "other.toml"
+    other.write_text((POLICIES / f"{NAME}.toml").read_text().replace("max_speed = 5.0", changed))
+    with pytest.raises(CheckpointError, match=why):
+        export_bundle(checkpoint, other)
+
+
+def test_a_bundle_beside_the_checkpoint_knows_what_it_was_trained_with(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError) as caught:
+        export_bundle(POLICIES / "field" / "field.pt", POLICIES / f"{NAME}.toml")
+    told = str(caught.value)
+    assert "env_scale = 1.0 (there 16.0)" in told and "shared_map_cell = 0 (there 8)" in told
+    assert "world_size" not in told and "unseen" not in told
+    # What `lpac train` was told is the same.
+    export_bundle(POLICIES / "field" / "field.pt", POLICIES / "field" / "config.toml")
+    # Another checkpoint's bundle says nothing.
+    shutil.copytree(POLICIES / "field" / "field", tmp_path / NAME)
+    shutil.copy(POLICIES / f"{NAME}.pt", tmp_path)
+    export_bundle(tmp_path / f"{NAME}.pt", POLICIES / f"{NAME}.toml")
+
+
 def test_the_authors_taps_with_a_cnn_are_a_whole_policy(tmp_path: Path) -> None:
     parameters, whole = POLICIES / f"{NAME}.toml", POLICIES / f"{NAME}.pt"
     bundle = export_bundle(AUTHORS_TAPS, parameters, cnn=whole)

@@ -74,7 +74,7 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
         ("heading_deg = 30.0", "heading_deg = 360.0", r"before\[0\] \(origin\): heading_deg = "),
         ("heading_deg = 30.0", "", r"before\[0\] \(origin\): latitude_deg, longitude_deg and"),
         ("# from_robot", "from_robot", r"before\[0\] \(origin\): from_robot: measures the origin"),
-        ('file = "world.env"', 'file = "w.env"', r"w.env: cannot be read: No such file"),
+        ('file = "world.env"', 'file = "w.env"', r"w.env: cannot be read: there is no such file"),
         ('[[steps]]\ndo = "takeoff"', "[steps]", "no TOML"),
         ('at_s = 40.0\nrobot = "r2"', 'at_s = 90.0\nrobot = "r2"',
          r"perturb: at_s = 80.0: r2 has no pilot: must be given"),
@@ -108,5 +108,5 @@ def test_worlds_sites_and_steps_must_be_there(script: Path) -> None:
     script.write_text("trials = 2\n")
     with pytest.raises(ValueError, match="steps: none are given"):
         load_script(script, Sites(script))
-    with pytest.raises(ValueError, match=r"none.toml: cannot be read: No such file"):
+    with pytest.raises(ValueError, match=r"none.toml: cannot be read: there is no such file"):
         load_script(script.with_name("none.toml"), Sites(script))

@@ -232,7 +232,7 @@ def test_what_is_no_bundle_is_said_in_a_line(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.zip").write_text("hello")
     for name, text in (
-        ("absent", "No such file"),
+        ("absent", "there is no such file"),
         ("empty", "manifest.json is missing; is this a bundle?"),
         ("text.zip", "neither a bundle directory nor its archive"),
     ):

@@ -28,7 +28,11 @@ from tests.training import SMALL, read
         ("come_back = 0.5", "come_back = 2.0", "come_back = 2.0: must be from 0 to 1"),
         ("epochs = 2", "epochs = 0", "fit: epochs = 0: must be at least 1"),
         ("epochs = 2", "epochs = 2\nlearning_rate = 0.0", "learning_rate = 0.0: must be above 0"),
-        ("epochs = 2", "epochs = 2\nbegin_with = 'no.pt'", r"fit.begin_with = '.*no.pt': No such"),
+        (
+            "epochs = 2",
+            "epochs = 2\nbegin_with = 'no.pt'",
+            r"fit.begin_with = '.*no.pt': there is no such",
+        ),
         ("epochs = 2", "epochs = 2\nbegin_with = 'small.toml'", "begin_with: .* no torch file"),
         ("rounds = 1", "rounds = -1", "dagger: rounds = -1: must be at least 0"),
         ('"n3"', '"n4"', "select: set_ups = 'n4': allowed are field, n1, n3, "),
@@ -48,7 +52,7 @@ def test_what_cannot_be(tmp_path: Path, old: str, new: str, text: str) -> None:
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
+    with pytest.raises(ConfigError, match=r"none\.toml: there is no such file"):
         read_config(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff")
     with pytest.raises(ConfigError, match="is not UTF-8"):

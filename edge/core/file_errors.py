@@ -1,0 +1,25 @@
+"""What is wrong with a file, in words that tell a person what to do."""
+
+import errno
+
+_WORDS = {
+    errno.ENOENT: "there is no such file or folder",
+    errno.EISDIR: "is a folder; a file is needed",
+    errno.ENOTDIR: "a part of this path is a file; a folder is needed",
+    errno.EEXIST: "is there already, and is no folder",
+    errno.EACCES: "this user may not read or write it",
+    errno.EPERM: "this user may not read or write it",
+    errno.EROFS: "is on a disk that is read-only",
+    errno.ENOSPC: "the disk is full",
+    errno.ENAMETOOLONG: "is too long a name",
+}
+
+
+def in_words(error: OSError) -> str:
+    """Without the file's name; as the system says it, if there are no better words."""
+    return _WORDS.get(error.errno or 0) or error.strerror or str(error)
+
+
+def is_known(error: OSError) -> bool:
+    """Whether there are such words."""
+    return error.errno in _WORDS
