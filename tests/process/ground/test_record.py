@@ -168,7 +168,13 @@ def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
     assert path.read_bytes().endswith(MAGIC)
 
 
-@pytest.mark.parametrize(("below", "why"), [("", "and is no folder"), ("more/logs", "a folder is needed")])
+@pytest.mark.parametrize(
+    ("below", "why"),
+    [
+        ("", "is there already, and is no folder"),
+        ("more/logs", "a part of this path is a file; a folder is needed"),
+    ],
+)
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, below: str, why: str) -> None:
     file = tmp_path / "file"
     file.write_text("")
