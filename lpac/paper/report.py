@@ -250,7 +250,8 @@ def write_transfer(
     # One alone is no comparison.
     several = len(told["conditions"]) > 1
     picture = "\n![mean cost over clairvoyant Lloyd's](conditions.png)\n" if several else ""
-    worlds = f"in the first {told['worlds']} worlds of the {told['world_set']} set"
+    first = "one world" if told["worlds"] == 1 else f"the first {told['worlds']} worlds"
+    worlds = f"in {first} of the {told['world_set']} set"
     if told["world_set"] is None:
         worlds = "of each team's missions"
     text = f"""# Transfer to other teams and worlds
@@ -263,8 +264,7 @@ The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells wi
 
 Mean cost after {told["duration_s"]:.0f} s over that at the start, {worlds}, and in brackets what
 it is times that of Lloyd's algorithm that knows the world, with the 95 % interval where several
-flights tell one. A folder for
-each set-up has its curves.
+flights tell one. A folder for each set-up has its curves.
 """
     return write_experiment("transfer", told, rows_csv, text, folder, flown, made_by)
 
