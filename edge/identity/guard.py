@@ -345,9 +345,10 @@ class SignedGuard:
         return envelope.payload, Speaker(card.role, card.name)
 
     def _is_news(self, key: str, envelope: Envelope) -> bool:
-        if envelope.fingerprint == self.card.fingerprint and envelope.start <= self._start:
-            # Its own word, said again. Another program with this key, if there is one and it began
-            # earlier, hears this one.
+        is_own = envelope.fingerprint == self.card.fingerprint
+        if is_own and self.card.role is Role.ROBOT and envelope.start <= self._start:
+            # A robot's own word, said again. Another program with this key, if there is one and it
+            # began earlier, hears this one.
             return False
         said, whose = (envelope.start, envelope.sequence), (envelope.fingerprint, key)
         with self._lock:
