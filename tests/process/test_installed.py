@@ -125,7 +125,7 @@ def program(lpac: Path, folder: Path, says: str, *arguments: str) -> Iterator[No
         (["robot", "check"], "robot.toml: cannot be read"),
         (["ground"], "fleet.toml: cannot be read"),
         (["report", "logs"], "logs"),
-        (["bundle", "verify", "absent"], "absent: No such file"),
+        (["bundle", "verify", "absent"], "absent: there is no such file"),
     ],
 )
 def test_a_mistake_is_one_line_here_too(
