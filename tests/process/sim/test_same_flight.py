@@ -72,8 +72,16 @@ class SeenFlight:
         return [(at_s, each.status) for at_s, each in told if each.status is not None]
 
     def states(self, robot: int) -> list[FlightState]:
-        """One after another, from the checks on: before, a program starts."""
-        states = [state for state, _ in groupby(s.state for _, s in self.statuses(robot))]
+        """One after another, from the checks on: before, a program starts.
+
+        On their way back the ground has robots wait for each other. How long, and how much of the
+        way is left to them then, hangs on the clocks' phases, and may be too short to be seen.
+        """
+        states = [status.state for _, status in self.statuses(robot)]
+        if _S.RETURN in states:
+            back = states.index(_S.RETURN)
+            states[back:] = [_S.RETURN if each is _S.HOLD else each for each in states[back:]]
+        states = [state for state, _ in groupby(states)]
         return states[states.index(_S.PREFLIGHT) :]
 
     def mission(self) -> list[FleetSnapshot]:
