@@ -192,7 +192,8 @@ def _page(
         ]
         said = "; ".join(f"{what}: {value}" for what, value in made_by[chapter.name].items())
         parts.append(
-            f'<p class="quiet">{_text(said)}. Data and figures for print: {chapter.name}/.</p>'
+            f'<p class="quiet">{_text(said)}. The command leaves data and figures for print in '
+            f"{chapter.name}/.</p>"
         )
     return "\n".join([*parts, CLOSING]) + "\n"
 
