@@ -1,5 +1,6 @@
 """One flight of a fleet on the simulated clock, by a script of the real ground."""
 
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from edge.core import log
 from edge.messages.mission import RobotStatus
+from edge.policy.bundle import load_bundle
 from lpac.analysis.logs import logs_of
 from lpac.analysis.truth import TrueTrack
 from lpac.ground.procedure import NothingComesError
@@ -17,8 +19,11 @@ from lpac.sim.fleet.listener import Say
 from lpac.sim.fleet.pilot import FOR_A_PILOT, LOOKS_S, Pilot, PilotFlight
 from lpac.sim.fleet.robots import Settings
 from lpac.sim.fleet.scripted import ScriptedFlight
-from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.radio import Air
+
+# No flight lasts so long, and as many of them end before the year 2038.
+_APART_S, _BEGINNINGS = 1000.0, 340_000
 
 
 def fly_simulated(
@@ -73,6 +78,10 @@ def _fly(
     air: Air | None,
 ) -> FleetFlight:
     earlier = set(folder.rglob("*.mcap"))
+    # Logs of several flights, read together, must be of different times, and those of the same
+    # flight, flown again, of the same.
+    flight_is = (scenario, load_bundle(bundle).id, settings, air, tuple(pilots))
+    beginning = zlib.crc32(repr(flight_is).encode()) % _BEGINNINGS
     fleet = SimulatedFleet(
         scenario,
         folder,
@@ -80,6 +89,7 @@ def _fly(
         settings={**(settings or {}), **(FOR_A_PILOT if pilots else {})},
         logs=logs,
         recorded=recorded,
+        epoch_s=EPOCH_S + _APART_S * beginning,
     )
     ground = fleet.ground
     for each in fleet.vehicles:

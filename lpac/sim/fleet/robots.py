@@ -214,7 +214,8 @@ class SimulatedRobots:
         self.folder = folder
         self.fleet_toml = folder / "fleet.toml"
         self.schedule = Schedule(epoch_s)
-        self._boots = 0
+        # Programs of different flights are different to whoever reads their logs.
+        self._boots = int(epoch_s)
         self._vehicle_step_s = vehicle_step_s
         self._logs = logs
         self._recorded = recorded

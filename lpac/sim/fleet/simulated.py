@@ -36,7 +36,7 @@ from lpac.sim.radio import GROUND, Radio, RadioLink, Subscriptions
 from lpac.sim.schedule import Schedule, WallClock
 
 # Long after any date that a robot takes for a wrong clock.
-_EPOCH_S = 1_800_000_000.0
+EPOCH_S = 1_800_000_000.0
 _FIRST_PORT = 7447
 _PATIENCE_S = 60.0
 
@@ -62,6 +62,7 @@ class SimulatedFleet(SimulatedRobots):
         vehicle_step_s: float = VEHICLE_STEP_S,
         logs: bool = False,
         recorded: Path | None = None,
+        epoch_s: float = EPOCH_S,
     ) -> None:
         """The programs of the last `absent` robots are not started yet.
 
@@ -74,7 +75,7 @@ class SimulatedFleet(SimulatedRobots):
             bundle,
             fleet="simulated",
             ports=range(_FIRST_PORT, _FIRST_PORT + scenario.robots),
-            epoch_s=_EPOCH_S,
+            epoch_s=epoch_s,
             settings=settings,
             spares=spares,
             vehicle_step_s=vehicle_step_s,

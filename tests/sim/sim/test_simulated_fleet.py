@@ -1,7 +1,6 @@
 """A fleet of real robot nodes under a real ground, on one simulated clock."""
 
 import dataclasses
-import shutil
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -20,6 +19,7 @@ from edge.messages.mission import FlightState
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
+from lpac.analysis.flight import FlightRecord
 from lpac.analysis.report import Examined, Wanted, examine
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.procedure import Procedure, Until
@@ -507,6 +507,24 @@ def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
         assert reported.mission_share(robot) == flown.mission_share > 0.5
 
 
+def test_flights_beside_each_other_are_told_apart(tmp_path: Path) -> None:
+    """Also of the same world; each is as long as it was."""
+    flown = [
+        fly_simulated(
+            low_flight(2, 1, duration_s), tmp_path / f"{duration_s:g}", SHIPPED, logs=True
+        )
+        for duration_s in (3.0, 6.0)
+    ]
+    reported = sorted(examine([tmp_path], Wanted(), lambda *_: None).trials, key=_duration_s)
+    assert [_duration_s(r) for r in reported] == [_duration_s(f.record) for f in flown]
+    for record, flight in zip(reported, flown, strict=True):
+        np.testing.assert_equal(record.normalized, flight.record.normalized)
+
+
+def _duration_s(record: FlightRecord) -> float:
+    return record.duration_s
+
+
 def test_recorded_steps_of_the_policy_are_the_same_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: Logged
 ) -> None:
@@ -531,8 +549,8 @@ def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -
     with pytest.raises(RecordingError, match=r"robot \d: its log has no step of the policy at"):
         recorded(low_flight(2, 2, 3.0), logged.folder)
     two = tmp_path / "two"
-    shutil.copytree(logged.folder, two)
-    again = fly_simulated(low_flight(1, 1, 2.0), two, SHIPPED, logs=True)
-    assert again.robots[0].logs == ("robots/0/logs/robot-0-0002.mcap",)
+    for number in (1, 2):
+        flight = fly_simulated(low_flight(1, 1, 2.0), two, SHIPPED, logs=True)
+        assert flight.robots[0].logs == (f"robots/0/logs/robot-0-000{number}.mcap",)
     with pytest.raises(RecordingError, match="holds logs of more than one flight"):
         recorded(low_flight(1, 1, 2.0), two)
