@@ -38,6 +38,8 @@ app = new_app()
 
 DEFAULT_OUT = Path("out/sim")
 DEFAULT_ROBOTS = 10
+# In the folder of whole robots' flight: of the world's size, or the range, that was asked for.
+_OWN_BUNDLE = "bundle"
 # Images and actions count for so long, s, or for two periods, if that is longer.
 _INPUT_AGE_S = 1.0
 
@@ -116,18 +118,18 @@ def sim(
     starts: Annotated[
         Path | None,
         typer.Option(
-            help="point: file with a line 'x y' for each robot, where it starts, m of the mission "
-            "frame; else that follows from the seed."
+            help="File with a line 'x y' for each robot, where it starts, m of the mission frame; "
+            "else that follows from the seed."
         ),
     ] = None,
     world_size: Annotated[
         int | None,
-        typer.Option(help="point: side of the world, in model units; else the bundle's."),
+        typer.Option(help="Side of the world, in model units; else the bundle's."),
     ] = None,
     communication_range: Annotated[
         float | None,
         typer.Option(
-            "--range", help="point: how far robots are heard, in model units; else the bundle's."
+            "--range", help="How far robots are heard, in model units; else the bundle's."
         ),
     ] = None,
     perception_hz: Annotated[float, typer.Option(help="How often a robot perceives.")] = 5.0,
@@ -224,7 +226,9 @@ def sim(
     ] = None,
 ) -> None:
     """Fly a swarm over an unknown world and print how well it covers it."""
+    from edge.core.frames import ModelScale
     from edge.core.world import parse_world
+    from lpac.sim.experiment import FIELD_SCALE
 
     _require_options_of(context, vehicle)
     count = _robot_count(robots)
@@ -234,8 +238,11 @@ def sim(
     _require_something_to_cover(world, world_features, features)
     clocks = _clocks(perception_hz, policy_hz, control_hz, synchronous=synchronous)
     max_input_age_s = max(_INPUT_AGE_S, 2.0 * clocks.perception_s, 2.0 * clocks.policy_s)
+    model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
+    starts_m = None if starts is None else _starts(starts, count, bundle, world_size, model)
     if vehicle is not VehicleKind.POINT:
         from lpac.sim.fleet.layout import FleetScenario
+        from lpac.sim.fleet.own_bundle import bundle_with
 
         flown: Literal["mavlink", "px4"] = "px4" if vehicle is VehicleKind.PX4 else "mavlink"
         check_px4(vehicle, px4)
@@ -249,6 +256,7 @@ def sim(
             sensor=sensor,
             secure=secure,
             transport="mesh" if transport is None else transport.value,
+            pads_m=starts_m,
         )
 
         settings: Settings = {
@@ -259,32 +267,40 @@ def sim(
                 "max_message_age_s": max_message_age, "max_input_age_s": max_input_age_s,
             },
         }  # fmt: skip
+        bundle_in = partial(
+            bundle_with, bundle, world_size=world_size, communication_range=communication_range
+        )
         if vehicle is VehicleKind.SIMULATED:
             _fly_on_clock(
-                fleet_scenario, bundle, as_json, out, recorded, settings, loss=loss, delay_s=delay
+                fleet_scenario,
+                bundle_in,
+                as_json,
+                out,
+                recorded,
+                settings,
+                loss=loss,
+                delay_s=delay,
             )
             return
 
-        def prepared() -> int | None:
-            """What is wrong with the flight itself has been said by now."""
-            return None if count is None else _say_if_carried(count, bundle, flown)
-
+        # What is wrong with the flight itself has been said before this is.
+        prepared = partial(_say_if_carried, count, bundle, flown)
         if not script:
-            _serve(fleet_scenario, bundle, px4, out or DEFAULT_OUT, prepared, settings)
+            _serve(fleet_scenario, bundle_in, px4, out or DEFAULT_OUT, prepared, settings)
             return
-        _launch(fleet_scenario, bundle, px4, as_json, out, prepared, settings)
+        _launch(fleet_scenario, bundle_in, px4, as_json, out, prepared, settings)
         return
-    from edge.core.frames import ModelScale
     from lpac.radio.modelled import ModelledRadio
-    from lpac.sim.experiment import FIELD_SCALE, Scenario
+    from lpac.sim.experiment import Scenario
     from lpac.sim.failure import Failure, LostRobots
 
     assert count is not None
     found = calibration(wifi, transport=transport is not None)
     if transport and (loss or delay):
-        both = f"--{'loss' if loss else 'delay'} and --transport"
-        raise ValueError(f"{both}: the model itself says what is lost, and how late messages are")
-    model = FIELD_SCALE if scale is Scale.FIELD else ModelScale(1.0, 1.0)
+        raise ValueError(
+            f"--{'loss' if loss else 'delay'} and --transport: the model itself says what is lost, "
+            "and how late messages are"
+        )
     scenario = Scenario(
         controller=controller.value,
         robots=count,
@@ -292,7 +308,7 @@ def sim(
         duration_s=duration,
         features=world_features,
         random_feature_count=features,
-        starts_m=None if starts is None else _starts(starts, count),
+        starts_m=starts_m,
         scale=model,
         loss=loss,
         delay_s=delay,
@@ -333,9 +349,6 @@ def sim(
 _ONLY_FOR = {
     "controller": (VehicleKind.POINT,),
     "scale": (VehicleKind.POINT,),
-    "starts": (VehicleKind.POINT,),
-    "world_size": (VehicleKind.POINT,),
-    "communication_range": (VehicleKind.POINT,),
     "synchronous": (VehicleKind.POINT,),
     "lag": (VehicleKind.POINT,),
     "position_error": (VehicleKind.POINT,),
@@ -384,10 +397,17 @@ def _as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int
     return robots
 
 
-def _say_if_carried(robots: int, bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:
-    """How many robots this machine carries; says so, and what to do if they are too few."""
+def _say_if_carried(
+    robots: int | None, bundle: Path, vehicle: Literal["mavlink", "px4"]
+) -> int | None:
+    """How many robots this machine carries; says so, and what to do if they are too few.
+
+    None, and nothing, if they were chosen by that.
+    """
     from lpac.sim.fleet.load import robots_carried
 
+    if robots is None:
+        return None
     carried = int(robots_carried(bundle, vehicle))
     if carried >= robots:
         typer.echo(_carries(carried), err=True)
@@ -404,7 +424,7 @@ def _carries(robots: int) -> str:
 
 def _launch(
     scenario: "FleetScenario",
-    bundle: Path,
+    bundle_in: Callable[[Path], Path],
     px4: Path | None,
     as_json: bool,
     out: Path | None,
@@ -422,6 +442,7 @@ def _launch(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
         folder = out or Path(nowhere)
+        bundle = bundle_in(folder / _OWN_BUNDLE)
         fleet = Fleet(scenario, folder, bundle, px4_build=px4, say=say, settings=settings)
         fleet.carried = prepared()
         flight = fly(fleet, say, lambda step: show(step, fleet.heard.statuses()))
@@ -430,7 +451,7 @@ def _launch(
 
 def _fly_on_clock(
     scenario: "FleetScenario",
-    bundle: Path,
+    bundle_in: Callable[[Path], Path],
     as_json: bool,
     out: Path | None,
     recorded: Path | None,
@@ -445,9 +466,10 @@ def _fly_on_clock(
 
     air = Air(loss=loss, delay_s=max(delay_s, Air().delay_s)) if loss or delay_s else None
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (_, say):
+        folder = out or Path(nowhere)
         flight = fly_simulated(
-            scenario, out or Path(nowhere), bundle, say, logs=out is not None, recorded=recorded,
-            settings=settings, air=air,
+            scenario, folder, bundle_in(folder / _OWN_BUNDLE), say, logs=out is not None,
+            recorded=recorded, settings=settings, air=air,
         )  # fmt: skip
     _show_fleet_flight(flight, as_json, out)
 
@@ -474,7 +496,7 @@ def _show_fleet_flight(flight: "FleetFlight", as_json: bool, out: Path | None) -
 
 def _serve(
     scenario: "FleetScenario",
-    bundle: Path,
+    bundle_in: Callable[[Path], Path],
     px4: Path | None,
     out: Path,
     prepared: Callable[[], int | None],
@@ -486,6 +508,7 @@ def _serve(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _live() as (show, say):
+            bundle = bundle_in(out / _OWN_BUNDLE)
             fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say, settings=settings)
             fleet.carried = prepared()
             with fleet:
@@ -636,8 +659,16 @@ def _require_something_to_cover(
         raise ValueError(f"{what}: the world would have nothing in it to cover")
 
 
-def _starts(path: Path, robots: int) -> tuple[tuple[float, float], ...]:
+def _starts(
+    path: Path, robots: int | None, bundle: Path, world_size: int | None, scale: "ModelScale"
+) -> tuple[tuple[float, float], ...]:
     """The positions in the file, m. Raises ValueError that names the line."""
+    from edge.policy.bundle import load_bundle
+
+    perception = load_bundle(bundle).manifest.perception
+    if world_size is None and perception is not None:
+        world_size = perception.world_size
+    side_m = math.inf if world_size is None else world_size / scale.env_scale
     starts_m = []
     for number, line in enumerate(_text(path).splitlines(), start=1):
         if not line.strip():
@@ -646,7 +677,14 @@ def _starts(path: Path, robots: int) -> tuple[tuple[float, float], ...]:
             x_m, y_m = map(float, line.replace(",", " ").split())
         except ValueError:
             raise ValueError(f"{path}: line {number}: must be 'x y', in m") from None
+        if not (0.0 <= x_m <= side_m and 0.0 <= y_m <= side_m):
+            raise ValueError(
+                f"{path}: line {number}: {line.strip()}: is outside of the world: must be from 0 "
+                f"to {side_m:g} m"
+            )
         starts_m.append((x_m, y_m))
+    if robots is None:
+        raise ValueError(f"{path}: needs a number of robots, and --robots is auto")
     if len(starts_m) != robots:
         raise ValueError(f"{path}: has {len(starts_m)} starts, and there are {robots} robots")
     return tuple(starts_m)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 
 import edge
 from edge.core.wire import PayloadType
-from edge.policy.bundle import Bundle, BundleError, load_bundle, make_bundle, write_bundle
+from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac import analysis, evaluate, radio, sim
 from lpac.analysis.coverage import Coverage
 from lpac.evaluate.worlds import SET_UPS, WorldSet, draw_world
@@ -35,6 +35,7 @@ from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.flight import FleetFlight
 from lpac.sim.fleet.flight import fly as fly_fleet
 from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.own_bundle import bundle_with
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.fleet.robots import Settings
 from lpac.sim.kept import KeptOutcomes, code_digest
@@ -247,19 +248,11 @@ def bundle_for(flight: EvaluationFlight, folder: Path) -> Path:
 
     A new one, in the folder, where the flight's own has others. Raises BundleError.
     """
-    bundle, set_up = _loaded(flight.bundle), SET_UPS[flight.set_up]
-    trained = bundle.manifest.perception
-    assert trained is not None  # `task_of` has seen to it
-    perception = replace(
-        trained, world_size=set_up.world_size, communication_range=set_up.communication_range
-    )
-    if perception == trained:
-        return Path(flight.bundle)
-    files = {name: bundle.files[name] for name in bundle.manifest.files}
-    write_bundle(
-        make_bundle(replace(bundle.manifest, perception=perception), files), folder / "own"
-    )
-    return folder / "own"
+    set_up = SET_UPS[flight.set_up]
+    return bundle_with(
+        Path(flight.bundle), folder / "own",
+        world_size=set_up.world_size, communication_range=set_up.communication_range,
+    )  # fmt: skip
 
 
 def settings_of(flight: EvaluationFlight) -> Settings:

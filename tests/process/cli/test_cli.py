@@ -227,17 +227,32 @@ def test_a_mistake_is_one_line(arguments: list[str], text: str) -> None:
     assert text in error_line(lpac(*arguments))
 
 
-def test_whole_robots_have_rates_and_a_radio_too() -> None:
+def test_a_start_outside_of_the_world_is_one(tmp_path: Path) -> None:
+    starts = tmp_path / "starts.txt"
+    starts.write_text("1 32\n1 33\n")
+    told = error_line(lpac("sim", "-n", "2", "--starts", starts))
+    assert "line 2: 1 33: is outside of the world: must be from 0 to 32 m" in told
+
+
+def test_whole_robots_have_knobs_too(tmp_path: Path) -> None:
+    starts = tmp_path / "starts.txt"
+    starts.write_text("4 4\n20 4\n4 20\n")
     options: dict[str, list[Any]] = {
         "as it is": [],
         "rates": ["--policy-hz", 1],
         "ages": ["--max-message-age", 0.01],
         "loss": ["--loss", 1],
+        "range": ["--range", 100],
+        "world": ["--world-size", 700],
+        "starts": ["--starts", starts],
     }
     whole = ("sim", "--vehicle", "simulated", "-n", 3, "--duration", 12, "--json")
     flights = {name: json.loads(lpac(*whole, *its).stdout) for name, its in options.items()}
     costs = {name: json.dumps(flight["cost_curve"]) for name, flight in flights.items()}
     assert len(set(costs.values())) == len(options), costs
+    began_m = np.array(flights["starts"]["start_positions_m"])[:, :2]
+    # They take off from there in gusts.
+    np.testing.assert_allclose(began_m, [[4, 4], [20, 4], [4, 20]], atol=1.5)
 
 
 def test_sim_has_the_knobs_of_an_experiment(tmp_path: Path) -> None:
