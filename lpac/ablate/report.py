@@ -30,8 +30,8 @@ def no_claim(ablation: Ablation) -> str | None:
         return None
     seeds = len(ablation.config.seeds)
     return (
-        f"{seeds} training seed{'s' if seeds > 1 else ''}: this says something of these policies, "
-        f"and is no claim about the method, which needs {LEAST_TRAININGS}"
+        f"{seeds} training seed{'s' if seeds > 1 else ''}: this says something about these "
+        f"policies, but is no claim about the method, which needs {LEAST_TRAININGS}"
     )
 
 
@@ -71,27 +71,27 @@ def _text(ablation: Ablation, results: Sequence[VariantResult]) -> str:
     chosen = (
         "of the validation set that no weights were chosen by"
         if config.world_set == "validation"
-        else "of the test set, which is opened now: whoever chooses by this has none any more"
+        else "of the test set, now opened: if you choose by this, it is no test set any more"
     )
     claim, flown_as = no_claim(ablation), results[0].variant.flown_as
     return f"""# What each part is worth
 
-Each variant is the base but for what its line says. Those that are trained are trained as the base
-is (seeds: {", ".join(map(str, config.seeds))}), in as many flights, states, epochs, rounds and
+Each variant is the base, except for what its line says. Those that are trained are trained as the
+base is (seeds: {", ".join(map(str, config.seeds))}), in as many flights, states, epochs, rounds and
 candidates; the others fly the base's policies. All fly over the {len(worlds)} worlds
 {worlds.start} to {worlds.stop - 1} {chosen} ({config.set_up},
 {config.duration_s:g} s), the base with {100.0 * flown_as.loss:g} % of messages lost, a delay of
 {flown_as.delay_s:g} s, and payloads in {flown_as.payload}.
 {f"{chr(10)}**{claim[0].upper()}{claim[1:]}.**{chr(10)}" if claim else ""}
-| variant | | trained | mean | over seeds | difference to base | 95 % | |
+| variant | | trained | mean | over seeds | difference from base | 95 % | |
 | --- | --- | --- | --- | --- | --- | --- | --- |
 {chr(10).join(_row(result) for result in results)}
 
 Cost at the end over that at the start; less is better. "Over seeds" is the standard deviation of
-the trainings' means. The intervals are of a bootstrap in which worlds are drawn in pairs, and
-trainings too: those of a variant and of the base each by themselves, unless they are the same. Of
-few trainings the intervals are rather too narrow; and each is by itself: of twenty, one is expected
-to miss.
+the trainings' means. The intervals are from a bootstrap that draws worlds in pairs, and
+trainings too: those of a variant and of the base separately, unless they are the same. With few
+trainings the intervals tend to be too narrow; and each stands alone: of twenty, one is expected
+to miss the true value.
 
 ![differences to the base](differences.png)
 

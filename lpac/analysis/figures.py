@@ -125,7 +125,7 @@ def overview(flight: FlightRecord) -> Figure:
             if np.isfinite(flight.true_cost).any():
                 lower.plot(
                     flight.curve_time_s, flight.normalized_true, color=style.VERMILLION, ls="--",
-                    lw=1.2, label=f"{flight.normalized_true[-1]:.2f}  where they were",
+                    lw=1.2, label=f"{flight.normalized_true[-1]:.2f}  true positions",
                 )  # fmt: skip
             _draw_lloyd(lower, flight)
             lower.legend(
@@ -177,7 +177,7 @@ def repeatability(flights: Sequence[FlightRecord]) -> Figure:
             Line2D([], [], color="k", lw=0.8, ls=style.DOTTED, label=f"{LLOYD}, {lloyd:.2f}"),
         ]
         if any(flight.truth for flight in flights):
-            handles.append(Line2D([], [], color=INK, lw=0.4, label="a trial, in truth"))
+            handles.append(Line2D([], [], color=INK, lw=0.4, label="a trial, true cost"))
         left.legend(
             handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2,
             handlelength=1.6, fontsize=7, columnspacing=1.0, borderaxespad=0.2,
@@ -365,12 +365,12 @@ def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
     _draw_robots(axes, end_m, colours)
     handles += [
         Line2D([], [], ls="", marker="o", ms=3, mfc="white", mec=INK, label="where it began"),
-        Line2D([], [], color=INK, lw=0.9, label="path, as it said"),
+        Line2D([], [], color=INK, lw=0.9, label="path, as estimated"),
     ]
     if flight.truth:
         handles += [
-            Line2D([], [], color=INK, lw=0.7, ls=style.DASHED, label="path, in truth"),
-            Line2D([], [], mec=INK, marker="s", ms=4, mfc="white", ls="", label="pad, in truth"),
+            Line2D([], [], color=INK, lw=0.7, ls=style.DASHED, label="true path"),
+            Line2D([], [], mec=INK, marker="s", ms=4, mfc="white", ls="", label="true pad"),
         ]
     handles.append(Line2D([], [], color=INK, marker="x", ms=4, ls="", label="landing point"))
     if flight.coverage is not None:
@@ -533,7 +533,7 @@ def _world_handles() -> list[Any]:
         Line2D([], [], color=GREY, lw=0.6, label="Voronoi cells"),
         Patch(color=style.DENSITY(0.9), label="density, seen"),
         Patch(color=style.DENSITY(0.9 * style.UNSEEN_STRENGTH), label="density, not yet seen"),
-        Line2D([], [], color=style.SEEN, lw=0.8, ls=style.DOTTED, label="edge of the seen"),
+        Line2D([], [], color=style.SEEN, lw=0.8, ls=style.DOTTED, label="edge of what was seen"),
     ]
 
 

@@ -226,7 +226,7 @@ class _LogReader:
                 except (AttributeError, OverflowError, TypeError, ValueError) as error:
                     odd[topic].append(str(error))
             if not begun:
-                notes.append(f"{path}: holds nothing, or broke off at its begin")
+                notes.append(f"{path}: is empty, or breaks off at its beginning")
         except FlightLogError as error:
             notes.append(f"{error}: left out")
         except ValueError as error:  # a message that is not even JSON

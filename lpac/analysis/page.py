@@ -14,11 +14,11 @@ _CAPTIONS = {
     "snapshots": "Robots, their paths so far and Voronoi cells over the density, which is faint "
     "where no robot had looked by then.",
     "start-and-end": "Where the robots began and ended the mission.",
-    "cost": "Coverage cost over that at the begin, beside what Lloyd's algorithm comes to, which "
-    "knows the whole density: a mark for comparison, and not the least that there is.",
-    "states": "What each robot did; dashed: begin and end of the mission.",
-    "messages": "Messages between the robots during the mission: age when they came, and the share "
-    "that did not come, by the gaps in the senders' numbering.",
+    "cost": "Coverage cost over that at the beginning, beside what Lloyd's algorithm reaches with "
+    "knowledge of the whole density: for comparison, not a lower bound.",
+    "states": "What each robot did. Dashed lines: beginning and end of the mission.",
+    "messages": "Messages between the robots during the mission: their age on arrival, and the "
+    "share that did not arrive, as gaps in the senders' numbering show.",
     "loops": "How late the loops' ticks were, in the minute before each time.",
 }
 _MOST_ROWS = 30
@@ -132,7 +132,7 @@ def _about(trial: FlightRecord) -> str:
     if trial.separation is not None:
         one, other = trial.separation.robots
         words.append(
-            f"Least distance, as the robots said: {trial.separation.distance_m:.2f} m between "
+            f"Least distance by the robots' estimates: {trial.separation.distance_m:.2f} m between "
             f"{one} and {other}, at {trial.separation.time_s:.1f} s."
         )
     if trial.true_separation is not None:
@@ -144,7 +144,7 @@ def _about(trial: FlightRecord) -> str:
             "initial."
         )
     if not trial.clocks_known:
-        words.append("Each robot's times are its own clock's: no ground log tells the offsets.")
+        words.append("Each robot's times are by its own clock: no ground log has the offsets.")
     return f"<p>{_text(' '.join(words))}</p>"
 
 

@@ -205,8 +205,8 @@ class _Worlds:
                     return _sizes_of(place, bundle, env_scale)
         sizes = _Sizes(512, 64, env_scale, 2.0, 1.0)
         self._notes.append(
-            f"{mission.name}: the policy's bundle is not here (give it with --bundle): taken for "
-            f"granted are a world of {sizes.world_size} cells and a sensor of {sizes.sensor_size}"
+            f"{mission.name}: the policy's bundle is not here (give it with --bundle): assumed are "
+            f"a world of {sizes.world_size} cells and a sensor of {sizes.sensor_size}"
         )
         return sizes
 
@@ -244,8 +244,8 @@ def _notes(logs: Logs, trial: FlightRecord, wanted: Wanted) -> Iterable[str]:
     if silent:
         whose = "any robot" if len(silent) == len(trial.robots) else ", ".join(silent)
         yield (
-            f"{trial.name}: no log of {whose} is here, only what the ground heard: nothing is "
-            "known of the messages that came there"
+            f"{trial.name}: no log of {whose} is here, only what the ground heard: which messages "
+            "arrived there is not known"
         )
     told = trial.messages
     if told is not None and not trial.clocks_known and len(told.heard_age_s):

@@ -51,7 +51,7 @@ def network(
             "--middleware",
             metavar="NAME",
             help="zenoh, cyclonedds, and fastdds where it is installed, if not given; may be "
-            "repeated. Robots without programs are always measured beside them.",
+            "repeated. The stream without any programs is always measured, too.",
         ),
     ] = None,
     robots: Annotated[
@@ -59,14 +59,14 @@ def network(
         typer.Option(
             "--robots",
             "-n",
-            help="How many restart, 3 if not given; and to how many the curves go, 10.",
+            help="How many robots restart (3 if not given), and up to how many the curves go (10).",
         ),
     ] = None,
     repetitions: Annotated[
-        int | None, typer.Option(help="10 of restarts, 3 of each point of the curves.")
+        int | None, typer.Option(help="If not given, 10 of restarts, 3 of each point of a curve.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="Of one run: 60 with restarts, 10 of a point.")
+        float | None, typer.Option(help="Length of a run: 60 with restarts, else 10, by default.")
     ] = None,
     namespaces: Annotated[
         str | None,

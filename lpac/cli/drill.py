@@ -44,20 +44,20 @@ def drill(
         ),
     ] = DrillVehicle.SIMULATED,
     px4: Annotated[
-        Path | None, typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it.")
+        Path | None, typer.Option(help="px4: PX4's build folder, made by `make px4_sitl`.")
     ] = None,
     faults: Annotated[
         list[str] | None,
         typer.Option("--fault", metavar="NAME", help="Only this fault; may be repeated."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(help="Fly each fault with so many seeds, from 0 on; 1 if none.")
+        int | None, typer.Option(help="Fly each fault with this many seeds, from 0 on; else 1.")
     ] = None,
     seed: Annotated[
         int | None,
         typer.Option(
-            help="Fly exactly this one; of one fault with its flight logs and a figure, all in "
-            "FAULT-SEED in --out."
+            help="Fly exactly this seed; with a single --fault also its flight logs and a figure, "
+            "all in FAULT-SEED in --out."
         ),
     ] = None,
     robots: Annotated[int, typer.Option("--robots", "-n", help="Number of robots.")] = 4,
@@ -70,12 +70,12 @@ def drill(
     out: Annotated[
         Path | None,
         typer.Option(
-            help=f"Folder for drill.json, drill.xml (JUnit), and what was flown; if not given "
-            f"{_OUT}, or with mavlink and px4 {_OUT}-mavlink and so on."
+            help=f"Folder for drill.json, drill.xml (JUnit), and what was flown; by default "
+            f"{_OUT}, or {_OUT}-mavlink or {_OUT}-px4."
         ),
     ] = None,
 ) -> None:
-    """Do faults to a fleet in flight, and judge by the vehicles' truth what is promised."""
+    """Inject faults into a fleet in flight, and judge by true positions what was promised."""
     from lpac.sim.drill.campaign import Campaign, fly_order
     from lpac.sim.drill.report import as_json as to_json
     from lpac.sim.drill.report import as_junit

@@ -48,13 +48,20 @@ def evaluate(
         ),
     ] = None,
     world_set: Annotated[
-        str, typer.Option("--set", help="training, validation, or test: look at that one once.")
+        str, typer.Option("--set", help="training, validation, or test; look at test only once.")
     ] = "validation",
-    worlds: Annotated[int, typer.Option("--worlds", "-k", help="The first so many of it.")] = 20,
+    worlds: Annotated[
+        int, typer.Option("--worlds", "-k", help="How many worlds of it, from the first on.")
+    ] = 20,
     duration: Annotated[float, typer.Option(help="Flight time, s.")] = 60.0,
     set_ups: Annotated[
         list[str] | None,
-        typer.Option("--set-up", metavar="NAME", help="field if not given; may be repeated."),
+        typer.Option(
+            "--set-up",
+            metavar="NAME",
+            help="Team and world: field (the default), n1 to n1000, paper, features-3, range-64, "
+            "and more (docs/research.md); may be repeated.",
+        ),
     ] = None,
     transfer: Annotated[
         bool,
@@ -85,7 +92,7 @@ def evaluate(
     lags: Annotated[
         list[float] | None,
         typer.Option(
-            "--lag", help="Also with robots that follow with this time constant, s; baselines too."
+            "--lag", help="Also with robots that respond with this time constant, s; baselines too."
         ),
     ] = None,
     position_errors: Annotated[
@@ -100,8 +107,8 @@ def evaluate(
         typer.Option(
             "--payload",
             metavar="TYPE",
-            help="Also with messages that carry float32 or int8 instead of float16, and with each "
-            "--loss or --transport so.",
+            help="Also with messages that carry float32 or int8 instead of float16; each --loss "
+            "and --transport is then flown with them, too.",
         ),
     ] = None,
     vehicle: Annotated[
@@ -181,7 +188,7 @@ def evaluate(
         return
     _show(told, compared=compare)
     if transports:
-        typer.echo("\n".join(["the model takes the Wi-Fi for:", *wifi_lines(found)]))
+        typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(found)]))
     typer.echo(f"\nsee {out}: evaluation.json, figures, and the worst worlds")
 
 
@@ -359,8 +366,8 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
     opened = told["test_set_opened"]
     if opened is not None:
         typer.echo(
-            f"the test set was opened, {opened['worlds']} worlds of it: whoever chooses by this "
-            "has none any more"
+            f"the test set was opened, {opened['worlds']} worlds of it: if you choose by this, "
+            "it is no test set any more"
         )
 
 
@@ -404,7 +411,7 @@ def _show_verdict(
 
     ratio, below = verdict["ratio"], verdict["a_below_b"]
     if verdict["better"] is None:
-        said = f"the data do not tell whether {a['name']} or {b['name']} is better"
+        said = f"the data do not show whether {a['name']} or {b['name']} is better"
     else:
         better, worse = (a, b) if verdict["better"] == "a" else (b, a)
         said = f"{better['name']} is better than {worse['name']}"
@@ -414,9 +421,9 @@ def _show_verdict(
         f"{100.0 * below[2]:.3g})"
     )
     if worlds < LEAST_WORLDS:
-        typer.echo(f"fewer than {LEAST_WORLDS} worlds do not tell, whatever their interval is")
+        typer.echo(f"fewer than {LEAST_WORLDS} worlds are too few, whatever their interval is")
     if not verdict["of_methods"]:
         typer.echo(
-            "that is said of these bundles; of the methods only with three trainings of each, "
-            "joined by commas"
+            "that is true of these bundles; it takes three trainings of each, joined by commas, to "
+            "say it of the methods"
         )

@@ -32,7 +32,7 @@ def export(
     ] = None,
     force: Annotated[
         bool,
-        typer.Option("--force", help="Although the checkpoint contradicts the parameter file."),
+        typer.Option("--force", help="Even if the checkpoint contradicts the parameter file."),
     ] = False,
 ) -> None:
     """Export a trained torch checkpoint as a bundle that runs without torch."""

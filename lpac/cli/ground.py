@@ -34,7 +34,7 @@ def ground(
 ) -> None:
     """Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.
 
-    It sets nothing in motion by itself. Started again, it goes on where the last one was.
+    It sets nothing in motion by itself. Started again, it continues where the last one stopped.
     """
     from lpac.ground.station.config import load_ground
     from lpac.ground.station.server import GroundProcess

@@ -21,7 +21,7 @@ def live_map(
         bool, typer.Option("--operate", help="Also command the fleet from the page.")
     ] = False,
     token: Annotated[
-        str | None, typer.Option(help="What a browser must know; made up where it is needed.")
+        str | None, typer.Option(help="The token; if not given, one is made where needed.")
     ] = None,
     over_tls: Annotated[
         bool, typer.Option("--tls", help="Serve over TLS, from the laptop with the authority.")
@@ -30,8 +30,9 @@ def live_map(
 ) -> None:
     """Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.
 
-    It only observes, unless --operate, and then asks for a token, which the address has. Who
-    listens on the network hears the token, unless --tls; browsers import its authority once.
+    It only observes, unless --operate is given; then it asks for a token, which is part of the
+    address. Without --tls anybody who listens on the network can read the token; with it, each
+    browser has to import the authority once.
     """
     import asyncio
     import datetime

@@ -24,7 +24,7 @@ Robots = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Px4 = Annotated[
     Path | None,
-    typer.Option(help="px4: PX4's build folder, as `make px4_sitl` fills it."),
+    typer.Option(help="px4: PX4's build folder, made by `make px4_sitl`."),
 ]
 Ray = Annotated[
     str | None,

@@ -34,9 +34,7 @@ if TYPE_CHECKING:
     from lpac.sim.experiment import Scenario, SimulatedFlight
     from lpac.sim.fleet.layout import FleetScenario
 
-app = new_app(
-    "paper", "Repeat the paper's experiments, and run those it argues for but does not report."
-)
+app = new_app("paper", "Repeat the paper's experiments, and run some that its arguments call for.")
 
 _OUT = Path("out/paper")
 _E1_WORLDS, _E2_TRIALS, _WORLD = 3, 3, 0
@@ -75,7 +73,8 @@ Vehicle = Annotated[
     VehicleKind, typer.Option(help="Points, or whole robots, as `lpac sim` has them.")
 ]
 Logs = Annotated[
-    Path | None, typer.Option(help="Fly nothing: folder of logs of flights, as of a field day.")
+    Path | None,
+    typer.Option(help="Folder of flight logs, such as a field day's; nothing is flown."),
 ]
 World = Annotated[
     int | None,
@@ -91,7 +90,7 @@ WorldFile = Annotated[
 Namespaces = Annotated[
     str | None,
     typer.Option(
-        metavar="NAME,NAME...", help="Of the network experiment, as `lpac bench network` has them."
+        metavar="NAME,NAME...", help="For the network experiment, as in `lpac bench network`."
     ),
 ]
 Quick = Annotated[bool, typer.Option("--quick", help="A small version that takes minutes.")]
@@ -107,7 +106,9 @@ def e1(
     bundle: FlownBundle = None,
     worlds: Annotated[
         int | None,
-        typer.Option("--worlds", "-k", help=f"Of the validation set; {_E1_WORLDS} if not given."),
+        typer.Option(
+            "--worlds", "-k", help=f"How many of the validation set; {_E1_WORLDS} if not given."
+        ),
     ] = None,
     vehicle: Vehicle = VehicleKind.POINT,
     px4: Px4 = None,
@@ -276,8 +277,8 @@ def _beside_points(
     others = [name for name, record in trials.items() if _flown_by({name: record}) != own]
     if others:
         typer.echo(
-            f"note: {bundle} is not what flew {', '.join(others)}, so nothing says what baselines "
-            "would see: they are left out; give the bundle that flew with --bundle",
+            f"note: {bundle} is not what flew {', '.join(others)}, so what baselines would see "
+            "there is not known: they are left out; give the bundle that flew with --bundle",
             err=True,
         )
     named = {
@@ -329,7 +330,7 @@ def e3(
     bundle: FlownBundle = None,
     world: World = None,
     vehicle: Annotated[
-        VehicleKind, typer.Option(help="point; or whole robots, of which a pilot takes some.")
+        VehicleKind, typer.Option(help="point; or whole robots, some of which a pilot takes.")
     ] = VehicleKind.POINT,
     px4: Px4 = None,
     logs: Logs = None,
@@ -532,9 +533,9 @@ def asynchrony(
         typer.Option(
             "--worlds",
             "-k",
-            help=f"The first so many of the validation set; {_WORLDS[VehicleKind.POINT]} of points "
-            f"if not given, {_WORLDS[VehicleKind.SIMULATED]} of whole robots on a simulated clock, "
-            "1 in real time.",
+            help="How many of the validation set, from the first on; if not given, "
+            f"{_WORLDS[VehicleKind.POINT]} for points, {_WORLDS[VehicleKind.SIMULATED]} for whole "
+            "robots on a simulated clock, 1 in real time.",
         ),
     ] = None,
     vehicle: Vehicle = VehicleKind.POINT,
@@ -612,7 +613,7 @@ def _by_rates(trials: "Mapping[str, FlightRecord]") -> "tuple[list[TimingResult]
     for name, record in trials.items():
         if not is_comparable(record):
             why = (
-                "its robots' rates differ, or their logs do not tell"
+                "its robots' rates differ, or are not in their logs"
                 if record.rates is None
                 else f"it lasted {record.curve_time_s[-1]:.0f} s, less than {TIMES_S[-1]:g}"
             )
@@ -636,13 +637,15 @@ def transfer(
         typer.Option(
             "--worlds",
             "-k",
-            help="Of the validation set: 20, or 2 with --quick; of whole robots on a simulated "
-            "clock 4, or 1, and 1 in real time.",
+            help="How many of the validation set; if not given, 20 for points (2 with --quick), 4 "
+            "for whole robots on a simulated clock (1 with --quick), 1 in real time.",
         ),
     ] = None,
     set_ups: Annotated[
         list[str] | None,
-        typer.Option("--set-up", metavar="NAME", help="Only this one; may be repeated."),
+        typer.Option(
+            "--set-up", metavar="NAME", help="Only this one (docs/research.md); may be repeated."
+        ),
     ] = None,
     vehicle: Annotated[
         VehicleKind,
@@ -757,7 +760,7 @@ def network(
     as_json: AsJson = False,
     out: Out = None,
 ) -> None:
-    """Table I, and throughput over the number of robots: `lpac bench network`, as installed."""
+    """Table I, and throughput by number of robots: `lpac bench network` with what is installed."""
     from lpac.cli.bench import network as measure
     from lpac.network.middleware import MIDDLEWARES
     from lpac.paper.report import write_network
@@ -786,10 +789,10 @@ def everything(
     ray: Ray = None,
     out: Out = None,
 ) -> None:
-    """All of them, and one page: each claim of the paper beside what came of it here.
+    """All of them, and one page: each claim of the paper beside the result here.
 
-    Whole robots fly e1, e2 and e3, and points with --quick. What was made with the same bundle and
-    code is not made again.
+    Whole robots fly e1, e2 and e3, or points with --quick. Results that were made with the same
+    bundle and code are not made again.
     """
     from edge.policy.bundle import load_bundle
     from lpac.paper.files import MADE_FOR_ALL

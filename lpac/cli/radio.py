@@ -14,9 +14,9 @@ WifiFile = Annotated[
     typer.Option(
         "--wifi",
         metavar="FILE",
-        help="With --transport: what the model takes the Wi-Fi for. A .toml file with any of "
+        help="With --transport: what the model assumes of the Wi-Fi. A .toml file with any of "
         "data_rate_mbit_s, multicast_rate_mbit_s, frame_loss, queue_s, ground_wired; or a .jsonl "
-        "file of what a field's radio was like.",
+        "file of records of a field's radio (`lpac fleet radio --record`).",
     ),
 ]
 

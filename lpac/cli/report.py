@@ -38,7 +38,7 @@ def report(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
-    """Make figures and one HTML page of flight logs; of several trials, how they repeat."""
+    """Make figures and an HTML page from flight logs; and how well trials repeat."""
     from lpac.analysis.report import Wanted, examine
 
     wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
@@ -81,7 +81,7 @@ def _line(values: dict[str, object]) -> str:
     if cost["normalized"] is not None:
         words.append(f"cost {cost['normalized']:.2f} of the initial")
     if cost["normalized_lloyd"] is not None:
-        words.append(f"Lloyd, who knows the world, {cost['normalized_lloyd']:.2f}")
+        words.append(f"Lloyd's algorithm, knowing the world, {cost['normalized_lloyd']:.2f}")
     if isinstance(separation, dict):
         words.append(f"least distance {separation['distance_m']:.2f} m")
     if isinstance(values["messages"], dict) and values["messages"]["loss_share"] is not None:

@@ -98,7 +98,7 @@ def setup(
         str, typer.Option(help="Where PX4's MAVLink comes in.")
     ] = "udpin://127.0.0.1:14551",
     command_timeout: Annotated[
-        float, typer.Option(help="After so long a hung program lets its vehicle hold, s.")
+        float, typer.Option(help="Time after which a hung program's vehicle holds, s.")
     ] = 0.5,
     wait: Annotated[float, typer.Option(help="How long to listen for the vehicle, s.")] = 10.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,

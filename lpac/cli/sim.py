@@ -110,7 +110,7 @@ def sim(
     ] = None,
     features: Annotated[int, typer.Option(help="Features of a random world.")] = 10,
     duration: Annotated[
-        float, typer.Option(help="Flight time, s; with mavlink and px4 that of the mission.")
+        float, typer.Option(help="Flight time, s; of whole robots, the time of the mission.")
     ] = 60.0,
     scale: Annotated[
         Scale, typer.Option(help="field: 16 units per m, velocity x 0.25; model: 1 and 1.")
@@ -166,13 +166,13 @@ def sim(
         ),
     ] = None,
     payload: Annotated[
-        PayloadName, typer.Option(help="point: what messages carry.")
+        PayloadName, typer.Option(help="point: number type in messages.")
     ] = PayloadName.FLOAT16,
     loss: Annotated[
         float,
         typer.Option(
-            help="point, simulated: probability that a message is lost; of whole robots from the "
-            "mission's start on, as with --delay."
+            help="point, simulated: probability that a message is lost; for whole robots this, and "
+            "--delay, apply from the mission's start on."
         ),
     ] = 0.0,
     delay: Annotated[
@@ -183,7 +183,9 @@ def sim(
     ] = 0.8,
     errors: Annotated[
         bool,
-        typer.Option(help="mavlink: positions, heights, compasses and batteries err, gusts blow."),
+        typer.Option(
+            help="simulated, mavlink: positions, heights, compasses and batteries err, gusts blow."
+        ),
     ] = True,
     sensor: Annotated[
         str, typer.Option(help="Not point: the type of the robots' sensor.", metavar="TYPE")
@@ -191,8 +193,8 @@ def sim(
     recorded: Annotated[
         Path | None,
         typer.Option(
-            help="simulated: an earlier flight's --out, whose policies' steps are taken again: the "
-            "same flight on any type of CPU."
+            help="simulated: the --out of an earlier flight, whose policy steps are used again: "
+            "the same flight on any type of CPU."
         ),
     ] = None,
     px4: Px4 = None,
@@ -207,8 +209,8 @@ def sim(
         RadioTransport | None,
         typer.Option(
             help="point: the radio that such a team would have, by a model of one Wi-Fi channel; "
-            "mavlink, px4: whether robots say what they say to each other (mesh, if not given), to "
-            "a router, or to all at once."
+            "mavlink, px4: whether robots send their messages to each other (mesh, the default), "
+            "through a router, or to all at once."
         ),
     ] = None,
     wifi: WifiFile = None,
@@ -340,7 +342,7 @@ def sim(
         f"{_flier(controller, bundle)}, {count} robots, seed {seed}: {_result(flight, duration)}"
     )
     if transport:
-        typer.echo(f"{transport.value}: {link_line(*scenario.link)}; it takes the Wi-Fi for")
+        typer.echo(f"{transport.value}: {link_line(*scenario.link)}; it assumes")
         typer.echo("\n".join(wifi_lines(found)))
     if out:
         typer.echo(f"see {out / 'flight.png'}")

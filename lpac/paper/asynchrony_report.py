@@ -138,7 +138,7 @@ def _curve(
 
 def _text(flown: Flown, results: Sequence[TimingResult], how: str) -> str:
     dashed = (
-        " Full lines: each robot at its own moments; dashed: all at the same ones."
+        " Solid lines: each robot at its own moments; dashed: all robots in step."
         if _in_step(results)
         else ""
     )
@@ -164,7 +164,7 @@ trained at the rates of the field alone (perception 5 Hz, policy 2.5 Hz), flies 
 
 ![cost over the rates](rates.png)
 
-*Cost over the policy's rate, in terms of that with the field's rates and own moments: above 1 is
+*Cost over the policy's rate, relative to that at the field's rates and own moments: above 1 is
 worse.{dashed} Bars are 95 % intervals of the ratio of means, {intervals}.*
 """,
         f"""{table(headings, [_row(flown, result) for result in results])}
@@ -177,8 +177,8 @@ messages are compressed.
     ]
     if flown.world_set is not None:
         parts.append(
-            """Messages, images and actions count for two of their periods, or as long as in the
-field if that is longer; late messages so much longer as they are late.
+            """Messages, images and actions stay valid for two of their periods, or as long as in
+the field if that is longer; late messages stay valid for longer, by as much as they may be late.
 """
         )
     if _late(results):
@@ -187,7 +187,7 @@ field if that is longer; late messages so much longer as they are late.
             """![cost over the delay of messages](staleness.png)
 
 *The same policy at the rates of the field, with messages that are late: each by half to one and a
-half of the mean delay; in terms of the cost without.*
+half times the mean delay. The cost is relative to that without delay.*
 """,
         )
     return "\n".join(parts)

@@ -115,7 +115,7 @@ def _computation(effort: Effort) -> Claim:
         "Computation",
         "What a robot computes does not depend on the number of robots.",
         f"A step with a hundred others heard, all in range, takes at most {_AS_LONG:g} times as "
-        "long as one with two: fifty times as many may not cost more than as much again.",
+        "long as one with two: fifty times as many may at most double it.",
         f"Perception and policy, on one core of the machine that wrote this page, in turns: "
         f"{1e3 * effort.of_two_s:.2f} ms with two, {1e3 * effort.of_hundred_s:.2f} ms with a "
         f"hundred, {ratio:.2f} times as long. The networks compute the same in both; only drawing "
@@ -131,9 +131,9 @@ def _decentralised(e3: Json) -> Claim:
     return Claim(
         "Decentralised",
         "Each robot decides by what it senses and what its neighbours say.",
-        "Nobody else's messages reach a robot's policy. It is undecided if on average more than "
-        f"{100.0 * _NEARLY_ALL:.0f} % of the others are in range: that could not be told from "
-        "knowing all.",
+        "No other messages reach a robot's policy. It is undecided if on average more than "
+        f"{100.0 * _NEARLY_ALL:.0f} % of the others are in range: that would be hardly different "
+        "from knowing all.",
         f"In E3's flight a robot had {mean:.1f} of {others} others in range, on average. The "
         "program gives its policy no other messages; its log holds all that the policy is given, "
         "and `lpac replay` comes to the same decisions from that alone.",
@@ -220,10 +220,10 @@ def _e3(e3: Json) -> list[Claim]:
             "E3: robust to a robot's removal",
             "A pilot takes a robot away in steady state and brings it back; the others make up for "
             "it. No figure is given.",
-            f"Away the cost is at most {_AWAY:g} times that before, and {_BACK:g} times once the "
-            "robot is back.",
-            f"{len(away)} robots taken: at worst {worst:.2f} times the cost before, settled after "
-            f"{settled_s:.0f} s at most; {remains:.2f} times at most once it is back.",
+            f"While the robot is away the cost is at most {_AWAY:g} times that before, and once it "
+            f"is back {_BACK:g} times.",
+            f"{len(away)} robots were taken: at worst {worst:.2f} times the cost before, settled "
+            f"after {settled_s:.0f} s at most; {remains:.2f} times at most once it is back.",
             _agrees(worst <= _AWAY and remains <= _BACK),
         )
     ]
@@ -284,9 +284,9 @@ def _asynchrony(told: Json) -> list[Claim]:
             "Asynchronous modules",
             "Perception, exchange and control run each at a rate of its own, and no robot waits "
             "for another.",
-            "The 95 % interval excludes that robots at their own moments cost more than "
-            f"{100.0 * (_ASYNCHRONOUS - 1.0):.0f} % more than all at the same. It differs if they "
-            "do in all of it.",
+            "By the whole 95 % interval, robots at their own moments cost at most "
+            f"{100.0 * (_ASYNCHRONOUS - 1.0):.0f} % more than robots in step. It differs if by the "
+            "whole interval they cost more than that.",
             f"{count}. All at the same moments: {ends([together])}.",
             verdict,
         )
@@ -413,7 +413,7 @@ def _density() -> Claim:
     return Claim(
         "Densities of robots",
         "3.1e-5 robots per cell in training, 3.8e-4 in the field.",
-        "Robots over cells.",
+        "Robots divided by cells.",
         f"{trained.robots} / {trained.world_size}² = {densities[0]:.1e}, and {field.robots} / "
         f"{field.world_size}² = {densities[1]:.1e}: the second is a tenth of what is printed.",
         Agreement.MISTAKE,

@@ -67,8 +67,8 @@ CHAPTERS = (
     Chapter(
         "async", "Rates and asynchrony",
         {
-            "rates": "Cost over the policy's rate, in terms of that with the field's rates. Full "
-            "lines: each robot at its own moments; dashed: all at the same ones.",
+            "rates": "Cost over the policy's rate, relative to that at the field's rates. Solid "
+            "lines: each robot at its own moments; dashed: all robots in step.",
             "staleness": "At the field's rates, with messages that are late.",
         },
     ),
@@ -175,8 +175,8 @@ def _page(
 ) -> str:
     parts = [
         opening(TITLE),
-        f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and what came of it here. "
-        "Everything was simulated: no robot of this report has flown.</p>",
+        f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and the result here. "
+        "Everything was simulated: no real robot has flown.</p>",
         *map(_said, claims),
     ]
     for chapter in CHAPTERS:

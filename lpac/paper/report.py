@@ -18,8 +18,8 @@ from lpac.sim.fleet.layout import MAX_ROBOTS
 _LEAST_M, _MOST_M = experiments.GPS_ERROR_M
 # How it was flown, for the reports.
 _POINTS = (
-    "Points flew over worlds of the validation set, each at once with the velocity that its policy "
-    "decided: without takeoff and landing, heights and wind"
+    "Points flew over worlds of the validation set, each at the velocity that its policy decided, "
+    "at once: without takeoff, landing, heights and wind"
 )
 POINTS = (
     f"{_POINTS}, and with a GPS error, where there is one ({_LEAST_M:g} to {_MOST_M:g} m), that "
@@ -30,22 +30,22 @@ WHOLE = (
     "Whole robots flew over worlds of the validation set, from pads with room between them: their "
     "programs' loops and separation, on {vehicles}."
 )
-WHOLE_BESIDE_POINTS = f"{WHOLE} What they are held against are points from the same pads."
+WHOLE_BESIDE_POINTS = f"{WHOLE} They are compared with points from the same pads."
 WHOLE_IN_TRUTH = (
-    f"{WHOLE} Costs are of where the vehicles truly were, and messages, where they are, are late "
-    "from the mission's start on."
+    f"{WHOLE} Costs are those of the vehicles' true positions. Where messages are late, they are "
+    "late from the mission's start on."
 )
 WHOLE_TRANSFERRED = (
-    f"{WHOLE} They do so in set-ups of up to {MAX_ROBOTS} robots, beside points from the same pads "
-    "with the same receivers' errors, and points from anywhere without. Costs are of where they "
-    "truly were. Lloyd's algorithm has the same starts as whole robots."
+    f"{WHOLE} They did so in set-ups of up to {MAX_ROBOTS} robots, beside points from the same "
+    "pads with the same receivers' errors, and points from anywhere without errors. Costs are "
+    "those of true positions. Lloyd's algorithm has the same starts as whole robots."
 )
 TAKEN_POINTS = (
     f"{POINTS} A robot that is taken is gone: it says and hears nothing and does not count; it is "
     "back where it was, knowing nothing."
 )
 _PILOTED = (
-    "a robot counts as taken while a pilot has it, and counts for the cost where it is meanwhile."
+    "a robot counts as taken while a pilot has it; for the cost it still counts, at its place."
 )
 TAKEN_WHOLE = (
     "Whole robots flew over a world of the validation set: their programs' loops and separation, "
@@ -54,17 +54,17 @@ TAKEN_WHOLE = (
 )
 LOGS = "From the logs of flights."
 LOGS_BY_RATES = (
-    f"{LOGS} The missions of each rate are held against those with the field's; costs are of where "
-    "the robots took themselves to be."
+    f"{LOGS} The missions of each rate are compared with those at the field's; costs are those of "
+    "the robots' estimated positions."
 )
 LOGS_BESIDE_POINTS = (
-    f"{LOGS} What they are held against are points from where the robots were as the mission began."
+    f"{LOGS} They are compared with points from where the robots were when the mission began."
 )
 TAKEN_LOGS = f"From the log of a flight: {_PILOTED}"
 NETWORK = "No vehicles: programs that send what robots send, beside a stream, measured {where}."
 _COSTS = (
-    "Costs are over that at the start: of points where they are; of whole robots and logs where "
-    "they took themselves to be, and in truth where that is known."
+    "Costs are divided by that at the start: for points, of their true positions; for whole robots "
+    "and logs, of estimated positions, and of true ones where those are known."
 )
 
 
@@ -100,7 +100,7 @@ shows them at 0, 15, 30 and 60 s; it gives no costs. {flown}
 
 ![costs](costs.png)
 
-The cost at the end, in brackets in truth. {_COSTS}
+The cost at the end, and in brackets that of the true positions. {_COSTS}
 
 {table(["", *names], rows)}
 """
@@ -140,7 +140,7 @@ def write_repeatability(
 
 The paper flies one world three times, each robot placed within 10 cm of the same start, and shows
 the cost over {experiments.E2_DURATION_S:g} s from the takeoff command: the curves differ, the costs
-at the end are similar, and GPS (1 to 5 m) scatters where robots end. Here {len(trials)} trials.
+at the end are similar, and GPS (1 to 5 m) scatters where robots end. Here: {len(trials)} trials.
 {_looked_at_text(from_s)} {flown}
 
 ![repeatability](repeatability.png)
@@ -151,8 +151,8 @@ at the end are similar, and GPS (1 to 5 m) scatters where robots end. Here {len(
 
 Costs after {spread["end_s"]:.0f} s: mean {spread["final_mean"]:.3f}, standard deviation
 {spread["final_deviation"]:.3f}; before that the deviation is
-{spread["largest_deviation_in_flight"]:.3f} at most. A robot ends
-{spread["mean_scatter_of_ends_m"]:.2f} m from the mean of its ends, on average.
+{spread["largest_deviation_in_flight"]:.3f} at most. On average a robot ends
+{spread["mean_scatter_of_ends_m"]:.2f} m from the mean of its end positions.
 {" ".join(experiments.who_is_missing(spread))}
 """
     told = {
@@ -171,8 +171,8 @@ def _looked_at_text(from_s: Mapping[str, float]) -> str:
             "another; until the mission begins, those on their pads count where they stand."
         )
     return (
-        "Times count from the mission's start: points have no takeoff, and logs may not tell of "
-        f"it, or tell of one more than {experiments.E2_DURATION_S:g} s earlier."
+        "Times count from the mission's start: points have no takeoff, and logs may not have one, "
+        f"or one more than {experiments.E2_DURATION_S:g} s earlier."
     )
 
 
@@ -262,9 +262,9 @@ The paper flies a policy that was trained with 32 robots in 1024 x 1024 cells wi
 {picture}
 {table(["", *policies], rows)}
 
-Mean cost after {told["duration_s"]:.0f} s over that at the start, {worlds}, and in brackets what
-it is times that of Lloyd's algorithm that knows the world, with the 95 % interval where several
-flights tell one. A folder for each set-up has its curves.
+Mean cost after {told["duration_s"]:.0f} s over that at the start, {worlds}, and in brackets its
+ratio to that of Lloyd's algorithm with knowledge of the world, with the 95 % interval where there
+are enough flights for one. A folder for each set-up has its curves.
 """
     return write_experiment("transfer", told, rows_csv, text, folder, flown, made_by)
 
@@ -307,7 +307,7 @@ def write_network(
     )
     versions = ", ".join(f"{name} {version}" for name, version in measured_on["versions"].items())
     unmet = sum(not run["met"] for run in told["runs"])
-    not_met = f"Left out are {unmet}, before which robots had not all met. " if unmet else ""
+    not_met = f"Runs left out, before which not all robots had met: {unmet}. " if unmet else ""
     text = f"""# Network
 
 The paper measures what a stream gets while the programs of three robots restart (Table I), and how

@@ -144,7 +144,7 @@ The first validation world, and the worst:
         for worlds in data.worlds
     )
     begun = config.fit.begin_with
-    begins = f"It begins with the weights of `{begun}`." if begun else "Its weights were drawn."
+    begins = f"It began with `{begun}`'s weights." if begun else "It began with random weights."
     return f"""# {name}
 
 A policy of the family `{config.network.get("family", "lpac")}`, bundle `{card.bundle_id}`.
@@ -182,9 +182,9 @@ round {best.candidate.round}, epoch {best.candidate.epoch}. Cost at the end over
 {shown if CLAIRVOYANT in card.baselines else ""}
 ## Limits
 
-It was chosen by these worlds, so that they flatter it: `lpac evaluate {name}` on others tells how
-good it is. One training seed says nothing of a method. Point robots flew: nothing of this is
-measured on vehicles. Other numbers of robots, ranges and worlds than above are untried.
+It was chosen by these worlds, so they flatter it: `lpac evaluate {name}` on others shows how good
+it is. One training seed says nothing about a method. Point robots flew: none of this was measured
+on vehicles. Numbers of robots, ranges and worlds other than those above are untried.
 """
 
 

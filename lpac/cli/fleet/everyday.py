@@ -95,7 +95,7 @@ def _deployed_cells(value: _Deployed) -> tuple["str | Text", ...]:
 
 
 def rollback(fleet: Fleet = DEFAULT_FLEET, robots: Robots = None, as_json: AsJson = False) -> None:
-    """Run the release before the present one again. A robot in flight refuses."""
+    """Go back to the release before the present one. A robot in flight refuses."""
     from lpac.fleet.deploy import rollback as roll_back
 
     config, chosen = open_fleet(fleet, robots)
@@ -263,7 +263,7 @@ def logs(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     follow: Annotated[
-        bool, typer.Option("--follow", "-f", help="Also what is to come, until Ctrl-C.")
+        bool, typer.Option("--follow", "-f", help="Also new lines as they come, until Ctrl-C.")
     ] = False,
     lines: Annotated[
         int, typer.Option("--lines", "-n", min=0, help="How many of each robot's last lines.")

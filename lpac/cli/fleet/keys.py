@@ -49,7 +49,7 @@ def operator(
 ) -> None:
     """Make another laptop a ground station of the fleet: the folder OUT, for it alone.
 
-    Of a NAME that has a card already the former key is revoked.
+    If NAME already has a card, its former key is revoked.
     """
     from edge.identity.card import Role
     from lpac.fleet.authority import new_member
@@ -109,7 +109,7 @@ def revoke(
     name: Annotated[str, typer.Argument(help="A robot or a ground station of the fleet.")],
     fleet: Fleet = DEFAULT_FLEET,
     in_flight: Annotated[
-        bool, typer.Option("--in-flight", help="Also a robot in the air, or who commands.")
+        bool, typer.Option("--in-flight", help="Also if it is in the air, or commands.")
     ] = False,
 ) -> None:
     """Let nobody listen to NAME any more: its drone or laptop was lost.

@@ -34,7 +34,7 @@ def enroll(
     ] = None,
     fleet: Fleet = DEFAULT_FLEET,
     user: Annotated[
-        str | None, typer.Option(help="Who logs in: root, as by default, or who may use sudo.")
+        str | None, typer.Option(help="Who logs in: root (the default), or a user with sudo.")
     ] = None,
     port: Annotated[int | None, typer.Option(help="Its ssh port, if not ssh's own.")] = None,
     address: Annotated[
@@ -43,16 +43,17 @@ def enroll(
     ] = None,
     robot_id: Annotated[
         int | None,
-        typer.Option(help="Its id in the fleet; of a new robot the number in its name otherwise."),
+        typer.Option(help="Its id in the fleet; by default, if new, the number in its name."),
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Also if it is enrolled as another robot.")
+        bool, typer.Option("--yes", help="Even if it is enrolled as another robot.")
     ] = False,
 ) -> None:
     """Make a computer with a vehicle a robot of the fleet; may be repeated at any time.
 
-    Key, place in the fleet's file as a spare, id, card, voxl-vision-hub, whoever commanded the
-    vehicle before, the release, and PX4's parameters. ssh asks for the password, if it is needed.
+    It gets a key, a place in the fleet's file as a spare, an id and a card; voxl-vision-hub is set,
+    programs that commanded the vehicle before are stopped; then come the release and PX4's
+    parameters. ssh asks for the password, if it is needed.
     """
     from lpac.fleet.settings import load_fleet
 

@@ -39,7 +39,7 @@ def radio(
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     seconds: Annotated[
-        float, typer.Option(min=10.0, max=3600.0, help="How long is listened, s.")
+        float, typer.Option(min=10.0, max=3600.0, help="How long to listen, s.")
     ] = 20.0,
     load: Annotated[
         bool, typer.Option("--load", help="With a bulk stream from the first robot meanwhile.")

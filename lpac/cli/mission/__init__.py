@@ -33,13 +33,17 @@ _NUMBERS = {"ignore_unknown_options": True}
 # The state's origin, fence and world are the whole fleet's.
 WaitFor = Annotated[
     str | None,
-    typer.Option("--robots", help="Said to all; only these must take it up, such as r1,r3."),
+    typer.Option("--robots", help="Sent to all; only these must accept it, such as r1,r3."),
 ]
 Yes = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Until all have landed.")]
 Names = Annotated[
     list[str] | None, typer.Argument(metavar="[ROBOT...]", help="The robots; else all.")
 ]
+OnlyNames = Annotated[
+    list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
+]
+OnlyRobots = Annotated[str | None, typer.Option("--robots", help="The same, such as r1,r3.")]
 
 
 # Where
@@ -54,7 +58,7 @@ def origin(
         typer.Argument(metavar="HEADING_DEG", help="Of the y axis, from true north, [0, 360)."),
     ] = None,
     from_robot: Annotated[
-        str, typer.Option("--from", help="Where this robot stands, and its nose points.")
+        str, typer.Option("--from", help="Where this robot stands, and y where its nose points.")
     ] = "",
     toward: Annotated[
         str, typer.Option("--toward", help="The y axis points to this robot; with --from.")
@@ -267,10 +271,26 @@ def _of_robots(request: Callable[[Addressed], "Request"]) -> None:
     app.command(name, help=request.__doc__)(command)
 
 
+def _of_named_robots(request: Callable[[Addressed], "Request"]) -> None:
+    """The same for a command that is never meant for all."""
+    name = request.__name__
+
+    def command(
+        names: OnlyNames = None,
+        fleet: Fleet = DEFAULT_FLEET,
+        robots: OnlyRobots = None,
+        as_json: AsJson = False,
+    ) -> None:
+        to = _named(names, fleet, robots)
+        ask(to, request(to), name, as_json=as_json)
+
+    app.command(name, help=request.__doc__)(command)
+
+
 def _named(names: list[str] | None, fleet: Path, robots: str | None) -> Addressed:
     """Whom a command addresses that takes robots' names as well as --robots."""
     if names and robots is not None:
-        raise ValueError("give the robots' names, or --robots, not both")
+        raise ValueError("give the robots' names or --robots, not both")
     return address(fleet, ",".join(names) if names else robots)
 
 
@@ -284,7 +304,7 @@ def enable(to: Addressed) -> "Request":
 
 @_of_robots
 def disable(to: Addressed) -> "Request":
-    """Nothing is to fly: what is in the air holds."""
+    """Let the robots fly no more: those in the air hold."""
     from lpac.ground.station.protocol import Enable
 
     return Enable(False, to.robots)
@@ -328,7 +348,7 @@ def hold(to: Addressed) -> "Request":
 
 @_of_robots
 def resume(to: Addressed) -> "Request":
-    """Withdraw hold, return or land; who flew the mission flies it again."""
+    """Withdraw hold, return or land; robots that flew the mission fly it again."""
     from lpac.ground.station.protocol import Resume
 
     return Resume(to.robots)
@@ -369,13 +389,13 @@ def _bring_down(
 # One robot at a time
 
 
-@_of_robots
+@_of_named_robots
 def pilot(to: Addressed) -> "Request":
     """Hand robots to human pilots, by name: the program commands nothing until `rejoin`."""
     return _give("pilot", to)
 
 
-@_of_robots
+@_of_named_robots
 def rejoin(to: Addressed) -> "Request":
     """Take robots back from their pilots, by name: they hold; then `start`."""
     return _give("rejoin", to)
@@ -395,12 +415,10 @@ def disarm(to: Addressed) -> "Request":
 
 @app.command()
 def kill(
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="ROBOT...", help="The robots; never all.")
-    ] = None,
+    names: OnlyNames = None,
     yes: Yes = False,
     fleet: Fleet = DEFAULT_FLEET,
-    robots: Robots = None,
+    robots: OnlyRobots = None,
     as_json: AsJson = False,
 ) -> None:
     """Stop the motors at once, also in the air: THE ROBOTS FALL. Asks first."""
@@ -427,7 +445,7 @@ def _give(kind: Literal["pilot", "rejoin", "kill"], to: Addressed) -> "Request":
 @app.command()
 def again(
     trial: Annotated[
-        str, typer.Argument(metavar="[TRIAL]", help="Its name; else numbered on.")
+        str, typer.Argument(metavar="[TRIAL]", help="Its name; else the next number.")
     ] = "",
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,

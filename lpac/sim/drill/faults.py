@@ -373,7 +373,7 @@ _RADIO = (
     ),
     Fault(
         name="radio-late", what="all messages come 3 s late, 1.5 to 4.5 s",
-        promise="who has no word of the ground that is younger than 3 s holds; nobody lands",
+        promise="a robot that has no word from the ground younger than 3 s holds; none lands",
         does=_once(RadioIs(delay_s=3.0)), hits=0, watched_s=30.0,
         bounds=(NotLandedBefore(30.0, "all"), LandsAtPad(_AT_PAD_M, "all")),
     ),
@@ -438,7 +438,7 @@ _RADIO = (
     ),
     Fault(
         name="ground-dies-in-return", what="the operator's laptop is gone on the way home",
-        promise="who is on its way holds after 3 s, and lands after 13 s; who lands goes on",
+        promise="a robot on its way holds after 3 s, lands after 13 s; one that lands goes on",
         phase="return", does=_once(GroundDies()), hits=0, home=False, watched_s=30.0,
         bounds=(Lands(14.0, "all"), Down(14.0 + _LANDING_S, "all")),
     ),
@@ -796,7 +796,7 @@ _PEOPLE = (
         bounds=(KeepsAway(1.0), LandsAtPad(_AT_PAD_M, "next")),
     ),
     Fault(
-        name="start-outside", what="who holds finds itself beyond the fence; resume is ordered",
+        name="start-outside", what="a held robot is beyond the fence; resume is ordered",
         promise="start is refused outside: it is flown back first",
         does=(
             *_once(OperatorOrders("hold")), Do(4.0, EstimateJumpsOut(4.5)),

@@ -679,7 +679,7 @@ def test_the_command_prints_the_summary(tmp_path: Path, flown: Path) -> None:
     line, last = result.stdout.splitlines()
     assert re.fullmatch(
         r"t2: 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d, 3 robots, 12 s, "
-        r"cost \d\.\d\d of the initial, Lloyd, who knows the world, \d\.\d\d, "
+        r"cost \d\.\d\d of the initial, Lloyd's algorithm, knowing the world, \d\.\d\d, "
         r"least distance \d\.\d\d m, \d\.\d % of the messages lost", line
     )  # fmt: skip
     assert last == f"see {tmp_path / 'report.html'}"

@@ -280,4 +280,4 @@ def test_a_measured_network_gets_its_table_and_what_made_it(tmp_path: Path) -> N
     }  # fmt: skip
     text = (tmp_path / "README.md").read_text()
     assert "| robots | zenoh | 2 | 75.0 ± 0.5 |  |  |" in text and "(robots.png)" in text
-    assert "Left out are 1, before which robots had not all met." in text
+    assert "Runs left out, before which not all robots had met: 1." in text
