@@ -238,7 +238,8 @@ def _transfer(transfer: Json) -> list[Claim]:
             if result["name"] in over:
                 ratio = result["over_clairvoyant"]["ratio_of_means"][0]
                 over[result["name"]] = max(over[result["name"]], ratio)
-                ratios.append(f"{result['name']} {ratio:.2f}")
+                whose = f"{result['name']} " if len(policies) > 1 else ""
+                ratios.append(f"{whose}{ratio:.2f}")
         parts.append(f"{condition['name']}: {', '.join(ratios)}")
     best = min(over.values())
     return [

@@ -3,6 +3,7 @@
 import html
 import itertools
 import json
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -212,4 +213,5 @@ def _verdict(verdict: Agreement) -> str:
 
 
 def _text(text: str) -> str:
-    return html.escape(text)
+    """As HTML; what is between backticks is code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
