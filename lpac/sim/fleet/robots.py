@@ -192,6 +192,7 @@ class SimulatedRobots:
         fleet: str,
         ports: Sequence[int],
         epoch_s: float,
+        boots: int = 0,
         settings: Settings | None = None,
         spares: int = 0,
         vehicle_step_s: float = VEHICLE_STEP_S,
@@ -200,10 +201,10 @@ class SimulatedRobots:
     ) -> None:
         """`folder` gets fleet.toml, the world and each robot's robot.toml, which are then read.
 
-        `ports` are the robots' zenoh ports; the wall clock begins at `epoch_s`. See `Layout.write`
-        for `settings` and `spares`. With `logs` the robots write theirs in `folder`. `recorded` is
-        such a folder of an earlier flight, whose policies' steps are then taken. Raises what
-        `Layout` does, and RecordingError.
+        `ports` are the robots' zenoh ports; the wall clock begins at `epoch_s`, and programs are
+        numbered from `boots` on. See `Layout.write` for `settings` and `spares`. With `logs` the
+        robots write theirs in `folder`. `recorded` is such a folder of an earlier flight, whose
+        policies' steps are then taken. Raises what `Layout` does, and RecordingError.
         """
         for table in ("autopilot", "link"):
             if table in (settings or {}):
@@ -214,8 +215,7 @@ class SimulatedRobots:
         self.folder = folder
         self.fleet_toml = folder / "fleet.toml"
         self.schedule = Schedule(epoch_s)
-        # Programs of different flights are different to whoever reads their logs.
-        self._boots = int(epoch_s)
+        self._boots = boots
         self._vehicle_step_s = vehicle_step_s
         self._logs = logs
         self._recorded = recorded

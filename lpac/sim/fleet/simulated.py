@@ -76,6 +76,8 @@ class SimulatedFleet(SimulatedRobots):
             fleet="simulated",
             ports=range(_FIRST_PORT, _FIRST_PORT + scenario.robots),
             epoch_s=epoch_s,
+            # Programs of flights at other times are others to whoever reads their logs.
+            boots=int(epoch_s - EPOCH_S),
             settings=settings,
             spares=spares,
             vehicle_step_s=vehicle_step_s,

@@ -52,7 +52,7 @@ def test_trainings_that_differ_more_than_the_variants_tell_nothing(tmp_path: Pat
 def test_few_seeds_are_no_claim(tmp_path: Path) -> None:
     for seeds, text in (("[7]", "1 training seed: "), ("[0, 1]", "2 training seeds: ")):
         said = no_claim(read_ablation(written(tmp_path, ("[0, 4]", seeds))))
-        assert said is not None and said.startswith(f"{text}this says something of these pol")
+        assert said is not None and said.startswith(f"{text}this says something about these pol")
     assert no_claim(read_ablation(written(tmp_path, SEEDS))) is None
     one = read_ablation(written(tmp_path, ("[0, 4]", "[7]")))
     base, *_ = results(one, {"base": [20], "no-features": [40], "slow": [30]})
