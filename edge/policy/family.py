@@ -8,8 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from edge.core import F32, F64
-from edge.policy.bundle import Bundle, Manifest
+from edge.core.part import array_problem, in_one_line
+from edge.policy.bundle import Bundle, BundleError, Manifest
 
 # Float32 rounding stays a factor of six below it, on x86-64 and on AArch64.
 TOLERANCE = 1e-5
@@ -81,11 +84,29 @@ class Agent(Protocol):
 
         `payloads` are of (message_size,), float16 or float32, in the order of the robots' ids;
         `degree` is how many neighbours the robot has, heard this time or not. A velocity or a
-        payload that is not finite, or of another shape, stops the robot.
+        payload that is not finite, or of another shape or type, stops the robot.
         """
 
     def reset(self) -> None:
         """A new mission begins: what `step` remembers of the last one is forgotten."""
+
+
+def perceived_problem(perceived: object) -> str:
+    """Why what `Agent.observe` gave is not used; "" if nothing is wrong with it."""
+    if not isinstance(perceived, Perceived):
+        return f"observe gives a {type(perceived).__name__}: must be a Perceived"
+    if not isinstance(perceived.features, np.ndarray):
+        return f"features are a {type(perceived.features).__name__}: must be a numpy array"
+    return ""
+
+
+def step_problem(step: object, message_size: int) -> str:
+    """Why what `Agent.step` gave is not used; "" if nothing is wrong with it."""
+    if not isinstance(step, PolicyStep):
+        return f"step gives a {type(step).__name__}: must be a PolicyStep"
+    return array_problem("velocity", step.velocity, (2,)) or array_problem(
+        "payload", step.payload, (message_size,)
+    )
 
 
 class Policy(Protocol):
@@ -128,10 +149,20 @@ class VerifiedPolicy:
     problem: str | None
 
 
+def golden_checks(policy: Policy) -> Iterator[GoldenCheck]:
+    """What its `verify` finds. Raises BundleError, also for whatever else that raises."""
+    try:
+        yield from policy.verify()
+    except BundleError:
+        raise
+    except Exception as error:  # a family may be anybody's
+        raise BundleError(f"policy: verify: {in_one_line(error)}") from error
+
+
 def verified(policy: Policy) -> VerifiedPolicy:
     """Try it. Raises BundleError if it has nothing to be tried with that can be read."""
-    failed = [check.name for check in policy.verify() if not check.passed]
+    failed = [check.name for check in golden_checks(policy) if not check.passed]
     problem = None
     if failed:
-        problem = f"{', '.join(failed)} of the bundle do not compute torch's golden outputs here"
+        problem = f"{', '.join(failed)} of the bundle do not compute its golden outputs here"
     return VerifiedPolicy(policy, problem)

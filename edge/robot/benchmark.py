@@ -10,6 +10,7 @@ import numpy as np
 from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
 from edge.core.frames import ModelScale
+from edge.core.part import PartError
 from edge.core.ports import Odometry
 from edge.core.wire import encode
 from edge.policy.family import Policy
@@ -60,7 +61,7 @@ def benchmark(policy: Policy, neighbours: int, seconds: float) -> Benchmark:
 
     All `neighbours` are in range, and each has sent a message before each tick. What they send and
     what the robot sees is random, of the sizes that it has in flight. Raises BundleError if no
-    robot can fly the policy, ValueError for a number that cannot be.
+    robot can fly the policy, PartError if it fails, ValueError for a number that cannot be.
     """
     if not 0 <= neighbours <= _MOST_NEIGHBOURS:
         raise ValueError(f"neighbours = {neighbours}: must be from 0 to {_MOST_NEIGHBOURS}")
@@ -130,7 +131,8 @@ class _Flight:
         between_s = perf_counter()
         inferred = self._pac.infer(now_s)
         ended_s = perf_counter()
-        assert perceived is not None and inferred is not None
+        if perceived is None or inferred is None:
+            raise PartError(self._pac.problem)
         assert len(inferred.senders) == len(self._offsets)
         return between_s - began_s, ended_s - between_s
 

@@ -8,6 +8,7 @@ simulated time; both run this code.
 import math
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from edge.core.fleet_time import FleetClock
 from edge.core.frames import ModelScale
 from edge.core.mailbox import Mailbox
 from edge.core.memory import RobotMemory
+from edge.core.part import PartError, array_problem, in_one_line
 from edge.core.perception import clamp_to_world, neighbours_in_range
 from edge.core.ports import Camera, Odometry, OdometrySource, Sensor
 from edge.core.shared_map import SharedMap
@@ -36,7 +38,14 @@ from edge.flight.safety import limit_speed
 from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.beacon import BEACON_BYTES
 from edge.policy.bundle import BundleError
-from edge.policy.family import Observation, Perceived, Policy
+from edge.policy.family import (
+    Observation,
+    Perceived,
+    Policy,
+    PolicyStep,
+    perceived_problem,
+    step_problem,
+)
 
 Position = tuple[float, float, float]  # in the mission frame, m
 
@@ -153,7 +162,7 @@ class Pac:
         self._action: _Timed | None = None
         self.clock = FleetClock()
         self.mailbox = Mailbox(robot_id, parameters.max_message_age_s)
-        self._sensor_problem = self._policy_problem = ""
+        self._sensor_problem = self._observe_problem = self._step_problem = ""
         # Replaced whole when the ground sets another origin or another world, which it does while
         # nobody flies.
         self.frame_id = 0
@@ -195,7 +204,8 @@ class Pac:
     def perceive(self, now_s: float) -> Perceived | None:
         """Sensor view -> robot map -> features, as the policy makes them.
 
-        None when there is nothing to perceive: no position, or no valid view.
+        None when there is nothing to perceive: no position, no valid view, or no valid features.
+        Raises PartError if sensor or policy raise anything.
         """
         if self._forget_map:
             self._forget_map = False
@@ -223,9 +233,10 @@ class Pac:
         position = clamp_to_world(own, self._perception.world_size)
         velocity_m_s = np.array(odometry.velocity_m_s[:2], np.float64)
         velocity = self._parameters.scale.velocity_to_model(velocity_m_s)
-        perceived = self._agent.observe(
-            Observation(position, self._memory.local_map(position), heard[near], velocity)
-        )
+        local_map = self._memory.local_map(position)
+        perceived = self._observe(Observation(position, local_map, heard[near], velocity))
+        if perceived is None:
+            return None
         self._features = _Timed(perceived.features, now_s)
         return perceived
 
@@ -237,7 +248,8 @@ class Pac:
         """Neighbours' messages and x_i -> action and the message Y_i for the neighbours.
 
         None when there is nothing to send: no fresh features, no position, or a result that is
-        not finite. Then the action is left to grow old, and `control` stops the robot.
+        not as `PolicyStep` has it. Then the action is left to grow old, and `control` stops the
+        robot. Raises PartError if the policy raises anything, and leaves it likewise.
 
         `on_ground`: what is sent is as large as in flight, so that a radio can be tried there.
         """
@@ -252,16 +264,10 @@ class Pac:
         degree = max(int(self._in_range(own, heard).sum()), int(near.sum()))
         heeded = [message for message, is_near in zip(messages, near, strict=True) if is_near]
         payloads = tuple(message.payload for message in heeded)
-        if self._reset_agent:
-            self._reset_agent = False
-            self._agent.reset()
-        velocity, payload = self._agent.step(features.value, payloads, degree)
-        size = self._policy.message_size
-        self._policy_problem = _problem_of("velocity", velocity, (2,)) or _problem_of(
-            "payload", payload, (size,)
-        )
-        if self._policy_problem:
+        step = self._step(features.value, payloads, degree)
+        if step is None:
             return None
+        velocity, payload = step
         self._action = _Timed(velocity, now_s)
         self._sequence += 1
         told = self._told
@@ -304,8 +310,8 @@ class Pac:
     @property
     def problem(self) -> str:
         """What is wrong with what the sensor, or the policy, gave last; "" if nothing is."""
-        # Each belongs to another thread.
-        of_sensor, of_policy = self._sensor_problem, self._policy_problem
+        # They are set in the threads of perception and of the policy.
+        of_sensor, of_policy = self._sensor_problem, self._observe_problem or self._step_problem
         if of_sensor:
             return f"sensor: {of_sensor}"
         return f"policy: {of_policy}" if of_policy else ""
@@ -316,10 +322,8 @@ class Pac:
         For a robot that is only checked: nothing may perceive meanwhile.
         """
         (own,) = self._to_model([position_m])
-        try:
+        with suppress(PartError):
             self._look(own, position_m[2])
-        except Exception as error:  # a sensor may be anybody's
-            return f"{type(error).__name__}: {error}"
         return self._sensor_problem
 
     def action_age_s(self, now_s: float) -> float | None:
@@ -342,21 +346,53 @@ class Pac:
     def _look(self, own: F64, height_m: float) -> tuple[F32, Bools | None] | None:
         """What the sensor shows, and where it saw, if that is not everywhere; None without that."""
         shown: tuple[F32, Bools | None] | None
-        if isinstance(self.sensor, Camera):
-            shown = self.sensor.look(own, height_m * self._parameters.scale.env_scale)
-        else:
-            view = self.sensor.view(own)
-            shown = None if view is None else (view, None)
-        if shown is None:
+        try:
+            if isinstance(self.sensor, Camera):
+                shown = self.sensor.look(own, height_m * self._parameters.scale.env_scale)
+            else:
+                view = self.sensor.view(own)
+                shown = None if view is None else (view, None)
+            view, seen = (None, None) if shown is None else shown
+        except Exception as error:  # a sensor may be anybody's, as a policy may
+            self._sensor_problem = in_one_line(error)
+            raise self._raised("sensor", self._sensor_problem) from error
+        if view is None:
             self._sensor_problem = "it shows nothing"
             return None
-        view, seen = shown
         # One cell that is not finite would stay in the map.
-        problem = _problem_of("view", view, (self._perception.sensor_size,) * 2)
-        if seen is not None and (seen.shape != view.shape or seen.dtype != np.bool_):
-            problem = problem or f"seen is {seen.dtype} {seen.shape}: must be bool, as the view"
+        problem = array_problem("view", view, (self._perception.sensor_size,) * 2)
+        if seen is not None and not problem:
+            problem = array_problem("seen", seen, view.shape)
+            if not problem and seen.dtype != np.bool_:
+                problem = f"seen is of type {seen.dtype}: must be bool"
         self._sensor_problem = problem
-        return None if problem else shown
+        return None if problem else (view, seen)
+
+    def _observe(self, observation: Observation) -> Perceived | None:
+        """What the policy makes of it, if that can be used."""
+        try:
+            perceived = self._agent.observe(observation)
+        except Exception as error:
+            self._observe_problem = in_one_line(error)
+            raise self._raised("policy", self._observe_problem) from error
+        self._observe_problem = perceived_problem(perceived)
+        return None if self._observe_problem else perceived
+
+    def _step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep | None:
+        """What the policy decides, if that can be used."""
+        try:
+            if self._reset_agent:
+                self._reset_agent = False
+                self._agent.reset()
+            step = self._agent.step(features, payloads, degree)
+        except Exception as error:
+            self._step_problem = in_one_line(error)
+            raise self._raised("policy", self._step_problem) from error
+        self._step_problem = step_problem(step, self._policy.message_size)
+        return None if self._step_problem else step
+
+    def _raised(self, whose: str, what: str) -> PartError:
+        return PartError(f"robot {self._robot_id}: {whose}: {what}")
 
     def _in_range(self, own: F64, positions_m: Sequence[Position]) -> npt.NDArray[np.bool_]:
         """(n,): which of the positions are within communication range of `own`, in model units."""
@@ -371,10 +407,3 @@ class Pac:
 
     def _is_old(self, timed: _Timed, now_s: float) -> bool:
         return now_s - timed.time_s > self._parameters.max_input_age_s
-
-
-def _problem_of(name: str, values: F32, shape: tuple[int, ...]) -> str:
-    """Why it is not used; "" if it has that shape and is finite."""
-    if values.shape != shape:
-        return f"{name} has shape {values.shape}: must be {shape}"
-    return "" if np.isfinite(values).all() else f"{name} has values that are not finite"

@@ -1,4 +1,4 @@
-"""`lpac bundle`: look at a bundle, prove that this machine computes what torch did, measure it."""
+"""`lpac bundle`: look at a bundle, prove that it computes here what it should, measure it."""
 
 import dataclasses
 import json
@@ -74,14 +74,14 @@ def info(path: BundlePath, as_json: AsJson = False) -> None:
 
 @app.command()
 def verify(path: BundlePath, as_json: AsJson = False) -> None:
-    """Check every hash, then run every graph and a swarm against torch's golden outputs."""
+    """Check every hash, then compute the bundle's golden outputs again: of graphs and a swarm."""
     from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
-    from edge.policy.family import TOLERANCE
+    from edge.policy.family import TOLERANCE, golden_checks
 
     bundle = load_bundle(path)
     checks = []
-    for check in load_policy(bundle).verify():
+    for check in golden_checks(load_policy(bundle)):
         checks.append(check)
         if not as_json:
             verdict = "ok" if check.passed else "FAILED"
@@ -99,7 +99,7 @@ def verify(path: BundlePath, as_json: AsJson = False) -> None:
         typer.echo(f"{name}: {found}")
     if failed:
         raise ValueError(
-            f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of torch's golden outputs"
+            f"{path}: {', '.join(failed)}: not within {TOLERANCE:g} of the golden outputs"
         )
 
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE, Ray, pool
+from lpac.cli.options import DEFAULT_BUNDLE, DEFAULT_SENSOR, Ray, Sensor, pool
 from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
 
 if TYPE_CHECKING:
     from lpac.sim.drill.campaign import Campaign, FlightOutcome, Flown
     from lpac.sim.drill.faults import Fault
+    from lpac.sim.drill.field import DrilledRobots
     from lpac.sim.drill.real_time import RealTimeDrill
 
 app = new_app()
@@ -62,6 +63,7 @@ def drill(
     ] = None,
     robots: Annotated[int, typer.Option("--robots", "-n", help="Number of robots.")] = 4,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
+    sensor: Sensor = DEFAULT_SENSOR,
     ray: Ray = None,
     listing: Annotated[
         bool, typer.Option("--list", help="Only say which faults there are.")
@@ -77,6 +79,7 @@ def drill(
 ) -> None:
     """Inject faults into a fleet in flight, and judge by true positions what was promised."""
     from lpac.sim.drill.campaign import Campaign, fly_order
+    from lpac.sim.drill.field import DrilledRobots
     from lpac.sim.drill.report import as_json as to_json
     from lpac.sim.drill.report import as_junit
 
@@ -90,14 +93,15 @@ def drill(
     chosen = _flown(chosen, vehicle, by_name=bool(faults))
     if out is None:
         out = _OUT if vehicle is DrillVehicle.SIMULATED else Path(f"{_OUT}-{vehicle}")
-    real_time = _real_time(vehicle, px4, ray, out, robots, bundle)
-    options = _options(vehicle, px4, robots, bundle)
+    drilled = DrilledRobots(robots, str(bundle.resolve()), sensor)
+    real_time = _real_time(vehicle, px4, ray, out, drilled)
+    options = _options(vehicle, px4, robots, bundle, sensor)
     if seed is not None and len(chosen) == 1 and real_time is None:
-        outcomes = [_fly_again(chosen[0], seed, robots, bundle, out / f"{chosen[0].name}-{seed}")]
+        outcomes = [_fly_again(chosen[0], seed, drilled, out / f"{chosen[0].name}-{seed}")]
     elif seed is not None and len(chosen) == 1 and real_time is not None:
         outcomes = [real_time.outcome(chosen[0], seed)]
     else:
-        campaign = Campaign(out, vehicle, robots, bundle, px4)
+        campaign = Campaign(out, vehicle, drilled, px4)
         flown = partial(pool(ray), fly_order) if real_time is None else real_time.fly_all
         outcomes = _fly(campaign, chosen, numbers, flown)
     if seed is not None and len(chosen) == 1:
@@ -169,8 +173,7 @@ def _real_time(
     px4: Path | None,
     ray: str | None,
     out: Path,
-    robots: int,
-    bundle: Path,
+    drilled: "DrilledRobots",
 ) -> "RealTimeDrill | None":
     """None on the simulated clock."""
     if px4 is not None and vehicle is not DrillVehicle.PX4:
@@ -187,14 +190,18 @@ def _real_time(
     log.listen(log.show_errors)
     # Whoever ends this command ends its programs, too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return RealTimeDrill(out, robots, bundle, px4)
+    return RealTimeDrill(out, drilled, px4)
 
 
-def _options(vehicle: DrillVehicle, px4: Path | None, robots: int, bundle: Path) -> str:
+def _options(
+    vehicle: DrillVehicle, px4: Path | None, robots: int, bundle: Path, sensor: str
+) -> str:
     """Those with which the same is flown again."""
     options = f"-n {robots}"
     if bundle != DEFAULT_BUNDLE:
         options += f" --bundle {bundle}"
+    if sensor != DEFAULT_SENSOR:
+        options += f" --sensor {sensor}"
     if vehicle is not DrillVehicle.SIMULATED:
         options += f" --vehicle {vehicle}"
     return options if px4 is None else f"{options} --px4 {px4}"
@@ -220,7 +227,7 @@ def _fly(
 
 
 def _fly_again(
-    fault: "Fault", seed: int, robots: int, bundle: Path, folder: Path
+    fault: "Fault", seed: int, drilled: "DrilledRobots", folder: Path
 ) -> "FlightOutcome":
     """The same flight once more, with the robots' logs and a figure."""
     from edge.core import log
@@ -234,7 +241,7 @@ def _fly_again(
     folder.mkdir(parents=True, exist_ok=True)
 
     def flown() -> FlightTruth:
-        truth = SimulatedDrill(robots, bundle).fly(fault, seed, logs=folder)
+        truth = SimulatedDrill(drilled).fly(fault, seed, logs=folder)
         write_figure(fault, truth, folder)
         write_truth(tracks_of(truth), folder / TRUTH)
         return truth

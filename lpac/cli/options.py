@@ -26,12 +26,16 @@ Px4 = Annotated[
     Path | None,
     typer.Option(help="px4: PX4's build folder, made by `make px4_sitl`."),
 ]
+Sensor = Annotated[
+    str, typer.Option(help="Whole robots: the type of their sensor.", metavar="TYPE")
+]
 Ray = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Fly on a Ray cluster, such as auto or HOST:6379."),
 ]
 DEFAULT_FLEET = Path("fleet.toml")
 DEFAULT_BUNDLE = SHIPPED_BUNDLE
+DEFAULT_SENSOR = "world"
 # The name of a lock has some hundred bytes.
 _LOCK_BYTES = 80
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE, Px4, VehicleKind, check_px4
+from lpac.cli.options import DEFAULT_BUNDLE, DEFAULT_SENSOR, Px4, Sensor, VehicleKind, check_px4
 from lpac.cli.radio import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
@@ -187,9 +187,7 @@ def sim(
             help="simulated, mavlink: positions, heights, compasses and batteries err, gusts blow."
         ),
     ] = True,
-    sensor: Annotated[
-        str, typer.Option(help="Not point: the type of the robots' sensor.", metavar="TYPE")
-    ] = "world",
+    sensor: Sensor = DEFAULT_SENSOR,
     recorded: Annotated[
         Path | None,
         typer.Option(
@@ -467,11 +465,11 @@ def _fly_on_clock(
     from lpac.sim.radio import Air
 
     air = Air(loss=loss, delay_s=max(delay_s, Air().delay_s)) if loss or delay_s else None
-    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (_, say):
+    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere:
         folder = out or Path(nowhere)
         flight = fly_simulated(
-            scenario, folder, bundle_in(folder / _OWN_BUNDLE), say, logs=out is not None,
-            recorded=recorded, settings=settings, air=air,
+            scenario, folder, bundle_in(folder / _OWN_BUNDLE), partial(typer.echo, err=True),
+            logs=out is not None, recorded=recorded, settings=settings, air=air,
         )  # fmt: skip
     _show_fleet_flight(flight, as_json, out)
 
@@ -624,10 +622,16 @@ def fly_points(
     from rich.console import Console
     from rich.progress import Progress
 
+    from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
+    from edge.policy.family import verified
     from lpac.sim.experiment import fly
 
     bundle = load_bundle(bundle_path)
+    if any(scenario.controller == Controller.LPAC.value for _, scenario in scenarios):
+        problem = verified(load_policy(bundle)).problem
+        if problem:
+            typer.echo(f"warning: {bundle_path}: {problem}: no robot takes off with it", err=True)
     gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
     flights = []
     console = Console(stderr=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from edge.core import F32, F64, Bools
 from edge.core.mailbox import Mailbox
+from edge.core.part import PartError
 from edge.core.ports import OdometrySource
 from edge.core.wire import Rejection
 from edge.drivers.world_sensor import WorldSensor
@@ -203,11 +204,11 @@ class ClockedPac(Pac):
     largest_payload = 0.0
 
     def infer(self, now_s: float, *, on_ground: bool = False) -> PolicyTick | None:
-        """See `Pac.infer`."""
+        """See `Pac.infer`. Raises PartError for whatever policy and sensor do wrong."""
         self._tell_time(now_s)
         tick = super().infer(now_s, on_ground=on_ground)
         if self.problem:
-            raise ValueError(f"robot {self._robot_id}: {self.problem}")
+            raise PartError(f"robot {self._robot_id}: {self.problem}")
         for payload in tick.payloads if tick else ():
             self.largest_payload = max(
                 self.largest_payload, float(np.abs(payload).max(initial=0.0))

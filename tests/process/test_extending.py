@@ -36,6 +36,19 @@ flights = zip(fly_batch(scenarios, bundle), scenarios)
 print(json.dumps([(a.positions_m == fly(b, bundle).positions_m).all().item() for a, b in flights]))
 """
 
+# `lpac` with an agent whose step does not work.
+BROKEN = """
+import lpac_lloyd.policy as policy
+from lpac.cli.main import main
+
+def step(self, features, payloads, degree):
+    return features[2]
+
+policy.LloydAgent.step = step
+if __name__ == "__main__":
+    main()
+"""
+
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -132,3 +145,24 @@ def test_what_is_not_installed_is_named(installed: Path, arguments: str, text: s
     refused = run(installed, "lpac", "sim", "--vehicle", "simulated", *shlex.split(arguments))
     assert refused.returncode == 1
     assert text in refused.stderr and "Traceback" not in refused.stderr
+
+
+@pytest.mark.usefixtures("bundle")
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "sim --bundle lloyd -n 2 --duration 5",
+        "sim --bundle lloyd -n 2 --duration 5 --vehicle simulated",
+        "evaluate lloyd --worlds 1 --set-up n3 --duration 5",
+        "bundle benchmark lloyd --seconds 0.1",
+        "drill --bundle lloyd -n 2 --fault none --seed 0",
+    ],
+)
+def test_what_an_agent_raises_is_one_line(installed: Path, arguments: str) -> None:
+    (installed / "site" / "broken.py").write_text(BROKEN)
+    refused = run(installed, "python", "broken.py", *shlex.split(arguments))
+    assert refused.returncode == 1
+    text = "policy: IndexError: index 2 is out of bounds for axis 0 with size 2 (site/broken.py, "
+    assert text in refused.stderr + refused.stdout and "Traceback" not in refused.stderr
+    if arguments.startswith("sim"):
+        assert refused.stderr.splitlines()[-1].startswith("lpac: robot ")

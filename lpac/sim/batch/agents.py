@@ -8,10 +8,11 @@ import numpy as np
 
 from edge.core import F32
 from edge.core.aggregation import HopBuffer
+from edge.core.part import in_one_line
 from edge.core.perception import PerceptionParameters
 from edge.drivers.registry import load_policy
 from edge.policy.bundle import Bundle
-from edge.policy.family import Observation, Perceived
+from edge.policy.family import Observation, perceived_problem, step_problem
 from edge.policy.lpac.images import PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 
@@ -19,6 +20,13 @@ from edge.policy.lpac.policy import LpacPolicy, position_feature
 _CNN_BATCH = 8
 
 Inputs = Mapping[str, F32]
+
+
+class PolicyFailedError(ArithmeticError):
+    """A policy raised an error, or computed what robots refuse.
+
+    The exact simulator shows what they do then.
+    """
 
 
 class PolicySteps(NamedTuple):
@@ -139,7 +147,12 @@ class SingleAgents:
 
     def inputs(self, robot: int, observation: Observation) -> Inputs:
         """What the agent says that it computed from, and the features that it computed."""
-        perceived: Perceived = self._agents[robot].observe(observation)
+        try:
+            perceived = self._agents[robot].observe(observation)
+        except Exception as error:
+            raise _failed(in_one_line(error)) from error
+        if problem := perceived_problem(perceived):
+            raise _failed(problem)
         return {**perceived.inputs, "features": perceived.features}
 
     def features(self, robots: Sequence[int], inputs: Sequence[Inputs]) -> list[F32]:
@@ -154,10 +167,15 @@ class SingleAgents:
         degrees: Sequence[int],
     ) -> PolicySteps:
         """See `Agents`."""
-        steps = [
-            self._agents[robot].step(seen, heard, degree)
-            for robot, seen, heard, degree in zip(robots, features, payloads, degrees, strict=True)
-        ]
+        steps = []
+        for robot, seen, heard, degree in zip(robots, features, payloads, degrees, strict=True):
+            try:
+                step = self._agents[robot].step(seen, heard, degree)
+            except Exception as error:
+                raise _failed(in_one_line(error)) from error
+            if problem := step_problem(step, self.message_size):
+                raise _failed(problem)
+            steps.append(step)
         return PolicySteps(
             np.stack([step.velocity for step in steps]), np.stack([step.payload for step in steps])
         )
@@ -165,6 +183,10 @@ class SingleAgents:
     def reset(self, robot: int) -> None:
         """See `Agents`."""
         self._agents[robot] = self._policies[robot].agent()
+
+
+def _failed(problem: str) -> PolicyFailedError:
+    return PolicyFailedError(f"policy: {problem}")
 
 
 def make_agents(bundle: Bundle, perceptions: Sequence[PerceptionParameters]) -> Agents:

@@ -24,7 +24,7 @@ from edge.core.wire import PayloadType, rounded
 from edge.flight.safety import limit_speed
 from edge.policy.family import Observation
 from edge.robot.pac import PacParameters
-from lpac.sim.batch.agents import Agents, Inputs
+from lpac.sim.batch.agents import Agents, Inputs, PolicyFailedError
 from lpac.sim.batch.seen import SeenMap, ShownWorld
 
 
@@ -41,10 +41,6 @@ def _age_error_s() -> float:
 _AGE_ERROR_S = _age_error_s()
 # The number of steps whose features are computed together while the flight goes on.
 _AHEAD = 8
-
-
-class PolicyFailedError(ArithmeticError):
-    """A policy computed what robots refuse: the exact simulator shows what they do then."""
 
 
 @dataclass(slots=True, eq=False)

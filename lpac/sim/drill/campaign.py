@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import edge
 import lpac
 from edge.core import log
+from edge.core.part import PartError
 from edge.policy.bundle import load_bundle
 from lpac.sim.drill.bounds import Figure, judge
 from lpac.sim.drill.faults import FAULTS, Fault
+from lpac.sim.drill.field import DrilledRobots
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.drill.truth import FlightTruth
 from lpac.sim.kept import KeptOutcomes, code_digest
@@ -33,8 +35,7 @@ class FlightTask(NamedTuple):
 
     fault: str
     seed: int
-    robots: int
-    bundle: str
+    drilled: DrilledRobots
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +74,8 @@ def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> Fli
     try:
         truth = flown()
         figures = judge(fault.judged_by, truth)
+    except PartError as error:
+        return FlightOutcome(fault.name, seed, (), str(error))
     except Exception as error:
         return FlightOutcome(fault.name, seed, (), f"{type(error).__name__}: {error}")
     unjudged = ""
@@ -84,27 +87,27 @@ def outcome_of(fault: Fault, seed: int, flown: Callable[[], FlightTruth]) -> Fli
 
 def fly_order(order: FlightTask) -> FlightOutcome:
     """One flight on the simulated clock, in whatever process this is."""
-    fault, drill = FAULTS[order.fault], _drill(order.robots, order.bundle)
+    fault, drill = FAULTS[order.fault], _drill(order.drilled)
     return outcome_of(fault, order.seed, lambda: drill.fly(fault, order.seed))
 
 
 @cache
-def _drill(robots: int, bundle: str) -> SimulatedDrill:
+def _drill(drilled: DrilledRobots) -> SimulatedDrill:
     # Thousands of flights say more than anybody reads.
     log.listen(log.show_errors)
-    return SimulatedDrill(robots, Path(bundle))
+    return SimulatedDrill(drilled)
 
 
 class Campaign:
     """The flights of one set-up, whose outcomes are in `folder`."""
 
     def __init__(
-        self, folder: Path, vehicle: str, robots: int, bundle: Path, px4_build: Path | None = None
+        self, folder: Path, vehicle: str, drilled: DrilledRobots, px4_build: Path | None = None
     ) -> None:
         """Raises BundleError, OSError."""
-        self._robots, self._bundle = robots, str(bundle.resolve())
+        self._drilled = drilled
         flown_by = {
-            "vehicle": vehicle, "robots": robots, "bundle": load_bundle(bundle).id,
+            "vehicle": vehicle, **asdict(drilled), "bundle": load_bundle(drilled.bundle).id,
             "code": code_digest(edge, lpac), "px4": px4_build and build_digest(px4_build),
         }  # fmt: skip
         self._kept = KeptOutcomes(folder / _FLIGHTS, flown_by)
@@ -125,7 +128,7 @@ class Campaign:
         kept = [key for fault, seed in wanted if (key := (fault.name, seed)) in self.outcomes]
         yield from (self.outcomes[key] for key in kept)
         orders = [
-            FlightTask(fault.name, seed, self._robots, self._bundle)
+            FlightTask(fault.name, seed, self._drilled)
             for fault, seed in wanted
             if (fault.name, seed) not in self.outcomes
         ]

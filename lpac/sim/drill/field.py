@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -25,7 +25,7 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.flight import Timeline
 from lpac.sim.drill.injections import Do, FenceWithout, Injection, OperatorOrders, OrderedKind
 from lpac.sim.drill.truth import FlightTruth, GivenOrder, VehicleTruth
-from lpac.sim.fleet.layout import FleetScenario, Layout
+from lpac.sim.fleet.layout import WORLD_SENSOR, FleetScenario, Layout
 
 # Receivers with corrections, whose estimates still wander by 0.15 m along each axis, and heights
 # that hardly walk.
@@ -172,11 +172,20 @@ class FaultyFleet(ABC):
         return tuple(numbers[name] for name in names or numbers)
 
 
-def scenario_of(fault: Fault, seed: int, robots: int) -> FleetScenario:
+@dataclass(frozen=True, slots=True)
+class DrilledRobots:
+    """Who flies in a drill: how many, with the bundle at what path, and what type of sensor."""
+
+    robots: int
+    bundle: str
+    sensor: str = WORLD_SENSOR
+
+
+def scenario_of(fault: Fault, seed: int, drilled: DrilledRobots) -> FleetScenario:
     """The fleet that flies it: members with keys, on vehicles that err, unless they are exact."""
     return FleetScenario(
-        robots=robots, seed=seed, secure=True, errors=not fault.exact,
-        budget=EXACT if fault.exact else ERRORS,
+        robots=drilled.robots, seed=seed, secure=True, errors=not fault.exact,
+        budget=EXACT if fault.exact else ERRORS, sensor=drilled.sensor,
     )  # fmt: skip
 
 

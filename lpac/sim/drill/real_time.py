@@ -11,7 +11,7 @@ from lpac.analysis.truth import TRUTH, write_truth
 from lpac.sim.cores import over_processes
 from lpac.sim.drill.campaign import LATE_S, FlightOutcome, FlightTask, outcome_of
 from lpac.sim.drill.faults import FAULTS, Fault
-from lpac.sim.drill.field import has_remote_control, scenario_of, settings_of
+from lpac.sim.drill.field import DrilledRobots, has_remote_control, scenario_of, settings_of
 from lpac.sim.drill.figure import write_figure
 from lpac.sim.drill.processes import process_field
 from lpac.sim.drill.truth import FlightTruth, tracks_of
@@ -31,14 +31,11 @@ class RealTimeDrill:
     Each flight leaves its logs, and a figure, in a folder of `folder`.
     """
 
-    def __init__(
-        self, folder: Path, robots: int, bundle: Path, px4_build: Path | None = None
-    ) -> None:
+    def __init__(self, folder: Path, drilled: DrilledRobots, px4_build: Path | None = None) -> None:
         """With `px4_build` on real PX4s of that build. Raises ValueError if it is none."""
         if px4_build is not None:
             px4_build = require_build(px4_build)
-        self._folder, self._robots, self._bundle = folder, robots, bundle
-        self._px4_build = px4_build
+        self._folder, self._drilled, self._px4_build = folder, drilled, px4_build
 
     def outcome(self, fault: Fault, seed: int) -> FlightOutcome:
         """Fly and judge; again if it broke a promise while this machine was late.
@@ -61,7 +58,7 @@ class RealTimeDrill:
         at_once = 1
         # PX4's ports are the same for all fleets.
         if self._px4_build is None:
-            at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * self._robots))
+            at_once = int(len(os.sched_getaffinity(0)) / (_CORES_EACH * self._drilled.robots))
         return over_processes(self.fly_task, tasks, max(1, at_once))
 
     def fly_task(self, task: FlightTask) -> FlightOutcome:
@@ -77,7 +74,7 @@ class RealTimeDrill:
     def _fly(self, fault: Fault, seed: int, folder: Path) -> FlightTruth:
         shutil.rmtree(folder, ignore_errors=True)
         fleet = Fleet(
-            scenario_of(fault, seed, self._robots), folder, self._bundle,
+            scenario_of(fault, seed, self._drilled), folder, Path(self._drilled.bundle),
             px4_build=self._px4_build, settings=settings_of(fault),
         )  # fmt: skip
         with (

@@ -14,7 +14,13 @@ from edge.core import F64
 from lpac.ground.procedure import NothingComesError, Procedure
 from lpac.ground.station.protocol import Request, SafetyCommand, TakeCommand
 from lpac.sim.drill.faults import Fault
-from lpac.sim.drill.field import FaultyFleet, has_remote_control, scenario_of, settings_of
+from lpac.sim.drill.field import (
+    DrilledRobots,
+    FaultyFleet,
+    has_remote_control,
+    scenario_of,
+    settings_of,
+)
 from lpac.sim.drill.flight import fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
     AutopilotSilent,
@@ -43,7 +49,7 @@ from lpac.sim.drill.injections import (
     WatchdogDies,
 )
 from lpac.sim.drill.truth import FlightTruth, VehicleTruth, vehicle_truth
-from lpac.sim.fleet.layout import WORLD
+from lpac.sim.fleet.layout import WORLD, WORLD_SENSOR
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.direct import DirectVehicle
 from lpac.sim.px4.vehicle import Px4Vehicle
@@ -238,25 +244,28 @@ class _Bases(NamedTuple):
 class SimulatedDrill:
     """Flies faults on the simulated clock, one by one; flights of one seed share their begin.
 
-    A flight follows from fault, seed, number of robots and bundle, whatever was flown before.
+    A flight follows from fault, seed and robots, whatever was flown before. Sensors of other types
+    than the built-in one may have a device, or a state: their flights share nothing.
     """
 
-    def __init__(self, robots: int, bundle: Path) -> None:
-        self._robots = robots
-        self._bundle = bundle
+    def __init__(self, drilled: DrilledRobots) -> None:
+        self._drilled = drilled
         self._key: object = None
         self._bases: _Bases | None = None
 
     def fly(self, fault: Fault, seed: int, logs: Path | None = None) -> FlightTruth:
         """One flight. With `logs` the robots write theirs in that folder."""
-        if logs is not None:
-            field = self._ready(fault, seed, logs, logged=True)
-            if fault.phase in ("mission", "return"):
-                field.carry_out(to_mission(field))
-        else:
+        on_ground = fault.phase in ("ready", "takeoff")
+        if logs is None and self._drilled.sensor == WORLD_SENSOR:
             bases = self._of(fault, seed)
-            field = (bases.ready if fault.phase in ("ready", "takeoff") else bases.mission).copy()
-        timeline = field.carry_out(fly(field, fault, seed, self._robots))
+            field = (bases.ready if on_ground else bases.mission).copy()
+        else:
+            with tempfile.TemporaryDirectory() as nowhere:
+                folder = Path(nowhere) if logs is None else logs
+                field = self._ready(fault, seed, folder, logged=logs is not None)
+            if not on_ground:
+                field.carry_out(to_mission(field))
+        timeline = field.carry_out(fly(field, fault, seed, self._drilled.robots))
         field.fleet.close()
         return field.truth(timeline)
 
@@ -273,10 +282,8 @@ class SimulatedDrill:
     def _ready(
         self, fault: Fault, seed: int, folder: Path, *, logged: bool = False
     ) -> SimulatedField:
-        scenario = scenario_of(fault, seed, self._robots)
-        fleet = SimulatedFleet(
-            scenario, folder, self._bundle, settings=settings_of(fault), logs=logged
-        )
+        scenario, bundle = scenario_of(fault, seed, self._drilled), Path(self._drilled.bundle)
+        fleet = SimulatedFleet(scenario, folder, bundle, settings=settings_of(fault), logs=logged)
         if has_remote_control(fault):
             for each in fleet.vehicles:
                 each.vehicle.rc_connected = True

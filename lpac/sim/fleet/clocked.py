@@ -41,15 +41,16 @@ def fly_simulated(
     """Prepare a fleet in `folder`, fly a mission of `scenario.duration_s`, and land.
 
     Robots fly the bundle at the path `bundle`, which stays where it is; `say` is told each step of
-    the script. With `logs` the robots write theirs below `folder`, in robots/ID/logs; `recorded` is
-    the folder of such a flight, whose policies' steps are taken again. `pilots` take robots out of
-    the field, and bring them back. `settings` are further keys of robot.toml's tables, for all
-    robots, and `air` is what becomes of messages from the mission's start on. Times, positions and
-    costs are in the record; `problem` says what kept the script from its end. Of what robots say
-    meanwhile only errors go to whoever listens to `edge.core.log`.
+    the script, and when it begins on the simulated clock. With `logs` the robots write theirs below
+    `folder`, in robots/ID/logs; `recorded` is the folder of such a flight, whose policies' steps
+    are taken again. `pilots` take robots out of the field, and bring them back. `settings` are
+    further keys of robot.toml's tables, for all robots, and `air` is what becomes of messages from
+    the mission's start on. Times, positions and costs are in the record; `problem` says what kept
+    the script from its end. Of what robots say meanwhile only errors go to whoever listens to
+    `edge.core.log`.
 
     Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
-    written, and RecordingError.
+    written, RecordingError, and PartError if a policy or a sensor raises anything.
     """
 
     def hand_on_errors(line: log.Line) -> None:
@@ -95,8 +96,11 @@ def _fly(
     for each in fleet.vehicles:
         each.vehicle.rc_connected = bool(pilots)
 
+    def say_when(text: str) -> None:
+        say(f"{ground.now_s:6.1f} s  {text}")
+
     def begin(step: str) -> None:
-        say(step)
+        say_when(step)
         if step == "mission":
             fleet.radio.air = air or fleet.radio.air
             for flown in pilots:
@@ -110,7 +114,7 @@ def _fly(
     flight = ScriptedFlight(
         ground, folder / "fleet.toml", scenario.duration_s,
         perturb=tuple(each for flown in pilots for each in flown.perturbations),
-        on_step=begin, say=say,
+        on_step=begin, say=say_when,
     )  # fmt: skip
     notes = _Notes(fleet)
     try:

@@ -27,6 +27,8 @@ MAX_ROBOTS = 30
 WORLD = WorldOrigin()
 ORIGIN = Origin(WORLD.latitude_deg, WORLD.longitude_deg, heading_deg=30.0)
 
+# The sensor's type that every installation has.
+WORLD_SENSOR = "world"
 # Pads, which are landing points too, of robots without a budget of their own.
 APART_M = places_apart(ERRORS.position_m, ERRORS.position_m).least_m
 # As far inside the field as there is room: what a robot takes its place to be walks.
@@ -59,7 +61,7 @@ class FleetScenario:
     random_feature_count: int = 10
     errors: bool = True
     budget: ErrorBudget = ERRORS
-    sensor: str = "world"
+    sensor: str = WORLD_SENSOR
     secure: bool = False
     transport: Transport = "mesh"
     pads_m: tuple[tuple[float, float], ...] | None = None

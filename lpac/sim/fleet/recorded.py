@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.core import F32
+from edge.core.part import PartError
 from edge.core.wire import Rejection, decode
 from edge.drivers.flight_log import read, read_metadata
 from edge.policy.bundle import Manifest
@@ -65,7 +66,7 @@ class RecordedAgent:
         return Perceived(np.zeros(0, np.float32), {})
 
     def step(self, features: F32, payloads: Sequence[F32], degree: int) -> PolicyStep:
-        """What was decided at this time. Raises RecordingError if nothing was."""
+        """What was decided at this time. Raises PartError if nothing was."""
         return self._steps.at(self._unix_s())
 
     def reset(self) -> None:
@@ -75,17 +76,16 @@ class RecordedAgent:
 class RecordedSteps:
     """The steps of one robot in one flight, by their times."""
 
-    def __init__(self, robot_id: int, steps: Mapping[int, PolicyStep]) -> None:
-        self._robot_id = robot_id
+    def __init__(self, steps: Mapping[int, PolicyStep]) -> None:
         self._steps = steps
 
     def at(self, unix_time_s: float) -> PolicyStep:
-        """Raises RecordingError if there was none."""
+        """Raises PartError if there was none."""
         step = self._steps.get(_in_ms(unix_time_s))
         if step is None:
-            raise RecordingError(
-                f"robot {self._robot_id}: its log has no step of the policy at {unix_time_s:.3f} s:"
-                " it is of another flight, or of other options"
+            raise PartError(
+                f"the robot's log has no step at {unix_time_s:.3f} s: it is of another flight, or "
+                "of other options"
             )
         return step
 
@@ -117,7 +117,7 @@ def recorded_steps(folder: Path, robot_id: int, policy: Policy) -> RecordedSteps
             step = PolicyStep(message["velocity"], sent.payload.astype(np.float32))
             if steps.setdefault(_in_ms(unix_time_s), step) is not step:
                 raise RecordingError(f"{folder}: holds logs of more than one flight")
-    return RecordedSteps(robot_id, steps)
+    return RecordedSteps(steps)
 
 
 def _in_ms(unix_time_s: float) -> int:

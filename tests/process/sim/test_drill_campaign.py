@@ -19,17 +19,18 @@ from lpac.sim.cluster import over_ray
 from lpac.sim.cores import over_cores
 from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
+from lpac.sim.drill.field import DrilledRobots
 from tests.process.cli.test_cli import error_line, lpac
 
 # They soon come down.
 LANDED, GONE = FAULTS["landed"], FAULTS["ground-dies"]
-ROBOTS = 2
+DRILLED = DrilledRobots(2, str(DEFAULT_BUNDLE))
 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], FlightOutcome]:
     """Two faults, over all cores."""
-    campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", ROBOTS, DEFAULT_BUNDLE)
+    campaign = Campaign(tmp_path_factory.mktemp("cores"), "simulated", DRILLED)
     return {
         (o.fault, o.seed): o
         for o in campaign.fly([LANDED, GONE], [1], partial(over_cores, fly_order))
@@ -47,7 +48,7 @@ def test_flights_over_cores_hold_what_is_promised(
 def test_a_cluster_of_two_nodes_flies_the_same(
     tmp_path: Path, cluster: Cluster, flown: dict[tuple[str, int], FlightOutcome]
 ) -> None:
-    campaign = Campaign(tmp_path, "simulated", ROBOTS, DEFAULT_BUNDLE)
+    campaign = Campaign(tmp_path, "simulated", DRILLED)
     again = campaign.fly([LANDED, GONE], [1], partial(over_ray(cluster.address), fly_order))
     assert {(outcome.fault, outcome.seed): outcome for outcome in again} == flown
 
@@ -77,7 +78,7 @@ def test_a_campaign_that_was_killed_goes_on(tmp_path: Path) -> None:
     # What another version of the code has flown does not count.
     first, *others = _lines(kept)
     kept.write_text("\n".join([first.replace('"code": "', '"code": "x'), *others]) + "\n")
-    assert Campaign(out, "simulated", ROBOTS, DEFAULT_BUNDLE).outcomes == {}
+    assert Campaign(out, "simulated", DRILLED).outcomes == {}
 
 
 def _lines(path: Path) -> list[str]:
@@ -97,11 +98,11 @@ def test_a_flight_again_is_that_flight_with_logs_and_figure(
     assert (folder / "drill.png").exists() and (folder / "drill.xml").exists()
     # On the clock of the robots' logs.
     truth, logs = load_truth(folder / TRUTH), read_logs([folder])
-    assert len(truth) == ROBOTS
+    assert len(truth) == DRILLED.robots
     for robot, track in truth.items():
         said_s = [status.time_s for status in logs.statuses[robot]]
         assert track.time_s[0] <= said_s[0] + 1.0 and said_s[-1] <= track.time_s[-1] + 1.0
-    assert len(list(folder.glob("robots/*/logs/*.mcap"))) == ROBOTS
+    assert len(list(folder.glob("robots/*/logs/*.mcap"))) == DRILLED.robots
 
 
 def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:

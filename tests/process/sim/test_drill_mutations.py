@@ -19,6 +19,7 @@ from edge.messages.mission import FlightState
 from lpac.ground.station.station import Station
 from lpac.sim.drill.bounds import judge
 from lpac.sim.drill.faults import FAULTS
+from lpac.sim.drill.field import DrilledRobots
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.fleet.robots import SimulatedWatchdog
@@ -130,7 +131,7 @@ def test_a_mutation_breaks_its_promise(
 
 @cache
 def _drill(robots: int) -> SimulatedDrill:
-    return SimulatedDrill(robots, SHIPPED)
+    return SimulatedDrill(DrilledRobots(robots, str(SHIPPED)))
 
 
 @cache

@@ -21,6 +21,7 @@ from edge.core.wire import PAYLOAD_TYPES
 from edge.drivers.world_sensor import WorldSensor
 from edge.policy.bundle import Bundle
 from edge.policy.family import Perceived
+from edge.policy.lpac.policy import LpacAgent
 from lpac.radio.airtime import TRANSPORTS, Wifi
 from lpac.radio.modelled import ModelledRadio
 from lpac.sim.batch import BatchedFlights, PolicyFailedError, fly_batch
@@ -297,3 +298,30 @@ def test_what_it_does_not_fly_is_named(shipped_bundle: Bundle) -> None:
     narrow = dataclasses.replace(shipped_bundle, manifest=manifest)
     with pytest.raises(PolicyFailedError, match="payload_limit"):
         fly_batch([Scenario(duration_s=2.0)], narrow)
+
+
+@pytest.mark.parametrize(
+    ("method", "gives", "said"),
+    [
+        ("observe", np.zeros(2, np.float32), "policy: observe gives a ndarray: must be a Perceiv"),
+        ("step", None, "policy: step gives a NoneType: must be a PolicyStep"),
+        ("observe", KeyError("map"), r"policy: KeyError: 'map' \(sim/test_batch.py, line "),
+        ("step", KeyError("hops"), r"policy: KeyError: 'hops' \(sim/test_batch.py, line "),
+    ],
+)
+def test_what_an_agent_does_wrong_is_one_line(
+    shipped_bundle: Bundle,
+    monkeypatch: pytest.MonkeyPatch,
+    method: str,
+    gives: object,
+    said: str,
+) -> None:
+    def wrong(*_: object) -> object:
+        if isinstance(gives, Exception):
+            raise gives
+        return gives
+
+    monkeypatch.setattr(LpacAgent, method, wrong)
+    flights = BatchedFlights([Scenario(robots=2)], shipped_bundle, agents=SingleAgents)
+    with pytest.raises(PolicyFailedError, match=said):
+        flights.advance([2.0])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from edge.core import F64
+from edge.core.part import PartError
 from edge.drivers.flight_log import read
 from edge.flight.replay import FlightReplay
 from edge.identity.guard import Unguarded
@@ -546,7 +547,7 @@ def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -
 
     with pytest.raises(RecordingError, match="has no flight log of robot 2"):
         recorded(low_flight(3, 1, 3.0), logged.folder)
-    with pytest.raises(RecordingError, match=r"robot \d: its log has no step of the policy at"):
+    with pytest.raises(PartError, match=r"robot \d: policy: the robot's log has no step at"):
         recorded(low_flight(2, 2, 3.0), logged.folder)
     two = tmp_path / "two"
     for number in (1, 2):

@@ -13,6 +13,7 @@ from edge.core import F32, F64, Bools
 from edge.core.aggregation import AggregatedMessage
 from edge.core.fleet_time import FleetTime
 from edge.core.frames import ModelScale
+from edge.core.part import PartError
 from edge.core.ports import Look, Odometry
 from edge.core.wire import Rejection, decode, encode
 from edge.policy.bundle import Bundle, BundleError, Manifest
@@ -146,7 +147,13 @@ def test_a_sensor_that_raises_is_tried_without_harm(
         raise OSError("no /dev/video7")
 
     monkeypatch.setattr(robot.sensor, "view", unplugged)
-    assert robot.try_sensor((1.0, 1.0, 5.0)) == "OSError: no /dev/video7"
+    line = unplugged.__code__.co_firstlineno + 1
+    what = f"OSError: no /dev/video7 (robot/test_pac.py, line {line})"
+    assert robot.try_sensor((1.0, 1.0, 5.0)) == what
+    with pytest.raises(PartError) as error:
+        robot.perceive(0.0)
+    assert str(error.value) == f"robot 1: sensor: {what}"
+    assert robot.problem == f"sensor: {what}"
 
 
 def test_by_the_papers_rule_a_silent_neighbour_still_counts_once(
@@ -338,6 +345,76 @@ class Watching:
 
     def reset(self) -> None:
         pass
+
+
+def raises() -> None:
+    np.stack([])
+
+
+@pytest.mark.parametrize("method", ["observe", "step", "reset"])
+def test_a_policy_that_raises_is_blamed_in_one_line(
+    shipped_bundle: Bundle, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    manifest = dataclasses.replace(shipped_bundle.manifest, family="watching", parameters={})
+    policy = Watching(manifest)
+    robot = make_robot(policy, World())
+    robot.perceive(0.0)
+    robot.infer(0.0)
+    robot.forget()
+    monkeypatch.setattr(policy, method, lambda *_: raises())
+    line = raises.__code__.co_firstlineno + 1
+    what = f"policy: ValueError: need at least one array to stack (robot/test_pac.py, line {line})"
+    with pytest.raises(PartError) as error:
+        robot.perceive(0.2)
+        robot.infer(0.2)
+    assert str(error.value) == f"robot 1: {what}"
+    assert robot.problem == what
+    assert robot.control(0.9) is not None  # by the last answer, until that is too old
+    assert robot.control(1.1) is None
+    monkeypatch.undo()
+    robot.perceive(1.2)
+    assert robot.infer(1.2) is not None
+    assert robot.problem == ""
+
+
+@pytest.mark.parametrize(
+    ("method", "gives", "problem"),
+    [
+        ("observe", np.zeros(2, np.float32), "observe gives a ndarray: must be a Perceived"),
+        ("observe", Perceived([0.0], {}), "features are a list: must be a numpy array"),  # type: ignore[arg-type]
+        ("step", None, "step gives a NoneType: must be a PolicyStep"),
+        (
+            "step",
+            PolicyStep([0.0, 0.0], np.zeros(0, np.float32)),  # type: ignore[arg-type]
+            "velocity is of type list: must be a numpy array of floats, of shape (2,)",
+        ),
+        (
+            "step",
+            PolicyStep(np.zeros(2, np.float32), np.zeros(3, np.float32)),
+            "payload has shape (3,): must be (0,)",
+        ),
+        (
+            "step",
+            PolicyStep(np.array([np.nan, 0.0], np.float32), np.zeros(0, np.float32)),
+            "velocity has values that are not finite",
+        ),
+    ],
+)
+def test_what_no_policy_may_give_is_not_used(
+    shipped_bundle: Bundle,
+    monkeypatch: pytest.MonkeyPatch,
+    method: str,
+    gives: object,
+    problem: str,
+) -> None:
+    manifest = dataclasses.replace(shipped_bundle.manifest, family="watching", parameters={})
+    policy = Watching(manifest)
+    robot = make_robot(policy, World())
+    monkeypatch.setattr(policy, method, lambda *_: gives)
+    robot.perceive(0.0)
+    assert robot.infer(0.0) is None
+    assert robot.control(0.1) is None
+    assert robot.problem == f"policy: {problem}"
 
 
 def test_a_policy_is_shown_what_is_unseen_if_its_manifest_asks(shipped_bundle: Bundle) -> None:

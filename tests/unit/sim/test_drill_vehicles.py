@@ -11,7 +11,7 @@ import pytest
 from lpac.sim.description import ERRORS, fence_around
 from lpac.sim.drill.campaign import LATE_S, Campaign, FlightOutcome, FlightTask, outcome_of
 from lpac.sim.drill.faults import FAULTS
-from lpac.sim.drill.field import supports
+from lpac.sim.drill.field import DrilledRobots, supports
 from lpac.sim.drill.processes import MAVLINK, PX4
 from lpac.sim.drill.simulated import SUPPORTED
 from lpac.sim.drill.truth import FlightTruth, VehicleTruth
@@ -82,6 +82,6 @@ def test_what_was_not_judged_is_flown_again(tmp_path: Path) -> None:
 
     faults = [FAULTS["held"], FAULTS["landed"]]
     for _ in range(2):
-        campaign = Campaign(tmp_path, "mavlink", 2, SHIPPED)
+        campaign = Campaign(tmp_path, "mavlink", DrilledRobots(2, str(SHIPPED)))
         assert len(list(campaign.fly(faults, [0], fly_all))) == 2
     assert sorted(flown) == ["held", "held", "landed"]
