@@ -22,7 +22,7 @@ class PolicyMessages:
 
 @dataclass(frozen=True, slots=True)
 class PolicyParameters:
-    """Our file: these tables."""
+    """What a policy was trained with, and what robots take of its messages: our file's tables."""
 
     perception: PerceptionParameters
     training: Training

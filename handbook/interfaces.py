@@ -4,42 +4,81 @@ import ast
 import dataclasses
 import inspect
 import textwrap
+import types
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from enum import Enum
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from edge.core import ports, vehicle
-from edge.core.perception import PerceptionParameters, window_corner
-from edge.messages import topics
-from edge.policy import bundle, family
 from handbook.markdown import code
 from lpac import api
-from lpac.train import family as learnable
 
 _LINE = 88
 _ROOT = Path(__file__).resolve().parent.parent
-# What docs/extending.md speaks of, by the kind of package that needs it.
+# What a package imports, by what it is for: each module, and the names that are taken from it.
 _INTERFACES = {
-    "A sensor": (
-        ports.SensorDriver, ports.SensorSetting, ports.Sensor, ports.Camera, ports.Look,
-        PerceptionParameters, window_corner,
-    ),
-    "A policy": (
-        family.PolicyFamily, family.Policy, family.Agent, family.Observation, family.Perceived,
-        family.PolicyStep, family.GoldenCheck, bundle.Manifest, bundle.Training,
-        bundle.BundleError, bundle.make_bundle, bundle.write_bundle,
-    ),
-    "A network that `lpac train` trains": (
-        learnable.LearnableFamily, learnable.Learnable, learnable.TrainableModule,
-    ),
-    "A vehicle": (
-        ports.VehicleDriver, ports.VehicleSetting, ports.OpenVehicle, ports.Vehicle,
-        ports.VehicleSetup, ports.Watchdog, vehicle.VehicleState, vehicle.Velocity,
-        vehicle.Position, vehicle.Action, vehicle.ActionResult, vehicle.Mode, vehicle.Gps,
-        vehicle.EstimatorStatus, vehicle.GlobalOrigin,
-    ),
-    "A radio": (topics.LinkDriver, topics.LinkSetting, topics.Link, topics.Topic),
-}  # fmt: skip
+    "A sensor": {
+        "edge.core.ports": "SensorDriver SensorSetting SensorOver Sensor Camera Look",
+        "edge.core.perception": "PerceptionParameters window_corner part_in_world",
+        "edge.core.world": "format_world Feature",
+        "edge.drivers.world_sensor": "world_sensor",
+    },
+    "A policy": {
+        "edge.policy.family": (
+            "PolicyFamily Policy Agent Observation Perceived PolicyStep GoldenCheck TOLERANCE "
+            "VerifiedPolicy verified"
+        ),
+        "edge.policy.bundle": (
+            "Bundle Manifest Training SCHEMA_VERSION make_bundle write_bundle BundleError"
+        ),
+        "edge.core.wire": "PayloadType FLOAT_PAYLOADS",
+        "edge.core.aggregation": "Geometry HopBuffer",
+    },
+    "A network that `lpac train` trains": {
+        "lpac.train.family": (
+            "LearnableFamily Learnable TrainableModule Inputs StateDict shift_operator"
+        ),
+        "export.parameters": "PolicyParameters PolicyMessages",
+    },
+    "What it is trained for": {
+        "lpac.train.task": "Task Teacher",
+        "lpac.train.config": "DataConfig",
+        "lpac.sim.experiment": "prepare Preparation",
+        "lpac.sim.baselines": "BaselineName",
+        "lpac.evaluate.flights": "fly_group FlightGroup EvaluationFlight FlownCost",
+    },
+    "A vehicle": {
+        "edge.core.ports": (
+            "VehicleDriver VehicleSetting OpenVehicle Vehicle VehicleSetup Watchdog"
+        ),
+        "edge.core.vehicle": (
+            "VehicleState Setpoint Velocity Position Action ActionResult Mode Gps EstimatorStatus "
+            "GlobalOrigin"
+        ),
+    },
+    "A radio": {
+        "edge.messages.topics": "LinkDriver LinkSetting Link Topic ReceiveCallback TlsFiles Group",
+        "edge.messages.admission": "Admission",
+        "edge.drivers.radio": "zenoh_radio",
+    },
+    "What all of them use": {
+        "edge.core": "F32 F64 Bools",
+        "edge.core.schema": "from_mapping ConfigError",
+    },
+    "A figure": {"lpac.analysis": "style"},
+}
+
+
+def names() -> set[tuple[str, str]]:
+    """All that the page of interfaces has: each name, after the module that it is imported from."""
+    return {
+        (module, name)
+        for taken in _INTERFACES.values()
+        for module, several in taken.items()
+        for name in several.split()
+    }
 
 
 def python_api() -> str:
@@ -59,33 +98,86 @@ def page() -> str:
     return "\n\n".join(
         [
             "# Interfaces",
-            "What a package of yours implements, and what it is given. "
-            "[Extending](../extending.md) builds one from beginning to end.",
+            "What a package of yours implements, what it is given, and what else it imports. "
+            "[Extending](../extending.md) builds one from beginning to end; bundles, flights and "
+            "worlds are in [the Python API](api.md).",
+            "Like those, the names here change only with a new minor version, and "
+            "[the changelog](../../CHANGELOG.md) says how.",
             *(
-                "\n\n".join(
-                    [f"## {title}", *(_described(it, it.__name__, "###", it) for it in things)]
-                )
-                for title, things in _INTERFACES.items()
+                part
+                for title, taken in _INTERFACES.items()
+                for part in (f"## {title}", *_each(taken))
             ),
         ]
     )
 
 
-def _described(thing: object, name: str, heading: str, imported: object = None) -> str:
+def _each(taken: Mapping[str, str]) -> Iterator[str]:
+    for module, several in taken.items():
+        for name in several.split():
+            parent = import_module(module)
+            if not hasattr(parent, name):  # a module of that package
+                import_module(f"{module}.{name}")
+            yield _described(getattr(parent, name), name, "###", module)
+
+
+def _described(thing: object, name: str, heading: str, imported: str = "") -> str:
+    """A name, `imported` from a module: its call or its fields, and what it says of itself."""
     parts = [f"{heading} {name}"]
-    if imported is not None:
-        parts.append(f"`from {getattr(imported, '__module__', '')} import {name}`")
+    if imported:
+        parts.append(f"`from {imported} import {name}`")
     if inspect.isclass(thing):
         parts += [_class(thing), inspect.getdoc(thing) or ""]
         for method, its in _methods(thing):
-            text = inspect.getdoc(its) or ""
-            parts.append(f"{heading}# {name}.{method}\n\n{_member(its)}\n\n{text}")
+            text, shown = inspect.getdoc(its) or "", method.replace("__", "\\_\\_")
+            parts.append(f"{heading}# {name}.{shown}\n\n{_member(its)}\n\n{text}")
     elif inspect.isfunction(thing):
         parts += [_function(thing), inspect.getdoc(thing) or ""]
+    elif inspect.ismodule(thing):
+        parts += [inspect.getdoc(thing) or "", _constants(thing)]
+        for function, its in inspect.getmembers(thing, inspect.isfunction):
+            if its.__module__ == thing.__name__ and not function.startswith("_"):
+                parts.append(_described(its, f"{name}.{function}", f"{heading}#"))
+    elif imported:
+        parts += _assignment(import_module(imported), name)
     else:
         # A path of the repository is told without the folder that it lies in.
         parts.append(code(repr(thing).replace(f"{_ROOT}/", "")))
     return "\n\n".join(part for part in parts if part)
+
+
+def _assignment(module: types.ModuleType, name: str) -> list[str]:
+    """A type or a number as the source has it, and the comment above it."""
+    source = inspect.getsource(module)
+    [found] = (
+        line
+        for line in ast.parse(source).body
+        if (isinstance(line, ast.Assign) and ast.unparse(line.targets[0]) == name)
+        or (isinstance(line, ast.AnnAssign) and ast.unparse(line.target) == name)
+    )
+    said = " ".join(line.removeprefix("# ") for line in _comment(found, source))
+    return [f"```python\n{ast.get_source_segment(source, found)}\n```", said]
+
+
+def _constants(module: types.ModuleType) -> str:
+    """Its numbers and texts, as the source has them."""
+    source = inspect.getsource(module)
+    found = []
+    for line in ast.parse(source).body:
+        if isinstance(line, ast.Assign) and not ast.unparse(line.targets[0]).startswith("_"):
+            with suppress(ValueError):  # what is computed is no constant
+                ast.literal_eval(line.value)
+                found.append(ast.get_source_segment(source, line) or "")
+    return "\n".join(["```python", *found, "```"]) if found else ""
+
+
+def _comment(line: ast.stmt, source: str) -> list[str]:
+    """The lines of the comment that stands above a line of the source, from their # on."""
+    lines = [each.strip() for each in source.splitlines()[: line.lineno - 1]]
+    first = len(lines)
+    while first and lines[first - 1].startswith("# "):
+        first -= 1
+    return lines[first:]
 
 
 def _methods(cls: type) -> list[tuple[str, Any]]:
@@ -105,11 +197,16 @@ def _class(cls: type) -> str:
         return "```python\n" + "\n".join(f"{it.name} = {it.value!r}" for it in cls) + "\n```"
     definition = _definition(cls)
     assert isinstance(definition, ast.ClassDef)
-    fields = [ast.unparse(line) for line in definition.body if isinstance(line, ast.AnnAssign)]
+    fields = [
+        text
+        for line in definition.body
+        if isinstance(line, ast.AnnAssign)
+        for text in (*_comment(line, _source(cls)), ast.unparse(line))
+    ]
     made = next((f for f in definition.body if getattr(f, "name", "") == "__init__"), None)
     if fields and (dataclasses.is_dataclass(cls) or issubclass(cls, tuple)):
         return "```python\n" + "\n".join(fields) + "\n```"
-    return _call(made, cls.__name__) if isinstance(made, ast.FunctionDef) else ""
+    return _call(made, cls.__name__, bound=True) if isinstance(made, ast.FunctionDef) else ""
 
 
 def _member(member: Any) -> str:
@@ -118,18 +215,25 @@ def _member(member: Any) -> str:
         assert isinstance(definition, ast.FunctionDef)
         returns = f": {ast.unparse(definition.returns)}" if definition.returns else ""
         return f"```python\n{definition.name}{returns}\n```"
-    return _function(getattr(member, "__func__", member))
+    return _function(getattr(member, "__func__", member), bound=True)
 
 
-def _function(function: Any) -> str:
+def _function(function: Any, *, bound: bool = False) -> str:
     definition = _definition(function)
     assert isinstance(definition, ast.FunctionDef | ast.AsyncFunctionDef)
-    return _call(definition, definition.name)
+    call = _call(definition, definition.name, bound=bound)
+    is_context = any(ast.unparse(each) == "contextmanager" for each in definition.decorator_list)
+    return call.replace("\n", "\n@contextmanager\n", 1) if is_context else call
 
 
-def _call(definition: ast.FunctionDef | ast.AsyncFunctionDef, name: str) -> str:
-    """The call as the source has it; one argument on a line where it is long."""
-    arguments = _arguments(definition.args)
+def _call(
+    definition: ast.FunctionDef | ast.AsyncFunctionDef, name: str, *, bound: bool = False
+) -> str:
+    """The call as the source has it; one argument on a line where it is long.
+
+    Who calls what is `bound` does not give the first.
+    """
+    arguments = _arguments(definition.args)[1 if bound else 0 :]
     returns = f" -> {ast.unparse(definition.returns)}" if definition.returns else ""
     text = f"{name}({', '.join(arguments)}){returns}"
     if len(text) > _LINE:
@@ -141,8 +245,6 @@ def _arguments(arguments: ast.arguments) -> list[str]:
     own = [*arguments.posonlyargs, *arguments.args]
     defaults = [*[None] * (len(own) - len(arguments.defaults)), *arguments.defaults]
     said = [_argument(*each) for each in zip(own, defaults, strict=True)]
-    if own and own[0].arg in ("self", "cls"):
-        del said[0]
     if arguments.vararg:
         said.append(f"*{ast.unparse(arguments.vararg)}")
     elif arguments.kwonlyargs:
@@ -156,4 +258,8 @@ def _argument(argument: ast.arg, default: ast.expr | None) -> str:
 
 
 def _definition(thing: Any) -> ast.stmt:
-    return ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
+    return ast.parse(_source(thing)).body[0]
+
+
+def _source(thing: Any) -> str:
+    return textwrap.dedent(inspect.getsource(thing))

@@ -27,13 +27,13 @@
     control.time_s, control["position_m"]           # (T,), (T, 3): as that robot wrote it
     [trial] = examine([Path("out/flight")]).trials  # all robots, on one clock
 
-docs/api.md shows each task, one robot's steps by hand too. Names are those of the modules that
-they come from, whose docstrings say more. They change only with a new minor version, and
-CHANGELOG.md says how; what is not in `__all__` may change at any time. Constants: `SHIPPED_BUNDLE`
-is the path of the policy that flies if no other is named, `FIELD_SCALE` the `ModelScale` of the
-paper's field tests, `BASELINES` the names of all baselines, `SET_UPS` sizes of worlds and teams, by
-name. What is wrong raises ValueError (`BundleError` is one), in one line that says what to do, or
-OSError for a file that is not there or cannot be used.
+docs/api.md shows each task, one robot's steps by hand too. Names are those of the modules that they
+come from, whose docstrings say more. They change only with a new minor version, and CHANGELOG.md
+says how. What is neither in `__all__` nor on the page "Interfaces" of the documentation may change
+at any time. Constants: `SHIPPED_BUNDLE` is the path of the policy that flies if no other is named,
+`FIELD_SCALE` the `ModelScale` of the paper's field tests, `BASELINES` the names of all baselines,
+`SET_UPS` sizes of worlds and teams, by name. What is wrong raises ValueError (`BundleError` is
+one), in one line that says what to do, or OSError for a file that is not there or cannot be used.
 
 Nothing is imported before it is used: matplotlib with what draws, the simulated whole robots with
 `fly_simulated`. The extra `sim` has all that is needed; torch never is.

@@ -20,8 +20,8 @@ def from_mapping(cls: type[T], mapping: object, where: str) -> T:
 
     `where` names the file, and then the path of keys, in errors. Field types may be bool, int,
     float, str, Literal, StrEnum, tuple[X, ...], dict[str, X], dataclasses, unions of one of these
-    with None, and object for anything. The dataclass checks its own values in __post_init__ with a
-    ValueError.
+    with None, and object for anything. The dataclass checks its own values in `__post_init__`, with
+    a ValueError.
 
     Raises ConfigError for an unknown or missing key, a wrong type or an impossible value.
     """

@@ -8,7 +8,10 @@ from edge.messages.topics import LinkSetting
 
 
 def zenoh_radio(setting: LinkSetting) -> ZenohLink | MulticastLink:
-    """It has no options. Raises LinkError or ConfigError."""
+    """The type "zenoh" of robot.toml's [link], a context manager; it has no options.
+
+    Raises LinkError or ConfigError.
+    """
     no_options("link", setting.options)
     in_group = () if setting.group is None else TOPICS_OF_GROUP
     zenoh = ZenohLink(

@@ -20,6 +20,7 @@ from edge.core.perception import PerceptionParameters
 from edge.core.schema import ConfigError, from_mapping
 from edge.core.wire import FLOAT_PAYLOADS, PayloadType
 
+# Of the manifests that this version reads and writes.
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 BUNDLE_ID = "bundle.id"

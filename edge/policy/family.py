@@ -20,7 +20,7 @@ TOLERANCE = 1e-5
 
 @dataclass(frozen=True, slots=True)
 class GoldenCheck:
-    """How far one part of a policy is, on this machine, from what its training computed."""
+    """How far one part of a policy is, on this machine, from the bundle's golden outputs."""
 
     name: str
     relative_error: float
@@ -128,7 +128,7 @@ class Policy(Protocol):
         """For one robot that has not flown yet. Raises BundleError if no robot can fly this."""
 
     def verify(self) -> Iterator[GoldenCheck]:
-        """Compute again what the bundle says that its training computed; nothing if it says none.
+        """Compute the bundle's golden outputs again; nothing if it has none.
 
         Raises BundleError if what it says cannot be read.
         """

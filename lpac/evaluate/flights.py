@@ -108,7 +108,10 @@ class EvaluationFlight:
 
 
 class FlownCost(NamedTuple):
-    """The coverage cost J (C,) in model units at times (C,), s, of the robots that are left."""
+    """A cost (C,) at times (C,), s.
+
+    That is J, the coverage cost in model units of the robots that are left, or another task's.
+    """
 
     time_s: tuple[float, ...]
     cost: tuple[float, ...]

@@ -145,6 +145,11 @@ The first validation world, and the worst:
     )
     begun = config.fit.begin_with
     begins = f"It began with `{begun}`'s weights." if begun else "It began with random weights."
+    judged = (
+        f"`lpac evaluate {name}` on others shows"
+        if CLAIRVOYANT in card.baselines
+        else ("only others show")
+    )
     return f"""# {name}
 
 A policy of the family `{config.network.get("family", "lpac")}`, bundle `{card.bundle_id}`.
@@ -182,7 +187,7 @@ round {best.candidate.round}, epoch {best.candidate.epoch}. Cost at the end over
 {shown if CLAIRVOYANT in card.baselines else ""}
 ## Limits
 
-It was chosen by these worlds, so they flatter it: `lpac evaluate {name}` on others shows how good
+It was chosen by these worlds, so they flatter it: {judged} how good
 it is. One training seed says nothing about a method. Point robots flew: none of this was measured
 on vehicles. Numbers of robots, ranges and worlds other than those above are untried.
 """

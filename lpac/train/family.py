@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # the processes that fly do without
 
 # Of R robots by name: (R, ...), float16 or float32.
 Inputs = Mapping[str, npt.NDArray[np.floating]]
+# A torch module's weights, by name.
 StateDict = Mapping[str, "torch.Tensor"]
 
 
@@ -94,10 +95,10 @@ def learnable(network: Mapping[str, object], where: str) -> Learnable:
 
 
 def shift_operator(adjacency: Bools, heard: Bools) -> F32:
-    """S_ij = 1/sqrt(d_i d_j) where i hears j, else 0; (B, N, N) all.
+    """The graph shift operator, normalised by both degrees; (B, N, N) all.
 
-    Degrees are those of `adjacency`, heard or not: so it is in flight, where a robot knows its
-    neighbours for longer than a lost message.
+    S_ij = 1/sqrt(d_i d_j) where i hears j, else 0. Degrees are those of `adjacency`, heard or
+    not: so it is in flight, where a robot knows its neighbours for longer than a lost message.
     """
     degrees = adjacency.sum(axis=2)
     scale = np.zeros(degrees.shape, np.float32)

@@ -35,7 +35,10 @@ class Teacher(Protocol):
 
 
 class Task(Protocol):
-    """See the module. Can be pickled."""
+    """What networks are trained for: whom they imitate, and what a good flight is.
+
+    Can be pickled.
+    """
 
     @property
     def baselines(self) -> Sequence[BaselineName]:

@@ -36,15 +36,27 @@ flights = zip(fly_batch(scenarios, bundle), scenarios)
 print(json.dumps([(a.positions_m == fly(b, bundle).positions_m).all().item() for a, b in flights]))
 """
 
-# `lpac` with an agent whose step does not work.
+# Another policy, with the golden outputs of this one.
+OTHER = """
+from dataclasses import replace
+from pathlib import Path
+from edge.policy.bundle import load_bundle, make_bundle, write_bundle
+
+bundle = load_bundle(Path("lloyd"))
+files = {name: bundle.files[name] for name in bundle.manifest.files}
+manifest = replace(bundle.manifest, parameters={"gain": 0.5001})
+write_bundle(make_bundle(manifest, files), Path("other"))
+"""
+
+# `lpac` with an agent that cannot perceive.
 BROKEN = """
 import lpac_lloyd.policy as policy
 from lpac.cli.main import main
 
-def step(self, features, payloads, degree):
-    return features[2]
+def observe(self, observation):
+    return observation.position[2]
 
-policy.LloydAgent.step = step
+policy.LloydAgent.observe = observe
 if __name__ == "__main__":
     main()
 """
@@ -87,14 +99,25 @@ def bundle(installed: Path) -> None:
 @pytest.mark.usefixtures("bundle")
 def test_the_bundle_says_what_it_is(installed: Path) -> None:
     info, verify = "lpac bundle info lloyd", "lpac bundle verify lloyd"
-    assert info in COMMANDS
+    assert f"{info}\n{verify}\n" in COMMANDS
     told = run(installed, *shlex.split(info))
     assert (told.returncode, told.stderr) == (0, "")
     for line in ("family       lloyd", "gain         0.5", "made by      lpac-lloyd 1.0"):
         assert line in told.stdout.splitlines()
-    assert run(installed, *shlex.split(verify)).returncode == 0
+    verified = run(installed, *shlex.split(verify))
+    assert (verified.returncode, verified.stderr) == (0, "")
+    assert verified.stdout.startswith("steps        relative error 0.0e+00  ok\n")
     times = run(installed, *shlex.split("lpac bundle benchmark lloyd --seconds 0.1 --json"))
     assert set(json.loads(times.stdout)["steps"]) == {"perceive", "infer"}
+
+
+@pytest.mark.usefixtures("bundle")
+def test_what_computes_something_else_is_not_verified(installed: Path) -> None:
+    assert run(installed, "python", "-c", OTHER).returncode == 0
+    verified = run(installed, "lpac", "bundle", "verify", "other")
+    assert verified.returncode == 1
+    assert "FAILED" in verified.stdout
+    assert verified.stderr.startswith("lpac: other: steps: not within 1e-05 of ")
 
 
 @pytest.mark.usefixtures("bundle")

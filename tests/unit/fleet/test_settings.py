@@ -24,7 +24,7 @@ from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"
 # A value that is commented out, at the start of its line, and the head of such a table.
-COMMENTED_OUT = re.compile(r"^# ((?:\w+ = |\[\w+\]).*)$", re.MULTILINE)
+COMMENTED_OUT = re.compile(r"^# ((?:\w+ = |\[[\w.]+\]).*)$", re.MULTILINE)
 
 
 def example(old: str = "", new: str = "") -> str:

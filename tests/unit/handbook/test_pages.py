@@ -1,8 +1,11 @@
 """The documentation's pages: their links, and a reference that leaves nothing out."""
 
+import ast
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,11 +13,14 @@ import typer
 
 from edge.messages.topics import TOPICS
 from handbook import commands, configuration, interfaces, messages, pages
+from lpac import api
 from lpac.cli.main import app
 from tests.conftest import ROOT
 
 _HEADING = re.compile(r"^#+ (.+)$", re.M)
 _CODE_BLOCK = re.compile(r"^```.*?^```", re.S | re.M)
+_GUIDE = ROOT / "docs" / "extending.md"
+_EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
 
 
 def anchors(page: str) -> set[str]:
@@ -127,12 +133,45 @@ def test_every_topic_message_and_code_is_in_the_reference() -> None:
 
 def test_interfaces_tell_calls_as_the_source_has_them() -> None:
     text = interfaces.page()
-    assert "```python\nview(position: F64) -> F32 | None\n```" in text
-    assert "```python\nmanifest: Manifest\n```" in text
-    for name in re.findall(
-        r"`([A-Z]\w+(?:Driver|Family))`", (ROOT / "docs/extending.md").read_text()
+    for said in (
+        "view(position: F64) -> F32 | None",
+        "manifest: Manifest",
+        "from_mapping(cls: type[T], mapping: object, where: str) -> T",
+        "@contextmanager\nworld_sensor(setting: SensorSetting) -> Iterator[SensorOver]",
+        "TOLERANCE = 1e-5",
     ):
+        assert f"```python\n{said}\n```" in text, said
+    assert "# Importance of what has not been seen yet.\nunknown_importance: float" in text
+    for name in re.findall(r"`([A-Z]\w+(?:Driver|Family))`", _GUIDE.read_text()):
         assert f"### {name}\n" in text, name
+    for module, name in interfaces.names():
+        assert f"### {name}\n\n`from {module} import {name}`\n" in text, name
+
+
+def imported(source: str) -> Iterator[tuple[str, str]]:
+    """Modules of the product, each with a name that is taken from it; "" for all of it."""
+    for node in ast.walk(ast.parse(source)):
+        names = []
+        if isinstance(node, ast.ImportFrom):
+            names = [(node.module or "", alias.name) for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [(alias.name, "") for alias in node.names]
+        yield from (each for each in names if each[0].split(".")[0] in ("edge", "export", "lpac"))
+
+
+@pytest.mark.parametrize("path", [_GUIDE, *_EXAMPLES], ids=lambda path: path.stem)
+def test_packages_import_what_the_reference_has(path: Path) -> None:
+    """What a package needs has a name that stays: in the API, or on the page of interfaces."""
+    text = path.read_text()
+    if path == _GUIDE:
+        text = "\n".join(re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S))
+    taken = set(imported(text)) - interfaces.names()
+    others = {
+        (module, name)
+        for module, name in taken
+        if name not in api.__all__ or getattr(api, name) is not getattr(import_module(module), name)
+    }
+    assert not others
 
 
 def test_a_notebook_is_a_page_of_its_cells() -> None:
