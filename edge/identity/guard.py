@@ -174,7 +174,9 @@ class SignedGuard:
 
     Nobody needs a list of members: each shows its card, which the authority has signed, now and
     then and when somebody new is heard; more often in the beginning over a link that
-    sends nothing again. `revocations` is the newest signed list that is known.
+    sends nothing again. It comes in its owner's envelope, by which others know a program that just
+    began, and may need their cards, also if it says nothing else, as a ground that does not
+    command. `revocations` is the newest signed list that is known.
     """
 
     def __init__(
@@ -221,8 +223,8 @@ class SignedGuard:
         """See `Guard`."""
         return {
             **{topic: partial(self._receive, topic, callback) for topic, callback in hear.items()},
-            CARD: self._receive_card,
-            GROUND_CARD: self._receive_card,
+            CARD: partial(self._receive_card, CARD),
+            GROUND_CARD: partial(self._receive_card, GROUND_CARD),
             REVOKED: self._receive_revocations,
         }
 
@@ -309,7 +311,7 @@ class SignedGuard:
             if self._show_soon:
                 self._new_until_s = now_s + _NEW_FOR_S
             self._shown_at_s, self._show_soon = now_s, False
-        shown = [(card, self._membership.card_data)]
+        shown = [(card, self.seal(card, self._membership.card_data))]
         if self.card.role is Role.OPERATOR and self.revocations:
             shown.append((REVOKED, self.revocations))
         return tuple(shown)
@@ -369,26 +371,39 @@ class SignedGuard:
         elif said > before.said:
             self._behind[whose] = _Behind(before.since_s, now_s, said)
 
-    def _receive_card(self, key: str, data: bytes) -> None:
+    def _receive_card(self, topic: Topic, key: str, data: bytes) -> None:
+        envelope = read_envelope(data)
+        reason = (
+            RefusedMessage.NO_ENVELOPE if envelope is None else self._shown(topic, key, envelope)
+        )
+        if reason is not None:
+            self._refuse(reason, key)
+
+    def _shown(self, topic: Topic, key: str, envelope: Envelope) -> RefusedMessage | None:
+        """A card in its owner's envelope: why it is not looked at, if it is not."""
         try:
-            card = verified(Card, data, self._authority)
+            card = verified(Card, envelope.payload, self._authority)
         except CardError:
-            self._refuse(RefusedMessage.FORGED, key)
-            return
-        topic = CARD if card.role is Role.ROBOT else GROUND_CARD
+            return RefusedMessage.FORGED
         if not _is_of(card, topic, key):
-            self._refuse(RefusedMessage.NOT_ALLOWED, key)
-            return
+            return RefusedMessage.NOT_ALLOWED
+        address = Address(self._authority, key)
+        if card.fingerprint != envelope.fingerprint or not envelope.is_from(
+            card.public_key, address
+        ):
+            return RefusedMessage.FORGED
         with self._lock:
             known = self._members.get(card.member)
-            if known is not None and known.serial >= card.serial:
-                return
             if known is None and len(self._members) >= _MOST_CARDS:
-                return
-            if known is not None:
-                del self._cards[known.fingerprint]
-            self._members[card.member] = self._cards[card.fingerprint] = card
-            self._show_soon = True
+                return None
+            if known is None or known.serial < card.serial:
+                if known is not None:
+                    del self._cards[known.fingerprint]
+                self._members[card.member] = self._cards[card.fingerprint] = card
+                self._show_soon = True
+        if card.fingerprint in self._cards and card.fingerprint not in self._revoked:
+            self._is_news(key, envelope)
+        return None
 
     def _receive_revocations(self, key: str, data: bytes) -> None:
         if data != self.revocations and not self.hear_revocations(data):

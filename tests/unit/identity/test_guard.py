@@ -253,9 +253,45 @@ def test_a_robots_key_is_no_operators_and_no_other_robots(one: Member, two: Memb
     ):
         assert not one.takes(topic, key, data)
     # A card for one is none for another.
-    three = membership(Role.ROBOT, "r3", 3)
-    one._topics[CARD]("robot/2/card", three.card_data)
+    one.hear(two, robot(3).say(STATUS, b"")[:1])
     assert one.guard.refused()["not_allowed"] == 4
+
+
+def test_a_card_counts_in_its_owners_envelope_only(one: Member) -> None:
+    two, three = robot(2), membership(Role.ROBOT, "r3", 3)
+    one._topics[CARD]("robot/3/card", three.card_data)
+    one._topics[CARD]("robot/3/card", two.guard.seal(CARD, three.card_data))
+    assert one.guard.refused() == {"no_envelope": 1, "forged": 1}
+    ((_, status),) = Member(three).say(STATUS, b"here")[-1:]
+    assert not one.takes(STATUS, "robot/3/status", status)
+
+
+def test_a_ground_that_began_again_and_says_nothing_is_shown_the_cards_soon(one: Member) -> None:
+    """One that does not command shows its card alone."""
+
+    def ground(start: int) -> Member:
+        return Member(membership(Role.OPERATOR, "ann", start=start))
+
+    def introduced(member: Member) -> list[tuple[Topic, bytes]]:
+        member.sent = []
+        member.guard.introduce()
+        return member.sent
+
+    former, again = ground(1), ground(2)
+    one.hear(former, introduced(former))
+    one.say(MESSAGE, b"")
+    one.now_s = former.now_s = 60.0
+    one.say(MESSAGE, b"")
+    one.now_s = former.now_s = 61.0
+    one.hear(former, introduced(former))
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
+    shown = introduced(again)
+    one.hear(again, shown)
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [CARD, MESSAGE]
+    # Said again by somebody else, it is no news.
+    one.now_s = 61.5
+    one.hear(again, shown)
+    assert [t for t, _ in one.say(MESSAGE, b"")] == [MESSAGE]
 
 
 def test_an_observer_says_a_state_and_nothing_else(one: Member) -> None:
