@@ -17,17 +17,15 @@ class SimulatedMembers:
     def __init__(self, fleet: str) -> None:
         self._fleet = fleet
         self.authority = self._signer("authority")
-        self._serial = 0
+        self._cards: dict[tuple[Role, str], bytes] = {}
         self._revocations = 0
 
     def join(self, role: Role, name: str, robot_id: int | None, start: int) -> Membership:
-        """One start of a member's program; its key is the same each time."""
-        signer = self._signer(f"{role} {name}")
-        self._serial += 1
-        card = Card(
-            self._fleet, role, name, signer.public_key, self._serial, _EXPIRES_UNIX_S, robot_id
-        )
-        return Membership(self.authority.public_key, signer, signed(card, self.authority), start)
+        """One start of a member's program; its key and its card are the same each time."""
+        signer, serial = self._signer(f"{role} {name}"), len(self._cards) + 1
+        card = Card(self._fleet, role, name, signer.public_key, serial, _EXPIRES_UNIX_S, robot_id)
+        card_data = self._cards.setdefault((role, name), signed(card, self.authority))
+        return Membership(self.authority.public_key, signer, card_data, start)
 
     def guard(
         self,

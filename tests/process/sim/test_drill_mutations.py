@@ -14,6 +14,7 @@ from edge.core import F64, log
 from edge.flight.orders import ORDERS
 from edge.flight.state import Robot
 from edge.flight.transitions import TRANSITIONS, Transition
+from edge.identity.guard import SignedGuard
 from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState
 from lpac.ground.station.station import Station
@@ -108,6 +109,15 @@ def ground_tells_nothing_of_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Station, "published_state", without)
 
 
+def cards_tell_nothing_of_a_new_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    is_news = SignedGuard._is_news
+
+    def among_others(self: SignedGuard, key: str, envelope: Any) -> bool:
+        return not key.endswith("/card") and is_news(self, key, envelope)
+
+    monkeypatch.setattr(SignedGuard, "_is_news", among_others)
+
+
 @pytest.mark.parametrize(
     ("mutate", "fault", "robots"),
     [
@@ -118,6 +128,7 @@ def ground_tells_nothing_of_holds(monkeypatch: pytest.MonkeyPatch) -> None:
         (landing_points_swapped, "none", PAIR),
         (ground_tells_nothing_of_holds, "held", PAIR),
         (without_brake, "somebody-over-the-pad", 3),
+        (cards_tell_nothing_of_a_new_program, "ground-restarts", 4),
     ],
     ids=lambda each: getattr(each, "__name__", str(each)),
 )
