@@ -61,8 +61,8 @@ class Camera(Protocol):
         """
 
 
-# A sensor over a world file's text, of which the second argument says what it is called in the
-# ValueError for one that cannot be used. A sensor that looks at the real world needs no text.
+# Makes a sensor. It is called with the text of a world file and the name by which a ValueError
+# should call that file if it cannot be used. A sensor that looks at the real world needs neither.
 SensorOver = Callable[[str, str], Sensor | Camera]
 
 
@@ -83,11 +83,12 @@ class SensorDriver(Protocol):
     """A type of sensor. What it opens is closed when the robot's program ends."""
 
     def __call__(self, setting: SensorSetting) -> AbstractContextManager[SensorOver]:
-        """What it opens is a `SensorOver`: a callable that makes the sensor.
+        """Entering it gives a `SensorOver`, a callable that makes the sensor.
 
-        It is called with a world file's text and what to call that file in a ValueError for one
-        that cannot be used. A sensor that looks at the real world needs neither. It is told where
-        the robot is, and nothing of its heading, its speed or which robot it is.
+        It is called with the text of a world file and the name by which a ValueError should call
+        that file if it cannot be used. A sensor that looks at the real world needs neither. A
+        sensor is told where the robot is, and nothing of its heading, its speed or which robot it
+        is.
 
         Raises ValueError or OSError, one line, for a sensor that cannot be used.
         """

@@ -87,5 +87,6 @@ def _value(hint: Any, value: object, where: str) -> Any:
             raise ConfigError(f"{where}: is too large a number") from None
     if type(value) is hint:
         return value
-    expected = {tuple: "a list", dict: "a table"}.get(origin or hint, getattr(hint, "__name__", ""))
+    in_words = {tuple: "a list", dict: "a table", str: "text in quotes"}
+    expected = in_words.get(origin or hint, getattr(hint, "__name__", ""))
     raise ConfigError(f"{where} = {value!r}: expected {expected}")

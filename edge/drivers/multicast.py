@@ -17,7 +17,8 @@ from threading import Event, Lock, Thread
 from typing import Self
 
 from edge.core import log
-from edge.drivers.zenoh_link import ZenohLink
+from edge.core.wire import MAX_ROBOT_ID
+from edge.drivers.zenoh_link import MAX_CERTIFIED_ID, ZenohLink
 from edge.identity.group import (
     TOPICS_OF_GROUP,
     Assembly,
@@ -31,7 +32,7 @@ from edge.identity.group import (
 from edge.messages.admission import Admission
 from edge.messages.topics import CARD, Group, ReceiveCallback, Topic
 
-# Of a hundred robots' messages those of a second.
+# Of a hundred robots' messages those of a second, where the kernel allows as much (rmem_max).
 _BUFFER_BYTES = 2**19
 # How soon it looks whether it is to end; and tries again to join, where there is no network yet.
 _WAKES_S, _JOINS_AGAIN_S = 0.25, 0.5
@@ -41,8 +42,11 @@ _FORGETS_AFTER_S = 5.0
 _REJOINS_AFTER_S = 5.0
 _CLOSE_TIMEOUT_S = 1.0
 # A thread that wakes for each datagram finds its caches cold: where more than so many come in a
-# second, as of thirty robots, it takes those of such a time together.
-_MANY_HZ, _COUNTS_FOR_S, _TOGETHER_S = 100.0, 1.0, 0.1
+# second, as of thirty robots, it takes those of such a time together. Where far more come, somebody
+# floods the group, and no buffer holds that for as long.
+_MANY_HZ, _FLOOD_HZ, _COUNTS_FOR_S, _TOGETHER_S = 100.0, 1000.0, 1.0, 0.1
+# By the present and by the former key: whoever claims them all takes no other's place.
+_MOST_PLACES = 2 * len(TOPICS_OF_GROUP) * (MAX_CERTIFIED_ID + 1)
 
 
 class MulticastLink:
@@ -76,7 +80,9 @@ class MulticastLink:
         self._counts = itertools.count()
         self._own_start = -1  # Of this program, once it has spoken.
         self._assembly = Assembly(math.inf if group.is_secret else _FORGETS_AFTER_S)
-        self._admission = Admission()
+        # No robot with a card has a greater one.
+        self._greatest_id = MAX_CERTIFIED_ID if group.is_secret else MAX_ROBOT_ID
+        self._admission = Admission(_MOST_PLACES)
         self._lock = Lock()
         self._problems: Counter[str] = Counter()
         self._strangers = 0
@@ -151,17 +157,18 @@ class MulticastLink:
             if many_come and not poll.poll(0):
                 self._closed.wait(_TOGETHER_S)
             with suppress(TimeoutError):
-                fragment = open_datagram(receiver.recv(2048), self._keys)
-                if fragment is None:
+                data = receiver.recv(2048)
+                came += 1
+                fragment = open_datagram(data, self._keys)
+                if fragment is None or fragment.sender > self._greatest_id:
                     self._strangers += 1
                     continue
-                came += 1
                 if not self._is_own(fragment):
                     heard_at_s = time.monotonic()
                     self._take(fragment, heard_at_s)
             counted_s = time.monotonic() - counts_since_s
             if counted_s >= _COUNTS_FOR_S:
-                many_come = came > _MANY_HZ * counted_s
+                many_come = _MANY_HZ * counted_s < came < _FLOOD_HZ * counted_s
                 came, counts_since_s = 0, time.monotonic()
 
     def _take(self, fragment: Fragment, now_s: float) -> None:
@@ -170,7 +177,9 @@ class MulticastLink:
         if message is None or callback is None:
             return
         key = f"robot/{fragment.sender}/{fragment.topic.name}"
-        if not self._admission.admits(fragment.topic, key, len(message), now_s):
+        # Who has a former key alone takes nothing from those who have the present one.
+        share = f"{fragment.key}/{key}"
+        if not self._admission.admits(fragment.topic, share, len(message), now_s):
             return
         try:
             is_theirs = callback(key, message)

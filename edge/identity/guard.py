@@ -371,13 +371,14 @@ class SignedGuard:
         elif said > before.said:
             self._behind[whose] = _Behind(before.since_s, now_s, said)
 
-    def _receive_card(self, topic: Topic, key: str, data: bytes) -> None:
+    def _receive_card(self, topic: Topic, key: str, data: bytes) -> bool:
         envelope = read_envelope(data)
         reason = (
             RefusedMessage.NO_ENVELOPE if envelope is None else self._shown(topic, key, envelope)
         )
         if reason is not None:
             self._refuse(reason, key)
+        return reason is None
 
     def _shown(self, topic: Topic, key: str, envelope: Envelope) -> RefusedMessage | None:
         """A card in its owner's envelope: why it is not looked at, if it is not."""
@@ -395,14 +396,18 @@ class SignedGuard:
         with self._lock:
             known = self._members.get(card.member)
             if known is None and len(self._members) >= _MOST_CARDS:
-                return None
+                return RefusedMessage.UNKNOWN_KEY
             if known is None or known.serial < card.serial:
                 if known is not None:
                     del self._cards[known.fingerprint]
                 self._members[card.member] = self._cards[card.fingerprint] = card
                 self._show_soon = True
-        if card.fingerprint in self._cards and card.fingerprint not in self._revoked:
-            self._is_news(key, envelope)
+        if card.fingerprint in self._revoked:
+            return RefusedMessage.REVOKED
+        if card.fingerprint not in self._cards:
+            return RefusedMessage.NOT_ALLOWED  # Somebody has a newer card in its place.
+        # Shown again and again, it is no less the member's.
+        self._is_news(key, envelope)
         return None
 
     def _receive_revocations(self, key: str, data: bytes) -> None:

@@ -69,11 +69,16 @@ def is_ipv4(text: str) -> bool:
 def require_group(key: str, group: str) -> tuple[str, int]:
     """The address and the port of a multicast group."""
     address, _, port = group.rpartition(":")
-    is_group = is_ipv4(address) and 224 <= int(address.partition(".")[0]) <= 239
+    # 224.0.0.0/24 is for the network's own protocols.
+    is_group = (
+        is_ipv4(address)
+        and 224 <= int(address.partition(".")[0]) <= 239
+        and not address.startswith("224.0.0.")
+    )
     if not (is_group and port.isdecimal() and 1 <= int(port) <= 65535):
         raise ValueError(
-            f"{key} = {group!r}: must be an IPv4 multicast address and a port, such as "
-            "'239.255.76.80:7450'"
+            f"{key} = {group!r}: must be an IPv4 multicast address, none of 224.0.0.0/24, and a "
+            "port from 1 to 65535, such as '239.255.76.80:7450'"
         )
     return address, int(port)
 

@@ -1,8 +1,9 @@
 """The group of robots: real sockets, members and strangers."""
 
+import itertools
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from threading import Event, Thread
@@ -14,11 +15,12 @@ import pytest
 from edge.drivers import multicast
 from edge.drivers.radio import zenoh_radio
 from edge.drivers.zenoh_link import ZenohLink, ZenohRouter
-from edge.identity.card import Card, Role, signed
+from edge.identity.card import Card, Revocations, Role, signed
+from edge.identity.envelope import Address, seal
 from edge.identity.group import PART_BYTES, GroupKey, MessageNumber, datagrams
 from edge.identity.guard import Membership, SignedGuard, Speaker
 from edge.identity.signature import Signer
-from edge.messages.topics import CARD, MESSAGE, STATUS, Group, Link, LinkSetting
+from edge.messages.topics import CARD, MESSAGE, STATUS, Group, Link, LinkSetting, Topic
 from lpac.sim.ports import free_ports
 from tests.process.drivers.test_zenoh_link import Inbox, endpoint, eventually
 
@@ -32,6 +34,13 @@ def group() -> Group:
     return Group("239.255.76.80", port, "127.0.0.1", (KEY, FORMER), is_secret=True)
 
 
+def signer_and_card(robot_id: int, enrolled: int = 1) -> tuple[Signer, Card]:
+    """A robot's, of the so many-th time that it was given any."""
+    signer = Signer(robot_id.to_bytes(16, "little") + enrolled.to_bytes(16, "little"))
+    name = f"r{robot_id}"
+    return signer, Card("test", Role.ROBOT, name, signer.public_key, enrolled, 2e9, robot_id)
+
+
 class Robot:
     """A member of the fleet in the group: what it hears of the others' messages, by their ids."""
 
@@ -42,14 +51,13 @@ class Robot:
         at: str | None = None,
         *,
         start: int = 1,
+        enrolled: int = 1,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.heard: dict[str, bytes] = {}
         self.all_heard: list[bytes] = []
         self.heard_at_s: list[float] = []
-        signer = Signer(robot_id.to_bytes(32, "little"))
-        name = f"r{robot_id}"
-        card = Card("test", Role.ROBOT, name, signer.public_key, 1, 2e9, robot_id)
+        signer, card = signer_and_card(robot_id, enrolled)
         membership = Membership(AUTHORITY.public_key, signer, signed(card, AUTHORITY), start)
         self.guard = SignedGuard(membership, clock_s)
         self.radio = zenoh_radio(
@@ -238,6 +246,93 @@ def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None
         eventually(lambda: second.heard["r1"] == b"genuine")
         eventually_hear(first, b"after", second)
         assert "not_allowed" in second.guard.refused()
+
+
+GREATEST = MessageNumber(2**48 - 1, 2**32 - 1)
+
+
+def shown_by_thief(card: bytes, signer: Signer, key: bytes) -> list[bytes]:
+    """As r1's card, in an envelope of the greatest number."""
+    address = Address(AUTHORITY.public_key, "robot/1/card")
+    message = seal(
+        card, signer=signer, address=address, start=GREATEST.start, sequence=GREATEST.sequence
+    )
+    return datagrams(message, topic=CARD, sender=1, number=GREATEST, key=GroupKey.of(key))
+
+
+@pytest.mark.parametrize("key", [KEY, FORMER], ids=["the present key", "the former key"])
+def test_no_forged_card_keeps_a_robots_own_from_being_heard(group: Group, key: bytes) -> None:
+    """Its number is the greatest; the robot has not been heard yet."""
+    with Robot(group, 2) as second, stranger() as thief:
+        (datagram,) = shown_by_thief(b"no card", Signer(b"t" * 32), key)
+
+        def refused() -> bool:
+            thief.sendto(datagram, (group.address, group.port))
+            return "forged" in second.guard.refused()
+
+        eventually(refused)
+        with Robot(group, 1) as first:
+            eventually_hear(first, b"here", second)
+
+
+def test_a_stolen_robots_card_does_not_keep_the_new_one_from_being_heard(group: Group) -> None:
+    """It was revoked, and the robot enrolled anew; the thief has the former key."""
+    signer, card = signer_and_card(1)
+    revoked = signed(Revocations(1, (card.fingerprint.hex(),)), AUTHORITY)
+    with Robot(group, 2) as second, stranger() as thief:
+        assert second.guard.hear_revocations(revoked)
+        (datagram,) = shown_by_thief(signed(card, AUTHORITY), signer, FORMER)
+
+        def refused() -> bool:
+            thief.sendto(datagram, (group.address, group.port))
+            return "revoked" in second.guard.refused()
+
+        eventually(refused)
+        with Robot(group, 1, enrolled=2) as first:
+            eventually_hear(first, b"here", second)
+
+
+@contextmanager
+def flooding(group: Group, said: list[bytes], rate_hz: float) -> Iterator[None]:
+    """Somebody who says that over and over."""
+    done = Event()
+
+    def flood(sender: socket.socket) -> None:
+        began_s = time.monotonic()
+        for count, datagram in enumerate(itertools.cycle(said), 1):
+            sender.sendto(datagram, (group.address, group.port))
+            if done.wait(max(0.0, began_s + count / rate_hz - time.monotonic())):
+                return
+
+    with stranger() as sender:
+        thread = Thread(target=flood, args=(sender,))
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
+
+
+@pytest.mark.parametrize("topic", [MESSAGE, CARD], ids=["messages", "cards"])
+@pytest.mark.parametrize("names", [[1], range(1000, 3000)], ids=["its name", "many names"])
+def test_whoever_has_the_former_key_alone_drowns_out_no_robot_that_begins(
+    group: Group, topic: Topic, names: Sequence[int]
+) -> None:
+    said = [
+        datagram
+        for number, name in enumerate(itertools.islice(itertools.cycle(names), 2000))
+        for datagram in datagrams(
+            b"x" * 100, topic=topic, sender=name, number=MessageNumber(2**40, number),
+            key=GroupKey.of(FORMER),
+        )
+    ]  # fmt: skip
+    with Robot(group, 2) as second, flooding(group, said, 800.0):
+        eventually(lambda: second.radio.refused() > 500)
+        with Robot(group, 1) as first:
+            eventually_hear(first, b"here", second)
+            for number in range(20):
+                eventually_hear(first, b"and here %d" % number, second)
 
 
 def test_who_has_the_former_key_is_heard_and_hears_nothing_new(group: Group) -> None:
