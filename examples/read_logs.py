@@ -19,7 +19,11 @@ if len(sys.argv) != 2:
 folder = Path(sys.argv[1])
 
 # What each robot wrote, topic by topic: columns over time, in its own clock.
-for name, topics in sorted(log_arrays(folder, "control", "received").items()):
+try:
+    logs = log_arrays(folder, "control", "received")
+except (OSError, ValueError) as error:
+    sys.exit(str(error))
+for name, topics in sorted(logs.items()):
     control, received = topics["control"], topics["received"]
     speed_m_s = np.linalg.norm(control["velocity_m_s"], axis=1)
     in_mission = control["state"] == "mission"

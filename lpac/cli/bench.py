@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from lpac.network.stations import NetworkStation
 
 app = new_app(
-    "bench", "Measure this machine's network: what programs say, and what they leave of it."
+    "bench",
+    "Measure this machine's network: what the programs send, and what bandwidth they leave.",
 )
 
 _OUT = Path("out/bench/network")
@@ -160,6 +161,12 @@ def _plan(
     )
 
 
+def require_namespaces(namespaces: str | None, robots: int | None) -> None:
+    """Raises ValueError, OSError if all experiments with so many robots could not run there."""
+    plans = [_plan(each, (), robots, None, None) for each in _experiments(None)]
+    _stations(namespaces, max(plan.stations for plan in plans))
+
+
 def _stations(namespaces: str | None, needed: int) -> list["NetworkStation"]:
     from lpac.network.stations import LOOPBACK, station_in
 
@@ -167,7 +174,12 @@ def _stations(namespaces: str | None, needed: int) -> list["NetworkStation"]:
         return [LOOPBACK] * needed
     names = namespaces.split(",")
     if len(names) < needed:
-        raise ValueError(f"--namespaces: {len(names)} given, and {needed} robots need one each")
+        fewer = (
+            f", or measure fewer: `lpac bench network -n {len(names)}`" if len(names) > 1 else ""
+        )
+        raise ValueError(
+            f"--namespaces: {len(names)} given, and {needed} robots need one each: name more{fewer}"
+        )
     if len(set(names)) < len(names):
         raise ValueError("--namespaces: one is given twice; each robot needs its own")
     return [station_in(name) for name in names[:needed]]

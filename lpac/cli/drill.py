@@ -41,7 +41,7 @@ def drill(
         typer.Option(
             help="simulated: on one simulated clock, over all cores; mavlink: one process per "
             "robot in real time, a few flights at once; px4: with real PX4s, one after another. "
-            "The latter two fly what `--list` says."
+            "The last two fly only the faults that `--list` marks."
         ),
     ] = DrillVehicle.SIMULATED,
     px4: Annotated[
@@ -93,6 +93,7 @@ def drill(
     chosen = _flown(chosen, vehicle, by_name=bool(faults))
     if out is None:
         out = _OUT if vehicle is DrillVehicle.SIMULATED else Path(f"{_OUT}-{vehicle}")
+    _require_sensor(sensor, bundle)
     drilled = DrilledRobots(robots, str(bundle.resolve()), sensor)
     real_time = _real_time(vehicle, px4, ray, out, drilled)
     options = _options(vehicle, px4, robots, bundle, sensor)
@@ -122,6 +123,17 @@ def drill(
             )
     if not all(outcome.held for outcome in outcomes):
         raise typer.Exit(1)
+
+
+def _require_sensor(type_: str, bundle: Path) -> None:
+    """Raises ConfigError before anything is flown."""
+    from edge.drivers.registry import open_sensor
+    from edge.policy.bundle import BundleError, load_bundle
+
+    manifest = load_bundle(bundle).manifest
+    if manifest.perception is None:
+        raise BundleError(f"{bundle}: the bundle has no perception: it cannot fly")
+    open_sensor(type_, {}, manifest)
 
 
 def _numbers(seeds: int | None, seed: int | None) -> list[int]:

@@ -795,11 +795,14 @@ def everything(
     bundle and code are not made again.
     """
     from edge.policy.bundle import load_bundle
+    from lpac.cli.bench import require_namespaces
     from lpac.paper.files import MADE_FOR_ALL
     from lpac.paper.repeated import write_page
 
     folder = out or _OUT
     loaded = load_bundle(bundle)
+    # Known before hours of flights.
+    require_namespaces(namespaces, _QUICK_NETWORK[0] if quick else None)
     vehicle = VehicleKind.POINT if quick else VehicleKind.SIMULATED
     flying: dict[str, Callable[[Path], None]] = {
         "e1": lambda its: e1(bundle=bundle, vehicle=vehicle, ray=ray, out=its),

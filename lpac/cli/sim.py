@@ -3,6 +3,7 @@
 import gc
 import json
 import math
+import re
 import shlex
 import signal
 import tempfile
@@ -10,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from edge.core.frames import ModelScale
     from edge.core.world import Feature
     from lpac.sim.experiment import FlightMoment, Scenario, SimulatedFlight
+    from lpac.sim.failure import Failure
     from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.layout import FleetScenario
     from lpac.sim.fleet.listener import Statuses
@@ -80,7 +82,35 @@ class Scale(StrEnum):
     MODEL = "model"
 
 
+# What an error may call an option's value.
+_OPTIONS = {
+    "communication_range": "--range", "control_hz": "--control-hz", "delay_s": "--delay",
+    "duration": "--duration", "features": "--features", "lag_s": "--lag", "loss": "--loss",
+    "max_message_age_s": "--max-message-age", "robots": "--robots", "seed": "--seed",
+    "world_size": "--world-size",
+}  # fmt: skip
+_OPTION_OF = re.compile(rf"\b({'|'.join(_OPTIONS)}) = ")
+_NOWHERE = re.compile(r"\S*/lpac-sim-\w+/")
+
+
+def _naming_options(command: Callable[..., None]) -> Callable[..., None]:
+    """What is wrong with an option's value is said of the option, not of what it becomes."""
+
+    @wraps(command)
+    def named(**given: object) -> None:
+        try:
+            command(**given)
+        except ValueError as error:
+            text = _OPTION_OF.sub(
+                lambda found: f"{_OPTIONS[found[1]]} ", _NOWHERE.sub("", str(error))
+            )
+            raise ValueError(text) from error
+
+    return named
+
+
 @app.command()
+@_naming_options
 def sim(
     *,
     context: typer.Context,
@@ -93,7 +123,10 @@ def sim(
         ),
     ] = VehicleKind.POINT,
     bundle: Annotated[Path, typer.Option(help="Policy bundle.")] = DEFAULT_BUNDLE,
-    controller: Annotated[Controller, typer.Option(help="Who flies.")] = Controller.LPAC,
+    controller: Annotated[
+        Controller,
+        typer.Option(help="What decides where robots fly; lpac: the bundle's policy."),
+    ] = Controller.LPAC,
     robots: Annotated[
         str,
         typer.Option(
@@ -101,7 +134,7 @@ def sim(
             "-n",
             metavar="N|auto",
             help=f"Number of robots; with mavlink and px4 also auto: as many, up to "
-            f"{DEFAULT_ROBOTS}, as this machine carries.",
+            f"{DEFAULT_ROBOTS}, as this machine can handle.",
         ),
     ] = str(DEFAULT_ROBOTS),
     seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 0,
@@ -134,7 +167,11 @@ def sim(
     ] = None,
     perception_hz: Annotated[float, typer.Option(help="How often a robot perceives.")] = 5.0,
     policy_hz: Annotated[
-        float, typer.Option(help="How often its policy decides, and it speaks.")
+        float,
+        typer.Option(
+            help="How often its policy decides, and it speaks: against --perception-hz, the "
+            "exchanges per perception."
+        ),
     ] = 2.5,
     control_hz: Annotated[float, typer.Option(help="How often it steers.")] = 10.0,
     synchronous: Annotated[
@@ -184,7 +221,8 @@ def sim(
     errors: Annotated[
         bool,
         typer.Option(
-            help="simulated, mavlink: positions, heights, compasses and batteries err, gusts blow."
+            help="simulated, mavlink: with errors of positions, heights, compasses and batteries, "
+            "and gusts."
         ),
     ] = True,
     sensor: Sensor = DEFAULT_SENSOR,
@@ -230,7 +268,7 @@ def sim(
     from edge.core.world import parse_world
     from lpac.sim.experiment import FIELD_SCALE
 
-    _require_options_of(context, vehicle)
+    _require_options_of(context, vehicle, controller, world)
     count = _robot_count(robots)
     if count is None and vehicle in (VehicleKind.POINT, VehicleKind.SIMULATED):
         raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
@@ -292,7 +330,6 @@ def sim(
         return
     from lpac.radio.modelled import ModelledRadio
     from lpac.sim.experiment import Scenario
-    from lpac.sim.failure import Failure, LostRobots
 
     assert count is not None
     found = calibration(wifi, transport=transport is not None)
@@ -319,15 +356,13 @@ def sim(
         world_size=world_size,
         communication_range=communication_range,
         lag_s=lag,
-        failures=(
-            *(() if lost is None else LostRobots.parse(lost).failures(count)),
-            *map(Failure.parse, away or ()),
-        ),
+        failures=_failures(lost, away or (), count, duration),
         position_bias=_position_bias(seed, position_error, count, model),
         clocks=clocks,
     )
     if out:
         out.mkdir(parents=True, exist_ok=True)
+    _tell_of_features_outside(world, world_features, bundle, world_size)
     [flight] = fly_points([(controller.value, scenario)], bundle)
     if out:
         from lpac.sim.report import write_flight
@@ -361,20 +396,82 @@ _ONLY_FOR = {
     "sensor": (VehicleKind.SIMULATED, VehicleKind.MAVLINK, VehicleKind.PX4),
     "recorded": (VehicleKind.SIMULATED,),
     "px4": (VehicleKind.PX4,),
+    "secure": (VehicleKind.SIMULATED, VehicleKind.MAVLINK, VehicleKind.PX4),
     "transport": (VehicleKind.POINT, VehicleKind.MAVLINK, VehicleKind.PX4),
     "wifi": (VehicleKind.POINT,),
     "script": (VehicleKind.MAVLINK, VehicleKind.PX4),
 }
 
 
-def _require_options_of(context: typer.Context, vehicle: VehicleKind) -> None:
+# A baseline sees what it is to see, and decides at once; nothing is sent.
+_OF_POLICIES = (
+    "perception_hz", "policy_hz", "control_hz", "synchronous", "payload", "loss", "delay",
+    "max_message_age",
+)  # fmt: skip
+
+
+def _require_options_of(
+    context: typer.Context, vehicle: VehicleKind, controller: Controller, world: Path | None
+) -> None:
     """An option that would do nothing is a mistake."""
-    for name, vehicles in _ONLY_FOR.items():
+    nothing = {
+        name: f"--vehicle {vehicle.value}" for name in _ONLY_FOR if vehicle not in _ONLY_FOR[name]
+    }
+    if controller is not Controller.LPAC:
+        nothing |= dict.fromkeys(_OF_POLICIES, f"--controller {controller.value}")
+    if world is not None:
+        nothing["features"] = f"--world {world}"
+    for name, beside in nothing.items():
         source = context.get_parameter_source(name)
-        if vehicle not in vehicles and source is not None and source.name == "COMMANDLINE":
+        if source is not None and source.name == "COMMANDLINE":
+            no = "no-" if context.params[name] is False else ""
+            raise ValueError(f"--{no}{name.replace('_', '-')} does nothing with {beside}")
+
+
+def _failures(
+    lost: str | None, away: Sequence[str], robots: int, duration_s: float
+) -> tuple["Failure", ...]:
+    """What --lost and --away say. Raises ValueError, also for what would come after the flight."""
+    from lpac.sim.failure import Failure, LostRobots
+
+    failures = [Failure.parse(each) for each in away]
+    if lost is not None:
+        failures += LostRobots.parse(lost).failures(robots)
+    for failure in failures:
+        if failure.from_s >= duration_s:
             raise ValueError(
-                f"--{name.replace('_', '-')} does nothing with --vehicle {vehicle.value}"
+                f"robot {failure.robot} is gone from {failure.from_s:g} s on: must be within the "
+                f"flight, --duration {duration_s:g}"
             )
+    return tuple(failures)
+
+
+def _tell_of_features_outside(
+    world: Path | None,
+    features: "Sequence[Feature] | None",
+    bundle: Path,
+    world_size: int | None,
+) -> None:
+    """Whoever makes the world smaller may not think of them."""
+    from edge.core.world import GaussianFeature
+    from edge.policy.bundle import load_bundle
+
+    perception = load_bundle(bundle).manifest.perception
+    if features is None or perception is None:
+        return
+    side = world_size or perception.world_size
+    places = [
+        (each.mean,) if isinstance(each, GaussianFeature) else each.vertices for each in features
+    ]
+    outside = sum(
+        not any(0.0 <= x <= side and 0.0 <= y <= side for x, y in place) for place in places
+    )
+    if outside:
+        typer.echo(
+            f"{world}: {outside} of {len(features)} features lie outside of the world, whose side "
+            f"is {side} model units",
+            err=True,
+        )
 
 
 def _robot_count(text: str) -> int | None:
@@ -718,8 +815,8 @@ def _clocks(
 
     rates_hz = {"perception": perception_hz, "policy": policy_hz, "control": control_hz}
     for loop, rate_hz in rates_hz.items():
-        if not 0.0 < rate_hz < math.inf:
-            raise ValueError(f"--{loop}-hz {rate_hz:g}: must be positive and finite")
+        if not 0.1 <= rate_hz <= 100.0:
+            raise ValueError(f"--{loop}-hz {rate_hz:g}: must be from 0.1 to 100")
     return Clocks(
         perception_s=1.0 / perception_hz,
         policy_s=1.0 / policy_hz,

@@ -1,6 +1,7 @@
 """The `lpac` command as a user types it."""
 
 import ast
+import io
 import json
 import os
 import platform
@@ -16,7 +17,8 @@ import numpy as np
 import pytest
 import typer
 
-from edge.core.world import parse_world
+from edge.core.world import GaussianFeature, format_world, parse_world
+from edge.policy.bundle import load_bundle, make_bundle, write_bundle
 from lpac.cli.main import app
 from tests.conftest import ROOT, SHIPPED
 
@@ -190,11 +192,11 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["sim", "--robots", "0"], "robots = 0: must be from 1 to 65536"),
-        (["sim", "--seed", "-1"], "seed = -1: must be at least 0"),
+        (["sim", "--robots", "0"], "--robots 0: must be from 1 to 65536"),
+        (["sim", "--seed", "-1"], "--seed -1: must be at least 0"),
         (["sim", "--world", "docs/demo.png"], "docs/demo.png: is not a text file"),
         (["sim", "--out", "README.md"], "README.md"),
-        (["sim", "--loss", "2"], "loss = 2.0: must be from 0 to 1"),
+        (["sim", "--loss", "2"], "--loss 2.0: must be from 0 to 1"),
         (["sim", "--transport", "mesh", "--loss", "0.1"], "--loss and --transport: the model"),
         (["sim", "--transport", "mesh", "--delay", "1"], "--delay and --transport: the model"),
         (["sim", "--transport", "mesh", "--wifi", "absent.toml"], "absent.toml"),
@@ -205,9 +207,27 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--world", "/dev/null"], "/dev/null: the world would have nothing in it"),
         (["sim", "--starts", "Makefile"], "Makefile: line 1: must be 'x y', in m"),
         (["sim", "--starts", "/dev/null"], "/dev/null: has 0 starts, and there are 10 robots"),
-        (["sim", "--policy-hz", "0"], "--policy-hz 0: must be positive"),
+        (["sim", "--policy-hz", "0"], "--policy-hz 0: must be from 0.1 to 100"),
         (["sim", "--position-error", "-1"], "--position-error -1: must be at least 0"),
         (["sim", "--lost", "10@5"], "lost robots 10@5: must be fewer than the team's 10"),
+        (["sim", "--lost", "2@60"], "robot 8 is gone from 60 s on: must be within the flight"),
+        (["sim", "--range", "0"], "--range 0.0: must be positive and finite"),
+        (["sim", "--secure"], "--secure does nothing with --vehicle point"),
+        (["sim", "--no-script"], "--no-script does nothing with --vehicle point"),
+        (["sim", "--world", "a.env", "--features", "3"], "--features does nothing with --world"),
+        (
+            ["sim", "--controller", "shared-cvt", "--loss", "0.5"],
+            "--loss does nothing with --controller shared-cvt",
+        ),
+        (
+            ["sim", "--vehicle", "simulated", "--control-hz", "1"],
+            "lpac: fleet.toml: robots.r0, in slots[0]: rates: --control-hz 1.0: PX4 needs",
+        ),
+        (
+            ["drill", "--sensor", "foo", "--fault", "none"],
+            "sensor: type = 'foo': is not installed here",
+        ),
+        (["paper", "all", "--namespaces", "a,b"], "2 given, and 10 robots need one each"),
         (["sim", "--away", "3@20-10"], "failure of robot 3: from_s = 20.0, until_s = 10.0: must"),
         (
             ["sim", "--lag", "1", "--vehicle", "mavlink"],
@@ -232,6 +252,31 @@ def test_a_start_outside_of_the_world_is_one(tmp_path: Path) -> None:
     starts.write_text("1 32\n1 33\n")
     told = error_line(lpac("sim", "-n", "2", "--starts", starts))
     assert "line 2: 1 33: is outside of the world: must be from 0 to 32 m" in told
+
+
+def test_features_that_a_smaller_world_leaves_out_are_counted(tmp_path: Path) -> None:
+    world = tmp_path / "world.env"
+    inside, outside = (
+        GaussianFeature((50.0, 50.0), (9.0, 9.0)),
+        GaussianFeature((300.0, 50.0), (9.0, 9.0)),
+    )
+    world.write_text(format_world((inside, outside)))
+    told = lpac("sim", "-n", 1, "--duration", 1, "--world", world, "--world-size", 128)
+    assert "1 of 2 features lie outside of the world, whose side is 128" in told.stderr
+
+
+def test_a_bundle_that_is_not_verified_flies_as_a_point_with_a_warning(tmp_path: Path) -> None:
+    bundle = load_bundle(SHIPPED)
+    golden = dict(np.load(io.BytesIO(bundle.files["golden.npz"])))
+    golden["swarm/velocities"] = golden["swarm/velocities"] * np.float32(1.001)
+    changed = io.BytesIO()
+    np.savez(changed, **golden)
+    files = {name: bundle.files[name] for name in bundle.manifest.files}
+    wrong = make_bundle(bundle.manifest, {**files, "golden.npz": changed.getvalue()})
+    write_bundle(wrong, tmp_path / "wrong")
+    told = lpac("sim", "-n", 1, "--duration", 1, "--bundle", tmp_path / "wrong")
+    assert told.returncode == 0
+    assert "wrong: swarm of the bundle do not compute its golden outputs here" in told.stderr
 
 
 def test_whole_robots_have_knobs_too(tmp_path: Path) -> None:

@@ -143,7 +143,10 @@ def test_for_people_it_is_a_table_that_says_where(tmp_path: Path) -> None:
         (["restarts", "-n", 1], "--robots 1: restarts needs at least 2"),
         (["--repetitions", 0], "--repetitions 0: must be at least 1"),
         (["--seconds", 0.5], "--seconds 0.5: must be at least 1"),
-        (["--namespaces", "a,b"], "--namespaces: 2 given, and 10 robots need one each"),
+        (
+            ["--namespaces", "a,b"],
+            "--namespaces: 2 given, and 10 robots need one each: name more, or measure fewer",
+        ),
         (["-n", 2, "--namespaces", "a,a"], "--namespaces: one is given twice"),
         (["-n", 2, "--namespaces", "no-such-1,no-such-2"], "--namespaces: "),
     ],

@@ -177,7 +177,7 @@ def test_the_printed_rotation_is_right_at_a_heading_of_90_degrees_alone() -> Non
         assert right == np.allclose(printed @ [0, 1, 0], ours.velocity_to_local(np.eye(3)[1]))
     rotation = claim(Experiments(), "Equation 4")
     assert rotation.verdict is Agreement.MISTAKE
-    assert "heading of 0° to 180°" in rotation.ours and "90° to 90°" in rotation.ours
+    assert "towards 180° if θ is 0°" in rotation.ours and "90° if θ is 90°" in rotation.ours
 
 
 def test_one_page_holds_everything(tmp_path: Path, shipped_bundle: Bundle) -> None:
@@ -200,6 +200,8 @@ def test_one_page_holds_everything(tmp_path: Path, shipped_bundle: Bundle) -> No
     assert told["made_by"] == made_by
     assert {c["name"].split(":")[0] for c in told["claims"]} > {"E2", "E3", "Equation 4"}
     assert all(claim["rule"] in page.replace("&#x27;", "'") for claim in told["claims"])
+    for number in range(len(told["claims"])):
+        assert f'href="#claim-{number}"' in page and f'id="claim-{number}"' in page
 
 
 def test_a_message_does_not_grow_with_who_is_heard(shipped_bundle: Bundle) -> None:
