@@ -37,6 +37,8 @@ Transport = Literal["mesh", "router", "multicast"]
 _KEYS = "~/.local/share/lpac/keys"
 _MAX_CPU = 1023
 
+_GROUP = "239.255.76.80:7450"
+
 # These stand on the command lines of ssh, and in files of systemd.
 _HOST = re.compile(r"[A-Za-z0-9_:][A-Za-z0-9_.:-]*")
 _USER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
@@ -88,20 +90,25 @@ class RadioConfig:
 
     transport: Transport = "mesh"
     router: str = ""
-    group: str = "239.255.76.80:7450"
+    group: str = _GROUP
     type: str = "zenoh"
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.router and not _is_endpoint(self.router):
             raise ValueError(
-                f"router = {self.router!r}: must be an IPv4 address and a port, such as "
-                "'192.168.8.2:7447'"
+                f"router = {self.router!r}: must be a computer's own IPv4 address and a port from "
+                "1 to 65535, such as '192.168.8.2:7447'"
             )
         if (self.transport == "mesh") == bool(self.router):
-            must = "must be left out" if self.router else "must be where the router is"
+            where = "must be where the router is, such as '192.168.8.2:7447'"
+            must = "must be left out" if self.router else where
             raise ValueError(f"transport = {self.transport!r}: router = {self.router!r}: {must}")
         require_group("group", self.group)
+        if self.transport != "multicast" and self.group != _GROUP:
+            raise ValueError(
+                f"transport = {self.transport!r}: group = {self.group!r}: must be left out"
+            )
         if not self.type:
             raise ValueError("type = '': must be 'zenoh', or the name of a radio of your own")
         if self.options and self.type == "zenoh":
@@ -320,9 +327,9 @@ class RobotTable:
             raise ValueError(
                 f"system_id is missing: robot_id = {self.robot_id} is not from 1 to 255"
             )
-        if self.address is not None and not is_ipv4(self.address):
-            raise ValueError(f"address = {self.address!r}: must be an IPv4 address")
-        if self.address is None and not is_ipv4(self.host):
+        if self.address is not None and not _is_of_computer(self.address):
+            raise ValueError(f"address = {self.address!r}: must be a computer's own IPv4 address")
+        if self.address is None and not _is_of_computer(self.host):
             raise ValueError(
                 f"address is missing: host = {self.host!r} is no IPv4 address, by which the other "
                 "robots could reach it"
@@ -473,7 +480,12 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
 
 def _is_endpoint(text: str) -> bool:
     address, _, port = text.rpartition(":")
-    return is_ipv4(address) and port.isdecimal() and 1 <= int(port) <= 65535
+    return _is_of_computer(address) and port.isdecimal() and 1 <= int(port) <= 65535
+
+
+def _is_of_computer(text: str) -> bool:
+    """Whether it is an IPv4 address by which others can reach one: not 0.0.0.0, no multicast."""
+    return is_ipv4(text) and 1 <= int(text.partition(".")[0]) <= 223
 
 
 def _cpus(text: str) -> tuple[int, ...]:

@@ -70,12 +70,18 @@ def read_wifi(path: Path | None) -> Calibration:
     """Of a .toml or a .jsonl file; without a path, all of it is assumed.
 
     Raises OSError; ConfigError that names file, key, value and what is allowed, also for records
-    that say nothing of what is assumed.
+    that say nothing of what is assumed, and for those of no radio.
     """
     if path is None:
         return _calibration(Wifi(), {})
     if path.suffix == ".jsonl":
-        found = calibrated(read_records(path))
+        records = read_records(path)
+        if records and not any(record.is_of_radio for record in records):
+            raise ConfigError(
+                f"{path}: these records are not of a radio: none told of signal, rate or how busy "
+                "the channel was, as with robots of `lpac sim`"
+            )
+        found = calibrated(records)
         if all(source.kind is SourceKind.ASSUMED for source in found.sources.values()):
             raise ConfigError(f"{path}: no record says anything of what the model assumes")
         return found

@@ -1,5 +1,6 @@
 """Who hears whom, as a picture: the share that came, and how old it was."""
 
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from lpac.analysis import style
 from lpac.radio.pairs import LATE_S, Pair
 
 _MOST_WRITTEN = 16
+# In characters.
+_TITLE_WIDTH = 90
 # Half of what was said: below, it is all the same.
 _WORST_MISSING = 0.5
 
@@ -29,7 +32,7 @@ def draw(robots: Sequence[str], pairs: Sequence[Pair], title: str, path: Path) -
                 values[row, column] = np.nan if value is None else value
         return values
 
-    with style.figure(style.WIDTH_IN, 0.55 * style.WIDTH_IN) as figure:
+    with style.figure(style.WIDTH_IN, 0.6 * style.WIDTH_IN) as figure:
         left, right = figure.subplots(1, 2)
         missing = matrix(lambda pair: 1.0 - pair.delivered)
         _panel(left, robots, missing, 100.0 * (1.0 - missing), ".0f", _WORST_MISSING)
@@ -38,7 +41,7 @@ def draw(robots: Sequence[str], pairs: Sequence[Pair], title: str, path: Path) -
         _panel(right, robots, ages_s, ages_s, ".2f", 2.0 * LATE_S)
         right.set_title(f"age, 99th percentile, s (late at {LATE_S:g})")
         left.set_ylabel("heard by")
-        figure.suptitle(title, fontsize=9)
+        figure.suptitle(textwrap.fill(title, _TITLE_WIDTH), fontsize=9)
         style.save(figure, path)
 
 
@@ -55,9 +58,9 @@ def _panel(
     if len(robots) > _MOST_WRITTEN:
         return
     for (row, column), value in np.ndenumerate(told):
-        if np.isfinite(value):
+        if row != column:
             dark = colours[row, column] > 0.6 * worst
             axes.text(
-                column, row, format(value, number), ha="center", va="center", fontsize=6,
-                color="#ffffff" if dark else style.INK,
+                column, row, format(value, number) if np.isfinite(value) else "-",
+                ha="center", va="center", fontsize=6, color="#ffffff" if dark else style.INK,
             )  # fmt: skip

@@ -43,6 +43,11 @@ class RadioRecord:
     signal_dbm: float | None = None
     busy_share: float | None = None
 
+    @property
+    def is_of_radio(self) -> bool:
+        """Whether a radio told anything; robots of `lpac sim` have none."""
+        return any(v is not None for v in (self.rate_mbit_s, self.signal_dbm, self.busy_share))
+
     def __post_init__(self) -> None:
         for name in ("sender", "receiver"):
             if not getattr(self, name):

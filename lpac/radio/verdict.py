@@ -27,6 +27,7 @@ _MODEL_ERR = 1.5
 _WEAK_DBM = -75.0
 # Where no radio tells its own; as docs/scaling.md has it.
 ASSUMED_RATE_MBIT_S = 220.0
+WHAT_RUNS = "`lpac fleet status` tells which programs run; of simulated robots, `lpac sim` does"
 
 
 class Room(NamedTuple):
@@ -117,10 +118,11 @@ def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> s
     assert room is not None
     of_which, beside = "", " beside a bulk stream" if checked.loaded else ""
     if room.robots > len(checked.robots):
-        of_which = f", of which {', '.join(checked.robots)} were judged,"
-    more_robots = room.carries - room.robots
+        of_which = f", of which {', '.join(checked.robots)} were judged"
+    more = room.carries - room.robots
     return (
-        f"carries {room.robots} robots{of_which}{beside} with room for {more_robots or 'no more'}"
+        f"carries {room.robots} robots{of_which}{beside}; by the model there is room for "
+        f"{f'{more} more' if more else 'no more'}"
     )
 
 
@@ -143,7 +145,7 @@ def _silent(checked: Checked) -> Iterator[_Found]:
     for name in checked.robots:
         window = checked.windows.get(name)
         if window is None:
-            yield 1.0, f"{name} is not heard here: `lpac fleet status` tells whether it runs"
+            yield 1.0, f"{name} is not heard here: {WHAT_RUNS}"
         elif window.sent < 1:
             yield 1.0, f"{name} says nothing to the others: `lpac watch` tells what it lacks"
 
@@ -153,8 +155,9 @@ def _channel(room: Room | None) -> Iterator[_Found]:
         return
     left = max(0.0, MOST_BUSY - room.others_share)
     text = (
-        f"in flight these {room.robots} robots ask for {_percent(room.flight_share)} of the "
-        f"channel, of which they can use {_percent(left)}: it carries {room.carries or 'none'}"
+        f"by the model these {room.robots} robots ask in flight for {_percent(room.flight_share)} "
+        f"of the channel, of which they can use {_percent(left)}: it carries "
+        f"{room.carries or 'none'}"
     )
     if room.others_share > 0.0:
         text += f"; others take {_percent(room.others_share)}: look for another channel"

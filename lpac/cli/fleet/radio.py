@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lpac.ground.station.subscriber import GroundSubscriber
     from lpac.radio.checked import Checked, WifiReading
     from lpac.radio.pairs import Pair, Window
-    from lpac.radio.verdict import RadioVerdict
+    from lpac.radio.verdict import RadioVerdict, Room
 
 # Counts are in a status of every two seconds.
 _HEARD_WITHIN_S = 6.0
@@ -102,7 +102,7 @@ def radio(
 
 def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load: bool) -> None:
     """Raises ValueError that says what the operator has to do first."""
-    from lpac.radio.verdict import obstacles
+    from lpac.radio.verdict import WHAT_RUNS, obstacles
 
     statuses: dict[str, RobotStatus] = {}
 
@@ -116,7 +116,7 @@ def _require_speaking(ground: "GroundSubscriber", names: Sequence[str], *, load:
     # Who is not heard is missed later.
     ground.wait_for(all_told, _HEARD_WITHIN_S)
     if not statuses:
-        raise ValueError("radio: no robot is heard: `lpac fleet status` tells whether they run")
+        raise ValueError(f"radio: no robot is heard: {WHAT_RUNS}")
     hindrances = obstacles(statuses)
     if hindrances:
         raise ValueError(f"radio: {'; '.join(hindrances)}")
@@ -226,13 +226,14 @@ def _print(
     names = checked.robots
     by_link = {(pair.receiver, pair.sender): pair for pair in found}
     for heading, cell in (
-        ("arrived %", partial(_delivered, expected_loss=checked.expected_loss)),
-        ("age p99 s", _age), (f"of {LATE_S:g} s or older %", _late),
+        ("arrived, %", partial(_delivered, expected_loss=checked.expected_loss)),
+        ("age p99, s", _age), (f"{LATE_S:g} s old or older, %", _late),
     ):  # fmt: skip
         typer.echo(f"{heading}: a row hears, a column says")
         rows: list[list[str | Text]] = [
             [receiver, *(
-                "" if (pair := by_link.get((receiver, sender))) is None else cell(pair)
+                cell(pair) if (pair := by_link.get((receiver, sender)))
+                else styled("" if receiver == sender else "-", FAINT)
                 for sender in names
             )]
             for receiver in names
@@ -253,24 +254,18 @@ def _print(
         typer.secho(problem, fg=BAD)
     if not told.problems:
         typer.secho(told.sentence, fg=GOOD)
-    if told.room is not None:
-        typer.secho(_basis(checked, told), dim=True)
+    # A failure needs none, unless it is the model that finds the channel too small.
+    if told.room is not None and (not told.problems or told.room.carries < told.room.robots):
+        typer.secho(_basis(checked, told.room), dim=True)
 
 
-def _basis(checked: "Checked", told: "RadioVerdict") -> str:
+def _basis(checked: "Checked", room: "Room") -> str:
     """What the room for more comes from."""
-    room = told.room
-    assert room is not None
-    assumed = "" if room.rate_told else ", which is assumed"
-    to_all = ""
-    if checked.transport == "multicast":
-        to_all = f" and {room.multicast_rate_mbit_s:g} Mbit/s to all, which is assumed"
     text = (
-        f"room by the model of docs/scaling.md: {checked.transport} at {room.rate_mbit_s:.0f} "
-        f"Mbit/s{assumed}{to_all}; {room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a "
-        f"second take {100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} "
-        f"bytes in flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay "
-        "below 60 %"
+        f"room by the model of docs/scaling.md: {checked.transport} at {_rates(checked, room)}; "
+        f"{room.ground_bytes:.0f} bytes {room.message_hz:.1f} times a second take "
+        f"{100.0 * room.ground_share:.0f} % of the channel, {room.flight_bytes:.0f} bytes in "
+        f"flight {100.0 * room.flight_share:.0f} %; up to {room.carries} robots stay below 60 %"
     )
     if room.busy_share is not None:
         text += (
@@ -285,6 +280,15 @@ def _basis(checked: "Checked", told: "RadioVerdict") -> str:
             "the air twice"
         )
     return text
+
+
+def _rates(checked: "Checked", room: "Room") -> str:
+    rate, to_all = f"{room.rate_mbit_s:.0f} Mbit/s", f"{room.multicast_rate_mbit_s:g} Mbit/s to all"
+    if checked.transport != "multicast":
+        return rate if room.rate_told else f"{rate} (assumed)"
+    if room.rate_told:
+        return f"{rate}, and an assumed {to_all}"
+    return f"{rate}, and {to_all} (both assumed)"
 
 
 def _delivered(pair: "Pair", *, expected_loss: float) -> "Text":

@@ -126,7 +126,7 @@ def test_idle_robots_on_the_ground_speak_as_in_a_mission(
     assert not room["rate_told"] and room["busy_share"] is None
     assert answer.returncode == (0 if found["ok"] else 1)
     if found["ok"]:
-        assert found["sentence"].startswith("carries 3 robots with room for ")
+        assert found["sentence"].startswith("carries 3 robots; by the model there is room for ")
     kept = read_records(records)
     assert len(kept) == 6
     assert {record.distance_m for record in kept} != {None}
@@ -140,7 +140,7 @@ def test_who_is_heard_badly_is_named(fleet: ThinAir, new_station: NewStation) ->
     assert answer.returncode == 1
     last = answer.stderr.splitlines()[-1]
     assert last.startswith("lpac: radio: the others hear ") and " of r1" in last
-    assert "arrived %: a row hears, a column says" in answer.stdout
+    assert "arrived, %: a row hears, a column says" in answer.stdout
 
 
 # Robots' computers are this machine's shell, with a radio that is busy three tenths of the time.

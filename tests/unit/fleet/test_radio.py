@@ -3,14 +3,14 @@
 import json
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from edge.messages.mission import RadioCounts
 from lpac.analysis.snapshot import FleetSnapshot
@@ -80,34 +80,50 @@ def test_a_laptop_knows_whether_it_is_in_the_wifi(
 
 
 class _Ground:
-    """Hears three robots that say 2.5 messages a second, on a clock that does not wait."""
+    """Hears robots that say 2.5 messages a second, on a clock that does not wait."""
 
-    now_s = 0.0
+    def __init__(self, *robots: int) -> None:
+        self._robots = robots
+        self.now_s = 0.0
 
     def wait_for(self, until: Callable[[FleetSnapshot], bool], timeout_s: float) -> None:
         self.now_s += timeout_s
         sent = round(2.5 * self.now_s)
         said = RadioCounts(sent, 1800 * sent, {str(n): (sent, 0, sent) for n in (1, 2, 3)})
         changes = {"uptime_s": self.now_s, "radio_counts": said, "armed": False}
-        robots = [snapshots.robot(snapshots.status(n, **changes)) for n in (1, 2, 3)]
+        robots = [snapshots.robot(snapshots.status(n, **changes)) for n in self._robots]
         until(snapshots.snapshot(*robots))
 
 
-def test_who_is_not_asked_about_takes_airtime_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, ground = write_fleet(tmp_path, 22, flying=3), _Ground()
-    # Robots without computers, as those of `lpac sim`.
-    path.write_text(re.sub(r'"(127.0.0.(\d))"', r'"r\2.invalid"\naddress = "\1"', path.read_text()))
-    monkeypatch.setattr(
-        "lpac.ground.station.subscriber.GroundSubscriber", lambda _: nullcontext(ground)
-    )
-    clock = SimpleNamespace(monotonic=lambda: ground.now_s)
-    monkeypatch.setattr(sys.modules["lpac.cli.fleet.radio"], "time", clock)
+Ask = Callable[..., Result]
 
+
+@pytest.fixture
+def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ask:
+    """`lpac fleet radio` of robots r1, r2, r3 without computers, as those of `lpac sim`.
+
+    It is told who is heard, [radio], and options.
+    """
+    path = write_fleet(tmp_path, 22, flying=3)
+    text = re.sub(r'"(127.0.0.(\d))"', r'"r\2.invalid"\naddress = "\1"', path.read_text())
+
+    def asked(heard: Sequence[int], radio: str, *options: object) -> Result:
+        ground = _Ground(*heard)
+        path.write_text(f"{text}\n[radio]\n{radio}\n")
+        monkeypatch.setattr(
+            "lpac.ground.station.subscriber.GroundSubscriber", lambda _: nullcontext(ground)
+        )
+        clock = SimpleNamespace(monotonic=lambda: ground.now_s)
+        monkeypatch.setattr(sys.modules["lpac.cli.fleet.radio"], "time", clock)
+        words = ["fleet", "radio", "--fleet", path, *options]
+        return CliRunner().invoke(app, [str(word) for word in words])
+
+    return asked
+
+
+def test_who_is_not_asked_about_takes_airtime_all_the_same(ask: Ask) -> None:
     def asked(*options: object) -> dict[str, Any]:
-        words = ["fleet", "radio", "--fleet", path, "--json", *options]
-        result = CliRunner().invoke(app, [str(word) for word in words])
+        result = ask((1, 2, 3), "", "--json", *options)
         assert result.exception is None, result.exception
         found: dict[str, Any] = json.loads(result.stdout)
         return found
@@ -115,7 +131,38 @@ def test_who_is_not_asked_about_takes_airtime_all_the_same(
     two = asked("--robots", "r1,r3")
     assert {(p["sender"], p["receiver"]) for p in two["pairs"]} == {("r1", "r3"), ("r3", "r1")}
     room = two["room"]["carries"] - 3
-    assert two["sentence"] == (
-        f"carries 3 robots, of which r1, r3 were judged, with room for {room}"
-    )
-    assert asked()["sentence"] == f"carries 3 robots with room for {room}"
+    by_model = f"by the model there is room for {room} more"
+    assert two["sentence"] == f"carries 3 robots, of which r1, r3 were judged; {by_model}"
+    assert asked()["sentence"] == f"carries 3 robots; {by_model}"
+
+
+@pytest.mark.parametrize(
+    ("radio", "rates"),
+    [
+        ("", "mesh at 220 Mbit/s (assumed);"),
+        (
+            'transport = "multicast"\nrouter = "127.0.0.1:7447"',
+            "multicast at 220 Mbit/s, and 6 Mbit/s to all (both assumed);",
+        ),
+    ],
+)
+def test_what_is_assumed_and_comes_from_the_model_is_called_so(
+    ask: Ask, radio: str, rates: str
+) -> None:
+    result = ask((1, 2, 3), radio)
+    assert result.exception is None, result.exception
+    assert "carries 3 robots; by the model there is room for " in result.stdout
+    assert f"room by the model of docs/scaling.md: {rates}" in result.stdout
+
+
+def test_who_is_not_heard_has_no_figures_and_there_is_no_room_to_tell_of(ask: Ask) -> None:
+    result = ask((1, 3), "")
+    assert "radio: r2 is not heard here: `lpac fleet status` tells" in str(result.exception)
+    assert "room" not in result.stdout
+    rows = [line.split() for line in result.stdout.splitlines() if re.match(r"r\d [ \d.-]+$", line)]
+    # Of each of three tables; nobody hears itself.
+    assert rows == [
+        ["r1", "-", "100"], ["r2", "-", "-"], ["r3", "100", "-"],
+        ["r1", "-", "0.02"], ["r2", "-", "-"], ["r3", "0.02", "-"],
+        ["r1", "-", "0"], ["r2", "-", "-"], ["r3", "0", "-"],
+    ]  # fmt: skip

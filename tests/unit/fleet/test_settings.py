@@ -327,6 +327,25 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
             "# [radio]", '[radio]\ntransport = "router"\nrouter = "laptop:7447"\n#',
             ["radio: router = 'laptop:7447'", "192.168.8.2:7447"],
         ),
+        *(
+            ("# [radio]", f'[radio]\ntransport = "router"\nrouter = "{router}"\n#',
+             [f"radio: router = '{router}'", "a computer's own IPv4", "1 to 65535", "192.168.8.2"])
+            for router in ("0.0.0.0:7447", "239.255.76.80:7450", "255.255.255.255:1", "10.0.0.1:0")
+        ),
+        (
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = ""\n#',
+            ["router = ''", "192.168.8.2:7447"],
+        ),
+        (
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
+            'group = "224.0.0.1:7450"\n#',
+            ["radio: group = '224.0.0.1:7450'", "none of 224.0.0.0/24", "239.255.76.80:7450"],
+        ),
+        (
+            "# [radio]", '[radio]\ngroup = "239.1.2.3:7450"\n#',
+            ["radio: transport = 'mesh': group = '239.1.2.3:7450': must be left out"],
+        ),
+        ('# address = "192.168.8.11"', 'address = "0.0.0.0"', ["robots.r1: address = '0.0.0.0'"]),
         ('"../out/image/arm64"', '""', ["image = ''", "path"]),
         ("# directory = ", "folder = ", ["unknown key 'folder'", "directory", "robots"]),
         ('"/opt/lpac"', '"/a"\ndirectory = "lpac"', ["directory = 'lpac'", "absolute"]),
@@ -346,7 +365,7 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ('"192.168.8.12"', '""', ["robots.r2: host = ''"]),
         ('"192.168.8.12"', '"root@r2"', ["robots.r2: host = 'root@r2'"]),
         ('"192.168.8.12"', '"r2"', ["robots.r2: address is missing", "host = 'r2'", "IPv4"]),
-        ('"192.168.8.12"', "12", ["robots.r2: host = 12", "str"]),
+        ('"192.168.8.12"', "12", ["robots.r2: host = 12", "text in quotes"]),
         ('# user = "root"', 'user = "-l"', ["robots.r1: user = '-l'"]),
         ("# port: for", "port = 0 #", ["robots.r1: port = 0", "1 to 65535"]),
         ("# zenoh_port = 7447", "zenoh_port = 70000", ["robots.r1: zenoh_port = 70000"]),

@@ -141,6 +141,18 @@ def test_a_toml_file_has_what_it_has(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_records_of_no_radio_are_refused(tmp_path: Path) -> None:
+    """As of robots of `lpac sim`: what they hear would be taken for a perfect channel."""
+    path = tmp_path / "loopback.jsonl"
+    silent = measured(Wifi(frame_loss=0.0), "multicast", 3, busy=False)
+    write_records(path, [silent, silent])
+    with pytest.raises(ConfigError, match="these records are not of a radio"):
+        read_wifi(path)
+    # One robot's radio may not tell what others' do.
+    write_records(path, [silent, replace(silent, signal_dbm=-60.0)])
+    assert read_wifi(path).sources["frame_loss"] == Source(SourceKind.DELIVERED, 2)
+
+
 def test_records_are_read(tmp_path: Path) -> None:
     path = tmp_path / "field.jsonl"
     records = [measured(FIELD, "mesh", 3), measured(FIELD, "multicast", 3)]

@@ -12,7 +12,7 @@ from lpac.radio.airtime import Traffic, Transport, Wifi, airtime, carries
 from lpac.radio.checked import Checked, WifiReading
 from lpac.radio.pairs import Pair, Window
 from lpac.radio.records import RadioRecord
-from lpac.radio.verdict import ASSUMED_RATE_MBIT_S, RadioVerdict, obstacles, verdict
+from lpac.radio.verdict import ASSUMED_RATE_MBIT_S, WHAT_RUNS, RadioVerdict, obstacles, verdict
 from tests.unit.ground import snapshots
 
 N, SENT, BYTES = 10, 50, 1795
@@ -51,7 +51,7 @@ def test_a_fleet_that_hears_itself_well() -> None:
     most = carries("mesh", Wifi(data_rate_mbit_s=ASSUMED_RATE_MBIT_S), traffic)
     told = verdict(checked(), heard())
     assert told.problems == ()
-    assert told.sentence == f"carries 10 robots with room for {most - N}"
+    assert told.sentence == f"carries 10 robots; by the model there is room for {most - N} more"
     assert told.room is not None
     assert (told.room.rate_told, told.room.busy_share) == (False, None)
     assert (told.room.ground_bytes, told.room.message_hz) == (BYTES + 85, 2.5)
@@ -123,8 +123,8 @@ def test_a_slow_rate_has_less_room() -> None:
 def test_a_channel_that_is_too_small_for_these_robots_is_a_problem() -> None:
     slow = verdict(checked(wifi=wifi(rate_mbit_s=6.0)), heard())
     assert slow.problems == (
-        "in flight these 10 robots ask for 235 % of the channel, of which they can use 60 %: it "
-        "carries 5",
+        "by the model these 10 robots ask in flight for 235 % of the channel, of which they can "
+        "use 60 %: it carries 5",
     )
     assert slow.sentence == slow.problems[0]
     # Beside a stream, too, of which nothing is asked.
@@ -139,7 +139,9 @@ def test_where_a_few_are_judged_the_others_still_take_airtime() -> None:
     told = verdict(few, [pair for pair in heard() if {pair.sender, pair.receiver} <= {"r0", "r1"}])
     # r9 is silent, which is no fault of those that are judged.
     assert told.problems == ()
-    assert told.sentence == "carries 9 robots, of which r0, r1 were judged, with room for 7"
+    assert told.sentence == (
+        "carries 9 robots, of which r0, r1 were judged; by the model there is room for 7 more"
+    )
 
 
 @pytest.mark.parametrize(
@@ -173,7 +175,7 @@ def test_the_worst_comes_first() -> None:
     pairs = [p for p in heard(r1_r2=(45, 0), r3_r2=(10, 0)) if p.sender not in ("r4", "r6")]
     told = verdict(checked(windows=windows), pairs)
     assert told.problems == (
-        "r4 is not heard here: `lpac fleet status` tells whether it runs",
+        f"r4 is not heard here: {WHAT_RUNS}",
         "r6 says nothing to the others: `lpac watch` tells what it lacks",
         "r2 hears 20 % of r3",
         "r2 hears 90 % of r1",
@@ -193,8 +195,8 @@ def test_a_weak_signal_is_told_of_who_is_heard_badly() -> None:
 def test_a_channel_that_others_take() -> None:
     (problem,) = verdict(checked(wifi=wifi(busy_share=0.31)), heard()).problems
     assert problem == (
-        "in flight these 10 robots ask for 34 % of the channel, of which they can use 33 %: it "
-        "carries 9; others take 27 %: look for another channel"
+        "by the model these 10 robots ask in flight for 34 % of the channel, of which they can use "
+        "33 %: it carries 9; others take 27 %: look for another channel"
     )
     # Who takes less leaves room for some.
     alone, beside = (verdict(checked(wifi=wifi(busy_share=busy)), heard()) for busy in (None, 0.25))
@@ -203,7 +205,7 @@ def test_a_channel_that_others_take() -> None:
     # A stream of the check's own is no stranger.
     loaded = verdict(checked(wifi=wifi(busy_share=0.8), loaded=True), heard())
     assert loaded.problems == ()
-    assert loaded.sentence.startswith("carries 10 robots beside a bulk stream with room for ")
+    assert loaded.sentence.startswith("carries 10 robots beside a bulk stream; by the model ")
 
 
 @given(st.floats(0.01, 1.0), st.floats(0.01, 1.0))
