@@ -1,4 +1,4 @@
-"""Two policies and a baseline over the same worlds: who is better, and how surely.
+"""Two policies and a baseline over the same worlds: which is better, and how certain that is.
 
 Two worlds tell nothing: with 50 it takes minutes, as `lpac evaluate` does.
 """

@@ -85,8 +85,8 @@ def python_api() -> str:
     """`lpac.api`, all of it."""
     return "\n\n".join(
         [
-            "# Python API",
-            "[The Python API](../api.md) shows how to use it; this is all of `lpac.api`.",
+            "# Python: reference",
+            "All of `lpac.api`; [the tour](../api.md) shows how to use it.",
             inspect.getdoc(api) or "",
             *(_described(getattr(api, name), name, "##") for name in api.__all__),
         ]
@@ -100,7 +100,7 @@ def page() -> str:
             "# Interfaces",
             "What a package of yours implements, what it is given, and what else it imports. "
             "[Extending](../extending.md) builds one from beginning to end; bundles, flights and "
-            "worlds are in [the Python API](api.md).",
+            "worlds are in [Python: reference](api.md).",
             "Like those, the names here change only with a new minor version, and "
             "[the changelog](../../CHANGELOG.md) says how.",
             *(

@@ -1,4 +1,4 @@
-"""The Python API: what a script or a notebook of yours needs, under names that stay.
+"""The Python API: what a script or a notebook of yours needs, under stable names.
 
     from pathlib import Path
     import matplotlib.pyplot as plt

@@ -13,7 +13,7 @@ from lpac.analysis.statistics import LEAST_TRAININGS
 from lpac.analysis.style import WIDTH_IN, tidy
 from lpac.train.files import write_atomically
 
-_COLOURS = {"better": style.GREEN, "worse": style.VERMILLION, "not told apart": style.GREY}
+_COLOURS = {"better": style.GREEN, "worse": style.VERMILLION, "not distinguishable": style.GREY}
 
 
 def write_report(ablation: Ablation, results: Sequence[VariantResult], folder: Path) -> None:
@@ -31,7 +31,7 @@ def no_claim(ablation: Ablation) -> str | None:
     seeds = len(ablation.config.seeds)
     return (
         f"{seeds} training seed{'s' if seeds > 1 else ''}: this says something about these "
-        f"policies, but is no claim about the method, which needs {LEAST_TRAININGS}"
+        f"policies, but does not support a claim about the method: that needs {LEAST_TRAININGS}"
     )
 
 

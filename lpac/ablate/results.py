@@ -38,12 +38,12 @@ class VariantResult:
         return float(means.std(ddof=1)) if len(means) > 1 else None
 
     @property
-    def verdict(self) -> Literal["better", "worse", "not told apart"] | None:
+    def verdict(self) -> Literal["better", "worse", "not distinguishable"] | None:
         """Of the variant, against the base."""
         if self.against_base is None:
             return None
         better = self.against_base.better
-        return "not told apart" if better is None else "better" if better == "a" else "worse"
+        return "not distinguishable" if better is None else "better" if better == "a" else "worse"
 
 
 def flights_of(

@@ -18,7 +18,7 @@ from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, Ro
 from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
-LLOYD = "Lloyd, who knows the world"
+LLOYD = "Lloyd, knowing the whole world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
 _MOST_NAMES, _MOST_TICKS = 12, 8
 _LONGEST_IN_DISC = 2

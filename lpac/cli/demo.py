@@ -30,7 +30,7 @@ def demo(
         ("LPAC, 30 % loss", Scenario(seed=seed, loss=0.3)),
         ("Decentralized CVT", Scenario(seed=seed, controller="decentralized-cvt")),
         ("Centralized CVT", Scenario(seed=seed, controller="centralized-cvt")),
-        ("Lloyd, who knows the world", Scenario(seed=seed, controller="clairvoyant-cvt")),
+        ("Lloyd, knowing the whole world", Scenario(seed=seed, controller="clairvoyant-cvt")),
     ]
     names = [name for name, _ in scenarios]
     flights = dict(zip(names, fly_points(scenarios, DEFAULT_BUNDLE), strict=True))

@@ -135,7 +135,7 @@ def evaluate(
         typer.Option(help="Folder for evaluation.json, figures, pictures, and what was flown."),
     ] = _OUT,
 ) -> None:
-    """Policies and baselines over many worlds: how well they cover, and how surely."""
+    """Policies and baselines over many worlds: how well they cover, with confidence intervals."""
     from lpac.evaluate.evaluation import as_json as to_json
     from lpac.evaluate.report import write_results
     from lpac.radio.modelled import ModelledRadio

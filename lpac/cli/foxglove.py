@@ -8,7 +8,7 @@ import typer
 from lpac.cli.apps import new_app
 from lpac.cli.options import DEFAULT_FLEET, Fleet
 
-app = new_app("foxglove", "The fleet in Foxglove, live or from the ground's logs; and a layout.")
+app = new_app("foxglove", "Show the fleet in Foxglove, live or from logs; or write its layout.")
 
 _LAYOUT = Path(__file__).parents[1] / "ground" / "foxglove" / "lpac.layout.json"
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.")]

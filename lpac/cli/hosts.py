@@ -29,7 +29,7 @@ def hosts(
         "out/fleet-demo"
     ),
 ) -> None:
-    """Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
+    """Simulate robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C."""
     from lpac.sim.hosts.hosts import SimulatedHosts
 
     def end(*_: object) -> None:

@@ -18,17 +18,21 @@ from lpac.cli.apps import CommandList
 _COMMANDS = {
     "demo": "Ten robots over an unknown world for 60 s, beside the baselines; makes a figure.",
     "sim": "Fly a swarm over an unknown world and print how well it covers it.",
-    "evaluate": "Policies and baselines over many worlds: how well they cover, and how surely.",
-    "train": "Train a policy, or continue where a training stopped; chosen by how it flies.",
+    "evaluate": (
+        "Policies and baselines over many worlds: how well they cover, with confidence intervals."
+    ),
+    "train": (
+        "Train a policy, or continue where a training stopped, keeping the weights that fly best."
+    ),
     "ablate": "Train a method without each of its parts, and say what each of them is worth.",
     "paper": "Repeat the paper's experiments, and run some that its arguments call for.",
-    "drill": "Inject faults into a fleet in flight, and judge by true positions what was promised.",
-    "hosts": "Run robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
+    "drill": "Inject faults into a fleet in flight, and judge by true positions whether promises held.",
+    "hosts": "Simulate robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
     "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",
     "mission": "Command the fleet, through `lpac ground`.",
     "watch": "Show fleet and mission, alarms first; h holds all robots, l lands them, ? helps.",
     "map": "Show the fleet on a live map, in a browser; needs `lpac ground`, and no internet.",
-    "foxglove": "The fleet in Foxglove, live or from the ground's logs; and a layout.",
+    "foxglove": "Show the fleet in Foxglove, live or from logs; or write its layout.",
     "site": "Places to fly at: origin, fence, pads and landing points, beside fleet.toml.",
     "record": "Write what `lpac ground` tells to a log, until Ctrl-C: statuses, commands, costs.",
     "report": "Make figures and an HTML page from flight logs; and how well trials repeat.",
@@ -37,7 +41,9 @@ _COMMANDS = {
     "export": "Export a trained torch checkpoint as a bundle that runs without torch.",
     "bundle": "Look at a policy bundle; verify or time it on this machine.",
     "robot": "Fly one robot, or check whether it could.",
-    "bench": "Measure this machine's network: what programs say, and what they leave of it.",
+    "bench": (
+        "Measure this machine's network: what the programs send, and what bandwidth they leave."
+    ),
     "log": "What the robots' and the ground's logs hold.",
 }
 # The extra that has a command's packages; without one they are in every install.
@@ -119,7 +125,7 @@ def _lpac(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", is_eager=True, callback=_print_version, help="Print it, and end."
+            "--version", is_eager=True, callback=_print_version, help="Print the version and exit."
         ),
     ] = False,
 ) -> None:

@@ -169,7 +169,7 @@ def e2(
     *,
     bundle: FlownBundle = None,
     trials: Annotated[
-        int | None, typer.Option(help=f"How often; {_E2_TRIALS} times if not given.")
+        int | None, typer.Option(help=f"How many trials; {_E2_TRIALS} times if not given.")
     ] = None,
     world: World = None,
     vehicle: Vehicle = VehicleKind.POINT,
@@ -792,7 +792,7 @@ def everything(
     """All of them, and one page: each claim of the paper beside the result here.
 
     Whole robots fly e1, e2 and e3, or points with --quick. Results that were made with the same
-    bundle and code are not made again.
+    bundle and code are reused.
     """
     from edge.policy.bundle import load_bundle
     from lpac.cli.bench import require_namespaces

@@ -33,7 +33,7 @@ def train(
     ray: Ray = None,
     as_json: AsJson = False,
 ) -> None:
-    """Train a policy, or continue where a training stopped; chosen by how it flies."""
+    """Train a policy, or continue where a training stopped, keeping the weights that fly best."""
     from lpac.train.config import read_config
     from lpac.train.run import TrainingRun
 

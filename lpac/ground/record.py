@@ -315,5 +315,5 @@ def _line(snapshot: FleetSnapshot, cost: Cost | None) -> str:
             f"cost {cost.normalized:.2f} of the initial",
         ]
         if cost.bound is not None:
-            words.append(f"Lloyd, who knows the world, {cost.bound / cost.initial:.2f}")
+            words.append(f"Lloyd, knowing the whole world, {cost.bound / cost.initial:.2f}")
     return "  ".join(words)

@@ -102,7 +102,7 @@ def _size(sizes: Sizes) -> Claim:
     return Claim(
         "Message size",
         "A message's size does not depend on the number of robots.",
-        "A robot that has heard a hundred others says no more bytes than one that has heard two.",
+        "A robot that has heard a hundred others sends no more bytes than one that has heard two.",
         f"{sizes.of_two} bytes at most in float16, with beacon, envelope and shared map, after two "
         f"others were heard; {sizes.of_hundred} after a hundred.",
         _agrees(sizes.of_hundred <= sizes.of_two),
@@ -201,8 +201,8 @@ def _e2(e2: Json) -> list[Claim]:
             "of their mean.",
             f"{len(e2['trials'])} trials: {mean:.3f} after {spread['end_s']:.0f} s, standard "
             f"deviation {final:.3f}, {100.0 * final / mean:.0f} % of it, and before that up to "
-            f"{spread['largest_deviation_in_flight']:.3f}. A robot ends "
-            f"{spread['mean_scatter_of_ends_m']:.1f} m from the mean of its ends.{later}",
+            f"{spread['largest_deviation_in_flight']:.3f}. On average a robot ends "
+            f"{spread['mean_scatter_of_ends_m']:.1f} m from the mean of its end positions.{later}",
             _agrees(final <= _SIMILAR * mean),
         )
     ]
@@ -285,9 +285,8 @@ def _asynchrony(told: Json) -> list[Claim]:
             "Asynchronous modules",
             "Perception, exchange and control run each at a rate of its own, and no robot waits "
             "for another.",
-            "By the whole 95 % interval, robots at their own moments cost at most "
-            f"{100.0 * (_ASYNCHRONOUS - 1.0):.0f} % more than robots in step. It differs if by the "
-            "whole interval they cost more than that.",
+            "Agrees if the whole 95 % interval of the extra cost of robots at their own moments "
+            f"lies below {100.0 * (_ASYNCHRONOUS - 1.0):.0f} %; differs if all of it lies above.",
             f"{count}. All at the same moments: {ends([together])}.",
             verdict,
         )
@@ -306,7 +305,7 @@ def _asynchrony(told: Json) -> list[Claim]:
             claims.append(
                 Claim(
                     name,
-                    f"{said} No measurement of either.",
+                    f"{said} Neither is measured.",
                     "It agrees if one such rate is better (its 95 % interval below 1), and differs "
                     "if all are worse.",
                     f"{count}. Perception at {FIELD_TIMING.perception_hz:g} Hz, exchange at "
@@ -377,8 +376,8 @@ def _team() -> Claim:
         "One access point carried no more than ten robots.",
         "By our model of one Wi-Fi channel, ten take less than 60 % of it.",
         f"At 60 % of a channel of {wifi.data_rate_mbit_s:g} Mbit/s, by the model, which no radio "
-        f"was compared with: {said}. The paper's wall is not this one: it says nothing of what "
-        "its robots sent.",
+        f"was compared with: {said}. The paper's limit may have another cause: it does not say how "
+        "much its robots sent.",
         Agreement.OPEN,
     )
 
@@ -397,12 +396,13 @@ def _rotation() -> Claim:
     for heading_deg in (0, 30, 90):
         north, east, _ = printed_rotation(math.radians(heading_deg)) @ np.array([0.0, 1.0, 0.0])
         azimuth_deg = round(math.degrees(math.atan2(east, north))) % 360
-        parts.append(f"with a heading of {heading_deg}° to {azimuth_deg}°")
+        parts.append(f"towards {azimuth_deg}° if θ is {heading_deg}°")
     return Claim(
         "Equation 4: from the mission's frame to the autopilot's",
         "R_z(3π/2 - θ) R_x(π), θ being the compass heading of the mission's y axis.",
         "The mission's y axis has to point to its heading.",
-        f"As it is printed, a robot that is told to fly along y flies {', '.join(parts)}. Ours is "
+        f"As it is printed, a robot that is told to fly along y goes {', '.join(parts[:-1])}, and "
+        f"{parts[-1]}. Ours is "
         "[[-sin θ, cos θ, 0], [cos θ, sin θ, 0], [0, 0, -1]], by the paper's own convention.",
         Agreement.MISTAKE,
     )

@@ -178,7 +178,8 @@ def _page(
         opening(TITLE),
         f"<p>{_text(_PAPER)}: each of its claims, figures and tables, and the result here. "
         "Everything was simulated: no real robot has flown.</p>",
-        *map(_said, claims),
+        _verdicts(claims),
+        *itertools.starmap(_said, enumerate(claims)),
     ]
     for chapter in CHAPTERS:
         if chapter.name not in made_by:
@@ -199,9 +200,18 @@ def _page(
     return "\n".join([*parts, CLOSING]) + "\n"
 
 
-def _said(claim: Claim) -> str:
+def _verdicts(claims: Sequence[Claim]) -> str:
+    rows = (
+        f'<tr><td><a href="#claim-{number}">{_text(claim.name)}</a></td>'
+        f"<td>{_verdict(claim.verdict)}</td></tr>"
+        for number, claim in enumerate(claims)
+    )
+    return f'<div class="wide"><table>{"".join(rows)}</table></div>'
+
+
+def _said(number: int, claim: Claim) -> str:
     return (
-        f"<h3>{_text(claim.name)}: {_verdict(claim.verdict)}</h3>"
+        f'<h3 id="claim-{number}">{_text(claim.name)}: {_verdict(claim.verdict)}</h3>'
         f"<p>The paper: {_text(claim.paper)}</p><p>Here: {_text(claim.ours)}</p>"
         f'<p class="quiet">Rule: {_text(claim.rule)}</p>'
     )

@@ -18,8 +18,8 @@ from lpac.sim.fleet.layout import MAX_ROBOTS
 _LEAST_M, _MOST_M = experiments.GPS_ERROR_M
 # How it was flown, for the reports.
 _POINTS = (
-    "Points flew over worlds of the validation set, each at the velocity that its policy decided, "
-    "at once: without takeoff, landing, heights and wind"
+    "Points flew over worlds of the validation set, each taking on its policy's velocity "
+    "instantly: without takeoff, landing, heights and wind"
 )
 POINTS = (
     f"{_POINTS}, and with a GPS error, where there is one ({_LEAST_M:g} to {_MOST_M:g} m), that "
@@ -30,7 +30,7 @@ WHOLE = (
     "Whole robots flew over worlds of the validation set, from pads with room between them: their "
     "programs' loops and separation, on {vehicles}."
 )
-WHOLE_BESIDE_POINTS = f"{WHOLE} They are compared with points from the same pads."
+WHOLE_BESIDE_POINTS = f"{WHOLE} They are compared with points that start from the same pads."
 WHOLE_IN_TRUTH = (
     f"{WHOLE} Costs are those of the vehicles' true positions. Where messages are late, they are "
     "late from the mission's start on."

@@ -46,7 +46,7 @@ def test_trainings_that_differ_more_than_the_variants_tell_nothing(tmp_path: Pat
     _, features, slow = results(
         ablation, {"base": [20, 30, 50], "no-features": [18, 29, 48], "slow": [10, 31, 52]}
     )
-    assert features.verdict == slow.verdict == "not told apart"
+    assert features.verdict == slow.verdict == "not distinguishable"
 
 
 def test_few_seeds_are_no_claim(tmp_path: Path) -> None:

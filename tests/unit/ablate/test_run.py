@@ -66,7 +66,7 @@ def test_what_comes_of_it(ablated: tuple[Path, list[AblationProgress]]) -> None:
     assert not told["of_methods"]
     assert (folder / "differences.png").stat().st_size > 5_000
     report = (folder / "README.md").read_text()
-    assert "\n**2 training seeds: this says something about these policies, but is no cl" in report
+    assert "\n**2 training seeds: this says something about these policies, but does not" in report
     assert f"| slow | Perception and policy are slow. | no | {slow['mean'][0]:.3f} | " in report
 
 
