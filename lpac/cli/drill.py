@@ -77,7 +77,7 @@ def drill(
         ),
     ] = None,
 ) -> None:
-    """Inject faults into a fleet in flight, and judge by true positions whether promises held."""
+    """Inject faults into a fleet in flight, and judge by the truth whether promises held."""
     from lpac.sim.drill.campaign import Campaign, fly_order
     from lpac.sim.drill.field import DrilledRobots
     from lpac.sim.drill.report import as_json as to_json

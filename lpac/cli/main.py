@@ -26,7 +26,7 @@ _COMMANDS = {
     ),
     "ablate": "Train a method without each of its parts, and say what each of them is worth.",
     "paper": "Repeat the paper's experiments, and run some that its arguments call for.",
-    "drill": "Inject faults into a fleet in flight, and judge by true positions whether promises held.",
+    "drill": "Inject faults into a fleet in flight, and judge by the truth whether promises held.",
     "hosts": "Simulate robot computers (Ubuntu, systemd, sshd, a simulated PX4 each) until Ctrl-C.",
     "ground": "Speak to the fleet, until Ctrl-C: `lpac mission`, `watch`, `map`, `record` need it.",
     "mission": "Command the fleet, through `lpac ground`.",
