@@ -32,6 +32,7 @@ from typing import Literal, Self
 import zenoh
 
 from edge.core import log
+from edge.core.address import is_loopback_endpoint, require_endpoint
 from edge.core.wire import MAX_ROBOT_ID
 from edge.messages.admission import Admission
 from edge.messages.topics import (
@@ -42,12 +43,10 @@ from edge.messages.topics import (
     Sender,
     TlsFiles,
     Topic,
-    is_loopback,
 )
 
 # Of 64 kB each, for topics that go later: a world that does not fit in there at once is dropped.
 _PATIENT_BATCHES = 8
-_ENDPOINT = re.compile(r"(tcp|tls)/(\[[^\s/\]]+\]|[^\s/:?#\[\]]+):\d{1,5}")
 _TOKEN = re.compile(r"robot/(\d{1,5})/alive/(\w{1,32})")
 # Of all topics' limits the largest, and what zenoh says besides.
 _MOST_BYTES = max(topic.limit_bytes for topic in TOPICS) + 2**12
@@ -352,7 +351,7 @@ def _config(
     retry = {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5}
     if mode == "peer":
         # Who calls nobody elsewhere need not be called from there.
-        host = "127.0.0.1" if connect and all(map(is_loopback, connect)) else "0.0.0.0"
+        host = "127.0.0.1" if connect and all(map(is_loopback_endpoint, connect)) else "0.0.0.0"
         listen = listen or (f"{'tcp' if tls is None else 'tls'}/{host}:0",)
     config = zenoh.Config()
     for key, value in {
@@ -480,11 +479,12 @@ def _check(
     if robot_id is not None and not 0 <= robot_id <= MAX_ROBOT_ID:
         raise LinkError(f"robot_id = {robot_id}: must be from 0 to {MAX_ROBOT_ID}")
     # zenoh itself would wait for ever for an endpoint that cannot be.
-    for name, endpoints in (("listen", listen), ("connect", connect)):
-        for endpoint in endpoints:
-            scheme = "tcp" if tls is None else "tls"
-            if not (_ENDPOINT.fullmatch(endpoint) and endpoint.startswith(f"{scheme}/")):
-                raise LinkError(f"{name} = {endpoint!r}: must be '{scheme}/<host>:<port>'")
+    try:
+        for name, endpoints in (("listen", listen), ("connect", connect)):
+            for endpoint in endpoints:
+                require_endpoint(name, endpoint, "tcp" if tls is None else "tls")
+    except ValueError as error:
+        raise LinkError(str(error)) from None
     if mode == "client" and not (connect or scouting):
         raise LinkError("mode = 'client' needs the router's endpoint in connect, or scouting")
     if tls is not None and robot_id is not None and robot_id > MAX_CERTIFIED_ID:

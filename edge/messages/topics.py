@@ -4,7 +4,6 @@ A topic's key is `lpac/<fleet>/robot/<id>/<name>` or `lpac/<fleet>/ground/<name>
 who sends what, sizes and priorities from here, and drops what is larger.
 """
 
-import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -100,11 +99,6 @@ class TlsFiles(NamedTuple):
     authority: str
     certificate: str
     key: str
-
-
-def is_loopback(endpoint: str) -> bool:
-    """Whether an endpoint such as tcp/127.0.0.1:7447 is out of other computers' reach."""
-    return re.match(r"\w+/(127\.|localhost:|\[::1\])", endpoint) is not None
 
 
 class Group(NamedTuple):

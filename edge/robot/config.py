@@ -12,6 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from edge.core.address import (
+    host_and_port,
+    ipv4,
+    is_loopback_endpoint,
+    require_endpoint,
+    require_host,
+)
 from edge.core.fence import Fence
 from edge.core.file_errors import in_words
 from edge.core.frames import ModelScale
@@ -25,7 +32,6 @@ from edge.flight.preflight import PreflightLimits
 from edge.flight.reach import Reach
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightParameters, RemoteControlLost, Robot
-from edge.messages.topics import is_loopback
 from edge.robot.pac import PacParameters
 
 # What fleet.toml has too. Each raises ValueError, one line that says what is allowed.
@@ -53,34 +59,28 @@ def require_system_id(system_id: int) -> None:
 
 def require_url(key: str, url: str) -> None:
     """Where PX4's datagrams come in."""
-    match = re.fullmatch(r"udpin://[^:/]+:(\d{1,5})", url)
+    match = re.fullmatch(r"udpin://([^:/]+):([0-9]{1,5})", url)
     if match is None:
         raise ValueError(f"{key} = {url!r}: must be udpin://ADDRESS:PORT")
-    if not 1 <= int(match[1]) <= 65535:
+    require_host(key, match[1])
+    if not 1 <= int(match[2]) <= 65535:
         raise ValueError(f"{key} = {url!r}: its port must be from 1 to 65535")
-
-
-def is_ipv4(text: str) -> bool:
-    """Whether it is an IPv4 address."""
-    numbers = text.split(".")
-    return len(numbers) == 4 and all(n.isdecimal() and int(n) <= 255 for n in numbers)
 
 
 def require_group(key: str, group: str) -> tuple[str, int]:
     """The address and the port of a multicast group."""
-    address, _, port = group.rpartition(":")
+    found = host_and_port(key, group)
+    address = None if found is None else ipv4(found[0])
     # 224.0.0.0/24 is for the network's own protocols.
     is_group = (
-        is_ipv4(address)
-        and 224 <= int(address.partition(".")[0]) <= 239
-        and not address.startswith("224.0.0.")
+        address is not None and address.is_multicast and address.packed[:3] != b"\xe0\x00\x00"
     )
-    if not (is_group and port.isdecimal() and 1 <= int(port) <= 65535):
+    if found is None or not is_group or found[1] == 0:
         raise ValueError(
             f"{key} = {group!r}: must be an IPv4 multicast address, none of 224.0.0.0/24, and a "
             "port from 1 to 65535, such as '239.255.76.80:7450'"
         )
-    return address, int(port)
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,13 +146,11 @@ class LinkConfig:
             raise ValueError("mode = 'client': connect or scouting must be set")
         for name in ("listen", "connect"):
             for endpoint in getattr(self, name):
-                if re.fullmatch(r"(tcp|tls)/\S+:\d{1,5}", endpoint) is None:
-                    raise ValueError(
-                        f"{name} = {endpoint!r}: must be tls/ADDRESS:PORT, or tcp/ADDRESS:PORT"
-                    )
+                require_endpoint(name, endpoint, "tls", "tcp")
         if self.group:
             require_group("group", self.group)
-        if bool(self.group) != bool(self.interface) or not is_ipv4(self.interface or "0.0.0.0"):
+        has_interface = ipv4(self.interface) is not None
+        if bool(self.group) != has_interface or (self.interface and not has_interface):
             raise ValueError(
                 f"interface = {self.interface!r}: must be the robot's own IPv4 address, with group "
                 "alone"
@@ -165,7 +163,7 @@ class LinkConfig:
             return True
         if self.group and not self.interface.startswith("127."):
             return True
-        return not all(map(is_loopback, (*self.listen, *self.connect)))
+        return not all(map(is_loopback_endpoint, (*self.listen, *self.connect)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,9 +25,11 @@ def live(
     """Serve the fleet to Foxglove, until Ctrl-C; needs `lpac ground`. It only observes."""
     import asyncio
 
+    from edge.core.address import require_host
     from lpac.fleet.settings import load_fleet
     from lpac.ground.foxglove.live import serve
 
+    require_host("--host", host)
     name = load_fleet(fleet).fleet
 
     def ready(its_port: int) -> None:

@@ -41,10 +41,12 @@ def live_map(
     import ssl
     import webbrowser
 
+    from edge.core.address import is_loopback, require_host
     from lpac.fleet.settings import load_fleet
-    from lpac.ground.map.access import Access, is_loopback, reached_at
+    from lpac.ground.map.access import Access, reached_at
     from lpac.ground.map.server import serve
 
+    require_host("--host", host)
     config = load_fleet(fleet)
     if token is not None and re.fullmatch(r"[A-Za-z0-9_-]+", token) is None:
         raise ValueError("--token: must be letters, digits, '-' and '_'")

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from edge.core.address import require_host
 from edge.core.schema import ConfigError
 from lpac.fleet.cards import CardGiven, give_card
 from lpac.fleet.deploy import deploy
@@ -26,7 +27,7 @@ from lpac.fleet.session import (
     explain,
     ssh_command,
 )
-from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
+from lpac.fleet.settings import FleetConfig, RobotHost, is_of_computer, load_fleet
 from lpac.fleet.writer import add_robot
 
 # As ssh-copy-id does it; the key comes on standard input.
@@ -156,6 +157,10 @@ def _robot(
         return known
     if host is None:
         raise ConfigError(f"{config.path}: robots.{name}: is not there: give its address")
+    # Before anything is sent there.
+    require_host("HOST", host)
+    if not (address is None or is_of_computer(address)):
+        raise ConfigError(f"--address {address!r}: must be a computer's own IPv4 address")
     if robot_id is None:
         number = re.search(r"\d+", name)
         if number is None:

@@ -14,14 +14,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from edge.core.address import host_and_port, ipv4, is_loopback_endpoint, require_host, same_host
 from edge.core.file_errors import in_words
 from edge.core.schema import ConfigError, from_mapping
 from edge.flight.margins import Margin, places_apart
-from edge.messages.topics import is_loopback
 from edge.robot.config import (
     AutopilotConfig,
     RobotConfig,
-    is_ipv4,
     require_group,
     require_name,
     require_robot_id,
@@ -40,7 +39,6 @@ _MAX_CPU = 1023
 _GROUP = "239.255.76.80:7450"
 
 # These stand on the command lines of ssh, and in files of systemd.
-_HOST = re.compile(r"[A-Za-z0-9_:][A-Za-z0-9_.:-]*")
 _USER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 _UNIT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@:-]*")
 _DIRECTORY = re.compile(r"(/[A-Za-z0-9_-][A-Za-z0-9_.-]*)+")
@@ -310,12 +308,12 @@ class RobotTable:
     robot: dict = field(default_factory=dict)  # type: ignore[type-arg]
 
     def __post_init__(self) -> None:
-        for name, pattern in (("host", _HOST), ("user", _USER)):
-            if pattern.fullmatch(getattr(self, name)) is None:
-                raise ValueError(
-                    f"{name} = {getattr(self, name)!r}: must be letters, digits, '.', '-' and "
-                    "'_', and not start with '.' or '-'"
-                )
+        require_host("host", self.host)
+        if _USER.fullmatch(self.user) is None:
+            raise ValueError(
+                f"user = {self.user!r}: must be letters, digits, '.', '-' and '_', and not start "
+                "with '.' or '-'"
+            )
         for name in ("port", "zenoh_port"):
             value = getattr(self, name)
             if value is not None and not 1 <= value <= 65535:
@@ -327,9 +325,9 @@ class RobotTable:
             raise ValueError(
                 f"system_id is missing: robot_id = {self.robot_id} is not from 1 to 255"
             )
-        if self.address is not None and not _is_of_computer(self.address):
+        if self.address is not None and not is_of_computer(self.address):
             raise ValueError(f"address = {self.address!r}: must be a computer's own IPv4 address")
-        if self.address is None and not _is_of_computer(self.host):
+        if self.address is None and not is_of_computer(self.host):
             raise ValueError(
                 f"address is missing: host = {self.host!r} is no IPv4 address, by which the other "
                 "robots could reach it"
@@ -444,7 +442,7 @@ def parse_fleet(path: Path, text: str) -> FleetConfig:
 def _is_all_here(config: FleetConfig) -> bool:
     """Whether it is a fleet that this computer simulates."""
     endpoints = [*map(config.endpoint, config.robots.values()), *config.everybody]
-    return bool(config.robots) and all(map(is_loopback, endpoints))
+    return bool(config.robots) and all(map(is_loopback_endpoint, endpoints))
 
 
 def _without_empty(slot: Mapping[str, Any]) -> dict[str, Any]:
@@ -479,13 +477,14 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
 
 
 def _is_endpoint(text: str) -> bool:
-    address, _, port = text.rpartition(":")
-    return _is_of_computer(address) and port.isdecimal() and 1 <= int(port) <= 65535
+    found = host_and_port("router", text)
+    return found is not None and is_of_computer(found[0]) and found[1] > 0
 
 
-def _is_of_computer(text: str) -> bool:
+def is_of_computer(text: str) -> bool:
     """Whether it is an IPv4 address by which others can reach one: not 0.0.0.0, no multicast."""
-    return is_ipv4(text) and 1 <= int(text.partition(".")[0]) <= 223
+    address = ipv4(text)
+    return address is not None and 1 <= address.packed[0] <= 223
 
 
 def _cpus(text: str) -> tuple[int, ...]:
@@ -519,7 +518,7 @@ def _shared_by_two(config: FleetConfig) -> Iterator[str]:
         for value in (
             f"robot_id = {robot.robot_id}",
             f"system_id = {robot.system_id}",
-            f"host = {robot.host!r}, port = {robot.port or 22}",
+            f"host = {same_host(robot.host)!r}, port = {robot.port or 22}",
             f"address = {robot.address!r}, zenoh_port = {robot.zenoh_port}",
         ):
             owner = owners.setdefault(value, robot.name)

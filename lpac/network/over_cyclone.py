@@ -25,7 +25,8 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from edge.messages.topics import MESSAGE, TOPICS, is_loopback
+from edge.core.address import is_loopback
+from edge.messages.topics import MESSAGE, TOPICS
 from lpac.network.middleware import Peer
 
 # Below the ports that `lpac.sim.ports` gives; each process's are of a block of its own, and so the
@@ -116,5 +117,5 @@ def open_peer(
     """As `OpenPeer`. Robots find each other by themselves, on ports of DDS."""
     address = endpoints[index].rpartition(":")[0]
     domain = int(endpoints[0].rpartition(":")[2]) // _PORTS_OF_A_BLOCK % _DOMAINS
-    config = _LOOPBACK if is_loopback(f"udp/{address}") else _WIFI
+    config = _LOOPBACK if is_loopback(address) else _WIFI
     return _CyclonePeer(domain, config.format(address=address), receive)

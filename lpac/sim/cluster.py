@@ -5,6 +5,7 @@ from collections.abc import Callable, Generator, Sequence
 
 import ray
 
+from edge.core.address import host_and_port
 from lpac.sim.cores import Outcome, Pool, Task
 
 _ANSWERS_WITHIN_S = 5.0
@@ -13,13 +14,13 @@ _ANSWERS_WITHIN_S = 5.0
 def over_ray(address: str) -> Pool:
     """A pool of all cores of the cluster at `address`: HOST:PORT, or what `ray.init` takes.
 
-    Raises ConnectionError if nobody listens there.
+    Raises ConnectionError if nobody listens there, ValueError if the host is none.
     """
-    host, _, port = address.rpartition(":")
-    if host and port.isdigit():
+    found = host_and_port("--ray", address)
+    if found is not None:
         # Ray would try for minutes.
         try:
-            socket.create_connection((host, int(port)), _ANSWERS_WITHIN_S).close()
+            socket.create_connection(found, _ANSWERS_WITHIN_S).close()
         except OSError as error:
             raise ConnectionError(f"no Ray cluster at {address}: {error}") from None
 

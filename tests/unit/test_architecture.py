@@ -59,8 +59,8 @@ ALLOWED = {
     },
     "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
     "lpac.network": {
-        "edge.messages", "edge.drivers", "lpac.analysis", "lpac.radio", "lpac.sim.ports",
-        "lpac.sim.programs",
+        "edge.core", "edge.messages", "edge.drivers", "lpac.analysis", "lpac.radio",
+        "lpac.sim.ports", "lpac.sim.programs",
     },
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},

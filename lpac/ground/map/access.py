@@ -7,7 +7,6 @@ other users and programs of this machine are not the operator.
 """
 
 import fcntl
-import ipaddress
 import secrets
 import socket
 import struct
@@ -16,18 +15,10 @@ from dataclasses import dataclass
 from typing import Literal
 from urllib.parse import urlsplit
 
+from edge.core.address import is_loopback
+
 # An interface's first address: netintro(4) of macOS, netdevice(7) of Linux.
 _SIOCGIFADDR = 0xC0206921 if sys.platform == "darwin" else 0x8915
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server bound to `host`."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def reached_at(host: str) -> list[str]:

@@ -16,12 +16,13 @@ from urllib.request import HTTPCookieProcessor, build_opener, urlopen
 import aiohttp
 import pytest
 
+from edge.core.address import is_loopback
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import ON_GROUND
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.fleet.authority import AuthorityError, create_authority
 from lpac.fleet.web_certificate import web_certificate
-from lpac.ground.map.access import Access, is_loopback, reached_at
+from lpac.ground.map.access import Access, reached_at
 from lpac.ground.map.server import Outbox, serving
 from lpac.ground.station.client import command, listen
 from lpac.ground.station.protocol import SetOrigin, TakeCommand

@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from lpac.cli.fleet.status import State, print_status
+from lpac.cli.main import app
 from lpac.fleet.logs import Entry, parse_entry, readable
 from lpac.fleet.operations import Outcome
 from lpac.fleet.settings import FleetConfig, load_fleet
@@ -36,6 +38,28 @@ def write_fleet(folder: Path, port: int, flying: int = 2, spares: int = 1) -> Pa
     )
     (folder / "world.env").write_text("CircularBND 100 100 10 1\n")
     return path
+
+
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [
+        (["fleet", "land", "--robots", "r1"], "robots.r1: host = '192.168.8.011'"),
+        (["fleet", "enroll", "r9", "192.168.8.011"], "HOST = '192.168.8.011'"),
+        (["fleet", "enroll", "r9", "drone9", "--address", "192.168.8.011"], "'192.168.8.011'"),
+        (["map", "--host", "127.0.0.011"], "--host = '127.0.0.011'"),
+        (["foxglove", "live", "--host", "127.0.0.011"], "--host = '127.0.0.011'"),
+    ],
+    ids=["file", "enroll", "address", "map", "foxglove"],
+)
+def test_an_address_that_others_read_in_another_way_is_refused(
+    tmp_path: Path, command: list[str], named: str
+) -> None:
+    path = write_fleet(tmp_path, 22)
+    if "land" in command:
+        path.write_text(path.read_text().replace('"127.0.0.1"', '"192.168.8.011"'))
+    result = CliRunner().invoke(app, [*command, "--fleet", str(path)])
+    assert isinstance(result.exception, ValueError)
+    assert named in str(result.exception) and "must be" in str(result.exception)
 
 
 def entry(text: object) -> Entry:

@@ -370,6 +370,38 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
         ("# port: for", "port = 0 #", ["robots.r1: port = 0", "1 to 65535"]),
         ("# zenoh_port = 7447", "zenoh_port = 70000", ["robots.r1: zenoh_port = 70000"]),
         ('# address = "192.168.8.11"', 'address = "r1.local"', ["robots.r1: address = 'r1.local'"]),
+        # C reads them as 192.168.8.9, which is another robot.
+        (
+            '"192.168.8.12"', '"192.168.8.011"',
+            ["robots.r2: host = '192.168.8.011': looks like an address", "leading zeros"],
+        ),
+        (
+            '"192.168.8.12"', '"192.168.8.011"\naddress = "192.168.8.12"',
+            ["robots.r2: host = '192.168.8.011': looks like an address"],
+        ),
+        ('# address = "192.168.8.11"', 'address = "192.168.8.011"', ["address = '192.168.8.011'"]),
+        ('# address = "192.168.8.11"', 'address = "\u0661.168.8.9"', ["robots.r1: address = '"]),
+        (
+            '# mavlink_url = "udpin://127.0.0.1', 'mavlink_url = "udpin://127.0.0.011',
+            ["robots.r1: mavlink_url = '127.0.0.011': looks like an address"],
+        ),
+        (
+            "# [radio]", '[radio]\ntransport = "router"\nrouter = "192.168.8.011:7447"\n#',
+            ["radio: router = '192.168.8.011': looks like an address"],
+        ),
+        (
+            "# [radio]", '[radio]\ntransport = "router"\nrouter = "192.168.8.2:\u0667"\n#',
+            ["radio: router = '192.168.8.2:\u0667': must be"],
+        ),
+        (
+            "# [radio]", '[radio]\ntransport = "multicast"\nrouter = "10.0.0.1:1"\n'
+            'group = "239.255.76.080:7450"\n#',
+            ["radio: group = '239.255.76.080': looks like an address"],
+        ),
+        (
+            'host = "192.168.8.12"', 'host = "::ffff:192.168.8.11"\naddress = "192.168.8.12"',
+            ["robots.r2: host = '192.168.8.11', port = 22: robot r1 has it too"],
+        ),
         ("robot_id = 2", "", ["robots.r2: robot_id is missing"]),
         ("robot_id = 2", "robot_id = -2", ["robots.r2: robot_id = -2", "0 to 65535"]),
         ("robot_id = 2", "robot_id = 256", ["robots.r2: system_id is missing", "256"]),

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 
+from edge.core.address import is_loopback
 from edge.messages.mission import ON_GROUND, FlightState, GroundState
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.map.access import Access, is_loopback
+from lpac.ground.map.access import Access
 from lpac.ground.map.view import Missions, detail_view
 from tests.unit.ground.snapshots import LOOP, robot, setup, status
 
