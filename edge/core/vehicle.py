@@ -112,7 +112,8 @@ class VehicleState:
     heartbeat, once a second, last at `heartbeat_at_s`.
     `origin` is the estimator's. `height_above_home_m` is above where the vehicle was armed, up
     positive. `battery` is the remaining share, 0 to 1, `voltage_v` the pack's. Both, `armable` and
-    `remote_control` are None again once they were not heard for 2.5 s. `problems` are the
+    `remote_control` are None again once they were not heard for 2.5 s, and so is `thrust`, the
+    share of the greatest thrust, 0 to 1, that the autopilot asks of its motors. `problems` are the
     autopilot's reasons why it would not arm, `warnings` what it finds wrong while it is armed, and
     why it takes over; the gravest come first. `remote_control` tells whether it hears one.
     `version` is its firmware's, such as "1.17.0".
@@ -131,6 +132,7 @@ class VehicleState:
     heading_rad: float | None = None
     origin: GlobalOrigin | None = None
     height_above_home_m: float | None = None
+    thrust: float | None = None
     mode: Mode | None = None
     armed: bool | None = None
     in_air: bool | None = None

@@ -33,6 +33,7 @@ RATES_HZ = {
     32: 20.0,  # LOCAL_POSITION_NED
     33: 5.0,  # GLOBAL_POSITION_INT
     49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
+    74: 5.0,  # VFR_HUD: thrust
     230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
     245: 5.0,  # EXTENDED_SYS_STATE
 }
@@ -40,6 +41,7 @@ RATES_HZ = {
 _CONNECTED_WITHIN_S = 2.5
 # Asked for twice a second; what is older says nothing about now.
 _SYS_STATUS_HEARD_S = 2.5
+_THRUST_HEARD_S = 2.5
 # What is told once counts for so long, and as long as a failsafe lasts.
 _TOLD_FOR_S = 15.0
 # The reason for a failsafe comes up to a heartbeat before its state.
@@ -87,7 +89,7 @@ class Px4Telemetry:
         self._told: tuple[dict[str, Any], VehicleState] | None = None
         self._clock = _VehicleClock()
         self._twin = _TwinWatch()
-        self._sys_status_at_s = -math.inf
+        self._sys_status_at_s = self._thrust_at_s = -math.inf
         self._gps_time_us: int | None = None
         self._jump_at_s: float | None = None
         self._origin: GlobalOrigin | None = None
@@ -104,6 +106,7 @@ class Px4Telemetry:
             "GPS_GLOBAL_ORIGIN": self._on_gps_global_origin,
             "ESTIMATOR_STATUS": self._on_estimator_status,
             "EXTENDED_SYS_STATE": self._on_extended_sys_state,
+            "VFR_HUD": self._on_vfr_hud,
             "STATUSTEXT": self._on_statustext,
             "EVENT": self._events.hear,
             "CURRENT_EVENT_SEQUENCE": self._events.hear_sequence,
@@ -136,6 +139,8 @@ class Px4Telemetry:
             if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
                 armable = None
                 fields |= dict.fromkeys(("armable", "battery", "voltage_v", "remote_control"))
+            if now_s - self._thrust_at_s > _THRUST_HEARD_S:
+                fields["thrust"] = None
             if heard.armed:
                 told = self._events.told(self._told_since_s(now_s))
                 fields["warnings"] = without_repetition((*told, *self._events.wrong(heard.mode)))
@@ -267,6 +272,10 @@ class Px4Telemetry:
     def _on_extended_sys_state(self, fields: Fields, _: float) -> None:
         state = fields["landed_state"]
         self._change(in_air=state > _ON_GROUND if state else None)
+
+    def _on_vfr_hud(self, fields: Fields, now_s: float) -> None:
+        self._change(thrust=fields["throttle"] / 100.0)
+        self._thrust_at_s = now_s - self._clock.delay_s
 
     def _on_gps_global_origin(self, fields: Fields, now_s: float) -> None:
         self._origin = GlobalOrigin(

@@ -155,6 +155,7 @@ class Px4Link:
             mavlink.MAVLINK_MSG_ID_ATTITUDE: (50.0, self._attitude),
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: (50.0, self._global_position_int),
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: (30.0, self._local_position_ned),
+            mavlink.MAVLINK_MSG_ID_VFR_HUD: (10.0, self._vfr_hud),
             mavlink.MAVLINK_MSG_ID_ODOMETRY: (30.0, self._odometry),
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: (0.0, self._autopilot_version),
             _EventSequence.id: (0.33, self._current_event_sequence),
@@ -497,6 +498,18 @@ class Px4Link:
             self._boot_ms(),
             *vehicle.local_position_m.tolist(),
             *vehicle.estimated_velocity_m_s.tolist(),
+        )
+
+    def _vfr_hud(self) -> Any:
+        vehicle = self.vehicle
+        north_m_s, east_m_s, down_m_s = vehicle.estimated_velocity_m_s.tolist()
+        return mavlink.MAVLink_vfr_hud_message(
+            math.nan,
+            math.hypot(north_m_s, east_m_s),
+            round(math.degrees(vehicle.estimated_heading_rad)) % 360,
+            int(100.0 * vehicle.thrust),
+            vehicle.global_position[2],
+            -down_m_s,
         )
 
     def _odometry(self) -> Any:

@@ -49,6 +49,8 @@ from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
 GRAVITY_M_S2 = 9.81
+# All motors at full thrust lift twice the weight, as PX4's own simulator's do.
+GREATEST_LIFT_M_S2 = 2.0 * GRAVITY_M_S2
 # Share of the wind that its change pushes the vehicle with, 1/s, and how soon control makes up.
 DRAG_PER_S = 0.3
 WIND_COMPENSATION_S = 5.0
@@ -176,8 +178,9 @@ class Px4Vehicle:
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
     and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
     any more), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (the share of its thrust
-    that a motor which weakens in flight costs it).
-    `truth` grows by one entry every 0.04 s.
+    that is lost in flight: above half of it, the vehicle sinks).
+    `thrust` is the share of the greatest one that its motors are asked for. `truth` grows by one
+    entry every 0.04 s.
     """
 
     def __init__(
@@ -207,7 +210,7 @@ class Px4Vehicle:
         )
         self._errors = errors
         self._walk_m = self._velocity_error_m_s = np.zeros(3)
-        self._compass_rad = self.compass_jump_rad = self.motor_loss = 0.0
+        self._compass_rad = self.compass_jump_rad = self.motor_loss = self.thrust = 0.0
         self.parameters: dict[str, int | float] = dict(PARAMETERS)
         self.fence: tuple[FencePolygon, ...] = ()
         self.truth: list[Truth] = []
@@ -786,6 +789,7 @@ class Px4Vehicle:
 
     def _move(self, dt_s: float) -> None:
         if not self.armed:
+            self.thrust = 0.0
             self._fall(dt_s)
             return
         command, yaw_rad, lag_s = self._command()
@@ -802,12 +806,7 @@ class Px4Vehicle:
             # It takes its nose to be where it is not, and so pushes the wrong way.
             cos, sin = math.cos(self._compass_rad), math.sin(self._compass_rad)
             north, east = cos * north + sin * east, cos * east - sin * north
-        built_in_loss = 0.0 if self._errors is None else self._errors.thrust_loss
-        thrust = 1.0 - max(built_in_loss, self.motor_loss)
-        down = min(
-            max((to_down - v_down) / self._airframe.lag_s, -thrust * parameters["MPC_ACC_UP_MAX"]),
-            parameters["MPC_ACC_DOWN_MAX"],
-        )
+        down = self._lift(to_down, v_down)
         acceleration = np.array([north, east, down])
         unmet_m_s = self.air_m_s - self.compensated_wind_m_s
         if not on_ground:
@@ -820,6 +819,22 @@ class Px4Vehicle:
         self.velocity_m_s = self.velocity_m_s + acceleration * dt_s
         self._turn(yaw_rad, dt_s)
         self._advance(dt_s)
+
+    def _lift(self, to_down: float, v_down: float) -> float:
+        """The acceleration downwards that the motors leave; sets the thrust they are asked for."""
+        parameters = self.parameters
+        built_in_loss = 0.0 if self._errors is None else self._errors.thrust_loss
+        power = 1.0 - max(built_in_loss, self.motor_loss)
+        wanted = min(
+            max((to_down - v_down) / self._airframe.lag_s, -power * parameters["MPC_ACC_UP_MAX"]),
+            parameters["MPC_ACC_DOWN_MAX"],
+        )
+        full_lift = power * GREATEST_LIFT_M_S2
+        stands = self.position_m[2] >= 0.0 and self._lift_began_s is None
+        wanted_lift = 0.0 if stands else GRAVITY_M_S2 - wanted
+        self.thrust = min(wanted_lift / max(full_lift, 1e-9), 1.0)
+        # A vehicle that lifts too little sinks, against the air's drag.
+        return max(wanted, GRAVITY_M_S2 - full_lift - DRAG_PER_S * max(v_down, 0.0))
 
     def _fall(self, dt_s: float) -> None:
         self.yaw_rate_rad_s = 0.0

@@ -61,7 +61,6 @@ ON_PURPOSE = {
     "SYSTEM_TIME": "not heard by anybody",
     "TIMESYNC": "not heard by anybody",
     "TIME_ESTIMATE_TO_TARGET": "not heard by anybody",
-    "VFR_HUD": "not heard by anybody",
     "VIBRATION": "not heard by anybody",
     # What it does send, but otherwise.
     "ATTITUDE": "50 Hz instead of 100: the simulated vehicle takes 50 steps a second",
@@ -270,7 +269,7 @@ class Ears:
 OTHER_EVENTS = {1203183, 5371654, 9421773, 11123101, 10716939, 5847165, 5623108}
 LANDING_DETECTED = 9844908
 # Of how many of these messages one was recorded.
-THINNED = {"ODOMETRY": 10, "ATTITUDE": 10}
+THINNED = {"ODOMETRY": 10, "ATTITUDE": 10, "VFR_HUD": 5}
 
 
 class Clock:
@@ -472,3 +471,18 @@ def test_the_same_events_come(replayed: Replay) -> None:
     assert [event for _, event in simulated] == [event for _, event in real]
     for (real_s, event), (simulated_s, _) in zip(real, simulated, strict=True):
         assert abs(simulated_s - real_s) < 0.75, event
+
+
+def thrusts(said: list[Said], begin_s: float, end_s: float) -> list[int]:
+    """In per cent, as told meanwhile."""
+    return [s.message.throttle for s in said if s.name == "VFR_HUD" and begin_s < s.at_s < end_s]
+
+
+def test_the_same_thrust_is_told() -> None:
+    """Half of the greatest one to hover, none before takeoff and after landing."""
+    flight = replay("normal")
+    _, takeoff_s, mission_s, return_s, down_s, end_s = flight.phases_s
+    for said in (flight.real, flight.simulated):
+        hovering = thrusts(said, mission_s + 3.0, return_s)
+        assert hovering and all(44 <= thrust <= 56 for thrust in hovering)
+        assert max(thrusts(said, 0.0, takeoff_s) + thrusts(said, down_s, end_s)) <= 1

@@ -92,6 +92,22 @@ def test_a_normal_flight() -> None:
     assert changes("normal", "quality") == [(0.0, _Q.LOST), (7.9, _Q.GOOD)]
 
 
+def test_the_thrust_of_a_normal_flight() -> None:
+    """None is known before it is told; half lifts the vehicle, and on the ground it falls."""
+    found = conclusions("normal")
+    assert found[0].vehicle.thrust is None
+    flown = [c.vehicle.thrust for c in found if 20.0 < c.time_s < 52.0]
+    assert all(thrust is not None and 0.4 < thrust < 0.6 for thrust in flown)
+    assert {c.vehicle.thrust for c in found if 63.8 < c.time_s < 66.0} == {0.0}
+
+
+def test_a_thrust_that_is_not_told_any_more_is_not_known() -> None:
+    telemetry = Px4Telemetry()
+    telemetry.hear("VFR_HUD", {"throttle": 48}, 10.0)
+    assert telemetry.state(12.0).thrust == 0.48
+    assert telemetry.state(13.0).thrust is None
+
+
 def test_gps_lost_in_the_mission() -> None:
     """At 26.9 s; PX4 itself acts at 34.4 s. It is back at 58.2 s, with a jump of 24 m."""
     assert changes("gps", "quality") == [
