@@ -132,9 +132,10 @@ class Vehicle(Protocol):
 
 
 class VehicleSetup(Protocol):
-    """What is done with a vehicle before a flight. Each method waits for it, and may raise OSError.
+    """What a vehicle must be for a flight. Each method waits for it, and may raise OSError.
 
-    Called from one thread alone, preflight's.
+    Called from one thread alone, preflight's, every two seconds: on the ground, where what is wrong
+    is set, and in flight, where somebody else may change it.
     """
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
@@ -149,6 +150,9 @@ class VehicleSetup(Protocol):
 
     def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
         """Replace PX4's fence by one polygon to stay in: latitude and longitude."""
+
+    def has_fence(self) -> bool:
+        """Whether the vehicle still has the fence that was uploaded last; False if none was."""
 
 
 class Watchdog(Protocol):

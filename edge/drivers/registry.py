@@ -128,7 +128,10 @@ def _vehicle(opened: OpenVehicle) -> OpenVehicle:
     if not isinstance(opened, OpenVehicle):
         raise TypeError(f"what it opens must be an OpenVehicle, not a {type(opened).__name__}")
     _require(opened.vehicle, "a vehicle", "state", "send", "command")
-    _require(opened.setup, "a vehicle's setup", "read_parameters", "set_parameter", "upload_fence")
+    _require(
+        opened.setup, "a vehicle's setup",
+        "read_parameters", "set_parameter", "upload_fence", "has_fence",
+    )  # fmt: skip
     return opened
 
 

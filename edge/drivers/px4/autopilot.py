@@ -6,6 +6,7 @@ MAVSDK repeats an unanswered one three times within two seconds, and arming must
 """
 
 import json
+import struct
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -53,6 +54,13 @@ _PREARM_CHECKS_S = 10.0
 _REASON_S = 0.3
 _STALE_COMMAND_S = 1.0
 _PARAMETER_ROUNDS, _PARAMETER_ROUND_S = 3, 0.3
+_ABSENT_AFTER_CALLS = 5
+# What PX4 calls the checksum over all of its parameters' names and values.
+_CHECKSUM = "_HASH_CHECK"
+# PX4 tells its fence's id once a second, and one that is on its way as it is replaced is old.
+_FENCE_TOLD_S, _FENCE_LATE_S = 3.5, 0.5
+_FENCE_ROUNDS, _FENCE_ROUND_S = 3, 0.5
+_FENCE = 1  # MAV_MISSION_TYPE
 
 
 class AutopilotError(OSError):
@@ -98,6 +106,13 @@ _COMMANDS = {
 _STARTS = frozenset({Action.ARM, Action.OFFBOARD})
 
 
+class _UploadedFence(NamedTuple):
+    """By what a fence is known again: the id is 0 where PX4, before v1.15, has none."""
+
+    corners: int
+    fence_id: int
+
+
 class _Link(NamedTuple):
     """One vehicle that was found."""
 
@@ -141,7 +156,15 @@ class MavsdkAutopilot:
         self._awaited = 0
         self._answer: int | None = None
         self._result: ActionResult | None = None
-        self._parameter_types: dict[str, int] = {}
+        self._parameters: dict[str, tuple[int, float | None]] = {}
+        self._acknowledged_fence_id: int | None = None
+        self._counted_fence: _UploadedFence | None = None
+        # Of preflight's thread: what was read at this checksum, and in how many calls there was no
+        # answer.
+        self._checksum: float | None = None
+        self._values: dict[str, int | float] = {}
+        self._unanswered: Counter[str] = Counter()
+        self._uploaded: tuple[_UploadedFence, float] | None = None
 
     def __enter__(self) -> Self:
         """Raises AutopilotError if there can be no such connection."""
@@ -237,26 +260,49 @@ class MavsdkAutopilot:
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
         """PX4's values; None where it has no such parameter. Called from one thread at a time.
 
+        Once they were read, one request is enough: PX4 tells a checksum over all of its
+        parameters, and only when it differs they are read again. What is not answered is asked for
+        again in later calls, until it cannot have been lost on the way.
+
         Raises AutopilotError if the vehicle is not there, or falls silent meanwhile.
         """
-        types = self._types_of(names)
-        parameters = Param(self._required_link().system)
-        values: dict[str, int | float | None] = dict.fromkeys(names)
-        for name, kind in types.items():
-            read = parameters.get_param_float if kind == _REAL32 else parameters.get_param_int
+        answer = self._ask_parameters([_CHECKSUM]).get(_CHECKSUM)
+        checksum = None if answer is None else answer[1]
+        # One whose bits are no number, as a float, is told as None.
+        if checksum is None or checksum != self._checksum:
+            self._checksum, self._values = checksum, {}
+        missing = [
+            name
+            for name in names
+            if name not in self._values and self._unanswered[name] < _ABSENT_AFTER_CALLS
+        ]
+        answers = self._ask_parameters(missing) if missing else {}
+        for name, (kind, told) in answers.items():
             try:
-                values[name] = read(name)
+                self._values[name] = self._value(name, kind, told)
             except MavsdkError as error:
                 # It was there a moment ago; each further one would be waited for as well.
                 raise AutopilotError(f"parameter {name}: {_reason(error)}") from error
-        return values
+        if answer is not None:
+            self._unanswered.update(set(missing) - answers.keys())
+        return {name: self._values.get(name) for name in names}
+
+    def _value(self, name: str, kind: int, told: float | None) -> int | float:
+        """An integer's bits are told as a float's, and not told where they are no number."""
+        if told is not None:
+            bits: int = struct.unpack("<i", struct.pack("<f", told))[0]
+            return told if kind == _REAL32 else bits
+        parameters = Param(self._required_link().system)
+        read = parameters.get_param_float if kind == _REAL32 else parameters.get_param_int
+        value: int | float = read(name)
+        return value
 
     def set_parameter(self, name: str, value: int | float) -> None:
         """Set it, in the type that PX4 has it in. Called from one thread at a time.
 
         Raises AutopilotError if the vehicle is not there, has no such parameter or refuses.
         """
-        kind = self._types_of([name]).get(name)
+        kind, _ = self._ask_parameters([name]).get(name, (None, None))
         if kind is None:
             raise AutopilotError(f"parameter {name}: the autopilot has none of that name")
         if kind == _INT32 and value != int(value):
@@ -279,10 +325,50 @@ class MavsdkAutopilot:
             Point(latitude_deg, longitude_deg) for latitude_deg, longitude_deg in vertices_deg
         ]
         fence = GeofenceData([Polygon(points, FenceType.INCLUSION)], [])
+        self._uploaded = None
+        with self._wake:
+            self._acknowledged_fence_id = None
         try:
             Geofence(self._required_link().system).upload_geofence(fence)
         except MavsdkError as error:
             raise AutopilotError(f"fence upload: {_reason(error)}") from error
+        with self._wake:
+            # The same message tells MAVSDK.
+            self._wake.wait_for(lambda: self._acknowledged_fence_id is not None, _FENCE_ROUND_S)
+            fence_id = self._acknowledged_fence_id or 0
+        self._uploaded = _UploadedFence(len(points), fence_id), time.monotonic() + _FENCE_LATE_S
+
+    def has_fence(self) -> bool:
+        """Whether PX4 still has the fence that was uploaded last; by its id, which PX4 tells.
+
+        PX4 is asked only where it does not: one before v1.15, of which only the number of corners
+        is known, or over a link that lost it. Called from one thread at a time.
+
+        Raises AutopilotError if the vehicle is not there, or does not answer.
+        """
+        if self._uploaded is None:
+            return False
+        uploaded, since_s = self._uploaded
+        if uploaded.fence_id:
+            told = self._telemetry.fence_id(max(since_s, time.monotonic() - _FENCE_TOLD_S))
+            if told is not None:
+                return told == uploaded.fence_id
+        return self._count_fence() == uploaded
+
+    def _count_fence(self) -> _UploadedFence:
+        """Begin a download and end it at once: its first answer says all that is asked."""
+        self._required_link()
+        with self._wake:
+            self._counted_fence = None
+        for _ in range(_FENCE_ROUNDS):
+            self._send("MISSION_REQUEST_LIST", mission_type=_FENCE)
+            with self._wake:
+                self._wake.wait_for(lambda: self._counted_fence is not None, _FENCE_ROUND_S)
+                counted = self._counted_fence
+            if counted is not None:
+                self._send("MISSION_ACK", type=0, mission_type=_FENCE)
+                return counted
+        raise AutopilotError("fence: the autopilot does not say whether it has it")
 
     def _required_link(self) -> _Link:
         link = self._link
@@ -290,22 +376,22 @@ class MavsdkAutopilot:
             raise AutopilotError(f"no vehicle on {self._url}")
         return link
 
-    def _types_of(self, names: Iterable[str]) -> dict[str, int]:
-        """Which of the parameters there are: all are asked for at once, so that none is waited for
-        on its own."""
+    def _ask_parameters(self, names: Iterable[str]) -> dict[str, tuple[int, float | None]]:
+        """Type and value, as told, of those that there are: all are asked for at once, so that none
+        is waited for on its own."""
         self._required_link()
         wanted = set(names)
         with self._wake:
-            self._parameter_types = {}
+            self._parameters = {}
         for _ in range(_PARAMETER_ROUNDS):
-            for name in sorted(wanted - self._parameter_types.keys()):
+            for name in sorted(wanted - self._parameters.keys()):
                 self._send("PARAM_REQUEST_READ", param_id=name, param_index=-1)
             with self._wake:
                 if self._wake.wait_for(
-                    lambda: self._parameter_types.keys() >= wanted, _PARAMETER_ROUND_S
+                    lambda: self._parameters.keys() >= wanted, _PARAMETER_ROUND_S
                 ):
                     break
-        return {name: self._parameter_types[name] for name in wanted & self._parameter_types.keys()}
+        return {name: self._parameters[name] for name in wanted & self._parameters.keys()}
 
     # Sending, from any thread
 
@@ -374,8 +460,24 @@ class MavsdkAutopilot:
 
     def _on_param_value(self, fields: dict[str, Any]) -> None:
         with self._wake:
-            self._parameter_types[fields["param_id"]] = fields["param_type"]
+            self._parameters[fields["param_id"]] = fields["param_type"], fields["param_value"]
             self._wake.notify_all()
+
+    def _on_mission_ack(self, fields: dict[str, Any]) -> None:
+        if self._is_of_our_fence(fields) and fields["type"] == 0:
+            with self._wake:
+                self._acknowledged_fence_id = fields.get("opaque_id", 0)
+                self._wake.notify_all()
+
+    def _on_mission_count(self, fields: dict[str, Any]) -> None:
+        if self._is_of_our_fence(fields):
+            with self._wake:
+                self._counted_fence = _UploadedFence(fields["count"], fields.get("opaque_id", 0))
+                self._wake.notify_all()
+
+    def _is_of_our_fence(self, fields: dict[str, Any]) -> bool:
+        asked = fields["target_system"], fields["target_component"]
+        return asked == self._own_id and fields["mission_type"] == _FENCE
 
     # The worker's thread
 
@@ -500,10 +602,15 @@ class MavsdkAutopilot:
 
     def _listen_to(self, system_id: int, system: System) -> None:
         direct = MavlinkDirect(system)
-        for name in self._telemetry.messages:
-            direct.subscribe_message(name, self._hears(name, self._on_telemetry(name)))
-        direct.subscribe_message("COMMAND_ACK", self._hears("COMMAND_ACK", self._on_command_ack))
-        direct.subscribe_message("PARAM_VALUE", self._hears("PARAM_VALUE", self._on_param_value))
+        answers = {
+            "COMMAND_ACK": self._on_command_ack,
+            "PARAM_VALUE": self._on_param_value,
+            "MISSION_ACK": self._on_mission_ack,
+            "MISSION_COUNT": self._on_mission_count,
+        }
+        telemetry = {name: self._on_telemetry(name) for name in self._telemetry.messages}
+        for name, act in (answers | telemetry).items():
+            direct.subscribe_message(name, self._hears(name, act))
         self._link = _Link(system, system_id, direct)
         log.info("autopilot found", system_id=system_id)
 

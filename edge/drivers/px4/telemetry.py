@@ -97,6 +97,7 @@ class Px4Telemetry:
         self._texts: deque[tuple[float, str]] = deque(maxlen=16)
         self._events = Px4Events()
         self._failsafe_at_s = -math.inf
+        self._fence: tuple[int, float] = 0, -math.inf
         self._handlers = {
             "HEARTBEAT": self._on_heartbeat,
             "SYS_STATUS": self._on_sys_status,
@@ -111,6 +112,7 @@ class Px4Telemetry:
             "EVENT": self._events.hear,
             "CURRENT_EVENT_SEQUENCE": self._events.hear_sequence,
             "AUTOPILOT_VERSION": self._on_autopilot_version,
+            "MISSION_CURRENT": self._on_mission_current,
         }
 
     @property
@@ -164,6 +166,12 @@ class Px4Telemetry:
         """How often the vehicle was found to have been switched on anew."""
         with self._lock:
             return self._clock.restarts
+
+    def fence_id(self, since_s: float) -> int | None:
+        """The id of PX4's fence as told since then, 0 for none; None: not told since."""
+        with self._lock:
+            fence_id, at_s = self._fence
+            return fence_id if at_s >= since_s else None
 
     def missing_events(self) -> tuple[int, int] | None:
         """The first and last sequence number of events that were lost and are to be asked for."""
@@ -268,6 +276,10 @@ class Px4Telemetry:
         if fields["hdg"] != _UNKNOWN_UINT16:
             changes["heading_rad"] = math.radians(fields["hdg"] / 100.0 % 360.0)
         self._change(**changes)
+
+    def _on_mission_current(self, fields: Fields, now_s: float) -> None:
+        # PX4 v1.14 tells none, which looks like 0.
+        self._fence = fields.get("fence_id", 0), now_s
 
     def _on_extended_sys_state(self, fields: Fields, _: float) -> None:
         state = fields["landed_state"]

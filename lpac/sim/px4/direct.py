@@ -48,6 +48,7 @@ class DirectVehicle:
         self._result: ActionResult | None = None
         self._asked: Action | None = None
         self._requested_at_s = -_REQUEST_AGAIN_S
+        self._uploaded: tuple[FencePolygon, ...] = ()
         for message_id, rate_hz in RATES_HZ.items():
             self._command_long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
         # Nobody else listens on this link: what the robot does not read costs time alone.
@@ -112,7 +113,11 @@ class DirectVehicle:
 
     def upload_fence(self, vertices_deg: Sequence[tuple[float, float]]) -> None:
         """Replace the fence by one polygon to stay in."""
-        self.vehicle.fence = (FencePolygon(True, tuple(vertices_deg)),)
+        self.vehicle.fence = self._uploaded = (FencePolygon(True, tuple(vertices_deg)),)
+
+    def has_fence(self) -> bool:
+        """Whether it still has the one that was uploaded."""
+        return bool(self._uploaded) and self.vehicle.fence == self._uploaded
 
     # What it sends
 

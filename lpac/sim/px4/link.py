@@ -2,11 +2,13 @@
 
 What is told, when and in which bits is PX4 v1.17's: tests/sim/sim/test_px4_recordings.py holds it
 to recordings of a real one, on its link to a companion computer. Parameters travel with their bytes
-in the float, an unknown parameter gets no answer, a fence is uploaded as a mission.
+in the float, an unknown parameter gets no answer, a fence is uploaded as a mission. What anybody
+changes is told to everybody: a parameter at once, the fence's id once a second.
 """
 
 import math
 import struct
+import zlib
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -67,48 +69,26 @@ _FENCE_VERTICES = {
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False,
 }
 _FENCE = mavlink.MAV_MISSION_TYPE_FENCE
+_CHECKSUM = "_HASH_CHECK"
+_EVENT, _CURRENT_EVENT_SEQUENCE = 410, 411
 _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
 
 
-class _EventMessage(mavlink.MAVLink_message):  # type: ignore[misc]
-    """PX4's EVENT, which pymavlink does not have."""
+class _Message(mavlink.MAVLink_message):  # type: ignore[misc]
+    """A message of PX4's that pymavlink does not have, or has without its last fields.
 
-    id = 410
-    msgname = "EVENT"
-    crc_extra = 160
+    `fields` are in the order in which `packed` has them.
+    """
 
-    def __init__(self, event: Px4Event, sequence: int, boot_ms: int) -> None:
-        super().__init__(self.id, self.msgname)
-        self.id = 1 << 24 | event.number
-        self.event_time_boot_ms = boot_ms
-        self.sequence = sequence
-        self.destination_component = self.destination_system = 0
-        self.log_levels = event.level << 4 | event.level
-        self.arguments = event.arguments.ljust(40, b"\0")
+    def __init__(self, number: int, name: str, crc_extra: int, packed: str, **fields: Any) -> None:
+        super().__init__(number, name)
+        self.__dict__.update(fields)
+        self._number, self._crc_extra = number, crc_extra
+        self._packed, self._names = packed, tuple(fields)
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
-        head = struct.pack(
-            "<IIHBBB", self.id, self.event_time_boot_ms, self.sequence,
-            self.destination_component, self.destination_system, self.log_levels,
-        )  # fmt: skip
-        return self._pack(mav, self.crc_extra, head + self.arguments, force_mavlink1=force_mavlink1)
-
-
-class _EventSequence(mavlink.MAVLink_message):  # type: ignore[misc]
-    """PX4's CURRENT_EVENT_SEQUENCE, which pymavlink does not have."""
-
-    id = 411
-    msgname = "CURRENT_EVENT_SEQUENCE"
-    crc_extra = 106
-
-    def __init__(self, sequence: int) -> None:
-        super().__init__(self.id, self.msgname)
-        self.sequence = sequence
-        self.flags = 0
-
-    def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
-        payload = struct.pack("<HB", self.sequence, self.flags)
-        return self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1)
+        payload = struct.pack(self._packed, *(getattr(self, name) for name in self._names))
+        return self._pack(mav, self._crc_extra, payload, force_mavlink1=force_mavlink1)
 
 
 class Px4Link:
@@ -131,6 +111,7 @@ class Px4Link:
         self._mavlink.robust_parsing = True
         self._out: list[Any] = []
         self._parameters_to_send: list[str] = []
+        self._parameters_told = dict(vehicle.parameters)
         self._upload: list[Any] = []
         self._upload_count = 0
         self._ground_station_at_s = -math.inf
@@ -138,7 +119,7 @@ class Px4Link:
         self._text_id = 0
         self.is_cut = False
         self._event_sequence = 0xFFF5
-        self._told: deque[_EventMessage] = deque(maxlen=EVENTS_KEPT)
+        self._told: deque[_Message] = deque(maxlen=EVENTS_KEPT)
         self._gps_told_at_s = -math.inf
         self._origin_told: tuple[float, float, float] | None = None
         # Message id -> builder; PX4's default rates on the onboard link, Hz.
@@ -158,7 +139,8 @@ class Px4Link:
             mavlink.MAVLINK_MSG_ID_VFR_HUD: (10.0, self._vfr_hud),
             mavlink.MAVLINK_MSG_ID_ODOMETRY: (30.0, self._odometry),
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: (0.0, self._autopilot_version),
-            _EventSequence.id: (0.33, self._current_event_sequence),
+            _CURRENT_EVENT_SEQUENCE: (0.33, self._current_event_sequence),
+            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT: (1.0, self._mission_current),
         }
         self._builders = {message: build for message, (_, build) in streams.items()}
         # What a client that asks for it gets, where that is not what the stream sends.
@@ -231,10 +213,15 @@ class Px4Link:
         vehicle = self.vehicle
         for event in vehicle.take_events():
             self._event_sequence = (self._event_sequence + 1) % 0x10000
-            self._told.append(_EventMessage(event, self._event_sequence, self._boot_ms()))
+            self._told.append(self._event(event))
             self._send(self._told[-1])
             self._texts.append((vehicle.time_s, event))
         self._send_texts()
+        if vehicle.parameters != self._parameters_told:
+            for name, value in vehicle.parameters.items():
+                if value != self._parameters_told.get(name):
+                    self._send_parameter(name)
+            self._parameters_told = dict(vehicle.parameters)
         for name in self._parameters_to_send[:PARAMETERS_AT_ONCE]:
             self._send_parameter(name)
         del self._parameters_to_send[:PARAMETERS_AT_ONCE]
@@ -364,7 +351,26 @@ class Px4Link:
         return None if is_known else self._gps_global_origin()
 
     def _current_event_sequence(self) -> Any:
-        return _EventSequence(self._event_sequence)
+        return _Message(
+            _CURRENT_EVENT_SEQUENCE, "CURRENT_EVENT_SEQUENCE", 106, "<HB",
+            sequence=self._event_sequence, flags=0,
+        )  # fmt: skip
+
+    def _event(self, event: Px4Event) -> _Message:
+        return _Message(
+            _EVENT, "EVENT", 160, "<IIHBBB40s", id=1 << 24 | event.number,
+            event_time_boot_ms=self._boot_ms(), sequence=self._event_sequence,
+            destination_component=0, destination_system=0,
+            log_levels=event.level << 4 | event.level, arguments=event.arguments.ljust(40, b"\0"),
+        )  # fmt: skip
+
+    def _mission_current(self) -> Any:
+        """There is no mission; of interest is the fence's id alone."""
+        return _Message(
+            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, "MISSION_CURRENT", 28, "<HHBBIII", seq=0,
+            total=0xFFFF, mission_state=1, mission_mode=0, mission_id=0, fence_id=self._fence_id(),
+            rally_points_id=0,
+        )  # fmt: skip
 
     def _estimator_status(self) -> Any:
         estimator = self.vehicle.estimator
@@ -675,7 +681,16 @@ class Px4Link:
 
     def _on_param_request_read(self, message: Any) -> None:
         names = list(self.vehicle.parameters)
-        if 0 <= message.param_index < len(names):
+        if message.param_id == _CHECKSUM:
+            # Of all names and values; its bits travel in the float, too.
+            checksum = zlib.crc32(repr(sorted(self.vehicle.parameters.items())).encode())
+            bits = struct.unpack("<f", struct.pack("<I", checksum))[0]
+            self._send(
+                mavlink.MAVLink_param_value_message(
+                    _CHECKSUM.encode(), bits, mavlink.MAV_PARAM_TYPE_UINT32, len(names), 0xFFFF
+                )
+            )
+        elif 0 <= message.param_index < len(names):
             self._send_parameter(names[message.param_index])
         elif message.param_id in self.vehicle.parameters:
             self._send_parameter(message.param_id)
@@ -694,12 +709,20 @@ class Px4Link:
 
     # Fence, by the mission protocol
 
-    def _answer_mission(self, message: Any, result: int) -> None:
+    def _fence_id(self) -> int:
+        """Of what is in it; 0: there is none."""
+        corners_deg = [(each.inclusion, each.vertices_deg) for each in self.vehicle.fence]
+        return zlib.crc32(repr(corners_deg).encode()) if corners_deg else 0
+
+    def _answer_mission(self, message: Any, result: int, fence_id: int = 0) -> None:
         self._send(
-            mavlink.MAVLink_mission_ack_message(
-                message.get_srcSystem(), message.get_srcComponent(), result, message.mission_type
+            _Message(
+                mavlink.MAVLINK_MSG_ID_MISSION_ACK, "MISSION_ACK", 153, "<BBBBI",
+                target_system=message.get_srcSystem(),
+                target_component=message.get_srcComponent(), type=result,
+                mission_type=message.mission_type, opaque_id=fence_id,
             )
-        )
+        )  # fmt: skip
 
     def _on_mission_count(self, message: Any) -> None:
         if message.mission_type != _FENCE:
@@ -730,17 +753,21 @@ class Px4Link:
             self._answer_mission(message, mavlink.MAV_MISSION_INVALID_PARAM1)
             return
         self.vehicle.fence = polygons
-        self._answer_mission(message, mavlink.MAV_MISSION_ACCEPTED)
+        self._answer_mission(message, mavlink.MAV_MISSION_ACCEPTED, self._fence_id())
 
     def _on_mission_request_list(self, message: Any) -> None:
-        vertices = 0
+        vertices, fence_id = 0, 0
         if message.mission_type == _FENCE:
             vertices = sum(len(polygon.vertices_deg) for polygon in self.vehicle.fence)
+            fence_id = self._fence_id()
         self._send(
-            mavlink.MAVLink_mission_count_message(
-                message.get_srcSystem(), message.get_srcComponent(), vertices, message.mission_type
+            _Message(
+                mavlink.MAVLINK_MSG_ID_MISSION_COUNT, "MISSION_COUNT", 221, "<HBBBI",
+                count=vertices, target_system=message.get_srcSystem(),
+                target_component=message.get_srcComponent(), mission_type=message.mission_type,
+                opaque_id=fence_id,
             )
-        )
+        )  # fmt: skip
 
     def _on_mission_request(self, message: Any) -> None:
         items = [(polygon, v) for polygon in self.vehicle.fence for v in polygon.vertices_deg]

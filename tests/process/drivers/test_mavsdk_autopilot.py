@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
+from lpac.sim.px4.world import FencePolygon
 from tests.conftest import ROOT
 from tests.said import lines_said
 
@@ -424,10 +426,61 @@ def test_parameters() -> None:
             autopilot.set_parameter("COM_OBL_RC_ACT", 1.5)
 
 
+def test_parameters_are_asked_for_one_by_one_only_once_one_of_them_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    vehicle, asked = new_vehicle(), list[str]()
+    answer = Px4Link._on_param_request_read
+
+    def on_param_request_read(self: Px4Link, message: Any) -> None:
+        asked.append(message.param_id)
+        answer(self, message)
+
+    monkeypatch.setattr(Px4Link, "_on_param_request_read", on_param_request_read)
+    names = ["COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NO_SUCH"]
+    with connected(vehicle) as (autopilot, server):
+        before = {"COM_OBL_RC_ACT": 0, "COM_OF_LOSS_T": 1.0, "NO_SUCH": None}
+        for _ in range(6):
+            assert autopilot.read_parameters(names) == before
+        asked.clear()
+        assert autopilot.read_parameters(names) == before
+        assert asked == ["_HASH_CHECK"]
+        with server.stepped:
+            vehicle.parameters["COM_OBL_RC_ACT"] = 4
+        assert autopilot.read_parameters(names) == before | {"COM_OBL_RC_ACT": 4}
+
+
+FENCE_DEG = [(39.95, -75.17), (39.96, -75.17), (39.96, -75.16), (39.95, -75.16)]
+
+
+@pytest.mark.parametrize("px4", ["v1.17", "v1.14"])
+def test_a_fence_that_others_change_or_clear_is_no_longer_there(
+    px4: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if px4 == "v1.14":
+        monkeypatch.setattr(Px4Link, "_fence_id", lambda _: 0)
+    vehicle = new_vehicle()
+    with connected(vehicle) as (autopilot, server):
+        assert not autopilot.has_fence()
+        others = (FencePolygon(True, tuple(FENCE_DEG[:3])),), ()
+        for fence in others:
+            autopilot.upload_fence(FENCE_DEG)
+            assert autopilot.has_fence()
+            told_s = vehicle.time_s + 2.0
+            assert server.wait_for(lambda until_s=told_s: vehicle.time_s > until_s, 60.0)  # type: ignore[misc]
+            assert autopilot.has_fence()
+            with server.stepped:
+                vehicle.fence = fence
+            deadline_s = time.monotonic() + 60.0
+            while autopilot.has_fence():
+                assert time.monotonic() < deadline_s
+                time.sleep(0.05)
+
+
 def test_fence() -> None:
     vehicle = new_vehicle()
     with connected(vehicle) as (autopilot, _):
-        vertices_deg = [(39.95, -75.17), (39.96, -75.17), (39.96, -75.16), (39.95, -75.16)]
+        vertices_deg = FENCE_DEG
         autopilot.upload_fence(vertices_deg)
         (polygon,) = vehicle.fence
         assert polygon.inclusion

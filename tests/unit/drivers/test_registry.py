@@ -31,7 +31,7 @@ class All:
     """Whatever is asked for."""
     def __init__(self, setting): self.setting = setting
     def view(self, position): pass
-    state = send = command = read_parameters = set_parameter = upload_fence = view
+    state = send = command = read_parameters = set_parameter = upload_fence = has_fence = view
     publish = is_claimed = peers = refused = view
 
 def added(setting):
