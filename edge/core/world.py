@@ -9,9 +9,9 @@ same features, because the policies are trained on its worlds, but for two of it
 - It takes every `BND` for circular with `sigma_x`. Here `sigma_y` and `rho` count.
 """
 
+import itertools
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,12 +91,13 @@ def parse_world(text: str, source: str = "world") -> tuple[Feature, ...]:
 
     Records are words separated by any white space, line ends included:
     `CircularBND x y sigma scale`, `BND x y sigma_x sigma_y rho scale` and
-    `Uniform num_vertices importance x1 y1 x2 y2 ...`.
+    `Uniform num_vertices importance x1 y1 x2 y2 ...`. Until April 2024 the library had a polygon's
+    importance last: that is read where only it makes sense, and refused where both orders do.
     Raises ValueError, one line with `source`, the record's number and kind, and what is wrong.
     """
-    words = iter(text.split())
+    words = _Reader(text)
     features: list[Feature] = []
-    for kind in words:
+    while kind := words.take():
         try:
             features.append(_read_feature(kind, words))
         except ValueError as error:
@@ -106,7 +107,10 @@ def parse_world(text: str, source: str = "world") -> tuple[Feature, ...]:
 
 
 def format_world(features: tuple[Feature, ...]) -> str:
-    """The world file of `features`, one record per line; `parse_world` gives them back exactly."""
+    """The world file of `features`, as the library writes it, but for a record's first line end.
+
+    `parse_world` gives them back exactly: a polygon's vertices are on lines of their own.
+    """
     return "".join(f"{_record(feature)}\n" for feature in features)
 
 
@@ -249,7 +253,22 @@ def _inside(vertices: tuple[tuple[float, float], ...], x: F64, y: F64) -> npt.ND
     return inside & ~on_edge
 
 
-def _read_feature(kind: str, words: Iterator[str]) -> Feature:
+class _Reader:
+    """A file's words, from the first to the last."""
+
+    def __init__(self, text: str) -> None:
+        lines = enumerate(text.splitlines())
+        self._words = ((word, number) for number, line in lines for word in line.split())
+        # That of the word which was taken last.
+        self.line = 0
+
+    def take(self) -> str:
+        """The next word; empty at the end."""
+        word, self.line = next(self._words, ("", self.line))
+        return word
+
+
+def _read_feature(kind: str, words: _Reader) -> Feature:
     match kind:
         case "CircularBND":
             x, y, sigma, scale = _read_numbers(words, "x y sigma scale")
@@ -260,33 +279,96 @@ def _read_feature(kind: str, words: Iterator[str]) -> Feature:
             )
             return GaussianFeature((x, y), (sigma_x, sigma_y), rho, scale)
         case "Uniform":
-            count = next(words, "missing")
-            if not _COUNT.fullmatch(count):
-                raise ValueError(f"num_vertices is {count}, must be a whole number >= 3")
-            (importance,) = _read_numbers(words, "importance")
-            vertices = []
-            for i in range(1, int(count) + 1):
-                x, y = _read_numbers(words, f"x{i} y{i}")
-                vertices.append((x, y))
-            return PolygonFeature(tuple(vertices), importance)
+            return _read_polygon(words)
         case _:
             raise ValueError("unknown kind, must be CircularBND, BND or Uniform")
 
 
-def _read_numbers(words: Iterator[str], names: str) -> list[float]:
-    numbers = []
-    for name in names.split():
-        word = next(words, "missing")
-        if not (_NUMBER.fullmatch(word) and math.isfinite(float(word))):
-            raise ValueError(f"{name} is {word}, must be a finite number (expected: {names})")
-        numbers.append(float(word))
-    return numbers
+def _read_polygon(words: _Reader) -> PolygonFeature:
+    count = words.take() or "missing"
+    if not (_COUNT.fullmatch(count) and int(count) >= 3):
+        raise ValueError(f"num_vertices is {count}, must be a whole number >= 3")
+    names = itertools.chain(["importance"], (f"x{i} y{i}" for i in range(1, int(count) + 1)))
+    numbers, lines = [], []
+    for expected in names:
+        for name in expected.split():
+            numbers.append(_read_number(words, name, expected))
+            lines.append(words.line)
+    orders = [_Order(numbers[0], numbers[1:], lines[1:]), _Order(numbers[-1], numbers[:-1], lines)]
+    # A line may end anywhere but in a vertex: how it is laid out says more than what it holds.
+    for makes_sense in (_Order.is_whole, _Order.is_weighted, _Order.is_simple):
+        orders = [order for order in orders if makes_sense(order)] or orders
+    if len(orders) == 2:
+        raise ValueError(
+            f"is either of importance {numbers[0]:g}, before its vertices, as in CoverageControl "
+            f"since April 2024, or of importance {numbers[-1]:g}, behind them, as until then: put "
+            "each vertex on a line of its own"
+        )
+    (order,) = orders
+    return PolygonFeature(order.vertices, order.importance)
+
+
+class _Order:
+    """One of the two orders in which a polygon's numbers may have been written."""
+
+    def __init__(self, importance: float, coordinates: list[float], lines: list[int]) -> None:
+        self.importance = importance
+        self.vertices = tuple(zip(coordinates[::2], coordinates[1::2], strict=True))
+        self._lines = lines
+
+    def is_whole(self) -> bool:
+        """Whether no line ends between a vertex's x and y."""
+        return all(a == b for a, b in zip(self._lines[::2], self._lines[1::2], strict=False))
+
+    def is_weighted(self) -> bool:
+        return self.importance >= 0.0
+
+    def is_simple(self) -> bool:
+        return _is_simple(self.vertices)
+
+
+def _is_simple(vertices: tuple[tuple[float, float], ...]) -> bool:
+    """Whether no corner is doubled, and no side meets another but in the corner between them."""
+    a = np.array(vertices)
+    b = np.roll(a, -1, axis=0)
+    side = b - a
+    following = np.roll(side, -1, axis=0)
+    back = (_cross(side, following) == 0.0) & ((side * following).sum(axis=1) <= 0.0)
+    if back.any():
+        return False
+    lower, upper = np.minimum(a, b), np.maximum(a, b)
+    for i in range(len(a) - 2):
+        others = slice(i + 2, len(a) - 1 if i == 0 else len(a))
+        across = _cross(side[i], a[others] - a[i]) * _cross(side[i], b[others] - a[i]) <= 0.0
+        across &= _cross(side[others], a[i] - a[others]) * _cross(
+            side[others], b[i] - a[others]
+        ) <= 0.0  # fmt: skip
+        beside = (lower[others] > upper[i]) | (upper[others] < lower[i])
+        if (across & ~beside.any(axis=1)).any():
+            return False
+    return True
+
+
+def _cross(u: F64, v: F64) -> F64:
+    product: F64 = u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+    return product
+
+
+def _read_numbers(words: _Reader, names: str) -> list[float]:
+    return [_read_number(words, name, names) for name in names.split()]
+
+
+def _read_number(words: _Reader, name: str, expected: str) -> float:
+    word = words.take() or "missing"
+    if not (_NUMBER.fullmatch(word) and math.isfinite(float(word))):
+        raise ValueError(f"{name} is {word}, must be a finite number (expected: {expected})")
+    return float(word)
 
 
 def _record(feature: Feature) -> str:
     if isinstance(feature, PolygonFeature):
-        coordinates = [c for vertex in feature.vertices for c in vertex]
-        return f"Uniform {len(feature.vertices)} {_words(feature.importance, *coordinates)}"
+        vertices = "".join(f"\n{_words(*vertex)}" for vertex in feature.vertices)
+        return f"Uniform {len(feature.vertices)} {_words(feature.importance)}{vertices}"
     if feature.sigma[0] == feature.sigma[1] and feature.correlation == 0.0:
         return f"CircularBND {_words(*feature.mean, feature.sigma[0], feature.scale)}"
     return f"BND {_words(*feature.mean, *feature.sigma, feature.correlation, feature.scale)}"

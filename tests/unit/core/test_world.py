@@ -248,6 +248,46 @@ def test_records_may_span_lines() -> None:
     assert parse_world(" \n") == ()
 
 
+PARK = (PolygonFeature(((100.0, 100.0), (200.0, 100.0), (200.0, 200.0), (100.0, 200.0)), 0.7),)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        # As the library wrote it until April 2024, and since.
+        "Uniform\n4\n100 100\n200 100\n200 200\n100 200\n0.7\n",
+        "Uniform\n4 0.7\n100 100\n200 100\n200 200\n100 200\n",
+        # In the wrong order corners are doubled.
+        "Uniform 4 100 100 200 100 200 200 100 200 0.7",
+        "Uniform 4 0.7 100 100 200 100 200 200 100 200",
+        "Uniform\n4\n100\n100\n200\n100\n200\n200\n100\n200\n0.7",
+    ],
+    ids=["until", "since", "until, in a line", "since, in a line", "a number a line"],
+)
+def test_the_importance_of_a_polygon_is_second_or_last(text: str) -> None:
+    assert parse_world(text) == PARK
+
+
+def test_the_order_is_what_makes_a_polygon_of_it() -> None:
+    (crossing_else,) = parse_world("Uniform 4 3 2 5 2 8 8 8 7 4")
+    assert crossing_else == PolygonFeature(((2.0, 5.0), (2.0, 8.0), (8.0, 8.0), (7.0, 4.0)), 3.0)
+    (negative_else,) = parse_world("Uniform 3 -1 0 0 1 1 0 2")
+    assert negative_else == PolygonFeature(((-1.0, 0.0), (0.0, 1.0), (1.0, 0.0)), 2.0)
+
+
+def test_a_polygon_that_makes_sense_in_both_orders_is_refused() -> None:
+    numbers = "0.25 131.6 182.6 121.8 138.2 193.4 180.4"
+    with pytest.raises(ValueError, match=r"^world: record 1 \(Uniform\): ") as error:
+        parse_world(f"Uniform 3 {numbers}")
+    assert "either of importance 0.25, before its vertices" in str(error.value)
+    assert "April 2024, or of importance 180.4, behind them" in str(error.value)
+    assert "each vertex on a line of its own" in str(error.value)
+    (second,) = parse_world("Uniform 3 0.25\n131.6 182.6\n121.8 138.2\n193.4 180.4")
+    assert isinstance(second, PolygonFeature) and second.importance == 0.25
+    (last,) = parse_world("Uniform 3\n0.25 131.6\n182.6 121.8\n138.2 193.4\n180.4")
+    assert isinstance(last, PolygonFeature) and last.importance == 180.4
+
+
 GAUSSIAN_FIELDS = "(expected: x y sigma_x sigma_y rho scale)"
 
 
@@ -271,8 +311,8 @@ GAUSSIAN_FIELDS = "(expected: x y sigma_x sigma_y rho scale)"
         ("CircularBND 1 2 3 -4", "(CircularBND): scale is -4.0, must be >= 0"),
         ("Uniform", "(Uniform): num_vertices is missing, must be a whole number >= 3"),
         ("Uniform 3.0 1", "(Uniform): num_vertices is 3.0, must be a whole number >= 3"),
-        ("Uniform 2 1 0 0 1 1", "(Uniform): num_vertices is 2, must be >= 3"),
-        ("Uniform 3 -1 0 0 1 1 0 1", "(Uniform): importance is -1.0, must be >= 0"),
+        ("Uniform 2 1 0 0 1 1", "(Uniform): num_vertices is 2, must be a whole number >= 3"),
+        ("Uniform 3 -1\n0 0\n1 1\n0 1", "(Uniform): importance is -1.0, must be >= 0"),
         (
             "Uniform 3 1 0 0 1 1 5",
             "(Uniform): y3 is missing, must be a finite number (expected: x3 y3)",
