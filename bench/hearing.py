@@ -30,14 +30,15 @@ from edge.drivers.multicast import MulticastLink
 from edge.drivers.registry import load_policy
 from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.card import Role
-from edge.identity.group import GroupKey, MessageNumber, datagrams, number_in
+from edge.identity.group import GroupKey, datagrams, number_in
 from edge.identity.guard import Speaker
+from edge.identity.news import MessageNumber
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon
 from edge.messages.topics import MESSAGE, Group, Link, Topic
 from edge.policy.bundle import load_bundle
 from lpac.ground.station.protocol import Start, Takeoff
 from lpac.sim.fleet.members import SimulatedMembers
-from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.ports import free_ports
 
 _FLEET, _SEED = "simulated", 1
@@ -46,7 +47,7 @@ _KEY = b"h" * 32
 # that somebody is there, s.
 _FLOWN_S, _WARM_UP_S = 15.0, 3.0
 # Programs that began after those of the flight.
-_START = 10**9
+_START = int(1e3 * (EPOCH_S + 3600.0))
 
 
 @dataclass(frozen=True, slots=True)

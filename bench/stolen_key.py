@@ -35,7 +35,7 @@ from lpac.analysis.truth import TrueTrack
 from lpac.ground.station.protocol import Enable, Request, SetOrigin, Start, Takeoff
 from lpac.sim.description import ERRORS
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
-from lpac.sim.fleet.simulated import SimulatedFleet
+from lpac.sim.fleet.simulated import EPOCH_S, SimulatedFleet
 from lpac.sim.radio import GROUND
 
 _CORES = 2
@@ -48,7 +48,7 @@ _STEP_S = 0.5
 # Of a Starling 2, from propeller to propeller.
 _WIDEST_M = 0.4
 # The thief's program began after all others.
-_START = 10**9
+_START = int(1e3 * (EPOCH_S + 3600.0))
 
 
 class Lie(StrEnum):

@@ -24,11 +24,11 @@ from edge.identity.group import (
     Assembly,
     Fragment,
     GroupKey,
-    MessageNumber,
     datagrams,
     number_in,
     open_datagram,
 )
+from edge.identity.news import MessageNumber
 from edge.messages.admission import Admission
 from edge.messages.topics import CARD, Group, ReceiveCallback, Topic
 
@@ -172,7 +172,7 @@ class MulticastLink:
                 came, counts_since_s = 0, time.monotonic()
 
     def _take(self, fragment: Fragment, now_s: float) -> None:
-        message = self._assembly.add(fragment, now_s)
+        message = self._assembly.add(fragment, now_s, time.time())
         callback = self._callbacks.get(fragment.topic)
         if message is None or callback is None:
             return

@@ -45,6 +45,7 @@ from nacl.bindings import (
 from nacl.exceptions import CryptoError
 
 from edge.identity.envelope import read_envelope
+from edge.identity.news import MessageNumber, Newest
 from edge.messages.topics import CARD, MESSAGE, Topic
 
 KEY_BYTES: int = crypto_secretbox_KEYBYTES
@@ -83,16 +84,6 @@ class GroupKey(NamedTuple):
 def key_of_open_fleet(fleet: str) -> bytes:
     """What a fleet without keys takes for one: it keeps fleets apart, and nothing secret."""
     return hashlib.sha256(f"lpac open fleet {fleet}".encode()).digest()
-
-
-class MessageNumber(NamedTuple):
-    """Of a sender's two messages the one with the greater number is newer."""
-
-    start: int
-    sequence: int
-
-
-_NOTHING = MessageNumber(-1, -1)
 
 
 def number_in(message: bytes) -> MessageNumber | None:
@@ -166,7 +157,7 @@ _Pieces = tuple[MessageNumber, int, int]
 class _Sender:
     """What came of one sender's messages on one topic; `key` is the newest that it spoke with."""
 
-    newest: MessageNumber = _NOTHING
+    newest: Newest = field(default_factory=Newest)
     newest_at_s: float = -math.inf
     key: int = sys.maxsize
     partial: dict[_Pieces, dict[int, bytes]] = field(default_factory=dict)
@@ -189,11 +180,15 @@ class Assembly:
         self._senders: dict[tuple[Topic, int], _Sender] = {}
         self.old = 0
 
-    def add(self, fragment: Fragment, now_s: float) -> bytes | None:
-        """The message that the fragment completes, if it does. `now_s` is a monotonic clock's."""
+    def add(self, fragment: Fragment, now_s: float, unix_s: float | None = None) -> bytes | None:
+        """The message that the fragment completes, if it does.
+
+        `now_s` is a monotonic clock's, `unix_s` the wall clock's, as `Newest` takes them.
+        """
         sender = self._sender(fragment)
         silent = now_s - sender.newest_at_s > self._forget_after_s
-        if (fragment.number <= sender.newest and not silent) or fragment.key > sender.key:
+        is_older = sender.newest.is_older(fragment.number, now_s, unix_s)
+        if (is_older and not silent) or fragment.key > sender.key:
             self.old += 1
             return None
         if fragment.of == 1:
@@ -212,7 +207,8 @@ class Assembly:
     def heard(self, fragment: Fragment, now_s: float) -> None:
         """The message that this fragment completed was its sender's, and so is its number."""
         sender = self._sender(fragment)
-        sender.newest, sender.newest_at_s = fragment.number, now_s
+        sender.newest.hear(fragment.number, now_s)
+        sender.newest_at_s = now_s
         sender.key = min(sender.key, fragment.key)
         sender.partial = {
             which: parts for which, parts in sender.partial.items() if which[0] > fragment.number

@@ -4,9 +4,9 @@ Who a message is from is decided here, before anything of it is decoded and what
 """
 
 import math
-from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from threading import Lock
@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 from edge.core import log
 from edge.identity.card import Card, CardError, Revocations, Role, verified
 from edge.identity.envelope import Address, Envelope, read_envelope, seal
+from edge.identity.news import NOTHING, MessageNumber, Newest
 from edge.identity.signature import Signer
 from edge.messages.topics import (
     CARD,
@@ -37,6 +38,8 @@ _SHOWN_IN_HASTE_EVERY_S, _HASTE_S = 0.5, 1.5
 _SHOWN_EVERY_S = {CARD: 1.0 / CARD.rate_hz, GROUND_CARD: 1.0 / GROUND_CARD.rate_hz}
 # What was on its way when a member's program started again has come by then.
 _LONGEST_TRANSIT_S = 5.0
+# No clock is further ahead than a wrong time zone makes it; one that was lost is behind.
+_MOST_AHEAD_MS = 24 * 3600e3
 
 
 class Speaker(NamedTuple):
@@ -59,14 +62,45 @@ class RefusedMessage(StrEnum):
     NOT_ALLOWED = "not_allowed"
     FORGED = "forged"
     REPLAYED = "replayed"
+    START_AHEAD = "start_ahead"
 
 
-class _Behind(NamedTuple):
-    """What a member says behind its own newest word: since when, until when, and the newest."""
+@dataclass(slots=True)
+class _Heard:
+    """What a member says on one key; all times are a monotonic clock's, s."""
 
-    since_s: float
-    at_s: float
-    said: tuple[int, int]
+    newest: Newest = field(default_factory=Newest)
+    newest_s: float = -math.inf
+    # Its newest word every second or so, back to the longest transit ago.
+    before: deque[tuple[float, MessageNumber]] = field(default_factory=deque)
+    # Of its words behind the newest one: since when they come, until when, and the greatest.
+    behind_since_s: float = -math.inf
+    behind_s: float = -math.inf
+    behind: MessageNumber = NOTHING
+    # When such a word came last that was no longer on its way: a second program said it.
+    twice_s: float = -math.inf
+
+    def hear(self, number: MessageNumber, now_s: float) -> None:
+        """It is news."""
+        self.newest.hear(number, now_s)
+        self.newest_s = now_s
+        if not self.before or now_s - self.before[-1][0] >= 1.0:
+            self.before.append((now_s, number))
+        while len(self.before) > 1 and now_s - self.before[1][0] > _LONGEST_TRANSIT_S:
+            self.before.popleft()
+
+    def hear_behind(self, number: MessageNumber, now_s: float) -> None:
+        """It is none: of two programs with one key the one that started last is heard."""
+        if now_s - self.behind_s > _LONGEST_TRANSIT_S:
+            self.behind_since_s, self.behind = now_s, NOTHING
+        if number <= self.behind:
+            return
+        self.behind_s, self.behind = now_s, number
+        said = [*self.before, (self.newest_s, self.newest.number)]
+        settled = [n for at_s, n in said if now_s - at_s > _LONGEST_TRANSIT_S]
+        goes_on = now_s - self.behind_since_s > _LONGEST_TRANSIT_S
+        if goes_on and settled and number <= settled[-1]:
+            self.twice_s = now_s
 
 
 class CardProblem(StrEnum):
@@ -100,7 +134,13 @@ class Guard(Protocol):
         """Robots that are listened to no more, and may still fly."""
 
     def robots_said_twice(self) -> frozenset[int]:
-        """Robots whose key two programs have, or whose messages somebody says again."""
+        """Robots whose key two programs have: the own one among them, if it is said elsewhere."""
+
+    def robots_ahead(self) -> frozenset[int]:
+        """Robots that number their starts further ahead of the clock than one can be wrong."""
+
+    def hear_time(self, unix_s: float) -> None:
+        """It is so late now; robots whose start lies more than a day ahead are not heard."""
 
     def refused(self) -> dict[str, int]:
         """How many messages were nobody's, by why."""
@@ -137,6 +177,13 @@ class Unguarded:
     def robots_said_twice(self) -> frozenset[int]:
         """See `Guard`."""
         return frozenset()
+
+    def robots_ahead(self) -> frozenset[int]:
+        """See `Guard`."""
+        return frozenset()
+
+    def hear_time(self, unix_s: float) -> None:
+        """See `Guard`."""
 
     def refused(self) -> dict[str, int]:
         """See `Guard`."""
@@ -195,8 +242,12 @@ class SignedGuard:
         self._revocations = Revocations(0)
         self._revoked: frozenset[bytes] = frozenset()
         self.revocations = b""
-        self._heard: dict[tuple[bytes, str], tuple[int, int]] = {}
-        self._behind: dict[tuple[bytes, str], _Behind] = {}
+        self._heard: defaultdict[tuple[bytes, str], _Heard] = defaultdict(_Heard)
+        # When a key's start lay ahead of the clock; when the own key was said by a later start.
+        self._ahead_s: dict[bytes, float] = {}
+        self._own_said_s = -math.inf
+        # The wall clock minus the monotonic one, once it is known.
+        self._unix_offset_s: float | None = None
         self._refused: Counter[RefusedMessage] = Counter()
         self._sequence = 0
         self._shown_at_s = self._new_until_s = -math.inf
@@ -255,15 +306,27 @@ class SignedGuard:
 
     def robots_said_twice(self) -> frozenset[int]:
         """See `Guard`."""
-        now_s = self._clock_s()
+        since_s = self._clock_s() - _LONGEST_TRANSIT_S
         with self._lock:
-            twice = [
-                self._cards.get(fingerprint)
-                for (fingerprint, _), behind in self._behind.items()
-                if behind.at_s - behind.since_s > _LONGEST_TRANSIT_S
-                and now_s - behind.at_s <= _LONGEST_TRANSIT_S
-            ]
-        return frozenset(card.robot_id for card in twice if card and card.robot_id is not None)
+            heard = {key for (key, _), said in self._heard.items() if said.newest_s >= since_s}
+            twice = {key for (key, _), said in self._heard.items() if said.twice_s >= since_s}
+            ahead = {key for key, at_s in self._ahead_s.items() if at_s >= since_s}
+        own = {self.card.fingerprint} if self._own_said_s >= since_s else set()
+        return self._robots(twice | (ahead & heard) | own)
+
+    def robots_ahead(self) -> frozenset[int]:
+        """See `Guard`."""
+        since_s = self._clock_s() - _LONGEST_TRANSIT_S
+        with self._lock:
+            return self._robots({key for key, at_s in self._ahead_s.items() if at_s >= since_s})
+
+    def _robots(self, fingerprints: Iterable[bytes]) -> frozenset[int]:
+        cards = (self._cards.get(fingerprint) for fingerprint in fingerprints)
+        return frozenset(card.robot_id for card in cards if card and card.robot_id is not None)
+
+    def hear_time(self, unix_s: float) -> None:
+        """See `Guard`."""
+        self._unix_offset_s = unix_s - self._clock_s()
 
     def refused(self) -> dict[str, int]:
         """See `Guard`."""
@@ -342,34 +405,37 @@ class SignedGuard:
             return RefusedMessage.NOT_ALLOWED
         if not envelope.is_from(card.public_key, Address(self._authority, key)):
             return RefusedMessage.FORGED
-        if not self._is_news(key, envelope):
-            return RefusedMessage.REPLAYED
+        refused = self._overtaken(key, card, envelope)
+        if refused is not None:
+            return refused
         return envelope.payload, Speaker(card.role, card.name)
 
-    def _is_news(self, key: str, envelope: Envelope) -> bool:
-        is_own = envelope.fingerprint == self.card.fingerprint
-        if is_own and self.card.role is Role.ROBOT and envelope.start <= self._start:
-            # A robot's own word, said again. Another program with this key, if there is one and it
-            # began earlier, hears this one.
-            return False
-        said, whose = (envelope.start, envelope.sequence), (envelope.fingerprint, key)
+    def _overtaken(self, key: str, card: Card, envelope: Envelope) -> RefusedMessage | None:
+        """Why the member's word does not count, if its number is the reason; else it is heard."""
+        number = MessageNumber(envelope.start, envelope.sequence)
+        now_s, offset_s = self._clock_s(), self._unix_offset_s
+        unix_s = None if offset_s is None else now_s + offset_s
+        # A ground whose computer's clock was wrong once would be out of reach in flight.
+        is_robot = card.role is Role.ROBOT
+        is_own = card.fingerprint == self.card.fingerprint and is_robot
         with self._lock:
-            before = self._heard.get(whose, (-1, -1))
-            if said <= before:
-                self._keep_behind(whose, said)
-                return False
-            self._heard[whose] = said
-            if envelope.start > before[0]:
+            if is_own and number.start <= self._start:
+                # A robot's own word, said again. Another program with this key, if there is one
+                # and it began earlier, hears this one.
+                return RefusedMessage.REPLAYED
+            if is_own:
+                self._own_said_s = now_s
+            if is_robot and unix_s is not None and number.start > 1e3 * unix_s + _MOST_AHEAD_MS:
+                self._ahead_s[card.fingerprint] = now_s
+                return RefusedMessage.START_AHEAD
+            heard = self._heard[card.fingerprint, key]
+            if heard.newest.is_older(number, now_s, unix_s):
+                heard.hear_behind(number, now_s)
+                return RefusedMessage.REPLAYED
+            if number.start != heard.newest.number.start:
                 self._show_soon = True  # A program that just began knows nobody's card.
-        return True
-
-    def _keep_behind(self, whose: tuple[bytes, str], said: tuple[int, int]) -> None:
-        """Of two programs with one key the one that started last is heard; the other goes on."""
-        now_s, before = self._clock_s(), self._behind.get(whose)
-        if before is None or now_s - before.at_s > _LONGEST_TRANSIT_S:
-            self._behind[whose] = _Behind(now_s, now_s, said)
-        elif said > before.said:
-            self._behind[whose] = _Behind(before.since_s, now_s, said)
+            heard.hear(number, now_s)
+        return None
 
     def _receive_card(self, topic: Topic, key: str, data: bytes) -> bool:
         envelope = read_envelope(data)
@@ -407,8 +473,8 @@ class SignedGuard:
         if card.fingerprint not in self._cards:
             return RefusedMessage.NOT_ALLOWED  # Somebody has a newer card in its place.
         # Shown again and again, it is no less the member's.
-        self._is_news(key, envelope)
-        return None
+        refused = self._overtaken(key, card, envelope)
+        return refused if refused is RefusedMessage.START_AHEAD else None
 
     def _receive_revocations(self, key: str, data: bytes) -> None:
         if data != self.revocations and not self.hear_revocations(data):

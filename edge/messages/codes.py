@@ -173,6 +173,7 @@ class ReasonCode(_Code):
     ARMING_CALLED_OFF = "arming_called_off"
     # The program itself.
     DUPLICATE_ID = "duplicate_id"
+    SAID_TWICE = "said_twice"
     WATCHDOG_ENDED = "watchdog_ended"
     LOG_NOT_WRITTEN = "log_not_written"
     GROUND_NOT_UNDERSTOOD = "ground_not_understood"

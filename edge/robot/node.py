@@ -300,7 +300,10 @@ class RobotNode:
         if not is_due:
             return
         # A robot's own wall clock may be wrong: there is no internet on a field.
-        unix_now_s = self._inbox.ground_unix_s(now_s) or self._ports.clock.unix_s()
+        ground_unix_s, own_unix_s = self._inbox.ground_unix_s(now_s), self._ports.clock.unix_s()
+        unix_now_s = ground_unix_s or own_unix_s
+        if ground_unix_s is not None:
+            self._guard.hear_time(max(ground_unix_s, own_unix_s))
         time = self._pac.clock.at(now_s)
         control.checks = self.readiness.checks(
             now_s,
@@ -450,6 +453,10 @@ class RobotNode:
         if self._is_duplicate():
             text = f"another program says that it is robot {self._config.robot_id}"
             alarms.append(Reason(ReasonCode.DUPLICATE_ID, text))
+        twice = sorted(self._guard.robots_said_twice() - {self._config.robot_id})
+        if twice:
+            text = f"two programs have the key of robot {', '.join(map(str, twice))}: end one, or "
+            alarms.append(Reason(ReasonCode.SAID_TWICE, f"{text}revoke it and restart the robot"))
         if not self._ports.watchdog.alive():
             text = "the watchdog has ended: only PX4 notices if this program hangs"
             alarms.append(Reason(ReasonCode.WATCHDOG_ENDED, text))
@@ -491,7 +498,9 @@ class RobotNode:
         return RadioCounts(sent, sent_bytes, {str(robot): each.counts for robot, each in arrivals})
 
     def _is_duplicate(self) -> bool:
-        return self._link is not None and self._link.is_claimed(self._config.robot_id)
+        robot_id = self._config.robot_id
+        is_claimed = self._link is not None and self._link.is_claimed(robot_id)
+        return is_claimed or robot_id in self._guard.robots_said_twice()
 
 
 def _news(status: RobotStatus) -> tuple[object, ...]:

@@ -141,8 +141,13 @@ async def _bring_up(
     clock = await measure_clock(session, unix_time_s)
     if abs(clock.offset_s) > GOOD_CLOCK_OFFSET_S + clock.uncertainty_s:
         port = robot.mavlink_port
-        if await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
+        if answer := await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
             done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
+            if answer["ahead"]:
+                problems.append(
+                    "its program started by a clock more than a day ahead, and is not listened to: "
+                    f"`lpac fleet restart --robots {robot.name}`"
+                )
     if locked and has_group_keys(config):
         try:
             if await give_group_keys(session, config, robot):

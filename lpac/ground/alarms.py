@@ -261,7 +261,7 @@ def _silent(fleet: _Fleet, seen: _Seen) -> _Found:
 def _duplicate(fleet: _Fleet, seen: _Seen) -> _Found:
     if not seen.robot.duplicate:
         return None
-    return "critical", "two programs say that they are this robot: end one"
+    return "critical", "two programs say that they are this robot: end one, or revoke its key"
 
 
 def _own(fleet: _Fleet, seen: _Seen) -> _Found:

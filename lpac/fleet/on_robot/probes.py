@@ -26,6 +26,8 @@ _CHECKS_WAIT_S = 8.0
 # Failed checks that mean that it has not looked yet.
 _NOT_SETTLED = ("checks_running", "failsafe_not_read")
 _PRIVATE = "/var/lib/private"
+# As `edge.drivers.identity_folder` writes it, and `edge.identity.guard` refuses it.
+_START, _MOST_AHEAD_MS = _PRIVATE + "/lpac/identity/start", 24 * 3600 * 1000
 # `lpac robot check` waits so long for the vehicle; the ground will be missing to its end.
 _CHECK_S = 10.0
 
@@ -44,7 +46,8 @@ def set_clock(offset_s: float, mavlink_port: int) -> Dict[str, Any]:
     """Take `offset_s` off the wall clock at once, and set the battery-backed clock if there is one.
 
     Refused while the vehicle is armed. On the ground the program may run meanwhile: it counts
-    monotonic time. Only the flight log's times jump as the clock does.
+    monotonic time. Only the flight log's times jump as the clock does. Starts of the program that
+    were numbered by a clock far `ahead`, which nobody listens to, are numbered anew.
     """
     service.refuse_in_flight(mavlink_port, "setting the clock")
     try:
@@ -53,10 +56,20 @@ def set_clock(offset_s: float, mavlink_port: int) -> Dict[str, Any]:
         raise Refused(
             "its clock cannot be set: the system does not let root do that (a container?)"
         ) from None
+    now_ms, ahead = int(1e3 * time.time()), False
+    try:
+        with open(_START, "r+") as file:
+            ahead = int(file.read()) > now_ms + _MOST_AHEAD_MS
+            if ahead:
+                file.seek(0)
+                file.truncate()
+                file.write("%d\n" % now_ms)
+    except (OSError, ValueError):  # None yet.
+        pass
     kept = False
     if glob.glob("/dev/rtc*") and shutil.which("hwclock"):
         kept = run(["hwclock", "-w"]).returncode == 0
-    return {"unix_time_s": time.time(), "hardware_clock": kept}
+    return {"unix_time_s": time.time(), "hardware_clock": kept, "ahead": ahead}
 
 
 # The computer

@@ -33,6 +33,10 @@ from lpac.ground.station.protocol import Request, ServerMessage
 from lpac.ground.station.station import Station
 
 _WORLD_PERIOD_S = 0.5
+_AHEAD = (
+    "is not listened to: its program started more than a day from now. Either its clock was wrong "
+    "(`lpac fleet up`, then `lpac fleet restart`), or somebody has its key (`lpac fleet revoke`)"
+)
 # Ticks are not exact.
 _EARLY_S = 0.1
 
@@ -111,6 +115,9 @@ class GroundNode:
         """Time has passed; some five times a second."""
         self._set_time()
         self.station.hear_twice(self._guard.robots_said_twice())
+        for robot_id in self._guard.robots_ahead():
+            name = self._names.get(f"robot/{robot_id}", "")
+            self._complain(f"ahead {robot_id}", name, _AHEAD)
         try:
             self.station.tick()
             self._step()
@@ -142,6 +149,7 @@ class GroundNode:
         unix_s = self._clock.unix_s()
         self.station.set_time(self._clock.monotonic_s(), unix_s)
         self.station.card_problem = self._guard.card_problem(unix_s)
+        self._guard.hear_time(unix_s)
 
     def _receive(self, key: str, data: bytes, speaker: Speaker) -> None:
         source, _, topic = key.rpartition("/")

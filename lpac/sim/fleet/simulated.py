@@ -133,6 +133,7 @@ class SimulatedFleet(SimulatedRobots):
     def _guard(self, role: Role, name: str, robot_id: int | None, start: int) -> Guard:
         if self.members is None:
             return Unguarded()
+        start += int(1e3 * self.schedule.unix_s())
         return self.members.guard(role, name, robot_id, start, self.schedule.monotonic_s)
 
 

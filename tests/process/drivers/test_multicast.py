@@ -17,8 +17,9 @@ from edge.drivers.radio import zenoh_radio
 from edge.drivers.zenoh_link import ZenohLink, ZenohRouter
 from edge.identity.card import Card, Revocations, Role, signed
 from edge.identity.envelope import Address, seal
-from edge.identity.group import PART_BYTES, GroupKey, MessageNumber, datagrams
+from edge.identity.group import PART_BYTES, GroupKey, datagrams
 from edge.identity.guard import Membership, SignedGuard, Speaker
+from edge.identity.news import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import CARD, MESSAGE, STATUS, Group, Link, LinkSetting, Topic
 from lpac.sim.ports import free_ports
@@ -246,6 +247,36 @@ def test_a_member_cannot_speak_for_another_nor_make_it_old(group: Group) -> None
         eventually(lambda: second.heard["r1"] == b"genuine")
         eventually_hear(first, b"after", second)
         assert "not_allowed" in second.guard.refused()
+
+
+def test_one_packet_with_a_stolen_key_mutes_no_robot_for_good(group: Group) -> None:
+    now_ms = int(1e3 * time.time())
+    with Robot(group, 2) as second, stranger() as thief:
+        second.guard.hear_time(time.time())
+
+        def stolen(start: int) -> bytes:
+            number = MessageNumber(start, 2**32 - 1)
+            signer, _ = signer_and_card(1)
+            address = Address(AUTHORITY.public_key, "robot/1/message")
+            said = seal(
+                b"stolen", signer=signer, address=address, start=start, sequence=number.sequence
+            )
+            key = GroupKey.of(KEY)
+            (datagram,) = datagrams(said, topic=MESSAGE, sender=1, number=number, key=key)
+            return datagram
+
+        place = group.address, group.port
+        with Robot(group, 1, start=now_ms) as first:
+            eventually_hear(first, b"before", second)
+            thief.sendto(stolen(2**48 - 1), place)
+            eventually(lambda: "start_ahead" in second.guard.refused())
+            eventually_hear(first, b"still there", second)
+            thief.sendto(stolen(now_ms + 20 * 3600 * 1000), place)
+            eventually(lambda: second.heard["r1"] == b"stolen")
+        with Robot(group, 1, start=int(1e3 * time.time()) + 1) as again:
+            eventually_hear(again, b"after its restart", second)
+            thief.sendto(stolen(now_ms + 20 * 3600 * 1000), place)
+            eventually_hear(again, b"and on", second)
 
 
 GREATEST = MessageNumber(2**48 - 1, 2**32 - 1)

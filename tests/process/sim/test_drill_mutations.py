@@ -110,12 +110,12 @@ def ground_tells_nothing_of_holds(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def cards_tell_nothing_of_a_new_program(monkeypatch: pytest.MonkeyPatch) -> None:
-    is_news = SignedGuard._is_news
+    overtaken = SignedGuard._overtaken
 
-    def among_others(self: SignedGuard, key: str, envelope: Any) -> bool:
-        return not key.endswith("/card") and is_news(self, key, envelope)
+    def of_others(self: SignedGuard, key: str, card: Any, envelope: Any) -> Any:
+        return None if key.endswith("/card") else overtaken(self, key, card, envelope)
 
-    monkeypatch.setattr(SignedGuard, "_is_news", among_others)
+    monkeypatch.setattr(SignedGuard, "_overtaken", of_others)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,9 @@ import pytest
 from bench.stolen_key import Lie, harms, held_up, ready_fleet
 from edge.identity.card import Role
 from edge.messages.codec import encode
+from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, Order, RobotStatus, SafetyAction
-from edge.messages.topics import ORDER, REVOKED, STATE, STATUS, TOPICS, Topic
+from edge.messages.topics import MESSAGE, ORDER, REVOKED, STATE, STATUS, TOPICS, Topic
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.ground.alarms import AlarmCode, alarms
 from lpac.ground.station.protocol import (
@@ -26,12 +27,15 @@ from lpac.ground.station.protocol import (
 )
 from lpac.sim.description import ERRORS
 from lpac.sim.fleet.members import SimulatedMembers
+from lpac.sim.fleet.simulated import EPOCH_S
 from tests.flown import FlownRobot
 from tests.sim.ground.field import Field, a_field
 
 _S = FlightState
 # On the radio, as a ground and as a robot.
 ENEMY, TWIN = -50, 0
+# An hour later than all programs start: what a thief says is newer.
+STOLEN_START = int(1e3 * (EPOCH_S + 3600.0))
 
 Seal = Callable[[Topic, bytes], bytes]
 
@@ -85,7 +89,7 @@ def test_with_keys_nobody_else_commands_it(with_the_key_of: str) -> None:
         role, name, robot_id = (
             (Role.ROBOT, "r1", 1) if with_the_key_of == "robot 1" else (Role.OBSERVER, "eve", None)
         )
-        seal = members.guard(role, name, robot_id, 10**9, lambda: 0.0).seal
+        seal = members.guard(role, name, robot_id, STOLEN_START, lambda: 0.0).seal
     attack(field, seal)
     assert field.states() == {_S.MISSION}
     assert {status_of(robot).operator for robot in field.robots} == {"alice"}
@@ -126,6 +130,28 @@ def test_two_programs_with_one_key_are_an_alarm() -> None:
     assert AlarmCode.DUPLICATE_ID not in alarms_of(field, "r0")
 
 
+@pytest.mark.parametrize("ahead_s", [20 * 3600.0, 1e11], ids=["within a day", "beyond"])
+def test_no_packet_of_a_thief_mutes_a_robot_for_good(ahead_s: float) -> None:
+    """The greatest number that its key can sign; robots say so themselves, and the ground."""
+    field = a_field(2, "ready", secure=True)
+    assert field.fleet.members is not None
+    start = min(int(1e3 * (field.fleet.schedule.unix_s() + ahead_s)), 2**48 - 1)
+    thief = field.fleet.members.guard(Role.ROBOT, "r1", 1, start, lambda: 0.0)
+    thief._sequence = 2**32 - 3
+    link, hears = field.fleet.radio.link(1, {}), field.robots[0]
+    for topic in (MESSAGE, STATUS):
+        link.publish(topic, thief.seal(topic, b"stolen"))
+    link.close()
+    told = ReasonCode.SAID_TWICE
+    field.until(lambda: told in {alarm.code for alarm in status_of(hears).alarms}, 15.0)
+    field.until(lambda: AlarmCode.DUPLICATE_ID in alarms_of(field, "r1"), 5.0)
+    if ahead_s < 1e6:
+        assert not status_of(hears).neighbour_ages_s
+        field.fleet.robots[1].start()
+    field.until(lambda: status_of(hears).neighbour_ages_s.keys() == {"1"}, 15.0)
+    field.until(lambda: told not in {alarm.code for alarm in status_of(hears).alarms}, 10.0)
+
+
 def alarms_of(field: Field, robot: str, before: FleetSnapshot | None = None) -> set[AlarmCode]:
     """What alice's views show of a robot."""
     alice = field.stations["alice"]
@@ -143,7 +169,7 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
     assert members is not None and alice.state is not None
     liar = field.robots[2]
     link = field.fleet.radio.link(liar.robot_id, {})
-    seal = members.guard(Role.ROBOT, "r2", 2, 10**9, lambda: 0.0).seal
+    seal = members.guard(Role.ROBOT, "r2", 2, STOLEN_START, lambda: 0.0).seal
     sequence = min(alice.state.sequence + sequences_ahead, 2**48)
     for i in range(40):
         status = status_of(liar)
@@ -236,9 +262,9 @@ class Enemy:
         self._field = field
         self._seals: list[Seal] = [
             as_it_is,
-            members.guard(Role.ROBOT, "r1", 1, 10**9, lambda: 0.0).seal,
-            members.guard(Role.OBSERVER, "eve", None, 10**9, lambda: 0.0).seal,
-            others.guard(Role.OPERATOR, "alice", None, 10**9, lambda: 0.0).seal,
+            members.guard(Role.ROBOT, "r1", 1, STOLEN_START, lambda: 0.0).seal,
+            members.guard(Role.OBSERVER, "eve", None, STOLEN_START, lambda: 0.0).seal,
+            others.guard(Role.OPERATOR, "alice", None, STOLEN_START, lambda: 0.0).seal,
         ]
         self.recorded: list[tuple[Topic, bytes]] = []
         for station in (-60, 7):

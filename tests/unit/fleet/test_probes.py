@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -235,6 +236,23 @@ def test_a_clock_is_set_by_its_offset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "armed", lambda _: False)
     assert probes.set_clock(offset_s=-20.0, mavlink_port=1)["hardware_clock"] is False
     assert set_to == [1020.0]
+
+
+@pytest.mark.parametrize(("days", "ahead"), [(0.9, False), (1.1, True)])
+def test_starts_that_were_numbered_by_a_clock_far_ahead_are_numbered_anew(
+    days: float, ahead: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    now_ms = 1_800_000_000_000
+    start = tmp_path / "start"
+    start.write_text(f"{now_ms + int(days * 86_400_000)}\n")
+    monkeypatch.setattr(probes, "_START", str(start))
+    monkeypatch.setattr("time.time", lambda: 1e-3 * now_ms)
+    monkeypatch.setattr("time.clock_settime", lambda *_: None)
+    monkeypatch.setattr("glob.glob", lambda _: [])
+    monkeypatch.setattr(service, "armed", lambda _: False)
+    before = start.read_text()
+    assert probes.set_clock(offset_s=5e5, mavlink_port=1)["ahead"] is ahead
+    assert start.read_text() == (f"{now_ms}\n" if ahead else before)
 
 
 def test_a_program_is_waited_for_until_it_has_looked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,7 +174,7 @@ def test_what_a_robot_says_of_itself(
             {"duplicate": True},
             "critical",
             _C.DUPLICATE_ID,
-            "two programs say that they are this robot: end one",
+            "two programs say that they are this robot: end one, or revoke its key",
         ),
         ({"clock_offset_s": -3.2}, "warning", _C.CLOCK, "its clock is 3 s behind"),
         ({"rates_hz": {"0": 0.5, "2": 2.5}}, "warning", _C.NEIGHBOURS, "hears badly: r0"),

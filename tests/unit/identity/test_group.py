@@ -13,13 +13,13 @@ from edge.identity.group import (
     PART_BYTES,
     Assembly,
     GroupKey,
-    MessageNumber,
     datagrams,
     frames,
     key_of_open_fleet,
     number_in,
     open_datagram,
 )
+from edge.identity.news import MessageNumber
 from edge.identity.signature import Signer
 from edge.messages.topics import CARD, MESSAGE
 

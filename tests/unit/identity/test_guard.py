@@ -385,3 +385,108 @@ def test_without_a_guard_a_message_is_its_keys() -> None:
 def test_the_link_itself_is_asked_for_the_rest(one: Member) -> None:
     assert one._link.is_claimed(7) and not one._link.is_claimed(1) and one._link.peers() == 3
     assert one._link.refused() == 11
+
+
+DAY_MS = 24 * 3600 * 1000
+NOW_S = 1.8e9
+
+
+def begun(robot_id: int, at_s: float) -> Member:
+    """A robot whose program started `at_s` after `NOW_S`, by a clock that is right."""
+    return robot(robot_id, start=int(1e3 * (NOW_S + at_s)))
+
+
+def thief(robot_id: int, ahead_ms: float, sequence: int = 2**32 - 1) -> Member:
+    """Somebody with that robot's key, `ahead_ms` ahead of `NOW_S`, and then of every sequence."""
+    member = robot(robot_id, start=min(int(1e3 * NOW_S + ahead_ms), 2**48 - 1))
+    member.guard._sequence = sequence - 1
+    return member
+
+
+def speak(
+    hearer: Member, member: Member, until_s: float, topic: Topic = MESSAGE
+) -> list[tuple[str, bytes, Speaker]]:
+    """What is heard of a member that speaks four times a second, and shows its card."""
+    before = len(hearer.heard)
+    while hearer.now_s < until_s:
+        hearer.now_s += 0.25
+        member.now_s = hearer.now_s
+        hearer.hear(member, member.say(topic, b"word"))
+    return hearer.heard[before:]
+
+
+def packet(member: Member, topic: Topic = MESSAGE) -> list[tuple[Topic, bytes]]:
+    """One message alone, without its card."""
+    return [(topic, member.guard.seal(topic, b"stolen"))]
+
+
+@pytest.mark.parametrize("topic", [MESSAGE, STATUS])
+def test_no_start_beyond_a_day_mutes_a_robot(one: Member, topic: Topic) -> None:
+    one.guard.hear_time(NOW_S)
+    two, enemy = begun(2, -60.0), thief(2, 2**48 if topic is MESSAGE else 1.1 * DAY_MS)
+    assert speak(one, two, 5.0, topic)
+    one.hear(enemy, packet(enemy, topic))
+    assert one.guard.refused()["start_ahead"] == 1
+    assert len(speak(one, two, 6.0, topic)) == 4
+    # And the operator is told: while the real one is heard, its key is somebody else's too.
+    assert one.guard.robots_said_twice() == one.guard.robots_ahead() == {2}
+    speak(one, two, 20.0, topic)
+    assert one.guard.robots_said_twice() == one.guard.robots_ahead() == set()
+
+
+@pytest.mark.parametrize("ahead_ms", [-60e3, 0.9 * DAY_MS], ids=["its own start", "a later one"])
+def test_whom_a_thief_silenced_is_heard_again_once_it_starts_again(
+    one: Member, ahead_ms: float
+) -> None:
+    one.guard.hear_time(NOW_S)
+    two, enemy = begun(2, -60.0), thief(2, ahead_ms)
+    assert speak(one, two, 5.0)
+    one.hear(enemy, stolen := packet(enemy))
+    speak(one, two, 12.0)
+    assert one.guard.robots_said_twice() == {2}, "and others say so"
+    again = begun(2, 13.0)
+    assert len(speak(one, again, 20.0)) == 32
+    # What the thief said is over, and so is what the robot said before.
+    one.hear(enemy, stolen)
+    one.hear(two, packet(two))
+    assert one.heard[-1][1] == b"word" and len(speak(one, again, 21.0)) == 4
+
+
+def test_a_start_that_was_heard_before_the_time_was_known_mutes_nobody_for_good(
+    one: Member,
+) -> None:
+    """A robot that lost its clock knows the time once it hears its ground."""
+    two, enemy = begun(2, -60.0), thief(2, 2**48)
+    assert speak(one, two, 1.0)
+    one.hear(enemy, packet(enemy))
+    assert not speak(one, two, 3.0)
+    one.guard.hear_time(NOW_S + 3.0)
+    assert speak(one, begun(2, 4.0), 5.0)
+
+
+def test_a_ground_is_heard_whatever_its_clock_was(one: Member) -> None:
+    """Robots in flight hear their ground, though its laptop's clock was wrong once."""
+    one.guard.hear_time(NOW_S)
+    ground = Member(membership(Role.OPERATOR, "ann", start=int(1e3 * NOW_S + 30 * DAY_MS)))
+    assert speak(one, ground, 1.0, STATE)
+    # Its clock was set right, and it started again.
+    again = Member(membership(Role.OPERATOR, "ann", start=int(1e3 * (NOW_S + 2.0))))
+    assert speak(one, again, 3.0, STATE)
+
+
+def test_messages_that_overtake_each_other_are_no_second_program(one: Member, two: Member) -> None:
+    late: list[tuple[Topic, bytes]] = []
+    for quarter in range(80):
+        one.now_s = 0.25 * quarter
+        said = packet(two)
+        one.hear(two, [*packet(two), *late, *late])
+        late = said
+    assert one.guard.refused()["replayed"] > 100
+    assert one.guard.robots_said_twice() == set()
+
+
+def test_a_robot_hears_that_another_has_its_key(one: Member) -> None:
+    one.hear(robot(2), packet(robot(2)))
+    enemy = robot(1, start=2)
+    one.hear(enemy, packet(enemy))
+    assert one.guard.robots_said_twice() == {1}
