@@ -23,8 +23,8 @@ import numpy as np
 from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
 from bench.stolen_key import ready_fleet
-from edge.core import log
 from edge.core.aggregation import AggregatedMessage
+from edge.core.logger import show
 from edge.core.wire import PayloadType, decode, encode, payload_type_of
 from edge.drivers.multicast import MulticastLink
 from edge.drivers.registry import load_policy
@@ -102,7 +102,7 @@ def measure(
 
 def _hear(others: int, seconds: float, robots: int) -> Heard:
     """In a process of its own, so that nothing else is counted."""
-    log.listen(log.show_errors)
+    show("error")
     port, zenoh_port = free_ports(2)
     group = Group("239.255.76.90", port, "127.0.0.1", (_KEY,), is_secret=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -9,7 +9,7 @@ from time import perf_counter, process_time
 
 from bench import BUNDLE
 from bench.report import Report, Table, Target, progress
-from edge.core import log
+from edge.core.logger import show
 from lpac.sim.fleet.clocked import fly_simulated
 from lpac.sim.fleet.layout import FleetScenario
 
@@ -59,7 +59,7 @@ def measure(robots: int = 10, mission_s: float = 20.0, runs: int = 3) -> Report:
 
 
 def _fly(robots: int, mission_s: float) -> dict[str, float]:
-    log.listen(log.show_errors)
+    show("error")
     gc.freeze()  # what is loaded stays
     with tempfile.TemporaryDirectory() as folder:
         wall_s, cpu_s = perf_counter(), process_time()

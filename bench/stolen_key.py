@@ -21,8 +21,9 @@ from rich.progress import track
 
 from bench import BUNDLE
 from bench.report import Report, Table, Target
-from edge.core import F32, F64, log
+from edge.core import F32, F64
 from edge.core.aggregation import AggregatedMessage
+from edge.core.logger import show
 from edge.core.wire import decode, encode
 from edge.drivers.registry import load_policy
 from edge.identity.card import Role
@@ -393,7 +394,7 @@ def _row(lie: Lie, harms: Sequence[Harm]) -> tuple[str, ...]:
 
 
 def _mission(robots: int, mission_s: float, seed: int) -> tuple[dict[Lie, Harm], HeldUp]:
-    log.listen(log.show_errors)
+    show("error")
     with tempfile.TemporaryDirectory() as folder:
         ready = ready_fleet(robots, seed, Path(folder))
         hovering = ready.copy()

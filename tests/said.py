@@ -3,7 +3,10 @@
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from edge.core import log
+import structlog
+from structlog.testing import LogCapture
+from structlog.typing import EventDict
+
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, Refusal, RefusalCode
 from edge.messages.mission import OrderResult
 from lpac.ground.station.protocol import CommandReport, ProblemCode, ResultCode
@@ -27,14 +30,14 @@ def refusal(text: str) -> Refusal | None:
 
 
 @contextmanager
-def lines_said() -> Iterator[list[log.Line]]:
-    """The log lines of this process, as they come."""
-    lines: list[log.Line] = []
-    before = log.listen(lines.append)
+def lines_said() -> Iterator[list[EventDict]]:
+    """The log lines of this process, as they come; the logger is then as it was before."""
+    before, lines = structlog.get_config(), LogCapture()
+    structlog.configure([lines], structlog.make_filtering_bound_logger("info"))
     try:
-        yield lines
+        yield lines.entries
     finally:
-        log.listen(before)
+        structlog.configure(**before)
 
 
 def codes(said: Iterable[FailedCheck | Reason]) -> list[CheckCode | ReasonCode]:

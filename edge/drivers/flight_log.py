@@ -47,7 +47,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from edge.core import log
+from edge.core.logger import log
 from edge.core.vehicle import VehicleState
 from edge.messages.mission import GroundState, Order, OrderResult, RobotStatus
 

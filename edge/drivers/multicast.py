@@ -16,7 +16,7 @@ from contextlib import suppress
 from threading import Event, Lock, Thread
 from typing import Self
 
-from edge.core import log
+from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
 from edge.drivers.zenoh_link import MAX_CERTIFIED_ID, ZenohLink
 from edge.identity.group import (
@@ -203,7 +203,7 @@ class MulticastLink:
             self._problems[what] += 1
             first = self._problems[what] == 1
         if first:
-            log.error("link failure", error, what=what)
+            log.error("link failure", exc_info=error, what=what)
 
 
 def _sending() -> socket.socket:

@@ -31,8 +31,8 @@ from typing import Literal, Self
 
 import zenoh
 
-from edge.core import log
 from edge.core.address import is_loopback_endpoint, require_endpoint
+from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
 from edge.messages.admission import Admission
 from edge.messages.topics import (
@@ -287,7 +287,7 @@ class ZenohLink:
             self._failures[what] += 1
             first = self._failures[what] == 1
         if first:
-            log.error("link failure", error, what=what)
+            log.error("link failure", exc_info=error, what=what)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         match = _TOKEN.fullmatch(str(sample.key_expr).removeprefix(self._prefix))

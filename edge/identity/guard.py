@@ -12,7 +12,7 @@ from functools import partial
 from threading import Lock
 from typing import NamedTuple, Protocol
 
-from edge.core import log
+from edge.core.logger import log
 from edge.identity.card import Card, CardError, Revocations, Role, verified
 from edge.identity.envelope import Address, Envelope, read_envelope, seal
 from edge.identity.news import NOTHING, MessageNumber, Newest

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import NamedTuple
 
-from edge.core import log
 from edge.core.fleet_time import FleetTime
+from edge.core.logger import log
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Camera, Odometry, Recorder, Sensor, Vehicle
 from edge.core.vehicle import Action, Mode, Setpoint, VehicleState

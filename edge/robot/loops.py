@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 
-from edge.core import log
+from edge.core.logger import log
 from edge.messages.mission import LoopStatus
 
 _LATENESSES_KEPT_S = 60.0
@@ -84,7 +84,9 @@ class Loop:
                 return  # The program ends, and has closed what the step waited for.
             # The first of a row says all; a log that fills the disk helps nobody.
             if self._failures & (self._failures - 1) == 0:
-                log.error("loop step failed", error, loop=self.name, failures=self._failures)
+                log.error(
+                    "loop step failed", exc_info=error, loop=self.name, failures=self._failures
+                )
 
 
 def _percentile(ascending: Sequence[float], share: float) -> float:

@@ -9,7 +9,7 @@ import itertools
 import math
 from collections.abc import Mapping
 
-from edge.core import log
+from edge.core.logger import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
 from edge.core.vehicle import Action
 from edge.flight.state import flown_s

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from edge.core import log
+from edge.core.logger import log, show
 from edge.core.ports import OpenVehicle, SensorOver, Vehicle, VehicleSetting, Watchdog
 from edge.core.px4_version import in_words
 from edge.core.schema import ConfigError
@@ -362,7 +362,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
     with ExitStack() as parts:
         policy, sensor_over, world = _load(config, parts)
         parts.enter_context(_robot_lock(config))
-        log.listen(log.show_errors)
+        show("error")
         clock = SystemClock()
         identity = _identity(config, lambda folder: listening_identity(folder, fleet=config.fleet))
         vehicle, setup, _ = parts.enter_context(_open_vehicle(config))

@@ -8,8 +8,8 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from edge.core import log
 from edge.core.fence import Fence
+from edge.core.logger import log
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement

@@ -196,10 +196,10 @@ def _real_time(
         return None
     if ray is not None:
         raise ValueError(f"--ray does nothing with --vehicle {vehicle}")
-    from edge.core import log
+    from edge.core.logger import show
     from lpac.sim.drill.real_time import RealTimeDrill
 
-    log.listen(log.show_errors)
+    show("error")
     # Whoever ends this command ends its programs, too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     return RealTimeDrill(out, drilled, px4)
@@ -242,14 +242,14 @@ def _fly_again(
     fault: "Fault", seed: int, drilled: "DrilledRobots", folder: Path
 ) -> "FlightOutcome":
     """The same flight once more, with the robots' logs and a figure."""
-    from edge.core import log
+    from edge.core.logger import show
     from lpac.analysis.truth import TRUTH, write_truth
     from lpac.sim.drill.campaign import outcome_of
     from lpac.sim.drill.figure import write_figure
     from lpac.sim.drill.simulated import SimulatedDrill
     from lpac.sim.drill.truth import FlightTruth, tracks_of
 
-    log.listen(log.show_errors)
+    show("error")
     folder.mkdir(parents=True, exist_ok=True)
 
     def flown() -> FlightTruth:

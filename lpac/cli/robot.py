@@ -107,7 +107,7 @@ def setup(
 
     It must be the only vehicle there, and disarmed. No configuration is needed.
     """
-    from edge.core import log
+    from edge.core.logger import show
     from edge.drivers.px4.autopilot import MavsdkAutopilot
     from edge.drivers.px4.driver import vehicle_lock
     from edge.flight.failsafe import required
@@ -116,7 +116,7 @@ def setup(
 
     requirements = required(rc.value, ceiling, command_timeout)
     port = AutopilotConfig(url, system_id).port
-    log.listen(log.show_errors)
+    show("error")
     with vehicle_lock(port), MavsdkAutopilot(url) as autopilot:
         report = set_up(autopilot, autopilot, requirements, system_id, wait)
     if as_json:

@@ -100,6 +100,8 @@ ONLY_IN = {
     "zenoh": {"edge/drivers/"},
     "cyclonedds": {"lpac/network/over_cyclone.py"},
     "mcap": {"edge/drivers/"},
+    # Elsewhere it is `edge.core.logger`, which loads it without rich.
+    "structlog": {"edge/core/logger.py", "edge/drivers/logs.py"},
     "pymavlink": {"lpac/sim/"},
     "typer": {"lpac/cli/"},
     "rich": {"lpac/cli/", "lpac/ground/terminal/"},
@@ -182,6 +184,15 @@ def test_cli_imports_its_parts_only_when_a_command_runs(path: Path) -> None:
         assert part_of(module) in ("lpac", "lpac.cli", "lpac.shipped") or module.split(".")[
             0
         ] not in {*OURS, "numpy", "rich"}, module
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(ROOT)))
+def test_log_lines_have_their_details_by_name(path: Path) -> None:
+    """structlog formats the event with further positional arguments, which can raise in flight."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        match node:
+            case ast.Call(ast.Attribute(ast.Name("log"), "info" | "warning" | "error"), args):
+                assert len(args) == 1, f"{path.relative_to(ROOT)}:{node.lineno}"
 
 
 def test_a_class_name_means_one_thing() -> None:

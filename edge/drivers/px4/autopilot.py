@@ -25,7 +25,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 from mavsdk.plugins.param import Param
 from mavsdk.system import System
 
-from edge.core import log
+from edge.core.logger import log
 from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
 from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
 

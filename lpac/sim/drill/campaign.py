@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import edge
 import lpac
-from edge.core import log
+from edge.core.logger import show
 from edge.core.part import PartError
 from edge.policy.bundle import load_bundle
 from lpac.sim.drill.bounds import Figure, judge
@@ -94,7 +94,7 @@ def fly_order(order: FlightTask) -> FlightOutcome:
 @cache
 def _drill(drilled: DrilledRobots) -> SimulatedDrill:
     # Thousands of flights say more than anybody reads.
-    log.listen(log.show_errors)
+    show("error")
     return SimulatedDrill(drilled)
 
 

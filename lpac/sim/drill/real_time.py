@@ -6,7 +6,7 @@ import signal
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
-from edge.core import log
+from edge.core.logger import show
 from lpac.analysis.truth import TRUTH, write_truth
 from lpac.sim.cores import over_processes
 from lpac.sim.drill.campaign import LATE_S, FlightOutcome, FlightTask, outcome_of
@@ -63,7 +63,7 @@ class RealTimeDrill:
 
     def fly_task(self, task: FlightTask) -> FlightOutcome:
         """One flight, in whatever process this is."""
-        log.listen(log.show_errors)
+        show("error")
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             return self.outcome(FAULTS[task.fault], task.seed)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edge.core import log
+from edge.core.logger import errors_only
 from edge.messages.mission import RobotStatus
 from edge.policy.bundle import load_bundle
 from lpac.analysis.logs import logs_of
@@ -46,25 +46,17 @@ def fly_simulated(
     are taken again. `pilots` take robots out of the field, and bring them back. `settings` are
     further keys of robot.toml's tables, for all robots, and `air` is what becomes of messages from
     the mission's start on. Times, positions and costs are in the record; `problem` says what kept
-    the script from its end. Of what robots say meanwhile only errors go to whoever listens to
-    `edge.core.log`.
+    the script from its end. Of what robots log meanwhile only errors are shown.
 
     Raises BundleError, ValueError for pads that find no room, OSError for a folder that cannot be
     written, RecordingError, and PartError if a policy or a sensor raises anything.
     """
 
-    def hand_on_errors(line: log.Line) -> None:
-        if line.level == "error":
-            before(line)
-
     # What ten robots say to their own logs is nothing for a person.
-    before = log.listen(hand_on_errors)
-    try:
+    with errors_only():
         return _fly(
             scenario, Path(folder), Path(bundle), say, logs, recorded, pilots, settings, air
         )
-    finally:
-        log.listen(before)
 
 
 def _fly(

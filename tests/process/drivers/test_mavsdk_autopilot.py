@@ -334,7 +334,7 @@ def results_of(commands: list[Action], vehicle: Px4Vehicle) -> list[tuple[str, s
             for action in others:
                 autopilot.command(action)
         wait(autopilot, lambda s: s.result and s.result.action is commands[-1])
-    commands_said = [line.details for line in lines if line.event == "command"]
+    commands_said = [line for line in lines if line["event"] == "command"]
     return [(str(said["action"]), str(said["refusal"])) for said in commands_said]
 
 
@@ -369,7 +369,7 @@ def test_a_start_that_waited_too_long_is_not_sent(monkeypatch: pytest.MonkeyPatc
         autopilot.command(Action.DISARM)
         autopilot.command(Action.ARM)
         wait(autopilot, lambda s: s.result and s.result.action is Action.ARM)
-    assert [line.details["refusal"] for line in lines if line.event == "command"] == [
+    assert [line["refusal"] for line in lines if line["event"] == "command"] == [
         "no answer",
         "asked for too long ago",
     ]
@@ -499,11 +499,11 @@ def test_an_impossible_url_is_named() -> None:
 
 PILOT_PROGRAM = """
 import ctypes, sys, time
-from edge.core import log
+from edge.core.logger import show
 from edge.drivers.px4.autopilot import MavsdkAutopilot
 from edge.core.vehicle import Action, Mode, Velocity
 
-log.listen(log.show_errors)
+show("error")
 
 def fly(velocity, until, action=None):
     while not until(autopilot.state()):

@@ -27,12 +27,12 @@ from tests.conftest import ROOT
 
 PROGRAM = """
 import ctypes, sys, time
-from edge.core import log
+from edge.core.logger import show
 from edge.drivers.px4.watchdog import WatchdogProcess
 from edge.drivers.px4.autopilot import MavsdkAutopilot
 from edge.core.vehicle import Action, Mode, Velocity
 
-log.listen(log.show_errors)
+show("error")
 port, system_id, way = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 
 def fly(velocity, until, action=None):

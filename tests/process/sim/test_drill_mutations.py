@@ -10,7 +10,8 @@ import pytest
 import edge.flight.guidance
 import edge.flight.orders
 import edge.flight.step
-from edge.core import F64, log
+from edge.core import F64
+from edge.core.logger import errors_only
 from edge.flight.orders import ORDERS
 from edge.flight.state import Robot
 from edge.flight.transitions import TRANSITIONS, Transition
@@ -152,10 +153,8 @@ def _broken_without(fault: str, robots: int) -> list[str]:
 
 
 def _broken(name: str, robots: int) -> list[str]:
-    fault, before = FAULTS[name], log.listen(log.show_errors)
-    try:
+    fault = FAULTS[name]
+    with errors_only():
         truth = _drill(robots).fly(fault, 0)
-    finally:
-        log.listen(before)
     figures = judge(fault.judged_by, truth)
     return [figure.name for figure in figures if figure.broken]

@@ -6,7 +6,7 @@ from datetime import datetime
 
 import pytest
 
-from edge.core import log
+from edge.core.logger import log, show
 from edge.drivers.logs import log_to
 from edge.messages.mission import FlightState
 from tests.said import lines_said
@@ -32,7 +32,7 @@ def test_a_robots_lines_are_json_in_the_journal_and_words_in_the_flight_log(
         try:
             raise ValueError("odd")
         except ValueError as error:
-            log.error("loop step failed", error, loop="policy")
+            log.error("loop step failed", exc_info=error, loop="policy")
     first, second = map(json.loads, capfd.readouterr().err.splitlines())
     assert datetime.fromisoformat(first.pop("timestamp")).tzinfo is not None
     assert first == {"event": "flight state", "level": "info", "state": "hold", "ticks": 3}
@@ -52,11 +52,11 @@ def test_without_a_listener_problems_go_to_standard_error(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     with lines_said():
-        for show in (log.show_problems, log.show_errors):
-            log.listen(show)
+        for least in ("warning", "error"):
+            show(least)
             log.info("all is well", robot=3)
             log.warning("it is slow", late_s=2)
-            log.error("it broke", OSError(5, "no disk"))
+            log.error("it broke", exc_info=OSError(5, "no disk"))
     warning, *errors = capfd.readouterr().err.splitlines()
     assert warning == "it is slow: late_s=2"
     assert errors == ["it broke (OSError(5, 'no disk'))"] * 2

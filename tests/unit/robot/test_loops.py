@@ -5,9 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from edge.core import log
-from edge.core.log import Line
 from edge.robot.loops import Loop
+from tests.said import lines_said
 
 
 def run_until(loop: Loop, done: threading.Event) -> None:
@@ -104,7 +103,7 @@ def test_a_loop_that_hangs_does_not_hold_up_its_stop() -> None:
 
 
 def test_what_fails_because_the_program_ends_is_no_defect() -> None:
-    began, closed, lines = threading.Event(), threading.Event(), list[Line]()
+    began, closed = threading.Event(), threading.Event()
 
     def step() -> None:
         began.set()
@@ -112,13 +111,10 @@ def test_what_fails_because_the_program_ends_is_no_defect() -> None:
         raise RuntimeError("closed")
 
     loop = Loop("test", 0.01, step)
-    before = log.listen(lines.append)
-    try:
+    with lines_said() as lines:
         loop.start()
         assert began.wait(20.0)
         assert not loop.stop(0.05)
         closed.set()
         assert loop.stop(20.0)
-    finally:
-        log.listen(before)
     assert not lines and loop.status().failures == 1

@@ -1,0 +1,50 @@
+"""The logger of robot and ground: structlog, which goes where the program says.
+
+Until it says so (`edge.drivers.logs.log_to` for a robot), warnings and errors go to standard error,
+in words. An exception is handed over as `exc_info`.
+"""
+
+import sys
+from collections.abc import Iterator, MutableMapping
+from contextlib import contextmanager
+from typing import Any, Literal
+
+# structlog imports rich for tracebacks in colour, only because it is there: 4 MB in each robot.
+_HIDDEN = {"rich"} - sys.modules.keys()
+sys.modules.update(dict.fromkeys(_HIDDEN))  # type: ignore[arg-type]
+import structlog  # noqa: E402
+
+for _name in _HIDDEN:
+    del sys.modules[_name]
+
+log: structlog.typing.FilteringBoundLogger = structlog.get_logger()
+
+
+def show(least: Literal["warning", "error"]) -> None:
+    """Send lines of at least that level to standard error, in words, and no others anywhere."""
+    structlog.configure(
+        [_in_words],
+        structlog.make_filtering_bound_logger(least),
+        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
+    )
+
+
+@contextmanager
+def errors_only() -> Iterator[None]:
+    """Pass over all lines but errors for as long as this context is open."""
+    before = structlog.get_config()["wrapper_class"]
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger("error"))
+    try:
+        yield
+    finally:
+        structlog.configure(wrapper_class=before)
+
+
+def _in_words(_logger: object, _level: str, entry: MutableMapping[str, Any]) -> str:
+    event, raised = entry.pop("event"), entry.pop("exc_info", None)
+    said = f"{event} ({raised!r})" if raised else str(event)
+    details = "".join(f" {key}={value}" for key, value in entry.items())
+    return f"{said}:{details}" if details else said
+
+
+show("warning")
