@@ -236,7 +236,143 @@ _WORDS: dict[str, str | tuple[str, str]] = {
     "navigator_geofence_import_failed": "PX4 could not take the fence",
     "navigator_geofence_invalid_against_cur_pos": "PX4's fence does not contain the vehicle",
     "navigator_geofence_invalid_against_home": "PX4's fence does not contain home",
+    "navigator_geofence_max_alt_from_home": ("PX4's fence: more than {0:.0f} m above home", "f"),
+    "navigator_geofence_max_dist_from_home": ("PX4's fence: more than {0:.0f} m from home", "f"),
+    "navigator_change_altitude_outside_geofence": "a height outside PX4's fence was asked for",
+    "navigator_reposition_outside_geofence": "a place outside PX4's fence was asked for",
+    "navigator_fail_max_hagl": "a height above the highest that it may fly at was asked for",
+    "navigator_takeoff_already_higher": "it is above its takeoff height already",
+    "navigator_terrain_collision_risk": "the ground is near: PX4 stops its descent",
+    "orbit_radius_exceeded": "an orbit that is too wide was asked for",
+    "mc_throw_launch_ready": "it starts when thrown",
+    "mc_throw_launch_not_ready": "it is disarmed, and does not start when thrown",
+    "commander_mode_fallback_internal": "an external mode does not answer: PX4 flies its own",
+    "commander_high_latency_lost": "the high-latency link is lost",
+    "commander_ctrl_high_latency_failed": "the high-latency link cannot be switched",
+    "commander_unsupported_auto_mode": "a mode that it does not have was asked for",
+    "commander_unsupported_arm_disarm_param": "arming was asked for by an unknown value",
+    # What it sets by itself, since one parameter does not suit another
+    "mc_pos_ctrl_tilt_set": ("PX4 set MPC_TILTMAX_AIR to {0:.0f} degrees: more is not safe", "f"),
+    "mc_pos_ctrl_land_tilt_set": (
+        "PX4 set MPC_TILTMAX_LND to {0:.0f} degrees, which is MPC_TILTMAX_AIR", "f",
+    ),
+    "mc_pos_ctrl_cruise_set": (
+        "PX4 set MPC_XY_CRUISE to {0:.1f} m/s, which is MPC_XY_VEL_MAX", "f",
+    ),
+    "mc_pos_ctrl_man_vel_set": (
+        "PX4 set MPC_VEL_MANUAL to {0:.1f} m/s, which is MPC_XY_VEL_MAX", "f",
+    ),
+    "mc_pos_ctrl_man_vel_back_set": (
+        "PX4 set MPC_VEL_MAN_BACK to {0:.1f} m/s, which is MPC_VEL_MANUAL", "f",
+    ),
+    "mc_pos_ctrl_man_vel_side_set": (
+        "PX4 set MPC_VEL_MAN_SIDE to {0:.1f} m/s, which is MPC_VEL_MANUAL", "f",
+    ),
+    "mc_pos_ctrl_up_vel_set": (
+        "PX4 set MPC_Z_V_AUTO_UP to {0:.1f} m/s, which is MPC_Z_VEL_MAX_UP", "f",
+    ),
+    "mc_pos_ctrl_down_vel_set": (
+        "PX4 set MPC_Z_V_AUTO_DN to {0:.1f} m/s, which is MPC_Z_VEL_MAX_DN", "f",
+    ),
+    "mc_pos_ctrl_hover_thrust_set": (
+        "PX4 set MPC_THR_HOVER to {0:.2f}: from MPC_THR_MIN to MPC_THR_MAX", "f",
+    ),
+    "ekf2_mag_type_invalid": "EKF2_MAG_TYPE is not valid: PX4 set its default",
+    "nf_delay_max_too_small": (
+        "PX4 set EKF2_DELAY_MAX to {1:.0f} ms, as its sensors need: restart the autopilot", "ff",
+    ),
+    "ekf2_aid_mask_gps": "EKF2_AID_MASK is obsolete: PX4 set EKF2_GPS_CTRL",
+    "ekf2_aid_mask_ev": "EKF2_AID_MASK is obsolete: PX4 set EKF2_EV_CTRL",
+    "ekf2_aid_mask_imu": "EKF2_AID_MASK is obsolete: PX4 set EKF2_IMU_CTRL",
+    "ekf2_aid_mask_drag": "EKF2_AID_MASK is obsolete: PX4 set EKF2_DRAG_CTRL",
+    "ekf2_aid_mask_opt_flow": "EKF2_AID_MASK is obsolete: PX4 set EKF2_OF_CTRL",
+    "ekf2_gps_ctrl_alt": "PX4 changed EKF2_GPS_CTRL: its height needs latitude and longitude",
+    "ekf2_hgt_ref_baro": "PX4 set EKF2_BARO_CTRL, as EKF2_HGT_REF needs",
+    "ekf2_hgt_ref_rng": "PX4 set EKF2_RNG_CTRL, as EKF2_HGT_REF needs",
+    "ekf2_hgt_ref_gps": "PX4 set EKF2_GPS_CTRL, as EKF2_HGT_REF needs",
+    "ekf2_hgt_ref_ev": "PX4 set EKF2_EV_CTRL, as EKF2_HGT_REF needs",
+    "commander_airmode_requires_no_arm_gesture": (
+        "MC_AIRMODE with yaw does not go with arming by the sticks (MAN_ARM_GESTURE)"
+    ),
+    # What fails on the ground, or beside the flight
+    "commander_load_param_failed": "its settings could not be loaded",
+    "commander_save_param_failed": "its settings could not be saved",
+    "commander_cal_cmd_denied": "it is being calibrated, and refused a command",
+    "commander_cal_no_inputs": "no sticks are heard to calibrate them",
+    "commander_cal_trim_param_set_failed": "the sticks' trim could not be saved",
+    "commander_esc_calibration_denied": "motor controllers are not calibrated now",
+    "logger_storage_full": ("PX4 does not log: {0} MiB are left", "I"),
+    "mavlink_log_not_enough_bw": ("the link is too slow to send PX4's log: {0} B/s", "I"),
+    "mavlink_param_rc_chan_out_of_bounds": "a parameter was mapped to a channel that is not there",
+    "col_prev_unsup_frame": ("obstacles came in a frame that it does not know ({0})", "B"),
+    "mavlink_rcv_lnd_target_unsup_coord": (
+        "a landing target came in a frame that it does not know ({0})", "B",
+    ),
+    "mavlink_rcv_odom_unsup_estimator_type": (
+        "odometry came from an estimator that it does not know ({0})", "B",
+    ),
+    "mavlink_rcv_sp_target_unsup_coord": (
+        "a setpoint came in a frame that it does not know ({0})", "B",
+    ),
+    "mavlink_rcv_sp_target_gl_invalid_coord": (
+        "a setpoint came in a frame that it does not know ({0})", "B",
+    ),
+    "mavlink_rcv_sp_target_invalid": "a setpoint came without position, velocity and acceleration",
+    "mavlink_rcv_sp_target_unsup_force": "a setpoint of a force came: it knows none",
+    "mavlink_rcv_sp_target_gl_unsup_force": "a setpoint of a force came: it knows none",
+    "px4io_comm_failed": "its input-output processor does not answer",
+    "px4io_config_read_failed": "its input-output processor does not answer",
+    "px4io_io_rc_config_upload_failed": "its input-output processor does not take its settings",
+    "px4io_proto_fw_mismatch": "its input-output processor has other firmware",
+    "mxs_system_fail": "the transponder has failed",
+    "mxs_xpdr_fail": "the transponder has failed",
+    "uavionix_adsb_out_cfg_unsupported_callsign_format": "the transponder's call sign is not valid",
+    "camera_capture_trigger_rate_exceeded": "the camera's trigger is faulty",
+    "pps_capture_pps_rate_exceeded": "GPS's pulse per second is faulty",
 }  # fmt: skip
+
+# Missions of PX4's own are none of this program's, and their faults alike to whoever reads of them.
+_OF_MISSIONS = {
+    "a mission that somebody sent to PX4 cannot be flown": (
+        "feasibility_mis_in_air_landing_req mission_do_jump_cycle mission_index_out_of_bound "
+        "mission_invalid_mission_state mission_item_set_failed mission_not_valid_loiter "
+        "mission_not_valid_refuse commander_mission_start_denied_no_mission "
+        "navigator_mis_add_land_or_rm_to navigator_mis_add_to_or_rm_land "
+        "navigator_mis_approach_wp_below_land navigator_mis_correct_glide_slope "
+        "navigator_mis_first_wp_far navigator_mis_first_wp_too_far navigator_mis_geofence_no_home "
+        "navigator_mis_geofence_no_home2 navigator_mis_geofence_violation "
+        "navigator_mis_glide_slope_too_steep navigator_mis_invalid_land "
+        "navigator_mis_land_before_rtl navigator_mis_land_missing "
+        "navigator_mis_land_wp_inside_orbit_radius navigator_mis_multiple_land "
+        "navigator_mis_no_home_rel_alt navigator_mis_starts_w_landing "
+        "navigator_mis_starts_w_landing2 navigator_mis_takeoff_missing "
+        "navigator_mis_takeoff_not_first navigator_mis_takeoff_or_land_missing "
+        "navigator_mis_takeoff_too_low navigator_mis_unsup_cmd "
+        "navigator_mis_unsupported_landing_approach_wp navigator_mis_vtol_items "
+        "navigator_mis_wp_below_home navigator_mis_wp_gate_too_close "
+        "navigator_mission_failure_heading rtl_unsupported_mav_frame"
+    ),
+    "PX4 could not read or keep its mission": (
+        "mavlink_mission_err_id mavlink_mission_storage_failure "
+        "mavlink_mission_storage_read_failure mavlink_mission_storage_write_failure "
+        "mavlink_mission_storage_write_failure2 mavlink_mission_storage_write_failure3 "
+        "mission_cannot_read_mission mission_failed_set_closest mission_failed_set_jump_count "
+        "mission_failed_to_read_wp mission_failed_to_write_do_jump rtl_failed_to_read_land_item"
+    ),
+    "a mission or fence was not transferred to or from PX4": (
+        "mavlink_mission_getlist_busy mavlink_mission_ignore_clear "
+        "mavlink_mission_ignore_mis_count mavlink_mission_item_partner_id_mismatch "
+        "mavlink_mission_mis_item_busy mavlink_mission_mis_item_invalid "
+        "mavlink_mission_mis_req_ignored_busy mavlink_mission_no_transfer "
+        "mavlink_mission_op_timeout mavlink_mission_partner_id_mismatch "
+        "mavlink_mission_partner_id_mismatch2 mavlink_mission_recv_unknown_mis_type "
+        "mavlink_mission_req_ignored mavlink_mission_seq_out_of_bounds "
+        "mavlink_mission_state_busy mavlink_mission_unknown_mis_type "
+        "mavlink_mission_wp_index_exceeds_list mavlink_mission_wp_index_out_of_bounds "
+        "mavlink_mission_wp_unexpected mavlink_mission_wp_unexpected2"
+    ),
+}
+_WORDS |= {name: text for text, names in _OF_MISSIONS.items() for name in names.split()}
 
 _AUTOPILOT = 1
 

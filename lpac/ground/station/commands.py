@@ -4,11 +4,19 @@ Pure, like the station: a command is a generator that looks at the station, chan
 and yields whenever it has to wait for what comes next.
 """
 
+import math
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping
 from typing import Any
 
-from edge.messages.codes import FENCE_NOT_TAKEN, Reason, Refusal, RefusalCode, texts
-from edge.messages.mission import FlightState, OrderKind, RobotStatus, is_too_low, world_id
+from edge.messages.codes import FENCE_NOT_TAKEN, ReasonCode, Refusal, RefusalCode, texts
+from edge.messages.mission import (
+    FlightState,
+    OrderKind,
+    RobotStatus,
+    is_over_landing_point,
+    is_too_low,
+    world_id,
+)
 from lpac.ground.station.protocol import (
     CommandProgress,
     CommandReport,
@@ -385,16 +393,17 @@ class CommandTask:
             yield from self._take_up(sequence, _obeying_words(request.action), _ACT_S)
             return
         yield from self._obeyed(sequence)
-        known: dict[str, tuple[FlightState, Reason]] = {}
+        known: dict[str, RobotStatus] = {}
         changed_s = station.now_s
         while heard := self._heard():
             for name, status in heard.items():
+                flown = known.get(name)
                 if is_down(status):
-                    self._settle(name, "on the ground")
+                    self._settle(name, *_came_down(request.action, flown, status))
                 elif status.state in _NOT_STEERED:
                     self._fail([name], *_why(status))
-                elif known.get(name) != (status.state, status.reason):
-                    known[name], changed_s = (status.state, status.reason), station.now_s
+                elif flown is None or (flown.state, flown.reason) != (status.state, status.reason):
+                    known[name], changed_s = status, station.now_s
                     self._say(name, _state_in_words(status))
                 elif station.now_s - changed_s > _LANDING_S:
                     self._fail([name], *_why(status))
@@ -852,6 +861,31 @@ def _obeying_words(safety_action: str) -> Effect:
         return _OBEYING_WORDS[safety_action].get(status.state)
 
     return effect
+
+
+def _came_down(
+    safety_action: str, flown: RobotStatus | None, status: RobotStatus
+) -> tuple[str, ResultCode]:
+    """What became of a robot on the ground; `flown` is what it last said of its flight, if any."""
+    if flown is not None and status.state is _S.FAULT:
+        code, text = _why(status)
+        return text, code
+    if flown is None or safety_action != "return" or _is_home(flown, status):
+        return "on the ground", _C.DONE
+    where = "at an unknown place"
+    if status.position_m is not None:
+        away_m = math.dist(status.position_m[:2], status.landing_point_m)
+        where = f"{away_m:.0f} m from its landing point"
+    return f"landed {where}; last seen in flight in {_state_in_words(flown)}", _C.LANDED_ELSEWHERE
+
+
+def _is_home(flown: RobotStatus, status: RobotStatus) -> bool:
+    """Whether it came down where return leads: at its landing point, or beside it."""
+    if is_over_landing_point(status):
+        return True
+    beside = any(alarm.code is ReasonCode.LANDS_BESIDE for alarm in flown.alarms)
+    chosen = beside or status.position_m is None
+    return chosen and flown.reason.code is ReasonCode.AT_LANDING_POINT
 
 
 def _why(status: RobotStatus) -> tuple[ResultCode, str]:

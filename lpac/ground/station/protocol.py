@@ -202,6 +202,7 @@ class ResultCode(StrEnum):
     NOT_READY = "not_ready"
     UNDER_SAFETY_ACTION = "under_safety_action"
     WRONG_STATE = "wrong_state"
+    LANDED_ELSEWHERE = "landed_elsewhere"
     TOO_LOW = "too_low"
     REFUSED = "refused"
     NOT_ORDERED = "not_ordered"

@@ -102,6 +102,47 @@ def test_a_spare_that_is_switched_off_keeps_nobody_on_the_ground() -> None:
     assert (state.safety_action, state.robot_safety_actions) == ("none", {})
 
 
+# Done is what was asked for
+
+
+def test_a_return_that_ends_elsewhere_is_not_done() -> None:
+    field = a_field(3, "flying")
+    field.until(lambda: min(robot.away_m for robot in field.robots) > 3.0)
+    lands = field.robots[1]
+    lands.crawl()
+    task = field.begin(SafetyCommand("return", wait=True))
+    field.run(2.0)
+    lands.vehicle.battery_remaining = 0.01
+    field.until(lambda: task.report, 120.0)
+    assert task.report is not None
+    assert not_done(task.report) == {"r1": ResultCode.LANDED_ELSEWHERE}
+    text = next(result.text for result in task.report.results if result.robot == "r1")
+    assert "m from its landing point" in text
+    assert "battery critical" in text
+
+
+def test_a_killed_robot_has_not_landed_on_command() -> None:
+    field = a_field(2, "flying")
+    field.join("bob")
+    field.run(2.0)
+    task = field.begin(SafetyCommand("land", wait=True))
+    field.until(lambda: field.states() == {_S.LAND})
+    field.run(1.0)
+    kill = field.begin(RobotCommand("kill", ("r0",)), "bob")
+    field.robots[0].silent = True
+    field.until(lambda: field.robots[0].said.armed is False)
+    field.robots[0].silent = False
+    field.until(lambda: task.report and kill.report)
+    assert task.report is not None
+    assert not_done(task.report) == {"r0": ResultCode.WRONG_STATE}
+
+
+def test_who_stood_on_the_ground_before_has_nothing_to_do() -> None:
+    field = a_field(2, "ready")
+    report = field.done(SafetyCommand("return", wait=True))
+    assert {result.text for result in report.results} == {"on the ground"}
+
+
 # A mission that was not started is not resumed
 
 

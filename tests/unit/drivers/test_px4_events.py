@@ -195,6 +195,14 @@ def test_a_reason_without_words_is_said_by_its_number() -> None:
     assert [reason.code for reason in events.told(0.0)] == ["0x01fedcba"]
 
 
+def test_a_parameter_that_px4_lowers_in_flight_is_told_by_its_name() -> None:
+    events = Px4Events()
+    told(events, [event(0, 0x01D7F608, 4, struct.pack("<f", 3.0))])
+    (reason,) = events.told(0.0)
+    text = "PX4 set MPC_VEL_MANUAL to 3.0 m/s, which is MPC_XY_VEL_MAX"
+    assert reason == ("mc_pos_ctrl_man_vel_set", (3.0,), text)
+
+
 def test_a_report_that_began_before_is_not_taken_for_one() -> None:
     events = Px4Events()
     told(events, report(0, BAROMETER)[1:])
