@@ -1,11 +1,13 @@
 """PX4 by MAVSDK: telemetry, setpoints and commands of one vehicle.
 
 Setpoints go through `mavlink_direct`, which sends each once: MAVSDK's offboard plugin would repeat
-the last one for ever and so hide a dead control loop from PX4's failsafe. Commands go the same way:
-MAVSDK repeats an unanswered one three times within two seconds, and arming must never be repeated.
+the last one for ever and so hide a dead control loop from PX4's failsafe. Commands go the same way
+(`dialogue`): MAVSDK repeats an unanswered one three times within two seconds, and arming must never
+be repeated.
 """
 
 import json
+import math
 import struct
 import time
 from collections import Counter
@@ -26,16 +28,11 @@ from mavsdk.plugins.param import Param
 from mavsdk.system import System
 
 from edge.core.logger import log
-from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
-from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
-
-_HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
+from edge.core.vehicle import Action, Setpoint, VehicleState, Velocity
+from edge.drivers.px4.dialogue import Dialogue
+from edge.drivers.px4.telemetry import Px4Telemetry
 
 _AUTOPILOT = 1  # component id
-_NAV_LAND, _DO_SET_MODE, _ARM_DISARM = 21, 176, 400
-_RUN_PREARM_CHECKS, _SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE = 401, 511, 512
-_CUSTOM_MODE, _MAIN_AUTO, _MAIN_OFFBOARD, _SUB_HOLD = 1.0, 4.0, 6.0, 3.0
-_FORCE = 21196.0
 _INT32, _REAL32 = 6, 9
 _LOCAL_NED = 1
 # Ignored: acceleration, yaw, yaw rate; and position or velocity.
@@ -43,16 +40,7 @@ _VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
 # More is a mistake, and beyond float32 it would be sent as infinite.
 _MAX_COORDINATE = 1e6
 
-# MAV_RESULT
-_ACCEPTED, _IN_PROGRESS = 0, 5
-_REFUSALS = {1: "not now", 2: "denied", 3: "not supported", 4: "failed", 6: "cancelled"}
-
-_LOOK_S = 0.2
 _RENEW_S = 1.0
-_STREAMS_S = 10.0
-_PREARM_CHECKS_S = 10.0
-_REASON_S = 0.3
-_STALE_COMMAND_S = 1.0
 _PARAMETER_ROUNDS, _PARAMETER_ROUND_S = 3, 0.3
 _ABSENT_AFTER_CALLS = 5
 # What PX4 calls the checksum over all of its parameters' names and values.
@@ -65,45 +53,6 @@ _FENCE = 1  # MAV_MISSION_TYPE
 
 class AutopilotError(OSError):
     """What the autopilot did not do, in one line."""
-
-
-class _Command(NamedTuple):
-    """How an action is sent: a COMMAND_LONG, `times` at most, until one is answered.
-
-    `overrides` are the actions that must not be carried out after this one was asked for.
-    """
-
-    number: int
-    parameters: tuple[float, ...]
-    times: int
-    wait_s: float
-    overrides: frozenset[Action]
-
-
-_COMMANDS = {
-    Action.ARM: _Command(_ARM_DISARM, (1.0,), 1, 1.5, frozenset()),
-    # Not repeated: a pilot may have taken the vehicle in between.
-    Action.OFFBOARD: _Command(_DO_SET_MODE, (_CUSTOM_MODE, _MAIN_OFFBOARD), 1, 1.5, frozenset()),
-    Action.HOLD: _Command(
-        _DO_SET_MODE,
-        (_CUSTOM_MODE, _MAIN_AUTO, _SUB_HOLD),
-        3,
-        0.5,
-        frozenset({Action.ARM, Action.OFFBOARD, Action.LAND}),
-    ),
-    Action.LAND: _Command(
-        _NAV_LAND,
-        (),
-        3,
-        0.5,
-        frozenset({Action.ARM, Action.OFFBOARD, Action.HOLD}),
-    ),
-    Action.DISARM: _Command(_ARM_DISARM, (0.0,), 3, 0.5, frozenset({Action.ARM, Action.OFFBOARD})),
-    # Sent every time: the answer may be the one to an ARM that it overtook.
-    Action.KILL: _Command(_ARM_DISARM, (0.0, _FORCE), 5, 0.1, frozenset(Action) - {Action.KILL}),
-}
-# What must not happen late, and not to a vehicle that is not there.
-_STARTS = frozenset({Action.ARM, Action.OFFBOARD})
 
 
 class _UploadedFence(NamedTuple):
@@ -142,20 +91,14 @@ class MavsdkAutopilot:
         self._link: _Link | None = None
         self._others: tuple[int, ...] = ()
         self._worker = Thread(target=self._work, name="autopilot")
-        self._next_s = self._next_renewal_s = self._next_streams_s = self._next_checks_s = 0.0
-        self._heard = (False, 0)
+        self._next_renewal_s = 0.0
         # Not to send on what is being destroyed.
         self._sending = Lock()
         self._failures: Counter[str] = Counter()
         # Guards what follows.
         self._wake = Condition()
         self._closing = False
-        self._queue: list[tuple[Action, float]] = []
-        self._running: Action | None = None
-        self._overridden = False
-        self._awaited = 0
-        self._answer: int | None = None
-        self._result: ActionResult | None = None
+        self._dialogue = Dialogue(self._telemetry)
         self._parameters: dict[str, tuple[int, float | None]] = {}
         self._acknowledged_fence_id: int | None = None
         self._counted_fence: _UploadedFence | None = None
@@ -214,7 +157,7 @@ class MavsdkAutopilot:
             now_s,
             system_id=None if link is None else link.system_id,
             other_system_ids=others,
-            result=self._result,
+            result=self._dialogue.result,
         )
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
@@ -243,16 +186,8 @@ class MavsdkAutopilot:
         HOLD, LAND, DISARM and KILL drop what they contradict: dropped commands end as "superseded".
         An action that waits already, or is being carried out, is not queued again.
         """
-        overrides = _COMMANDS[action].overrides
         with self._wake:
-            if action is self._running or any(action is queued for queued, _ in self._queue):
-                return
-            for queued, _ in self._queue:
-                if queued in overrides:
-                    self._finish(queued, "superseded")
-            self._queue = [entry for entry in self._queue if entry[0] not in overrides]
-            self._overridden = self._overridden or self._running in overrides
-            self._queue.append((action, time.monotonic()))
+            self._dialogue.command(action, time.monotonic())
             self._wake.notify_all()
 
     # Before flight: these wait for the vehicle, a few seconds at most
@@ -413,11 +348,6 @@ class MavsdkAutopilot:
             return False
         return True
 
-    def _send_command(self, number: int, *parameters: float) -> bool:
-        padded = (*parameters, *(0.0,) * (7 - len(parameters)))
-        fields = {f"param{i}": value for i, value in enumerate(padded, 1)}
-        return self._send("COMMAND_LONG", command=number, confirmation=0, **fields)
-
     def _count(self, what: str, detail: str) -> None:
         """Count a failure, and log the first of its kind: there may be many a second."""
         self._failures[what] += 1
@@ -440,10 +370,9 @@ class MavsdkAutopilot:
     def _on_telemetry(self, name: str) -> Callable[[dict[str, Any]], None]:
         def on_telemetry(fields: dict[str, Any]) -> None:
             self._telemetry.hear(name, fields, time.monotonic())
-            needs_origin = self._telemetry.needs_origin()
-            if needs_origin or name in ("STATUSTEXT", "EVENT"):
+            if self._telemetry.needs_origin() or name in ("STATUSTEXT", "EVENT"):
                 with self._wake:
-                    self._next_s = 0.0 if needs_origin else self._next_s
+                    self._dialogue.next_s = -math.inf
                     self._wake.notify_all()
 
         return on_telemetry
@@ -451,12 +380,11 @@ class MavsdkAutopilot:
     def _on_command_ack(self, fields: dict[str, Any]) -> None:
         asked = fields["target_system"], fields["target_component"]
         ours = all(to in (0, own) for to, own in zip(asked, self._own_id, strict=True))
-        if not ours or fields["result"] == _IN_PROGRESS:
+        if not ours:
             return
         with self._wake:
-            if fields["command"] == self._awaited:
-                self._answer = fields["result"]
-                self._wake.notify_all()
+            self._dialogue.hear_ack(fields["command"], fields["result"], time.monotonic())
+            self._wake.notify_all()
 
     def _on_param_value(self, fields: dict[str, Any]) -> None:
         with self._wake:
@@ -484,106 +412,28 @@ class MavsdkAutopilot:
     def _work(self) -> None:
         while True:
             with self._wake:
-                self._wake.wait_for(self._has_work, max(self._next_s - time.monotonic(), 0.0))
+                self._wake.wait_for(
+                    self._has_work, max(self._dialogue.next_s - time.monotonic(), 0.0)
+                )
                 if self._closing:
                     return
-                action, asked_at_s = self._queue.pop(0) if self._queue else (None, 0.0)
-                self._running, self._overridden = action, False
             try:
-                if action is not None:
-                    self._carry_out(action, asked_at_s)
                 self._keep_up(time.monotonic())
             except Exception as error:
                 self._count("autopilot thread", repr(error))
 
     def _has_work(self) -> bool:
-        return self._closing or bool(self._queue) or time.monotonic() >= self._next_s
-
-    def _finish(self, action: Action, refusal: str) -> None:
-        self._result = ActionResult(action, not refusal, refusal, time.monotonic())
-        log.info("command", action=action.value, accepted=not refusal, refusal=refusal)
-
-    def _carry_out(self, action: Action, asked_at_s: float) -> None:
-        refusal = "internal error"
-        try:
-            refusal = self._refusal(action, asked_at_s)
-        finally:
-            with self._wake:
-                self._running = None
-                self._finish(action, refusal)
-        # Sooner than the next that is due.
-        self._request(_HEARTBEAT)
-        self._request(_EXTENDED_SYS_STATE)
-
-    def _refusal(self, action: Action, asked_at_s: float) -> str:
-        """Carry it out; "" or why it was not."""
-        began_s = time.monotonic()
-        if action in _STARTS and began_s - asked_at_s > _STALE_COMMAND_S:
-            return "asked for too long ago"
-        if self._link is None or (action in _STARTS and not self.state().connected):
-            return "no vehicle"
-        command = _COMMANDS[action]
-        answer = None
-        for _ in range(command.times):
-            if not self._overridden:
-                answer = self._ask(command)
-            if self._overridden or self._closing:
-                return "superseded"
-            if answer is not None and action is not Action.KILL:
-                break
-        if answer is None:
-            return "no answer"
-        return "" if answer == _ACCEPTED else self._explain(answer, began_s)
-
-    def _ask(self, command: _Command) -> int | None:
-        """Send it once, and wait for the answer."""
-        with self._wake:
-            self._awaited, self._answer = command.number, None
-        self._send_command(command.number, *command.parameters)
-        with self._wake:
-            self._wake.wait_for(
-                lambda: self._answer is not None or self._overridden or self._closing,
-                command.wait_s,
-            )
-            self._awaited = 0
-            return self._answer
-
-    def _explain(self, answer: int, since_s: float) -> str:
-        """PX4 says why it refused soon before or after the answer."""
-        word = _REFUSALS.get(answer, f"result {answer}")
-        with self._wake:
-            self._wake.wait_for(
-                lambda: bool(self._telemetry.refusal_reasons(since_s)) or self._overridden,
-                _REASON_S,
-            )
-        reasons = "; ".join(reason.text for reason in self._telemetry.refusal_reasons(since_s))
-        return f"{word}: {reasons}" if reasons else word
+        return self._closing or time.monotonic() >= self._dialogue.next_s
 
     def _keep_up(self, now_s: float) -> None:
-        """Find the vehicle, and keep its streams and its origin coming."""
-        self._next_s = now_s + _LOOK_S
+        """Find the vehicle, and say to it what is due."""
         if self._link is None or now_s >= self._next_renewal_s:
-            self._look_for_vehicles()
-        if self._link is None:
-            return
-        state = self.state()
-        heard = state.connected, self._telemetry.restarts()
-        if heard != self._heard or now_s >= self._next_streams_s:
-            self._heard, self._next_streams_s = heard, now_s + _STREAMS_S
-            self._ask_for_streams()
-        if self._telemetry.needs_origin():
-            self._request(_GPS_GLOBAL_ORIGIN)
-        missing = self._telemetry.missing_events()
-        if missing is not None:
-            self._send("REQUEST_EVENT", first_sequence=missing[0], last_sequence=missing[1])
-        if now_s >= self._next_renewal_s:
             self._next_renewal_s = now_s + _RENEW_S
-            self._request(_GPS_GLOBAL_ORIGIN)
-            if not state.armed:
-                self._request(_AUTOPILOT_VERSION)
-        if now_s >= self._next_checks_s and state.armable is False and not state.armed:
-            self._next_checks_s = now_s + _PREARM_CHECKS_S
-            self._send_command(_RUN_PREARM_CHECKS)
+            self._look_for_vehicles()
+        with self._wake:
+            said = self._dialogue.say(now_s, self.state() if self._link is not None else None)
+        for name, fields in said:
+            self._send(name, **fields)
 
     def _look_for_vehicles(self) -> None:
         assert self._mavsdk is not None
@@ -613,13 +463,6 @@ class MavsdkAutopilot:
             direct.subscribe_message(name, self._hears(name, act))
         self._link = _Link(system, system_id, direct)
         log.info("autopilot found", system_id=system_id)
-
-    def _ask_for_streams(self) -> None:
-        for message_id, rate_hz in RATES_HZ.items():
-            self._send_command(_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
-
-    def _request(self, message_id: int) -> None:
-        self._send_command(_REQUEST_MESSAGE, message_id)
 
 
 @cache

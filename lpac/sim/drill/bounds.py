@@ -213,6 +213,24 @@ class AllDown:
         return Figure("not down in the end", up, 0, "")
 
 
+@dataclass(frozen=True, slots=True)
+class FewCommands:
+    """No vehicle is sent more commands within any time so long: PX4 loses answers in a burst.
+
+    A real PX4 does not tell how many it is sent.
+    """
+
+    within_s: float
+    most: int
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        most = 0
+        for vehicle in flight.vehicles:
+            before = np.searchsorted(vehicle.time_s, vehicle.time_s - self.within_s)
+            most = max(most, int((vehicle.commands - vehicle.commands[before]).max(initial=0)))
+        return Figure(f"commands within {self.within_s:g} s", most, self.most, "")
+
+
 def always(beyond_fence_m: float, carried: Whose) -> tuple[Criterion, ...]:
     """What counts in every flight; the fault itself may bring who is `carried` so far outside."""
     inside: tuple[Criterion, ...] = (InsideFence(),)
@@ -222,7 +240,7 @@ def always(beyond_fence_m: float, carried: Whose) -> tuple[Criterion, ...]:
             inside = (InsideFence(whose="others"), *inside)
     return (
         AllKnown(), Apart(), *inside, BelowCeiling(), NoUnorderedStart(), NobodyFalls(),
-        ComesDownGently(), PilotIsAlone(), AllDown(),
+        ComesDownGently(), PilotIsAlone(), AllDown(), FewCommands(1.0, 20), FewCommands(10.0, 60),
     )  # fmt: skip
 
 

@@ -38,8 +38,8 @@ class VehicleTruth:
     """One vehicle: `time_s` (T,) ascending, `position_m` and `velocity_m_s` (T, 3).
 
     `mode` (T,) has `Px4Mode`s' numbers, `setpoint_at_s` (T,) when the last setpoint had come,
-    `is_velocity` (T,) whether that was one, as in a mission. `velocity_error_m_s` (T,) is as in
-    `Truth`.
+    `is_velocity` (T,) whether that was one, as in a mission. `velocity_error_m_s` and
+    `commands` (T,) are as in `Truth`.
     """
 
     time_s: F64
@@ -51,6 +51,7 @@ class VehicleTruth:
     setpoint_at_s: F64
     is_velocity: Bools
     velocity_error_m_s: F64
+    commands: npt.NDArray[np.int64]
 
     @property
     def airborne(self) -> Bools:
@@ -75,7 +76,7 @@ class VehicleTruth:
         return VehicleTruth(
             self.time_s[part], self.position_m[part], self.velocity_m_s[part], self.mode[part],
             self.armed[part], self.landed[part], self.setpoint_at_s[part], self.is_velocity[part],
-            self.velocity_error_m_s[part],
+            self.velocity_error_m_s[part], self.commands[part],
         )  # fmt: skip
 
 
@@ -140,4 +141,5 @@ def vehicle_truth(entries: Sequence[Truth], to_mission: LocalTransform) -> Vehic
         setpoint_at_s=of(lambda entry: entry.setpoint_at_s, np.float64),
         is_velocity=of(lambda entry: entry.follows == "velocity", np.bool_),
         velocity_error_m_s=of(lambda entry: entry.velocity_error_m_s, np.float64),
+        commands=of(lambda entry: entry.commands, np.int64),
     )

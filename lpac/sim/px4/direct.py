@@ -8,10 +8,10 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core.ports import Clock
-from edge.core.vehicle import Action, ActionResult, Setpoint, VehicleState, Velocity
-from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
-from lpac.sim.px4.link import FORCE, Px4Link
-from lpac.sim.px4.modes import CUSTOM_MODES, Px4Mode
+from edge.core.vehicle import Action, Setpoint, VehicleState, Velocity
+from edge.drivers.px4.dialogue import Dialogue
+from edge.drivers.px4.telemetry import Px4Telemetry
+from lpac.sim.px4.link import Px4Link, request_event
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.px4.world import FencePolygon
 
@@ -19,14 +19,6 @@ _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 # Which fields count; see MAVLink's POSITION_TARGET_TYPEMASK.
 _VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
 _AUTOPILOT, _COMPANION = 1, 191  # component ids
-_REQUEST_AGAIN_S = 1.0
-_COMMANDS: dict[Action, tuple[int, tuple[float, ...]]] = {
-    Action.ARM: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,)),
-    Action.DISARM: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,)),
-    Action.KILL: (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE)),
-    Action.LAND: (mavlink.MAV_CMD_NAV_LAND, ()),
-}
-_MODES = {Action.OFFBOARD: Px4Mode.OFFBOARD, Action.HOLD: Px4Mode.HOLD}
 
 
 class DirectVehicle:
@@ -45,16 +37,10 @@ class DirectVehicle:
         self._clock = clock
         self._link = Px4Link(vehicle, system_id=system_id)
         self._telemetry = Px4Telemetry()
-        self._result: ActionResult | None = None
-        self._asked: Action | None = None
-        self._requested_at_s = -_REQUEST_AGAIN_S
         self._uploaded: tuple[FencePolygon, ...] = ()
-        for message_id, rate_hz in RATES_HZ.items():
-            self._command_long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 1e6 / rate_hz)
+        self._dialogue = Dialogue(self._telemetry)
         # Nobody else listens on this link: what the robot does not read costs time alone.
-        for message_id, kind in mavlink.mavlink_map.items():
-            if message_id and kind.msgname not in self._telemetry.messages:
-                self._command_long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, -1.0)
+        self._link.silence(self._telemetry.messages)
 
     def step(self, dt_s: float) -> None:
         """Let the vehicle fly on, and hear what it says."""
@@ -63,20 +49,18 @@ class DirectVehicle:
         said = self._said()
         for name, fields in () if self.is_cut else said:
             if name == "COMMAND_ACK":
-                self._hear_answer(fields, now_s)
+                self._dialogue.hear_ack(fields["command"], fields["result"], now_s)
             elif name in self._telemetry.messages:
                 self._telemetry.hear(name, fields, now_s)
-        if self._telemetry.needs_origin() or now_s - self._requested_at_s >= _REQUEST_AGAIN_S:
-            self._requested_at_s = now_s
-            self._request(mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-            self._request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
+        if now_s >= self._dialogue.next_s or self._telemetry.needs_origin():
+            self._say(now_s)
 
     # The robot's ports
 
     def state(self) -> VehicleState:
         """The newest of everything."""
         return self._telemetry.state(
-            self._clock.monotonic_s(), system_id=self._system_id, result=self._result
+            self._clock.monotonic_s(), system_id=self._system_id, result=self._dialogue.result
         )
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
@@ -96,12 +80,9 @@ class DirectVehicle:
 
     def command(self, action: Action) -> None:
         """Ask for it; what came of it is known after the vehicle's next step."""
-        self._asked = action
-        if action in _MODES:
-            self._command_long(mavlink.MAV_CMD_DO_SET_MODE, 1.0, *CUSTOM_MODES[_MODES[action]])
-        else:
-            number, parameters = _COMMANDS[action]
-            self._command_long(number, *parameters)
+        now_s = self._clock.monotonic_s()
+        self._dialogue.command(action, now_s)
+        self._say(now_s)
 
     def read_parameters(self, names: Sequence[str]) -> dict[str, int | float | None]:
         """PX4's parameters; None for one that it does not have."""
@@ -121,27 +102,14 @@ class DirectVehicle:
 
     # What it sends
 
-    def _hear_answer(self, fields: Mapping[str, Any], now_s: float) -> None:
-        if self._asked is None or fields["command"] in (
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE,
-        ):  # fmt: skip
-            return
-        accepted = fields["result"] == mavlink.MAV_RESULT_ACCEPTED
-        refusal = "" if accepted else f"result {fields['result']}"
-        self._result = ActionResult(self._asked, accepted, refusal, now_s)
-        self._asked = None
-        # Sooner than the next that is due.
-        self._request(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
-        self._request(mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE)
-
-    def _request(self, message_id: int) -> None:
-        self._command_long(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id)
-
-    def _command_long(self, number: int, *parameters: float) -> None:
-        padded = (*parameters, *(0.0,) * (7 - len(parameters)))
-        self._send(
-            mavlink.MAVLink_command_long_message(self._system_id, _AUTOPILOT, number, 0, *padded)
-        )
+    def _say(self, now_s: float) -> None:
+        for name, fields in self._dialogue.say(now_s, self.state()):
+            if name == "REQUEST_EVENT":
+                self._send(request_event(**fields))
+            else:
+                self._send(
+                    mavlink.MAVLink_command_long_message(self._system_id, _AUTOPILOT, **fields)
+                )
 
     # The wire
 

@@ -10,7 +10,7 @@ import math
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,7 @@ _FENCE_VERTICES = {
 _FENCE = mavlink.MAV_MISSION_TYPE_FENCE
 _CHECKSUM = "_HASH_CHECK"
 _EVENT, _CURRENT_EVENT_SEQUENCE = 410, 411
+_COMMAND_KINDS = ("COMMAND_LONG", "COMMAND_INT")
 _UNKNOWN_COVARIANCE = [math.nan] + [0.0] * 20
 
 
@@ -89,6 +90,14 @@ class _Message(mavlink.MAVLink_message):  # type: ignore[misc]
     def pack(self, mav: Any, force_mavlink1: bool = False) -> Any:
         payload = struct.pack(self._packed, *(getattr(self, name) for name in self._names))
         return self._pack(mav, self._crc_extra, payload, force_mavlink1=force_mavlink1)
+
+
+def request_event(first_sequence: int, last_sequence: int) -> Any:
+    """The message that asks PX4 for events again."""
+    return _Message(
+        412, "REQUEST_EVENT", 33, "<HHBB", first_sequence=first_sequence,
+        last_sequence=last_sequence, target_system=0, target_component=0,
+    )  # fmt: skip
 
 
 class Px4Link:
@@ -165,7 +174,7 @@ class Px4Link:
             "MISSION_REQUEST_LIST": self._on_mission_request_list,
             "MISSION_REQUEST_INT": self._on_mission_request,
             "MISSION_CLEAR_ALL": self._on_mission_clear_all,
-            # REQUEST_EVENT, which pymavlink does not have.
+            "REQUEST_EVENT": self._on_request_event,
             "UNKNOWN_412": self._on_request_event,
         }
         self._commands: dict[int, Callable[[Any], MavResult]] = {
@@ -181,6 +190,13 @@ class Px4Link:
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
         }
 
+    def silence(self, but: Collection[str]) -> None:
+        """Send none of the streams but those of these messages, until they are asked for."""
+        for message_id in self._builders:
+            kind = mavlink.mavlink_map.get(message_id)
+            if message_id and kind is not None and kind.msgname not in but:
+                self._set_interval(message_id, math.inf)
+
     def receive(self, datagram: bytes) -> None:
         """Act on what a client sent; anything that is no MAVLink, or not for us, is ignored."""
         if self.is_cut:
@@ -190,7 +206,9 @@ class Px4Link:
 
     def hear(self, message: Any) -> None:
         """Act on one message of a client; one that is not for us is ignored."""
-        handler = self._handlers.get(message.get_type())
+        kind = message.get_type()
+        self.vehicle.commands += kind in _COMMAND_KINDS
+        handler = self._handlers.get(kind)
         target = getattr(message, "target_system", 0)
         if handler is not None and target in (0, self.system_id):
             handler(message)
@@ -585,8 +603,11 @@ class Px4Link:
 
     def _on_request_event(self, message: Any) -> None:
         """Send again what was missed; of what is too long ago nothing is said."""
-        frame = bytes(message.data)
-        first, last = struct.unpack("<HH", frame[10 : 10 + frame[1]].ljust(4, b"\0")[:4])
+        if isinstance(message, _Message):
+            first, last = message.first_sequence, message.last_sequence
+        else:
+            frame = bytes(message.data)
+            first, last = struct.unpack("<HH", frame[10 : 10 + frame[1]].ljust(4, b"\0")[:4])
         for told in self._told:
             if (told.sequence - first) % 0x10000 <= (last - first) % 0x10000:
                 self._send(told)

@@ -153,7 +153,8 @@ class Truth:
     """What is really so at one time: world frame, m and m/s.
 
     `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
-    asked for. `velocity_error_m_s` is how wrong its estimate of the horizontal velocity is.
+    asked for. `velocity_error_m_s` is how wrong its estimate of the horizontal velocity is, and
+    `commands` how many commands have been sent to it so far.
     """
 
     time_s: float
@@ -165,6 +166,7 @@ class Truth:
     setpoint_at_s: float = -math.inf
     follows: Literal["position", "velocity"] | None = None
     velocity_error_m_s: float = 0.0
+    commands: int = 0
 
 
 class Px4Vehicle:
@@ -215,7 +217,7 @@ class Px4Vehicle:
         self.fence: tuple[FencePolygon, ...] = ()
         self.truth: list[Truth] = []
 
-        self.time_s = 0.0
+        self.time_s, self.commands = 0.0, 0
         self.position_m: F64 = np.array([*start_m, 0.0])
         self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
         self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0
@@ -1019,6 +1021,7 @@ class Px4Vehicle:
                 self._setpoint_at_s,
                 self._follows(),
                 math.hypot(*self._velocity_error_m_s[:2].tolist()),
+                self.commands,
             )
         )
 

@@ -14,7 +14,8 @@ import pytest
 from geographiclib.geodesic import Geodesic
 
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
-from edge.drivers.px4.autopilot import _COMMANDS, AutopilotError, MavsdkAutopilot
+from edge.drivers.px4.autopilot import AutopilotError, MavsdkAutopilot
+from edge.drivers.px4.dialogue import _COMMANDS
 from lpac.sim.ports import free_ports
 from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import MavResult, Px4Mode
@@ -33,8 +34,8 @@ NORTH = Velocity((1.0, 0.0, 0.0))
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """No command is given up because this machine is slow."""
     patient = {action: command._replace(wait_s=60.0) for action, command in _COMMANDS.items()}
-    monkeypatch.setattr("edge.drivers.px4.autopilot._COMMANDS", patient)
-    monkeypatch.setattr("edge.drivers.px4.autopilot._STALE_COMMAND_S", 60.0)
+    monkeypatch.setattr("edge.drivers.px4.dialogue._COMMANDS", patient)
+    monkeypatch.setattr("edge.drivers.px4.dialogue._STALE_COMMAND_S", 60.0)
 
 
 def new_vehicle(seed: int = 1, **parameters: float) -> Px4Vehicle:
@@ -330,7 +331,7 @@ def results_of(commands: list[Action], vehicle: Px4Vehicle) -> list[tuple[str, s
         wait(autopilot, lambda s: s.armable)
         with server.stepped:
             autopilot.command(first)
-            wait(autopilot, lambda _: autopilot._running is first)
+            wait(autopilot, lambda _: autopilot._dialogue.running is first)
             for action in others:
                 autopilot.command(action)
         wait(autopilot, lambda s: s.result and s.result.action is commands[-1])

@@ -19,6 +19,7 @@ from lpac.sim.drill.bounds import (
     Criterion,
     Down,
     FallsSilent,
+    FewCommands,
     Figure,
     FliesOn,
     Holds,
@@ -73,6 +74,7 @@ def a_vehicle(pad_m: tuple[float, float], height_m: float) -> VehicleTruth:
         setpoint_at_s=np.where(armed, np.minimum(np.floor(t * 10.0) / 10.0, LAND_S), -math.inf),
         is_velocity=(t >= 10.0) & (t < LAND_S),
         velocity_error_m_s=np.zeros_like(t),
+        commands=(3.0 * t).astype(np.int64),
     )
 
 
@@ -194,6 +196,12 @@ CASES: list[tuple[Criterion, FlightTruth, FlightTruth]] = [
     ),
     (AllDown(), WELL, changed(WELL, armed=after(TAKEOFF_S, True, FIRST.armed))),
     (AllDown(), WELL, changed(WELL, position_m=after(45.0, (5.0, 5.0, 3.0), FLOWN_M))),
+    (FewCommands(1.0, 20), WELL, changed(WELL, commands=FIRST.commands + after(30.0, 200, 0))),
+    (
+        FewCommands(10.0, 60),
+        changed(WELL, commands=(5.0 * TIMES_S).astype(np.int64)),
+        changed(WELL, commands=(8.0 * TIMES_S).astype(np.int64)),
+    ),
     (Lands(20.5), WELL, changed(WELL, mode=after(0.0, Px4Mode.OFFBOARD, FIRST.mode, 45.0))),
     (
         Lands(10.5, after="later"),

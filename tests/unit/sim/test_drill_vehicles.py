@@ -54,6 +54,7 @@ def never_down(late_s: float) -> FlightTruth:
         setpoint_at_s=np.full(count, -math.inf),
         is_velocity=np.zeros(count, np.bool_),
         velocity_error_m_s=np.zeros(count),
+        commands=np.zeros(count, np.int64),
     )
     return FlightTruth(
         (vehicle,), (), 0.0, 0.0, {}, (), fence_around(32.0, 1, ERRORS), np.zeros((1, 2)), 0.5,
