@@ -257,6 +257,17 @@ def _battery_critical(f: _Flight) -> None:
     f.run(4.0)
 
 
+def _px4_changed(f: _Flight) -> None:
+    """Somebody else changes the autopilot, and can be set back; and then goes on to do so."""
+    f.fly()
+    f.vehicle.parameters["GF_ACTION"] = 0
+    f.vehicle.fence = ()
+    f.run(6.0)
+    vars(f.fleet.vehicles[0])["set_parameter"] = _refuses_to_be_set
+    f.vehicle.parameters["GF_ACTION"] = 0
+    f.until(_S.LAND)
+
+
 def _ground_lost(f: _Flight) -> None:
     f.fly()
     f.cut(True)
@@ -499,6 +510,10 @@ def _not_enabled(f: _Flight) -> None:
     f.run(3.0)
 
 
+def _refuses_to_be_set(name: str, value: float) -> None:
+    raise OSError(f"parameter {name} = {value}: denied")
+
+
 def _silence(f: _Flight, duration_s: float) -> None:
     """Whatever the vehicle says is lost."""
     vars(f.fleet.vehicles[0])["_said"] = tuple
@@ -550,6 +565,7 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "battery_low_in_hold": (_battery_low_in_hold, {}),
     "battery_critical": (_battery_critical, {}),
     "battery_not_told": (_battery_not_told, {}),
+    "px4_changed": (_px4_changed, {}),
     "ground_lost": (_ground_lost, {}),
     "ground_lost_for_a_while": (_ground_lost_for_a_while, {}),
     "ground_lost_below_another": (_ground_lost_below_another, {}),

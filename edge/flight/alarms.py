@@ -87,6 +87,10 @@ def battery_not_known(t: Tick) -> str | None:
     return reason_if(unknown, "battery is not known")
 
 
+def px4_changed(t: Tick) -> str | None:
+    return None if t.inputs.px4_change is None else t.inputs.px4_change.text
+
+
 def ground_lost(t: Tick) -> str | None:
     return reason_if(not t.ground_heard, "ground lost")
 
@@ -106,6 +110,7 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.POSITION_DOUBTFUL: position_doubtful,
     ReasonCode.TOO_CLOSE: too_close,
     ReasonCode.OUTSIDE_FENCE: outside,
+    ReasonCode.PX4_CHANGED: px4_changed,
     ReasonCode.LANDS_BESIDE: lands_beside,
     ReasonCode.BATTERY_LOW: battery_low,
     ReasonCode.BATTERY_NOT_KNOWN: battery_not_known,

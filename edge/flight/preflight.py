@@ -62,7 +62,8 @@ class PreflightInputs:
     `system_id` is the configured one. `position` is what the position is worth; `position_m` (3,)
     and `landing_point_m` (2,) are in the mission frame; the slot's height is above the takeoff
     point. How far robots must be apart follows from `errors`. `failsafe_problems` come from
-    `failsafe.check`, None until the vehicle's parameters were read. `neighbours` are the other
+    `failsafe.check`, None until the vehicle's parameters were read. `fence_changed`: the vehicle's
+    fence was the right one, and somebody else has changed it. `neighbours` are the other
     robots that were heard lately, `not_understood` those who said what cannot be read, `unheard`
     those that the ground hears and this one does not, `fell_silent` those who did so in flight and
     may still be in the air, as of their last word; how far to stay from them is in `separation`.
@@ -84,6 +85,7 @@ class PreflightInputs:
     fence: Fence
     reach: Reach
     fence_uploaded: bool
+    fence_changed: bool
     origin: Origin | None
     position: PositionJudgement
     position_m: Sequence[float] | None
@@ -222,7 +224,10 @@ def _arming(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     if not inputs.fence_uploaded:
         yield FailedCheck(
             CheckCode.FENCE_NOT_UPLOADED,
-            "autopilot does not have the fence: wait for the upload, or check the link",
+            "somebody else changed or cleared the autopilot's fence: find out who, and wait until "
+            "it is uploaded again"
+            if inputs.fence_changed
+            else "autopilot does not have the fence: wait for the upload, or check the link",
             settles_by_itself=True,
         )
 

@@ -9,7 +9,7 @@ estimator's zero is not the pad.
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from edge.core import F64
 from edge.core.fence import Fence
@@ -46,6 +46,16 @@ _STARTED = Reason(ReasonCode.PROGRAM_STARTED, "program started")
 # Who has it land: the ground, a return that came home, or what cannot wait.
 LandBy = Literal["ground", "return", "safety"]
 RemoteControlLost = Literal["alarm", "hold", "land"]
+
+
+class Px4Change(NamedTuple):
+    """Change in flight, by somebody else, of parameters or fence that preflight had found right.
+
+    `stays`: it could not be set back.
+    """
+
+    text: str
+    stays: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +167,8 @@ class FlightInputs:
     fly by. `order` is new in this tick; of one that is not understood there is the form. `energy`
     is None when the battery is not known. `lands_beside_m` (2,) is where it comes down since
     another robot stands at its landing point; None: there. `fell_silent` are those who did so in
-    flight and may still be in the air, as of their last word.
+    flight and may still be in the air, as of their last word. `px4_change` is None as long as PX4
+    keeps to what preflight found.
     """
 
     now_s: float
@@ -179,6 +190,7 @@ class FlightInputs:
     lands_beside_m: tuple[float, float] | None = None
     fell_silent: tuple[Neighbour, ...] = ()
     policy_problem: str = ""
+    px4_change: Px4Change | None = None
 
 
 @dataclass(frozen=True, slots=True)

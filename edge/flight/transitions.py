@@ -19,6 +19,7 @@ from edge.flight.alarms import (
     policy_stale,
     position_doubtful,
     position_lost,
+    px4_changed,
     reason_if,
     remote_control_lost,
     too_close,
@@ -209,9 +210,17 @@ def _ground_long_lost(t: Tick) -> str | None:
     )
 
 
+def _free_to_return(t: Tick) -> bool:
+    return t.safety_action == "none" and t.ground_heard and not t.failsafe_acts
+
+
 def _battery_low_in_hold(t: Tick) -> str | None:
-    free = t.safety_action == "none" and t.ground_heard and not t.failsafe_acts
-    return battery_low(t) if free else None
+    return battery_low(t) if _free_to_return(t) else None
+
+
+def _px4_stays_changed(t: Tick) -> str | None:
+    stays = t.inputs.px4_change is not None and t.inputs.px4_change.stays
+    return px4_changed(t) if stays and _free_to_return(t) else None
 
 
 def _left_alone(t: Tick) -> str | None:
@@ -388,6 +397,9 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition((_S.HOLD, _S.PILOT), _S.LAND, _R.NOBODY_ANSWERED,
                "it hovers for no reason that anybody gave, and nobody answers", _left_alone,
                alarm=True),
+    Transition((_S.HOLD, _S.MISSION), _S.RETURN, _R.PX4_CHANGED,
+               "PX4's parameters or fence were changed and not set back, and the ground commands "
+               "nothing", _px4_stays_changed, alarm=True),
     Transition((_S.MISSION,), _S.RETURN, _R.BATTERY_LOW,
                "the battery is low, or just lasts for the way home", battery_low, alarm=True),
     Transition((_S.HOLD,), _S.RETURN, _R.BATTERY_LOW, "the same, and the ground commands nothing",

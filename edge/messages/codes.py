@@ -155,6 +155,7 @@ class ReasonCode(_Code):
     OUTSIDE_FENCE = "outside_fence"
     LANDS_BESIDE = "lands_beside"
     REMOTE_CONTROL_LOST = "remote_control_lost"
+    PX4_CHANGED = "px4_changed"
     NOBODY_ANSWERED = "nobody_answered"
     HOVERS_ALONE = "hovers_alone"
     POLICY_STALE = "policy_stale"

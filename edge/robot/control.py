@@ -19,6 +19,7 @@ from edge.flight.silence import highest_still_m, last_word
 from edge.flight.state import (
     FlightInputs,
     FlightMemory,
+    Px4Change,
     Robot,
     exceeds_silence,
     failsafe_acts,
@@ -63,10 +64,10 @@ class FlightControl:
     """Flies one robot. `tick` belongs to the control thread; the fields may be read from any.
 
     Another thread sets `checks`, `peers` (the other robots' beacons), `revoked` (robots that nobody
-    listens to any more), and `world` for the `wanted_world_id`, whole. `obeyed_sequence` and
-    `operator` are the last ground state's. `assignment` is what is flown by, `not_taken` what of
-    the ground's state it is not. `fell_silent` is as in `FlightInputs`. `energy` is how long the
-    battery lasts, and the way home takes.
+    listens to any more), `px4_change`, and `world` for the `wanted_world_id`, whole.
+    `obeyed_sequence` and `operator` are the last ground state's. `assignment` is what is flown by,
+    `not_taken` what of the ground's state it is not. `fell_silent` is as in `FlightInputs`.
+    `energy` is how long the battery lasts, and the way home takes.
     """
 
     def __init__(
@@ -102,6 +103,7 @@ class FlightControl:
         self.flight = FlightMemory()
         self.alarms: tuple[Reason, ...] = ()
         self.checks: Checks | None = None
+        self.px4_change: Px4Change | None = None
         self.peers: tuple[HeardBeacon, ...] = ()
         self.revoked: frozenset[int] = frozenset()
         self.fell_silent: tuple[Neighbour, ...] = ()
@@ -165,6 +167,7 @@ class FlightControl:
             energy=self._energy(now_s, vehicle, odometry),
             lands_beside_m=self._look_where_to_land(peers, silent),
             fell_silent=self.fell_silent,
+            px4_change=self.px4_change,
         )
         self.energy = inputs.energy
         before, robot = self.flight, self.assignment.robot

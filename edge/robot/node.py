@@ -19,6 +19,7 @@ from edge.messages.bounds import MOST_TEXTS
 from edge.messages.codec import MessageError, encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import (
+    AIRBORNE,
     ON_GROUND,
     FlightState,
     LoopStatus,
@@ -56,6 +57,8 @@ _RADIO_COUNTS_PERIOD_S = 1.9
 # After as many of the policy's periods without a message, or so long, a beacon goes alone: others
 # forget one after 3 s.
 _SILENT_TICKS, _SILENT_S = 1.5, 1.0
+# Where it commands the vehicle, and may set it back to what it was.
+_STEERS = (FlightState.ARMING, *AIRBORNE)
 _CHECKS_RUNNING = (FailedCheck(CheckCode.CHECKS_RUNNING, "checks are still running", True),)
 
 
@@ -285,14 +288,17 @@ class RobotNode:
     def preflight_step(self) -> None:
         """Prepare and check the vehicle, a few times a second; it may wait for the vehicle.
 
-        One that is armed is neither prepared nor about to take off: it is checked less often.
+        One that is armed is not about to take off: it is only watched, and less often.
         """
         control = self._control
         self._look_for_world()
         assignment = control.assignment
         is_due = self._checks_are_due(self._ports.clock.monotonic_s())
         if is_due:
-            self.readiness.prepare(self._ports.clock.monotonic_s(), assignment)
+            self.readiness.prepare(
+                self._ports.clock.monotonic_s(), assignment, steers=control.flight.state in _STEERS
+            )
+            control.px4_change = self.readiness.px4_change
         now_s = self._ports.clock.monotonic_s()
         peers = self._inbox.peers(now_s)
         control.peers = peers

@@ -5,7 +5,7 @@ holds up the caller for many seconds.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from edge.core.fence import Fence
@@ -16,16 +16,18 @@ from edge.core.position import PositionJudgement
 from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
-from edge.flight.state import Robot
+from edge.flight.state import Px4Change, Robot
 from edge.identity.guard import CardProblem
 from edge.messages.beacon import HeardBeacon
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import Origin
 from edge.robot.config import RobotConfig
 
-# Parameters may be changed by others meanwhile.
-_READ_AGAIN_S = 5.0
+# Parameters and fence may be changed by others meanwhile, also in flight.
+_LOOK_AGAIN_S = 1.5
 _TRY_AGAIN_S = 3.0
+# What is set back in flight is looked at each second.
+_SET_BACK_WITHIN_S = 3.5
 
 _MAX_ANSWER_AGE_S = 2.0
 
@@ -47,10 +49,10 @@ class Checks(NamedTuple):
 
 
 class Readiness:
-    """The checks of one robot before flight.
+    """The checks of one robot before flight, and whether what they found lasts in flight.
 
     `explanations` say what PX4 would do when something fails; `changes` are the parameters that
-    were set.
+    were set; `px4_change` is as in `FlightInputs`.
     """
 
     def __init__(
@@ -73,37 +75,55 @@ class Readiness:
         # What they were made for; all else that they follow from is configured.
         self._ceiling_m: float | None = None
         self._parameter_problems: tuple[str, ...] | None = None
-        self._parameters_due_s = self._fence_due_s = -math.inf
+        # The last that were right.
+        self._right: dict[str, int | float | None] = {}
+        self._look_due_s = self._fence_due_s = -math.inf
         self._uploaded: tuple[Origin, Fence] | None = None
+        self._fence_changed = False
+        # Of this flight.
+        self.px4_change: Px4Change | None = None
+        self._changed: tuple[str, ...] = ()
+        self._changed_since_s = math.inf
         self.explanations: tuple[str, ...] = ()
         self.changes: tuple[str, ...] = ()
 
-    def prepare(self, now_s: float, assignment: Assignment) -> None:
-        """Read, and set if the configuration says so, what the vehicle must be; only on the ground.
+    def prepare(self, now_s: float, assignment: Assignment, *, steers: bool = False) -> None:
+        """Read, and set if the configuration says so, what the vehicle must be.
 
-        The fence goes to the vehicle when the mission's origin is known.
+        The fence goes to the vehicle when the mission's origin is known. In flight, what others
+        change is set back where this program `steers`.
         """
         origin, fence = assignment.origin, assignment.robot.fence
         failsafe, flight = self._config.failsafe, self._config.flight
         if fence.ceiling_m != self._ceiling_m:
             self._ceiling_m = fence.ceiling_m
             self._requirements = required(failsafe.rc, fence.ceiling_m, flight.command_timeout_s)
-            self._parameter_problems = None
-            self._parameters_due_s = -math.inf
+            self._forget()
         vehicle = self._vehicle.state()
         if not vehicle.connected:
-            self._parameters_due_s, self._uploaded = -math.inf, None
+            self._forget()
+            self._uploaded, self._fence_changed = None, False
             return
         # Nothing is set while it is not sure which vehicle answers.
-        if vehicle.armed is not False or vehicle.other_system_ids:
+        if vehicle.armed is None or vehicle.other_system_ids:
             return
-        if now_s >= self._parameters_due_s:
-            self._parameters_due_s = now_s + (_READ_AGAIN_S if self._read() else _TRY_AGAIN_S)
+        if vehicle.armed:
+            if now_s >= self._look_due_s:
+                self._watch(now_s, steers=steers)
+            return
+        self.px4_change, self._changed, self._changed_since_s = None, (), math.inf
+        if now_s >= self._look_due_s:
+            self._look_due_s = now_s + (_LOOK_AGAIN_S if self._read() else _TRY_AGAIN_S)
+            self._look_at_fence(now_s)
         if origin is None or self._uploaded == (origin, fence):
             return
         if now_s >= self._fence_due_s:
             self._fence_due_s = now_s + _TRY_AGAIN_S
             self._upload_fence(origin, fence)
+
+    def _forget(self) -> None:
+        self._parameter_problems, self._right = None, {}
+        self._look_due_s = -math.inf
 
     def checks(
         self,
@@ -140,6 +160,7 @@ class Readiness:
             fence=robot.fence,
             reach=robot.reach,
             fence_uploaded=origin is not None and self._uploaded == (origin, robot.fence),
+            fence_changed=self._fence_changed,
             origin=origin,
             position=position,
             position_m=None if odometry is None else odometry.position_m,
@@ -169,19 +190,26 @@ class Readiness:
 
     def _read(self) -> bool:
         """Whether everything is as it must be."""
+        # What others have changed is told once before it is set.
+        sets = self._config.failsafe.parameters == "set" and self._parameter_problems != ()
         try:
             values = self._setup.read_parameters(PARAMETERS)
-            if self._config.failsafe.parameters == "set" and self._set_wrong(values):
+            if sets and self._set_wrong(values):
                 values = self._setup.read_parameters(PARAMETERS)
         except OSError as error:
             log.warning("PX4 parameters not read or set", error=str(error))
             self._parameter_problems = None
             return False
-        self._parameter_problems = check_parameters(self._requirements, values)
+        problems = check_parameters(self._requirements, values)
+        if not problems:
+            self._right = {each.name: values[each.name] for each in self._requirements}
+        changed = "; ".join(_differences(self._right, values))
+        said_of_all = f" (changed by somebody else: {changed})" if problems and changed else ""
+        self._parameter_problems = tuple(problem + said_of_all for problem in problems)
         timeout_s = self._config.flight.command_timeout_s
         hang = f"if this program hangs, its watchdog lets PX4 hold, {timeout_s:g} s later"
         self.explanations = (hang, *explain(values))
-        return not self._parameter_problems
+        return not problems
 
     def _set_wrong(self, values: dict[str, int | float | None]) -> bool:
         """Set what is wrong and can be set; whether there was any."""
@@ -193,20 +221,104 @@ class Readiness:
             and requirement.value_to_set is not None
         ]
         for requirement, value in wrong:
-            self._setup.set_parameter(requirement.name, value)
-            change = f"{requirement.name} from {values[requirement.name]:g} to {value:g}"
-            self.changes = (*self.changes, change)
-            log.warning("PX4 parameter set", change=change, why=requirement.why)
+            self._set(requirement.name, values[requirement.name], value, requirement.why)
         return bool(wrong)
 
+    def _set(self, name: str, before: float | None, value: float, why: str) -> None:
+        self._setup.set_parameter(name, value)
+        change = f"{name} from {before:g} to {value:g}"
+        self.changes = (*self.changes, change)
+        log.warning("PX4 parameter set", change=change, why=why)
+
+    def _look_at_fence(self, now_s: float) -> None:
+        """What is no longer there is uploaded again a little later: the operator reads of it."""
+        if self._uploaded is None:
+            return
+        try:
+            if self._setup.has_fence():
+                return
+        except OSError as error:
+            log.warning("fence not read", error=str(error))
+        else:
+            self._fence_changed = True
+            log.warning("fence was changed by somebody else")
+        self._uploaded, self._fence_due_s = None, now_s + _TRY_AGAIN_S
+
     def _upload_fence(self, origin: Origin, fence: Fence) -> None:
-        frame = origin.frame()
-        grown_m = fence.grown_m(self._config.failsafe.fence_margin_m)
         # Without an answer the vehicle may have this one, the one before, or none.
         self._uploaded = None
         try:
-            self._setup.upload_fence([frame.to_global_deg(*vertex) for vertex in grown_m])
+            self._send_fence(origin, fence)
         except OSError as error:
             log.warning("fence upload failed", error=str(error))
             return
-        self._uploaded = origin, fence
+        self._uploaded, self._fence_changed = (origin, fence), False
+
+    def _send_fence(self, origin: Origin, fence: Fence) -> None:
+        frame = origin.frame()
+        grown_m = fence.grown_m(self._config.failsafe.fence_margin_m)
+        self._setup.upload_fence([frame.to_global_deg(*vertex) for vertex in grown_m])
+
+    # In flight
+
+    def _watch(self, now_s: float, *, steers: bool) -> None:
+        """Whether all is as preflight found it; what is not is set back, if that is allowed."""
+        self._look_due_s = now_s + _LOOK_AGAIN_S
+        # Armed by others, or before this program was started: nothing was found right.
+        if self._parameter_problems != () or self._uploaded is None:
+            return
+        try:
+            read = self._setup.read_parameters(PARAMETERS)
+            has_fence = self._setup.has_fence()
+        except OSError as error:
+            log.warning("not known whether PX4 was changed", error=str(error))
+            return
+        # What was not answered is not thereby changed.
+        values = {n: was if read[n] is None else read[n] for n, was in self._right.items()}
+        wrong: tuple[str, ...] = ()
+        if check_parameters(self._requirements, values):
+            wrong = _differences(self._right, values)
+        else:
+            self._right = values
+        may_set = not wrong or self._config.failsafe.parameters == "set"
+        if not has_fence:
+            wrong = (*wrong, "its fence")
+        if not wrong:
+            self._changed_since_s = math.inf
+            if self._changed:
+                what = ", ".join(self._changed)
+                text = f"somebody changed the autopilot in flight, and it was set back: {what}"
+                self.px4_change = Px4Change(text, False)
+            return
+        self._changed = tuple(dict.fromkeys((*self._changed, *wrong)))
+        self._changed_since_s = min(self._changed_since_s, now_s)
+        stays = not may_set or now_s - self._changed_since_s > _SET_BACK_WITHIN_S
+        self._look_due_s = now_s + (_LOOK_AGAIN_S if stays else 0.0)
+        how = "and it stays so" if stays else "it is set back"
+        text = f"somebody changed the autopilot in flight, {how}: {', '.join(wrong)}"
+        change = Px4Change(text, stays)
+        if change != self.px4_change:
+            log.warning("PX4 was changed in flight", what=wrong, stays=stays)
+        self.px4_change = change
+        if steers:
+            self._set_back(values if may_set else self._right, has_fence=has_fence)
+
+    def _set_back(self, values: dict[str, int | float | None], *, has_fence: bool) -> None:
+        try:
+            for name, right in self._right.items():
+                if right is not None and values[name] != right:
+                    self._set(name, values[name], right, "changed in flight")
+            if not has_fence and self._uploaded is not None:
+                self._send_fence(*self._uploaded)
+        except OSError as error:
+            log.warning("PX4 not set back", error=str(error))
+
+
+def _differences(
+    before: Mapping[str, float | None], after: Mapping[str, float | None]
+) -> tuple[str, ...]:
+    return tuple(
+        f"{name} from {was:g} to {now:g}"
+        for name, was in before.items()
+        if was is not None and (now := after.get(name)) is not None and now != was
+    )

@@ -13,9 +13,10 @@ import pytest
 from edge.core import F64
 from edge.core.part import PartError
 from edge.drivers.flight_log import read
+from edge.flight.failsafe import required
 from edge.flight.replay import FlightReplay
 from edge.identity.guard import Unguarded
-from edge.messages.codes import ReasonCode
+from edge.messages.codes import CheckCode, ReasonCode
 from edge.messages.mission import FlightState
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
@@ -42,6 +43,7 @@ from lpac.sim.fleet.recorded import RecordingError
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.world import FencePolygon
 from lpac.sim.radio import GROUND
 from tests.conftest import SHIPPED
 from tests.flown import PRECISE
@@ -65,15 +67,24 @@ def a_low_fleet(folder: Path) -> SimulatedFleet:
     return SimulatedFleet(low_flight(2, 3, 60.0), folder, SHIPPED)
 
 
+def all_are_ready(told: FleetSnapshot) -> bool:
+    return all(robot.status is not None and robot.status.ready for robot in told.robots)
+
+
+def to_ready(ground: SimulatedGround) -> Procedure[None]:
+    """From the start to all robots ready to take off."""
+    yield Until(lambda told: all(robot.fresh for robot in told.robots), 30.0)
+    for request in (SetOrigin(ORIGIN), Enable()):
+        report = yield request
+        assert report.done, (request, report)
+    ready = yield Until(all_are_ready, 60.0)
+    assert ready, ground.snapshot
+
+
 def to_mission(ground: SimulatedGround) -> Procedure[None]:
     """From the start to all robots in their mission."""
-    yield Until(lambda told: all(robot.fresh for robot in told.robots), 30.0)
-    for request in (SetOrigin(ORIGIN), Enable(), Takeoff(), Start()):
-        if isinstance(request, Takeoff):
-            ready = yield Until(
-                lambda told: all(robot.status and robot.status.ready for robot in told.robots), 60.0
-            )
-            assert ready, ground.snapshot
+    yield from to_ready(ground)
+    for request in (Takeoff(), Start()):
         report = yield request
         assert report.done, (request, report)
 
@@ -228,6 +239,138 @@ def test_a_robot_says_what_befell_it_and_the_other_flies_on(
     assert not fleet.ground.command(Start(("r0",))).done
     again = fleet.ground.snapshot.robots[0].status
     assert again is not None and again.state is not FlightState.MISSION
+
+
+def gf_action_is(value: int) -> Callable[[SimulatedFleet], None]:
+    def do(fleet: SimulatedFleet) -> None:
+        fleet.vehicles[0].vehicle.parameters["GF_ACTION"] = value
+
+    return do
+
+
+def fence_is_cleared(fleet: SimulatedFleet) -> None:
+    fleet.vehicles[0].vehicle.fence = ()
+
+
+def fence_is_another(fleet: SimulatedFleet) -> None:
+    vehicle = fleet.vehicles[0].vehicle
+    (polygon,) = vehicle.fence
+    vehicle.fence = (FencePolygon(True, polygon.vertices_deg[::-1]),)
+
+
+def as_preflight_found_it(fleet: SimulatedFleet) -> bool:
+    changed, other = (each.vehicle for each in fleet.vehicles)
+    fences = [[polygon.vertices_deg for polygon in each.fence] for each in (changed, other)]
+    return fences[0] == fences[1] and changed.parameters["GF_ACTION"] == 2
+
+
+BY_SOMEBODY_ELSE = pytest.mark.parametrize(
+    ("changed", "code"),
+    [
+        (gf_action_is(0), CheckCode.FAILSAFE_WRONG),
+        (fence_is_cleared, CheckCode.FENCE_NOT_UPLOADED),
+        (fence_is_another, CheckCode.FENCE_NOT_UPLOADED),
+    ],
+)
+
+
+@BY_SOMEBODY_ELSE
+def test_a_vehicle_that_others_change_on_the_ground_is_not_ready_until_it_is_set_back(
+    changed: Callable[[SimulatedFleet], None], code: CheckCode, tmp_path: Path
+) -> None:
+    fleet = a_low_fleet(tmp_path)
+    fleet.ground.carry_out(to_ready(fleet.ground))
+    changed(fleet)
+
+    def says_why(told: FleetSnapshot) -> bool:
+        status = told.robots[0].status
+        checks = () if status is None else status.failed_checks
+        return any(check.code is code and "somebody else" in check.text for check in checks)
+
+    assert fleet.ground.carry_out(_until(says_why, 3.0))
+    assert not all_are_ready(fleet.ground.snapshot)
+    assert fleet.ground.carry_out(_until(all_are_ready, 6.0))
+    assert as_preflight_found_it(fleet)
+
+
+@BY_SOMEBODY_ELSE
+def test_a_vehicle_that_others_change_in_flight_is_set_back(
+    changed: Callable[[SimulatedFleet], None], code: CheckCode
+) -> None:
+    fleet = in_mission()
+    changed(fleet)
+    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    fleet.ground.carry_out(_pass(3.0))
+    assert as_preflight_found_it(fleet)
+    # It still says so: somebody did it.
+    assert tells_of_the_change(fleet.ground.snapshot)
+    assert states(fleet) == {FlightState.MISSION}
+    assert fleet.ground.command(SafetyCommand("land", wait=True)).done
+    fleet.ground.carry_out(_pass(3.0))
+    assert not tells_of_the_change(fleet.ground.snapshot)
+
+
+def refused(name: str, value: float) -> None:
+    raise OSError(f"parameter {name} = {value}: denied")
+
+
+def not_uploaded(vertices_deg: object) -> None:
+    raise OSError("fence upload: denied")
+
+
+@pytest.mark.parametrize(
+    ("changed", "cannot"),
+    [
+        (gf_action_is(0), {"set_parameter": refused}),
+        (fence_is_cleared, {"upload_fence": not_uploaded}),
+    ],
+)
+def test_a_vehicle_that_cannot_be_set_back_comes_home(
+    changed: Callable[[SimulatedFleet], None], cannot: dict[str, Any]
+) -> None:
+    fleet = in_mission()
+    vars(fleet.vehicles[0]).update(cannot)
+    changed(fleet)
+    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    assert fleet.ground.carry_out(_until(returns_for_it, 6.0))
+    other = fleet.ground.snapshot.robots[1].status
+    assert other is not None and other.state is FlightState.MISSION
+
+
+def test_who_may_not_set_parameters_comes_home_at_once(tmp_path: Path) -> None:
+    settings = {"failsafe": {"parameters": "refuse"}}
+    fleet = SimulatedFleet(low_flight(2, 3, 60.0), tmp_path, SHIPPED, settings=settings)
+    for each in fleet.vehicles:
+        for requirement in required("none", ceiling_m=30.0):
+            if requirement.value_to_set is not None:
+                each.vehicle.parameters[requirement.name] = requirement.value_to_set
+    fleet.ground.carry_out(to_mission(fleet.ground))
+    gf_action_is(0)(fleet)
+    assert fleet.ground.carry_out(_until(returns_for_it, 5.0))
+    assert fleet.vehicles[0].vehicle.parameters["GF_ACTION"] == 0
+
+
+def test_who_flies_by_hand_may_change_what_he_likes() -> None:
+    fleet = _in_mission(for_a_pilot=True).copy()
+    flown_by_a_pilot(fleet)
+    fleet.ground.carry_out(_pass(3.0))
+    gf_action_is(0)(fleet)
+    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+    fleet.ground.carry_out(_pass(10.0))
+    assert fleet.vehicles[0].vehicle.parameters["GF_ACTION"] == 0
+
+
+def tells_of_the_change(told: FleetSnapshot) -> bool:
+    status = told.robots[0].status
+    alarms = () if status is None else status.alarms
+    return any(alarm.code is ReasonCode.PX4_CHANGED for alarm in alarms)
+
+
+def returns_for_it(told: FleetSnapshot) -> bool:
+    status = told.robots[0].status
+    return status is not None and (status.state, status.reason.code) == (
+        FlightState.RETURN, ReasonCode.PX4_CHANGED,
+    )  # fmt: skip
 
 
 def test_programs_start_late_and_start_again(tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ from edge.flight.state import (
     FlightInputs,
     FlightMemory,
     FlightParameters,
+    Px4Change,
     RemoteControlLost,
     Robot,
     Tick,
@@ -145,6 +146,7 @@ class World:
         self.battery: float | None = 0.9
         self.remote_control: bool | None = True
         self.energy: Energy | None = None
+        self.px4_change: Px4Change | None = None
         self.beats: list[tuple[float, Mode, bool, bool, bool]] = []
         self.heard = VehicleState(origin=GlobalOrigin(47.0, 8.0, 0.0), height_above_home_m=0)
         # The rest of the inputs.
@@ -417,6 +419,7 @@ class World:
             order=self.order,
             uptime_s=self.now_s - self.started_s,
             energy=self.energy,
+            px4_change=self.px4_change,
         )
 
     def _decide(self, vehicle: VehicleState) -> Decision:
@@ -1139,6 +1142,40 @@ def test_battery_low_returns_and_critical_lands(world: World) -> None:
     assert world.state() is FlightState.LAND
     world.enable(safety_action="hold")
     world.until(FlightState.LANDED, 20.0)
+
+
+CHANGED = "somebody changed the autopilot in flight, and it stays so: GF_ACTION from 2 to 0"
+
+
+def test_an_autopilot_that_others_change_is_an_alarm(world: World) -> None:
+    world.fly()
+    world.px4_change = Px4Change("somebody changed the autopilot in flight", stays=False)
+    assert codes(world.tick()) == [ReasonCode.PX4_CHANGED]
+    world.run(5.0)
+    assert world.state() is FlightState.MISSION
+
+
+def test_an_autopilot_that_others_change_for_good_brings_it_home(world: World) -> None:
+    world.fly()
+    world.px4_change = Px4Change(CHANGED, stays=True)
+    assert codes(world.tick()) == [ReasonCode.PX4_CHANGED]
+    assert world.why == (FlightState.RETURN, ReasonCode.PX4_CHANGED)
+    world.enable(safety_action="hold")
+    world.run(1.0)
+    assert world.state() is FlightState.HOLD
+    world.enable()
+    world.run(0.2)
+    assert world.why == (FlightState.RETURN, ReasonCode.PX4_CHANGED)
+    world.until(FlightState.LANDED, 40.0)
+
+
+def test_a_takeoff_from_an_autopilot_that_others_change_ends_at_home(world: World) -> None:
+    world.ready()
+    world.obey("takeoff")
+    world.until(FlightState.TAKEOFF, 10.0)
+    world.px4_change = Px4Change(CHANGED, stays=True)
+    world.until(FlightState.RETURN, 25.0)
+    world.until(FlightState.LANDED, 40.0)
 
 
 def test_a_lost_position_stops_and_then_lands(world: World) -> None:
@@ -2018,6 +2055,7 @@ def _surroundings(world: World, draw: random.Random) -> None:
     world.busy = draw.choice(((), (), (5,)))
     world.failed_checks = draw.choice(((), (), None, (FailedCheck(CheckCode.OTHER, "x"),)))
     world.battery = draw.choice((0.9, 0.9, 0.2, 0.1))
+    world.px4_change = draw.choice((None, None, Px4Change("x", draw.random() < 0.5)))
     world.energy = draw.choice(
         (None, Energy(draw.uniform(0, 900), draw.uniform(0, 300), None, 3.4))
     )

@@ -76,6 +76,7 @@ READY = PreflightInputs(
     fence=Fence(((0.0, 0.0), (32.0, 0.0), (32.0, 32.0), (0.0, 32.0)), 2.0, 3.0, 25.0),
     reach=Reach(),
     fence_uploaded=True,
+    fence_changed=False,
     origin=ORIGIN,
     position=PositionJudgement(PositionQuality.GOOD, None),
     position_m=(8.0, 8.0, 0.0),
