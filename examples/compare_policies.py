@@ -1,12 +1,13 @@
 """Two policies and a baseline over the same worlds: which is better, and how certain that is.
 
-Two worlds tell nothing: with 50 it takes minutes, as `lpac evaluate` does.
+Two worlds tell nothing, and it says so: with 50 it takes minutes, as `lpac evaluate` does.
 """
 
 from pathlib import Path
 
 from lpac.api import (
     SHIPPED_BUNDLE,
+    VERDICT_RULE,
     Condition,
     cost_curves,
     evaluate,
@@ -14,6 +15,7 @@ from lpac.api import (
     make_evaluation,
     policy_method,
     verdict_of,
+    what_would_tell,
 )
 
 OTHER_BUNDLE = Path(__file__).parents[1] / "policies" / "general" / "general"
@@ -40,7 +42,9 @@ field, general, *_ = results[conditions[0]]
 verdict = verdict_of(field, general)
 value, low, high = verdict.ratio
 print(f"\nfield over general: {value:.3f} (95 %: {low:.3f} to {high:.3f})")
-better = {"a": "field is better", "b": "general is better", None: "two worlds do not tell"}
-print(better[verdict.better])
+better = {"a": "field is better", "b": "general is better"}
+undecided = what_would_tell(verdict.difference, evaluation.worlds)
+print(better.get(verdict.better, undecided))
+print(f"the rule: {VERDICT_RULE}")
 cost_curves(conditions[0], results[conditions[0]]).savefig("compare_policies.png")
 print("see compare_policies.png")

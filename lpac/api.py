@@ -78,6 +78,8 @@ if TYPE_CHECKING:
     from lpac.analysis.report import Examined as Examined
     from lpac.analysis.report import Wanted as Wanted
     from lpac.analysis.report import examine as examine
+    from lpac.analysis.statistics import VERDICT_RULE as VERDICT_RULE
+    from lpac.analysis.statistics import what_would_tell as what_would_tell
     from lpac.evaluate.evaluation import Condition as Condition
     from lpac.evaluate.evaluation import Evaluation as Evaluation
     from lpac.evaluate.evaluation import Method as Method
@@ -126,6 +128,7 @@ _TAKEN = {
     ),
     "lpac.analysis.flight": "FlightRecord RobotRecord",
     "lpac.analysis.report": "Examined Wanted examine",
+    "lpac.analysis.statistics": "VERDICT_RULE what_would_tell",
     "lpac.evaluate.evaluation": "Condition Evaluation Method MethodResult verdict_of",
     "lpac.evaluate.figures": "cost_curves distributions",
     "lpac.evaluate.flights": "BASELINES",

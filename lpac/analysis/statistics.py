@@ -23,6 +23,11 @@ CONFIDENCE = 0.95
 LEAST_TRAININGS = 3
 # Of fewer not even a difference of one sign in all of them would be telling: 2 * 0.5^5 > 0.05.
 LEAST_WORLDS = 6
+# By what `compare` calls one better, for people.
+VERDICT_RULE = (
+    f"one is better if the 95 % interval of the difference of their mean costs, over the same "
+    f"worlds, leaves 0 out, and there are {LEAST_WORLDS} worlds or more"
+)
 _RESAMPLES = 2000
 _SEED = 0
 
@@ -149,6 +154,22 @@ def compare(
             for values, trained in ((a, trained_a), (b, trained_b))
         ),
     )
+
+
+def what_would_tell(difference: Interval95, worlds: int) -> str:
+    """How many worlds would show which of two is better, where `worlds` do not; for people.
+
+    `difference` is the verdict's: intervals shrink with the root of the number of worlds.
+    """
+    if worlds < LEAST_WORLDS:
+        few = f"{worlds} worlds are" if worlds > 1 else "one world is"
+        return f"{few} too few to tell: at least {LEAST_WORLDS} are needed, and 50 often are"
+    value, low, high = difference
+    width = max(high - value, value - low)
+    if not abs(value) > 0.001 * width:
+        return f"{worlds} worlds do not tell: no difference is seen in them"
+    enough = max(worlds + 1, math.ceil(worlds * (width / abs(value)) ** 2))
+    return f"{worlds} worlds do not tell: if the difference is as it looks, about {enough} would"
 
 
 def performance_profile(values: F64, thresholds: F64) -> F64:

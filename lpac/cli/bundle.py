@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.printing import working
 
 app = new_app("bundle", "Look at a policy bundle; verify or time it on this machine.")
 
@@ -117,7 +118,8 @@ def benchmark(
     from edge.robot.benchmark import benchmark as measure
 
     bundle = load_bundle(path)
-    result = measure(load_policy(bundle), neighbours, seconds)
+    with working("measuring"):
+        result = measure(load_policy(bundle), neighbours, seconds)
     if as_json:
         steps = {
             step.step: {**dataclasses.asdict(step), "share": step.share} for step in result.steps

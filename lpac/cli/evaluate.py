@@ -322,7 +322,7 @@ def _write_worst(
     flights = list(dict.fromkeys(flight for pair in wanted.values() for flight in pair))
     flown: dict[EvaluationFlight, SimulatedFlight] = {}
     with progress_of("pictures of the worst worlds") as progress:
-        task = progress.add_task("", total=len(flights))
+        task = progress.add_task("", total=len(flights) + len(wanted))
         for group in cores(fly_group, groups_of(flights)) if flights else ():
             flown.update(group)
             progress.update(task, advance=len(group))
@@ -331,9 +331,12 @@ def _write_worst(
             write_world(
                 shown, out / "worst" / name.replace("/", "-") / f"{place:02d}-world-{world}"
             )
+            progress.update(task, advance=1)
 
 
 def _show(told: Mapping[str, Any], *, compared: bool) -> None:
+    from lpac.analysis.statistics import VERDICT_RULE
+
     policies = [method["name"] for method in told["methods"] if method["bundles"]]
     for condition in told["conditions"]:
         typer.echo(
@@ -345,6 +348,7 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
             typer.echo(f"{link_line(radio['loss'], radio['delay_s'])}\n")
         of_all = condition["results"]
         print_table(_COLUMNS, [_row(one) for one in of_all], right=_COLUMNS[1:])
+        typer.echo(f"\n{_COLUMNS_SAY}")
         of_policies = [one for one in of_all if one["name"] in policies]
         for one in of_policies:
             typer.echo(
@@ -360,6 +364,7 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
                 if baseline not in of_policies
             ]
             print_table(("against", *policies), rows)
+            typer.echo(f"\n{VERDICT_RULE}; else they are not told apart")
         if compared:
             _show_verdict(condition["compared"], *told["methods"][:2], worlds=told["worlds"])
         typer.echo()
@@ -371,7 +376,19 @@ def _show(told: Mapping[str, Any], *, compared: bool) -> None:
         )
 
 
-_COLUMNS = ("", "mean", "95 %", "p90", "worst", "area", "/clair", "p90", "/Lloyd")
+_COLUMNS = (
+    "", "mean\nJ / J(0)", "95 %", "p90", "worst", "area", "vs\nclair-\nvoyant", "p90",
+    "vs\nbest\nLloyd",
+)  # fmt: skip
+_COLUMNS_SAY = (
+    "J / J(0): cost at the end over that at the start: its mean over the worlds and in which "
+    "interval that is, at 95 % confidence; p90: nine worlds of ten end below, worst: the worst "
+    "one\n"
+    "area: the mean of J / J(0) over the flight, so the area under its curve\n"
+    "vs clairvoyant: how many times that of Lloyd's algorithm that knows the world, mean over "
+    "mean, and, world by world, p90\n"
+    "vs best Lloyd: how many times that of the best of ten such runs, in each world"
+)
 
 
 def _row(result: Mapping[str, Any]) -> list[str]:
@@ -399,7 +416,7 @@ def _share(told: Mapping[str, Any]) -> str:
 def _against(policy: Mapping[str, Any], baseline: str) -> "Text":
     """Whether better, and in how many worlds it ends above the baseline."""
     above, verdict = policy["above"][baseline], policy["against"][baseline]
-    text = {"a": "better", "b": "worse", None: "undecided"}[verdict["better"]]
+    text = {"a": "better", "b": "worse", None: "not told apart"}[verdict["better"]]
     style = {"a": GOOD, "b": BAD, None: ""}[verdict["better"]]
     return styled(f"{text}, above it in {100.0 * above['share']:.3g} %", style)
 
@@ -407,7 +424,7 @@ def _against(policy: Mapping[str, Any], baseline: str) -> "Text":
 def _show_verdict(
     verdict: Mapping[str, Any], a: Mapping[str, Any], b: Mapping[str, Any], *, worlds: int
 ) -> None:
-    from lpac.analysis.statistics import LEAST_WORLDS
+    from lpac.analysis.statistics import Interval95, what_would_tell
 
     ratio, below = verdict["ratio"], verdict["a_below_b"]
     if verdict["better"] is None:
@@ -420,8 +437,8 @@ def _show_verdict(
         f"lower in {100.0 * below[0]:.3g} % of the worlds ({100.0 * below[1]:.3g} to "
         f"{100.0 * below[2]:.3g})"
     )
-    if worlds < LEAST_WORLDS:
-        typer.echo(f"fewer than {LEAST_WORLDS} worlds are too few, whatever their interval is")
+    if verdict["better"] is None:
+        typer.echo(what_would_tell(Interval95(*verdict["difference"]), worlds))
     if not verdict["of_methods"]:
         typer.echo(
             "that is true of these bundles; it takes three trainings of each, joined by commas, to "

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.printing import working
 
 app = new_app()
 
@@ -40,7 +41,8 @@ def export(
     from edge.policy.lpac.manifest import LpacManifest
     from export.exporter import export_bundle
 
-    bundle = export_bundle(checkpoint, params, name, cnn=cnn, force=force)
+    with working("exporting"):
+        bundle = export_bundle(checkpoint, params, name, cnn=cnn, force=force)
     write_bundle(bundle, output)
 
     manifest, lpac = bundle.manifest, LpacManifest.of(bundle.manifest)

@@ -7,6 +7,7 @@ import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.options import DEFAULT_FLEET, Fleet
+from lpac.cli.printing import progress_of
 
 app = new_app("foxglove", "Show the fleet in Foxglove, live or from logs; or write its layout.")
 
@@ -49,8 +50,9 @@ def log(
     from lpac.ground.foxglove.logs import convert, ground_logs
 
     paths = ground_logs(folder)
-    with typer.progressbar(length=len(paths), label="reading") as bar:
-        convert(paths, out, lambda done: bar.update(done - bar.pos))
+    with progress_of("logs") as progress:
+        task = progress.add_task("", total=len(paths))
+        convert(paths, out, lambda done: progress.update(task, completed=done))
     typer.echo(f"{out}: open it in Foxglove, with the panels of `lpac foxglove layout`")
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import typer
 
-from lpac.cli.printing import BAD, FAINT, GOOD, print_table, styled
+from lpac.cli.printing import BAD, FAINT, GOOD, lines_of, print_table, styled
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -169,8 +169,17 @@ def _progress() -> Iterator[Callable[["CommandProgress"], None]]:
     def keep(progress: "CommandProgress") -> None:
         told[progress.robot] = progress.text
 
+    def how_far() -> str:
+        last = "; ".join(f"{robot}  {text}".strip() for robot, text in list(told.items()))
+        return f"{time.monotonic() - began_s:6.1f} s  {last or 'nothing yet'}"
+
+    def keep_and_print(progress: "CommandProgress") -> None:
+        keep(progress)
+        line(progress)
+
     if not console.is_terminal:
-        yield line
+        with lines_of(how_far):
+            yield keep_and_print
         return
     with Live(get_renderable=table, console=console, transient=True):
         yield keep

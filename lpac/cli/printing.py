@@ -1,8 +1,11 @@
 """Tables, notes and colours, as all commands print them."""
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import TYPE_CHECKING
+
+import typer
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -10,6 +13,9 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 GOOD, BAD, NOTABLE, FAINT = "green", "red", "yellow", "dim"
+
+# Where there is no terminal to show it live, how far a command is gets a line so often, s.
+LINE_EVERY_S = 10.0
 
 
 def print_table(
@@ -67,7 +73,31 @@ def new_table(*, narrow: bool, heading: bool = True) -> "Table":
     )
 
 
-def progress_of(what: str) -> "Progress":
+@contextmanager
+def lines_of(how_far: Callable[[], str]) -> Iterator[None]:
+    """A line on stderr every `LINE_EVERY_S`, as long as this context lasts.
+
+    For where there is no terminal. `how_far` is called in another thread.
+    """
+    ended = threading.Event()
+
+    def tell() -> None:
+        # A pipe that nobody reads any more does not end the work.
+        with suppress(OSError):
+            while not ended.wait(LINE_EVERY_S):
+                typer.echo(how_far(), err=True)
+
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+@contextmanager
+def progress_of(what: str) -> Iterator["Progress"]:
     """On stderr: how many are done of how many, the time left, and each task's description."""
     from rich.console import Console
     from rich.progress import (
@@ -78,10 +108,23 @@ def progress_of(what: str) -> "Progress":
         TimeRemainingColumn,
     )
 
-    return Progress(
+    progress = Progress(
         TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         TextColumn("{task.description}"), console=Console(stderr=True), transient=True,
     )  # fmt: skip
+
+    def how_far() -> str:
+        running = [task for task in progress.tasks if not task.finished] or progress.tasks[-1:]
+        words = []
+        for task in running:
+            of = "" if task.total is None else f" of {task.total:g}"
+            left = [] if task.finished else time_left(task.time_remaining)
+            said = [f"{what} {task.completed:g}{of}", *left]
+            words.append(", ".join([*said, *filter(None, [task.description])]))
+        return "; ".join(words) or what
+
+    with _shown(progress, how_far):
+        yield progress
 
 
 @contextmanager
@@ -90,16 +133,36 @@ def progress_of_run() -> Iterator[Callable[[float, str, Sequence[str]], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-    with Progress(
+    progress = Progress(
         TextColumn("{task.fields[stage]:<20}"), BarColumn(), TaskProgressColumn(),
         TextColumn("{task.fields[numbers]}"), console=Console(stderr=True), transient=True,
-    ) as progress:  # fmt: skip
-        task = progress.add_task("", total=1.0, stage="", numbers="")
+    )  # fmt: skip
+    task = progress.add_task("", total=1.0, stage="begins", numbers="")
 
-        def show(done: float, stage: str, numbers: Sequence[str]) -> None:
-            progress.update(task, completed=done, stage=stage, numbers="  ".join(numbers))
+    def show(done: float, stage: str, numbers: Sequence[str]) -> None:
+        progress.update(task, completed=done, stage=stage, numbers="  ".join(numbers))
 
+    def how_far() -> str:
+        now = progress.tasks[0]
+        said = (now.fields["stage"], f"{now.percentage:.0f} %", now.fields["numbers"])
+        return "  ".join(filter(None, said))
+
+    with _shown(progress, how_far):
         yield show
+
+
+@contextmanager
+def working(text: str) -> Iterator[None]:
+    """Say on stderr what is being done, as long as it takes."""
+    from rich.console import Console
+
+    console = Console(stderr=True, highlight=False, markup=False)
+    with console.status(text) if console.is_terminal else lines_of(lambda: text):
+        yield
+
+
+def _shown(progress: "Progress", how_far: Callable[[], str]) -> AbstractContextManager[object]:
+    return progress if progress.console.is_terminal else lines_of(how_far)
 
 
 def time_left(left_s: float | None) -> list[str]:
@@ -107,6 +170,8 @@ def time_left(left_s: float | None) -> list[str]:
     if left_s is None:
         return []
     minutes = round(left_s / 60.0)
+    if minutes == 0:
+        return ["less than 1 min left"]
     return [
         f"{minutes // 60}:{minutes % 60:02d} h left" if minutes >= 60 else f"{minutes} min left"
     ]

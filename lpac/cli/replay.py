@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.printing import working
 
 if TYPE_CHECKING:
     from edge.drivers.flight_log import FlightMetadata
@@ -38,14 +39,15 @@ def replay(
 
     paths = list(_segments(logs))
     metadata = {path: read_metadata(path) for path in paths}
-    flights = _flights(metadata)
-    flown = any(flight.ticks for flight in flights.values())
     policy_bundle: Bundle | None = None
     comparisons: tuple[Comparison, ...] = ()
-    if _has_policy_ticks(paths):
-        policy_bundle, comparisons = _policy(metadata, bundle)
-    elif not flown:
-        raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
+    with working("running the logs again"):
+        flights = _flights(metadata)
+        flown = any(flight.ticks for flight in flights.values())
+        if _has_policy_ticks(paths):
+            policy_bundle, comparisons = _policy(metadata, bundle)
+        elif not flown:
+            raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
     if as_json:
         typer.echo(
             json.dumps(

@@ -1,7 +1,6 @@
 """`lpac record` and `lpac report`: what happened, kept and shown."""
 
 import json
-import sys
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +8,7 @@ from typing import Annotated
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.printing import progress_of_run
 
 app = new_app()
 
@@ -42,12 +42,16 @@ def report(
     from lpac.analysis.report import Wanted, examine
 
     wanted = Wanted(trials=tuple(trial or ()), times_s=_times_s(times), world=world, bundle=bundle)
-    with _Bar() as bar:
-        examined = examine(folders, wanted, bar.show)
+    with progress_of_run() as show:
+
+        def tell(what: str, share: float) -> None:
+            show(share, what, ())
+
+        examined = examine(folders, wanted, tell)
         # Only once there is something to draw: what draws takes a second to load.
         from lpac.analysis.write_report import write
 
-        page = write(examined, out or folders[0] / "report", wanted.times_s, bar.show)
+        page = write(examined, out or folders[0] / "report", wanted.times_s, tell)
     summary = examined.summary()
     if as_json:
         typer.echo(json.dumps(summary, indent=2))
@@ -91,20 +95,3 @@ def _line(values: dict[str, object]) -> str:
         if isinstance(found, list | dict) and found:
             words.append(f"{len(found)} {name}")
     return ", ".join(words)
-
-
-class _Bar:
-    """How far it is, on a terminal."""
-
-    def __enter__(self) -> "_Bar":
-        self._shown = sys.stderr.isatty()
-        return self
-
-    def show(self, what: str, share: float) -> None:
-        if self._shown:
-            done = round(20 * share)
-            typer.echo(f"\r\033[K[{'#' * done}{' ' * (20 - done)}] {what}", err=True, nl=False)
-
-    def __exit__(self, *_: object) -> None:
-        if self._shown:
-            typer.echo("\r\033[K", err=True, nl=False)

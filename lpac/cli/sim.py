@@ -19,6 +19,7 @@ import typer
 
 from lpac.cli.apps import new_app
 from lpac.cli.options import DEFAULT_BUNDLE, DEFAULT_SENSOR, Px4, Sensor, VehicleKind, check_px4
+from lpac.cli.printing import lines_of, progress_of
 from lpac.cli.radio import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
@@ -564,10 +565,17 @@ def _fly_on_clock(
     air = Air(loss=loss, delay_s=max(delay_s, Air().delay_s)) if loss or delay_s else None
     with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere:
         folder = out or Path(nowhere)
-        flight = fly_simulated(
-            scenario, folder, bundle_in(folder / _OWN_BUNDLE), partial(typer.echo, err=True),
-            logs=out is not None, recorded=recorded, settings=settings, air=air,
-        )  # fmt: skip
+        said = ["the fleet is made"]
+
+        def say(text: str) -> None:
+            said.append(text)
+            typer.echo(text, err=True)
+
+        with lines_of(lambda: f"{said[-1]}: still at it"):
+            flight = fly_simulated(
+                scenario, folder, bundle_in(folder / _OWN_BUNDLE), say,
+                logs=out is not None, recorded=recorded, settings=settings, air=air,
+            )  # fmt: skip
     _show_fleet_flight(flight, as_json, out)
 
 
@@ -715,10 +723,7 @@ def _table(title: str, statuses: "Statuses") -> "Table":
 def fly_points(
     scenarios: list[tuple[str, "Scenario"]], bundle_path: Path
 ) -> list["SimulatedFlight"]:
-    """Simulate the named scenarios with a progress bar for each, on stderr."""
-    from rich.console import Console
-    from rich.progress import Progress
-
+    """Simulate the named scenarios; how far each is goes to stderr."""
     from edge.drivers.registry import load_policy
     from edge.policy.bundle import load_bundle
     from edge.policy.family import verified
@@ -731,8 +736,7 @@ def fly_points(
             typer.echo(f"warning: {bundle_path}: {problem}: no robot takes off with it", err=True)
     gc.freeze()  # what is loaded by now stays: not to be looked through during the flight
     flights = []
-    console = Console(stderr=True)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
+    with progress_of("s flown:") as progress:
         for name, scenario in scenarios:
             task = progress.add_task(name, total=scenario.duration_s)
             flights.append(fly(scenario, bundle, partial(_show, progress, task)))

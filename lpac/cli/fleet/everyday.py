@@ -18,11 +18,10 @@ from lpac.cli.fleet.progress import (
     require_all,
     run_all,
     run_for_each,
-    working,
 )
 from lpac.cli.fleet.status import SHORT, flight, program
 from lpac.cli.options import DEFAULT_FLEET, AsJson, Fleet, Robots, open_fleet
-from lpac.cli.printing import BAD, GOOD, print_notes, print_table, styled
+from lpac.cli.printing import BAD, GOOD, print_notes, print_table, styled, working
 
 if TYPE_CHECKING:
     from rich.text import Text

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
-from lpac.cli.printing import BAD, FAINT, GOOD, new_table, plain, print_notes, styled
+from lpac.cli.printing import BAD, FAINT, GOOD, lines_of, new_table, plain, print_notes, styled
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -73,13 +73,6 @@ def run_for_each(
         else o
         for o in outcomes
     ]
-
-
-@contextmanager
-def working(text: str) -> Iterator[None]:
-    """Say on a terminal what is being done, as long as it takes."""
-    with _stderr().status(text):
-        yield
 
 
 def print_problems(outcomes: Sequence["Outcome[T]"]) -> None:
@@ -156,10 +149,20 @@ class _Progress:
         from rich.live import Live
 
         if not self._console.is_terminal:
-            yield
+            with lines_of(self._how_far):
+                yield
             return
         with Live(get_renderable=self._table, console=self._console, transient=True):
             yield
+
+    def _how_far(self) -> str:
+        """In one line, of those that are not done."""
+        shares = [
+            f"{row.name}  {row.step}" + ("" if row.share is None else f" {row.share:.0%}")
+            for row in list(self.rows.values())
+            if row.outcome is None
+        ]
+        return f"{time.monotonic() - self._began_s:6.1f} s  {'; '.join(shares)}"
 
     def _line(self, name: str, text: str) -> None:
         if not self._console.is_terminal:

@@ -4,8 +4,9 @@ import json
 import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +15,7 @@ import typer
 
 from lpac.cli.ground_requests import address, looking
 from lpac.cli.options import DEFAULT_FLEET, Fleet
-from lpac.cli.printing import BAD, FAINT, NOTABLE, styled
+from lpac.cli.printing import BAD, FAINT, NOTABLE, lines_of, styled
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
@@ -140,9 +141,29 @@ class _View:
         """The live part, as long as this context lasts and if there is a terminal."""
         self._start_live()
         try:
-            yield
+            # With JSON lines there is no live part on a terminal either.
+            with nullcontext() if self._live.is_started else lines_of(self._how_far):
+                yield
         finally:
             self._live.stop()
+
+    def _how_far(self) -> str:
+        """The step, and what the robots do, in one line."""
+        now_s = time.monotonic()
+        clock = self._clock(now_s)
+        states = Counter(
+            "not heard" if robot.status is None or not robot.fresh else robot.status.state.value
+            for robot in self.subscriber.snapshot.robots
+            if robot.name in self.robots
+        )
+        doing = ", ".join(f"{count} {state}" for state, count in states.items())
+        return f"{now_s - self._began_s:7.1f} s  {self._step or 'script'}: {clock}: {doing}"
+
+    def _clock(self, now_s: float) -> str:
+        passed_s = now_s - self._step_began_s
+        if self._at_most_s is None:
+            return f"{passed_s:.0f} s"
+        return f"{passed_s:.0f} s, {max(0.0, self._at_most_s - passed_s):.0f} s left"
 
     def _start_live(self) -> None:
         # It would take what is printed to stdout to itself.
@@ -156,10 +177,6 @@ class _View:
 
         from edge.messages.mission import FlightState
 
-        passed_s = time.monotonic() - self._step_began_s
-        clock = f"{passed_s:.0f} s"
-        if self._at_most_s is not None:
-            clock += f", {max(0.0, self._at_most_s - passed_s):.0f} s left"
         rows = Table.grid(padding=(0, 2, 0, 0))
         for robot in self.subscriber.snapshot.robots:
             if robot.name not in self.robots:
@@ -175,5 +192,5 @@ class _View:
                 styled("" if status.battery is None else f"{status.battery:.0%}", FAINT),
                 styled(status.reason.text, FAINT),
             )
-        first = Text(f"{self._step or 'script'}: {clock}", "bold")
+        first = Text(f"{self._step or 'script'}: {self._clock(time.monotonic())}", "bold")
         return Group(first, Text("Ctrl-C holds the fleet", "bold red"), rows)

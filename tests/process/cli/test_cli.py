@@ -34,7 +34,9 @@ def lpac(*arguments: object, cwd: Path = ROOT) -> subprocess.CompletedProcess[st
 def error_line(result: subprocess.CompletedProcess[str]) -> str:
     """The one line that a failed command leaves."""
     assert result.returncode != 0
-    (line,) = result.stderr.strip().splitlines()
+    *before, line = result.stderr.strip().splitlines()
+    # How far it was, where it took long.
+    assert all(re.match(r"[a-z ]+ \d+( of \d+)?\b|.* \d+ %", text) for text in before), before
     assert line.startswith("lpac: ")
     return line
 

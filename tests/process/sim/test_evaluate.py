@@ -15,6 +15,8 @@ import pytest
 from ray.cluster_utils import Cluster
 
 from edge.policy.bundle import load_bundle
+from lpac.analysis.statistics import VERDICT_RULE
+from lpac.cli.evaluate import _show as show_evaluation
 from lpac.cli.options import DEFAULT_BUNDLE
 from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
 from lpac.radio.records import RadioRecord, write_records
@@ -57,6 +59,22 @@ def test_it_tells_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:
     # A baseline says nothing that could be lost.
     assert lossy["results"][1] == prior and lossy["results"][0] != policy
     assert lost["results"][0]["final"]["mean"][0] > policy["final"]["mean"][0]
+
+
+def test_it_says_what_its_columns_are_and_how_many_worlds_would_tell(
+    evaluated: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = {**evaluated[1], "conditions": evaluated[1]["conditions"][:1]}
+    show_evaluation(plain, compared=False)
+    said = capsys.readouterr().out
+    for column in ("J / J(0)", "p90", "worst", "area", "vs clairvoyant", "vs best Lloyd"):
+        assert f"{column}: " in said
+    assert VERDICT_RULE in said and "not told apart" in said and "undecided" not in said
+    policy, prior, _ = plain["conditions"][0]["results"]
+    plain["conditions"] = [{**plain["conditions"][0], "compared": policy["against"][prior["name"]]}]
+    plain["methods"] = [plain["methods"][0], {"name": prior["name"], "bundles": []}]
+    show_evaluation(plain, compared=True)
+    assert "2 worlds are too few to tell: at least 6" in capsys.readouterr().out
 
 
 def test_it_draws_what_it_flew(evaluated: tuple[Path, dict[str, Any]]) -> None:

@@ -1,6 +1,7 @@
 """What a set of results says, and how surely."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from edge.core import F64
 from lpac.analysis.statistics import (
+    Interval95,
     at_most_share,
     bootstrap,
     compare,
@@ -18,6 +20,7 @@ from lpac.analysis.statistics import (
     performance_profile,
     ratio_of_means,
     share_below,
+    what_would_tell,
 )
 
 COSTS = st.just(0.0) | st.floats(0.01, 10.0)
@@ -134,6 +137,22 @@ def test_few_worlds_prove_nothing() -> None:
     a = np.full((1, 5), 0.2)
     assert compare(a, a + 0.1).better is None
     assert compare(np.full((1, 6), 0.2), np.full((1, 6), 0.3)).better == "a"
+
+
+def test_how_many_worlds_would_tell() -> None:
+    few = what_would_tell(Interval95(0.1, -0.5, 0.7), 2)
+    assert few == "2 worlds are too few to tell: at least 6 are needed, and 50 often are"
+    # Four times as many halve the interval, which then ends at 0.
+    some = what_would_tell(Interval95(0.1, -0.1, 0.3), 20)
+    assert some.endswith("if the difference is as it looks, about 80 would")
+    assert "no difference is seen" in what_would_tell(Interval95(0.0, -0.1, 0.1), 20)
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(0.0, 1.0, (1, 20)), rng.normal(0.2, 1.0, (1, 20))
+    undecided = compare(a, b)
+    assert undecided.better is None
+    enough = int(re.findall(r"about (\d+)", what_would_tell(undecided.difference, 20))[0])
+    repeats = enough // 20 + 1
+    assert compare(np.tile(a, repeats), np.tile(b, repeats)).better is not None
 
 
 def test_only_the_same_worlds_are_pairs() -> None:
