@@ -18,7 +18,7 @@ demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torc
 	.venv/bin/lpac demo --out out/demo
 
 fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly simulated PX4s: out/fly/flight.png
-	.venv/bin/lpac sim --vehicle mavlink --robots auto --seed 5 --duration 50 --out out/fly
+	.venv/bin/lpac sim --vehicle mavlink --seed 5 --duration 50 --out out/fly
 
 setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control, Foxglove
 

@@ -95,10 +95,9 @@ def _what_is_missing(error: ModuleNotFoundError, command: str | None) -> str:
     extra = next((extra for extra, its in _EXTRAS.items() if command in its), None)
     if package == "edge" or extra is None:
         raise error
-    return (
-        f"lpac: {package} is not installed here: `pip install 'lpac-edge[{extra}]'`, "
-        "or `make setup` in the repository"
-    )
+    from lpac.extras import install_command
+
+    return f"lpac: {package} is not installed here: `{install_command(extra)}`"
 
 
 app = typer.Typer(

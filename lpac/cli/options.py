@@ -77,7 +77,9 @@ def pool(ray: str | None) -> "Pool":
     try:
         from lpac.sim.cluster import over_ray
     except ModuleNotFoundError:
-        raise ValueError("--ray needs Ray: `pip install 'lpac-edge[ray]'`") from None
+        from lpac.extras import install_command
+
+        raise ValueError(f"--ray needs Ray: `{install_command('ray')}`") from None
     return over_ray(ray)
 
 

@@ -8,8 +8,7 @@ import shlex
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from functools import partial, wraps
 from pathlib import Path
@@ -18,21 +17,28 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.options import DEFAULT_BUNDLE, DEFAULT_SENSOR, Px4, Sensor, VehicleKind, check_px4
+from lpac.cli.options import (
+    DEFAULT_BUNDLE,
+    DEFAULT_SENSOR,
+    IN_REAL_TIME,
+    Px4,
+    Sensor,
+    VehicleKind,
+    check_px4,
+)
 from lpac.cli.printing import lines_of, progress_of
 from lpac.cli.radio import WifiFile, calibration, link_line, wifi_lines
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
-    from rich.table import Table
 
     from edge.core.frames import ModelScale
     from edge.core.world import Feature
+    from lpac.cli.live import FleetDisplay
     from lpac.sim.experiment import FlightMoment, Scenario, SimulatedFlight
     from lpac.sim.failure import Failure
     from lpac.sim.fleet.flight import FleetFlight
     from lpac.sim.fleet.layout import FleetScenario
-    from lpac.sim.fleet.listener import Statuses
     from lpac.sim.fleet.processes import Fleet
     from lpac.sim.fleet.robots import Settings
     from lpac.sim.ticks import Clocks
@@ -129,15 +135,15 @@ def sim(
         typer.Option(help="What decides where robots fly; lpac: the bundle's policy."),
     ] = Controller.LPAC,
     robots: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--robots",
             "-n",
             metavar="N|auto",
-            help=f"Number of robots; with mavlink and px4 also auto: as many, up to "
-            f"{DEFAULT_ROBOTS}, as this machine can handle.",
+            help=f"Number of robots; else {DEFAULT_ROBOTS}, and with mavlink and px4 auto: as "
+            f"many, up to {DEFAULT_ROBOTS}, as this machine can handle.",
         ),
-    ] = str(DEFAULT_ROBOTS),
+    ] = None,
     seed: Annotated[int, typer.Option(help="World, starts, clocks and losses follow from it.")] = 0,
     world: Annotated[
         Path | None, typer.Option(help="CoverageControl world file (.env) instead of a random one.")
@@ -270,9 +276,7 @@ def sim(
     from lpac.sim.experiment import FIELD_SCALE
 
     _require_options_of(context, vehicle, controller, world)
-    count = _robot_count(robots)
-    if count is None and vehicle in (VehicleKind.POINT, VehicleKind.SIMULATED):
-        raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
+    count = _robot_count(robots, vehicle)
     world_features = parse_world(_text(world), str(world)) if world else None
     _require_something_to_cover(world, world_features, features)
     clocks = _clocks(perception_hz, policy_hz, control_hz, synchronous=synchronous)
@@ -475,9 +479,13 @@ def _tell_of_features_outside(
         )
 
 
-def _robot_count(text: str) -> int | None:
+def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
     """None for auto."""
+    if text is None:
+        return None if vehicle in IN_REAL_TIME else DEFAULT_ROBOTS
     if text == "auto":
+        if vehicle not in IN_REAL_TIME:
+            raise ValueError(f"--robots auto does nothing with --vehicle {vehicle}")
         return None
     try:
         return int(text)
@@ -533,17 +541,23 @@ def _launch(
 
     `prepared` is called before anything starts; it tells how many robots this machine carries.
     """
+    from lpac.cli.live import FleetDisplay
     from lpac.sim.fleet.flight import fly
     from lpac.sim.fleet.processes import Fleet
 
     # Whoever stops this program means the fleet too.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere, _live() as (show, say):
+    with (
+        tempfile.TemporaryDirectory(prefix="lpac-sim-") as nowhere,
+        FleetDisplay(scenario.robots) as display,
+    ):
         folder = out or Path(nowhere)
         bundle = bundle_in(folder / _OWN_BUNDLE)
-        fleet = Fleet(scenario, folder, bundle, px4_build=px4, say=say, settings=settings)
+        fleet = Fleet(scenario, folder, bundle, px4_build=px4, say=display.say, settings=settings)
         fleet.carried = prepared()
-        flight = fly(fleet, say, lambda step: show(step, fleet.heard.statuses()))
+        flight = fly(
+            fleet, display.say, lambda step: display.show_or_say(step, fleet.heard.statuses())
+        )
     _show_fleet_flight(flight, as_json, out)
 
 
@@ -608,27 +622,28 @@ def _serve(
     settings: "Settings",
 ) -> None:
     """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
+    from lpac.cli.live import FleetDisplay
     from lpac.sim.fleet.processes import Fleet
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with _live() as (show, say):
+        with FleetDisplay(scenario.robots) as display:
             bundle = bundle_in(out / _OWN_BUNDLE)
-            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=say, settings=settings)
+            fleet = Fleet(scenario, out, bundle, px4_build=px4, say=display.say, settings=settings)
             fleet.carried = prepared()
             with fleet:
                 while not fleet.heard.wait_for(lambda s: len(s) == len(fleet.robots), 0.2):
                     fleet.require_running()
                     fleet.vehicles.require_running()
-                    show("programs start", fleet.heard.statuses())
+                    display.show_or_say("programs start", fleet.heard.statuses())
                 fleet.begin()
-                typer.echo(
+                display.print(
                     f"{len(fleet.robots)} robots run until Ctrl-C; in a second terminal:\n\n"
                     f"  export LPAC_FLEET={shlex.quote(str(out / fleet.fleet_toml.name))}\n"
                     "  lpac ground\n"
                 )
                 try:
-                    _watch_over(fleet, show, say)
+                    _watch_over(fleet, display)
                 finally:
                     # The robots' programs must be ended, whoever is in a hurry.
                     for number in (signal.SIGINT, signal.SIGTERM):
@@ -637,9 +652,7 @@ def _serve(
         typer.echo("ended")
 
 
-def _watch_over(
-    fleet: "Fleet", show: Callable[[str, "Statuses"], None], say: Callable[[str], None]
-) -> None:
+def _watch_over(fleet: "Fleet", display: "FleetDisplay") -> None:
     """Say once that this machine does not keep up, and of each robot that its program has ended.
 
     Raises FleetError if all have, VehicleError if a vehicle has ended.
@@ -653,71 +666,15 @@ def _watch_over(
             fleet.require_keeping_up()
         except OverloadError as error:
             if keeps_up:
-                say(str(error))
+                display.say(str(error))
             keeps_up = False
         for robot in [robot for robot in running if not robot.running]:
             running.remove(robot)
-            say(f"the program of {robot.name} has ended, {robot.ending()}")
-        show(f"fleet {fleet.name}", fleet.heard.statuses())
+            display.say(f"the program of {robot.name} has ended, {robot.ending()}")
+        display.show(f"fleet {fleet.name}", fleet.heard.statuses())
         fleet.forget()
         time.sleep(0.2)
     raise SimulatedFleetError("the programs of all robots have ended")
-
-
-@contextmanager
-def _live() -> Iterator[tuple[Callable[[str, "Statuses"], None], Callable[[str], None]]]:
-    """On stderr: a table of the robots, on a terminal only; and a way to say a line above it."""
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console(stderr=True, highlight=False)
-    began_s = time.monotonic()
-
-    def say(text: str) -> None:
-        console.print(f"{time.monotonic() - began_s:6.1f} s  {text}", markup=False)
-
-    if not console.is_terminal:
-        yield (lambda *_: None), say
-        return
-    with Live(console=console, auto_refresh=False, transient=True) as live:
-        shown_s = -1.0
-
-        def show(step: str, statuses: "Statuses") -> None:
-            nonlocal shown_s
-            now_s = time.monotonic() - began_s
-            if now_s - shown_s >= 0.5:
-                shown_s = now_s
-                live.update(_table(f"{now_s:.0f} s: {step}", statuses), refresh=True)
-
-        yield show, say
-
-
-def _table(title: str, statuses: "Statuses") -> "Table":
-    from rich.table import Table
-
-    from edge.messages.codes import texts
-
-    table = Table(title=title, title_justify="left")
-    for heading, style in (
-        ("robot", ""), ("state", "bold"), ("x", ""), ("y", ""), ("height", ""), ("m/s", ""),
-        ("hears", ""), ("battery", ""), ("", ""),
-    ):  # fmt: skip
-        justify: Literal["left", "right"] = "right" if heading else "left"
-        table.add_column(heading, style=style, justify=justify, no_wrap=True)
-    for robot, status in sorted(statuses.items()):
-        position_m = status.position_m or ()
-        speed_m_s = sum(v * v for v in (status.velocity_m_s or ())[:2]) ** 0.5
-        table.add_row(
-            f"r{robot}",
-            status.state.value,
-            *(f"{metres:.1f}" for metres in position_m),
-            *("" for _ in range(3 - len(position_m))),
-            f"{speed_m_s:.1f}",
-            str(len(status.neighbour_ages_s)),
-            "" if status.battery is None else f"{100.0 * status.battery:.0f} %",
-            texts(status.alarms if status.armed else status.failed_checks) or status.reason.text,
-        )
-    return table
 
 
 def fly_points(
@@ -791,7 +748,7 @@ def _starts(
             )
         starts_m.append((x_m, y_m))
     if robots is None:
-        raise ValueError(f"{path}: needs a number of robots, and --robots is auto")
+        raise ValueError(f"{path}: has {len(starts_m)} starts: add --robots {len(starts_m)}")
     if len(starts_m) != robots:
         raise ValueError(f"{path}: has {len(starts_m)} starts, and there are {robots} robots")
     return tuple(starts_m)

@@ -9,6 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from types import MappingProxyType
 from typing import Protocol
 
+from lpac.extras import install_command
+
 # No middleware at all: what the others are compared with.
 NOTHING = "nothing"
 
@@ -65,7 +67,7 @@ def _of_fast_dds() -> str | None:
     return told
 
 
-_BENCH = "pip install 'lpac-edge[bench]'"
+_BENCH = install_command("bench")
 MIDDLEWARES: Mapping[str, Middleware] = MappingProxyType(
     {
         "zenoh": Middleware(

@@ -58,9 +58,10 @@ ALLOWED = {
         "edge.core", "edge.messages", "edge.identity", "lpac.analysis", "lpac.radio",
     },
     "lpac.radio.heat_map": {"edge.core", "lpac.analysis", "lpac.radio"},
+    "lpac.extras": set(),
     "lpac.network": {
-        "edge.core", "edge.messages", "edge.drivers", "lpac.analysis", "lpac.radio",
-        "lpac.sim.ports", "lpac.sim.programs",
+        "edge.core", "edge.messages", "edge.drivers", "lpac.analysis", "lpac.extras",
+        "lpac.radio", "lpac.sim.ports", "lpac.sim.programs",
     },
     # Nothing of the simulators needs it.
     "lpac.sim.batch": {*_EDGE, "lpac.sim"},
@@ -73,9 +74,9 @@ ALLOWED = {
     },
     "lpac.paper": {*_EDGE, "lpac.analysis", "lpac.radio", "lpac.sim", "lpac.evaluate"},
     "lpac.cli": {
-        *_EDGE, "edge.robot.process", "export", "lpac.shipped", "lpac.analysis",
-        "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch", "lpac.evaluate", "lpac.train",
-        "lpac.ablate", "lpac.paper",
+        *_EDGE, "edge.robot.process", "export", "lpac.extras", "lpac.shipped",
+        "lpac.analysis", "lpac.ground", "lpac.radio", "lpac.sim", "lpac.sim.batch",
+        "lpac.evaluate", "lpac.train", "lpac.ablate", "lpac.paper",
         "lpac.fleet", "lpac.fleet.settings", "lpac.fleet.writer", "lpac.fleet.authority",
         "lpac.radio.heat_map", "lpac.network",
     },

@@ -20,6 +20,7 @@ import typer
 from edge.core.world import GaussianFeature, format_world, parse_world
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
 from lpac.cli.main import app
+from lpac.extras import install_command
 from tests.conftest import ROOT, SHIPPED
 
 
@@ -337,8 +338,7 @@ def test_what_is_not_installed_is_said_in_one_line() -> None:
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert error_line(result) == (
-        "lpac: torch is not installed here: `pip install 'lpac-edge[export]'`, "
-        "or `make setup` in the repository"
+        f"lpac: torch is not installed here: `{install_command('export')}`"
     )
 
 

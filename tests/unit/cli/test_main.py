@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from lpac.cli.apps import CommandList
 from lpac.cli.main import _EXTRAS, _what_is_missing, app
+from lpac.extras import install_command
 from tests.conftest import ROOT
 
 LISTED: Any = typer.main.get_command(app)
@@ -67,7 +68,7 @@ def test_an_error_of_the_program_is_no_missing_install() -> None:
         _missing("mcap", "robot")
     with pytest.raises(ModuleNotFoundError, match="edge"):
         _missing("edge.absent", "sim")
-    assert "'lpac-edge[ground]'" in _missing("aiohttp.web", "map")
+    assert install_command("ground") in _missing("aiohttp.web", "map")
 
 
 def _missing(module: str, command: str) -> str:

@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from lpac.cli.main import app
+from lpac.extras import install_command
 from lpac.network.figures import of_restarts, over_robots
 from lpac.network.measure import Plan
 from lpac.network.middleware import MIDDLEWARES, NOTHING
@@ -148,6 +149,6 @@ def test_a_middleware_that_is_not_installed_is_named_with_what_to_do(tmp_path: P
     result = CliRunner().invoke(app, ["bench", "network", "--out", str(tmp_path / "out")])
     assert isinstance(result.exception, ValueError)
     told = str(result.exception)
-    assert told.startswith("Cyclone DDS is not installed here: `pip install 'lpac-edge[bench]'`")
+    assert told.startswith(f"Cyclone DDS is not installed here: `{install_command('bench')}`")
     assert told.endswith("--middleware zenoh")
     assert not (tmp_path / "out").exists()

@@ -1,7 +1,9 @@
 """What is said of how many robots a machine carries."""
 
 import pytest
+from typer.testing import CliRunner
 
+from lpac.cli import sim as cli
 from lpac.cli.sim import _as_many_as_carried, _say_if_carried
 from lpac.sim.fleet import load
 from lpac.sim.fleet.processes import Backlog, OverloadError
@@ -23,6 +25,28 @@ def test_as_many_robots_fly_as_the_machine_carries(
     assert _as_many_as_carried(SHIPPED, "mavlink") == robots
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(f": flying {robots}")
+
+
+@pytest.mark.parametrize(
+    ("options", "robots"),
+    [
+        (("--vehicle", "mavlink"), 5),
+        (("--vehicle", "mavlink", "--no-script"), 5),
+        (("--vehicle", "mavlink", "--robots", "auto"), 5),
+        (("--vehicle", "px4", "--px4", "build"), 1),
+        (("--vehicle", "mavlink", "-n", "7"), 7),
+        (("--vehicle", "simulated"), 10),
+    ],
+)
+def test_programs_fly_as_many_as_the_machine_carries_unless_it_is_said_how_many(
+    monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], robots: int
+) -> None:
+    flown: list[int] = []
+    monkeypatch.setattr(load, "_units_per_s", lambda _: FIVE_FLEW)
+    for fly in ("_launch", "_serve", "_fly_on_clock"):
+        monkeypatch.setattr(cli, fly, lambda scenario, *_, **__: flown.append(scenario.robots))
+    result = CliRunner().invoke(cli.app, options)
+    assert (result.exit_code, flown) == (0, [robots]), result.output
 
 
 def test_who_asks_for_more_is_warned(
