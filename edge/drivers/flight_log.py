@@ -36,6 +36,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
@@ -378,7 +379,8 @@ class _Segment:
     """One file. Raises what the file system raises."""
 
     def __init__(self, path: Path, max_bytes: int, topics: Mapping[str, LoggedTopic]) -> None:
-        self._file = path.open("xb")
+        # Where a fleet flew is not for everybody who has a login.
+        self._file = open(path, "xb", opener=partial(os.open, mode=0o640))  # noqa: SIM115
         self._max_bytes = max_bytes
         self._topics = topics
         # The chunks are closed by `sync` alone.

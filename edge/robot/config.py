@@ -15,6 +15,7 @@ from typing import Literal
 from edge.core.address import (
     host_and_port,
     ipv4,
+    is_loopback,
     is_loopback_endpoint,
     require_endpoint,
     require_host,
@@ -96,23 +97,31 @@ class AutopilotConfig:
     """The vehicle: a `type` of `edge.drivers.registry`, and what that takes.
 
     `url` is where PX4's datagrams come in, e.g. udpin://127.0.0.1:14551; `system_id` which one it
-    is.
+    is. At another address whoever is on that network can pose as the vehicle: that must be said, by
+    `insecure`.
     """
 
     url: str
     system_id: int
     type: str = "px4"
+    insecure: bool = False
     options: dict[str, object] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         if self.type == "px4":
             require_url("url", self.url)
+            if not (self.insecure or is_loopback(self.url[len("udpin://") :].rpartition(":")[0])):
+                raise ValueError(
+                    f"url = {self.url!r}: whoever is on that network could pose as the vehicle: "
+                    "must be at 127.0.0.1; where PX4 is at the other end of a wire of its own, say "
+                    "insecure = true"
+                )
         require_system_id(self.system_id)
 
-    @property
-    def port(self) -> int:
-        """The UDP port of `url`."""
-        return int(self.url.rpartition(":")[2])
+
+def port_of(url: str) -> int:
+    """The UDP port of an URL that `require_url` accepts."""
+    return int(url.rpartition(":")[2])
 
 
 @dataclass(frozen=True, slots=True)

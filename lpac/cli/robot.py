@@ -97,6 +97,9 @@ def setup(
     url: Annotated[
         str, typer.Option(help="Where PX4's MAVLink comes in.")
     ] = "udpin://127.0.0.1:14551",
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Another address than 127.0.0.1, which others reach.")
+    ] = False,
     command_timeout: Annotated[
         float, typer.Option(help="Time after which a hung program's vehicle holds, s.")
     ] = 0.5,
@@ -111,13 +114,13 @@ def setup(
     from edge.drivers.px4.autopilot import MavsdkAutopilot
     from edge.drivers.px4.driver import vehicle_lock
     from edge.flight.failsafe import required
-    from edge.robot.config import AutopilotConfig
+    from edge.robot.config import AutopilotConfig, port_of
     from edge.robot.setup import set_up
 
     requirements = required(rc.value, ceiling, command_timeout)
-    port = AutopilotConfig(url, system_id).port
+    AutopilotConfig(url, system_id, insecure=insecure)
     show("error")
-    with vehicle_lock(port), MavsdkAutopilot(url) as autopilot:
+    with vehicle_lock(port_of(url)), MavsdkAutopilot(url) as autopilot:
         report = set_up(autopilot, autopilot, requirements, system_id, wait)
     if as_json:
         typer.echo(json.dumps(report._asdict(), indent=2))

@@ -21,6 +21,7 @@ from edge.flight.margins import Margin, places_apart
 from edge.robot.config import (
     AutopilotConfig,
     RobotConfig,
+    port_of,
     require_group,
     require_name,
     require_robot_id,
@@ -165,7 +166,7 @@ class RobotHost:
     @property
     def mavlink_port(self) -> int:
         """The UDP port of `mavlink_url`."""
-        return AutopilotConfig(self.mavlink_url, self.system_id).port
+        return port_of(self.mavlink_url)
 
 
 @dataclass(frozen=True, slots=True)
@@ -455,7 +456,7 @@ def _robot(name: str, mapping: object, shared: Mapping[str, Any], where: str) ->
     autopilot = from_mapping(
         AutopilotConfig,
         {
-            **shared.get("autopilot", {}),
+            **_merged(shared, table.robot).get("autopilot", {}),
             **({} if table.mavlink_url is None else {"url": table.mavlink_url}),
             "system_id": table.robot_id if table.system_id is None else table.system_id,
         },

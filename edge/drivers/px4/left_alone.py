@@ -36,12 +36,15 @@ def land_if_left(
     after_s: float,
     pipe: int | None = None,
     program: int | None = None,
+    *,
+    only_here: bool = False,
 ) -> bool:
     """Land the vehicle once it has hovered for `after_s`; True when there is nothing left to do.
 
     False as soon as `pipe` can be read. `udp` hears the vehicle: its datagrams are read here, and
     nobody else gets them, unless `program`, the process that hangs, takes them still: it is killed
-    if none comes. Mode OFFBOARD is PX4's to end: without setpoints it lands by itself.
+    if none comes. With `only_here` other computers' datagrams are nobody's. Mode OFFBOARD is PX4's
+    to end: without setpoints it lands by itself.
     """
     heard_s = since_s = time.monotonic()
     asked_s, hovered, sequence = -_AGAIN_S, False, 0
@@ -52,7 +55,7 @@ def land_if_left(
         now_s = time.monotonic()
         if pipe in readable:
             return False
-        for beat, sender in _waiting(udp):
+        for beat, sender in _waiting(udp, only_here=only_here):
             if beat.system_id != system_id:
                 continue
             if now_s - heard_s > _GAP_S:
@@ -79,11 +82,13 @@ def land_if_left(
                 udp.sendto(land_command(sequence, system_id, _COMPONENT), peer)
 
 
-def _waiting(udp: socket.socket) -> Iterator[tuple[Heartbeat, tuple[str, int]]]:
+def _waiting(udp: socket.socket, *, only_here: bool) -> Iterator[tuple[Heartbeat, tuple[str, int]]]:
     """The heartbeats that have come, and from where."""
     with suppress(OSError):
         while True:
             data, address = udp.recvfrom(_DATAGRAM_BYTES, socket.MSG_DONTWAIT)
+            if only_here and not address[0].startswith("127."):
+                continue
             if (beat := heartbeat(data)) is not None:
                 yield beat, (address[0], address[1])
 
@@ -105,7 +110,8 @@ def main() -> None:
     try:
         # Not as the program reads it: what the program refuses must not keep a vehicle in the air.
         config = tomllib.loads(Path(path).read_text("utf-8"))
-        port = int(config["autopilot"]["url"].rsplit(":", 1)[1])
+        host, port = config["autopilot"]["url"].rpartition("/")[2].rsplit(":", 1)
+        port = int(port)
         system_id = int(config["autopilot"]["system_id"])
         after_s = float(config.get("flight", {}).get("hover_land_s", _HOVER_LAND_S))
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -115,7 +121,7 @@ def main() -> None:
         # A program that is started again has the datagrams, since it asks for the port later.
         udp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         udp.bind(("0.0.0.0", port))
-        land_if_left(udp, system_id, after_s)
+        land_if_left(udp, system_id, after_s, only_here=host.startswith("127."))
 
 
 if __name__ == "__main__":

@@ -82,23 +82,29 @@ def armed(mavlink_port: int) -> bool:
 def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dict[str, Any]]:
     """The first heartbeat of an autopilot that comes to the UDP port of this host, None if none.
 
-    `sender` is the address and the port that it came from. Whoever has the port notices nothing.
+    `sender` is the address and the port that it came from; another computer's counts only if none
+    of this one's came in that time. Whoever has the port notices nothing.
     """
+    from_elsewhere = None
     kind = socket.SOCK_DGRAM  # IP packets, without the frames around them
     with contextlib.closing(socket.socket(socket.AF_PACKET, kind, socket.htons(_IP))) as packets:
         until_s = time.monotonic() + wait_s
         while True:
             left_s = until_s - time.monotonic()
             if left_s <= 0.0:
-                return None
+                return from_elsewhere
             packets.settimeout(left_s)
             try:
                 packet = packets.recv(65535)
             except socket.timeout:
-                return None
+                return from_elsewhere
             beat = heartbeat(_datagram(packet, port))
-            if beat is not None:
-                return dict(beat._asdict(), sender=_sender(packet))
+            if beat is None:
+                continue
+            found = dict(beat._asdict(), sender=_sender(packet))
+            if found["sender"][0].startswith("127."):
+                return found
+            from_elsewhere = from_elsewhere or found
 
 
 def _datagram(packet: bytes, port: int) -> bytes:

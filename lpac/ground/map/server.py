@@ -23,6 +23,7 @@ from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent
 from lpac.ground.alarms import Alarm, Before, alarms
 from lpac.ground.map.access import Access, reached_at
+from lpac.ground.map.connections import Connection, accepting
 from lpac.ground.map.view import (
     Json,
     Missions,
@@ -295,6 +296,8 @@ class LiveMap:
     async def _guard(
         self, request: web.Request, handler: Callable[[web.Request], Any]
     ) -> web.StreamResponse:
+        if isinstance(request.protocol, Connection):
+            request.protocol.asked()
         cookie = _cookie(request)
         query = request.query.get("token")
         refusal = self._access.refusal(
@@ -437,13 +440,16 @@ async def serving(
     live_map = LiveMap(fleet, access, operate=operate)
     runner = web.AppRunner(live_map.app(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
-    try:
+    assert runner.server is not None
+    async with contextlib.AsyncExitStack() as parts:
+        parts.push_async_callback(runner.cleanup)
         try:
-            await web.TCPSite(runner, host, port, ssl_context=tls).start()
+            own, own_port = await parts.enter_async_context(
+                accepting(runner.server, host, port, tls)
+            )
         except OSError as error:
             reason = error.strerror or error
             raise OSError(f"--host {host} --port {port}: cannot serve there: {reason}") from None
-        own, own_port, *_ = runner.addresses[0]
         names = [f"[{name}]" if ":" in name else name for name in reached_at(own)]
         query = "" if access.token is None else f"?token={access.token}"
         async with asyncio.TaskGroup() as group:
@@ -453,8 +459,8 @@ async def serving(
             finally:
                 for task in tasks:
                     task.cancel()
-    finally:
-        await runner.cleanup()
+                # Pages are told before their connections end.
+                await runner.shutdown()
 
 
 async def serve(

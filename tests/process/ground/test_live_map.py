@@ -3,12 +3,14 @@
 import asyncio
 import datetime
 import json
+import resource
+import socket
 import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import HTTPCookieProcessor, build_opener, urlopen
@@ -22,6 +24,7 @@ from edge.messages.mission import ON_GROUND
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.fleet.authority import AuthorityError, create_authority
 from lpac.fleet.web_certificate import web_certificate
+from lpac.ground.map import connections
 from lpac.ground.map.access import Access, reached_at
 from lpac.ground.map.server import Outbox, serving
 from lpac.ground.station.client import command, listen
@@ -117,6 +120,71 @@ def test_on_the_network_the_address_has_a_token(fleet: FlownFleet) -> None:
         assert name in reached_at("0.0.0.0") and name is not None and not is_loopback(name)
         asyncio.run(ask(address))
     assert reached_at("127.0.0.1") == ["127.0.0.1"]
+
+
+@pytest.mark.parametrize("with_tls", [False, True], ids=["http", "https"])
+def test_connections_that_ask_for_nothing_keep_no_page_from_opening(
+    tmp_path: Path, with_tls: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of many addresses, too; and they are closed in time."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    monkeypatch.setattr(connections, "HEAD_S", 1.0)
+    tls: ssl.SSLContext | None = None
+    scheme: Literal["http", "https"] = "http"
+    if with_tls:
+        files = web_certificate(
+            create_authority(tmp_path / "keys", "field"),
+            ["127.0.0.1"],
+            datetime.datetime.now(datetime.UTC),
+        )
+        tls, scheme = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH), "https"
+        tls.load_cert_chain(files.certificate, files.key)
+
+    async def connects(place: tuple[str, int], source: str) -> socket.socket:
+        idle = socket.socket()
+        idle.setblocking(False)
+        idle.bind((source, 0))
+        await asyncio.get_running_loop().sock_connect(idle, place)
+        return idle
+
+    async def ends(idle: socket.socket) -> None:
+        with suppress(ConnectionError):
+            assert await asyncio.get_running_loop().sock_recv(idle, 1) == b""
+
+    async def ask() -> None:
+        access = Access(local=True, token="correct-horse", scheme=scheme)
+        async with (
+            serving("nobody", host="127.0.0.1", port=0, access=access, operate=False, tls=tls) as (
+                address,
+            ),
+            aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session,
+        ):
+            parts = urlsplit(address)
+            assert parts.hostname is not None and parts.port is not None
+            place = parts.hostname, parts.port
+            idle = [await connects(place, "127.0.0.2") for _ in range(1200)]
+            # At once, since those of one address are so many at most.
+            async with asyncio.timeout(PATIENCE_S):
+                assert (await session.get(address, ssl=False)).status == 200
+                async with session.ws_connect(address.replace("/?", "/live?"), ssl=False) as page:
+                    assert (await page.receive_json())["kind"] == "hello"
+                    for host in range(3, 23):
+                        idle += [await connects(place, f"127.0.0.{host}") for _ in range(40)]
+                    async with aiohttp.ClientSession() as another:
+                        assert (await another.get(address, ssl=False)).status == 403
+                    await asyncio.gather(*map(ends, idle))
+                    # Who asked stays.
+                    await page.send_json({"select": None})
+                    assert not page.closed
+                assert (await session.get(address, ssl=False)).status == 200
+            for each in idle:
+                each.close()
+
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, limits[1]), limits[1]))
+    try:
+        asyncio.run(ask())
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
 def test_over_tls_browsers_know_the_fleets_authority(tmp_path: Path) -> None:

@@ -131,6 +131,12 @@ def test_arrays_come_back_bit_by_bit(
         assert message["value"] == value and at_s == time_s + 0.5
 
 
+def test_logs_are_not_for_everybody_with_a_login(tmp_path: Path) -> None:
+    with flight_log(tmp_path) as flown:
+        flown.record("policy", 1.0, {})
+    assert [path.stat().st_mode & 0o777 for path in tmp_path.glob("*.mcap")] == [0o640]
+
+
 def test_metadata_says_who_flew_what(tmp_path: Path) -> None:
     with flight_log(tmp_path):
         pass

@@ -142,6 +142,9 @@ def test_a_robot_gets_what_is_its_own(tmp_path: Path) -> None:
         '# mavlink_url = "udpin://127.0.0.1:14551"', 'mavlink_url = "udpin://10.0.0.1:9"'
     )
     text = text.replace('# address = "192.168.8.11"', 'address = "10.0.0.1"')
+    text = text.replace(
+        "[robots.r2]", "[robots.r1.robot.autopilot]\ninsecure = true\n\n[robots.r2]"
+    )
     config = load_fleet(fleet_file(tmp_path, text.replace("# zenoh_port = 7447", "zenoh_port = 7")))
     first, third = rendered(config, "r1", tmp_path), rendered(config, "r3", tmp_path)
     assert (first.fleet, first.robot_id, first.autopilot.system_id) == ("demo", 1, 1)
@@ -420,6 +423,11 @@ def test_a_drop_in_says_what_differs(tmp_path: Path) -> None:
             ["robots.r2: address = '192.168.8.11', zenoh_port = 7447: robot r1 has it too"],
         ),
         ('# mavlink_url = "udpin:', 'mavlink_url = "udp:', ["robots.r1: mavlink_url = 'udp:"]),
+        (
+            'url = "udpin://127.0.0.1:14551"  # where',
+            'url = "udpin://0.0.0.0:14551"  # where',
+            ["robots.r1: autopilot: url = 'udpin://0.0.0.0:14551'", "insecure = true"],
+        ),
         ('url = "udpin://127.0.0.1:14551"  # where', "#", ["robots.r1: autopilot: url is missing"]),
         ('# cpus = ""', 'cpus = "6-4"', ["robots.r1: cpus = '6-4'", "'4-6'"]),
         ('# cpus = ""', 'cpus = "4,"', ["robots.r1: cpus = '4,'"]),
