@@ -221,7 +221,7 @@ def _arming(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     else:
         for problem in inputs.failsafe_problems:
             yield FailedCheck(CheckCode.FAILSAFE_WRONG, f"autopilot's {problem}")
-    if not inputs.fence_uploaded:
+    if inputs.fence_changed or not inputs.fence_uploaded:
         yield FailedCheck(
             CheckCode.FENCE_NOT_UPLOADED,
             "somebody else changed or cleared the autopilot's fence: find out who, and wait until "

@@ -190,11 +190,11 @@ class Readiness:
 
     def _read(self) -> bool:
         """Whether everything is as it must be."""
-        # What others have changed is told once before it is set.
+        # What others have changed is told before it is set, and until the next look finds it so.
         sets = self._config.failsafe.parameters == "set" and self._parameter_problems != ()
         try:
             values = self._setup.read_parameters(PARAMETERS)
-            if sets and self._set_wrong(values):
+            if sets and self._set_wrong(values) and not self._right:
                 values = self._setup.read_parameters(PARAMETERS)
         except OSError as error:
             log.warning("PX4 parameters not read or set", error=str(error))
@@ -231,11 +231,12 @@ class Readiness:
         log.warning("PX4 parameter set", change=change, why=why)
 
     def _look_at_fence(self, now_s: float) -> None:
-        """What is no longer there is uploaded again a little later: the operator reads of it."""
+        """What others have changed is told before it is uploaded, and until the next look."""
         if self._uploaded is None:
             return
         try:
             if self._setup.has_fence():
+                self._fence_changed = False
                 return
         except OSError as error:
             log.warning("fence not read", error=str(error))
@@ -252,7 +253,7 @@ class Readiness:
         except OSError as error:
             log.warning("fence upload failed", error=str(error))
             return
-        self._uploaded, self._fence_changed = (origin, fence), False
+        self._uploaded = origin, fence
 
     def _send_fence(self, origin: Origin, fence: Fence) -> None:
         frame = origin.frame()

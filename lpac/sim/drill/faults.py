@@ -49,6 +49,7 @@ from lpac.sim.drill.injections import (
     EstimateFreezes,
     EstimateIsRight,
     EstimateJumpsOut,
+    FenceCleared,
     FenceWithout,
     GroundClockSteps,
     GroundDies,
@@ -158,6 +159,13 @@ def _once(*injections: object) -> tuple[Do, ...]:
     return tuple(Do(0.0, injection) for injection in injections)  # type: ignore[arg-type]
 
 
+# PX4 acts, by thresholds that preflight allows, before the robot does.
+_CRITICAL_FOR_PX4 = ParameterIs("BAT_LOW_THR", 0.5), ParameterIs("BAT_CRIT_THR", 0.4), Drain(0.38)
+# What another ground station does again and again, for as long as a takeoff may take.
+_EACH_SECOND = range(180)
+_BEYOND_PX4_FENCE_M = 8.0
+# Noticed after 3 s at most, and set back at once.
+_SET_BACK_S = 5.0
 _NOBODY = "nothing happens"
 _ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
 
@@ -578,7 +586,7 @@ _ENERGY_AND_AIR = (
     Fault(
         name="battery-critical-for-px4", what="a battery is critical for PX4, not for the robot",
         promise="PX4 holds, and then lands; the robot does not take it from PX4",
-        does=_once(ParameterIs("BAT_LOW_THR", 0.9), ParameterIs("BAT_CRIT_THR", 0.8), Drain(0.7)),
+        does=_once(*_CRITICAL_FOR_PX4),
         bounds=(MissionEnds(1.5), Lands(8.0), Down(8.0 + _LANDING_S), FliesOn(20.0)),
     ),
     Fault(
@@ -664,6 +672,49 @@ _PEOPLE = (
         promise="it is not fought for: it lands",
         does=_once(ModeIs(Px4Mode.LAND)),
         bounds=(Lands(0.5), StraightDown(3.0), Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="parameter-changed",
+        what="another ground station lets PX4 fly on without its program, which dies 5 s later",
+        promise="an alarm, and the robot has set it back: PX4 lands the vehicle",
+        does=(
+            *_once(
+                ParameterIs("COM_OBL_RC_ACT", 5), ParameterIs("COM_OF_LOSS_T", 30.0),
+                ParameterIs("GF_ACTION", 0),
+            ),
+            Do(_SET_BACK_S, ProgramDies(), mark="dies"),
+        ),
+        bounds=(
+            FliesOn(_SET_BACK_S, 0.9, "hit"), Lands(1.3, after="dies"),
+            Down(_SET_BACK_S + _LANDING_S), FliesOn(20.0),
+        ),
+    ),
+    Fault(
+        name="fence-cleared",
+        what="another ground station clears PX4's fence; 5 s later the robot is 3 m beyond it",
+        promise="an alarm, and the robot has uploaded it again: PX4 holds the vehicle",
+        does=(
+            *_once(FenceCleared()), Do(_SET_BACK_S, EstimateJumpsOut(_BEYOND_PX4_FENCE_M)),
+            # PX4 holds the place where it took itself to be.
+            Do(_SET_BACK_S + 10.0, EstimateIsRight()),
+        ),
+        beyond_fence_m=POSITION_ERROR_M + _BEYOND_PX4_FENCE_M,
+        bounds=(FliesOn(_SET_BACK_S, 0.9, "hit"), Holds(_SET_BACK_S + 1.5), FliesOn(20.0)),
+    ),
+    Fault(
+        name="parameter-changed-before",
+        what="another ground station sets a parameter of PX4 each second before takeoff",
+        promise="it does not take off",
+        phase="ready",
+        does=tuple(Do(at_s, ParameterIs("COM_OBL_RC_ACT", 5)) for at_s in _EACH_SECOND),
+        bounds=(StaysDown(), TakesOff("others")),
+    ),
+    Fault(
+        name="fence-cleared-before",
+        what="another ground station clears PX4's fence each second before takeoff",
+        promise="it does not take off",
+        phase="ready", does=tuple(Do(at_s, FenceCleared()) for at_s in _EACH_SECOND),
+        bounds=(StaysDown(), TakesOff("others")),
     ),
     Fault(
         name="remote-control-lost", what="a robot's remote control is lost, and rc_lost = alarm",
@@ -876,7 +927,7 @@ _PAIRS = (
         name="px4-lands-and-return", what="a battery is critical for PX4; the operator returns all",
         promise="PX4's failsafe comes before the return",
         does=(
-            *_once(ParameterIs("BAT_LOW_THR", 0.9), ParameterIs("BAT_CRIT_THR", 0.8), Drain(0.7)),
+            *_once(*_CRITICAL_FOR_PX4),
             Do(2.0, OperatorOrders("return"), "all"),
         ),
         bounds=(Lands(8.0), Down(8.0 + _LANDING_S), LandsAtPad(_AT_PAD_M, "others")),

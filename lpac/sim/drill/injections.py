@@ -223,8 +223,16 @@ class RemoteControl(PilotInjection):
 
 
 @dataclass(frozen=True, slots=True)
+class FenceCleared(VehicleInjection):
+    """Another ground station clears PX4's fence."""
+
+    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+        vehicle.fence = ()
+
+
+@dataclass(frozen=True, slots=True)
 class ParameterIs(VehicleInjection):
-    """One of PX4's own parameters has this value."""
+    """One of PX4's own parameters has this value, set by another ground station."""
 
     name: str
     value: float

@@ -17,6 +17,8 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from edge.robot.config import Rates, load_config
 from lpac.ground.procedure import Ground, NothingComesError, Procedure, Until
 from lpac.ground.station.client import GroundError
@@ -29,6 +31,7 @@ from lpac.sim.drill.injections import (
     BatteryIs,
     Do,
     Drain,
+    FenceCleared,
     FenceWithout,
     GroundDies,
     GroundStarts,
@@ -37,6 +40,7 @@ from lpac.sim.drill.injections import (
     LoseGps,
     OperatorOrders,
     OriginJumps,
+    ParameterIs,
     PilotInjection,
     ProgramDies,
     ProgramEnds,
@@ -50,6 +54,7 @@ from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import WORLD
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
+from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.sitl.build import Px4Build
 from lpac.sim.sitl.ground_station import RealVehicle, RealVehicles
@@ -63,8 +68,11 @@ _PROGRAMS = (
 # program that is as in the field hangs on demand.
 MAVLINK: tuple[type, ...] = (VehicleInjection, AutopilotSilent, *_PROGRAMS)
 # What a ground station or a pilot can do to a real one, and PX4's own simulator to its vehicle.
-PX4: tuple[type, ...] = (LoseGps, BatteryIs, OriginJumps, PilotInjection, *_PROGRAMS)
+PX4: tuple[type, ...] = (
+    LoseGps, BatteryIs, OriginJumps, ParameterIs, FenceCleared, PilotInjection, *_PROGRAMS,
+)  # fmt: skip
 
+_INT32, _REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
 # How long a command may take, each robot.
 _PATIENCE_S = 60.0
 # A vehicle steps every 0.02 s; after as long without a step somebody looks all the same.
@@ -406,6 +414,11 @@ class Px4Field(ProcessField):
                 vehicle.drain(remaining)
             case BatteryIs(remaining):
                 vehicle.change_battery(remaining)
+            case ParameterIs(name, value):
+                is_int = isinstance(PARAMETERS[name], int)
+                vehicle.set_parameter(name, value, _INT32 if is_int else _REAL32)
+            case FenceCleared():
+                vehicle.clear_fence()
             case OriginJumps(by_m):
                 vehicle.jump_estimator_origin(*by_m)
             case PilotInjection():

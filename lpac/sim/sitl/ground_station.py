@@ -164,6 +164,11 @@ class RealVehicle:
             raw = float(np.array([int(value)], np.int32).view(np.float32)[0])
         self._send(mavlink.MAVLink_param_set_message(self._system, 1, name.encode(), raw, kind))
 
+    def clear_fence(self) -> None:
+        """As another ground station does it."""
+        fence = mavlink.MAV_MISSION_TYPE_FENCE
+        self._send(mavlink.MAVLink_mission_clear_all_message(self._system, 1, fence))
+
     def _tell_of_battery(self, remaining: float) -> None:
         cell_v = _EMPTY_CELL_V + remaining * (_FULL_CELL_V - _EMPTY_CELL_V)
         self._send(

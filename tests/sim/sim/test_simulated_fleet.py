@@ -289,7 +289,7 @@ def test_a_vehicle_that_others_change_on_the_ground_is_not_ready_until_it_is_set
 
     assert fleet.ground.carry_out(_until(says_why, 3.0))
     assert not all_are_ready(fleet.ground.snapshot)
-    assert fleet.ground.carry_out(_until(all_are_ready, 6.0))
+    assert fleet.ground.carry_out(_until(all_are_ready, 10.0))
     assert as_preflight_found_it(fleet)
 
 
