@@ -21,8 +21,6 @@ _COARSE_CELLS = 128
 _CELLS_PER_ROBOT = 16**2
 # It ends when a step gains less than this share of the cost.
 _LEAST_GAIN = 1e-5
-# A robot that does not know where it is, is still where it was.
-_REMEMBERED_S = 2.0
 # Nobody flies there, and squares of more are not finite.
 _FURTHEST_M = 1e6
 
@@ -118,14 +116,13 @@ class Whereabouts:
     """Tells which robots' positions count for J; it remembers where they were."""
 
     def __init__(self) -> None:
-        # By name: when it was known, by the ground's clock, and (x, y).
-        self._last: dict[str, tuple[float, tuple[float, float]]] = {}
+        self._last: dict[str, tuple[float, float]] = {}
 
     def counted(self, snapshot: FleetSnapshot) -> dict[str, tuple[float, float]]:
         """The robots that count, by name: (x, y) in the mission frame, m. Pictures come in order.
 
-        Those in the air; while nobody is, all. Who does not know where it is counts in the air for
-        a moment with where it was, else not; who was not heard for a while never counts.
+        Those in the air; while nobody is, all. Who does not know where it is counts in the air
+        with where it was last, else not; who was not heard for a while never counts.
         """
         flying, known = {}, {}
         for robot in snapshot.robots:
@@ -134,10 +131,9 @@ class Whereabouts:
                 continue
             place_m = _position_m(status)
             if place_m is not None:
-                self._last[robot.name] = snapshot.unix_time_s, place_m
-            elif in_air(status) and robot.name in self._last:
-                known_at_s, last_m = self._last[robot.name]
-                place_m = last_m if snapshot.unix_time_s - known_at_s <= _REMEMBERED_S else None
+                self._last[robot.name] = place_m
+            elif in_air(status):
+                place_m = self._last.get(robot.name)
             if place_m is not None:
                 known[robot.name] = place_m
                 if in_air(status):

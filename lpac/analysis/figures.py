@@ -20,7 +20,7 @@ from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
 LLOYD = "Lloyd, knowing the whole world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
-_MOST_NAMES, _MOST_TICKS = 12, 8
+_MOST_NAMES, _MOST_TICKS, _MOST_STATES_IN_ROW = 12, 8, 7
 _LONGEST_IN_DISC = 2
 _HALO = [withStroke(linewidth=1.6, foreground="white")]
 
@@ -207,9 +207,10 @@ def states(flight: FlightRecord) -> Figure:
     with style.figure(WIDTH_IN, 0.9 + 0.2 * max(len(flight.robots), 3)) as figure:
         axes = figure.subplots()
         handles = _draw_states(axes, flight)
+        rows = -(-len(handles) // _MOST_STATES_IN_ROW)
         figure.legend(
-            handles=handles, loc="outside upper center", ncols=len(handles), handlelength=1.0,
-            handleheight=0.8,
+            handles=handles, loc="outside upper center", ncols=-(-len(handles) // rows),
+            handlelength=1.0, handleheight=0.8,
         )  # fmt: skip
         axes.set(xlabel="time (s)", xlim=(flight.from_s, flight.to_s))
         return figure

@@ -9,8 +9,9 @@ say the same of one flight, to the last digit. What the numbers mean:
 - **J**, the coverage cost, is taken at the record's `cost_time_s`: of a fleet's flight each second,
   and at the end. The mission's robots count that are in the air, as they say (`in_air`), where they
   took themselves to be: on the straight line between two positions that they said, no more than
-  `FRESH_S` apart, else, for that long, where they said last. **True J** counts the same robots
-  where their vehicles were. Both are normalised by the first of their own.
+  `FRESH_S` apart, else where they said last. Who is not heard for longer than that does not count;
+  who says that it flies, and not where, does: else the cost would jump. **True J** counts the same
+  robots where their vehicles were. Both are normalised by the first of their own.
 - The **least separation** is 3-D, of any two robots in the air; the **fence margin** the least
   horizontal distance inside the fence in the air. They are told of where the robots took themselves
   to be, from the mission's takeoff to its landing; and, where vehicles tell, of where all of these
@@ -78,10 +79,11 @@ class RobotRecord:
     flying: npt.NDArray[np.bool_]
     said: tuple[LoggedStatus, ...] = ()
 
-    def places_at(self, times_s: F64) -> F64:
+    def places_at(self, times_s: F64, *, remembered: bool = False) -> F64:
         """(len(times_s), 3): where it was in the air, m; NaN where it was not, or is not known.
 
-        Between two positions that it knew, no more than a moment apart, it is on the way.
+        Between two positions that it knew, no more than a moment apart, it is on the way. While it
+        knows none for longer it is, if that is to be `remembered`, at the last one.
         """
         known = np.isfinite(self.position_m[:, 0])
         if not known.any():
@@ -93,7 +95,9 @@ class RobotRecord:
         before = np.searchsorted(known_s, times_s, side="right") - 1
         after = np.minimum(before + 1, len(known_s) - 1)
         at = np.maximum(before, 0)
-        in_air &= (before >= 0) & (times_s - known_s[at] <= FRESH_S)
+        in_air &= before >= 0
+        if not remembered:
+            in_air &= times_s - known_s[at] <= FRESH_S
         span_s = known_s[after] - known_s[at]
         share = np.clip((times_s - known_s[at]) / np.maximum(span_s, 1e-9), 0.0, 1.0)
         share = np.where(span_s <= FRESH_S, share, 0.0)[:, None]
@@ -219,7 +223,9 @@ class FlightRecord:
         """When anybody counts for J, (C,); and where these are, (C, N, 2), m, NaN who does not."""
         if self.coverage is None or not len(self.cost_time_s):
             return np.zeros(0), np.zeros((0, len(self.robots), 2))
-        places_m = np.stack([r.places_at(self.cost_time_s)[:, :2] for r in self.robots], axis=1)
+        places_m = np.stack(
+            [r.places_at(self.cost_time_s, remembered=True)[:, :2] for r in self.robots], axis=1
+        )
         counts = np.isfinite(places_m[..., 0]).any(axis=1)
         return self.cost_time_s[counts], places_m[counts]
 

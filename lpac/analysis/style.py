@@ -84,7 +84,13 @@ _STYLE: dict[Any, Any] = {
 def figure(width_in: float, height_in: float) -> Iterator[Figure]:
     """A figure that is drawn, within this context, in this style."""
     with mpl.rc_context(_STYLE):
-        yield Figure(figsize=(width_in, height_in), layout="constrained")
+        drawn = Figure(figsize=(width_in, height_in), layout="constrained")
+        yield drawn
+        # Drawing lays out once more: only by then are axes of a fixed aspect, and what is beside
+        # them, in their places.
+        engine = drawn.get_layout_engine()
+        assert engine is not None
+        engine.execute(drawn)
 
 
 def save(drawn: Figure, path: Path) -> bytes:

@@ -176,13 +176,13 @@ def test_who_counts() -> None:
     assert counted(snapshot()) == {}
 
 
-def test_who_does_not_know_where_it_is_counts_for_a_moment() -> None:
+def test_who_does_not_know_where_it_is_counts_in_the_air_where_it_was() -> None:
     whereabouts = Whereabouts()
     here, nowhere = (S.HOLD, True, 0.1, 1.0), (S.HOLD, True, 0.1, None)
     other = (S.HOLD, True, 0.1, 5.0)
     whereabouts.counted(snapshot(here, other))
     assert whereabouts.counted(snapshot(nowhere, other, unix_time_s=1.9))["r0"] == (1.0, 2.0)
-    assert "r0" not in whereabouts.counted(snapshot(nowhere, other, unix_time_s=2.1))
+    assert whereabouts.counted(snapshot(nowhere, other, unix_time_s=60.0))["r0"] == (1.0, 2.0)
     whereabouts.counted(snapshot(here, other, unix_time_s=3.0))
     on_ground = (S.LANDED, False, 0.1, None)
     assert "r0" not in whereabouts.counted(snapshot(on_ground, other, unix_time_s=3.5))

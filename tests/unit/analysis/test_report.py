@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from typer.testing import CliRunner
 
 from edge.core.coverage import coverage_cost
@@ -25,6 +26,7 @@ from edge.messages.codes import ReasonCode
 from edge.messages.mission import FlightState, LoopStatus, Order, OrderResult, RobotStatus
 from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import load_bundle
+from lpac.analysis import figures
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.figures import overview
 from lpac.analysis.logs import read_logs
@@ -523,7 +525,7 @@ def test_a_trial_ends_when_all_have_landed_or_are_reset(
         assert lasted_s == pytest.approx(10.0 if flights == 2 else 40.0, abs=0.01)
 
 
-def test_a_position_that_is_unknown_for_a_moment_moves_no_cost(tmp_path: Path) -> None:
+def test_a_robot_that_does_not_know_where_it_is_counts_where_it_was(tmp_path: Path) -> None:
     writer = Writer((FIRST,))
 
     def change(status: RobotStatus, at_s: float) -> RobotStatus:
@@ -536,8 +538,62 @@ def test_a_position_that_is_unknown_for_a_moment_moves_no_cost(tmp_path: Path) -
     after_s = cost.cost_time_s
     expected = np.array([FIRST.cost(20.0 + at_s) for at_s in after_s])
     assert cost.cost[after_s < 6.0] == pytest.approx(expected[after_s < 6.0], rel=1e-3)
-    # Not for ever.
-    assert cost.cost[-1] > 1.01 * expected[-1]
+    # On the whole way it is where it was last, and the least distance is not told of that.
+    places_m = np.array([FIRST.place_m(robot, 30.0) for robot in range(3)])
+    places_m[1] = FIRST.place_m(1, 26.0)
+    assert cost.cost[-1] == pytest.approx(coverage_cost(IMPORTANCE, places_m * SCALE), rel=1e-3)
+    assert "r1" not in cost.places_at(10.0)
+
+
+def test_without_any_position_for_seconds_the_cost_does_not_jump(tmp_path: Path) -> None:
+    writer = Writer((FIRST,))
+
+    def change(status: RobotStatus, at_s: float) -> RobotStatus:
+        lost = status.robot_id != 2 and 22.0 < at_s < 27.5
+        return dataclasses.replace(status, position_m=None) if lost else status
+
+    writer.change = change
+    writer.ground(tmp_path)
+    trial = examined(tmp_path).trials[0]
+    assert len(trial.curve_time_s) == len(trial.cost_time_s)
+    after_s = trial.curve_time_s
+    # Robots 0 and 1 on their way, then where they were last.
+    in_between = (after_s > 2.0) & (after_s < 7.0)
+    for at_s, cost in zip(after_s[in_between], trial.cost[in_between], strict=True):
+        places_m = [FIRST.place_m(robot, 22.0 if robot < 2 else 20.0 + at_s) for robot in range(3)]
+        assert cost == pytest.approx(
+            coverage_cost(IMPORTANCE, np.array(places_m) * SCALE), rel=0.05
+        )
+
+
+def test_nothing_of_a_figure_is_cut(tmp_path: Path) -> None:
+    """Each state, an alarm and a restart: as many entries as a legend may have."""
+    writer = Writer((FIRST,))
+    flown = (S.ARMING, S.TAKEOFF, S.HOLD, S.RETURN, S.PILOT, S.FAULT, S.INIT)
+    states = dict(enumerate(flown, 2))
+
+    def change(status: RobotStatus, at_s: float) -> RobotStatus:
+        state = states.get(int(at_s) - 20, status.state) if status.robot_id == 1 else status.state
+        alarms = (reason("battery", ReasonCode.BATTERY_LOW),) if at_s > 25.0 else ()
+        nonce = 99 if status.robot_id == 2 and at_s >= 26.0 else status.boot_nonce
+        return dataclasses.replace(status, state=state, alarms=alarms, boot_nonce=nonce)
+
+    writer.change = change
+    writer.ground(tmp_path)
+    writer.robots(tmp_path)
+    [trial] = examined(tmp_path).trials
+    assert trial.messages is not None and trial.restarts
+    for figure in (
+        figures.states(trial), figures.start_and_end(trial), figures.overview(trial),
+        figures.costs([trial]), figures.snapshots(trial, (0.0, 3.0, 6.0, 10.0)),
+        figures.snapshots_and_costs({"a policy of some name": trial, "another": trial}),
+        figures.repeatability([trial, trial]), figures.messages(trial, trial.messages),
+        figures.loops(trial),
+    ):  # fmt: skip
+        save(figure, tmp_path / "figure")
+        pixels = imread(tmp_path / "figure.png")
+        edges = (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1])
+        assert all((edge == 1.0).all() for edge in edges), figure
 
 
 def nowhere(status: RobotStatus, _: float) -> RobotStatus:
