@@ -19,6 +19,7 @@ BENCHES = (
     "simulated",
     "closed_loop",
     "payloads",
+    "usual",
     "stolen_key",
     "flood",
     "hearing",

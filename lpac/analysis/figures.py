@@ -18,6 +18,9 @@ from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness, Messages, Ro
 from lpac.analysis.style import FAINT, GREY, INK, WIDTH_IN, tidy
 
 SNAPSHOTS = (0.0, 0.25, 0.5, 1.0)  # of a mission's duration
+# Beside a cost that rises by so much.
+_RISES = "It may rise at first: robots leave what\nthey cover, to see what nobody has seen."
+_RISE = 0.05
 LLOYD = "Lloyd, knowing the whole world"
 _MUCH_MS, _MUCH_LOSS = 200.0, 10.0
 _MOST_NAMES, _MOST_TICKS, _MOST_STATES_IN_ROW = 12, 8, 7
@@ -77,6 +80,8 @@ def draw_costs(axes: Axes, flights: Mapping[str, FlightRecord]) -> None:
     for index, (name, flight) in enumerate(flights.items()):
         _draw_cost(axes, flight, *style.CURVES[index % len(style.CURVES)], name)
     _frame_costs(axes, max(flight.duration_s for flight in flights.values()))
+    if any(map(_rises, flights.values())):
+        axes.text(1.02, 0.0, _RISES, transform=axes.transAxes, fontsize=7, va="bottom")
 
 
 def draw_states(axes: Axes, flight: FlightRecord) -> None:
@@ -134,7 +139,10 @@ def overview(flight: FlightRecord) -> Figure:
             )  # fmt: skip
         lower.set(ylabel=r"cost $J\,/\,J(0)$", ylim=(0.0, None))
         tidy(lower)
-        lower.set(xlabel="time since the mission began (s)", xlim=(flight.from_s, flight.to_s))
+        time_label = "time since the mission began (s)"
+        if _rises(flight):
+            time_label += f"\n{_RISES.replace('It', 'The cost')}"
+        lower.set(xlabel=time_label, xlim=(flight.from_s, flight.to_s))
         right.align_ylabels([upper, middle, lower])
         return figure
 
@@ -445,6 +453,11 @@ def _draw_cost(axes: Axes, flight: FlightRecord, colour: str, dashes: Any, name:
             flight.curve_time_s, flight.normalized, color=colour, ls=dashes, lw=1.3,
             label=f"{flight.normalized[-1]:.2f}  {name}",
         )  # fmt: skip
+
+
+def _rises(flight: FlightRecord) -> bool:
+    cost = flight.normalized
+    return bool((cost - np.minimum.accumulate(cost)).max(initial=0.0) > _RISE)
 
 
 def _draw_lloyd(axes: Axes, flight: FlightRecord, colour: str = style.LLOYD) -> None:

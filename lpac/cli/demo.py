@@ -23,6 +23,7 @@ def demo(
     """Ten robots over an unknown world for 60 s, beside the baselines; makes a figure."""
     from lpac.sim.experiment import Scenario
     from lpac.sim.report import write_demo
+    from lpac.sim.usual import judgement, usual_points
 
     out.mkdir(parents=True, exist_ok=True)
     scenarios = [
@@ -40,3 +41,10 @@ def demo(
     )
     typer.echo(f"coverage cost after 60 s over initial cost: {costs}")
     typer.echo(f"see {out / 'demo.png'}")
+    policy, clairvoyant = (flights[name] for name in (names[0], names[-1]))
+    usual = usual_points(policy.scenario, policy.bundle_id)
+    typer.echo(judgement(policy.cost[-1] / clairvoyant.cost[-1], usual))
+    typer.echo(
+        "next: `make fly`, or `lpac sim --vehicle mavlink --out out/fly`, flies whole robots; "
+        "`lpac sim --help`"
+    )

@@ -609,6 +609,11 @@ def _show_fleet_flight(flight: "FleetFlight", as_json: bool, out: Path | None) -
             logged = any(robot.logs for robot in flight.robots)
             logs = f"; the flight logs are in {out / 'robots'}" if logged else ""
             typer.echo(f"see {out / 'flight.png'}{logs}")
+            if logged:
+                typer.echo(
+                    f"next: `lpac report {shlex.quote(str(out))}` makes all figures and a page; "
+                    "with `lpac sim --vehicle mavlink --no-script` you command (docs/ground.md)"
+                )
     if flight.problem or not flight.all_landed:
         raise typer.Exit(1)
 

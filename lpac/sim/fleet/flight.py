@@ -31,6 +31,7 @@ from lpac.sim.fleet.scripted import CommandOutcome, ScriptedFlight
 from lpac.sim.fleet.vehicles import SimulatedVehicles, VehicleError
 from lpac.sim.sitl.build import Px4Build
 from lpac.sim.sitl.ground_station import RealVehicles
+from lpac.sim.usual import judgement, usual_whole
 
 _LOOPS = ("perception", "policy", "control")
 _IN_TIME = Backlog(0.0, 0.0)
@@ -506,6 +507,11 @@ def summary_lines(flight: FleetFlight) -> list[str]:
             f"the robots take themselves to be, {_shown(record.normalized_true[-1])} for "
             "where they are"
         )
+        ratio = record.true_cost[-1] / record.lloyd
+        if np.isfinite(ratio):
+            simulated = flight.vehicle != "px4"
+            usual = usual_whole(scenario, flight.bundle_id) if simulated else None
+            lines.append(judgement(ratio, usual))
     else:
         lines.append("the world has no importance anywhere, so that there was nothing to cover")
     least = record.true_separation
@@ -514,12 +520,8 @@ def summary_lines(flight: FleetFlight) -> list[str]:
             f"least true separation in the air: {least.distance_m:.2f} m, robots "
             f"{' and '.join(least.robots)} at {flight.since_start_s(least.time_s):.0f} s"
         )
-    margin_m, true_margin_m = record.fence_margin_m, record.true_fence_margin_m
-    crossed = "CROSSED" if margin_m < 0.0 else "not crossed"
-    lines.append(
-        f"fence {crossed}: {_shown(margin_m)} m inside at least as estimated, "
-        f"{_shown(true_margin_m)} m in truth"
-    )
+    position_error_m = scenario.budget.position_m
+    lines.append(_fence_line(record.fence_margin_m, record.true_fence_margin_m, position_error_m))
     lines.append(
         f"in the mission {100.0 * min(r.mission_share for r in robots):.0f} to "
         f"{100.0 * max(r.mission_share for r in robots):.0f} % of its time; restarts: {restarts}; "
@@ -543,6 +545,24 @@ def summary_lines(flight: FleetFlight) -> list[str]:
         )
     lines.append(f"{sum(len(robot.logs) for robot in robots)} flight logs")
     return lines
+
+
+def _fence_line(margin_m: float, true_margin_m: float, position_error_m: float) -> str:
+    """Robots keep the fence as they estimate their places, which may truly err by so much."""
+    estimated, true = (
+        "not known"
+        if not np.isfinite(m)
+        else f"{m:.2f} m inside"
+        if m >= 0.0
+        else f"{-m:.2f} m beyond it"
+        for m in (margin_m, true_margin_m)
+    )
+    said = f"at the nearest {estimated} by the robots' estimates, {true} in truth"
+    if margin_m < 0.0 or true_margin_m < -position_error_m:
+        return f"fence CROSSED: {said}"
+    if true_margin_m < 0.0:
+        said = f"{said}, within the {position_error_m:g} m by which estimates may err"
+    return f"fence kept: {said}"
 
 
 def _outcome(flight: FleetFlight) -> str:

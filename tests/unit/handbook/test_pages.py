@@ -44,6 +44,25 @@ def test_links_lead_somewhere(page: str) -> None:
             assert anchor in anchors(target), (page, link)
 
 
+def test_the_readmes_first_commands_exist_and_tests_are_among_them() -> None:
+    section = (ROOT / "README.md").read_text().partition("## Try it")[2].partition("## ")[0]
+    told = re.findall(r"^make (\w+)", section, re.M)
+    assert told == ["demo", "fly", "test", "help"]
+    assert set(told) <= set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
+
+
+def test_a_first_hour_needs_no_address_that_is_not_there() -> None:
+    """Of ours there is none to name; of PX4 there is."""
+    assert "git clone REPOSITORY" not in (ROOT / "docs" / "start.md").read_text()
+    steps = (ROOT / "docs" / "px4.md").read_text().partition("## A real PX4 on this machine")[2]
+    for step in (
+        "git clone --recursive --branch v1.17.0 https://github.com/PX4/PX4-Autopilot\n",
+        "bash Tools/setup/ubuntu.sh --no-nuttx",
+        "make px4_sitl\n",
+    ):
+        assert step in steps, step
+
+
 def test_the_readme_needs_no_page_that_is_made_from_code() -> None:
     """It is read in the repository, where these pages are not."""
     linked = {pages.target(link, "README.md") for link in pages.links(pages.page_text("README.md"))}

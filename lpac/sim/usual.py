@@ -1,0 +1,80 @@
+"""How flights of the shipped policy usually end: what a single flight is compared with.
+
+A flight's *ratio* is its coverage cost J at the end over what Lloyd's algorithm comes to that knows
+the whole world, from where the robots truly are. `usual.json` has the range of eight flights in
+ten; `python -m bench usual` flies them and writes it.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lpac.sim.experiment import Scenario
+from lpac.sim.fleet.layout import FleetScenario
+
+USUAL_JSON = Path(__file__).with_suffix(".json")
+# What was flown: points as `lpac demo` has them, and whole robots with errors of their receivers.
+POINTS, WHOLE = Scenario(), FleetScenario(duration_s=50.0)
+_SHARES = (0.1, 0.9)
+
+
+class Usual(NamedTuple):
+    """Of `flights` flights of so many robots, eight in ten ended with a ratio in this range."""
+
+    robots: int
+    flights: int
+    least: float
+    greatest: float
+
+    @classmethod
+    def of(cls, robots: int, ratios: Sequence[float]) -> "Usual":
+        least, greatest = np.quantile(ratios, _SHARES).round(2).tolist()
+        return cls(robots, len(ratios), least, greatest)
+
+
+def usual_points(scenario: Scenario, bundle_id: str) -> Usual | None:
+    """None if nothing like it was flown."""
+    if replace(scenario, seed=POINTS.seed) != POINTS:
+        return None
+    return _nearest("points", scenario.robots, bundle_id)
+
+
+def usual_whole(scenario: FleetScenario, bundle_id: str) -> Usual | None:
+    """Of the nearest number of robots that was flown; None if nothing like it was."""
+    alike = replace(
+        scenario, seed=WHOLE.seed, robots=WHOLE.robots, duration_s=WHOLE.duration_s,
+        secure=WHOLE.secure, transport=WHOLE.transport,
+    )  # fmt: skip
+    if alike != WHOLE or scenario.duration_s < WHOLE.duration_s:
+        return None
+    return _nearest("whole", scenario.robots, bundle_id)
+
+
+def _nearest(what: str, robots: int, bundle_id: str) -> Usual | None:
+    measured = json.loads(USUAL_JSON.read_text())
+    if measured["bundle_id"] != bundle_id:
+        return None
+    return min(
+        (Usual(*each) for each in measured[what]), key=lambda each: abs(each.robots - robots)
+    )
+
+
+def judgement(ratio: float, usual: Usual | None) -> str:
+    """Whether a flight with that ratio is good, for people."""
+    said = f"{ratio:.2f} times the cost of Lloyd's algorithm, which knows the whole world"
+    if usual is None:
+        return f"is that good? {said}"
+    verdict = "as usual"
+    if ratio < usual.least:
+        verdict = "better than usual"
+    elif ratio > usual.greatest:
+        verdict = "worse than usual"
+    robots = "1 robot" if usual.robots == 1 else f"{usual.robots} robots"
+    return (
+        f"is that good? {verdict}: {said}; 8 in 10 such flights of {robots}: "
+        f"{usual.least:.2f} to {usual.greatest:.2f} ({usual.flights} were flown)"
+    )
