@@ -101,8 +101,11 @@ class Readiness:
             self._forget()
         vehicle = self._vehicle.state()
         if not vehicle.connected:
-            self._forget()
-            self._uploaded, self._fence_changed = None, False
+            self._look_due_s = -math.inf
+            # What flew goes on, for all that is known.
+            if not vehicle.armed:
+                self._forget()
+                self._uploaded, self._fence_changed = None, False
             return
         # Nothing is set while it is not sure which vehicle answers.
         if vehicle.armed is None or vehicle.other_system_ids:

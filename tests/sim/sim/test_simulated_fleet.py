@@ -360,6 +360,17 @@ def test_who_flies_by_hand_may_change_what_he_likes() -> None:
     assert fleet.vehicles[0].vehicle.parameters["GF_ACTION"] == 0
 
 
+def test_what_was_found_right_is_still_watched_after_the_autopilot_was_silent() -> None:
+    fleet = in_mission()
+    fleet.vehicles[0].is_cut = True
+    fleet.ground.carry_out(_pass(4.0))
+    fleet.vehicles[0].is_cut = False
+    fleet.ground.carry_out(_pass(1.0))
+    gf_action_is(0)(fleet)
+    assert fleet.vehicles[0].vehicle.armed
+    assert fleet.ground.carry_out(_until(tells_of_the_change, 5.0))
+
+
 def tells_of_the_change(told: FleetSnapshot) -> bool:
     status = told.robots[0].status
     alarms = () if status is None else status.alarms
