@@ -24,7 +24,7 @@ lpac mission enable
 address=$(grep -o 'http://[^ ]*' "$out/map.log")
 nice python -m tests.process.ground.browser "$address" docs/map.png --wait 55 &
 page=$!
-lpac mission takeoff --interval 1
+lpac mission takeoff --yes --interval 1
 lpac mission start
 sleep 15
 nice lpac watch --screenshot "$out/watch.svg" --size 118x24

@@ -16,6 +16,7 @@ from lpac.cli.options import (
     Ray,
     VehicleKind,
     check_px4,
+    found,
     pool_for,
 )
 from lpac.cli.printing import BAD, GOOD, print_table, progress_of, styled
@@ -136,23 +137,24 @@ def evaluate(
     ] = _OUT,
 ) -> None:
     """Policies and baselines over many worlds: how well they cover, with confidence intervals."""
+    given = methods or [str(DEFAULT_BUNDLE)]
+    for path in (part for text in given for part in text.split(",") if "/" in part):
+        found(Path(path))
     from lpac.evaluate.evaluation import as_json as to_json
-    from lpac.evaluate.report import write_results
     from lpac.radio.modelled import ModelledRadio
     from lpac.sim.failure import LostRobots
 
     check_px4(vehicle, px4)
-    given = methods or [str(DEFAULT_BUNDLE)]
     if compare and len(given) != 2:
         raise ValueError(f"--compare needs two methods; {len(given)} given")
     if losses and transports:
         raise ValueError("--loss and --transport: the model itself says what is lost")
     lost_robots = [LostRobots.parse(text) for text in lost or []]
-    found = calibration(wifi, transport=bool(transports))
+    calibrated = calibration(wifi, transport=bool(transports))
     lossy: list[dict[str, Any]] = [
         *({"loss": loss} for loss in losses or []),
         *(
-            {"radio": ModelledRadio(transport_named(name), found.wifi)}
+            {"radio": ModelledRadio(transport_named(name), calibrated.wifi)}
             for name in dict.fromkeys(transports or [])
         ),
     ]
@@ -175,11 +177,14 @@ def evaluate(
     evaluation = _evaluation(
         given, world_set, worlds, duration, set_ups, changes, baselines, px4, transfer=transfer
     )
+    # What draws is slow to load, and a bundle that is missing is told by now.
+    from lpac.evaluate.report import write_results
+
     cores = pool_for(vehicle, ray)
     results = _fly(evaluation, cores, out)
     told = to_json(evaluation, results, compared=compare)
     told["test_set_opened"] = _opened(evaluation)
-    sources = {name: source._asdict() for name, source in found.sources.items()}
+    sources = {name: source._asdict() for name, source in calibrated.sources.items()}
     told["wifi_from"] = sources if transports else None
     write_results(told, results, out)
     _write_worst(evaluation, results, cores, out)
@@ -188,7 +193,7 @@ def evaluate(
         return
     _show(told, compared=compare)
     if transports:
-        typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(found)]))
+        typer.echo("\n".join(["what the model assumes of the Wi-Fi:", *wifi_lines(calibrated)]))
     typer.echo(f"\nsee {out}: evaluation.json, figures, and the worst worlds")
 
 

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from lpac.cli.apps import new_app
+from lpac.cli.options import found
 from lpac.cli.printing import working
 
 app = new_app()
@@ -14,11 +15,16 @@ app = new_app()
 @app.command()
 def export(
     checkpoint: Annotated[
-        Path, typer.Argument(help="LPAC state dict (.pt), or the authors' folder of tensors.")
+        Path,
+        typer.Argument(
+            callback=found, help="LPAC state dict (.pt), or the authors' folder of tensors."
+        ),
     ],
     params: Annotated[
         Path,
-        typer.Option(help="Our parameter file (TOML), or a coverage_control_params.toml."),
+        typer.Option(
+            callback=found, help="Our parameter file (TOML), or a coverage_control_params.toml."
+        ),
     ],
     output: Annotated[
         Path,
@@ -29,7 +35,9 @@ def export(
     ] = None,
     cnn: Annotated[
         Path | None,
-        typer.Option(help="State dict whose CNN is taken, such as for the authors' folder."),
+        typer.Option(
+            callback=found, help="State dict whose CNN is taken, such as for the authors' folder."
+        ),
     ] = None,
     force: Annotated[
         bool,

@@ -57,10 +57,18 @@ _EXTRAS = {
     "bench": ("bench",),
 }
 _INTERRUPTED = 130
+# What these have done is on the disk.
+_GO_ON = ("train", "ablate", "evaluate", "drill")
 
 
 class _Lpac(CommandList):
     """Knows its commands without loading them. A robot has, and lists, few of them."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        # Who mistypes one is told the nearest of these names.
+        names: dict[str, Any] = dict.fromkeys(_COMMANDS)
+        self.commands = names
 
     def list_commands(self, ctx: Any) -> list[str]:
         return [name for name in _COMMANDS if find_spec(f"lpac.cli.{name}") is not None]
@@ -81,7 +89,8 @@ class _Lpac(CommandList):
             # `python -m` dies of the signal, whatever is caught, if it came while a string was
             # executed, as named tuples do when they are imported. The next string forgets that.
             exec("")
-            typer.echo("lpac: interrupted", err=True)
+            then = ": the same command goes on" if ctx.invoked_subcommand in _GO_ON else ""
+            typer.echo(f"lpac: interrupted{then}", err=True)
             raise typer.Exit(_INTERRUPTED) from None
         except ModuleNotFoundError as error:
             sys.exit(_what_is_missing(error, ctx.invoked_subcommand))

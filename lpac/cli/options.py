@@ -102,6 +102,13 @@ def folder_lock(what: str, folder: Path) -> "ProcessLock":
     return ProcessLock(f"{what} in {last_part}")
 
 
+def found(path: Path | None) -> Path | None:
+    """A callback of options: what is missing is told before anything slow is loaded."""
+    if path is not None:
+        path.stat()
+    return path
+
+
 def user_at_host() -> str:
     """What this operator is called if nothing says otherwise. Raises ValueError."""
     try:

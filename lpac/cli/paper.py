@@ -19,6 +19,7 @@ from lpac.cli.options import (
     VehicleKind,
     check_px4,
     folder_lock,
+    found,
     pool,
     pool_for,
 )
@@ -65,8 +66,9 @@ Bundle = Annotated[Path, typer.Option(help="Policy bundle.")]
 FlownBundle = Annotated[
     Path | None,
     typer.Option(
+        callback=found,
         help="Policy bundle, the shipped one if not given; with --logs the one that flew, which "
-        "says what baselines see and how far robots hear."
+        "says what baselines see and how far robots hear.",
     ),
 ]
 Vehicle = Annotated[
@@ -74,7 +76,9 @@ Vehicle = Annotated[
 ]
 Logs = Annotated[
     Path | None,
-    typer.Option(help="Folder of flight logs, such as a field day's; nothing is flown."),
+    typer.Option(
+        callback=found, help="Folder of flight logs, such as a field day's; nothing is flown."
+    ),
 ]
 World = Annotated[
     int | None,

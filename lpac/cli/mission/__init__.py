@@ -1,5 +1,6 @@
 """`lpac mission`: command the fleet."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -319,14 +320,22 @@ def takeoff(
     abort_on_failure: Annotated[
         bool, typer.Option("--abort-on-failure", help="Nobody else takes off once one has failed.")
     ] = False,
+    yes: Yes = False,
     fleet: Fleet = DEFAULT_FLEET,
     robots: Robots = None,
     as_json: AsJson = False,
 ) -> None:
-    """Take off, the highest first; done when all hold at their heights."""
+    """Take off, the highest first; done when all hold at their heights.
+
+    Asks first at a terminal. A script, which has none, means it.
+    """
     from lpac.ground.station.protocol import Takeoff
 
     to = _named(names, fleet, robots)
+    who = ", ".join(to.robots) or f"all robots of fleet {to.fleet}"
+    confirm(
+        f"Start the motors of {who}, and take off?", "takeoff", yes=yes or not sys.stdin.isatty()
+    )
     ask(to, Takeoff(to.robots, interval, abort_on_failure), "takeoff", as_json=as_json)
 
 

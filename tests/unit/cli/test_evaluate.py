@@ -36,7 +36,7 @@ def test_options_that_cannot_be(options: dict[str, Any], text: str, tmp_path: Pa
 
 
 def test_bundles_that_cannot_fly(tmp_path: Path) -> None:
-    with pytest.raises(BundleError, match="nothing"):
+    with pytest.raises(FileNotFoundError, match="nothing"):
         evaluate(methods=[str(tmp_path / "nothing")], out=tmp_path)
     broken = tmp_path / "broken"
     shutil.copytree(SHIPPED, broken)

@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import re
+import sys
 import tomllib
 from typing import Any
 
@@ -61,6 +62,54 @@ def test_an_extra_that_people_are_told_to_install_exists(extra: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert project["optional-dependencies"][extra]
     assert set(_EXTRAS[extra]) <= set(LISTED.list_commands(None))
+
+
+def test_a_mistyped_command_is_told_the_nearest() -> None:
+    told = CliRunner().invoke(app, ["simm"])
+    assert told.exit_code == 2 and "Did you mean 'sim'?" in told.output
+    assert "Did you mean" not in CliRunner().invoke(app, ["xyzzy"]).output
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("train", "lpac: interrupted: the same command goes on"),
+        ("sim", "lpac: interrupted"),
+    ],
+)
+def test_ctrl_c_says_whether_the_same_command_goes_on(
+    command: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Module:
+        app = typer.Typer()
+
+        @staticmethod
+        @app.command()
+        def interrupted(file: str) -> None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("lpac.cli.main.importlib.import_module", lambda _: Module)
+    ended = CliRunner().invoke(app, [command, "file"])
+    assert ended.exit_code == 130 and ended.output.strip() == said
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["train", "missing"], ["ablate", "missing"], ["evaluate", "missing"],
+        ["export", "missing", "--params", "missing", "-o", "out"],
+        ["paper", "e1", "--logs", "missing"], ["paper", "e1", "--bundle", "missing"],
+    ],
+    ids=lambda command: " ".join(command[:2]),
+)  # fmt: skip
+def test_a_missing_file_is_told_before_what_is_slow_is_loaded(
+    command: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("torch", "lpac.evaluate.report", "lpac.evaluate.figures", "lpac.train.run"):
+        monkeypatch.setitem(sys.modules, module, None)
+    missing = CliRunner().invoke(app, command).exception
+    assert isinstance(missing, OSError | ValueError), missing
+    assert "missing" in str(missing)
 
 
 def test_an_error_of_the_program_is_no_missing_install() -> None:

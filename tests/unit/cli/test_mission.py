@@ -1,5 +1,7 @@
 """`lpac mission`, and what the ground says of its commands."""
 
+import io
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,6 +25,49 @@ from lpac.ground.station.protocol import (
     TakeCommand,
     Takeoff,
 )
+from tests.unit.cli.test_fleet import write_fleet
+
+
+class Terminal(io.StringIO):
+    """What a person types."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("typed", "options", "asked"),
+    [
+        (Terminal("n\n"), (), True),
+        (Terminal("y\n"), (), True),
+        (Terminal(""), ("--yes",), False),
+        (io.StringIO(""), (), False),
+    ],
+    ids=["no", "yes", "--yes", "script"],
+)
+def test_takeoff_asks_who_sits_at_a_terminal(
+    typed: io.StringIO,
+    options: tuple[str, ...],
+    asked: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    ordered: list[Request] = []
+    monkeypatch.setattr(
+        "lpac.cli.mission.ask", lambda to, request, *_, **__: ordered.append(request)
+    )
+    monkeypatch.setattr("sys.stdin", typed)
+    command: Any = typer.main.get_command(app)
+    arguments = ["takeoff", "--fleet", str(write_fleet(tmp_path, 22)), "--robots", "r1", *options]
+    if typed.getvalue() == "n\n":
+        with pytest.raises(ValueError, match="takeoff: nothing was done"):
+            command.main(arguments, standalone_mode=False)
+        assert not ordered
+    else:
+        command.main(arguments, standalone_mode=False)
+        assert ordered == [Takeoff(("r1",), 2.0)]
+    assert ("Start the motors of r1, and take off?" in capsys.readouterr().err) == asked
 
 
 @pytest.mark.parametrize(
