@@ -497,6 +497,23 @@ def _autopilot_silent_while_arming(f: _Flight) -> None:
     _silence(f, 4.0)
 
 
+def _position_silent(f: _Flight) -> None:
+    """Of what the vehicle says, positions alone are lost."""
+    f.fly()
+    vehicle = f.fleet.vehicles[0]
+    said = vehicle._said
+    vars(vehicle)["_said"] = lambda: [each for each in said() if each[0] != "LOCAL_POSITION_NED"]
+    f.run(3.0)
+    del vars(vehicle)["_said"]
+    f.run(1.0)
+
+
+def _disarmed_in_air(f: _Flight) -> None:
+    f.fly()
+    f.vehicle.disarm(force=True)
+    f.run(4.0)
+
+
 def _battery_not_told(f: _Flight) -> None:
     f.fly()
     f.vehicle.dead_sensors.add(SimulatedSensor.BATTERY)
@@ -594,6 +611,8 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "wind_over_the_fence": (_wind_over_the_fence, {}),
     "px4_fence": (_px4_fence, {}),
     "px4_lands": (_px4_lands, {}),
+    "position_silent": (_position_silent, {}),
+    "disarmed_in_air": (_disarmed_in_air, {}),
     "autopilot_silent": (partial(_autopilot_silent, duration_s=5.0), {}),
     "autopilot_silent_until_down": (partial(_autopilot_silent, duration_s=12.0), {}),
     "autopilot_silent_while_arming": (_autopilot_silent_while_arming, {}),

@@ -109,7 +109,8 @@ class VehicleState:
     since the vehicle was armed; the vehicle did not move when they did. Whether to trust them is
     for `position.judge` to say.
     `mode`, `armed` and `failsafe` (the autopilot acts on a failure by itself) come with its
-    heartbeat, once a second, last at `heartbeat_at_s`.
+    heartbeat, once a second, last at `heartbeat_at_s`. `fell` is whether it was disarmed, or
+    switched on anew, while it was in the air by its own word; until it is armed again.
     `origin` is the estimator's. `height_above_home_m` is above where the vehicle was armed, up
     positive. `battery` is the remaining share, 0 to 1, `voltage_v` the pack's. Both, `armable` and
     `remote_control` are None again once they were not heard for 2.5 s, and so is `thrust`, the
@@ -137,6 +138,7 @@ class VehicleState:
     armed: bool | None = None
     in_air: bool | None = None
     failsafe: bool | None = None
+    fell: bool = False
     heartbeat_at_s: float = float("-inf")
     battery: float | None = None
     voltage_v: float | None = None

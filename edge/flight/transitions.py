@@ -76,13 +76,22 @@ def _disarmed(t: Tick) -> str | None:
     return reason_if(t.inputs.vehicle.armed is False, "disarmed")
 
 
+def _fell(t: Tick) -> str | None:
+    vehicle, flight = t.inputs.vehicle, t.flight
+    known = flight.killed or flight.reason.code is _R.DISARMED_IN_AIR
+    return reason_if(vehicle.fell and not known, "disarmed in the air: it fell")
+
+
 def _link_lost(t: Tick) -> str | None:
     lost = not t.inputs.vehicle.connected and not t.silent
     return reason_if(lost, "the autopilot does not answer")
 
 
 def _disarmed_again(t: Tick) -> str | None:
-    return _disarmed(t) if t.heard_since_entry and not t.flight.killed else None
+    vehicle, flight = t.inputs.vehicle, t.flight
+    # Only with a position it is known whether the autopilot was switched on anew.
+    heard = min(vehicle.heartbeat_at_s, vehicle.position_at_s) > flight.since_s
+    return _disarmed(t) if heard and not vehicle.fell and not flight.killed else None
 
 
 def _armed_before(t: Tick) -> str | None:
@@ -296,6 +305,11 @@ def _at_slot(t: Tick) -> str | None:
     return reason_if(there and t.inputs.vehicle.in_air is True, f"at its height, {wanted_m:g} m")
 
 
+def _nothing_to_decide_by(t: Tick) -> str | None:
+    unknown = t.inputs.odometry is None and policy_stale(t) is not None
+    return reason_if(unknown, "no position comes from the autopilot")
+
+
 def _at_landing_point(t: Tick) -> str | None:
     odometry = t.inputs.odometry
     if odometry is None:
@@ -322,9 +336,12 @@ TRANSITIONS: tuple[Transition, ...] = (
                "the operator orders disarm, on the ground", _always("disarm ordered"),
                order="disarm", actions=(Action.DISARM,)),
     # What the vehicle does, whoever made it.
+    Transition((*AIRBORNE, _S.PILOT, _S.FAULT), _S.FAULT, _R.DISARMED_IN_AIR,
+               "the vehicle is disarmed in the air, or its autopilot starts anew there", _fell,
+               alarm=True),
     Transition((*AIRBORNE, _S.PILOT), _S.LANDED, _R.DISARMED, "the vehicle is disarmed", _disarmed),
-    Transition((_S.FAULT,), _S.INIT, _R.DISARMED, "the vehicle is disarmed, and was not killed",
-               _disarmed_again),
+    Transition((_S.FAULT,), _S.INIT, _R.DISARMED,
+               "the vehicle is disarmed, was not killed, and did not fall", _disarmed_again),
     Transition((*AIRBORNE, _S.PILOT), _S.FAULT, _R.AUTOPILOT_SILENT,
                "the autopilot does not answer", _link_lost, alarm=True),
     Transition((_S.IDLE, _S.PREFLIGHT, _S.LANDED), _S.INIT, _R.AUTOPILOT_SILENT,
@@ -404,6 +421,9 @@ TRANSITIONS: tuple[Transition, ...] = (
                "the battery is low, or just lasts for the way home", battery_low, alarm=True),
     Transition((_S.HOLD,), _S.RETURN, _R.BATTERY_LOW, "the same, and the ground commands nothing",
                _battery_low_in_hold, alarm=True),
+    Transition((_S.MISSION,), _S.HOLD, _R.AUTOPILOT_SILENT,
+               "the policy has no fresh answer since no position comes", _nothing_to_decide_by,
+               alarm=True),
     Transition((_S.MISSION,), _S.HOLD, _R.POLICY_STALE, "the policy has no fresh answer",
                policy_stale, alarm=True),
     # The way of a flight.

@@ -132,6 +132,7 @@ class ReasonCode(_Code):
     # The vehicle.
     DISARMED = "disarmed"
     AUTOPILOT_SILENT = "autopilot_silent"
+    DISARMED_IN_AIR = "disarmed_in_air"
     ARMED_BEFORE = "armed_before"
     ARMED_BY_OTHERS = "armed_by_others"
     PILOT = "pilot"

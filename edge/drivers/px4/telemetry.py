@@ -51,6 +51,8 @@ _FAILSAFE_LATE_S = 2.5
 # for every second between.
 _JUMP_M, _JUMP_M_S = 1.0, 1.0
 _ORIGIN_ANSWER_S = 0.5
+# Who lands says so for longer before it is disarmed: PX4 waits for COM_DISARM_LAND, 2 s.
+_LANDED_BEFORE_S = 0.3
 # After a longer silence, nobody knows what of a jump in height was motion.
 _HEIGHT_JUMP_WITHIN_S = 1.0
 
@@ -90,6 +92,10 @@ class Px4Telemetry:
         self._clock = _VehicleClock()
         self._twin = _TwinWatch()
         self._sys_status_at_s = self._thrust_at_s = -math.inf
+        # Since it was armed: when it last said that it is in the air, and first that it landed; and
+        # whether it had not said so by the time that it was disarmed.
+        self._in_air_at_s = self._landed_at_s = -math.inf
+        self._disarmed_aloft = False
         self._gps_time_us: int | None = None
         self._jump_at_s: float | None = None
         self._origin: GlobalOrigin | None = None
@@ -211,7 +217,14 @@ class Px4Telemetry:
             self._failsafe_at_s = now_s
         armed = bool(fields["base_mode"] & _SAFETY_ARMED)
         if armed and not self._heard.armed:
-            self._change(height_jumped_m=0.0)
+            self._in_air_at_s = self._landed_at_s = -math.inf
+            self._change(height_jumped_m=0.0, fell=False)
+        elif self._heard.armed and not armed:
+            landed = -math.inf < self._landed_at_s <= now_s - _LANDED_BEFORE_S
+            self._disarmed_aloft = self._in_air_at_s > -math.inf and not landed
+            # Within that time nobody comes down and is disarmed unheard.
+            lately = now_s - self._in_air_at_s < _CONNECTED_WITHIN_S
+            self._change(fell=self._disarmed_aloft and lately)
         self._change(
             mode=Mode(mode_name(fields["custom_mode"])),
             armed=armed,
@@ -281,9 +294,14 @@ class Px4Telemetry:
         # PX4 v1.14 tells none, which looks like 0.
         self._fence = fields.get("fence_id", 0), now_s
 
-    def _on_extended_sys_state(self, fields: Fields, _: float) -> None:
+    def _on_extended_sys_state(self, fields: Fields, now_s: float) -> None:
         state = fields["landed_state"]
-        self._change(in_air=state > _ON_GROUND if state else None)
+        in_air = state > _ON_GROUND if state else None
+        if in_air and self._heard.armed:
+            self._in_air_at_s, self._landed_at_s = now_s, -math.inf
+        elif in_air is False and self._landed_at_s == -math.inf:
+            self._landed_at_s = now_s
+        self._change(in_air=in_air)
 
     def _on_vfr_hud(self, fields: Fields, now_s: float) -> None:
         self._change(thrust=fields["throttle"] / 100.0)
@@ -302,7 +320,10 @@ class Px4Telemetry:
         velocity_m_s = _vector(fields, "vx", "vy", "vz")
         boot_s = fields["time_boot_ms"] / 1e3
         self._twin.vehicle_time(boot_s, now_s)
+        restarts = self._clock.restarts
         at_s = now_s - self._clock.hear(boot_s, now_s)
+        if self._clock.restarts > restarts and not self._heard.armed:
+            self._change(fell=self._disarmed_aloft)
         was_held_back = self._jump_at_s is not None
         if self._is_held_back(position_m, velocity_m_s, at_s, now_s):
             return

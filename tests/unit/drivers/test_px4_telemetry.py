@@ -243,6 +243,81 @@ def test_a_driver_that_died_takes_the_readiness() -> None:
 FLOWN_UNTIL_S = {"gps": 26.8, "sensors_die": 8.5, "kill": 30.0}
 
 
+class Said:
+    """What a vehicle says of its flight, from message to message."""
+
+    def __init__(self) -> None:
+        self.telemetry, self.now_s = Px4Telemetry(), 100.0
+
+    def heartbeat(self, *, armed: bool) -> None:
+        fields = {"autopilot": 12, "system_status": 4, "base_mode": armed << 7, "custom_mode": 0}
+        self.telemetry.hear("HEARTBEAT", fields, self.now_s)
+
+    def landed_state(self, *, in_air: bool) -> None:
+        self.telemetry.hear("EXTENDED_SYS_STATE", {"landed_state": 2 if in_air else 1}, self.now_s)
+
+    def position(self, boot_s: float) -> None:
+        fields = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
+        fields["time_boot_ms"] = round(1e3 * boot_s)
+        self.telemetry.hear("LOCAL_POSITION_NED", fields, self.now_s)
+
+    def fly(self) -> None:
+        self.heartbeat(armed=True)
+        self.landed_state(in_air=True)
+        self.position(self.now_s)
+
+    @property
+    def fell(self) -> bool:
+        return self.telemetry.state(self.now_s).fell
+
+
+def test_a_landing_is_told_before_the_motors_stop() -> None:
+    said = Said()
+    said.fly()
+    said.now_s += 1.0
+    said.landed_state(in_air=False)
+    said.now_s += 0.5
+    said.heartbeat(armed=False)
+    assert not said.fell
+
+
+@pytest.mark.parametrize("started_anew", [False, True])
+def test_what_is_disarmed_in_the_air_falls(started_anew: bool) -> None:
+    said = Said()
+    said.fly()
+    said.now_s += 1.5
+    if started_anew:
+        # Its first words come together.
+        said.landed_state(in_air=False)
+    said.heartbeat(armed=False)
+    assert said.fell
+    said.now_s += 10.0
+    said.heartbeat(armed=False)
+    assert said.fell
+    said.heartbeat(armed=True)
+    assert not said.fell
+
+
+@pytest.mark.parametrize("started_anew", [False, True])
+def test_what_became_of_a_flight_that_was_not_heard_is_told_by_the_vehicles_time(
+    started_anew: bool,
+) -> None:
+    said = Said()
+    said.fly()
+    said.now_s += 20.0
+    said.heartbeat(armed=False)
+    said.landed_state(in_air=False)
+    assert not said.fell
+    said.now_s += 3.0
+    said.position(5.0 if started_anew else said.now_s)
+    assert said.fell is started_anew
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_nothing_falls_in_a_recording(name: str) -> None:
+    assert not any(vehicle.fell for _, vehicle, _ in conclusions(name))
+
+
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_no_recording_has_a_false_loss(name: str) -> None:
     """A stall of the machine that recorded them makes a robot stop, but not land."""

@@ -141,6 +141,7 @@ class World:
         # What is heard of it.
         self.telemetry = True
         self.silent_from_s = math.inf
+        self.fell = False
         self.position_known = True
         self.accuracy_m = 0.9
         self.battery: float | None = 0.9
@@ -377,6 +378,7 @@ class World:
         return replace(
             self.heard,
             connected=silence_s < 2.5,
+            fell=self.fell,
             battery=self.battery,
             position_local_m=(0.0, 0.0, 0.0),
             position_at_s=min(self.now_s, self.silent_from_s),
@@ -1426,6 +1428,35 @@ def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
     world.armed = False
     world.telemetry = True
     world.until(FlightState.IDLE, 5.0)
+
+
+def test_a_vehicle_that_was_disarmed_in_the_air_has_not_landed(world: World) -> None:
+    world.fly()
+    world.armed, world.fell = False, True
+    world.until(FlightState.FAULT, 2.5)
+    assert world.why == (FlightState.FAULT, ReasonCode.DISARMED_IN_AIR)
+    world.run(5.0)
+    assert world.state() is FlightState.FAULT
+    assert world.flight.alarming
+
+
+def test_an_autopilot_that_answers_again_after_it_started_anew_in_the_air(world: World) -> None:
+    world.fly()
+    world.telemetry = False
+    world.until(FlightState.FAULT, 6.0)
+    world.armed, world.fell, world.telemetry = False, True, True
+    world.run(5.0)
+    assert world.why == (FlightState.FAULT, ReasonCode.DISARMED_IN_AIR)
+
+
+def test_without_positions_the_policy_is_not_to_blame(world: World) -> None:
+    world.fly()
+    world.silent_from_s = world.now_s
+    world.run(0.9)
+    assert world.state() is FlightState.MISSION
+    world.policy_m_s = None
+    world.tick()
+    assert world.why == (FlightState.HOLD, ReasonCode.AUTOPILOT_SILENT)
 
 
 def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
