@@ -39,7 +39,7 @@ def land_if_left(
     *,
     only_here: bool = False,
 ) -> bool:
-    """Land the vehicle once it has hovered for `after_s`; True when there is nothing left to do.
+    """Land the vehicle once it has hovered for `after_s`; True once it is down, or somebody's.
 
     False as soon as `pipe` can be read. `udp` hears the vehicle: its datagrams are read here, and
     nobody else gets them, unless `program`, the process that hangs, takes them still: it is killed
@@ -47,7 +47,8 @@ def land_if_left(
     to end: without setpoints it lands by itself.
     """
     heard_s = since_s = time.monotonic()
-    asked_s, hovered, sequence = -_AGAIN_S, False, 0
+    asked_s, sequence = -_AGAIN_S, 0
+    hovered = holds = False
     peer: tuple[str, int] | None = None
     while True:
         inputs = [udp.fileno()] if pipe is None else [udp.fileno(), pipe]
@@ -59,12 +60,13 @@ def land_if_left(
             if beat.system_id != system_id:
                 continue
             if now_s - heard_s > _GAP_S:
-                since_s, hovered = now_s, False
+                since_s, hovered, holds = now_s, False, False
             heard_s, peer = now_s, sender
-            if not beat.armed or beat.mode == "land":
-                return _end("it lands" if beat.armed else "it is disarmed")
-            if beat.mode == "hold":
-                hovered = True
+            if not beat.armed:
+                return _end("it is disarmed")
+            if beat.mode in ("hold", "land"):
+                # PX4 may go back to hold, and is asked again then.
+                hovered, holds = True, beat.mode == "hold"
             elif hovered or beat.mode != "offboard":
                 return _end(f"somebody has it: {beat.mode}")
         if program is not None and now_s - heard_s > _DEAF_S:
@@ -74,7 +76,7 @@ def land_if_left(
             program = None
         if now_s - heard_s > max(after_s, _GAP_S) + _FRESH_S:
             return _end("it is not heard")
-        due = hovered and now_s - since_s >= after_s and now_s - heard_s < _FRESH_S
+        due = holds and now_s - since_s >= after_s and now_s - heard_s < _FRESH_S
         if due and peer is not None and now_s - asked_s >= _AGAIN_S:
             say("nobody has taken the vehicle: land")
             asked_s, sequence = now_s, sequence + 1

@@ -257,6 +257,10 @@ def test_no_datagram_breaks_it(data: bytes) -> None:
         # PX4 ends it by itself.
         ((OFFBOARD,), False),
         ((LAND,), False),
+        # It does not go through with it.
+        ((LAND, HOLD), True),
+        ((HOLD, LAND, HOLD), True),
+        ((HOLD, LAND, POSITION, HOLD), False),
         ((HOLD, POSITION, HOLD), False),
         ((HOLD, OFFBOARD, HOLD), False),
         ((), False),
