@@ -64,8 +64,11 @@ def outside(t: Tick) -> str | None:
 
 
 def lands_beside(t: Tick) -> str | None:
-    beside_m = t.inputs.lands_beside_m
-    if beside_m is None:
+    beside_m, flight = t.inputs.lands_beside_m, t.flight
+    where_it_is = flight.state is FlightState.LAND and (
+        flight.reason.code is not ReasonCode.AT_LANDING_POINT
+    )
+    if beside_m is None or where_it_is or flight.state is FlightState.PILOT:
         return None
     away_m = math.dist(beside_m, t.robot.parameters.landing_point_m)
     return f"somebody stands or fell silent at its landing point: lands {away_m:.0f} m beside it"

@@ -427,10 +427,16 @@ class Px4Field(ProcessField):
                 raise TypeError(f"{injection} is not done to a real PX4")
 
     def vehicle_truths(self) -> tuple[VehicleTruth, ...]:
-        """By PX4's own logs, which are whole once it has ended. Raises VehicleError without one."""
+        """By PX4's own logs, which are whole once it has ended.
+
+        Raises VehicleError without one, or if a PX4 has not taken what a fault is done by.
+        """
         px4s, truths = self.fleet.vehicles, []
         assert isinstance(px4s, Px4Build)
-        for robot, _ in enumerate(self.vehicles):
+        for robot, vehicle in enumerate(self.vehicles):
+            if vehicle.unconfirmed:
+                names = ", ".join(vehicle.unconfirmed)
+                raise VehicleError(f"could not be flown: the PX4 of r{robot} did not take {names}")
             logged = px4s.logged_truth(robot)
             if not logged:
                 raise VehicleError(f"the PX4 of r{robot} has left no log of its flight")

@@ -280,6 +280,8 @@ class _Moment(NamedTuple):
         programs = [process_usage(os.getpid())]
         if ground.running:
             programs.append(process_usage(ground.pid))
+        if isinstance(fleet.vehicles, Px4Build):
+            programs += map(process_usage, fleet.vehicles.pids())
         return cls(
             time.monotonic(),
             tuple(robot.usage() for robot in fleet.robots),

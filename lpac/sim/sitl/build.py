@@ -274,11 +274,10 @@ class Px4Build:
             )  # fmt: skip
         return entries
 
-    def pid(self, number: int) -> int:
-        """The process of a PX4."""
-        process = self._instances[number].process
-        assert process is not None
-        return process.pid
+    def pids(self) -> list[int]:
+        """The processes of the PX4s that run."""
+        processes = [instance.process for instance in self._instances]
+        return [p.pid for p in processes if p is not None and p.poll() is None]
 
     def _track(self, instance: _Instance) -> TrueTrack:
         truth = read_truth(instance.logs(), self._world) if instance.clock else None

@@ -28,7 +28,7 @@ _PERIOD_S = 0.02
 _HEARTBEAT_PERIOD_S = 0.5
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 # PX4 misses a remote control after half a second, and takes a pilot's mode only with one.
-_STICKS_PERIOD_S, _MODE_AGAIN_S = 0.05, 0.3
+_STICKS_PERIOD_S, _MODE_AGAIN_S, _PARAMETERS_AGAIN_S = 0.05, 0.3, 0.5
 # Full sticks; PX4's own are curved, slack in the middle, and 10 m/s.
 _STICKS_M_S = 4.0
 _AS_THE_STICKS_SAY = {
@@ -51,6 +51,7 @@ _RATES_HZ = {
 }
 _HEARD = {
     *_RATES_HZ, mavlink.MAVLINK_MSG_ID_HEARTBEAT, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+    mavlink.MAVLINK_MSG_ID_PARAM_VALUE,
 }  # fmt: skip
 
 
@@ -72,6 +73,9 @@ class RealVehicle:
         self._ground_altitude_m = math.nan
         self._heartbeat_due_s = self._sticks_due_s = self._mode_due_s = 0.0
         self._heading_rad = 0.0
+        # What PX4 has not confirmed yet, by name: its bits as a real number, and its type.
+        self._asked: dict[str, tuple[float, int]] = {}
+        self._parameters_due_s = 0.0
         self._sticks_m_s: tuple[float, ...] = (0.0, 0.0, 0.0)
         self._pilots_mode: Px4Mode | None = None
         self._system = instance + 1
@@ -95,6 +99,11 @@ class RealVehicle:
         if heard and not self._rc_connected:
             self._calibrate()
         self._rc_connected = heard
+
+    @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """The parameters that PX4 was told, and has not confirmed yet."""
+        return tuple(self._asked)
 
     @property
     def landed(self) -> bool:
@@ -158,11 +167,12 @@ class RealVehicle:
         )  # fmt: skip
 
     def set_parameter(self, name: str, value: float, kind: int) -> None:
-        """Of PX4; an integer is sent by its bits."""
-        raw = value
+        """Of PX4, again until it confirms it; an integer is sent by its bits."""
+        raw = float(np.float32(value))
         if kind == mavlink.MAV_PARAM_TYPE_INT32:
             raw = float(np.array([int(value)], np.int32).view(np.float32)[0])
-        self._send(mavlink.MAVLink_param_set_message(self._system, 1, name.encode(), raw, kind))
+        self._asked[name] = raw, kind
+        self._parameters_due_s = 0.0
 
     def clear_fence(self) -> None:
         """As another ground station does it."""
@@ -215,8 +225,6 @@ class RealVehicle:
                 self._tell_of_battery(self._battery)
             # It does not listen from the first moment on.
             if not self.time_s:
-                if self._rc_connected:
-                    self._calibrate()
                 for message, rate_hz in _RATES_HZ.items():
                     self._command(
                         mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message, round(1e6 / rate_hz)
@@ -224,6 +232,12 @@ class RealVehicle:
         if self.rc_connected and now_s >= self._sticks_due_s:
             self._sticks_due_s = now_s + _STICKS_PERIOD_S
             self._send(self._sticks())
+        if now_s >= self._parameters_due_s:
+            self._parameters_due_s = now_s + _PARAMETERS_AGAIN_S
+            for name, (raw, kind) in self._asked.items():
+                self._send(
+                    mavlink.MAVLink_param_set_message(self._system, 1, name.encode(), raw, kind)
+                )
         if self._pilots_mode is self.mode:
             self._pilots_mode = None
         if self._pilots_mode is not None and now_s >= self._mode_due_s:
@@ -267,6 +281,12 @@ class RealVehicle:
             self.mode = _MODES.get(custom, self.mode)
         elif kind == "LOCAL_POSITION_NED":
             self._local_m = np.array([message.x, message.y, message.z])
+        elif kind == "PARAM_VALUE":
+            # By its bits: most integers are no numbers as real ones.
+            told = np.float32(message.param_value).tobytes()
+            asked = self._asked.get(message.param_id)
+            if asked is not None and np.float32(asked[0]).tobytes() == told:
+                del self._asked[message.param_id]
         elif kind == "GPS_GLOBAL_ORIGIN":
             latitude, longitude = message.latitude * 1e-7, message.longitude * 1e-7
             north_m, east_m = self._world.to_world(latitude, longitude)

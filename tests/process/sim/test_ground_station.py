@@ -122,3 +122,33 @@ def test_sticks_are_heard_first_and_the_mode_is_asked_for_until_it_is_so(
     now_s += 1.0
     vehicle.exchange()
     assert not only(px4.hear(), "RC_CHANNELS_OVERRIDE")
+
+
+def test_parameters_are_told_again_until_they_are_confirmed(
+    link: tuple[RealVehicle, Px4EndOfTheLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle, px4 = link
+    now_s = 100.0
+    monkeypatch.setattr("lpac.sim.sitl.ground_station.time.monotonic", lambda: now_s)
+    vehicle.set_parameter("SIM_GPS_USED", 0, mavlink.MAV_PARAM_TYPE_INT32)
+    vehicle.set_parameter("SIM_GPS_USED", 10, mavlink.MAV_PARAM_TYPE_INT32)
+    vehicle.set_parameter("MPC_VEL_MANUAL", 4.1, mavlink.MAV_PARAM_TYPE_REAL32)
+    vehicle.exchange()
+    told = {each.param_id: each for each in only(px4.hear(), "PARAM_SET")}
+    assert told.keys() == {"SIM_GPS_USED", "MPC_VEL_MANUAL"}
+    for number, kept in enumerate(told.values()):
+        # Of one it says what it had before, which is no confirmation.
+        value = kept.param_value if kept.param_id == "SIM_GPS_USED" else 10.0
+        name = kept.param_id.encode()
+        px4.say(mavlink.MAVLink_param_value_message(name, value, kept.param_type, 2, number))
+    vehicle.exchange()
+    assert vehicle.unconfirmed == ("MPC_VEL_MANUAL",)
+    now_s += 1.0
+    vehicle.exchange()
+    (again,) = only(px4.hear(), "PARAM_SET")
+    px4.say(mavlink.MAVLink_param_value_message(b"MPC_VEL_MANUAL", again.param_value, 9, 2, 1))
+    vehicle.exchange()
+    assert len(vehicle.unconfirmed) == 0
+    now_s += 1.0
+    vehicle.exchange()
+    assert only(px4.hear(), "PARAM_SET") == []

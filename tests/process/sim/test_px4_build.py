@@ -196,7 +196,7 @@ def test_a_px4_that_ends_is_told_with_its_last_words(build: Path, tmp_path: Path
         "echo 'ERROR [px4] Startup script returned with return value: 256'\nexit 3\n"
     )
     with Px4Build(build, [(0.0, 0.0)], WorldOrigin(), tmp_path / "px4") as vehicles:
-        os.waitid(os.P_PID, vehicles.pid(0), os.WEXITED | os.WNOWAIT)
+        os.waitid(os.P_PID, vehicles.pids()[0], os.WEXITED | os.WNOWAIT)
         with pytest.raises(VehicleError) as raised:
             vehicles.require_running()
     log = tmp_path / "px4" / "0" / "px4.log"
@@ -224,7 +224,7 @@ def test_a_px4_ends_with_whoever_started_it(build: Path, tmp_path: Path) -> None
         "from lpac.sim.px4.world import WorldOrigin; from lpac.sim.sitl.build import Px4Build\n"
         "build, out = map(Path, sys.argv[1:])\n"
         "with Px4Build(build, [(0.0, 0.0)], WorldOrigin(), out) as vehicles:\n"
-        "    print(vehicles.pid(0), flush=True); time.sleep(60.0)\n"
+        "    print(vehicles.pids()[0], flush=True); time.sleep(60.0)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", start, build, tmp_path / "px4"],

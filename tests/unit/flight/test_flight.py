@@ -142,6 +142,7 @@ class World:
         self.telemetry = True
         self.silent_from_s = math.inf
         self.fell = False
+        self.lands_beside_m: tuple[float, float] | None = None
         self.position_known = True
         self.accuracy_m = 0.9
         self.battery: float | None = 0.9
@@ -421,6 +422,7 @@ class World:
             order=self.order,
             uptime_s=self.now_s - self.started_s,
             energy=self.energy,
+            lands_beside_m=self.lands_beside_m,
             px4_change=self.px4_change,
         )
 
@@ -1375,6 +1377,18 @@ def test_what_was_not_told_while_the_program_stood_still_is_not_lost(world: Worl
     world.run(4.0)
     assert world.state() is FlightState.HOLD
     assert ReasonCode.REMOTE_CONTROL_LOST not in codes(world.tick())
+
+
+def test_who_lands_where_it_is_does_not_land_beside_its_landing_point(world: World) -> None:
+    world.fly()
+    world.lands_beside_m = (2.0, 1.0)
+    assert codes(world.tick()) == [ReasonCode.LANDS_BESIDE]
+    world.enable(safety_action="return")
+    world.until(FlightState.RETURN, 2.0)
+    assert ReasonCode.LANDS_BESIDE in codes(world.tick())
+    world.battery = 0.05
+    world.until(FlightState.LAND, 2.0)
+    assert ReasonCode.LANDS_BESIDE not in codes(world.tick())
 
 
 def test_a_battery_that_is_not_known_in_flight_is_an_alarm(world: World) -> None:
