@@ -36,7 +36,7 @@ def read_parameters(path: Path) -> PolicyParameters:
     Raises ConfigError that names the file and the line or key.
     """
     try:
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: {in_words(error)}") from None
     except UnicodeDecodeError:

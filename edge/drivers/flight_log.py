@@ -25,28 +25,36 @@ are objects, and numbers that are not finite are the strings "NaN", "Infinity" a
 import binascii
 import contextlib
 import dataclasses
+import errno
 import json
 import math
+import mmap
 import os
 import re
+import shutil
+import struct
 import time
 import types
 import typing
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from threading import Lock
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 import zstandard
-from mcap.exceptions import InvalidMagic
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
-from mcap.writer import CompressionType, Writer
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from edge.core.logger import log
 from edge.core.vehicle import VehicleState
@@ -57,11 +65,16 @@ _METADATA = "lpac"
 _MESSAGE_OVERHEAD_BYTES = 64
 _CHUNK_OVERHEAD_BYTES = 512
 _SMALLEST_SEGMENT_BYTES = 2**18
+# For what else has to be written; of a small disk a tenth.
+_LEAST_FREE_BYTES = 20_000_000
 # Whoever reads a log may not know who made it: nothing unpacks to more.
 _MOST_MESSAGE_BYTES = 2**22
 _MOST_CHUNK_BYTES = 2**24
 _MOST_UNPACKED_SHARE = 200.0
 _ARRAY_KINDS = "biuf"
+# How a chunk, and the metadata of `_METADATA`, begin: what reading goes on with behind damage.
+_ANCHOR = re.compile(rb"\x06.{36}\x04\0\0\0zstd|\x0c.{8}\x04\0\0\0lpac", re.DOTALL)
+_RECORD = struct.Struct("<BQ")
 
 
 class FlightLogError(ValueError):
@@ -120,8 +133,9 @@ def topic(name: str, kind: type, /, **more: Any) -> LoggedTopic:
 class FlightLog:
     """Writes what a robot, or the ground, records; implements `Recorder`.
 
-    `record` may be called from any thread, everything else from one thread at a time. After an
-    error of the file system it records nothing more and says so once; nothing raises in flight.
+    `record` may be called from any thread, everything else from one thread at a time. Nothing
+    raises in flight: after an error of the file system, or while the disk is full, it writes
+    nothing and says so once, and goes on in a new segment as soon as it can.
     """
 
     def __init__(
@@ -142,10 +156,11 @@ class FlightLog:
         Shorter periods compress worse.
 
         No segment grows beyond `max_segment_bytes`, and the oldest ones of this name are deleted
-        so that all of them, of earlier starts too, stay within `max_total_bytes`.
+        so that all of them, of earlier starts too, stay within `max_total_bytes`, and leave
+        20 MB of the disk free, or a tenth of a smaller one.
 
-        Raises ValueError if a limit is impossible. If nothing can be written there, `recording` is
-        False from the beginning.
+        Raises ValueError if a limit is impossible. While nothing can be written there, `recording`
+        is False.
         """
         if max_segment_bytes < _SMALLEST_SEGMENT_BYTES:
             raise ValueError(
@@ -174,13 +189,13 @@ class FlightLog:
         self._sync_period_s = sync_period_s
         self._synced_at_s = time.monotonic()
         self._segment: _Segment | None = None
+        self._stopped = self._closed = False
         with self._stopping_on_error():
-            directory.mkdir(parents=True, exist_ok=True)
             self._begin_segment()
 
     @property
     def recording(self) -> bool:
-        """Whether messages are kept. Any thread may ask."""
+        """Whether messages are written. Any thread may ask."""
         return self._segment is not None
 
     @property
@@ -190,7 +205,7 @@ class FlightLog:
 
     def record(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
         """Keep one message; nobody may change it, or the arrays in it, afterwards."""
-        if self._segment is None:
+        if self._closed:
             return
         with self._lock:
             self._dropped += len(self._queue) == self._queue.maxlen
@@ -204,8 +219,10 @@ class FlightLog:
         self._write_queue()
         if time.monotonic() - self._synced_at_s >= self._sync_period_s:
             with self._stopping_on_error():
-                if self._segment is not None:
-                    self._segment.sync()
+                if self._segment is None:
+                    self._begin_segment()
+                else:
+                    self._sync(self._segment)
             self._synced_at_s = time.monotonic()
             self._report_dropped()
 
@@ -215,25 +232,28 @@ class FlightLog:
         with self._stopping_on_error():
             if self._segment is not None:
                 self._segment.close()
-        self._segment = None
         self._report_dropped()
+        self._segment, self._closed = None, True
 
     def _write_queue(self) -> None:
+        if self._segment is None:
+            return  # What was recorded last waits until something can be written again.
         with self._lock:
             queue, self._queue = self._queue, deque(maxlen=self._queue.maxlen)
         with self._stopping_on_error():
-            for topic, unix_time_s, message in queue:
-                self._write(topic, unix_time_s, message)
+            while queue:
+                self._write(*queue.popleft())
+        with self._lock:
+            self._dropped += len(queue)
 
     def _write(self, topic: str, unix_time_s: float, message: Mapping[str, object]) -> None:
-        if self._segment is None:
-            return
+        assert self._segment is not None
         try:
             encoded = _encode(topic, self._topics[topic], unix_time_s, message)
         except Exception as error:  # whatever it is, the others are worth keeping
             self._refuse(topic, repr(error))
             return
-        if len(encoded.data) > min(self._max_segment_bytes // 2, _MOST_MESSAGE_BYTES):
+        if len(encoded.data) > min(self._segment.max_bytes // 2, _MOST_MESSAGE_BYTES):
             self._refuse(topic, f"its {len(encoded.data)} bytes are too many")
             return
         if not self._segment.has_room_for(encoded):
@@ -241,7 +261,17 @@ class FlightLog:
             self._begin_segment()
         self._segment.write(encoded)
         if self._segment.pending_bytes > _MOST_CHUNK_BYTES // 2:
-            self._segment.sync()
+            self._sync(self._segment)
+
+    def _sync(self, segment: "_Segment") -> None:
+        if self._spare_bytes() < segment.pending_bytes:
+            self._delete_oldest(segment.pending_bytes, but=segment.path)
+        if self._spare_bytes() < segment.pending_bytes:
+            # Its end fits into what is left free.
+            segment.close()
+            self._begin_segment()
+        else:
+            segment.sync()
 
     def _refuse(self, topic: str, why: str) -> None:
         with self._lock:
@@ -251,24 +281,53 @@ class FlightLog:
             log.error("flight log cannot hold a message", topic=topic, why=why)
 
     def _report_dropped(self) -> None:
-        if self._dropped > self._dropped_reported:
+        if self._dropped > self._dropped_reported and self.recording:
             log.warning("flight log dropped messages", dropped=self._dropped)
             self._dropped_reported = self._dropped
 
     def _begin_segment(self) -> None:
-        name = self._metadata.log_name
-        segments = _segments(self._directory, name)
-        number = max(segments, default=0) + 1
-        sizes = {path: path.stat().st_size for _, path in sorted(segments.items())}
+        self._segment = None
+        self._directory.mkdir(parents=True, exist_ok=True)
+        number = max(_segments(self._directory, self._metadata.log_name), default=0) + 1
+        path = self._directory / f"{self._metadata.log_name}-{number:04}.mcap"
+        self._delete_oldest(_SMALLEST_SEGMENT_BYTES, new_bytes=self._max_segment_bytes)
+        spare_bytes = self._spare_bytes()
+        if spare_bytes < _SMALLEST_SEGMENT_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        # Several on a small disk, so that the oldest one is not nearly all that there is.
+        max_bytes = min(self._max_segment_bytes, max(_SMALLEST_SEGMENT_BYTES, spare_bytes // 4))
+        segment = _Segment(path, max_bytes, self._topics)
+        try:
+            segment.begin(self._metadata)
+        except BaseException:
+            segment.abandon()
+            path.unlink(missing_ok=True)
+            raise
+        self._segment = segment
+        if self._stopped:
+            self._stopped = False
+            log.warning("flight log goes on", path=str(path))
+
+    def _delete_oldest(
+        self, wanted_bytes: int, new_bytes: int = 0, but: Path | None = None
+    ) -> None:
+        """Delete segments until `wanted_bytes` are to spare, and the total has `new_bytes` left."""
+        segments = _segments(self._directory, self._metadata.log_name)
+        sizes = {path: path.stat().st_size for _, path in sorted(segments.items()) if path != but}
+        # Where others fill the disk none is deleted in vain.
+        helps = self._spare_bytes() + sum(sizes.values()) >= wanted_bytes
         for path, size in list(sizes.items()):
-            if sum(sizes.values()) + self._max_segment_bytes <= self._max_total_bytes:
+            is_within = sum(sizes.values()) + new_bytes <= self._max_total_bytes
+            if is_within and not (helps and self._spare_bytes() < wanted_bytes):
                 break
             path.unlink(missing_ok=True)
             del sizes[path]
             log.info("flight log deleted its oldest segment", path=str(path), bytes=size)
-        path = self._directory / f"{name}-{number:04}.mcap"
-        self._segment = _Segment(path, self._max_segment_bytes, self._topics)
-        self._segment.begin(self._metadata)
+
+    def _spare_bytes(self) -> int:
+        """How much may be written before too little of the disk is free."""
+        disk = shutil.disk_usage(self._directory)
+        return disk.free - min(_LEAST_FREE_BYTES, disk.total // 10)
 
     @contextlib.contextmanager
     def _stopping_on_error(self) -> Iterator[None]:
@@ -278,8 +337,40 @@ class FlightLog:
             segment, self._segment = self._segment, None
             if segment is not None:
                 segment.abandon()
-            self._queue.clear()
-            log.error("flight log stopped", directory=str(self._directory), why=repr(error))
+                with self._lock:
+                    self._dropped += segment.pending_messages
+            if not self._stopped:
+                self._stopped = True
+                path = self._directory if segment is None else segment.path
+                log.error("flight log stopped", path=str(path), why=repr(error))
+
+
+class Missing(NamedTuple):
+    """What a log does not hold: all between two messages, or before the first, or after the last.
+
+    `damaged` is False where the log just ends: its program was killed, lost its power, or writes.
+    """
+
+    path: Path
+    since_unix_s: float | None
+    until_unix_s: float | None
+    damaged: bool
+
+    def __str__(self) -> str:
+        what = "is damaged" if self.damaged else "breaks off"
+        since_s, until_s = self.since_unix_s, self.until_unix_s
+        since = "its beginning" if since_s is None else _at(since_s)
+        until = "on" if until_s is None else f"to {_at(until_s)}"
+        return f"{self.path}: {what}: holds nothing from {since} {until}"
+
+
+def _at(unix_s: float) -> str:
+    return f"{datetime.fromtimestamp(unix_s).astimezone():%Y-%m-%d %H:%M:%S}"
+
+
+def warn(missing: Missing) -> None:
+    """Say it to people."""
+    log.warning(str(missing))
 
 
 def read_metadata(path: Path) -> FlightMetadata:
@@ -288,40 +379,81 @@ def read_metadata(path: Path) -> FlightMetadata:
     Raises FlightLogError if it is no MCAP file or was not written by a robot, OSError if it cannot
     be read.
     """
-    for record in _records(path):
-        if isinstance(record, Metadata) and record.name == _METADATA:
-            texts: dict[str, Any] = record.metadata
-            try:
-                numbers = {key: int(texts[key]) for key in ("robot_id", "boot_nonce")}
-                return FlightMetadata(**{**texts, **numbers})
-            except (KeyError, TypeError, ValueError):
-                break
+    for records in _whole(path, lambda _: None):
+        for record in records:
+            if isinstance(record, Metadata):
+                texts: dict[str, Any] = record.metadata
+                try:
+                    numbers = {key: int(texts[key]) for key in ("robot_id", "boot_nonce")}
+                    names = (field.name for field in dataclasses.fields(FlightMetadata))
+                    return FlightMetadata(**{**{name: texts[name] for name in names}, **numbers})
+                except (KeyError, TypeError, ValueError):
+                    break
     raise FlightLogError(f"{path}: was not written by a robot, or broke off before it began")
 
 
-def read(path: Path, *only: str) -> Iterator[tuple[str, float, dict[str, Any]]]:
+def read(
+    path: Path, *only: str, missing: Callable[[Missing], None] = warn
+) -> Iterator[tuple[str, float, dict[str, Any]]]:
     """(topic, Unix time in s, message) of one segment in the order of writing.
 
-    With topics in `only` all others are passed over, three times as fast. A segment that breaks
-    off, since the robot was killed or lost its power, is read up to there.
+    With topics in `only` all others are passed over, three times as fast. What is damaged is passed
+    over, and a segment that breaks off, since the robot was killed or lost its power, is read up to
+    there; `missing` is told of either.
     Arrays are numpy's again, bit by bit, and bytes are bytes.
 
     Raises FlightLogError if it is no flight log, OSError if it cannot be read.
     """
     topics: dict[int, str] = {}
-    for record in _records(path):
-        if isinstance(record, Channel):
-            topics[record.id] = record.topic
-        elif isinstance(record, Message):
-            topic = topics.get(record.channel_id)
-            if topic is None:
-                raise FlightLogError(f"{path}: holds a message of no topic")
-            if not only or topic in only:
-                try:
-                    message = _message(record.data)
-                except (TypeError, ValueError, RecursionError) as error:
-                    raise FlightLogError(f"{path}: {topic}: is not a log's: {error}") from None
-                yield topic, record.log_time / 10**9, message
+    for records in _whole(path, missing):
+        for record in records:
+            if isinstance(record, Metadata):
+                topics.update(_topics_in(record))
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                topic = topics[record.channel_id]
+                if not only or topic in only:
+                    try:
+                        message = _message(record.data)
+                    except (TypeError, ValueError, RecursionError) as error:
+                        raise FlightLogError(f"{path}: {topic}: is not a log's: {error}") from None
+                    yield topic, record.log_time / 10**9, message
+
+
+def repair(path: Path, out: Path, missing: Callable[[Missing], None] = warn) -> int:
+    """Write what is whole of a segment as a new one, which is not there yet; how many messages.
+
+    Raises FlightLogError if nothing is; OSError.
+    """
+    count = 0
+    with out.open("xb") as file:
+        writer = Writer(file, 2**20, CompressionType.ZSTD)
+        writer.start()
+        schemas, channels = {0: 0}, dict[int, int]()
+        for records in _whole(path, missing):
+            for record in records:
+                match record:
+                    case Metadata(name, texts):
+                        writer.add_metadata(name, texts)
+                        for number, topic in _topics_in(record).items():
+                            channels.setdefault(number, writer.register_channel(topic, "json", 0))
+                    case Schema(number, data, encoding, name):
+                        schemas[number] = writer.register_schema(name, encoding, data)
+                    case Channel():
+                        schema = schemas.get(record.schema_id, 0)
+                        channels[record.id] = writer.register_channel(record.topic, "json", schema)
+                    case Message():
+                        channel = channels[record.channel_id]
+                        writer.add_message(
+                            channel, record.log_time, record.data, record.publish_time
+                        )
+                        count += 1
+        writer.finish()  # type: ignore[no-untyped-call]
+    if not count:
+        out.unlink()
+        raise FlightLogError(f"{path}: holds no whole message")
+    return count
 
 
 def _message(data: bytes) -> dict[str, Any]:
@@ -333,39 +465,109 @@ def _message(data: bytes) -> dict[str, Any]:
     return message
 
 
-def _records(path: Path) -> Iterator[McapRecord]:
+def _whole(path: Path, missing: Callable[[Missing], None]) -> Iterator[list[McapRecord]]:
+    """What is as it was written: our metadata, and the records of each chunk, by their checksums.
+
+    Other records tell only whether something is missing between them.
+    """
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
-        # The zeros that a power loss can leave do not pass for data: their checksum is wrong.
-        limit = min(size, _MOST_CHUNK_BYTES)
-        reader = StreamReader(
-            file, emit_chunks=True, validate_crcs=True, record_size_limit=limit
-        ).records
-        while True:
-            try:
-                record = next(reader)
-                records = _unpacked(record) if isinstance(record, Chunk) else [record]
-            except StopIteration:
-                return
-            except FlightLogError as error:
-                raise FlightLogError(f"{path}: {error}") from None
-            except InvalidMagic:
-                if file.tell() > 8:
-                    return
-                raise FlightLogError(f"{path}: is not an MCAP file") from None
-            except Exception:  # mcap's own, struct's, zstandard's: all mean that it breaks off here
-                return
-            yield from records
+        if not size:
+            missing(Missing(path, None, None, damaged=False))
+            return
+        with mmap.mmap(file.fileno(), size, access=mmap.ACCESS_READ) as data:
+            yield from _whole_of(path, data, missing)
+
+
+def _whole_of(
+    path: Path, data: mmap.mmap, missing: Callable[[Missing], None]
+) -> Iterator[list[McapRecord]]:
+    begins = MCAP0_MAGIC.startswith(data[:8])
+    whole_to, at, since_s = len(MCAP0_MAGIC), 0, None
+    damaged, found = not begins, False
+    channels: set[int] = set()
+    while anchor := _ANCHOR.search(data, at):
+        try:
+            records, end = _records_at(data, anchor.start(), len(data))
+            for record in records:
+                if isinstance(record, Metadata):
+                    channels.update(_topics_in(record))
+                elif isinstance(record, Channel):
+                    channels.add(record.id)
+                elif isinstance(record, Message) and record.channel_id not in channels:
+                    raise ValueError("holds a message of no topic")
+        except Exception:  # mcap's own, struct's, zstandard's: all mean that it is damaged
+            at = anchor.start() + 1
+            continue
+        damaged = damaged or not _indexes(data, whole_to, anchor.start())
+        times_s = [record.log_time / 10**9 for record in records if isinstance(record, Message)]
+        if damaged and times_s:
+            missing(Missing(path, since_s, times_s[0], damaged=True))
+            damaged = False
+        since_s = times_s[-1] if times_s else since_s
+        yield records
+        whole_to = at = end
+        found = True
+    if not found and not begins:
+        raise FlightLogError(f"{path}: is not an MCAP file")
+    is_closed = data[-8:] == MCAP0_MAGIC and len(data) > 8
+    if damaged or not is_closed or not _ends(data, whole_to):
+        missing(Missing(path, since_s, None, damaged=damaged or is_closed))
+
+
+def _records_at(data: mmap.mmap, begin: int, size: int) -> tuple[list[McapRecord], int]:
+    """Raises an exception of any kind for what is not as it was written."""
+    opcode, length = _RECORD.unpack_from(data, begin)
+    end = begin + _RECORD.size + length
+    if end > size or length > _MOST_CHUNK_BYTES:
+        raise ValueError("breaks off")
+    stream = ReadDataStream(BytesIO(data[begin + _RECORD.size : end]))
+    record = (Chunk if opcode == Opcode.CHUNK else Metadata).read(stream)
+    if stream.count != length:  # Or it would pass for what is behind it, too.
+        raise ValueError("its length is not what it says")
+    if isinstance(record, Chunk):
+        return _unpacked(record), end
+    crc = record.metadata.get("crc")
+    if crc is not None and crc != _crc(record.metadata):
+        raise ValueError("its metadata are damaged")
+    return [record], end
+
+
+def _indexes(data: mmap.mmap, begin: int, end: int) -> bool:
+    """Whether nothing is between a chunk and the next but its messages' indexes."""
+    while begin + _RECORD.size + 6 <= end:
+        opcode, length = _RECORD.unpack_from(data, begin)
+        (entries,) = struct.unpack_from("<I", data, begin + _RECORD.size + 2)
+        is_header = opcode == Opcode.HEADER and begin == len(MCAP0_MAGIC)
+        if not is_header and (opcode != Opcode.MESSAGE_INDEX or length != 6 + entries):
+            return False
+        begin += _RECORD.size + length
+    return begin == end
+
+
+def _ends(data: mmap.mmap, begin: int) -> bool:
+    """Whether nothing more was recorded: the end of the data follows, behind the last indexes."""
+    end = data.find(_RECORD.pack(Opcode.DATA_END, 4), begin)
+    return end >= 0 and _indexes(data, begin, end)
+
+
+def _topics_in(metadata: Metadata) -> dict[int, str]:
+    """By the numbers of their channels; should the chunk that has them be damaged."""
+    return dict(enumerate(metadata.metadata.get("topics", "").split(), 1))
+
+
+def _crc(texts: Mapping[str, str]) -> str:
+    """Of all texts but the one that is called so."""
+    others = sorted(item for item in texts.items() if item[0] != "crc")
+    return f"{zlib.crc32(json.dumps(others).encode()):08x}"
 
 
 def _unpacked(chunk: Chunk) -> list[McapRecord]:
-    """Raises FlightLogError for what no flight log has, before it takes any memory."""
+    """Raises ValueError for what no flight log has, before it takes any memory."""
     packed, stated = chunk.data, chunk.uncompressed_size
-    if chunk.compression != "zstd":
-        raise FlightLogError(f"is compressed by {chunk.compression!r}, not by 'zstd'")
     size = max(stated, zstandard.frame_content_size(packed))
     if size > min(_MOST_CHUNK_BYTES, 2**16 + _MOST_UNPACKED_SHARE * len(packed)):
-        raise FlightLogError(f"{len(packed)} bytes of it would be {size}: is no flight log")
+        raise ValueError(f"{len(packed)} bytes of it would be {size}: is no flight log")
     return breakup_chunk(chunk, validate_crc=True)
 
 
@@ -379,10 +581,13 @@ class _Segment:
     """One file. Raises what the file system raises."""
 
     def __init__(self, path: Path, max_bytes: int, topics: Mapping[str, LoggedTopic]) -> None:
+        self.path = path
+        self.max_bytes = max_bytes
+        self.pending_messages = 0
         # Where a fleet flew is not for everybody who has a login.
         self._file = open(path, "xb", opener=partial(os.open, mode=0o640))  # noqa: SIM115
-        self._max_bytes = max_bytes
         self._topics = topics
+        self._texts: dict[str, str] | None = None  # to be repeated
         # The chunks are closed by `sync` alone.
         self._writer = Writer(self._file, max_bytes, CompressionType.ZSTD)
         self._channels: dict[str, int] = {}
@@ -390,13 +595,15 @@ class _Segment:
         # writes, which repeats them.
         self._pending_bytes = sum(len(topic.schema) + 128 for topic in topics.values())
         self._summary_bytes = self._pending_bytes + _CHUNK_OVERHEAD_BYTES
-        self._pending_messages = 0
 
     def begin(self, metadata: LogMetadata) -> None:
         """Write what comes before the first message."""
         self._writer.start()
         texts = {key: str(value) for key, value in dataclasses.asdict(metadata).items()}
-        self._writer.add_metadata(_METADATA, texts)
+        texts["topics"] = " ".join(self._topics)
+        self._texts = {"crc": _crc(texts), **texts}
+        self._writer.add_metadata(_METADATA, self._texts)
+        self._summary_bytes += sum(len(text.encode()) + 64 for text in self._texts.values())
         for name, topic in self._topics.items():
             schema = self._writer.register_schema(topic.schema_name, "jsonschema", topic.schema)
             self._channels[name] = self._writer.register_channel(name, "json", schema)
@@ -406,7 +613,7 @@ class _Segment:
         """Whether the file, closed after this message, is within its limit."""
         size = self._file.tell() + self._pending_bytes + self._summary_bytes
         size += len(encoded.data) + _MESSAGE_OVERHEAD_BYTES + _CHUNK_OVERHEAD_BYTES
-        return size <= self._max_bytes
+        return size <= self.max_bytes
 
     @property
     def pending_bytes(self) -> int:
@@ -416,18 +623,24 @@ class _Segment:
     def write(self, encoded: _Encoded) -> None:
         channel = self._channels[encoded.topic]
         self._writer.add_message(channel, encoded.time_ns, encoded.data, encoded.time_ns)
-        self._pending_messages += 1
+        self.pending_messages += 1
         self._pending_bytes += len(encoded.data) + _MESSAGE_OVERHEAD_BYTES
 
     def sync(self) -> None:
         """Close the chunk, and wait until the disk has it."""
         self._writer.flush()  # type: ignore[no-untyped-call]
+        if self.pending_messages and self._texts is not None:
+            # Once more: without them nobody knows what the rest of a damaged file is.
+            self._writer.add_metadata(_METADATA, self._texts)
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._texts = None
         os.fsync(self._file.fileno())
-        if self._pending_messages:
-            self._pending_messages = self._pending_bytes = 0
+        if self.pending_messages:
+            self.pending_messages = self._pending_bytes = 0
             self._summary_bytes += _CHUNK_OVERHEAD_BYTES
 
     def close(self) -> None:
+        self.sync()
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._file.flush()
         os.fsync(self._file.fileno())

@@ -7,14 +7,18 @@
 | `certificate.pem`, `authority.pem` | for TLS: of the same key, and of the authority |
 | `revoked` | the newest list of revoked keys that was heard |
 | `start` | the number of this start of the program, greater than those before |
+| `room` | nothing: kept for the files above, should the disk be full |
 | `group-keys` | of a robot: the fleet's keys of its multicast group, in hexadecimal digits, a line
 each, the newest first; for nobody else to read |
 """
 
 import base64
+import errno
 import os
 import re
+import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +34,9 @@ from edge.messages.topics import TlsFiles
 # The DER of an Ed25519 secret key (RFC 8410) is this, and then its seed.
 _PKCS8_HEAD = bytes.fromhex("302e020100300506032b657004220420")
 _MOST_BYTES = 2**16
-_REVOKED, _START = "revoked", "start"
+_REVOKED, _START, _ROOM = "revoked", "start", "room"
+_ROOM_BYTES = 2**16
+_DAY_MS = 86_400_000
 AUTHORITY_PEM, CERTIFICATE_PEM, KEY_PEM = "authority.pem", "certificate.pem", "key.pem"
 IDENTITY_JSON = "identity.json"
 GROUP_KEYS = "group-keys"
@@ -51,11 +57,14 @@ class Identity:
         """What the program speaks and hears through; `clock_s` is its monotonic clock."""
         return SignedGuard(self.membership, clock_s, self.revocations)
 
-    def exchange_revocations(self, guard: SignedGuard) -> None:
-        """Tell the guard of a newer list on the disk, and the disk of a newer one that it heard.
+    def keep(self, guard: SignedGuard) -> None:
+        """Write what the next start has to know, unless it is on the disk: this start, and the
+        revocations that the guard heard. Tell the guard of newer ones on the disk.
 
-        Raises OSError.
+        Raises OSError that names the file.
         """
+        if _last_start(self.folder / _START) < self.membership.start:
+            _write(self.folder / _START, f"{self.membership.start}\n".encode())
         kept = _revocations_in(self.folder)
         if kept == guard.revocations:
             return
@@ -68,13 +77,19 @@ def load_identity(folder: Path, *, fleet: str, unix_s: float) -> Identity:
     """The identity in the folder, for a new start of the program.
 
     Starts are numbered by the wall clock, ms, or by one more than the last where that is behind:
-    a computer whose clock was lost is heard all the same.
+    a computer whose clock was lost is heard all the same. A number that cannot be written is no
+    obstacle: `Identity.keep` says so, and tries again.
 
     Raises ConfigError, in one line, for what cannot be used; OSError.
     """
-    start = max(_last_start(folder / _START) + 1, int(unix_s * 1e3))
-    identity = _load(folder, fleet, start)
-    _write(folder / _START, f"{start}\n".encode())
+    last, unix_ms = _last_start(folder / _START), int(unix_s * 1e3)
+    identity = _load(folder, fleet, max(last + 1, unix_ms))
+    try:
+        _write(folder / _START, f"{identity.membership.start}\n".encode())
+    except OSError:
+        if unix_ms <= last:
+            # The next start would have the same number; this grows until the computer restarts.
+            return _load(folder, fleet, last + 1 + time.monotonic_ns() // 10**6 % _DAY_MS)
     return identity
 
 
@@ -217,9 +232,29 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _write(path: Path, data: bytes) -> None:
+    """Raises OSError that names the file."""
+    room = path.with_name(_ROOM)
+    try:
+        _replace(path, data)
+    except OSError as error:
+        if error.errno != errno.ENOSPC or not room.exists():
+            raise
+        room.unlink()
+        _replace(path, data)
+    if not room.exists():
+        with suppress(OSError):
+            _replace(room, bytes(_ROOM_BYTES))
+
+
+def _replace(path: Path, data: bytes) -> None:
     new = path.with_name(f"{path.name}-new")
-    with new.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
+    try:
+        with new.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            new.unlink()
+        raise OSError(error.errno, error.strerror, str(path)) from None

@@ -178,6 +178,7 @@ class ReasonCode(_Code):
     SAID_TWICE = "said_twice"
     WATCHDOG_ENDED = "watchdog_ended"
     LOG_NOT_WRITTEN = "log_not_written"
+    IDENTITY_NOT_WRITTEN = "identity_not_written"
     GROUND_NOT_UNDERSTOOD = "ground_not_understood"
 
 

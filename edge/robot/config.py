@@ -358,7 +358,7 @@ class RobotConfig:
 def load_config(path: Path) -> RobotConfig:
     """The configuration in the file, its paths made absolute. Raises ConfigError."""
     try:
-        mapping = tomllib.loads(path.read_text())
+        mapping = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -134,6 +134,8 @@ class RobotNode:
             bundle_id=self._bundle_id,
             bundle_problem=policy.problem,
         )
+        # Why its identity cannot be written, said by whoever writes it.
+        self.identity_problem = ""
         self._statuses = 0
         # What it said last of itself: there before anybody can have heard it.
         self.status: RobotStatus | None = None
@@ -467,7 +469,11 @@ class RobotNode:
             text = "the watchdog has ended: only PX4 notices if this program hangs"
             alarms.append(Reason(ReasonCode.WATCHDOG_ENDED, text))
         if not self._ports.recorder.recording:
-            alarms.append(Reason(ReasonCode.LOG_NOT_WRITTEN, "the flight log is not written"))
+            text = "the flight log is not written: make room on its disk, or mend that"
+            alarms.append(Reason(ReasonCode.LOG_NOT_WRITTEN, text))
+        if self.identity_problem:
+            text = f"what the next start has to know is not written: {self.identity_problem}"
+            alarms.append(Reason(ReasonCode.IDENTITY_NOT_WRITTEN, text))
         if self._inbox.ground_refusal:
             text = f"the ground is not understood: {self._inbox.ground_refusal}"
             alarms.append(Reason(ReasonCode.GROUND_NOT_UNDERSTOOD, text))

@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from edge.core.file_errors import in_words as file_error_in_words
 from edge.core.logger import log, show
 from edge.core.ports import OpenVehicle, SensorOver, Vehicle, VehicleSetting, Watchdog
 from edge.core.px4_version import in_words
@@ -143,7 +144,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
         keep_news = None
         if identity is not None and signed is not None:
-            keep_news = partial(identity.exchange_revocations, signed)
+            keep_news = partial(identity.keep, signed)
         program = _Program(config, node, vehicle, watchdog, recorder, link, keep_news)
         gc.collect()
         gc.freeze()  # What is loaded stays: a collection in flight need not look through it.
@@ -269,7 +270,9 @@ class _Program:
         if action is not None:
             log.warning("program ends in flight", vehicle=action)
             self._command(action)
-        for loop in (*others, *self._chores):
+        preflight, *chores = self._chores
+        preflight.stop(_JOIN_S)  # It may wait for the vehicle, whose closing ends that.
+        for loop in (*others, *chores):
             self._stop(loop)
 
     def _stop(self, loop: Loop) -> None:
@@ -291,7 +294,13 @@ class _Program:
     def _write_step(self) -> None:
         self._recorder.flush()
         if self._keep_news is not None:
-            self._keep_news()
+            try:
+                self._keep_news()
+                self._node.identity_problem = ""
+            except OSError as error:
+                if not self._node.identity_problem:
+                    log.error("identity not written", why=str(error))
+                self._node.identity_problem = f"{error.filename}: {file_error_in_words(error)}"
 
     def _status_step(self) -> None:
         now_s = time.monotonic()

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edge.core import F64
-from edge.drivers.flight_log import FlightLogError, read
+from edge.drivers.flight_log import FlightLogError, Missing, read
 
 _NOT_FINITE = frozenset({"NaN", "Infinity", "-Infinity"})
 
@@ -50,25 +50,29 @@ def log_arrays(path: Path | str, *topics: str) -> dict[str, dict[str, Columns]]:
     another. With `topics` only these are read, which is faster, and each log has all of them.
 
     Raises ValueError if there are no logs, FlightLogError, also a ValueError, for a file that is
-    none, OSError. In a folder such a file is left out, with a warning.
+    none, OSError. In a folder such a file is left out, with a warning. So is what a damaged log
+    does not hold.
     """
     path = Path(path)
     paths = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
     if not paths:
         raise ValueError(f"{path}: holds no logs (*.mcap)")
     found: dict[str, dict[str, _Messages]] = {}
+    gaps: list[Missing] = []
     for file in paths:
         numbered = re.fullmatch(r"(.+)-\d+", file.stem)
         log = found.setdefault(
             numbered[1] if numbered else file.stem, {topic: _Messages() for topic in topics}
         )
         try:
-            for topic, time_s, message in read(file, *topics):
+            for topic, time_s, message in read(file, *topics, missing=gaps.append):
                 log.setdefault(topic, _Messages()).add(time_s, message)
         except FlightLogError as error:
             if not path.is_dir():
                 raise
             warnings.warn(f"{error}: left out", stacklevel=2)
+    for gap in gaps:
+        warnings.warn(str(gap), stacklevel=2)
     return {
         name: {topic: messages.columns() for topic, messages in log.items()}
         for name, log in found.items()

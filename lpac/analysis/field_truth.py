@@ -88,7 +88,7 @@ def _in_mission(file: Measured, to_mission: ToMission) -> F64:
 
 
 def _of_table(path: Path) -> Measured:
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.reader(file)
         header = tuple(name.strip() for name in next(rows, []))
         if header not in (_MISSION, _GLOBAL):

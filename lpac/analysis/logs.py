@@ -21,7 +21,7 @@ import numpy as np
 from edge.core import F64
 from edge.core.fence import Fence
 from edge.core.schema import from_mapping
-from edge.drivers.flight_log import FlightLogError, FlightMetadata, read, read_metadata
+from edge.drivers.flight_log import FlightLogError, FlightMetadata, Missing, read, read_metadata
 from edge.messages.codes import Reason, Refusal
 from edge.messages.mission import FlightState, LoopStatus, Origin, RobotStatus
 from lpac.analysis.field_truth import (
@@ -217,7 +217,8 @@ class _LogReader:
             else:
                 take = partial(self._take_from_robot, self._begin_robot(path))
                 topics = ("status", "received", "order")
-            for topic, time_s, message in read(path, *topics):
+            gaps: list[Missing] = []
+            for topic, time_s, message in read(path, *topics, missing=gaps.append):
                 begun = True
                 try:
                     take(topic, time_s, message)
@@ -225,8 +226,9 @@ class _LogReader:
                     odd[topic].append(f"{error} is missing")
                 except (AttributeError, OverflowError, TypeError, ValueError) as error:
                     odd[topic].append(str(error))
-            if not begun:
-                notes.append(f"{path}: is empty, or breaks off at its beginning")
+            notes += map(str, gaps)
+            if not begun and not gaps:
+                notes.append(f"{path}: is empty")
         except FlightLogError as error:
             notes.append(f"{error}: left out")
         except ValueError as error:  # a message that is not even JSON

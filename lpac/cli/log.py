@@ -11,11 +11,6 @@ from lpac.cli.apps import new_app
 app = new_app("log", "What the robots' and the ground's logs hold.")
 
 
-@app.callback()
-def main() -> None:
-    """So that `trials` is a command of its own."""
-
-
 @app.command()
 def trials(
     folder: Annotated[Path, typer.Argument(help="Folder of logs (*.mcap).")],
@@ -25,28 +20,63 @@ def trials(
 
     In JSON: file -> trial -> [first, last] Unix time, s; the time without a trial is under "".
     """
-    from datetime import datetime
-
     from edge.drivers.flight_log import FlightLogError, read
 
-    found: dict[str, dict[str, tuple[float, float]]] = {}
+    # Robots' clocks may be set meanwhile, and never go back in uptime: file -> (program, trial) ->
+    # first and last uptime, and when each program began, by its clock as it was at last.
+    uptimes: dict[Path, dict[tuple[str, str, str], tuple[float, float]]] = {}
+    began_s: dict[tuple[str, str], float] = {}
     for path in sorted(folder.rglob("*.mcap")):
-        times: dict[str, tuple[float, float]] = {}
+        times: dict[tuple[str, str, str], tuple[float, float]] = {}
         try:
-            for _, time_s, status in read(path, "status"):
-                trial = str(status.get("trial", ""))
-                first_s, last_s = times.get(trial, (time_s, time_s))
-                # The clock may be set meanwhile.
-                times[trial] = (min(first_s, time_s), max(last_s, time_s))
+            for _, time_s, status in read(path, "status", missing=_say):
+                uptime_s = status.get("uptime_s")
+                if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
+                    uptime_s = 0.0
+                program = (path.stem.rpartition("-")[0], str(status.get("boot_nonce")))
+                began_s[program] = time_s - uptime_s
+                key = (*program, str(status.get("trial", "")))
+                first_s, last_s = times.get(key, (uptime_s, uptime_s))
+                times[key] = (min(first_s, uptime_s), max(last_s, uptime_s))
         except FlightLogError as error:
             # Perhaps the power went before the first byte of it was on the disk.
-            typer.echo(f"lpac: {error}: left out", err=True)
+            _say(f"{error}: left out")
             continue
-        found[str(path.relative_to(folder))] = times
+        uptimes[path] = times
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    for path, times in uptimes.items():
+        trials = found[str(path.relative_to(folder))] = {}
+        for (name, nonce, trial), span_s in times.items():
+            first_s, last_s = (began_s[name, nonce] + uptime_s for uptime_s in span_s)
+            before_s, after_s = trials.get(trial, (first_s, last_s))
+            trials[trial] = (min(first_s, before_s), max(last_s, after_s))
     if as_json:
         typer.echo(json.dumps(found, indent=2))
         return
-    for name, times in found.items():
-        for trial, (first_s, last_s) in times.items():
-            began, ended = (datetime.fromtimestamp(s).astimezone() for s in (first_s, last_s))
-            typer.echo(f"{name}  {began:%Y-%m-%d %H:%M:%S} to {ended:%H:%M:%S}  {trial or '-'}")
+    for file, trials in found.items():
+        for trial, (first_s, last_s) in trials.items():
+            typer.echo(f"{file}  {_span(first_s, last_s)}  {trial or '-'}")
+
+
+@app.command()
+def repair(
+    log: Annotated[Path, typer.Argument(help="A damaged log (*.mcap).")],
+    out: Annotated[Path, typer.Argument(help="The file to write, which is not there yet.")],
+) -> None:
+    """Write what is whole of a damaged log, and say what is missing."""
+    from edge.drivers.flight_log import repair
+
+    count = repair(log, out, _say)
+    typer.echo(f"{out}: {count:,} messages")
+
+
+def _say(text: object) -> None:
+    typer.echo(f"lpac: {text}", err=True)
+
+
+def _span(first_s: float, last_s: float) -> str:
+    from datetime import datetime
+
+    first, last = (datetime.fromtimestamp(s).astimezone() for s in (first_s, last_s))
+    ended = f"{last:%H:%M:%S}" if last.date() == first.date() else f"{last:%Y-%m-%d %H:%M:%S}"
+    return f"{first:%Y-%m-%d %H:%M:%S} to {ended}"

@@ -12,7 +12,7 @@ from lpac.cli.apps import new_app
 from lpac.cli.printing import working
 
 if TYPE_CHECKING:
-    from edge.drivers.flight_log import FlightMetadata
+    from edge.drivers.flight_log import FlightMetadata, Missing
     from edge.flight.replay import FlightReplay
     from edge.policy.bundle import Bundle
     from edge.policy.lpac.replay import Comparison
@@ -35,19 +35,21 @@ def replay(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Run policy and flight decisions again on flight logs; say what differs."""
-    from edge.drivers.flight_log import read_metadata
+    from edge.drivers.flight_log import Missing
 
-    paths = list(_segments(logs))
-    metadata = {path: read_metadata(path) for path in paths}
+    metadata = _metadata(logs)
+    paths, missing = list(metadata), list[Missing]()
     policy_bundle: Bundle | None = None
     comparisons: tuple[Comparison, ...] = ()
     with working("running the logs again"):
-        flights = _flights(metadata)
+        flights = _flights(metadata, missing)
         flown = any(flight.ticks for flight in flights.values())
         if _has_policy_ticks(paths):
             policy_bundle, comparisons = _policy(metadata, bundle)
         elif not flown:
             raise ValueError(f"{', '.join(map(str, logs))}: no policy ticks: the policy never ran")
+    for gap in missing:
+        typer.echo(f"lpac: {gap}", err=True)
     if as_json:
         typer.echo(
             json.dumps(
@@ -56,6 +58,7 @@ def replay(
                     "robots": sorted({each.robot_id for each in metadata.values()}),
                     "logs": [str(path) for path in paths],
                     "outputs": {c.name: _output(c) for c in comparisons},
+                    "missing": [{**gap._asdict(), "path": str(gap.path)} for gap in missing],
                     "flights": [
                         _flight(path, metadata[path], flight) for path, flight in flights.items()
                     ],
@@ -70,6 +73,26 @@ def replay(
                 f"largest difference {c.largest_difference:g}"
             )
         _print_flights(flights, metadata)
+    problems = _problems(comparisons, flights, missing)
+    if problems:
+        raise ValueError("; ".join(problems))
+    if not as_json and policy_bundle is not None:
+        found = "computes what it computed in flight"
+        if not comparisons:
+            found = "is not run again: only policies of the family lpac are"
+        typer.echo(f"{policy_bundle.manifest.name} {policy_bundle.id[:12]}: {found}")
+    if not as_json and flown:
+        passed = sum(flight.passed_over for flight in flights.values())
+        but = f", but for {passed:,} ticks that were passed over" if passed else ""
+        typer.echo(f"flight: decides what it decided in flight{but}")
+
+
+def _problems(
+    comparisons: "Iterable[Comparison]",
+    flights: "Mapping[Path, FlightReplay]",
+    missing: "Iterable[Missing]",
+) -> list[str]:
+    """Why it is not said that all is as it was in flight."""
     problems = []
     differing = [c for c in comparisons if c.differing]
     if differing:
@@ -82,17 +105,26 @@ def replay(
             f"not what was decided in flight: {ticks:,} ticks differ"
             + (f" in the last digits alone: {_ROUNDS}" if rounds else "")
         )
-    if problems:
-        raise ValueError("; ".join(problems))
-    if not as_json and policy_bundle is not None:
-        found = "computes what it computed in flight"
-        if not comparisons:
-            found = "is not run again: only policies of the family lpac are"
-        typer.echo(f"{policy_bundle.manifest.name} {policy_bundle.id[:12]}: {found}")
-    if not as_json and flown:
-        passed = sum(flight.passed_over for flight in flights.values())
-        but = f", but for {passed:,} ticks that were passed over" if passed else ""
-        typer.echo(f"flight: decides what it decided in flight{but}")
+    damaged = sorted({gap.path.name for gap in missing if gap.damaged})
+    if damaged:
+        problems.append(f"not all could be run again: {', '.join(damaged)}: damaged")
+    return problems
+
+
+def _metadata(logs: Iterable[Path]) -> "dict[Path, FlightMetadata]":
+    """By segment. Of a folder, what no robot wrote is left out."""
+    from edge.drivers.flight_log import FlightLogError, read_metadata
+
+    metadata = {}
+    for path in _segments(logs):
+        try:
+            metadata[path] = read_metadata(path)
+        except FlightLogError as error:
+            if path in logs:
+                raise
+            # Perhaps the power went before the first byte of it was on the disk.
+            typer.echo(f"lpac: {error}: left out", err=True)
+    return metadata
 
 
 def _policy(
@@ -122,17 +154,25 @@ def _policy(
     if bundle.manifest.family != "lpac":
         # What such an agent remembers from step to step is not in the log.
         return bundle, ()
-    messages = chain.from_iterable(read(path, "perception", "policy") for path in metadata)
+    messages = chain.from_iterable(
+        read(path, "perception", "policy", missing=_told_already) for path in metadata
+    )
     return bundle, run_again(LpacPolicy(bundle), messages)
 
 
 def _has_policy_ticks(paths: Iterable[Path]) -> bool:
     from edge.drivers.flight_log import read
 
-    return any(True for path in paths for _ in read(path, "policy"))
+    return any(True for path in paths for _ in read(path, "policy", missing=_told_already))
 
 
-def _flights(metadata: "Mapping[Path, FlightMetadata]") -> "dict[Path, FlightReplay]":
+def _told_already(_: "Missing") -> None:
+    """By `_flights`, which reads all of them."""
+
+
+def _flights(
+    metadata: "Mapping[Path, FlightMetadata]", missing: "list[Missing]"
+) -> "dict[Path, FlightReplay]":
     """What the programs decide now, by their logs. A program's segments are in order."""
     from edge.drivers.flight_log import read
     from edge.flight.record import TickError, TickReader
@@ -142,7 +182,7 @@ def _flights(metadata: "Mapping[Path, FlightMetadata]") -> "dict[Path, FlightRep
     flights = {}
     for path, program in metadata.items():
         flights[path] = flight = FlightReplay(readers.setdefault(program, TickReader()))
-        for _, unix_time_s, message in read(path, "flight"):
+        for _, unix_time_s, message in read(path, "flight", missing=missing.append):
             try:
                 flight.run(unix_time_s, message)
             except TickError as error:

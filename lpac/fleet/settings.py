@@ -393,7 +393,7 @@ def read_fleet(path: Path) -> str:
 def parse_fleet(path: Path, text: str) -> FleetConfig:
     """The fleet that a file of this text would describe. Raises ConfigError."""
     try:
-        mapping = tomllib.loads(text)
+        mapping = tomllib.loads(text.removeprefix("\ufeff"))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
     slots = mapping.get("slots")

@@ -228,7 +228,7 @@ def load_script(path: Path, sites: Sites) -> Script:
     Looks into the worlds and sites that the script will need, too.
     """
     try:
-        mapping = tomllib.loads(path.read_bytes().decode())
+        mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except ValueError as error:

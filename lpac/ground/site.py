@@ -440,7 +440,7 @@ class Sites:
         """A site that was saved."""
         path = self.path(name)
         try:
-            mapping = tomllib.loads(path.read_bytes().decode())
+            mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
         except FileNotFoundError:
             known = ", ".join(self.names()) or "none"
             raise ConfigError(f"{path}: there is no such site; known are {known}") from None

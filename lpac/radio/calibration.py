@@ -90,7 +90,7 @@ def read_wifi(path: Path | None) -> Calibration:
             f"{path}: must be a .toml file of the model's values, or a .jsonl file of records"
         )
     try:
-        mapping = tomllib.loads(path.read_bytes().decode())
+        mapping = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: is not TOML: {error}") from None
     wifi = from_mapping(Wifi, mapping, str(path))

@@ -268,7 +268,7 @@ class ReadConfig:
 def read_toml(path: Path) -> str:
     """The text of a file that is TOML. Raises ConfigError that names the file, and the line."""
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
         tomllib.loads(text)
     except OSError as error:
         raise ConfigError(f"{path}: {in_words(error)}") from None

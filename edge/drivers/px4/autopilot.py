@@ -8,7 +8,9 @@ be repeated.
 
 import json
 import math
+import re
 import struct
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -469,11 +471,30 @@ class MavsdkAutopilot:
 def _take_over_log() -> None:
     """Once: another callback would free the one that MAVSDK's threads may be in."""
     log_subscribe(_log_mavsdk)
+    # Its Python prints what its callbacks raise.
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] == "mavsdk":
+            vars(module)["print"] = lambda *parts: _say_mavsdk(" ".join(map(str, parts)))
 
 
 def _log_mavsdk(level: LogLevel, text: str, _file: str | None, _line: int) -> bool:
-    """Into our log, and not to the terminal."""
+    """Warnings and errors into our log, nothing to the terminal."""
+    if level >= LogLevel.WARN:
+        _say_mavsdk(text)
     return True
+
+
+_mavsdk_said: Counter[str] = Counter()
+_MOST_MAVSDK_SAID = 1000
+
+
+def _say_mavsdk(text: str) -> None:
+    kind = re.sub(r"\d+", "#", text)
+    if kind in _mavsdk_said or len(_mavsdk_said) < _MOST_MAVSDK_SAID:
+        _mavsdk_said[kind] += 1
+        times = _mavsdk_said[kind]
+        if times & (times - 1) == 0:  # A log that fills the disk helps nobody.
+            log.warning("MAVSDK", says=text, times=times)
 
 
 def _reason(error: MavsdkError) -> str:

@@ -111,7 +111,7 @@ def main() -> None:
     (path,) = sys.argv[1:]
     try:
         # Not as the program reads it: what the program refuses must not keep a vehicle in the air.
-        config = tomllib.loads(Path(path).read_text("utf-8"))
+        config = tomllib.loads(Path(path).read_text("utf-8-sig"))
         host, port = config["autopilot"]["url"].rpartition("/")[2].rsplit(":", 1)
         port = int(port)
         system_id = int(config["autopilot"]["system_id"])

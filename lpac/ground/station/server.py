@@ -7,11 +7,13 @@ import asyncio
 import math
 import socket
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
+from edge.core.file_errors import in_words
+from edge.core.logger import log
 from edge.drivers.clock import SystemClock
 from edge.drivers.zenoh_link import ZenohLink
 from edge.identity.guard import Unguarded
@@ -67,7 +69,7 @@ class GroundProcess:
         guard = None if identity is None else identity.guard(clock.monotonic_s)
         self._exchange = (
             None if identity is None or guard is None
-            else partial(identity.exchange_revocations, guard)
+            else partial(identity.keep, guard)
         )  # fmt: skip
         self._node = GroundNode(config.setup, clock, self, guard or Unguarded())
         self._clients: set[_Client] = set()
@@ -77,6 +79,7 @@ class GroundProcess:
         self._world_path = self._socket_path.with_suffix(".world")
         self._state_path = self._socket_path.with_suffix(".state")
         self._stepped = asyncio.Event()
+        self._cannot_write = False
 
     async def run(self, on_listening: Callable[[], None]) -> None:
         """Until it is cancelled; `on_listening` is called once clients can connect.
@@ -125,7 +128,7 @@ class GroundProcess:
         next_s = time.monotonic()
         while True:
             if self._exchange is not None:
-                with suppress(OSError):  # Only the next one misses it.
+                with self._writing():
                     self._exchange()
             self._node.tick()
             try:
@@ -147,7 +150,7 @@ class GroundProcess:
             self._tell(message)
         if isinstance(message, FleetSetup) and message.world not in ("", self._world):
             self._world = message.world
-            with suppress(OSError, ValueError):  # Only the next one misses it.
+            with self._writing(), suppress(ValueError):
                 self._world_path.write_text(message.world, "utf-8")
         if self._clients:
             line = to_line(message)
@@ -162,9 +165,20 @@ class GroundProcess:
     def commanded(self, state: GroundState) -> None:
         """To the disk."""
         new = self._state_path.with_suffix(".state-new")
-        with suppress(OSError):  # Only the next one misses it.
+        with self._writing():
             new.write_bytes(encode(state))
             new.replace(self._state_path)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """What the next start has to know, and misses if it cannot be written: said once."""
+        try:
+            yield
+        except OSError as error:
+            if not self._cannot_write:
+                self._cannot_write = True
+                why = f"{error.filename or self._state_path.parent}: {in_words(error)}"
+                log.warning("what the next start has to know is not written", why=why)
 
     def _recall(self) -> None:
         station = self._node.station

@@ -24,8 +24,10 @@ from edge.drivers.flight_log import (
     FlightLog,
     FlightLogError,
     FlightMetadata,
+    Missing,
     read,
     read_metadata,
+    repair,
     topic,
 )
 from edge.messages.mission import FlightState, GroundState, Order, OrderResult, Origin, Place
@@ -171,7 +173,7 @@ def test_mcaps_own_reader_finds_messages_schemas_and_index(tmp_path: Path) -> No
         assert summary is not None and summary.statistics is not None
         assert summary.statistics.message_count == len(messages)
         assert {channel.topic for channel in summary.channels.values()} == set(messages)
-        assert [record.name for record in reader.iter_metadata()] == ["lpac"]
+        assert [record.name for record in reader.iter_metadata()] == ["lpac", "lpac"]
         found = {}
         for schema, channel, record in reader.iter_messages():
             assert schema is not None and schema.encoding == "jsonschema"
@@ -276,9 +278,12 @@ def test_a_file_cut_at_any_byte_is_read_up_to_there(tmp_path: Path) -> None:
     data = whole.read_bytes()
     for size in range(len(data) + 1):
         cut.write_bytes(data[:size])
-        found = [message["number"] for _, _, message in read(cut)]
+        lost: list[Missing] = []
+        found = [message["number"] for _, _, message in read(cut, missing=lost.append)]
         # A chunk is whole before the index of its messages, which follows it.
         assert found == list(range(len(found)))
+        since_s = NOW if found else None
+        assert lost == ([Missing(cut, since_s, None, damaged=False)] if size < len(data) else [])
         assert len(found) >= sum(end <= size for end in ends)
         if size == begun:
             assert read_metadata(cut) == METADATA
@@ -300,7 +305,56 @@ def test_a_file_that_ends_in_rubbish_is_read_up_to_there(tmp_path: Path) -> None
     for rubbish in (bytes(5000), NOISE[:5000].tobytes()):
         for kept, numbers in ((len(data), [0, 1]), (len(data) - 600, [0])):
             path.write_bytes(data[:kept] + rubbish)
-            assert [message["number"] for _, _, message in read(path)] == numbers
+            lost: list[Missing] = []
+            found = [message["number"] for _, _, message in read(path, missing=lost.append)]
+            assert found == numbers and lost == [Missing(path, NOW, None, damaged=False)]
+
+
+@pytest.fixture(scope="module")
+def a_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of ten chunks, a second apart, with one message each."""
+    folder = tmp_path_factory.mktemp("flight")
+    topics = {"policy": topic("Policy", Place), "status": topic("Status", Place)}
+    log = FlightLog(folder, METADATA, topics, sync_period_s=0)
+    for number in range(10):
+        log.record("status", NOW + number, {"number": number, "array": NOISE[:100]})
+        log.flush()
+    log.close()
+    return folder / "robot-3-0001.mcap"
+
+
+@pytest.mark.parametrize("flip", [0xFF, 0x01, 0x04])
+def test_a_flipped_byte_anywhere_costs_at_most_what_is_said_to_be_missing(
+    a_flight: Path, tmp_path: Path, flip: int
+) -> None:
+    data, damaged = a_flight.read_bytes(), tmp_path / "robot-3-0001.mcap"
+    for at in range(len(data)):
+        damaged.write_bytes(data[:at] + bytes([data[at] ^ flip]) + data[at + 1 :])
+        lost: list[Missing] = []
+        found = [message["number"] for _, _, message in read(damaged, missing=lost.append)]
+        assert len(found) >= 9 and read_metadata(damaged) == METADATA
+        for number in set(range(10)) - set(found):
+            (gap,) = lost
+            assert gap.damaged
+            assert gap.since_unix_s == (None if number == 0 else NOW + number - 1)
+            assert gap.until_unix_s == (None if number == 9 else NOW + number + 1)
+
+
+def test_what_is_whole_of_a_damaged_log_is_repaired(a_flight: Path, tmp_path: Path) -> None:
+    data, damaged, out = a_flight.read_bytes(), tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    for at in (len(data) // 2, data.index(b"zstd")):  # the second has the channels
+        damaged.write_bytes(data[:at] + bytes([data[at] ^ 0xFF]) + data[at + 1 :])
+        lost: list[Missing] = []
+        assert repair(damaged, out, lost.append) == 9 and len(lost) == 1
+        unsaid: list[Missing] = []
+        whole = [(name, time_s) for name, time_s, _ in read(damaged, missing=unsaid.append)]
+        assert [(name, s) for name, s, _ in read(out, missing=unsaid.append)] == whole
+        assert unsaid == lost and read_metadata(out) == METADATA
+        with out.open("rb") as file:
+            assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 9
+        with pytest.raises(FileExistsError):
+            repair(damaged, out)
+        out.unlink()
 
 
 @pytest.mark.parametrize("sync_period_s", [0, 1000])

@@ -37,12 +37,12 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
     guard = identity.guard(lambda: 0.0)
     authority.revoke("r3")
     assert guard.hear_revocations(authority.revocations)
-    identity.exchange_revocations(guard)
+    identity.keep(guard)
     assert load_identity(folder, fleet="demo", unix_s=3e9).revocations == authority.revocations
     # And what comes onto the disk meanwhile, in flight.
     authority.revoke("r3")
     (folder / "revoked").write_bytes(authority.revocations)
-    identity.exchange_revocations(guard)
+    identity.keep(guard)
     assert guard.revocations == authority.revocations
 
 
