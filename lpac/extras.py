@@ -18,5 +18,7 @@ def install_command(extra: str) -> str:
     if origin.get("dir_info", {}).get("editable"):
         return f"pip install -e {shlex.quote(f'{unquote(urlsplit(url).path)}[{extra}]')}"
     if "vcs_info" in origin:
+        # Some releases of pip take none without a host.
+        url = url.replace("file:///", "file://localhost/")
         url = f"{origin['vcs_info']['vcs']}+{url}@{origin['vcs_info']['commit_id']}"
     return f"pip install {shlex.quote(f'{_NAME}[{extra}] @ {url}')}"

@@ -95,7 +95,7 @@ class FleetDisplay:
         elif self._clock() - self._told_s >= LINE_EVERY_S:
             states = Counter(status.state.value for status in statuses.values())
             counts = ", ".join(f"{count} {state}" for state, count in states.most_common())
-            self.say(f"{step}: {counts or 'nobody is heard yet'}")
+            self.say(f"{step}; robots: {counts or 'not heard yet'}")
 
 
 def fleet_table(statuses: "dict[int, RobotStatus | None]") -> "Table":

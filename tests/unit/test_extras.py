@@ -32,6 +32,10 @@ GIT = "https://git.example.org/lab/lpac-edge"
             {"vcs_info": {"vcs": "git", "commit_id": "3f2a"}, "url": GIT},
             f"pip install 'lpac-edge[sim] @ git+{GIT}@3f2a'",
         ),
+        (
+            {"vcs_info": {"vcs": "git", "commit_id": "3f2a"}, "url": "file:///srv/lpac-edge"},
+            "pip install 'lpac-edge[sim] @ git+file://localhost/srv/lpac-edge@3f2a'",
+        ),
         (None, "pip install 'lpac-edge[sim]'"),
     ],
 )

@@ -101,7 +101,7 @@ def test_without_a_terminal_a_line_says_how_far_it_is(monkeypatch: pytest.Monkey
             display.show_or_say("return", statuses(state=FlightState.LAND))
     assert terminal.lines() == [
         "   0.0 s  return",
-        "  10.0 s  return: 1 idle, 1 mission, 1 land",
-        "  20.0 s  return: 1 idle, 1 mission, 1 land",
+        "  10.0 s  return; robots: 1 idle, 1 mission, 1 land",
+        "  20.0 s  return; robots: 1 idle, 1 mission, 1 land",
         "",
     ]
