@@ -12,6 +12,7 @@ same features, because the policies are trained on its worlds, but for two of it
 import itertools
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,6 +177,11 @@ def rasterize(
         raster /= maximum
         raster *= norm
     return raster
+
+
+def has_importance(features: Iterable[Feature]) -> bool:
+    """Whether there is anything to cover: a feature of a scale, or an importance, above 0."""
+    return any(_weight(feature) > 0.0 for feature in features)
 
 
 def _weight(feature: Feature) -> float:

@@ -470,6 +470,8 @@ def _draw_lloyd(axes: Axes, flight: FlightRecord, colour: str = style.LLOYD) -> 
 
 def _frame_costs(axes: Axes, end_s: float) -> None:
     _frame_cost_axes(axes, end_s)
+    if not axes.get_legend_handles_labels()[0]:
+        return  # There was nothing to cover.
     axes.legend(
         loc="center left", bbox_to_anchor=(1.01, 0.5), title="$J$ at the end / $J(0)$",
         alignment="left", handlelength=2.8, fontsize=7,

@@ -722,7 +722,9 @@ def _result(flight: "SimulatedFlight", duration_s: float) -> str:
 def _require_something_to_cover(
     world: Path | None, of_file: "Sequence[Feature] | None", random_features: int
 ) -> None:
-    empty = random_features == 0 if of_file is None else not of_file
+    from edge.core.world import has_importance
+
+    empty = random_features == 0 if of_file is None else not has_importance(of_file)
     if empty:
         what = "--features 0" if world is None else str(world)
         raise ValueError(f"{what}: the world would have nothing in it to cover")

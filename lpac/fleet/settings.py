@@ -379,7 +379,7 @@ def read_fleet(path: Path) -> str:
     """The file's text, its ends of lines as they are. Raises ConfigError."""
     try:
         # Not read_text, which would change them.
-        return path.read_bytes().decode()
+        return path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError as error:
         raise ConfigError(
             f"{path}: cannot be read: {in_words(error)}: give --fleet, or set LPAC_FLEET"
@@ -393,7 +393,7 @@ def read_fleet(path: Path) -> str:
 def parse_fleet(path: Path, text: str) -> FleetConfig:
     """The fleet that a file of this text would describe. Raises ConfigError."""
     try:
-        mapping = tomllib.loads(text.removeprefix("\ufeff"))
+        mapping = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: no TOML: {error}") from None
     slots = mapping.get("slots")

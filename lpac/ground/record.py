@@ -220,7 +220,7 @@ def record(
     It waits for the ground process, also for the next when one ends. When its terminal is closed
     (SIGHUP) it ends as `lpac ground` does: once nobody that is heard is in the air. `say` gets what
     a person is to know; `show` where things stand, every few seconds. Raises OSError if nothing
-    (more) can be written.
+    can be written.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -232,9 +232,10 @@ def record(
     log = FlightLog(directory, metadata, TOPICS, max_total_bytes=_MAX_TOTAL_BYTES)
     recording = Recording(log.record)
     with contextlib.closing(recording), contextlib.closing(log):
-        _require(log, directory)
+        if not log.recording:
+            raise OSError(f"{directory}: nothing can be written there; is the disk full?")
         say(f"recording to {directory}; Ctrl-C ends it")
-        following = _follow(fleet, log, directory, recording, say, show)
+        following = _follow(fleet, log, recording, say, show)
         asyncio.run(_until_stopped(following, recording))
     say(f"recorded to {directory}")
 
@@ -261,7 +262,6 @@ async def _until_stopped(following: Coroutine[None, None, None], recording: Reco
 async def _follow(
     fleet: str,
     log: FlightLog,
-    directory: Path,
     recording: Recording,
     say: Callable[[str], None],
     show: Callable[[str], None],
@@ -278,7 +278,6 @@ async def _follow(
                 if not isinstance(told, FleetSnapshot):
                     continue
                 log.flush()
-                _require(log, directory)
                 cost = recording.cost
                 if cost is not None and cost.flying_mission and cost.trial != trial:
                     trial = cost.trial
@@ -294,11 +293,6 @@ async def _follow(
             recording.flying = False  # as far as is known
             log.flush()
             await asyncio.sleep(_RETRY_S)
-
-
-def _require(log: FlightLog, directory: Path) -> None:
-    if not log.recording:
-        raise OSError(f"{directory}: nothing more can be written there; is the disk full?")
 
 
 def _line(snapshot: FleetSnapshot, cost: Cost | None) -> str:

@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol
 
 from edge.core.file_errors import in_words
 from edge.core.schema import ConfigError, from_mapping
-from edge.core.world import parse_world
+from edge.core.world import has_importance, parse_world
 from edge.messages.codes import texts
 from edge.messages.mission import FlightState, GroundState, Origin, RobotStatus
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
@@ -253,8 +253,8 @@ def read_world(path: Path) -> str:
         raise ConfigError(f"{path}: cannot be read: {in_words(error)}") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: no text: {error}") from None
-    if not parse_world(text, str(path)):
-        raise ConfigError(f"{path}: holds no features")
+    if not has_importance(parse_world(text, str(path))):
+        raise ConfigError(f"{path}: holds no features of any importance")
     return text
 
 

@@ -208,6 +208,7 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--world", "tests"], "tests: is a folder; a file is needed"),
         (["sim", "--features", "0"], "--features 0: the world would have nothing in it to cover"),
         (["sim", "--world", "/dev/null"], "/dev/null: the world would have nothing in it"),
+        (),
         (["sim", "--starts", "Makefile"], "Makefile: line 1: must be 'x y', in m"),
         (["sim", "--starts", "/dev/null"], "/dev/null: has 0 starts, and there are 10 robots"),
         (["sim", "--policy-hz", "0"], "--policy-hz 0: must be from 0.1 to 100"),
