@@ -23,6 +23,7 @@ def zenoh_radio(setting: LinkSetting) -> ZenohLink | MulticastLink:
         scouting=setting.scouting,
         subscriptions={t: c for t, c in setting.subscriptions.items() if t not in in_group},
         tls=setting.tls,
+        members=setting.members,
     )
     if setting.group is None:
         return zenoh

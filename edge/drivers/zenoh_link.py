@@ -22,23 +22,27 @@ import json
 import os
 import re
 import secrets
+import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from functools import partial
 from threading import Event, Lock, Thread
 from typing import Literal, Self
 
 import zenoh
 
-from edge.core.address import is_loopback_endpoint, require_endpoint
+from edge.core.address import is_loopback, is_loopback_endpoint, require_endpoint
 from edge.core.logger import log
 from edge.core.wire import MAX_ROBOT_ID
+from edge.drivers.door import Door, DoorStatus, listening
 from edge.messages.admission import Admission
 from edge.messages.topics import (
     GROUND_CARD,
     STATE,
     TOPICS,
+    Knocking,
     ReceiveCallback,
     Sender,
     TlsFiles,
@@ -54,6 +58,7 @@ _MOST_TOKENS = 1000
 # As many as PX4's system ids, of which every vehicle has one of its own.
 MAX_CERTIFIED_ID = 255
 _CLOSE_TIMEOUT_S = 1.0
+_KNOCKS_EVERY_S = 0.5
 # A client looks for its router so often, and waits so long for an answer.
 _ENTER_AGAIN_S = 0.3
 _ENTER_TIMEOUT_S = 1.0
@@ -96,13 +101,15 @@ class ZenohLink:
         scouting: bool = False,
         subscriptions: Mapping[Topic, ReceiveCallback] | None = None,
         tls: TlsFiles | None = None,
+        members: Knocking | None = None,
     ) -> None:
         """Open the session.
 
         `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all of them
         `tls/<host>:<port>`; without `listen` a peer takes a free port. It opens even if nobody
         answers, a client even without its router, and connects later. `scouting` finds others by
-        multicast.
+        multicast. With `members` it keeps strangers from the port that it listens on, and knocks
+        at others' (`edge.drivers.door`).
 
         `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
         and the data, from zenoh's threads, several at once; what this session publishes is not
@@ -125,6 +132,14 @@ class ZenohLink:
         self._closed = Event()
         self._entering: Thread | None = None
         self._session: zenoh.Session | None = None
+        self._members = members
+        self._doors: list[Door] = []
+        self._knocking: Thread | None = None
+        if members is not None:
+            self._knocking = Thread(
+                target=self._knock, name="knock", args=(members, connect), daemon=True
+            )
+            self._knocking.start()
         self._publishers: dict[Topic, zenoh.Publisher] = {}
         config = _config(self._prefix, self._session_id, mode, listen, connect, scouting, tls)
         enter = partial(self._enter, config, subscriptions or {})
@@ -188,6 +203,10 @@ class ZenohLink:
         """How many messages it did not look at: too many at once, or too large."""
         return self._admission.refused
 
+    def doors(self) -> list[DoorStatus]:
+        """How it stands with each port that other computers reach."""
+        return [door.status for door in self._doors]
+
     def failures(self) -> int:
         """How many calls of callbacks and of `publish` failed; each kind's first is logged."""
         with self._lock:
@@ -196,6 +215,8 @@ class ZenohLink:
     def close(self) -> None:
         """Leave the radio, within a second or so; again is no error."""
         self._closed.set()
+        for door in self._doors:
+            door.close()
         # A connection whose other end is out of reach holds it, too.
         closing = Thread(target=self._close_session, daemon=True)
         closing.start()
@@ -216,13 +237,15 @@ class ZenohLink:
 
     def _enter(self, config: zenoh.Config, subscriptions: Mapping[Topic, ReceiveCallback]) -> None:
         """Raises LinkError."""
-        session = _open(config)
+        session, doors = _open_behind_doors(config, self._members)
         try:
             self._publishers = self._declare(session, subscriptions)
         except BaseException:
+            for door in doors:
+                door.close()
             session.close()  # type: ignore[no-untyped-call]
             raise
-        self._session = session
+        self._session, self._doors = session, doors
 
     def _enter_in_time(self, enter: Callable[[], None]) -> None:
         """Once the router answers, or never."""
@@ -233,6 +256,20 @@ class ZenohLink:
             except (LinkError, zenoh.ZError) as error:
                 self._failed("enter", error)
             self._closed.wait(_ENTER_AGAIN_S)
+
+    def _knock(self, members: Knocking, connect: Sequence[str]) -> None:
+        """At each port that it is to be connected to, until it is."""
+        places = [endpoint.partition("/")[2].rpartition(":") for endpoint in connect]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+            udp.setblocking(False)
+            while True:
+                met = () if self._session is None else _met(self._session)
+                for host, _, port in places:
+                    if host not in met and not is_loopback(host):
+                        with suppress(OSError):  # No network yet, or nobody of that name.
+                            udp.sendto(members.knock(), (host, int(port)))
+                if self._closed.wait(_KNOCKS_EVERY_S):
+                    return
 
     def _declare(
         self, session: zenoh.Session, subscriptions: Mapping[Topic, ReceiveCallback]
@@ -312,14 +349,23 @@ class ZenohRouter:
     Close it, or use it as a context manager.
     """
 
-    def __init__(self, *, fleet: str, listen: Sequence[str], tls: TlsFiles | None = None) -> None:
-        """`listen` are endpoints, as `ZenohLink` has them; with `tls` members alone are let in.
+    def __init__(
+        self,
+        *,
+        fleet: str,
+        listen: Sequence[str],
+        tls: TlsFiles | None = None,
+        members: Knocking | None = None,
+    ) -> None:
+        """`listen` are endpoints and `members` who knocks, as `ZenohLink` has them.
+
+        With `tls` members alone are let in.
 
         Raises LinkError if a setting is wrong, or a port is taken.
         """
         _check(fleet, None, "router", listen, (), False, tls)
         config = _config(f"lpac/{fleet}/", _session_id(None), "router", listen, (), False, tls)
-        self._session = _open(config)
+        self._session, self._doors = _open_behind_doors(config, members)
 
     def __enter__(self) -> Self:
         return self
@@ -329,6 +375,8 @@ class ZenohRouter:
 
     def close(self) -> None:
         """All clients are alone then, and look for it; again is no error."""
+        for door in self._doors:
+            door.close()
         if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
 
@@ -498,6 +546,37 @@ def _session_id(robot_id: int | None) -> str:
     """
     rank = MAX_ROBOT_ID + 1 if robot_id is None else robot_id
     return f"1{secrets.token_hex(12)}{rank.to_bytes(3, 'little').hex()}"
+
+
+def _open_behind_doors(
+    config: zenoh.Config, members: Knocking | None
+) -> tuple[zenoh.Session, list[Door]]:
+    """A session, and a door for each port of it that other computers reach."""
+    if members is None:
+        return _open(config), []
+    with ExitStack() as others:
+        before = {inode: others.enter_context(found) for inode, found in listening().items()}
+        session = _open(config)
+    doors = []
+    for inode, found in listening().items():
+        if inode in before or is_loopback(found.getsockname()[0]):
+            found.close()
+        else:
+            try:
+                doors.append(Door(found, members, partial(_met, session)))
+            except OSError as error:
+                log.error("the radio's port is open to strangers", exc_info=error)
+    return session, doors
+
+
+def _met(session: zenoh.Session) -> list[str]:
+    """The IPv4 addresses of all who are connected."""
+    try:
+        links = session.info.links()
+    except zenoh.ZError:  # closed
+        return []
+    places = (re.fullmatch(r"\w+/([0-9.]+):[0-9]+", str(link.dst)) for link in links)
+    return [place[1] for place in places if place is not None]
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:

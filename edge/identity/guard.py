@@ -333,17 +333,41 @@ class SignedGuard:
         with self._lock:
             return {reason.value: count for reason, count in self._refused.items()}
 
+    # At the port, before there is a connection: see `edge.drivers.door`
+
+    def knock(self) -> bytes:
+        """See `edge.messages.topics.Knocking`: the own card, in an envelope for this alone."""
+        return self._seal(_knock_key(self.card), self._membership.card_data)
+
+    def is_knock(self, data: bytes) -> bool:
+        """See `edge.messages.topics.Knocking`. A robot's own knock, said again, is none."""
+        envelope = read_envelope(data)
+        if envelope is None or envelope.fingerprint in self._revoked:
+            return False
+        try:
+            card = verified(Card, envelope.payload, self._authority)
+        except CardError:
+            return False
+        key = _knock_key(card)
+        is_theirs = card.fingerprint == envelope.fingerprint and envelope.is_from(
+            card.public_key, Address(self._authority, key)
+        )
+        return is_theirs and self._overtaken(key, card, envelope) is None
+
     # What goes out
 
     def seal(self, topic: Topic, payload: bytes) -> bytes:
         """The payload in this member's envelope."""
+        return self._seal(self._own_key(topic), payload)
+
+    def _seal(self, key: str, payload: bytes) -> bytes:
         with self._lock:
             self._sequence += 1
             sequence = self._sequence
         return seal(
             payload,
             signer=self._membership.signer,
-            address=Address(self._authority, self._own_key(topic)),
+            address=Address(self._authority, key),
             start=self._start,
             sequence=sequence,
         )
@@ -529,6 +553,10 @@ class _SigningLink:
     def sends_again(self) -> bool:
         """Whether what is lost on its way is said once more."""
         return self._link.sends_again
+
+
+def _knock_key(card: Card) -> str:
+    return f"{'ground' if card.robot_id is None else f'robot/{card.robot_id}'}/knock"
 
 
 def _is_of(card: Card, topic: Topic, key: str) -> bool:

@@ -176,6 +176,9 @@ class ReasonCode(_Code):
     # The program itself.
     DUPLICATE_ID = "duplicate_id"
     SAID_TWICE = "said_twice"
+    STRANGERS_FLOOD = "strangers_flood"
+    RADIO_QUEUE_FULL = "radio_queue_full"
+    DESCRIPTORS_SHORT = "descriptors_short"
     WATCHDOG_ENDED = "watchdog_ended"
     LOG_NOT_WRITTEN = "log_not_written"
     IDENTITY_NOT_WRITTEN = "identity_not_written"

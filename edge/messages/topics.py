@@ -93,6 +93,16 @@ class Link(Protocol):
 ReceiveCallback = Callable[[str, bytes], bool | None]
 
 
+class Knocking(Protocol):
+    """What a member knocks with, and knows others' knocks by."""
+
+    def knock(self) -> bytes:
+        """A new datagram, which says who this is."""
+
+    def is_knock(self, data: bytes) -> bool:
+        """Whether a member sent it, for the first time."""
+
+
 class TlsFiles(NamedTuple):
     """A member's paths: the authority's certificate, its own, and its secret key, all PEM."""
 
@@ -123,7 +133,8 @@ class LinkSetting(NamedTuple):
     from any thread with the key below `lpac/<fleet>/`, such as robot/3/message, and the data; they
     only store. What is larger or more often than its topic allows is for the link to drop
     (`edge.messages.admission`). With `tls` only members of the fleet are let in; without, whoever
-    reaches it. With `group` robots tell each other there what they have to say.
+    reaches it. With `group` robots tell each other there what they have to say. With `members`
+    it keeps strangers from its port, where it has one.
     """
 
     fleet: str
@@ -136,6 +147,7 @@ class LinkSetting(NamedTuple):
     subscriptions: Mapping[Topic, ReceiveCallback]
     tls: TlsFiles | None
     group: Group | None = None
+    members: Knocking | None = None
 
 
 class LinkDriver(Protocol):

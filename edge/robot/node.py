@@ -139,6 +139,8 @@ class RobotNode:
         self._statuses = 0
         # What it said last of itself: there before anybody can have heard it.
         self.status: RobotStatus | None = None
+        # Of its computer, as the program's owner found it.
+        self.host_alarms: tuple[Reason, ...] = ()
         # What the ground was told last, and when.
         self._told: tuple[object, ...] = ()
         self._told_at_s = -math.inf
@@ -457,7 +459,7 @@ class RobotNode:
         )
 
     def _alarms(self) -> tuple[Reason, ...]:
-        alarms = []
+        alarms = [*self.host_alarms]
         if self._is_duplicate():
             text = f"another program says that it is robot {self._config.robot_id}"
             alarms.append(Reason(ReasonCode.DUPLICATE_ID, text))

@@ -12,7 +12,7 @@ import math
 import secrets
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from edge.core.px4_version import in_words
 from edge.core.schema import ConfigError
 from edge.core.vehicle import Action, Setpoint
 from edge.drivers.clock import SystemClock
+from edge.drivers.door import DoorStatus, allow_most_descriptors, descriptors_short
 from edge.drivers.flight_log import FlightLog
 from edge.drivers.identity_folder import (
     GROUP_KEYS,
@@ -39,9 +40,9 @@ from edge.drivers.stop import Stop
 from edge.drivers.systemd import ALIVE, READY, STOPPING, ServiceManager, status_text
 from edge.identity.group import MOST_BYTES, MOST_FRAGMENTS, frames, key_of_open_fleet
 from edge.identity.guard import Unguarded
-from edge.messages.codes import CheckCode, FailedCheck
+from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode
 from edge.messages.mission import LoopStatus
-from edge.messages.topics import Group, Link, LinkSetting
+from edge.messages.topics import Group, Knocking, Link, LinkSetting
 from edge.policy.family import VerifiedPolicy
 from edge.robot.config import RobotConfig, require_group
 from edge.robot.log import open_log
@@ -96,6 +97,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
     libc = ctypes.CDLL(None)
     libc.mallopt(_M_ARENA_MAX, 1)
     libc.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+    allow_most_descriptors()
     with ExitStack() as parts:
         # 1. Policy, sensor and world, before anything that moves.
         policy, sensor_over, world = _load(config, parts)
@@ -139,7 +141,7 @@ def run(config: RobotConfig, stop: Stop) -> None:
             boot_epoch=int(clock.unix_s() * 1e3),
         )
         # 6. The radio that feeds it, and takes what it says.
-        link = parts.enter_context(_open_link(config, node, config.robot_id, identity))
+        link = parts.enter_context(_open_link(config, node, config.robot_id, identity, signed))
         node.attach(link)
         # 7. The loops, and what ends them: the vehicle holds or lands, then everything is closed.
         keep_news = None
@@ -180,13 +182,18 @@ def _identity(config: RobotConfig, load: Callable[[Path], Identity]) -> Identity
 
 
 def _open_link(
-    config: RobotConfig, node: RobotNode, robot_id: int | None, identity: Identity | None
+    config: RobotConfig,
+    node: RobotNode,
+    robot_id: int | None,
+    identity: Identity | None,
+    members: Knocking | None,
 ) -> AbstractContextManager[Link]:
     """The radio, as that robot, or with None as somebody who only listens."""
     link = config.link
     setting = LinkSetting(
         config.fleet, robot_id, link.mode, link.listen, link.connect, link.scouting, link.options,
         node.subscriptions, None if identity is None else identity.tls, _group(config, identity),
+        members,
     )  # fmt: skip
     return open_link(link.type, setting)
 
@@ -307,6 +314,8 @@ class _Program:
         if now_s >= self._loops_due_s:
             self._loops_due_s = now_s + _LOOPS_PERIOD_S
             self._loop_statuses = {loop.name: loop.status() for loop in self._loops}
+            doors: list[DoorStatus] = getattr(self._link, "doors", list)()
+            self._node.host_alarms = tuple(host_alarms(doors, descriptors_short()))
         status = self._node.status_step(self._loop_statuses)
         self._status_text = status_text(
             status,
@@ -316,6 +325,19 @@ class _Program:
             peers=self._link.peers(),
             insecure=self._config.link.insecure,
         )
+
+
+def host_alarms(doors: Iterable[DoorStatus], short: str) -> Iterator[Reason]:
+    """What the operator must see of the radio's ports, and of descriptors that are short."""
+    if short:
+        yield Reason(ReasonCode.DESCRIPTORS_SHORT, f"{short}: soon nobody can connect")
+    for door in doors:
+        if door.flooded:
+            text = f"strangers flood its radio port: {door.refused} refused; members get in"
+            yield Reason(ReasonCode.STRANGERS_FLOOD, text)
+        if door.queue_full:
+            text = "its radio port has a full queue: nobody new gets in"
+            yield Reason(ReasonCode.RADIO_QUEUE_FULL, text)
 
 
 def _robot_lock(config: RobotConfig) -> ProcessLock:
@@ -393,7 +415,7 @@ def check(config: RobotConfig, wait_s: float) -> CheckReport:
             boot_epoch=0,
         )
         # Not as the robot itself: its program is not running.
-        node.attach(parts.enter_context(_open_link(config, node, None, identity)))
+        node.attach(parts.enter_context(_open_link(config, node, None, identity, None)))
         # Of its own, since the checks wait for the vehicle; it looks as often as a flight does.
         control = Loop("control", 1.0 / config.rates.control_hz, node.control_step)
         control.start()

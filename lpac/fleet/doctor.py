@@ -325,7 +325,9 @@ def _doors(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
     if users:
         found = f"{', '.join(users)}: no password, or the one that every VOXL comes with"
         return DoctorCheck(name, "FAILED", found, on(robot, *(f"passwd {user}" for user in users)))
-    expected = {("tcp", robot.port or 22), ("tcp", robot.zenoh_port)}
+    # Members knock at the UDP port of the radio's number.
+    radio = {(protocol, robot.zenoh_port) for protocol in ("tcp", "udp")}
+    expected = {("tcp", robot.port or 22), *radio}
     if config.radio.transport == "multicast":
         expected.add(("udp", int(config.radio.group.rpartition(":")[2])))
     others = [
@@ -341,7 +343,13 @@ def _doors(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
     if others:
         found = f"other programs listen to the network: {_ports(others)}"
         return DoctorCheck(name, "warning", found, "stop what the fleet does not need")
-    return DoctorCheck(name, "ok", "ssh and the radio alone listen to the network")
+    found = "ssh and the radio alone listen to the network"
+    if config.keys is None:
+        return DoctorCheck(name, "ok", found)
+    if not facts["drops_strangers"]:
+        found += "; the kernel cannot drop strangers: whoever floods the radio's port closes it"
+        return DoctorCheck(name, "warning", found, "keep strangers out of the Wi-Fi")
+    return DoctorCheck(name, "ok", f"{found}; the kernel drops strangers who flood it")
 
 
 def _may_be_mavlink(port: Facts) -> bool:

@@ -1,9 +1,11 @@
 """The router of a fleet whose robots are its clients: a process that outlives `lpac ground`."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 from edge.core.schema import ConfigError
+from edge.drivers.door import allow_most_descriptors
 from edge.drivers.stop import Stop
 from edge.drivers.zenoh_link import ZenohRouter
 from lpac.fleet.settings import load_fleet
@@ -23,6 +25,8 @@ def serve_router(path: Path, stop: Stop, on_listening: Callable[[str], None]) ->
         )
     identity = load_own_identity(config, None)
     tls = None if identity is None else identity.tls
-    with ZenohRouter(fleet=config.fleet, listen=(config.router,), tls=tls):
+    members = None if identity is None else identity.guard(time.monotonic)
+    allow_most_descriptors()
+    with ZenohRouter(fleet=config.fleet, listen=(config.router,), tls=tls, members=members):
         on_listening(config.router)
         stop.wait()

@@ -3,12 +3,16 @@
 Nothing here changes anything, but `set_clock`.
 """
 
+import contextlib
+import ctypes
 import glob
 import hashlib
 import json
 import os
 import re
 import shutil
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -106,8 +110,22 @@ def facts(directory: str, mavlink_port: int, names: List[str]) -> Dict[str, Any]
         group_keys=group_keys_sha256(),
         open_ports=open_ports(_output(["ss", "-H", "-t", "-u", "-l", "-n", "-p"])),
         factory_passwords=_factory_passwords(),
+        drops_strangers=_drops_strangers(),
     )
     return found
+
+
+def _drops_strangers() -> bool:
+    """Whether this kernel has what keeps strangers from the radio's port (`edge.drivers.door`)."""
+    passes_all = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0xFFFFFFFF))
+    program = struct.pack("HL", 1, ctypes.addressof(passes_all))
+    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as one:
+        try:
+            one.setsockopt(socket.SOL_SOCKET, 26, program)
+            one.getsockopt(socket.SOL_SOCKET, 55, 36)
+        except OSError:
+            return False
+    return True
 
 
 def _card() -> Optional[str]:

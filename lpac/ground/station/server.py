@@ -72,6 +72,7 @@ class GroundProcess:
             else partial(identity.keep, guard)
         )  # fmt: skip
         self._node = GroundNode(config.setup, clock, self, guard or Unguarded())
+        self._members = guard
         self._clients: set[_Client] = set()
         self._world = config.setup.world
         self._socket_path = socket_path(config.setup.fleet)
@@ -103,6 +104,7 @@ class GroundProcess:
                 topic: partial(received, hear) for topic, hear in self._node.subscriptions.items()
             },
             tls=None if identity is None else identity.tls,
+            members=self._members,
         ) as link:
             self._node.attach(link)
             server = await asyncio.start_unix_server(self._serve, self._socket_path, limit=MAX_LINE)

@@ -107,6 +107,7 @@ def well(config: FleetConfig, name: str) -> Examination:
         },
         "containers": [], "card": card_of(config, robot), "group_keys": "00ff",
         "factory_passwords": [],
+        "drops_strangers": True,
         "open_ports": [{"protocol": "tcp", "port": 22, "program": "sshd"},
                        {"protocol": "tcp", "port": 7447, "program": "python3"}],
     }  # fmt: skip

@@ -490,3 +490,30 @@ def test_a_robot_hears_that_another_has_its_key(one: Member) -> None:
     enemy = robot(1, start=2)
     one.hear(enemy, packet(enemy))
     assert one.guard.robots_said_twice() == {1}
+
+
+def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
+    """Of one that was never heard, too; a stranger who recorded it gets in nowhere with it."""
+    two, ground = robot(2), Member(membership(Role.OPERATOR, "ann"))
+    for member in (two, ground):
+        knock = member.guard.knock()
+        assert one.guard.is_knock(knock) and not one.guard.is_knock(knock)
+        assert one.guard.is_knock(member.guard.knock())
+        changed = bytearray(member.guard.knock())
+        changed[-1] ^= 1
+        assert not one.guard.is_knock(bytes(changed))
+    # Nor with the own one, nor a card that was shown, nor as another.
+    assert not one.guard.is_knock(one.guard.knock())
+    assert not one.guard.is_knock(two.guard.seal(CARD, two.guard._membership.card_data))
+    assert not one.guard.is_knock(robot(2, authority=OTHER_FLEET).guard.knock())
+    thief = robot(3)
+    assert not one.guard.is_knock(
+        thief.guard._seal("robot/2/knock", membership(Role.ROBOT, "r2", 2).card_data)
+    )
+    revoked = signed(Revocations(1, (two.guard.card.fingerprint.hex(),)), AUTHORITY)
+    assert one.guard.hear_revocations(revoked) and not one.guard.is_knock(two.guard.knock())
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_are_a_knock(data: bytes) -> None:
+    assert not robot(1).guard.is_knock(data)
