@@ -445,6 +445,19 @@ def _does_not_climb(f: _Flight) -> None:
     f.until(_S.LANDED, _S.PREFLIGHT)
 
 
+def _sinks(f: _Flight) -> None:
+    f.fly()
+    f.vehicle.motor_loss = 0.53
+    f.until(_S.LANDED, _S.PREFLIGHT)
+
+
+def _stands_on_the_ground(f: _Flight) -> None:
+    """Its motors push against the ground, so that PX4 takes it to be in the air."""
+    f.fly()
+    f.vehicle.motor_loss = 0.9
+    f.until(_S.LANDED, _S.PREFLIGHT)
+
+
 def _armed_by_others(f: _Flight) -> None:
     f.ready()
     f.begin()
@@ -607,6 +620,8 @@ FLIGHTS: Mapping[str, tuple[Callable[[_Flight], None], Settings]] = {
     "ground_ends_takeoff": (_ground_ends_takeoff, {}),
     "orders_refused": (_orders_refused, {}),
     "does_not_climb": (_does_not_climb, {}),
+    "sinks": (_sinks, {}),
+    "stands_on_the_ground": (_stands_on_the_ground, {}),
     "armed_by_others": (_armed_by_others, {}),
     "wind_over_the_fence": (_wind_over_the_fence, {}),
     "px4_fence": (_px4_fence, {}),

@@ -23,7 +23,8 @@ class Neighbour(NamedTuple):
     """Another robot: its position and velocity in the mission frame, as they were `age_s` ago.
 
     And what it told of its surroundings in the mission `trial`, if robots share maps. `is_piloted`:
-    somebody else than its program flies it, so that it looks out for nobody.
+    somebody else than its program flies it, or it does not hold its height, so that nobody knows
+    where it flies next.
     """
 
     robot_id: int

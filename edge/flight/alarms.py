@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from edge.core.position import PositionQuality
+from edge.core.vehicle import Action
 from edge.flight.state import Tick
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import AIRBORNE, FlightState
@@ -48,6 +49,19 @@ def position_lost(t: Tick) -> str | None:
 def position_doubtful(t: Tick) -> str | None:
     doubtful = t.inputs.position.quality is PositionQuality.DOUBTFUL
     return reason_if(doubtful, f"position doubtful: {t.inputs.position.text}")
+
+
+def off_height(t: Tick) -> str | None:
+    return reason_if(t.off_height_s >= 0.0, "it does not hold its height")
+
+
+def disarm_refused(t: Tick) -> str | None:
+    result = t.inputs.vehicle.result
+    if t.flight.landed_since_s is None or result is None or result.at_s < t.flight.since_s:
+        return None
+    refused = result.action is Action.DISARM and not result.accepted
+    text = f"on the ground, and PX4 does not disarm ({result.text}): keep away; kill stops it"
+    return reason_if(refused, text)
 
 
 def too_close(t: Tick) -> str | None:
@@ -111,6 +125,8 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
     ReasonCode.REMOTE_CONTROL_LOST: remote_control_lost,
     ReasonCode.POSITION_LOST: position_lost,
     ReasonCode.POSITION_DOUBTFUL: position_doubtful,
+    ReasonCode.OFF_HEIGHT: off_height,
+    ReasonCode.DISARM_REFUSED: disarm_refused,
     ReasonCode.TOO_CLOSE: too_close,
     ReasonCode.OUTSIDE_FENCE: outside,
     ReasonCode.PX4_CHANGED: px4_changed,

@@ -189,7 +189,8 @@ def _hold(
     depth_m = fence.distance_m(*position_m[:2].tolist())
     back_inside_m = _BACK_INSIDE_SHARE * fence.buffer_m
     recovering = depth_m < 0.0 or (guidance.recovering and depth_m < back_inside_m)
-    lands = not recovering and not Tick(robot, flight, inputs).ground_heard
+    tick = Tick(robot, flight, inputs)
+    lands = not recovering and (not tick.ground_heard or tick.off_height_s >= 0.0)
     wanted_m_s = (np.array(place.position_m) - position_m) / _AHEAD_S
     velocity_m_s = make_room(
         position_m,

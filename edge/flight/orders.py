@@ -66,9 +66,9 @@ def _cannot_disarm(t: Tick) -> Refusal | None:
     arming = t.flight.state is _S.ARMING  # It may be armed before that is heard.
     if vehicle.armed is False and not arming:
         return Refusal(RefusalCode.NOT_ARMED, "is not armed")
-    if vehicle.in_air:
+    if t.in_air:
         return Refusal(RefusalCode.IN_THE_AIR, "in the air: land it first")
-    known = arming or (vehicle.armed and vehicle.in_air is False)
+    known = arming or (vehicle.armed and t.in_air is False)
     if known:
         return None
     return Refusal(RefusalCode.ARMED_NOT_KNOWN, "not known to be armed, and on the ground")
@@ -95,7 +95,7 @@ def _not_in_place(t: Tick) -> Refusal | None:
         return Refusal(RefusalCode.POSITION_NOT_GOOD, doubtful)
     if odometry is None or height is None:
         return Refusal(RefusalCode.PLACE_NOT_KNOWN, "position or height is not known")
-    if not (vehicle.armed and vehicle.in_air):
+    if not (vehicle.armed and t.in_air):
         return Refusal(RefusalCode.NOT_IN_THE_AIR, "the vehicle is not in the air")
     if acts := failsafe(t):
         return Refusal(RefusalCode.FAILSAFE, acts)

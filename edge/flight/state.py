@@ -18,6 +18,7 @@ from edge.core.ports import Odometry
 from edge.core.position import PositionJudgement, PositionQuality
 from edge.core.vehicle import PILOTED, Mode, Vector, VehicleState
 from edge.flight.energy import Energy
+from edge.flight.lift import Lift
 from edge.flight.margins import ErrorBudget, places_apart
 from edge.flight.reach import Reach
 from edge.flight.safety import Closest, MotionLimits, SeparationLimits, stopping_m
@@ -125,6 +126,7 @@ class FlightMemory:
     `armed_by` is whose takeoff order this program armed it by, `disarmed_at_s` when the vehicle was
     last known to be disarmed.
     `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
+    `lift` is whether it holds its height, and whether it stands on the ground.
     """
 
     state: FlightState = FlightState.INIT
@@ -151,6 +153,7 @@ class FlightMemory:
     trial: str = ""
     obeyed_expiry_s: float = -math.inf
     answers: tuple[OrderResult, ...] = ()
+    lift: Lift = field(default_factory=Lift)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,6 +336,22 @@ class Tick:
         return height_m(self.flight, self.inputs.odometry)
 
     @property
+    def wanted_height_m(self) -> float | None:
+        """The height that it is told to keep or to reach; None if there is none."""
+        if self.flight.state in (FlightState.MISSION, FlightState.RETURN):
+            return self.robot.parameters.slot_height_m
+        return None if self.flight.target_m is None else self.flight.target_m[2]
+
+    @property
+    def off_height_s(self) -> float:
+        """For how long it has been known not to hold its height, s; below 0 if it is not."""
+        return self.flight.lift.off_s(self.inputs.now_s)
+
+    @property
+    def in_air(self) -> bool | None:
+        return in_air(self.flight, self.inputs.vehicle, self.inputs.now_s)
+
+    @property
     def knows_place(self) -> bool:
         """Whether the position is good to fly by."""
         return self.inputs.position.quality is PositionQuality.GOOD
@@ -368,6 +387,11 @@ def height_m(flight: FlightMemory, odometry: Odometry | None) -> float | None:
     if odometry is None or flight.datum_m is None:
         return None
     return odometry.position_m[2] - flight.datum_m
+
+
+def in_air(flight: FlightMemory, vehicle: VehicleState, now_s: float) -> bool | None:
+    """Whether the vehicle is; None when unknown. One that stands is not, whatever PX4 says."""
+    return False if flight.lift.stands(now_s) else vehicle.in_air
 
 
 def flown_s(flight: FlightMemory, vehicle: VehicleState, now_s: float) -> float | None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from edge.core.vehicle import Action, Mode, Vector, VehicleState
 from edge.flight.alarms import alarms
+from edge.flight.lift import Lift, Motion, look
 from edge.flight.orders import ORDERS, answered, new_order, obeyed, refusal
 from edge.flight.state import (
     STALE_TELEMETRY_S,
@@ -17,11 +18,19 @@ from edge.flight.state import (
     Robot,
     Tick,
     failsafe_acts,
+    in_air,
     is_silent,
 )
 from edge.flight.transitions import TRANSITIONS, Transition
 from edge.messages.codes import Reason, Refusal, RefusalCode
-from edge.messages.mission import ON_GROUND, STEERED, FlightState, Order, OrderKind
+from edge.messages.mission import (
+    AIRBORNE,
+    ON_GROUND,
+    STEERED,
+    FlightState,
+    Order,
+    OrderKind,
+)
 
 _S = FlightState
 
@@ -29,6 +38,8 @@ _S = FlightState
 _STREAM_S = 0.5
 _ASK_AGAIN_S = 1.0
 _LANDED_DISARM_S = 3.0
+# A return climbs at half the speed that it is told at least.
+_CLIMBS_SHARE = 0.5
 
 
 class Decision(NamedTuple):
@@ -86,8 +97,9 @@ def _look(t: Tick) -> FlightMemory:
         flight = _with(flight, reached=flight.reached or _as_needed(flight.state, vehicle))
     if not is_silent(flight, now_s) and (flight.reached or flight.state not in STEERED):
         flight = _with(flight, silent_until_s=-math.inf)
+    flight = _with(flight, lift=_lift(t))
     landed_since_s = now_s if flight.landed_since_s is None else flight.landed_since_s
-    down = flight.state is _S.LAND and vehicle.in_air is False
+    down = flight.state is _S.LAND and in_air(flight, vehicle, now_s) is False
     flight = _with(flight, landed_since_s=landed_since_s if down else None)
     if failsafe_acts(vehicle):
         flight = replace(flight, failsafe_at_s=now_s)
@@ -108,6 +120,24 @@ def _look(t: Tick) -> FlightMemory:
     if flight.state is _S.PILOT and flight.datum_m is None and t.age_s > STALE_TELEMETRY_S:
         flight = replace(flight, datum_m=_home_m(inputs))
     return flight
+
+
+def _lift(t: Tick) -> Lift:
+    flight, inputs, odometry = t.flight, t.inputs, t.inputs.odometry
+    if flight.state not in AIRBORNE:
+        return Lift()
+    # Beneath somebody who hovers above it, a takeoff waits.
+    climbs_m_s = 0.0 if flight.state is _S.TAKEOFF else _CLIMBS_SHARE * t.robot.limits.max_climb_m_s
+    motion = Motion(
+        height_m=t.height_m,
+        climb_m_s=None if odometry is None else odometry.velocity_m_s[2],
+        wanted_m=t.wanted_height_m,
+        approach_m_s=climbs_m_s,
+        thrust=inputs.vehicle.thrust,
+        in_air=inputs.vehicle.in_air,
+        ground_below_m=t.robot.errors.height_m,
+    )
+    return look(flight.lift, motion, inputs.now_s, inputs.now_s - flight.tick_at_s)
 
 
 def _with(flight: FlightMemory, **changes: Any) -> FlightMemory:
@@ -166,6 +196,7 @@ def enter(row: Transition, reason: str, t: Tick) -> FlightMemory:
         landed_since_s=None,
         land_by=row.land_by,
         killed=flight.killed or row.kills,
+        lift=flight.lift.entered(steered=row.target in STEERED),
     )
 
 

@@ -16,6 +16,7 @@ from edge.flight.alarms import (
     battery_low,
     failsafe,
     ground_lost,
+    off_height,
     policy_stale,
     position_doubtful,
     position_lost,
@@ -34,6 +35,8 @@ _ARMING_TIMEOUT_S = 6.0
 _AT_HEIGHT_M = 0.5
 _AT_LANDING_POINT_M = 0.5
 _AT_REST_M_S = 0.4
+# To leave those who are near, before it comes down through their heights.
+_LEAVES_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +168,11 @@ def _position_lost(t: Tick) -> str | None:
 
 def _on_ground(t: Tick) -> str | None:
     # Nothing that the ground repeats may lift a vehicle off.
-    return reason_if(t.inputs.vehicle.in_air is False and not t.silent, "it stands on the ground")
+    return reason_if(t.in_air is False and not t.silent, "it stands on the ground")
+
+
+def _long_off_height(t: Tick) -> str | None:
+    return off_height(t) if t.off_height_s >= _LEAVES_S else None
 
 
 def _battery_critical(t: Tick) -> str | None:
@@ -191,8 +198,13 @@ def _ground_holds_landing(t: Tick) -> str | None:
     return None if emergency else _ground_holds(t)
 
 
+def _may_leave(t: Tick) -> bool:
+    """Whether it may fly elsewhere: PX4's failsafe does not act, and it holds its height."""
+    return not t.failsafe_acts and t.off_height_s < 0.0
+
+
 def _ground_returns(t: Tick) -> str | None:
-    return reason_if(t.safety_action == "return" and not t.failsafe_acts, "ground commands return")
+    return reason_if(t.safety_action == "return" and _may_leave(t), "ground commands return")
 
 
 def _ground_returns_landing(t: Tick) -> str | None:
@@ -220,7 +232,7 @@ def _ground_long_lost(t: Tick) -> str | None:
 
 
 def _free_to_return(t: Tick) -> bool:
-    return t.safety_action == "none" and t.ground_heard and not t.failsafe_acts
+    return t.safety_action == "none" and t.ground_heard and _may_leave(t)
 
 
 def _battery_low_in_hold(t: Tick) -> str | None:
@@ -234,7 +246,7 @@ def _px4_stays_changed(t: Tick) -> str | None:
 
 def _left_alone(t: Tick) -> str | None:
     since_s, limit_s = t.flight.alone_since_s, t.robot.parameters.hover_land_s
-    if since_s is None or t.silent or t.inputs.vehicle.in_air is not True:
+    if since_s is None or t.silent or t.in_air is not True:
         return None
     return reason_if(t.inputs.now_s - since_s > limit_s, f"nobody answered for {limit_s:g} s")
 
@@ -377,6 +389,10 @@ TRANSITIONS: tuple[Transition, ...] = (
                alarm=True),
     Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.LAND, _R.ON_GROUND, "it stands on the ground",
                _on_ground, alarm=True),
+    Transition((_S.TAKEOFF, _S.MISSION, _S.RETURN), _S.HOLD, _R.OFF_HEIGHT,
+               "it does not hold its height", off_height, alarm=True),
+    Transition((_S.HOLD,), _S.LAND, _R.OFF_HEIGHT, "the same, 3 s later", _long_off_height,
+               alarm=True),
     # The operator gives it away.
     Transition((_S.HOLD, _S.MISSION, _S.RETURN), _S.PILOT, _R.GIVEN_TO_PILOT,
                "the operator orders pilot", _always("given to a pilot"), order="pilot",

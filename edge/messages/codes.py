@@ -152,6 +152,8 @@ class ReasonCode(_Code):
     BATTERY_LOW = "battery_low"
     BATTERY_NOT_KNOWN = "battery_not_known"
     ON_GROUND = "on_ground"
+    DISARM_REFUSED = "disarm_refused"
+    OFF_HEIGHT = "off_height"
     TOO_CLOSE = "too_close"
     OUTSIDE_FENCE = "outside_fence"
     LANDS_BESIDE = "lands_beside"

@@ -13,6 +13,7 @@ from edge.core.vehicle import Action, Mode, Setpoint, VehicleState
 from edge.flight.energy import Consumption, Energy, EnergyParameters, home_s
 from edge.flight.guidance import Guidance, MissionSetpoint, guide
 from edge.flight.landing import Point, may_stand, place_to_land, standing_robots
+from edge.flight.lift import OFF_HEIGHT_M
 from edge.flight.record import Given, made
 from edge.flight.safety import Closest, nearest
 from edge.flight.silence import highest_still_m, last_word
@@ -50,6 +51,8 @@ _MAX_CHECKS_AGE_S = 5.0
 # Longer than any drone stays in the air.
 _REVOKED_STAYS_S = 1800.0
 _BUSY = (FlightState.ARMING, FlightState.TAKEOFF)
+# Where others take a robot to keep its own height.
+_AT_OWN_HEIGHT = (FlightState.HOLD, FlightState.MISSION, FlightState.RETURN)
 
 
 class GroundWorld(NamedTuple):
@@ -373,7 +376,11 @@ class FlightControl:
                 told.append(
                     Neighbour(beacon.robot_id, beacon.position_m, beacon.velocity_m_s, age_s)
                 )
-        piloted = {peer.beacon.robot_id for peer in peers if peer.beacon.state is FlightState.PILOT}
+        piloted = {
+            beacon.robot_id
+            for beacon, _ in peers
+            if beacon.state is FlightState.PILOT or _is_off_height(beacon)
+        }
         return tuple(
             neighbour._replace(is_piloted=neighbour.robot_id in piloted)
             for neighbour in (*heard, *told)
@@ -508,3 +515,9 @@ class FlightControl:
             given = (answer for answer in self.flight.answers if answer.order_id == order_id)
             record = {**asdict(inputs.order), "answer": next(given, None)}
             self._recorder.record("order", self._unix_clock_s(), record)
+
+
+def _is_off_height(beacon: Beacon) -> bool:
+    if beacon.position_m is None or beacon.state not in _AT_OWN_HEIGHT:
+        return False
+    return abs(beacon.position_m[2] - beacon.slot_height_m) > OFF_HEIGHT_M

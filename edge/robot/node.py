@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from edge.core.logger import log
 from edge.core.ports import Clock, Recorder, SensorOver, Vehicle, VehicleSetup, Watchdog
 from edge.core.vehicle import Action
-from edge.flight.state import flown_s
+from edge.flight.state import flown_s, in_air
 from edge.identity.guard import Guard, Speaker
 from edge.messages.beacon import BEACON_BYTES, Beacon, decode_beacon, encode_beacon, tag
 from edge.messages.bounds import MOST_TEXTS
@@ -432,7 +432,7 @@ class RobotNode:
             loops=dict(loops),
             fence=robot.fence,
             not_taken=control.not_taken,
-            in_air=vehicle.in_air,
+            in_air=in_air(flight, vehicle, now_s),
             global_deg=self._navigation.global_deg(vehicle),
             hdop=gps.hdop if gps is not None and math.isfinite(gps.hdop) else None,
             policy_velocity_m_s=(

@@ -520,6 +520,26 @@ class MissionEnds:
 
 
 @dataclass(frozen=True, slots=True)
+class LeavesMission:
+    """So long after it was so far below its height, the last velocity setpoint has come."""
+
+    below_m: float
+    within_s: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        latest_s = -math.inf
+        for vehicle in _of(flight, self.whose):
+            part = vehicle.between(flight.fault_s, math.inf)
+            height_m = part.position_m[:, 2]
+            low = np.flatnonzero(height_m < height_m[0] - self.below_m)
+            flown = part.setpoint_at_s[part.is_velocity & part.is_in(Px4Mode.OFFBOARD)]
+            ended_s = float(flown.max(initial=flight.fault_s))
+            latest_s = max(latest_s, ended_s - float(part.time_s[low[0]]) if len(low) else math.inf)
+        return Figure("leaves the mission", latest_s, self.within_s, "s")
+
+
+@dataclass(frozen=True, slots=True)
 class FallsSilent:
     """Nothing is sent to the vehicle any more."""
 
@@ -613,6 +633,22 @@ class KeepsHeight:
             if len(heights_m):
                 farthest_m = max(farthest_m, float(np.abs(heights_m - heights_m[0]).max()))
         return Figure("leaves its height", farthest_m, self.within_m, "m")
+
+
+@dataclass(frozen=True, slots=True)
+class Climbs:
+    """Wherever it has got to, it climbs no further than that again."""
+
+    at_most_m: float
+    whose: Whose = "hit"
+
+    def figure(self, flight: FlightTruth) -> Figure:
+        farthest_m = 0.0
+        for vehicle in _of(flight, self.whose):
+            heights_m = vehicle.between(flight.fault_s, math.inf).position_m[:, 2]
+            climbed_m = heights_m - np.minimum.accumulate(heights_m)
+            farthest_m = max(farthest_m, float(climbed_m.max(initial=0.0)))
+        return Figure("climbs again", farthest_m, self.at_most_m, "m")
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from typing import Literal
 
 from lpac.sim.drill.bounds import (
     POSITION_ERROR_M,
+    Climbs,
     ComesBack,
     Criterion,
     Down,
@@ -22,6 +23,7 @@ from lpac.sim.drill.bounds import (
     LandApart,
     Lands,
     LandsAtPad,
+    LeavesMission,
     MissionEnds,
     MotorsOff,
     Moves,
@@ -115,6 +117,10 @@ _BRAKED = Stands(2.0, 5.0, speed_m_s=0.8)
 _BRAKED_LATER = Stands(2.6, 6.0, speed_m_s=0.8)
 # Without a ground they stand, but part before they come down where they are.
 _WAIT = Stands(7.0, 12.5, "all", may_part=True)
+# Full thrust lifts less than the weight: the vehicle sinks at 1.2 m/s in the end, or 0.3 m/s.
+_SINKS, _SINKS_SLOWLY = MotorWeakens(0.57), MotorWeakens(0.525)
+# Off its height by 1.5 m for 2 s, as estimated; control and estimate may be half a metre off.
+_SINKING_NOTICED = LeavesMission(below_m=2.0, within_s=2.3)
 # By no more than landing points lie apart; before that they stop, and gusts carry them.
 _PARTS_M = 8.0 + 3.0
 _PART = StaysNear(3.8, 12.5, _PARTS_M, "all")
@@ -615,6 +621,38 @@ _ENERGY_AND_AIR = (
         promise="the mission goes on",
         does=_once(MotorWeakens(0.33)),
         bounds=(FliesOn(20.0, 0.9, "all"), LandsAtPad(_AT_PAD_M, "all")),
+    ),
+    Fault(
+        name="sinks", what="a robot's motors lift too little in flight, and it sinks",
+        promise="1.5 m below its height for 2 s: it holds, apart from others, and lands 3 s later",
+        does=_once(_SINKS),
+        bounds=(_SINKING_NOTICED, Lands(8.5), Down(8.5 + _LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="sinks-slowly", what="a robot's motors lift a little too little: it sinks at 0.3 m/s",
+        promise="as one that sinks faster, but later",
+        does=_once(_SINKS_SLOWLY), watched_s=30.0,
+        bounds=(_SINKING_NOTICED, Lands(15.0), Down(15.0 + _LANDING_S), FliesOn(30.0)),
+    ),
+    Fault(
+        name="sinks-in-takeoff", what="a robot's motors lift too little while it climbs",
+        promise="it holds, and lands 3 s later",
+        phase="takeoff", does=(Do(9.0, _SINKS),),
+        bounds=(TakesOff("others"), Down(20.0 + _LANDING_S)),
+    ),
+    Fault(
+        name="sinks-in-return", what="a robot's motors lift too little on its way home",
+        promise="it holds, apart from others, and lands 3 s later",
+        phase="return", does=_once(_SINKS), hits=2,
+        bounds=(Down(20.0 + _LANDING_S), LandsAtPad(_AT_PAD_M, "others")),
+    ),
+    Fault(
+        name="sinks-for-a-while", what="a robot's motors lift too little for 7 s",
+        promise="it lands all the same, and does not climb to its height again",
+        does=(*_once(_SINKS), Do(7.0, MotorWeakens(0.0))),
+        bounds=(
+            _SINKING_NOTICED, Lands(8.5), Climbs(2.0), Down(8.5 + _LANDING_S), FliesOn(20.0),
+        ),
     ),
     Fault(
         name="does-not-climb", what="a robot's motors do not lift it",

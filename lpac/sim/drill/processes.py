@@ -38,6 +38,7 @@ from lpac.sim.drill.injections import (
     GroundStops,
     Injection,
     LoseGps,
+    MotorWeakens,
     OperatorOrders,
     OriginJumps,
     ParameterIs,
@@ -69,7 +70,8 @@ _PROGRAMS = (
 MAVLINK: tuple[type, ...] = (VehicleInjection, AutopilotSilent, *_PROGRAMS)
 # What a ground station or a pilot can do to a real one, and PX4's own simulator to its vehicle.
 PX4: tuple[type, ...] = (
-    LoseGps, BatteryIs, OriginJumps, ParameterIs, FenceCleared, PilotInjection, *_PROGRAMS,
+    LoseGps, BatteryIs, OriginJumps, MotorWeakens, ParameterIs, FenceCleared, PilotInjection,
+    *_PROGRAMS,
 )  # fmt: skip
 
 _INT32, _REAL32 = mavlink.MAV_PARAM_TYPE_INT32, mavlink.MAV_PARAM_TYPE_REAL32
@@ -421,6 +423,8 @@ class Px4Field(ProcessField):
                 vehicle.clear_fence()
             case OriginJumps(by_m):
                 vehicle.jump_estimator_origin(*by_m)
+            case MotorWeakens(loss):
+                vehicle.weaken_motors(loss)
             case PilotInjection():
                 injection.apply(vehicle, robot, self)
             case _:

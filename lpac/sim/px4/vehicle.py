@@ -49,8 +49,8 @@ from lpac.sim.px4.parameters import PARAMETERS
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
 GRAVITY_M_S2 = 9.81
-# All motors at full thrust lift twice the weight, as PX4's own simulator's do.
-GREATEST_LIFT_M_S2 = 2.0 * GRAVITY_M_S2
+# All motors at full thrust, and the air's drag on what sinks: as in PX4's own simulator.
+GREATEST_LIFT_M_S2, SINKING_DRAG_PER_S = 20.0, 1.0
 # Share of the wind that its change pushes the vehicle with, 1/s, and how soon control makes up.
 DRAG_PER_S = 0.3
 WIND_COMPENSATION_S = 5.0
@@ -180,7 +180,7 @@ class Px4Vehicle:
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
     and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
     any more), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (the share of its thrust
-    that is lost in flight: above half of it, the vehicle sinks).
+    that is lost in flight: above 0.51 the vehicle sinks).
     `thrust` is the share of the greatest one that its motors are asked for. `truth` grows by one
     entry every 0.04 s.
     """
@@ -836,7 +836,7 @@ class Px4Vehicle:
         wanted_lift = 0.0 if stands else GRAVITY_M_S2 - wanted
         self.thrust = min(wanted_lift / max(full_lift, 1e-9), 1.0)
         # A vehicle that lifts too little sinks, against the air's drag.
-        return max(wanted, GRAVITY_M_S2 - full_lift - DRAG_PER_S * max(v_down, 0.0))
+        return max(wanted, GRAVITY_M_S2 - full_lift - SINKING_DRAG_PER_S * max(v_down, 0.0))
 
     def _fall(self, dt_s: float) -> None:
         self.yaw_rate_rad_s = 0.0

@@ -41,6 +41,8 @@ _CHANNELS = {
 }  # fmt: skip
 # PX4's own default.
 _SATELLITES = 10
+# SIH_T_MAX of PX4's own quadrotor: what each motor lifts at full thrust, N.
+_FULL_THRUST_N = 5.0
 # BAT1_SOURCE: what MAVLink tells, instead of PX4's own simulator. And cells as the simulator's.
 _EXTERNAL_BATTERY = 1
 _CELLS, _EMPTY_CELL_V, _FULL_CELL_V = 4, 3.6, 4.05
@@ -137,6 +139,11 @@ class RealVehicle:
         """Its receiver sees no satellite from now on, or sees them again."""
         satellites = 0 if lost else _SATELLITES
         self.set_parameter("SIM_GPS_USED", satellites, mavlink.MAV_PARAM_TYPE_INT32)
+
+    def weaken_motors(self, loss: float) -> None:
+        """Its motors lose this share of their full thrust."""
+        thrust_n = (1.0 - loss) * _FULL_THRUST_N
+        self.set_parameter("SIH_T_MAX", thrust_n, mavlink.MAV_PARAM_TYPE_REAL32)
 
     def drain(self, remaining: float) -> None:
         """The battery of an armed vehicle falls to this share within a second.

@@ -611,15 +611,29 @@ def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: F
     assert flown.order("start", "a").accepted
 
 
-def test_who_is_flown_by_a_pilot_is_kept_away_from_further(flown: Flown) -> None:
+@pytest.mark.parametrize(
+    ("state", "above_its_height_m", "goes"),
+    [
+        (FlightState.HOLD, 0.0, False),
+        (FlightState.PILOT, 0.0, True),
+        # It sinks, and hangs there.
+        (FlightState.MISSION, -1.4, False),
+        (FlightState.MISSION, -1.6, True),
+    ],
+)
+def test_who_is_flown_by_a_pilot_or_off_its_height_is_kept_away_from_further(
+    flown: Flown, state: FlightState, above_its_height_m: float, goes: bool
+) -> None:
     flown.take_off()
     flown.explore("a")
     x_m, y_m, height_m = flown.odometry()
-    for state, goes in ((FlightState.HOLD, False), (FlightState.PILOT, True)):
-        for _ in range(50):
-            flown.peers(peer(5, state, (x_m, y_m + 3.0, height_m)))
-            flown.tick()
-        assert (math.dist(flown.odometry()[:2], (x_m, y_m + 3.0)) > 4.5) == goes
+    other = dataclasses.replace(
+        peer(5, state, (x_m, y_m + 3.0, height_m)), slot_height_m=height_m - above_its_height_m
+    )
+    for _ in range(50):
+        flown.peers(other)
+        flown.tick()
+    assert (math.dist(flown.odometry()[:2], (x_m, y_m + 3.0)) > 4.5) == goes
 
 
 def test_a_revoked_robot_is_kept_away_from_where_it_was_last(flown: Flown) -> None:

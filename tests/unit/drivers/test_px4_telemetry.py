@@ -16,6 +16,7 @@ from edge.core.position import (
 )
 from edge.core.vehicle import Action, Mode, VehicleState
 from edge.drivers.px4.telemetry import Px4Telemetry
+from edge.flight.lift import Lift, Motion, look
 from edge.flight.state import FlightInputs, FlightMemory
 from edge.flight.step import step
 from edge.messages.codes import Reason, ReasonCode
@@ -99,6 +100,34 @@ def test_the_thrust_of_a_normal_flight() -> None:
     flown = [c.vehicle.thrust for c in found if 20.0 < c.time_s < 52.0]
     assert all(thrust is not None and 0.4 < thrust < 0.6 for thrust in flown)
     assert {c.vehicle.thrust for c in found if 63.8 < c.time_s < 66.0} == {0.0}
+
+
+@pytest.mark.parametrize("name", ["normal", "kill", "stop", "battery", "battery_fast"])
+def test_a_flight_by_its_height_and_thrust(name: str) -> None:
+    """It holds its height in offboard, never seems to stand in the air, and does once it is down.
+
+    On its legs its estimated height walks by up to 0.7 m.
+    """
+    lift, stood_m = Lift(), []
+    for now_s, vehicle, _ in conclusions(name):
+        if not vehicle.armed or vehicle.position_local_m is None:
+            continue
+        assert vehicle.velocity_local_m_s is not None
+        motion = Motion(
+            height_m=-vehicle.position_local_m[2],
+            climb_m_s=-vehicle.velocity_local_m_s[2],
+            wanted_m=4.3 if vehicle.mode is Mode.OFFBOARD else None,
+            approach_m_s=0.0,
+            thrust=vehicle.thrust,
+            in_air=vehicle.in_air,
+            ground_below_m=4.5,
+        )
+        lift = look(lift, motion, now_s, TICK_S)
+        assert lift.off_s(now_s) < 0.0
+        if lift.stands(now_s):
+            stood_m.append(-vehicle.position_local_m[2])
+    assert lift.hover_thrust is not None and 0.45 < lift.hover_thrust < 0.55
+    assert stood_m and max(stood_m) < 0.8
 
 
 def test_a_thrust_that_is_not_told_any_more_is_not_known() -> None:

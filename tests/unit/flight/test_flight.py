@@ -136,7 +136,9 @@ class World:
         self.setpoint_at_s = -math.inf
         self.commands: list[Action] = []
         self.refuses: dict[Action, str] = {}
-        self.heavy = self.stuck = False
+        self.heavy = self.stuck = self.never_lands = False
+        # Its motors do not lift it, so that it sinks so fast; and PX4 always says "in the air".
+        self.sinks_m_s = 0.0
         self.watchdog = True
         # What is heard of it.
         self.telemetry = True
@@ -306,7 +308,7 @@ class World:
             self.mode = self.failsafe
         self._move(dt_s)
         if self.now_s >= self.next_beat_s:
-            in_air = self.armed and self.height_m > 0.1
+            in_air = self.armed and (self.height_m > 0.1 or self.never_lands)
             failsafe = self.armed and self.failsafe is not None
             beat = (self.next_beat_s, self.mode, self.armed, in_air, failsafe)
             self.next_beat_s += PERIOD_S
@@ -352,6 +354,8 @@ class World:
         self.velocity_m_s = self.velocity_m_s + 0.4 * (wanted_m_s - self.velocity_m_s)
         if self.heavy:
             self.velocity_m_s[2] = min(self.velocity_m_s[2], 0.0)
+        if self.sinks_m_s:
+            self.velocity_m_s[2] = -self.sinks_m_s
         self.position_m = self.position_m + self.velocity_m_s * dt_s
         if self.height_m > 0.0:
             self.landed_at_s = None
@@ -359,8 +363,14 @@ class World:
         self.position_m[2] = 0.0
         self.velocity_m_s = np.zeros(3)
         self.landed_at_s = self.now_s if self.landed_at_s is None else self.landed_at_s
-        if self.mode is Mode.LAND and self.now_s - self.landed_at_s > 2.0:
+        down_s = self.now_s - self.landed_at_s
+        if self.mode is Mode.LAND and down_s > 2.0 and Action.DISARM not in self.refuses:
             self.armed = False
+
+    def _thrust(self) -> float:
+        if not self.armed or (self.height_m == 0.0 and self.mode is Mode.LAND):
+            return 0.0
+        return 1.0 if self.sinks_m_s or self.height_m == 0.0 else 0.5
 
     # The robot
 
@@ -381,6 +391,7 @@ class World:
             connected=silence_s < 2.5,
             fell=self.fell,
             battery=self.battery,
+            thrust=self._thrust(),
             position_local_m=(0.0, 0.0, 0.0),
             position_at_s=min(self.now_s, self.silent_from_s),
             position_changed_at_s=min(self.now_s, self.silent_from_s),
@@ -1088,6 +1099,93 @@ def test_a_robot_that_was_knocked_down_in_its_mission_lands(world: World) -> Non
         world.tick()
     world.until(FlightState.LAND, 3.0)
     assert world.flight.alarming
+
+
+def test_a_robot_that_sinks_holds_apart_and_lands(world: World) -> None:
+    world.fly()
+    world.sinks_m_s = 0.8
+    sank_at_s = world.now_s
+    world.until(FlightState.HOLD, 6.0)
+    # 1.5 m take 1.9 s.
+    assert world.now_s - sank_at_s == pytest.approx(1.9 + 2.0, abs=0.3)
+    assert world.why == (FlightState.HOLD, ReasonCode.OFF_HEIGHT)
+    # Nothing leads it elsewhere meanwhile.
+    world.enable(safety_action="return")
+    world.battery = 0.2
+    decision = world.tick()
+    assert codes(decision)[0] is ReasonCode.OFF_HEIGHT
+    assert world.refuse("start") in (RefusalCode.GROUND_COMMANDS, RefusalCode.NOT_AT_HEIGHT)
+    held_at_s = world.now_s
+    world.until(FlightState.LAND, 3.5)
+    assert world.why == (FlightState.LAND, ReasonCode.OFF_HEIGHT)
+    assert world.now_s - held_at_s < 3.2
+    world.until(FlightState.LANDED, 15.0)
+
+
+def test_a_robot_that_sinks_as_it_returns_holds_or_takes_off_lands(world: World) -> None:
+    def sinks() -> None:
+        world.sinks_m_s = 0.8
+        world.until(FlightState.LAND, 8.0)
+        assert world.why == (FlightState.LAND, ReasonCode.OFF_HEIGHT)
+        world.until(FlightState.LANDED, 20.0)
+        world.sinks_m_s = 0.0
+
+    world.fly()
+    world.enable(safety_action="return")
+    world.until(FlightState.RETURN, 1.0)
+    sinks()
+    world.hover()
+    sinks()
+    world.ready()
+    world.obey("takeoff")
+    while world.height_m < 8.0:
+        world.tick()
+    sinks()
+
+
+def test_a_robot_that_is_given_time_to_climb_to_its_height_returns(world: World) -> None:
+    """From where a hold stopped its takeoff."""
+    world.ready()
+    world.obey("takeoff")
+    while world.height_m < 2.0:
+        world.tick()
+    world.run(2.5 - world.latency_s)
+    world.enable(safety_action="hold")
+    world.until(FlightState.HOLD, 1.0)
+    world.run(5.0)
+    world.enable(safety_action="return")
+    world.until(FlightState.LANDED, 60.0)
+    assert ReasonCode.OFF_HEIGHT not in {row.code for row in world.taken}
+
+
+def test_what_stands_on_the_ground_is_landed_whatever_the_autopilot_says(world: World) -> None:
+    """It pushes upwards, PX4 says that it is in the air, and would not disarm it."""
+    world.fly()
+    world.sinks_m_s = 4.0
+    world.never_lands = True
+    world.refuses = {Action.DISARM: "denied"}
+    while world.height_m > 0.0:
+        world.tick()
+    world.until(FlightState.LAND, 2.8)
+    assert world.why == (FlightState.LAND, ReasonCode.ON_GROUND)
+    # Its motors lift again, and PX4 lands: they idle.
+    world.sinks_m_s = 0.0
+    world.run(8.0)
+    assert world.height_m == 0.0 and world.armed
+    assert ReasonCode.DISARM_REFUSED in codes(world.tick())
+    assert world.asked(Action.DISARM) > 1
+    world.refuses = {}
+    world.until(FlightState.LANDED, 4.0)
+
+
+def test_disarm_is_taken_from_what_stands_whatever_the_autopilot_says(world: World) -> None:
+    world.fly()
+    assert world.refuse("disarm") is RefusalCode.IN_THE_AIR
+    world.never_lands = True
+    world.sinks_m_s = 4.0
+    world.until(FlightState.LAND, 8.0)
+    world.obey("disarm")
+    assert world.why == (FlightState.PILOT, ReasonCode.DISARM_ORDERED)
 
 
 def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:

@@ -23,6 +23,7 @@ from edge.flight.guidance import (
     MissionVelocity,
     guide,
 )
+from edge.flight.lift import Lift
 from edge.flight.safety import MotionLimits
 from edge.flight.state import FlightInputs, FlightMemory, FlightParameters, Robot
 from edge.messages.mission import FlightState
@@ -276,6 +277,15 @@ def test_who_has_parted_stays_there_though_it_hears_nobody_or_the_ground_again()
     heard_again = hold_over_each_other(PAIR_M, 20.0, ground_age_s=lambda t: 5.0 if t < 8.0 else 0.1)
     flickers = hold_over_each_other(PAIR_M, 20.0, ground_age_s=lambda t: 2.5 + 0.2 * (t % 5.0))
     assert min(map(least_apart_m, (deaf, heard_again, flickers))) > 6.5
+
+
+def test_who_does_not_hold_its_height_parts_from_who_is_above_or_below() -> None:
+    lost = replace(flight(FlightState.HOLD, AT_SLOT), lift=Lift(off_since_s=97.0))
+    for hold, parts in ((lost, True), (flight(FlightState.HOLD, AT_SLOT), False)):
+        vehicle = Vehicle(AT_SLOT)
+        other = Neighbour(2, (AT_SLOT[0] + 1.0, AT_SLOT[1], SLOT_M - 4.5), STILL, 0.0)
+        vehicle.fly(hold, 3.0, neighbours=(other,))
+        assert (math.dist(vehicle.position_m[:2], other.position_m[:2]) > 2.5) == parts
 
 
 def test_who_was_carried_outside_comes_back_before_it_parts() -> None:

@@ -1,0 +1,108 @@
+"""Whether the vehicle holds its height, and whether it stands on the ground.
+
+The autopilot reports neither of a vehicle whose motors lift too little: told to climb, it pushes
+against the ground and takes itself to be in the air. Height, climb rate and thrust tell. Nothing
+here has a clock.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+# No error of control keeps it so far from its height for so long; others fly there.
+OFF_HEIGHT_M, _OFF_S = 1.5, 2.0
+# Nothing that flies keeps a height for so long at a thrust so far from the one that carries it.
+_STANDS_S = 2.0
+_STILL_M_S = 0.3
+_FALLS_SHARE, _CLIMBS_SHARE, _FULL_THRUST = 0.5, 1.2, 0.95
+# The thrust that carries it is learned near its height.
+_AT_HEIGHT_M, _LEARNED_WITHIN_S = 0.5, 10.0
+# After a longer pause nobody knows what it did.
+_LONGEST_TICK_S = 0.5
+
+
+class Motion(NamedTuple):
+    """A vehicle's motion in one tick; heights above the takeoff point; None is not known.
+
+    `wanted_m` is the height that it is told to keep or to reach, None if it is told to land, and
+    `approach_m_s` how fast it comes nearer to that at least: 0 if it may pause on its way.
+    `ground_below_m` is the greatest height that it may be told of while it stands on the ground.
+    """
+
+    height_m: float | None
+    climb_m_s: float | None
+    wanted_m: float | None
+    approach_m_s: float
+    thrust: float | None
+    in_air: bool | None
+    ground_below_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Lift:
+    """What is remembered from tick to tick.
+
+    `slack_m` is how far it may still be from its height, since it is on its way. It has been
+    further off since `off_since_s`, and moved and pushed as what stands since `stands_since_s`;
+    None if it does not. `hover_thrust` is what carries it, None before it was at its height.
+    """
+
+    slack_m: float = math.inf
+    off_since_s: float | None = None
+    stands_since_s: float | None = None
+    hover_thrust: float | None = None
+
+    def off_s(self, now_s: float) -> float:
+        """For how long it has been known not to hold its height, s; below 0 if it is not."""
+        return -math.inf if self.off_since_s is None else now_s - self.off_since_s - _OFF_S
+
+    def stands(self, now_s: float) -> bool:
+        """Whether it stands on the ground, whatever the autopilot says."""
+        since_s = self.stands_since_s
+        return since_s is not None and now_s - since_s >= _STANDS_S
+
+    def entered(self, *, steered: bool) -> "Lift":
+        """The same in a new state. A lost height is forgotten only where nobody steers it."""
+        return replace(self, slack_m=math.inf, off_since_s=self.off_since_s if steered else None)
+
+
+def look(lift: Lift, motion: Motion, now_s: float, dt_s: float) -> Lift:
+    """The memory after a tick that came `dt_s` after the last one."""
+    dt_s = min(max(dt_s, 0.0), _LONGEST_TICK_S)
+    off_m = math.nan
+    if motion.height_m is not None and motion.wanted_m is not None:
+        off_m = abs(motion.height_m - motion.wanted_m)
+    slack_m = lift.slack_m
+    if math.isfinite(off_m):
+        slack_m = min(max(slack_m - motion.approach_m_s * dt_s, 0.0), off_m)
+    off_since_s, is_lost = lift.off_since_s, lift.off_s(now_s) >= 0.0
+    if not is_lost:
+        off_since_s = _since(off_since_s, off_m > slack_m + OFF_HEIGHT_M, now_s)
+    hover_thrust = lift.hover_thrust
+    if off_m < _AT_HEIGHT_M and not is_lost and motion.in_air and motion.thrust is not None:
+        before = motion.thrust if hover_thrust is None else hover_thrust
+        hover_thrust = before + (motion.thrust - before) * dt_s / _LEARNED_WITHIN_S
+    seems_to_stand = _seems_to_stand(motion, hover_thrust, is_lost=is_lost)
+    stands_since_s = _since(lift.stands_since_s, seems_to_stand, now_s)
+    return Lift(slack_m, off_since_s, stands_since_s, hover_thrust)
+
+
+def _since(before_s: float | None, holds: bool, now_s: float) -> float | None:
+    if not holds:
+        return None
+    return now_s if before_s is None else before_s
+
+
+def _seems_to_stand(motion: Motion, hover_thrust: float | None, *, is_lost: bool) -> bool:
+    height_m, climb_m_s, thrust = motion.height_m, motion.climb_m_s, motion.thrust
+    if height_m is None or climb_m_s is None or thrust is None or hover_thrust is None:
+        return False
+    if abs(climb_m_s) > _STILL_M_S or height_m > motion.ground_below_m:
+        return False
+    if thrust < _FALLS_SHARE * hover_thrust:
+        return True
+    if motion.wanted_m is None:
+        return False
+    # Told to climb, or where it came to rest after it sank, it pushes and does not rise.
+    climbs = is_lost or height_m < motion.wanted_m - OFF_HEIGHT_M
+    return climbs and thrust > min(_CLIMBS_SHARE * hover_thrust, _FULL_THRUST)
