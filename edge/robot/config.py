@@ -240,7 +240,8 @@ class PolicyConfig:
 class FailsafeConfig:
     """What PX4 does when something fails: for an RC pilot, or for none.
 
-    `parameters`: whether wrong PX4 parameters are set before flight, or arming is refused.
+    `parameters`: whether wrong PX4 parameters are set, also in flight if somebody else changes
+    them, or arming is refused.
     `fence_margin_m`: how far outside our fence PX4's own is. `rc_lost`: what a robot does whose
     pilot's remote control is lost in flight.
     """

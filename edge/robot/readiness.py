@@ -123,6 +123,8 @@ class Readiness:
         if now_s >= self._fence_due_s:
             self._fence_due_s = now_s + _TRY_AGAIN_S
             self._upload_fence(origin, fence)
+            # Not at once: somebody who goes on to clear it is given the time to.
+            self._look_due_s = max(self._look_due_s, now_s + _LOOK_AGAIN_S)
 
     def _forget(self) -> None:
         self._parameter_problems, self._right = None, {}
