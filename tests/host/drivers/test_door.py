@@ -86,6 +86,27 @@ while time.monotonic() - began_s < longest_s:
 """
 
 
+_LEFT_ALONE = """
+import sys
+from edge.drivers.px4 import left_alone
+print("listens", flush=True)
+left_alone.main()
+"""
+_VEHICLE = """
+import socket, sys, time
+from tests.process.drivers.test_watchdog import HOLD, beat
+udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+udp.settimeout(0.2)
+while True:
+    udp.sendto(beat(7, HOLD), (sys.argv[1], 14551))
+    try:
+        udp.recv(300)
+        print("told to land", flush=True)
+    except OSError:
+        print("told nothing", flush=True)
+"""
+
+
 class Program:
     """A Python program in one of the networks, and the lines that it prints."""
 
@@ -236,3 +257,19 @@ def test_strangers_come_in_again_when_the_flood_is_over(
             while not ground.lines:
                 assert time.monotonic() < until_s
                 time.sleep(0.1)
+
+
+def test_no_stranger_speaks_for_a_vehicle_that_was_left_alone(
+    air: Callable[[str], str], tmp_path: Path
+) -> None:
+    toml = tmp_path / "robot.toml"
+    url = "udpin://127.0.0.1:14551"
+    toml.write_text(f'[autopilot]\nurl = "{url}"\nsystem_id = 7\n[flight]\nhover_land_s = 0.0\n')
+    with Program(air(ROBOT), _LEFT_ALONE, str(toml)) as alone:
+        alone.says("listens")
+        with Program(air(STRANGER), _VEHICLE, ROBOT) as stranger:
+            for _ in range(5):
+                stranger.says("told nothing")
+            with Program(air(ROBOT), _VEHICLE, "127.0.0.1") as vehicle:
+                vehicle.says("told to land")
+            assert "told to land" not in stranger.lines
