@@ -4,7 +4,7 @@ A robot takes itself to be where its autopilot does, metres beside the truth, an
 looks there; so costs by the robots' own positions hide that error. What tells more is a file in the
 folder that has the robot's name, beside its logs: `truth.csv` of whatever measured it, such as
 motion capture or a video, or PX4's logs (`*.ulg`), whose fixes count while the receiver has fixed
-its carrier phases, to centimetres.
+its carrier phases, to centimetres. The log of a PX4 in software says where its vehicle really was.
 """
 
 import csv
@@ -17,12 +17,15 @@ import numpy as np
 
 from edge.core import F64
 from lpac.analysis.truth import TrueTrack
-from lpac.analysis.ulog import read_topics
+from lpac.analysis.ulog import Topic, read_topics
 
 TRUTH_TABLE, AUTOPILOT_LOGS = "truth.csv", "*.ulg"
 _MISSION = ("unix_s", "x_m", "y_m", "height_m")
 _GLOBAL = ("unix_s", "latitude_deg", "longitude_deg", "height_m")
-_RECEIVER = "sensor_gps"
+# Which Unix time it was at which of PX4's own, s: `lpac sim` leaves it with the logs of its PX4s,
+# which know no time of day.
+CLOCK_TABLE = "clock.csv"
+_RECEIVER, _GROUND_TRUTH = "sensor_gps", "vehicle_global_position_groundtruth"
 _RTK_FIXED = 6
 # Of a vehicle that stands, or is held in a hand to be switched on, no height is above it.
 _AIRBORNE_ABOVE_M = 0.3
@@ -113,7 +116,10 @@ def _numbers(row: Sequence[str], where: str) -> list[float]:
 
 def _of_autopilot(path: Path) -> Measured:
     """Heights count from the first fix: PX4 begins a log as the vehicle is armed on the ground."""
-    fixes = read_topics(path, (_RECEIVER,)).get(_RECEIVER)
+    topics = read_topics(path, (_RECEIVER, _GROUND_TRUTH))
+    if _GROUND_TRUTH in topics:
+        return _of_simulator(topics[_GROUND_TRUTH], path)
+    fixes = topics.get(_RECEIVER)
     if fixes is None:
         return _NOWHERE
     fixed = (fixes["fix_type"] == _RTK_FIXED) & (fixes["time_utc_usec"] > 0)
@@ -128,3 +134,20 @@ def _of_autopilot(path: Path) -> Measured:
     latitude_deg, longitude_deg, altitude_m = (column[fixed] for column in columns)
     places = np.column_stack([latitude_deg, longitude_deg, altitude_m - altitude_m[0]])
     return Measured(boot_s + started_unix_s, places, is_global=True)
+
+
+def _of_simulator(truth: Topic, path: Path) -> Measured:
+    """Nothing where it is not known when that was."""
+    clock = next((at for folder in path.parents if (at := folder / CLOCK_TABLE).is_file()), None)
+    if clock is None:
+        return _NOWHERE
+    try:
+        unix_s, px4_s = np.loadtxt(clock, delimiter=",", ndmin=2).T
+    except ValueError as error:
+        raise ValueError(f"{clock}: {error}") from None
+    if not (np.diff(px4_s) >= 0.0).all():
+        raise ValueError(f"{clock}: its PX4 was started more than once")
+    boot_s, altitude_m = truth["timestamp"] * 1e-6, truth["alt"]
+    known = (boot_s >= px4_s[0]) & (boot_s <= px4_s[-1])
+    places = np.column_stack([truth["lat"], truth["lon"], altitude_m - altitude_m[0]])
+    return Measured(np.interp(boot_s[known], px4_s, unix_s), places[known], is_global=True)

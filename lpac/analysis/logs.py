@@ -368,10 +368,12 @@ class _LogReader:
     def _take_places(self) -> None:
         """Of each robot whose folder holds what an instrument told; of the others nothing."""
         robots = {self._logs.name(robot_id): robot_id for robot_id in self._logs.statuses}
+        # A simulator's folders are called by the robots' ids.
+        folders = {str(robot_id): robot_id for robot_id in self._logs.statuses} | robots
         told: dict[int, list[Measured]] = {robot_id: [] for robot_id in robots.values()}
         unfixed: dict[str, None] = {}
         for path, places in self._places:
-            of = next((folder.name for folder in path.parents if folder.name in robots), None)
+            of = next((folder.name for folder in path.parents if folder.name in folders), None)
             if of is None:
                 why = f"is not in the folder of a robot ({', '.join(robots)})"
                 self._logs.notes.append(f"{path}: {why}: left out")
@@ -380,7 +382,7 @@ class _LogReader:
             elif places.is_global and not self._origins:
                 self._logs.notes.append(f"{path}: no robot told of the mission's origin: left out")
             else:
-                told[robots[of]].append(places)
+                told[folders[of]].append(places)
         if unfixed and any(told.values()):
             self._logs.notes.append(
                 f"no RTK fix in the log of PX4: {', '.join(unfixed)}: less is known in truth"

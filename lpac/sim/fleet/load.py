@@ -18,8 +18,9 @@ from lpac.sim.experiment import Scenario, fly
 from lpac.sim.programs import python_program
 
 # A robot's program takes as much of a processor, with its vehicle, as so many units of work a
-# second; a PX4 takes 0.2 to 0.35 of a core where a program and a simulated vehicle take 0.09.
-_UNITS_PER_S = {"mavlink": 3.0, "px4": 10.0}
+# second. A core does 27 a second; a PX4 takes 0.1 to 0.2 of one, and a robot's program beside it
+# 0.05 to 0.14: two cores carry three of them.
+_UNITS_PER_S = {"mavlink": 3.0, "px4": 8.0}
 
 # The rest is for what comes at once: programs that start, and what else the machine does.
 _SHARE_TO_USE = 0.55

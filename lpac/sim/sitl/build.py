@@ -32,6 +32,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core import F64
+from lpac.analysis.field_truth import CLOCK_TABLE
 from lpac.analysis.truth import TrueTrack
 from lpac.sim.fleet.vehicles import AutopilotAddress, VehicleError
 from lpac.sim.px4.modes import Px4Mode
@@ -94,6 +95,7 @@ class _Instance:
     started_unix_s: float = math.inf
     started_s: float = math.inf
     parser: Any = None
+    clock_table: Any = None
 
     def to_monotonic_s(self, times_s: F64) -> F64:
         """PX4's times as `time.monotonic()`."""
@@ -178,6 +180,10 @@ class Px4Build:
             for instance in self._instances:
                 truth = stack.enter_context(_udp(TRUTH_PORT + instance.number))
                 truth.setblocking(False)
+                instance.folder.mkdir(parents=True, exist_ok=True)
+                instance.clock_table = stack.enter_context(
+                    (instance.folder / CLOCK_TABLE).open("w", buffering=1)
+                )
                 instance.parser = mavlink.MAVLink(None)
                 instance.parser.robust_parsing = True
                 self._selector.register(truth, selectors.EVENT_READ, instance)
@@ -292,7 +298,6 @@ class Px4Build:
 
     def _start(self, instance: _Instance) -> None:
         folder = instance.folder
-        folder.mkdir(parents=True, exist_ok=True)
         for name in _KEPT_FILES:
             (folder / name).unlink(missing_ok=True)
         (folder / _PARAMETERS_SCRIPT).write_text(
@@ -365,6 +370,7 @@ class Px4Build:
                 with self._heard_lock:
                     if not instance.clock or now_s - instance.clock[-1][0] > _CLOCK_PERIOD_S:
                         instance.clock.append((now_s, time_us * 1e-6))
+                        print(f"{time.time():.3f},{time_us * 1e-6:.3f}", file=instance.clock_table)
             elif message_id == mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION:
                 for message in instance.parser.parse_buffer(frame) or ():
                     self._hear(instance, now_s, message)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from lpac.sim.fleet import load
 from lpac.sim.fleet.flight import fly, summary_lines
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.load import robots_carried
@@ -20,6 +21,12 @@ STEPS = (
 
 def test_what_a_machine_carries_is_found_out_by_work() -> None:
     assert robots_carried(SHIPPED, "mavlink") > robots_carried(SHIPPED, "px4") / 2.0 > 0.0
+
+
+def test_two_cores_carry_three_px4s(monkeypatch: pytest.MonkeyPatch) -> None:
+    # As two cores were measured on which three flew, and five when nothing else ran.
+    monkeypatch.setattr(load, "_units_per_s", lambda _: 53.0)
+    assert 3 <= robots_carried(SHIPPED, "px4") < 5
 
 
 @pytest.mark.parametrize("in_the_air", [False, True])

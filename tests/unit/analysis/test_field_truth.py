@@ -143,3 +143,35 @@ def test_a_table_that_is_none_is_named(day: Path, text: str, why: str) -> None:
     assert why in str(error.value)
     (note,) = examined(day).notes
     assert why in note and note.endswith("left out")
+
+
+def write_simulated_log(folder: Path, robot: int, ahead_s: float) -> None:
+    """As a PX4 in software leaves it, whose clock is a tenth slow, and knows no time of day."""
+    path = folder / "log" / "2026-11-29" / "19_50_11.ulg"
+    path.parent.mkdir(parents=True)
+    fields = (
+        "vehicle_global_position_groundtruth:uint64_t timestamp;double lat;double lon;float alt;"
+    )
+    data = HEADER + message("B", bytes(40)) + message("F", fields.encode())
+    data += message("A", struct.pack("<BH", 0, 0) + b"vehicle_global_position_groundtruth")
+    clock = []
+    for at_s in [float(TIMES_S[0]) - 5.0, *TIMES_S.tolist()]:
+        x_m, y_m, height_m = truly_m(robot, at_s)
+        height_m = 0.0 if at_s < TIMES_S[0] else height_m
+        px4_s = 0.9 * at_s + ahead_s
+        clock.append(f"{BEGAN_S + at_s!r},{px4_s!r}\n")
+        packed = struct.pack("<2df", *ORIGIN.frame().to_global_deg(x_m, y_m), 10.0 + height_m)
+        data += message("D", struct.pack("<HQ", 0, round(px4_s * 1e6)) + packed)
+    path.write_bytes(data)
+    (folder / "clock.csv").write_text("".join(clock))
+
+
+def test_logs_of_px4s_in_software_tell_where_their_vehicles_were(day: Path) -> None:
+    for robot in range(3):
+        write_simulated_log(day / "px4" / str(robot), robot, 200.0 + robot)
+    found = examined(day)
+    (values,) = found.summary()["trials"]
+    assert found.notes == ()
+    cost = values["truth"]["cost"]
+    assert cost["initial"] == pytest.approx(true_cost(FIRST.begin_s), rel=3e-3)
+    assert cost["final"] == pytest.approx(true_cost(FIRST.begin_s + FIRST.duration_s), rel=3e-3)
