@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from edge.core.counted import counted
 from edge.core.fence import Fence
 from edge.core.mailbox import Neighbour
 from edge.core.position import PositionJudgement, PositionQuality
@@ -106,13 +107,17 @@ class PreflightInputs:
 
 
 def failed_checks(inputs: PreflightInputs, limits: PreflightLimits) -> tuple[FailedCheck, ...]:
-    """Every check that fails, one plain line each with what to do; empty means ready."""
-    return (
+    """Every check that fails, one plain line each with what to do; empty means ready.
+
+    What somebody has to do comes first, then what is only to be waited for, and may follow from it.
+    """
+    found = (
         *_program(inputs, limits),
         *_vehicle(inputs, limits),
         *_place(inputs),
         *_fleet(inputs, limits),
     )
+    return tuple(sorted(found, key=lambda check: check.settles_by_itself))
 
 
 def _program(inputs: PreflightInputs, limits: PreflightLimits) -> Iterator[FailedCheck]:
@@ -221,7 +226,8 @@ def _arming(inputs: PreflightInputs) -> Iterator[FailedCheck]:
     else:
         for problem in inputs.failsafe_problems:
             yield FailedCheck(CheckCode.FAILSAFE_WRONG, f"autopilot's {problem}")
-    if inputs.fence_changed or not inputs.fence_uploaded:
+    # Without a mission origin there is none to upload, and that is a check of its own.
+    if inputs.fence_changed or not (inputs.fence_uploaded or inputs.origin is None):
         yield FailedCheck(
             CheckCode.FENCE_NOT_UPLOADED,
             "somebody else changed or cleared the autopilot's fence: find out who, and wait until "
@@ -281,7 +287,7 @@ def _gps(gps: Gps | None, limits: PreflightLimits) -> Iterator[FailedCheck]:
     if gps.satellites < limits.min_satellites:
         yield FailedCheck(
             CheckCode.GPS_FEW_SATELLITES,
-            f"GPS sees {gps.satellites} satellites, must see {limits.min_satellites}: "
+            f"GPS sees {counted(gps.satellites, 'satellite')}, must see {limits.min_satellites}: "
             "wait, or move to open sky",
             settles_by_itself=True,
         )

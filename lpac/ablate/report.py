@@ -6,6 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from edge.core.counted import counted
 from lpac.ablate.config import Ablation
 from lpac.ablate.results import VariantResult, as_json, is_claim
 from lpac.analysis import style
@@ -30,7 +31,7 @@ def no_claim(ablation: Ablation) -> str | None:
         return None
     seeds = len(ablation.config.seeds)
     return (
-        f"{seeds} training seed{'s' if seeds > 1 else ''}: this says something about these "
+        f"{counted(seeds, 'training seed')}: this says something about these "
         f"policies, but does not support a claim about the method: that needs {LEAST_TRAININGS}"
     )
 

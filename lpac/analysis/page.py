@@ -8,6 +8,7 @@ from datetime import datetime
 from typing import NamedTuple
 
 from edge.core import F64
+from edge.core.counted import counted
 from lpac.analysis.flight import LOOPS, FlightRecord, LoopLateness
 
 _CAPTIONS = {
@@ -126,7 +127,7 @@ def _summary(trials: Sequence[FlightRecord]) -> str:
 
 def _about(trial: FlightRecord) -> str:
     words = [
-        f"{len(trial.robots)} robots, {trial.duration_s:.0f} s, from "
+        f"{counted(len(trial.robots), 'robot')}, {trial.duration_s:.0f} s, from "
         f"{datetime.fromtimestamp(trial.begin_s).astimezone():%Y-%m-%d %H:%M:%S %Z}."
     ]
     if trial.separation is not None:

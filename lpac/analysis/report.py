@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from edge.core.counted import counted
 from edge.messages.mission import world_id as id_of
 from edge.policy.bundle import Bundle, BundleError, load_bundle
 from lpac.analysis.coverage import Coverage
@@ -109,7 +110,9 @@ def _choose(logs: Logs, missions: list[Mission], wanted: Wanted) -> list[Mission
         left_out = "".join(f"; {note}" for note in logs.notes[:_MOST_NOTES])
         more = len(logs.notes) - _MOST_NOTES
         left_out += f"; and {more} more such notes" if more > 0 else ""
-        raise ValueError(f"no mission was flown in these logs, of {robots} robots{left_out}")
+        raise ValueError(
+            f"no mission was flown in these logs, of {counted(robots, 'robot')}{left_out}"
+        )
     if not wanted.trials:
         return missions
     names = [mission.name for mission in missions]

@@ -267,6 +267,7 @@ def _fly_again(
 
 
 def _show(outcomes: list["FlightOutcome"], options: str) -> None:
+    from edge.core.counted import counted
     from lpac.analysis.statistics import at_most_share
     from lpac.sim.drill.faults import FAULTS
     from lpac.sim.drill.report import flown_again_by, shown, summaries
@@ -287,8 +288,8 @@ def _show(outcomes: list["FlightOutcome"], options: str) -> None:
     broken = [outcome for outcome in outcomes if not outcome.held]
     share = 100.0 * at_most_share(len(outcomes), len(broken))
     typer.echo(
-        f"{len(broken)} of {len(outcomes)} flights broke a promise: at 95 % confidence at most "
-        f"{share:.3g} % do, in this model"
+        f"{len(broken)} of {counted(len(outcomes), 'flight')} broke a promise: at 95 % confidence "
+        f"at most {share:.3g} % do, in this model"
     )
     for outcome in broken:
         what = outcome.error or "; ".join(map(shown, outcome.broken))

@@ -36,6 +36,7 @@ def ground(
 
     It sets nothing in motion by itself. Started again, it continues where the last one stopped.
     """
+    from edge.core.counted import counted
     from lpac.ground.station.config import load_ground
     from lpac.ground.station.server import GroundProcess
 
@@ -47,7 +48,7 @@ def ground(
     process = GroundProcess(config, _print_event)
     started = (
         f"ground station {config.setup.operator} of fleet {config.setup.fleet}, "
-        f"{len(config.setup.robots)} robots: Ctrl-C ends it"
+        f"{counted(len(config.setup.robots), 'robot')}: Ctrl-C ends it"
     )
     asyncio.run(_run(process, config.setup, lambda: typer.echo(started)))
 

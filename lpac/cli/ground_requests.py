@@ -66,6 +66,8 @@ def show(
     to: Addressed, report: "CommandReport", name: str, *, as_json: bool, details: Details
 ) -> None:
     """Print a command's report. Raises ValueError unless all did it."""
+    from edge.core.counted import counted
+
     if as_json:
         robots = {
             r.robot: {"done": r.done, "code": r.code, "text": r.text, **details.get(r.robot, {})}
@@ -91,7 +93,8 @@ def show(
     if failed:
         count = len(report.results)
         raise ValueError(
-            f"{name}: {count - len(failed)} of {count} robots did it; failed: {', '.join(failed)}"
+            f"{name}: {count - len(failed)} of {counted(count, 'robot')} did it; failed: "
+            f"{', '.join(failed)}"
         )
 
 

@@ -61,6 +61,9 @@ def _toml(value: float | bool) -> str:
 
 
 def _text(source: "Source") -> str:
+
+    from edge.core.counted import counted
+
     said = {
         "assumed": "assumed",
         "file": "from the file",
@@ -68,5 +71,4 @@ def _text(source: "Source") -> str:
         "busy": "from how busy the channel was",
         "delivered": "from what multicast delivered",
     }[source.kind.value]
-    count = f"{source.records} record{'' if source.records == 1 else 's'}"
-    return f"{said}, {count}" if source.records else said
+    return f"{said}, {counted(source.records, 'record')}" if source.records else said

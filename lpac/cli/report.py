@@ -74,13 +74,16 @@ def _times_s(times: str | None) -> tuple[float, ...]:
 
 def _line(values: dict[str, object]) -> str:
     """A trial in one line."""
+
+    from edge.core.counted import counted
+
     cost, separation = values["cost"], values["separation"]
     assert isinstance(cost, dict) and isinstance(values["robots"], list)
     began_unix_s = values["began_unix_s"]
     assert isinstance(began_unix_s, float)
     words = [
         f"{values['trial']}: {datetime.fromtimestamp(began_unix_s):%Y-%m-%d %H:%M:%S}, "
-        f"{len(values['robots'])} robots, {values['duration_s']:.0f} s"
+        f"{counted(len(values['robots']), 'robot')}, {values['duration_s']:.0f} s"
     ]
     if cost["normalized"] is not None:
         words.append(f"cost {cost['normalized']:.2f} of the initial")
@@ -90,8 +93,8 @@ def _line(values: dict[str, object]) -> str:
         words.append(f"least distance {separation['distance_m']:.2f} m")
     if isinstance(values["messages"], dict) and values["messages"]["loss_share"] is not None:
         words.append(f"{100.0 * values['messages']['loss_share']:.1f} % of the messages lost")
-    for name in ("alarms", "restarts"):
-        found = values[name]
+    for name in ("alarm", "restart"):
+        found = values[f"{name}s"]
         if isinstance(found, list | dict) and found:
-            words.append(f"{len(found)} {name}")
+            words.append(counted(len(found), name))
     return ", ".join(words)

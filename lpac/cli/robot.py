@@ -67,6 +67,7 @@ def check(
 
     With parameters = "set" in the configuration, unsafe PX4 parameters are set.
     """
+    from edge.core.counted import counted
     from edge.robot.config import load_config
     from edge.robot.process import check as check_robot
 
@@ -84,7 +85,7 @@ def check(
             typer.echo(f"FAILED  {failed_check.text}")
     if report.failed:
         count = len(report.failed)
-        raise ValueError(f"not ready to fly: {count} check{'s' if count > 1 else ''} failed")
+        raise ValueError(f"not ready to fly: {counted(count, 'check')} failed")
     typer.echo("ready to fly", err=as_json)
 
 

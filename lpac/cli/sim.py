@@ -271,6 +271,7 @@ def sim(
     ] = None,
 ) -> None:
     """Fly a swarm over an unknown world and print how well it covers it."""
+    from edge.core.counted import counted
     from edge.core.frames import ModelScale
     from edge.core.world import parse_world
     from lpac.sim.experiment import FIELD_SCALE
@@ -377,7 +378,8 @@ def sim(
         typer.echo(json.dumps(flight.summary(), indent=2))
         return
     typer.echo(
-        f"{_flier(controller, bundle)}, {count} robots, seed {seed}: {_result(flight, duration)}"
+        f"{_flier(controller, bundle)}, {counted(count, 'robot')}, seed {seed}: "
+        f"{_result(flight, duration)}"
     )
     if transport:
         typer.echo(f"{transport.value}: {link_line(*scenario.link)}; it assumes")
@@ -627,6 +629,7 @@ def _serve(
     settings: "Settings",
 ) -> None:
     """Run a fleet of processes for `lpac ground` until Ctrl-C, and only listen to it."""
+    from edge.core.counted import counted
     from lpac.cli.live import FleetDisplay
     from lpac.sim.fleet.processes import Fleet
 
@@ -643,7 +646,7 @@ def _serve(
                     display.show_or_say("programs start", fleet.heard.statuses())
                 fleet.begin()
                 display.print(
-                    f"{len(fleet.robots)} robots run until Ctrl-C; in a second terminal:\n\n"
+                    f"{counted(len(fleet.robots), 'robot')} until Ctrl-C; in a second terminal:\n\n"
                     f"  export LPAC_FLEET={shlex.quote(str(out / fleet.fleet_toml.name))}\n"
                     "  lpac ground\n"
                 )

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+from edge.core.counted import counted
 from edge.core.schema import ConfigError
 from edge.drivers.identity_folder import card_in
 from edge.messages.codes import CheckCode, FailedCheck, texts
@@ -304,7 +305,9 @@ def _group(robot: RobotHost, fleet: Mapping[str, Facts]) -> DoctorCheck:
     if others:
         found = f"it has another one than {', '.join(others)}: not all of them hear each other"
         return DoctorCheck(name, "FAILED", found, _UP)
-    return DoctorCheck(name, "ok", f"it has one, and so have {len(has)} of {len(fleet)} robots")
+    return DoctorCheck(
+        name, "ok", f"it has one, and so have {len(has)} of {counted(len(fleet), 'robot')}"
+    )
 
 
 def _others_than_most(has: Mapping[str, Any], robot: str) -> list[str]:
@@ -555,7 +558,11 @@ def _radio(pings: Mapping[str, Facts] | str, answering: set[str]) -> DoctorCheck
     if bad:
         return DoctorCheck(name, "warning", "; ".join(bad), fix)
     slowest_ms = max(ping["mean_ms"] for ping in heard.values())
-    return DoctorCheck(name, "ok", f"{len(heard)} robots answer within {slowest_ms:.1f} ms")
+    return DoctorCheck(
+        name,
+        "ok",
+        f"{counted(len(heard), 'robot')}: slowest answer within {slowest_ms:.1f} ms",
+    )
 
 
 def _mavlink(robot: RobotHost, facts: Facts) -> DoctorCheck:

@@ -7,6 +7,7 @@ from enum import StrEnum
 from typing import Literal, NamedTuple, TypeVar
 
 from edge.core.arrivals import Arrivals
+from edge.core.counted import counted
 from edge.flight.preflight import PreflightLimits
 from edge.messages.codes import (
     BATTERY_REASONS,
@@ -231,7 +232,7 @@ def _of_fleet(fleet: _Fleet) -> Iterator[tuple[Severity, AlarmCode, str]]:
         yield "critical", AlarmCode.NAME_SHARED, text
     if ground is not None and ground.safety_action_by not in ("", ground.operator):
         held = [n for n, i in fleet.setup.robots.items() if ground.safety_action_for(i) == "hold"]
-        text = f"{ground.safety_action_by} asks {len(held)} robots to hold"
+        text = f"{ground.safety_action_by} asks {counted(len(held), 'robot')} to hold"
         yield "warning", AlarmCode.HELD_BY_OTHERS, text
     if not fleet.snapshot.commander and not flying:
         yield "note", AlarmCode.NOBODY_COMMANDS, "nobody commands the fleet yet"
@@ -346,7 +347,7 @@ def _gps(fleet: _Fleet, seen: _Seen) -> _Found:
     if not is_flying(seen.status):
         return None
     if satellites is not None and satellites < LIMITS.min_satellites:
-        return "warning", f"GPS sees {satellites} satellites"
+        return "warning", f"GPS sees {counted(satellites, 'satellite')}"
     if hdop is not None and not hdop <= LIMITS.max_hdop:
         return "warning", f"GPS precision (HDOP) is {hdop:.1f}"
     return None

@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from edge.core import F64
+from edge.core.counted import counted
 from edge.core.file_errors import in_words
 from edge.drivers.flight_log import FlightLog, topic
 from edge.messages.mission import FlightState, GroundState, RobotStatus
@@ -281,7 +282,8 @@ async def _follow(
                 cost = recording.cost
                 if cost is not None and cost.flying_mission and cost.trial != trial:
                     trial = cost.trial
-                    say(f"trial {trial or '(no name)'} begins with {len(cost.robots)} robots")
+                    robots = counted(len(cost.robots), "robot")
+                    say(f"trial {trial or '(no name)'} begins with {robots}")
                 now_s = time.monotonic()
                 if shown_at_s is None or now_s - shown_at_s >= _SHOW_PERIOD_S:
                     shown_at_s = now_s
@@ -300,7 +302,7 @@ def _line(snapshot: FleetSnapshot, cost: Cost | None) -> str:
     heard = sum(robot.fresh for robot in snapshot.robots)
     words = [
         time.strftime("%H:%M:%S", time.localtime(snapshot.unix_time_s)),
-        f"{heard} of {len(snapshot.robots)} robots heard",
+        f"{heard} of {counted(len(snapshot.robots), 'robot')} heard",
     ]
     if cost is not None and cost.normalized is not None and cost.initial:
         words += [

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from edge.core.counted import counted
 from lpac.analysis.statistics import Interval95
 from lpac.evaluate.worlds import FIELD, SET_UPS
 from lpac.paper.asynchrony import FIELD as FIELD_TIMING
@@ -222,8 +223,9 @@ def _e3(e3: Json) -> list[Claim]:
             "it. No figure is given.",
             f"While the robot is away the cost is at most {_AWAY:g} times that before, and once it "
             f"is back {_BACK:g} times.",
-            f"{len(away)} robots were taken: at worst {worst:.2f} times the cost before, settled "
-            f"after {settled_s:.0f} s at most; {remains:.2f} times at most once it is back.",
+            f"{counted(len(away), 'robot')} taken: at worst {worst:.2f} times the cost before, "
+            f"settled after {settled_s:.0f} s at most; {remains:.2f} times at most once it is "
+            "back.",
             _agrees(worst <= _AWAY and remains <= _BACK),
         )
     ]

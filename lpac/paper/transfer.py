@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge.core import F64
+from edge.core.counted import counted
 from lpac.analysis.flight import FlightRecord
 from lpac.evaluate.evaluation import (
     CLAIRVOYANT,
@@ -42,7 +43,7 @@ def results_of_logs(
     for (robots, features), names in sorted(by_team.items()):
         own = [missions[name] for name in names]
         of_clairvoyant = _curves([clairvoyant[name] for name in names], time_s)
-        results[Condition(f"{_count(robots, 'robot')}, {_count(features, 'feature')}")] = [
+        results[Condition(f"{counted(robots, 'robot')}, {counted(features, 'feature')}")] = [
             MethodResult(
                 method=method,
                 time_s=time_s,
@@ -62,10 +63,6 @@ def results_of_logs(
 def _curves(records: Sequence[FlightRecord], time_s: F64) -> F64:
     """(1, K, C): normalised costs."""
     return np.array([[np.interp(time_s, r.curve_time_s, r.normalized) for r in records]])
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def as_json(

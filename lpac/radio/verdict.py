@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from edge.core.counted import counted
 from edge.messages.mission import RobotStatus
 from lpac.radio.airtime import Wifi, airtime, carries
 from lpac.radio.checked import Checked, WifiReading
@@ -121,8 +122,8 @@ def _sentence(checked: Checked, room: Room | None, problems: Sequence[str]) -> s
         of_which = f", of which {', '.join(checked.robots)} were judged"
     more = room.carries - room.robots
     return (
-        f"carries {room.robots} robots{of_which}{beside}; by the model there is room for "
-        f"{f'{more} more' if more else 'no more'}"
+        f"carries {counted(room.robots, 'robot')}{of_which}{beside}; by the model there is room "
+        f"for {f'{more} more' if more else 'no more'}"
     )
 
 

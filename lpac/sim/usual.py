@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from edge.core.counted import counted
 from lpac.sim.experiment import Scenario
 from lpac.sim.fleet.layout import FleetScenario
 
@@ -73,8 +74,8 @@ def judgement(ratio: float, usual: Usual | None) -> str:
         verdict = "better than usual"
     elif ratio > usual.greatest:
         verdict = "worse than usual"
-    robots = "1 robot" if usual.robots == 1 else f"{usual.robots} robots"
     return (
-        f"is that good? {verdict}: {said}; 8 in 10 such flights of {robots}: "
-        f"{usual.least:.2f} to {usual.greatest:.2f} ({usual.flights} were flown)"
+        f"is that good? {verdict}: {said}; 8 in 10 such flights of "
+        f"{counted(usual.robots, 'robot')}: {usual.least:.2f} to {usual.greatest:.2f} "
+        f"({usual.flights} were flown)"
     )

@@ -132,10 +132,12 @@ def _described(diagnoses: "Sequence[Diagnosis]") -> dict[str, Any]:
 
 
 def _require_none_failed(diagnoses: "Sequence[Diagnosis]") -> None:
+    from edge.core.counted import counted
+
     failed = [each.robot for each in diagnoses if each.failed()]
     if failed:
         count = sum(len(each.failed()) for each in diagnoses)
-        raise ValueError(f"{count} check{'s' if count > 1 else ''} failed, on {', '.join(failed)}")
+        raise ValueError(f"{counted(count, 'check')} failed, on {', '.join(failed)}")
 
 
 # up

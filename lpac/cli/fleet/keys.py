@@ -117,6 +117,7 @@ def revoke(
     This laptop's `lpac ground` tells the robots, at once and for as long as it runs. Robots keep
     away from where they heard a revoked one last.
     """
+    from edge.core.counted import counted
     from lpac.fleet.cards import open_authority
     from lpac.fleet.settings import load_fleet
 
@@ -127,7 +128,7 @@ def revoke(
     if why and not in_flight:
         raise ValueError(f"{why}: add --in-flight if that is what you want")
     count = len(authority.revoke(name))
-    typer.echo(f"{name} is revoked ({count} {'card' if count == 1 else 'cards'})")
+    typer.echo(f"{name} is revoked ({counted(count, 'card')})")
     typer.echo(
         "robots know it 2 s after they hear this laptop's `lpac ground`: let it run while they "
         "are on; one that never hears it goes on listening"

@@ -99,11 +99,13 @@ def print_json(
 
 def require_all(outcomes: Sequence["Outcome[T]"], done: str) -> None:
     """Raises ValueError, such as "stopped on 2 of 3 robots; failed: r2", unless all did it."""
+    from edge.core.counted import counted
+
     failed = [outcome.robot.name for outcome in outcomes if outcome.problem is not None]
     if failed:
         count = len(outcomes)
         raise ValueError(
-            f"{done} {count - len(failed)} of {count} robot{'s' if count > 1 else ''}; "
+            f"{done} {count - len(failed)} of {counted(count, 'robot')}; "
             f"failed: {', '.join(failed)}"
         )
 

@@ -9,6 +9,8 @@ from typing import Literal, NamedTuple
 
 from rich.cells import cell_len, set_cell_size
 
+from edge.core.counted import counted
+
 TextStyle = Literal[
     "", "strong", "faint", "good", "calm", "busy", "foreign", "critical", "warning", "note", "bar",
     "banner",
@@ -96,4 +98,4 @@ def some(names: Sequence[str], width: int) -> str:
         text = " ".join(names[:count]) + (f" +{more}" if more else "")
         if cell_len(text) <= width:
             return text
-    return f"{len(names)} robots" if len(names) > 1 else "".join(names)
+    return counted(len(names), "robot") if len(names) > 1 else "".join(names)

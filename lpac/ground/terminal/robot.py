@@ -6,6 +6,7 @@ from itertools import zip_longest
 
 from rich.cells import cell_len
 
+from edge.core.counted import counted
 from edge.messages.mission import ON_GROUND, RobotStatus
 from lpac.analysis.snapshot import FleetSnapshot, RobotSnapshot
 from lpac.ground.alarms import LATE_MS, Alarm
@@ -136,7 +137,7 @@ def _lasts(status: RobotStatus) -> str:
 
 def _gps(status: RobotStatus) -> str:
     return _listed(
-        "" if status.satellites is None else f"{status.satellites} satellites",
+        "" if status.satellites is None else counted(status.satellites, "satellite"),
         "" if status.hdop is None else f"HDOP {status.hdop:.1f}",
         "" if status.gps_accuracy_m is None else f"accurate to {status.gps_accuracy_m:.1f} m",
         "" if status.global_deg is None else "at {:.6f} {:.6f}".format(*status.global_deg),

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from edge.core import F64
+from edge.core.counted import counted
 from edge.core.world import rasterize
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState
 from lpac.analysis.coverage import Coverage
@@ -495,7 +496,7 @@ def summary_lines(flight: FleetFlight) -> list[str]:
     scenario, robots, record = flight.scenario, flight.robots, flight.record
     restarts = sum(robot.restarts for robot in robots)
     not_done = sum(not report.done for _, report in flight.commands)
-    lines = [f"{scenario.robots} robots, seed {scenario.seed}: {_outcome(flight)}"]
+    lines = [f"{counted(scenario.robots, 'robot')}, seed {scenario.seed}: {_outcome(flight)}"]
     if flight.problem is not None:
         lines.append(f"PROBLEM: {flight.problem}")
     if flight.overloaded or not flight.any_took_off:
@@ -545,7 +546,7 @@ def summary_lines(flight: FleetFlight) -> list[str]:
             f"the vehicles fell {flight.lateness.vehicles_s:.1f} s behind real time, the robots "
             f"left out {flight.lateness.robots_s:.1f} s of control"
         )
-    lines.append(f"{sum(len(robot.logs) for robot in robots)} flight logs")
+    lines.append(counted(sum(len(robot.logs) for robot in robots), "flight log"))
     return lines
 
 

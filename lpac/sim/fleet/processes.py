@@ -16,6 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from edge.core import F64
+from edge.core.counted import counted
 from edge.robot.config import Rates
 from lpac.sim.fleet.keys import write_keys
 from lpac.sim.fleet.layout import WORLD, FleetScenario, Layout
@@ -59,8 +60,8 @@ class OverloadError(RuntimeError):
         fewer = robots // 2 if carried is None else max(1, min(robots - 1, carried))
         advice = f"fly fewer: -n {fewer}" if robots > 1 else "end what else runs on it"
         super().__init__(
-            f"this machine does not keep up with {robots} robots: within {_WHILE_S:g} s the "
-            f"vehicles fell {lateness.vehicles_s:.1f} s behind real time, the robots left out "
+            f"this machine does not keep up with {counted(robots, 'robot')}: within {_WHILE_S:g} s "
+            f"the vehicles fell {lateness.vehicles_s:.1f} s behind real time, the robots left out "
             f"{lateness.robots_s:.1f} s of control; {advice}"
         )
 
@@ -107,7 +108,7 @@ class RobotProcess:
     def pid(self) -> int:
         """Raises RuntimeError if the program was never started."""
         if self._process is None:
-            raise RuntimeError(f"robot {self.robot_id} was not started")
+            raise RuntimeError(f"{self.name} was not started")
         return self._process.pid
 
     def send_signal(self, number: signal.Signals) -> None:
@@ -312,7 +313,7 @@ class Fleet:
         for robot in self.robots:
             if not robot.running:
                 raise SimulatedFleetError(
-                    f"the program of robot {robot.robot_id} has ended, {robot.ending()}"
+                    f"the program of {robot.name} has ended, {robot.ending()}"
                 )
 
     def begin(self) -> None:
@@ -374,6 +375,6 @@ class Fleet:
         until_s = time.monotonic() + STOP_WITHIN_S
         for robot in running:
             if robot.wait(max(0.0, until_s - time.monotonic())) is None:
-                self._say(f"robot {robot.robot_id} did not end within {STOP_WITHIN_S:g} s: killed")
+                self._say(f"{robot.name} did not end within {STOP_WITHIN_S:g} s: killed")
                 robot.send_signal(signal.SIGKILL)
                 robot.wait(STOP_WITHIN_S)

@@ -134,7 +134,7 @@ def test_a_killed_robot_program_falls_silent_and_can_be_started_again(
         fleet.robots[1].send_signal(signal.SIGKILL)
         assert fleet.robots[1].wait(60.0) == -signal.SIGKILL
         assert fleet.heard.wait_for(lambda statuses: set(statuses) == {0}, 60.0)
-        with pytest.raises(SimulatedFleetError, match="the program of robot 1 has ended"):
+        with pytest.raises(SimulatedFleetError, match="the program of r1 has ended"):
             fleet.require_running()
         fleet.robots[1].start()
         assert fleet.heard.wait_for(

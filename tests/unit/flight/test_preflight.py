@@ -156,6 +156,12 @@ INPUTS: list[tuple[dict[str, Any], CheckCode, str]] = [
         "autopilot does not have the fence: wait for the upload",
     ),
     ({"origin": None}, _C.ORIGIN_NOT_SET, "mission origin is not set: set it on the ground"),
+    # The cause alone: a fence that has no place cannot be uploaded.
+    (
+        {"origin": None, "fence_uploaded": False},
+        _C.ORIGIN_NOT_SET,
+        "mission origin is not set: set it on the ground",
+    ),
     ({"position_m": None}, _C.PLACE_NOT_KNOWN, "place in the fence is not known"),
     (
         {"position_m": (1.0, 8.0, 0.0)},
