@@ -515,7 +515,9 @@ def _position_silent(f: _Flight) -> None:
     f.fly()
     vehicle = f.fleet.vehicles[0]
     said = vehicle._said
-    vars(vehicle)["_said"] = lambda: [each for each in said() if each[0] != "LOCAL_POSITION_NED"]
+    vars(vehicle)["_said"] = lambda now_s: [
+        each for each in said(now_s) if each[0] != "LOCAL_POSITION_NED"
+    ]
     f.run(3.0)
     del vars(vehicle)["_said"]
     f.run(1.0)
@@ -546,7 +548,7 @@ def _refuses_to_be_set(name: str, value: float) -> None:
 
 def _silence(f: _Flight, duration_s: float) -> None:
     """Whatever the vehicle says is lost."""
-    vars(f.fleet.vehicles[0])["_said"] = tuple
+    vars(f.fleet.vehicles[0])["_said"] = lambda _: ()
     f.run(duration_s)
     del vars(f.fleet.vehicles[0])["_said"]
 

@@ -117,6 +117,8 @@ class VehicleState:
     share of the greatest thrust, 0 to 1, that the autopilot asks of its motors. `problems` are the
     autopilot's reasons why it would not arm, `warnings` what it finds wrong while it is armed, and
     why it takes over; the gravest come first. `remote_control` tells whether it hears one.
+    `link_lost` is the share of the autopilot's messages that were lost on the way in the last ten
+    seconds, in steps of 5 %, and `link_twice` whether they arrive more than once.
     `version` is its firmware's, such as "1.17.0".
     `result` is the outcome of the last command that ended.
     """
@@ -148,6 +150,8 @@ class VehicleState:
     problems: tuple[AutopilotReason, ...] = ()
     warnings: tuple[AutopilotReason, ...] = ()
     remote_control: bool | None = None
+    link_lost: float = 0.0
+    link_twice: bool = False
     version: str | None = None
     result: ActionResult | None = None
 

@@ -13,7 +13,7 @@ from edge.flight.state import Tick
 from edge.messages.codes import Reason, ReasonCode
 from edge.messages.mission import AIRBORNE, FlightState
 
-# One message of silence is no loss: PX4 tells twice a second.
+# Some messages of silence are no loss: PX4 tells five times a second.
 _REMOTE_CONTROL_LOST_S = 1.0
 
 
@@ -108,6 +108,16 @@ def px4_changed(t: Tick) -> str | None:
     return None if t.inputs.px4_change is None else t.inputs.px4_change.text
 
 
+def link_loses(t: Tick) -> str | None:
+    share = t.inputs.vehicle.link_lost
+    return reason_if(share > 0.0, f"{share:.0%} of the autopilot's messages are lost on the way")
+
+
+def link_twice(t: Tick) -> str | None:
+    text = "MAVLink arrives twice: a second path leads from the autopilot to this program"
+    return reason_if(t.inputs.vehicle.link_twice, text)
+
+
 def ground_lost(t: Tick) -> str | None:
     return reason_if(not t.ground_heard, "ground lost")
 
@@ -137,13 +147,22 @@ ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
 }
 
 
+# Before takeoff, too.
+_LINK_ALARMS: Mapping[ReasonCode, Callable[[Tick], str | None]] = {
+    ReasonCode.LINK_LOSES: link_loses,
+    ReasonCode.LINK_TWICE: link_twice,
+}
+
+
 def alarms(t: Tick) -> tuple[Reason, ...]:
     """What the operator must see, the gravest first, each thing once."""
     found = [t.flight.reason] if t.flight.alarming else []
-    if t.flight.state in (*AIRBORNE, FlightState.PILOT):
-        found += [
-            Reason(code, text) for code, condition in ALARMS.items() if (text := condition(t))
-        ]
+    in_flight = t.flight.state in (*AIRBORNE, FlightState.PILOT)
+    conditions = {**ALARMS, **_LINK_ALARMS} if in_flight else _LINK_ALARMS
+    found += [
+        Reason(code, text) for code, condition in conditions.items() if (text := condition(t))
+    ]
+    if in_flight:
         warnings = t.inputs.vehicle.warnings
         found += [Reason(ReasonCode.PX4, f"PX4: {warning.text}") for warning in warnings]
     return tuple(dict.fromkeys(found))

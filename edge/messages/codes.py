@@ -144,6 +144,8 @@ class ReasonCode(_Code):
     ARMING_FAILED = "arming_failed"
     ARMED = "armed"
     PX4 = "px4"
+    LINK_LOSES = "link_loses"
+    LINK_TWICE = "link_twice"
     # What the robot notices.
     CONTROL_SILENT = "control_silent"
     POSITION_LOST = "position_lost"

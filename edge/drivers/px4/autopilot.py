@@ -20,7 +20,6 @@ from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from mavsdk.component_type import ComponentType
-from mavsdk.connection_result import ConnectionResult
 from mavsdk.exceptions import MavsdkError
 from mavsdk.logging import LogLevel, log_subscribe
 from mavsdk.mavsdk import Configuration, Mavsdk
@@ -31,6 +30,7 @@ from mavsdk.system import System
 
 from edge.core.logger import log
 from edge.core.vehicle import Action, Setpoint, VehicleState, Velocity
+from edge.drivers.px4.datagrams import Datagrams, LinkState
 from edge.drivers.px4.dialogue import Dialogue
 from edge.drivers.px4.telemetry import Px4Telemetry
 
@@ -43,13 +43,15 @@ _VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
 _MAX_COORDINATE = 1e6
 
 _RENEW_S = 1.0
-_PARAMETER_ROUNDS, _PARAMETER_ROUND_S = 3, 0.3
+# How often what was not answered is asked for again: where messages are lost, rather more often.
+_ROUNDS, _ROUNDS_WITH_LOSS = 3, 12
+_PARAMETER_ROUND_S = 0.3
 _ABSENT_AFTER_CALLS = 5
 # What PX4 calls the checksum over all of its parameters' names and values.
 _CHECKSUM = "_HASH_CHECK"
 # PX4 tells its fence's id once a second, and one that is on its way as it is replaced is old.
 _FENCE_TOLD_S, _FENCE_LATE_S = 3.5, 0.5
-_FENCE_ROUNDS, _FENCE_ROUND_S = 3, 0.5
+_FENCE_ROUND_S = 0.5
 _FENCE = 1  # MAV_MISSION_TYPE
 
 
@@ -89,6 +91,7 @@ class MavsdkAutopilot:
         self._wanted_system_id = system_id
         self._telemetry = Px4Telemetry()
         self._mavsdk: Mavsdk | None = None
+        self._datagrams: Datagrams | None = None
         self._own_id = (0, 0)
         self._link: _Link | None = None
         self._others: tuple[int, ...] = ()
@@ -120,10 +123,14 @@ class MavsdkAutopilot:
             configuration.system_id = self._wanted_system_id
         self._own_id = (configuration.system_id, configuration.component_id)
         self._mavsdk = Mavsdk(configuration)
-        result = self._mavsdk.add_any_connection(self._url)
-        if result is not ConnectionResult.SUCCESS:
+        try:
+            self._datagrams = self._open(self._mavsdk)
+        except (OSError, ValueError) as error:
             self._mavsdk.destroy()
-            raise AutopilotError(f"autopilot url = {self._url!r}: {result.name}")
+            raise AutopilotError(f"autopilot url = {self._url!r}: {error}") from error
+        if self._wanted_system_id is not None:
+            self._datagrams.follow(self._wanted_system_id)
+        self._datagrams.start()
         self._worker.start()
         return self
 
@@ -135,6 +142,15 @@ class MavsdkAutopilot:
     ) -> None:
         self.close()
 
+    def _open(self, mavsdk: Mavsdk) -> Datagrams:
+        host, _, port = self._url.removeprefix("udpin://").rpartition(":")
+        if not port.isdecimal():
+            raise ValueError("must be udpin://ADDRESS:PORT")
+        datagrams = Datagrams(host, int(port), mavsdk.pass_received_raw_bytes)
+        mavsdk.add_any_connection("raw://")
+        mavsdk.subscribe_raw_bytes_to_be_sent(datagrams.send)
+        return datagrams
+
     def close(self) -> None:
         """Stop, without a word to the vehicle. Commands that still wait are not sent."""
         with self._wake:
@@ -142,6 +158,8 @@ class MavsdkAutopilot:
             self._wake.notify_all()
         if self._worker.ident is not None:
             self._worker.join()
+        if self._datagrams is not None:
+            self._datagrams.close()
         if self._mavsdk is not None:
             with self._sending:
                 self._mavsdk.destroy()
@@ -153,12 +171,15 @@ class MavsdkAutopilot:
         now_s = time.monotonic()
         link = self._link
         others = self._others
-        if link is not None and self._telemetry.has_twin(now_s):
+        heard = LinkState() if self._datagrams is None else self._datagrams.state(now_s)
+        if link is not None and (heard.has_others or self._telemetry.has_twin(now_s)):
             others = (*others, link.system_id)
         return self._telemetry.state(
             now_s,
             system_id=None if link is None else link.system_id,
             other_system_ids=others,
+            link_lost=heard.lost,
+            link_twice=heard.twice,
             result=self._dialogue.result,
         )
 
@@ -297,7 +318,7 @@ class MavsdkAutopilot:
         self._required_link()
         with self._wake:
             self._counted_fence = None
-        for _ in range(_FENCE_ROUNDS):
+        for _ in range(self._rounds()):
             self._send("MISSION_REQUEST_LIST", mission_type=_FENCE)
             with self._wake:
                 self._wake.wait_for(lambda: self._counted_fence is not None, _FENCE_ROUND_S)
@@ -313,6 +334,9 @@ class MavsdkAutopilot:
             raise AutopilotError(f"no vehicle on {self._url}")
         return link
 
+    def _rounds(self) -> int:
+        return _ROUNDS_WITH_LOSS if self.state().link_lost else _ROUNDS
+
     def _ask_parameters(self, names: Iterable[str]) -> dict[str, tuple[int, float | None]]:
         """Type and value, as told, of those that there are: all are asked for at once, so that none
         is waited for on its own."""
@@ -320,7 +344,7 @@ class MavsdkAutopilot:
         wanted = set(names)
         with self._wake:
             self._parameters = {}
-        for _ in range(_PARAMETER_ROUNDS):
+        for _ in range(self._rounds()):
             for name in sorted(wanted - self._parameters.keys()):
                 self._send("PARAM_REQUEST_READ", param_id=name, param_index=-1)
             with self._wake:
@@ -463,6 +487,8 @@ class MavsdkAutopilot:
         telemetry = {name: self._on_telemetry(name) for name in self._telemetry.messages}
         for name, act in (answers | telemetry).items():
             direct.subscribe_message(name, self._hears(name, act))
+        assert self._datagrams is not None
+        self._datagrams.follow(system_id)
         self._link = _Link(system, system_id, direct)
         log.info("autopilot found", system_id=system_id)
 

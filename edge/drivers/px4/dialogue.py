@@ -31,6 +31,8 @@ _STALE_COMMAND_S = 1.0
 _APART_S, _ANSWER_S, _TIMES = 0.02, 0.3, 5
 # A position that jumped waits for its origin, for half a second at most.
 _ORIGIN_URGENT_S = 0.1
+# A heartbeat that is so late was lost; it alone tells the mode.
+_HEARTBEAT_LATE_S, _HEARTBEAT_AGAIN_S = 1.2, 0.3
 _EVENTS_AGAIN_S = 0.2
 # How late a request may come because nobody looked.
 _LOOK_S = 0.2
@@ -92,11 +94,9 @@ _STREAMS = tuple(
 _ORIGIN = _Request(_REQUEST_MESSAGE, (_GPS_GLOBAL_ORIGIN,), 1.0)
 _VERSION = _Request(_REQUEST_MESSAGE, (_AUTOPILOT_VERSION,), 1.0)
 _CHECKS = _Request(_RUN_PREARM_CHECKS, (), 10.0)
+_MODE = _Request(_REQUEST_MESSAGE, (_HEARTBEAT,))
 # What a command changes: sooner than the next that is due.
-_AFTER_COMMAND = (
-    _Request(_REQUEST_MESSAGE, (_HEARTBEAT,)),
-    _Request(_REQUEST_MESSAGE, (_EXTENDED_SYS_STATE,)),
-)
+_AFTER_COMMAND = (_MODE, _Request(_REQUEST_MESSAGE, (_EXTENDED_SYS_STATE,)))
 
 
 class _Running:
@@ -279,8 +279,14 @@ class Dialogue:
             elif self._due_s.get(request, math.inf) <= now_s:
                 del self._due_s[request]
         if self._telemetry.needs_origin():
-            urgent_s = self._sent_s.get(_ORIGIN, -math.inf) + _ORIGIN_URGENT_S
-            self._due_s[_ORIGIN] = min(self._due_s[_ORIGIN], urgent_s)
+            self._hasten(_ORIGIN, _ORIGIN_URGENT_S)
+        if now_s - vehicle.heartbeat_at_s > _HEARTBEAT_LATE_S:
+            self._hasten(_MODE, _HEARTBEAT_AGAIN_S)
+
+    def _hasten(self, request: _Request, after_s: float) -> None:
+        """Ask for it so soon after the last time."""
+        soon_s = self._sent_s.get(request, -math.inf) + after_s
+        self._due_s[request] = min(self._due_s.get(request, math.inf), soon_s)
 
 
 def _refusal(action: Action, asked_at_s: float, now_s: float, vehicle: VehicleState | None) -> str:

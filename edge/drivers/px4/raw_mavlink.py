@@ -5,7 +5,7 @@ For Python 3.6 and newer, and the standard library alone: the watchdog loads not
 """
 
 import struct
-from typing import NamedTuple, Optional
+from typing import Iterator, NamedTuple, Optional
 
 _AUTOPILOT = 1  # component id
 _HEARTBEAT, _COMMAND_LONG = 0, 76
@@ -75,26 +75,48 @@ def _crc(data: bytes) -> int:
     return crc
 
 
-def heartbeat(data: bytes) -> Optional[Heartbeat]:
-    """The first heartbeat of an autopilot among a datagram's messages, None if there is none."""
-    while len(data) >= 12:
+class RawFrame(NamedTuple):
+    """One MAVLink frame: `number` counts those of a link, `content` is all of it."""
+
+    system_id: int
+    component_id: int
+    message_id: int
+    number: int
+    payload: bytes
+    content: bytes
+
+
+def frames(data: bytes) -> Iterator[RawFrame]:
+    """A datagram's frames, up to the first that is none."""
+    while len(data) >= 8:
         if data[0] == 0xFD:  # MAVLink 2
             size, header = data[1], 10
-            system, component = data[5], data[6]
-            message = data[7] | data[8] << 8 | data[9] << 16
             total = header + size + 2 + (13 if data[2] & 1 else 0)
         elif data[0] == 0xFE:  # MAVLink 1
             size, header = data[1], 6
-            system, component, message = data[3], data[4], data[5]
             total = header + size + 2
         else:
-            return None
+            return
         if len(data) < total:
-            return None
-        if message == _HEARTBEAT and component == _AUTOPILOT:
-            # Trailing zeros are left out of a MAVLink 2 payload.
-            payload = data[header : header + size].ljust(9, b"\0")
-            custom_mode, _, autopilot, base_mode, _, _ = struct.unpack("<IBBBBB", payload[:9])
-            return Heartbeat(system, autopilot, bool(base_mode & _ARMED), mode_name(custom_mode))
+            return
+        if header == 10:
+            number, system, component = data[4], data[5], data[6]
+            message = data[7] | data[8] << 8 | data[9] << 16
+        else:
+            number, system, component, message = data[2], data[3], data[4], data[5]
+        payload = data[header : header + size]
+        yield RawFrame(system, component, message, number, payload, data[:total])
         data = data[total:]
+
+
+def heartbeat(data: bytes) -> Optional[Heartbeat]:
+    """The first heartbeat of an autopilot among a datagram's messages, None if there is none."""
+    for frame in frames(data):
+        if frame.message_id == _HEARTBEAT and frame.component_id == _AUTOPILOT:
+            # Trailing zeros are left out of a MAVLink 2 payload.
+            payload = frame.payload.ljust(9, b"\0")
+            custom_mode, _, autopilot, base_mode, _, _ = struct.unpack("<IBBBBB", payload[:9])
+            return Heartbeat(
+                frame.system_id, autopilot, bool(base_mode & _ARMED), mode_name(custom_mode)
+            )
     return None

@@ -28,7 +28,7 @@ Fields = Mapping[str, Any]
 
 # Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
 RATES_HZ = {
-    1: 2.0,  # SYS_STATUS
+    1: 5.0,  # SYS_STATUS
     24: 5.0,  # GPS_RAW_INT
     32: 20.0,  # LOCAL_POSITION_NED
     33: 5.0,  # GLOBAL_POSITION_INT
@@ -37,9 +37,11 @@ RATES_HZ = {
     230: 5.0,  # ESTIMATOR_STATUS: at less, one with a doubt would stop a robot
     245: 5.0,  # EXTENDED_SYS_STATE
 }
-# PX4 sends a heartbeat at least every second.
-_CONNECTED_WITHIN_S = 2.5
-# Asked for twice a second; what is older says nothing about now.
+# Whatever it says, it is there; but after a silence, and without a heartbeat for long, its mode is
+# not known. PX4 sends one every second, and when it is asked.
+_CONNECTED_WITHIN_S, _HEARTBEAT_WITHIN_S = 2.5, 10.0
+_TWIN_WITHIN_S = 5.0
+# Asked for five times a second; what is older says nothing about now.
 _SYS_STATUS_HEARD_S = 2.5
 _THRUST_HEARD_S = 2.5
 # What is told once counts for so long, and as long as a failsafe lasts.
@@ -90,7 +92,8 @@ class Px4Telemetry:
         # What was made of it last, unless it has changed since: with which other fields.
         self._told: tuple[dict[str, Any], VehicleState] | None = None
         self._clock = _VehicleClock()
-        self._twin = _TwinWatch()
+        self._hardware_at_s: dict[tuple[int, ...], float] = {}
+        self._alive_at_s = self._heard_from_s = -math.inf
         self._sys_status_at_s = self._thrust_at_s = -math.inf
         # Since it was armed: when it last said that it is in the air, and first that it landed; and
         # whether it had not said so by the time that it was disarmed.
@@ -133,6 +136,10 @@ class Px4Telemetry:
         """
         with self._lock:
             self._handlers[name](fields, now_s)
+            at_s = now_s - self._clock.delay_s
+            if at_s - self._alive_at_s > _CONNECTED_WITHIN_S:
+                self._heard_from_s = at_s
+            self._alive_at_s = at_s
 
     def state(self, now_s: float, **of_link: Any) -> VehicleState:
         """The newest of everything; `of_link` are the fields that are not known here.
@@ -142,7 +149,10 @@ class Px4Telemetry:
         """
         with self._lock:
             heard = self._heard
-            fields = of_link | {"connected": now_s - heard.heartbeat_at_s < _CONNECTED_WITHIN_S}
+            is_alive = now_s - self._alive_at_s < _CONNECTED_WITHIN_S
+            mode_known_s = max(self._heard_from_s, now_s - _HEARTBEAT_WITHIN_S)
+            knows_mode = heard.heartbeat_at_s >= mode_known_s
+            fields = of_link | {"connected": is_alive and knows_mode}
             armable = heard.armable
             if now_s - self._sys_status_at_s > _SYS_STATUS_HEARD_S:
                 armable = None
@@ -164,9 +174,13 @@ class Px4Telemetry:
             return self._jump_at_s is not None
 
     def has_twin(self, now_s: float) -> bool:
-        """Whether two vehicles seem to speak with the same system id."""
+        """Whether two vehicles speak with the same system id, by their hardware ids.
+
+        Some boards have theirs all in common.
+        """
         with self._lock:
-            return self._twin.seen(now_s)
+            since_s = now_s - _TWIN_WITHIN_S
+            return sum(at_s > since_s for at_s in self._hardware_at_s.values()) > 1
 
     def restarts(self) -> int:
         """How often the vehicle was found to have been switched on anew."""
@@ -319,7 +333,6 @@ class Px4Telemetry:
         position_m = _vector(fields, "x", "y", "z")
         velocity_m_s = _vector(fields, "vx", "vy", "vz")
         boot_s = fields["time_boot_ms"] / 1e3
-        self._twin.vehicle_time(boot_s, now_s)
         restarts = self._clock.restarts
         at_s = now_s - self._clock.hear(boot_s, now_s)
         if self._clock.restarts > restarts and not self._heard.armed:
@@ -398,7 +411,7 @@ class Px4Telemetry:
             self._texts.append((now_s, _REFUSAL.sub("", text)))
 
     def _on_autopilot_version(self, fields: Fields, now_s: float) -> None:
-        self._twin.hardware((fields["uid"], *fields["uid2"]), now_s)
+        self._hardware_at_s[(fields["uid"], *fields["uid2"])] = now_s
         version = fields["flight_sw_version"]
         if version:
             self._change(version=".".join(str(version >> bits & 0xFF) for bits in (24, 16, 8)))
@@ -436,36 +449,6 @@ class _VehicleClock:
             self._at_pace = 0
             self.delay_s = 0.0
         return self.delay_s
-
-
-class _TwinWatch:
-    """Notices that two vehicles speak with one system id: MAVSDK takes them for one.
-
-    Their clocks differ, so that time seems to go back again and again; and so may their hardware
-    ids, which some boards have all in common.
-    """
-
-    _WITHIN_S = 5.0
-    _BACK_S = 0.03
-    _TIMES = 3
-
-    def __init__(self) -> None:
-        self._last_s = -math.inf
-        self._back_at_s: deque[float] = deque(maxlen=self._TIMES)
-        self._hardware_at_s: dict[tuple[int, ...], float] = {}
-
-    def vehicle_time(self, vehicle_s: float, now_s: float) -> None:
-        if vehicle_s < self._last_s - self._BACK_S:
-            self._back_at_s.append(now_s)
-        self._last_s = vehicle_s
-
-    def hardware(self, uid: tuple[int, ...], now_s: float) -> None:
-        self._hardware_at_s[uid] = now_s
-
-    def seen(self, now_s: float) -> bool:
-        since_s = now_s - self._WITHIN_S
-        back = len(self._back_at_s) == self._TIMES and self._back_at_s[0] > since_s
-        return back or sum(at_s > since_s for at_s in self._hardware_at_s.values()) > 1
 
 
 def _vector(fields: Fields, *names: str) -> Vector:

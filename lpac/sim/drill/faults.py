@@ -39,7 +39,6 @@ from lpac.sim.drill.bounds import (
     always,
 )
 from lpac.sim.drill.injections import (
-    AutopilotSilent,
     BatteryIs,
     CarriedToPad,
     ClockSteps,
@@ -85,10 +84,12 @@ from lpac.sim.drill.injections import (
     SensorDies,
     WatchdogDies,
     WindBlows,
+    WireIs,
 )
 from lpac.sim.px4.errors import GREATEST_WIND_M_S
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Airframe, SimulatedSensor
+from lpac.sim.px4.wire import MavlinkWire
 
 Phase = Literal["ready", "takeoff", "mission", "return"]
 Settings = Mapping[str, Mapping[str, object]]
@@ -271,7 +272,7 @@ _PROGRAMS = (
         name="autopilot-silent",
         what="the wire between a robot's computer and its autopilot is cut",
         promise="PX4 lands 1 s after the last setpoint that reached it",
-        does=_once(AutopilotSilent()),
+        does=_once(WireIs(MavlinkWire(loss=1.0))),
         bounds=(Lands(1.3), StraightDown(3.0), Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
@@ -310,6 +311,43 @@ _PROGRAMS = (
         promise="PX4 lands it where it is",
         phase="takeoff", does=(Do(9.0, ProgramDies()),),
         bounds=(TakesOff("others"), Down(9.0 + _LANDING_S)),
+    ),
+)  # fmt: skip
+
+_MISSION_GOES_ON = (FliesOn(20.0, 0.95, "all"), LandsAtPad(_AT_PAD_M, "all"))
+
+_WIRES = (
+    *(
+        Fault(
+            name=f"link-loses-{percent}",
+            what=f"{percent} % of all MAVLink messages are lost, either way",
+            promise="the mission goes on, with an alarm that names the share",
+            does=_once(WireIs(MavlinkWire(loss=percent / 100.0))), hits=0, bounds=_MISSION_GOES_ON,
+        )
+        for percent in (5, 10, 20, 30)
+    ),
+    Fault(
+        name="link-loses-30-before",
+        what="30 % of all MAVLink messages are lost, from before takeoff on",
+        promise="a takeoff may have to be ordered again; who takes off flies and comes home",
+        phase="ready", does=_once(WireIs(MavlinkWire(loss=0.3))), hits=0, watched_s=60.0,
+        bounds=(LandsAtPad(_AT_PAD_M, "all"),),
+    ),
+    Fault(
+        name="link-repeats", what="MAVLink messages come twice, once 60 to 110 ms late",
+        promise="the mission goes on, with an alarm that says so",
+        does=_once(WireIs(MavlinkWire(twice=1.0))), hits=0, bounds=_MISSION_GOES_ON,
+    ),
+    Fault(
+        name="link-repeats-late", what="MAVLink messages come twice, once 2 s late",
+        promise="the mission goes on, with an alarm that says so",
+        does=_once(WireIs(MavlinkWire(twice=1.0, late_s=(1.9, 2.1)))), hits=0,
+        bounds=_MISSION_GOES_ON,
+    ),
+    Fault(
+        name="link-reorders", what="each fifth MAVLink message is overtaken, by 60 to 110 ms",
+        promise="it counts as lost; the mission goes on",
+        does=_once(WireIs(MavlinkWire(late=0.2))), hits=0, bounds=_MISSION_GOES_ON,
     ),
 )  # fmt: skip
 
@@ -1022,6 +1060,6 @@ _PAIRS = (
 FAULTS: Mapping[str, Fault] = {
     fault.name: fault
     for fault in (
-        NOMINAL, *_PROGRAMS, *_RADIO, *_POSITIONS, *_ENERGY_AND_AIR, *_PEOPLE, *_PAIRS,
+        NOMINAL, *_PROGRAMS, *_WIRES, *_RADIO, *_POSITIONS, *_ENERGY_AND_AIR, *_PEOPLE, *_PAIRS,
     )
 }  # fmt: skip

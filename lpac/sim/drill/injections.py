@@ -15,6 +15,7 @@ from edge.core import F64
 from lpac.sim.fleet.pilot import PilotedVehicle
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.vehicle import Px4Vehicle, SimulatedSensor
+from lpac.sim.px4.wire import MavlinkWire
 
 _PILOT_M_S, _PILOT_GAIN_PER_S = 3.0, 0.7
 _PILOT_ARRIVED_M, _PILOT_ABOVE_M = 1.0, 3.0
@@ -213,6 +214,16 @@ class MotorWeakens(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
+class WireIs(VehicleInjection):
+    """What becomes of all MAVLink messages between computer and autopilot."""
+
+    wire: MavlinkWire
+
+    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+        vehicle.wire = self.wire
+
+
+@dataclass(frozen=True, slots=True)
 class RemoteControl(PilotInjection):
     """Somebody's remote control is on and heard, or not."""
 
@@ -349,11 +360,6 @@ class WatchdogDies:
 
 
 @dataclass(frozen=True, slots=True)
-class AutopilotSilent:
-    """The wire between computer and autopilot is cut."""
-
-
-@dataclass(frozen=True, slots=True)
 class DiskFills:
     """Nothing more can be written."""
 
@@ -456,7 +462,7 @@ class FenceWithout:
 
 Injection = (
     VehicleInjection | ProgramDies | ProgramEnds | ProgramStarts | ProgramStops | LoopHangs
-    | WatchdogDies | AutopilotSilent | DiskFills | ClockSteps | GroundClockSteps | SecondProgram
+    | WatchdogDies | DiskFills | ClockSteps | GroundClockSteps | SecondProgram
     | RadioIs | RadioCut | GroundStops | GroundDies | GroundStarts | SecondGroundJoins
     | SecondGroundHolds | SecondGroundTakesCommand | SecondGroundDies | OperatorOrders
     | FenceWithout

@@ -27,7 +27,6 @@ from lpac.sim.drill.faults import Fault
 from lpac.sim.drill.field import FaultyFleet
 from lpac.sim.drill.flight import Timeline, fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
-    AutopilotSilent,
     BatteryIs,
     Do,
     Drain,
@@ -67,7 +66,7 @@ _PROGRAMS = (
 )  # fmt: skip
 # Nobody cuts this machine's own network, fills its disk or steps its clock, and no loop of a
 # program that is as in the field hangs on demand.
-MAVLINK: tuple[type, ...] = (VehicleInjection, AutopilotSilent, *_PROGRAMS)
+MAVLINK: tuple[type, ...] = (VehicleInjection, *_PROGRAMS)
 # What a ground station or a pilot can do to a real one, and PX4's own simulator to its vehicle.
 PX4: tuple[type, ...] = (
     LoseGps, BatteryIs, OriginJumps, MotorWeakens, ParameterIs, FenceCleared, PilotInjection,
@@ -351,15 +350,6 @@ class MavlinkField(ProcessField):
     def vehicles_late_s(self, began_s: float) -> float:
         """In all."""
         return self.fleet.lateness().vehicles_s
-
-    def inject(self, injection: Injection, robots: tuple[int, ...]) -> None:
-        """Now; the wire to a simulated vehicle can be cut, too."""
-        if not isinstance(injection, AutopilotSilent):
-            super().inject(injection, robots)
-            return
-        with self.stepped:
-            for robot in robots:
-                self._simulated.links[robot].is_cut = True
 
     def inject_vehicle(self, injection: VehicleInjection, robot: int) -> None:
         """To the vehicle itself."""

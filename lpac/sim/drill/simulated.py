@@ -23,7 +23,6 @@ from lpac.sim.drill.field import (
 )
 from lpac.sim.drill.flight import fly, to_mission, to_ready
 from lpac.sim.drill.injections import (
-    AutopilotSilent,
     ClockSteps,
     Cut,
     DiskFills,
@@ -215,8 +214,6 @@ class SimulatedField(FaultyFleet):
             case WatchdogDies():
                 assert robot.watchdog is not None
                 robot.watchdog.die()
-            case AutopilotSilent():
-                robot.vehicle.is_cut = True
             case DiskFills():
                 robot.fill_disk()
             case ClockSteps(by_s):

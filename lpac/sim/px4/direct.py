@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from edge.core.ports import Clock
 from edge.core.vehicle import Action, Setpoint, VehicleState, Velocity
 from edge.drivers.px4.dialogue import Dialogue
+from edge.drivers.px4.reception import Frame, VehicleFrames
 from edge.drivers.px4.telemetry import Px4Telemetry
 from lpac.sim.px4.link import Px4Link, request_event
 from lpac.sim.px4.vehicle import Px4Vehicle
@@ -19,12 +20,16 @@ _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 # Which fields count; see MAVLink's POSITION_TARGET_TYPEMASK.
 _VELOCITY_MASK, _POSITION_MASK = 0b110111000111, 0b110111111000
 _AUTOPILOT, _COMPANION = 1, 191  # component ids
+# Message -> the field with the vehicle's time, and its unit, s.
+_TIMES = {
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: ("time_boot_ms", 1e-3),
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: ("time_boot_ms", 1e-3),
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: ("time_usec", 1e-6),
+}
 
 
 class DirectVehicle:
     """A `Vehicle` and its `VehicleSetup`; `step` lets its time pass.
-
-    `is_cut`: the wire to the computer is, so that neither hears the other.
 
     It says and hears MAVLink, message by message, as over a wire, and rounded as on one: what the
     robot knows of it is what PX4 tells, at PX4's rates.
@@ -32,13 +37,13 @@ class DirectVehicle:
 
     def __init__(self, vehicle: Px4Vehicle, system_id: int, clock: Clock) -> None:
         self.vehicle = vehicle
-        self.is_cut = False
         self._system_id = system_id
         self._clock = clock
         self._link = Px4Link(vehicle, system_id=system_id)
         self._telemetry = Px4Telemetry()
         self._uploaded: tuple[FencePolygon, ...] = ()
         self._dialogue = Dialogue(self._telemetry)
+        self._frames = VehicleFrames()
         # Nobody else listens on this link: what the robot does not read costs time alone.
         self._link.silence(self._telemetry.messages)
 
@@ -46,8 +51,7 @@ class DirectVehicle:
         """Let the vehicle fly on, and hear what it says."""
         self.vehicle.step(dt_s)
         now_s = self._clock.monotonic_s()
-        said = self._said()
-        for name, fields in () if self.is_cut else said:
+        for name, fields in self._said(now_s):
             if name == "COMMAND_ACK":
                 self._dialogue.hear_ack(fields["command"], fields["result"], now_s)
             elif name in self._telemetry.messages:
@@ -59,9 +63,11 @@ class DirectVehicle:
 
     def state(self) -> VehicleState:
         """The newest of everything."""
+        now_s = self._clock.monotonic_s()
         return self._telemetry.state(
-            self._clock.monotonic_s(), system_id=self._system_id, result=self._dialogue.result
-        )
+            now_s, system_id=self._system_id, result=self._dialogue.result,
+            link_lost=self._frames.lost(now_s), link_twice=self._frames.arrives_twice(now_s),
+        )  # fmt: skip
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
         """Send it once."""
@@ -114,15 +120,18 @@ class DirectVehicle:
     # The wire
 
     def _send(self, message: Any) -> None:
-        if self.is_cut:
-            return
         header = message.get_header()
         header.srcSystem, header.srcComponent = self._system_id, _COMPANION
         self._link.hear(_rounded(message))
 
-    def _said(self) -> Iterable[tuple[str, Mapping[str, Any]]]:
-        """Name and fields of each message that comes from the vehicle now."""
-        return [(message.get_type(), vars(_rounded(message))) for message in self._link.say()]
+    def _said(self, now_s: float) -> Iterable[tuple[str, Mapping[str, Any]]]:
+        """Name and fields of each message of the vehicle's that is taken now."""
+        for message in self._link.say():
+            number, message_id = message.link_number, message.get_msgId()
+            time_name, unit_s = _TIMES.get(message_id, ("", 0.0))
+            vehicle_s = getattr(message, time_name) * unit_s if time_name else None
+            if self._frames.take(Frame(0, number % 256, number, message_id, vehicle_s), now_s):
+                yield message.get_type(), vars(_rounded(message))
 
 
 def _rounded(message: Any) -> Any:

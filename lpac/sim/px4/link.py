@@ -20,6 +20,7 @@ from edge.core import F64
 from lpac.sim.px4.checks import Component, Px4Event
 from lpac.sim.px4.modes import CUSTOM_MODES, PILOTED, MavResult, Px4Mode
 from lpac.sim.px4.vehicle import GRAVITY_M_S2, Px4Setpoint, Px4Vehicle, SimulatedSensor
+from lpac.sim.px4.wire import OnTheWire
 from lpac.sim.px4.world import FencePolygon
 
 FORCE = 21196.0  # MAV_CMD_COMPONENT_ARM_DISARM: param 2 that skips the checks
@@ -105,7 +106,8 @@ class Px4Link:
 
     Over a wire: give it datagrams (`receive`), take from it those that are due (`due`). Within one
     process the same goes as message objects (`hear`, `say`), which costs a tenth: their numbers
-    must be rounded as MAVLink would. `is_cut`: the wire is, so that neither end hears the other.
+    must be rounded as MAVLink would. What is lost, late or doubled on the way is the vehicle's
+    `wire`. Each message that is said has its `link_number`, from 1 on.
     """
 
     def __init__(
@@ -126,7 +128,8 @@ class Px4Link:
         self._ground_station_at_s = -math.inf
         self._texts: deque[tuple[float, Px4Event]] = deque()
         self._text_id = 0
-        self.is_cut = False
+        self._on_the_wire = OnTheWire(system_id)
+        self._link_number = 0
         self._event_sequence = 0xFFF5
         self._told: deque[_Message] = deque(maxlen=EVENTS_KEPT)
         self._gps_told_at_s = -math.inf
@@ -199,8 +202,6 @@ class Px4Link:
 
     def receive(self, datagram: bytes) -> None:
         """Act on what a client sent; anything that is no MAVLink, or not for us, is ignored."""
-        if self.is_cut:
-            return
         for message in self._mavlink.parse_buffer(datagram) or ():
             self.hear(message)
 
@@ -208,6 +209,8 @@ class Px4Link:
         """Act on one message of a client; one that is not for us is ignored."""
         kind = message.get_type()
         self.vehicle.commands += kind in _COMMAND_KINDS
+        if self._on_the_wire.is_lost(self.vehicle.wire):
+            return
         handler = self._handlers.get(kind)
         target = getattr(message, "target_system", 0)
         if handler is not None and target in (0, self.system_id):
@@ -217,17 +220,15 @@ class Px4Link:
         """The datagrams to send now: what there is to say, packed."""
         datagrams = [b""]
         for message in self.say():
-            if self.is_cut:
-                continue
+            self._mavlink.seq = message.link_number % 256
             packet = bytes(message.pack(self._mavlink))
-            self._mavlink.seq = (self._mavlink.seq + 1) % 256
             if len(datagrams[-1]) + len(packet) > MAX_DATAGRAM_BYTES:
                 datagrams.append(b"")
             datagrams[-1] += packet
         return [datagram for datagram in datagrams if datagram]
 
     def say(self) -> list[Any]:
-        """The messages to send now: answers first, then the streams whose time has come."""
+        """The messages that arrive now: answers first, then the streams whose time has come."""
         vehicle = self.vehicle
         for event in vehicle.take_events():
             self._event_sequence = (self._event_sequence + 1) % 0x10000
@@ -251,7 +252,10 @@ class Px4Link:
                 self._due_s[message] = max(due_s + interval_s, now_s)
                 self._send_now(message)
         messages, self._out = self._out, []
-        return messages
+        for message in messages:
+            self._link_number += 1
+            message.link_number = self._link_number
+        return self._on_the_wire.pass_on(messages, vehicle.wire, vehicle.time_s)
 
     def _send(self, message: Any) -> None:
         self._out.append(message)

@@ -46,6 +46,7 @@ from lpac.sim.px4.modes import (
     Px4Mode,
 )
 from lpac.sim.px4.parameters import PARAMETERS
+from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
 GRAVITY_M_S2 = 9.81
@@ -180,7 +181,7 @@ class Px4Vehicle:
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
     and velocity go on being told, and are the old ones), `dead_sensors` (their drivers say nothing
     any more), `battery_remaining` (0 to 1), `rc_connected`, `motor_loss` (the share of its thrust
-    that is lost in flight: above 0.51 the vehicle sinks).
+    that is lost in flight: above 0.51 the vehicle sinks), `wire` (what becomes of its messages).
     `thrust` is the share of the greatest one that its motors are asked for. `truth` grows by one
     entry every 0.04 s.
     """
@@ -217,7 +218,7 @@ class Px4Vehicle:
         self.fence: tuple[FencePolygon, ...] = ()
         self.truth: list[Truth] = []
 
-        self.time_s, self.commands = 0.0, 0
+        self.time_s, self.commands, self.wire = 0.0, 0, MavlinkWire()
         self.position_m: F64 = np.array([*start_m, 0.0])
         self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
         self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0

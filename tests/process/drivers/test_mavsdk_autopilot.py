@@ -2,11 +2,13 @@
 
 import math
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import MavResult, Px4Mode
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Setpoint, Px4Vehicle
+from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
 from tests.conftest import ROOT
 from tests.said import lines_said
@@ -145,6 +148,40 @@ def implied_altitude_m(state: VehicleState) -> float:
     return state.origin.altitude_m - known(state.position_local_m)[2]
 
 
+@contextmanager
+def second_path(autopilot: MavsdkAutopilot, server: Px4Server) -> Iterator[None]:
+    """Sends a vehicle's datagrams a second time, and passes on what is answered to it."""
+    (link,) = (instance.link for instance in server._instances)
+    port = int(autopilot._url.rpartition(":")[2])
+    due, over = link.due, threading.Event()
+    late: list[tuple[float, bytes]] = []
+
+    def due_twice() -> list[bytes]:
+        datagrams = due()
+        late.extend((time.monotonic() + 0.1, datagram) for datagram in datagrams)
+        return datagrams
+
+    def forward() -> None:
+        while not over.is_set():
+            with server.stepped:
+                server.stepped.wait(0.1)
+                while late and late[0][0] <= time.monotonic():
+                    udp.sendto(late.pop(0)[1], ("127.0.0.1", port))
+                with suppress(BlockingIOError):
+                    link.receive(udp.recv(2048))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.setblocking(False)
+        link.due = due_twice  # type: ignore[method-assign]
+        thread = threading.Thread(target=forward)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
 # Telemetry
 
 
@@ -254,6 +291,65 @@ def test_a_clock_that_differs_from_now_on_is_no_backlog() -> None:
         with server.stepped:
             time.sleep(1.5)
         wait(autopilot, lambda s: time.monotonic() - s.position_at_s < 0.2)
+
+
+@pytest.mark.parametrize("loss", [0.1, 0.3])
+def test_a_link_that_loses_messages(loss: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is there, its parameters are read, and it flies."""
+    monkeypatch.undo()
+    vehicle = new_vehicle()
+    vehicle.wire = MavlinkWire(loss=loss)
+    with connected(vehicle) as (autopilot, _):
+        lost = wait(autopilot, lambda s: s.link_lost).link_lost
+        assert loss - 0.1 < lost < loss + 0.1
+        names = ["COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NAV_DLL_ACT", "EKF2_HGT_REF"]
+        assert None not in autopilot.read_parameters(names).values()
+        wait(autopilot, lambda s: s.armable)
+        # Each may be lost, or its answer, and neither is sent twice on one order.
+        began_s = time.monotonic()
+        while not autopilot.state().armed or autopilot.state().mode is not Mode.OFFBOARD:
+            autopilot.send(CLIMB)
+            armed = autopilot.state().armed
+            autopilot.command(Action.OFFBOARD if armed else Action.ARM)
+            assert time.monotonic() < began_s + 60.0
+            time.sleep(0.05)
+        state = wait(autopilot, lambda s: (s.height_above_home_m or 0.0) > 1.5, CLIMB)
+        assert (state.connected, state.other_system_ids) == (True, ())
+
+
+def test_messages_that_come_twice_and_late() -> None:
+    vehicle = new_vehicle()
+    vehicle.wire = MavlinkWire(twice=1.0, late_s=(1.9, 2.1))
+    with connected(vehicle) as (autopilot, _):
+        take_off(autopilot)
+        wait(autopilot, lambda s: s.mode is Mode.OFFBOARD and s.link_twice, CLIMB)
+        until_s = time.monotonic() + 3.0
+
+        def is_as_before(state: VehicleState) -> bool:
+            assert (state.mode, state.armed) == (Mode.OFFBOARD, True)
+            assert state.jumped_at_s == -math.inf
+            assert state.other_system_ids == () and state.link_lost == 0.0
+            return time.monotonic() > until_s
+
+        wait(autopilot, is_as_before, STAY)
+
+
+def test_of_two_paths_one_is_answered() -> None:
+    """All that the vehicle says comes by another port, too, 0.1 s later."""
+    vehicle = new_vehicle()
+    armings: list[float] = []
+    arm = vehicle.arm
+
+    def counted(*, force: bool = False) -> MavResult:
+        armings.append(vehicle.time_s)
+        return arm(force=force)
+
+    vehicle.arm = counted  # type: ignore[method-assign]
+    with connected(vehicle) as (autopilot, server), second_path(autopilot, server):
+        wait(autopilot, lambda s: s.link_twice and s.armable)
+        assert autopilot.state().other_system_ids == ()
+        assert carry_out(autopilot, Action.ARM) == ""
+        assert len(armings) == 1
 
 
 # Setpoints

@@ -1,6 +1,7 @@
 """A fleet of real robot nodes under a real ground, on one simulated clock."""
 
 import dataclasses
+import re
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -43,6 +44,7 @@ from lpac.sim.fleet.recorded import RecordingError
 from lpac.sim.fleet.scripted import ScriptedFlight
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.px4.modes import Px4Mode
+from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
 from lpac.sim.radio import GROUND
 from tests.conftest import SHIPPED
@@ -345,6 +347,8 @@ def test_who_may_not_set_parameters_comes_home_at_once(tmp_path: Path) -> None:
             if requirement.value_to_set is not None:
                 each.vehicle.parameters[requirement.name] = requirement.value_to_set
     fleet.ground.carry_out(to_mission(fleet.ground))
+    # Away from its landing point.
+    fleet.ground.carry_out(_pass(5.0))
     gf_action_is(0)(fleet)
     assert fleet.ground.carry_out(_until(returns_for_it, 5.0))
     assert fleet.vehicles[0].vehicle.parameters["GF_ACTION"] == 0
@@ -362,9 +366,9 @@ def test_who_flies_by_hand_may_change_what_he_likes() -> None:
 
 def test_what_was_found_right_is_still_watched_after_the_autopilot_was_silent() -> None:
     fleet = in_mission()
-    fleet.vehicles[0].is_cut = True
+    fleet.vehicles[0].vehicle.wire = MavlinkWire(loss=1.0)
     fleet.ground.carry_out(_pass(4.0))
-    fleet.vehicles[0].is_cut = False
+    fleet.vehicles[0].vehicle.wire = MavlinkWire()
     fleet.ground.carry_out(_pass(1.0))
     gf_action_is(0)(fleet)
     assert fleet.vehicles[0].vehicle.armed
@@ -382,6 +386,37 @@ def returns_for_it(told: FleetSnapshot) -> bool:
     return status is not None and (status.state, status.reason.code) == (
         FlightState.RETURN, ReasonCode.PX4_CHANGED,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("wire", "code", "text"),
+    [
+        (MavlinkWire(loss=0.2), ReasonCode.LINK_LOSES, r"(15|20|25)% of the autopilot's messages"),
+        (MavlinkWire(twice=1.0), ReasonCode.LINK_TWICE, "MAVLink arrives twice"),
+        (
+            MavlinkWire(twice=1.0, late_s=(1.9, 2.1)),
+            ReasonCode.LINK_TWICE,
+            "MAVLink arrives twice",
+        ),
+    ],
+)
+def test_a_bad_link_to_the_autopilot_is_told(
+    wire: MavlinkWire, code: ReasonCode, text: str
+) -> None:
+    """In flight, where the mission goes on, and before takeoff, where the robot is ready."""
+    fleet = in_mission()
+    for each in fleet.vehicles:
+        each.vehicle.wire = wire
+    fleet.ground.carry_out(_pass(15.0))
+    for told in fleet.ground.snapshot.robots:
+        assert told.status is not None and told.status.state is FlightState.MISSION
+        (alarm,) = (alarm for alarm in told.status.alarms if alarm.code is code)
+        assert re.match(text, alarm.text)
+    fleet.ground.command(SafetyCommand("land", wait=True))
+    fleet.ground.carry_out(_pass(15.0))
+    for told in fleet.ground.snapshot.robots:
+        assert told.status is not None and code in [alarm.code for alarm in told.status.alarms]
+        assert CheckCode.OTHER_VEHICLES not in [check.code for check in told.status.failed_checks]
 
 
 def test_programs_start_late_and_start_again(tmp_path: Path) -> None:

@@ -40,7 +40,9 @@ class Conversation:
         self.answer = answer
         self.said: list[tuple[float, int, float]] = []
         self.now_s = 0.0
-        self.vehicle: VehicleState | None = VehicleState(connected=True, armed=False, armable=True)
+        self.vehicle: VehicleState | None = VehicleState(
+            connected=True, armed=False, armable=True, heartbeat_at_s=math.inf
+        )
 
     def go_on(self, for_s: float, each: Callable[[float], None] = lambda _: None) -> None:
         until_s = self.now_s + for_s

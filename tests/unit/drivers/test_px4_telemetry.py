@@ -207,6 +207,35 @@ def test_what_sys_status_told_is_not_known_once_it_falls_silent() -> None:
     assert found[-1].connected and found[-1].position_at_s > 34.0
 
 
+def test_a_vehicle_is_there_as_long_as_it_says_anything() -> None:
+    """Without a heartbeat for ten seconds: its mode is not known then."""
+    telemetry = Px4Telemetry()
+    for heard_s, message in (r for r in recorded("normal") if r.is_px4):
+        kind = message.get_type()
+        if kind in telemetry.messages and not (kind == "HEARTBEAT" and heard_s > 30.0):
+            telemetry.hear(kind, message.to_dict(), heard_s)
+        if 30.0 < heard_s < 44.0:
+            connected = telemetry.state(heard_s).connected
+            assert connected == (heard_s - telemetry.state(heard_s).heartbeat_at_s < 10.0)
+        if heard_s > 44.0:
+            break
+    assert not connected
+
+
+def test_after_a_silence_it_is_there_once_its_mode_is_known() -> None:
+    telemetry = Px4Telemetry()
+    silent_s, connected = (30.0, 35.0), []
+    for heard_s, message in (r for r in recorded("normal") if r.is_px4):
+        kind = message.get_type()
+        if kind in telemetry.messages and not silent_s[0] < heard_s < silent_s[1]:
+            telemetry.hear(kind, message.to_dict(), heard_s)
+            state = telemetry.state(heard_s)
+            connected.append((heard_s, state.connected))
+            assert not state.connected or heard_s < 35.0 or state.heartbeat_at_s > 35.0
+    back_s = next(s for s, is_there in connected if s > 35.0 and is_there)
+    assert 35.0 < back_s < 36.1
+
+
 def test_battery_critical_while_landing_is_px4s_own_failsafe() -> None:
     assert changes("battery_fast", "mode", "failsafe")[-6:] == [
         (14.0, _M.OFFBOARD, False),

@@ -1,0 +1,219 @@
+"""Which of a vehicle's MAVLink frames are taken, and what became of the others; no socket or clock.
+
+A router, or a second path, may bring frames twice, late or out of order: one that was taken before,
+or is older than the newest, is not taken. MAVLink numbers the frames of a link by one byte, so what
+is lost on the way can be counted. That byte comes round within seconds: where it alone does not
+tell what is late, the vehicle's own time does, of those messages that have it.
+"""
+
+import math
+from collections import deque
+from collections.abc import Hashable, Iterator
+from enum import Enum
+from typing import NamedTuple
+
+_NUMBERS = 256
+_MOST_PATHS = 8
+# A greater gap is another stream, or a link that was silent.
+_MOST_LOST = 64
+_REMEMBERED_S = 3.0
+# A vehicle that is silent so long may have been switched on anew, or be another one.
+_SILENT_S = 1.0
+# Frames of a path that is so late are not taken, even those that have no time.
+_LATE_S = 0.2
+# By so much the time of one vehicle does not go back.
+_BACK_S = 0.03
+# Shares and alarms are those of so many whole seconds, and of so many frames.
+_LOSS_S, _OTHERS_S, _LEAST_FRAMES = 10, 5, 100
+_LEAST_TWICE, _LEAST_OTHERS, _OTHERS_SHARE = 20, 3, 0.25
+
+
+class Frame(NamedTuple):
+    """One frame: `path` is what it came by, `number` MAVLink's sequence, `content` all of it.
+
+    `vehicle_s` is the vehicle's time when it was sent; None where the message has none.
+    """
+
+    path: Hashable
+    number: int
+    content: Hashable
+    message_id: int
+    vehicle_s: float | None = None
+
+
+class _Sort(Enum):
+    NEXT = "next"
+    AGAIN = "again"
+    LATE = "late"
+    OTHER = "other"
+
+
+class _Path:
+    """The numbers of one path's frames, and the vehicle's time of the newest of each message."""
+
+    def __init__(self) -> None:
+        self.newest: int | None = None
+        self.missing: set[int] = set()
+        self.newest_s: dict[int, float] = {}
+        self.heard_at_s = -math.inf
+
+
+class _Second:
+    """What came within one second."""
+
+    def __init__(self, second: int) -> None:
+        self.second = second
+        self.taken = self.timed = self.lost = self.again = self.others = 0
+
+
+class VehicleFrames:
+    """The frames of one vehicle, over whatever paths they come.
+
+    `path` is the one to answer by: of the frames that are taken, most come by it.
+    """
+
+    def __init__(self) -> None:
+        self.path: Hashable = None
+        self._path_at_s = -math.inf
+        self._paths: dict[Hashable, _Path] = {}
+        # Of each message that has the vehicle's time: that of the newest, when it came, and whence.
+        self._newest: dict[int, tuple[float, float, Hashable]] = {}
+        self._taken: dict[Hashable, tuple[float, Hashable]] = {}
+        self._seconds: deque[_Second] = deque(maxlen=_LOSS_S + 1)
+
+    def take(self, frame: Frame, now_s: float) -> bool:
+        """Whether it is to be taken: it is neither old nor was taken before."""
+        self._forget(now_s)
+        if self._began_anew(frame, now_s):
+            self._newest.clear()
+            self._paths.clear()
+        self._forget_paths(now_s)
+        path = self._paths.setdefault(frame.path, _Path())
+        back_s = self._back_s(frame)
+        is_old = back_s > 0.0 if frame.vehicle_s is not None else self._is_late(path)
+        sort = self._sort(frame, path, now_s)
+        path.heard_at_s = now_s
+        second = self._this(now_s)
+        second.again += sort is _Sort.AGAIN
+        if self._is_by_another(frame, back_s) and sort in (_Sort.NEXT, _Sort.OTHER):
+            second.others += 1
+        if is_old or sort is not _Sort.NEXT:
+            return False
+        second.taken += 1
+        self._taken[frame.content] = now_s, frame.path
+        if frame.vehicle_s is not None:
+            second.timed += 1
+            self._newest[frame.message_id] = frame.vehicle_s, now_s, frame.path
+        if frame.path != self.path and now_s - self._path_at_s > _SILENT_S:
+            self.path = frame.path
+        if frame.path == self.path:
+            self._path_at_s = now_s
+        return True
+
+    def lost(self, now_s: float) -> float:
+        """The share of the frames that were lost in the last ten seconds, in steps of 5 %."""
+        seconds = tuple(self._within(_LOSS_S, now_s))
+        taken, lost = sum(s.taken for s in seconds), sum(s.lost for s in seconds)
+        return round(20.0 * lost / (taken + lost)) / 20.0 if taken + lost >= _LEAST_FRAMES else 0.0
+
+    def arrives_twice(self, now_s: float) -> bool:
+        """Whether frames come again that were taken before."""
+        return sum(s.again for s in self._within(_OTHERS_S, now_s)) >= _LEAST_TWICE
+
+    def has_others(self, now_s: float) -> bool:
+        """Whether two vehicles seem to speak with one system id.
+
+        Time goes back again and again then, or things are said of one time by two paths that are
+        not the same.
+        """
+        seconds = tuple(self._within(_OTHERS_S, now_s))
+        others = sum(s.others for s in seconds)
+        least = max(_LEAST_OTHERS, _OTHERS_SHARE * sum(s.timed for s in seconds))
+        return others >= least and others > sum(s.again for s in seconds)
+
+    def _forget(self, now_s: float) -> None:
+        while self._taken:
+            content, (at_s, _) = next(iter(self._taken.items()))
+            if now_s - at_s <= _REMEMBERED_S:
+                return
+            del self._taken[content]
+
+    def _forget_paths(self, now_s: float) -> None:
+        """Anybody can make one more."""
+        if len(self._paths) > _MOST_PATHS:
+            self._paths = {
+                key: path
+                for key, path in self._paths.items()
+                if now_s - path.heard_at_s <= _SILENT_S
+            }
+
+    def _began_anew(self, frame: Frame, now_s: float) -> bool:
+        """Whether the vehicle was switched on anew, or another one is there instead."""
+        newest = self._newest.get(frame.message_id)
+        if frame.vehicle_s is None or newest is None or frame.content in self._taken:
+            return False
+        silent_s = now_s - newest[1]
+        if frame.vehicle_s >= newest[0]:
+            return False
+        # What was sent before the silence is only late.
+        may_have_started = silent_s > _SILENT_S and frame.vehicle_s < silent_s + _SILENT_S
+        return may_have_started or silent_s > 2.0 * _REMEMBERED_S
+
+    def _back_s(self, frame: Frame) -> float:
+        """By how much the vehicle's time goes back with this frame."""
+        newest = self._newest.get(frame.message_id)
+        return 0.0 if frame.vehicle_s is None or newest is None else newest[0] - frame.vehicle_s
+
+    def _is_by_another(self, frame: Frame, back_s: float) -> bool:
+        """Whether one vehicle would not say it so, if it does not say it again."""
+        newest = self._newest.get(frame.message_id)
+        if frame.vehicle_s is None or newest is None:
+            return False
+        return back_s > _BACK_S or (back_s == 0.0 and newest[2] != frame.path)
+
+    def _is_late(self, path: _Path) -> bool:
+        """Whether what comes by this path is older than what came by another."""
+        newest_s = max((newest_s for newest_s, _, _ in self._newest.values()), default=-math.inf)
+        return max(path.newest_s.values(), default=-math.inf) < newest_s - _LATE_S
+
+    def _sort(self, frame: Frame, path: _Path, now_s: float) -> _Sort:
+        """What it is among the frames of its own path, and of those that were taken."""
+        taken = self._taken.get(frame.content)
+        by_other = taken is not None and taken[1] != frame.path
+        silent = now_s - path.heard_at_s > _SILENT_S
+        ahead = 1 if silent or path.newest is None else (frame.number - path.newest) % _NUMBERS
+        if taken is not None and not by_other and ahead != 1:
+            return _Sort.AGAIN
+        comes_next = 0 < ahead <= _MOST_LOST
+        was_missing = not comes_next and frame.number in path.missing
+        if frame.vehicle_s is not None:
+            # Time tells more than a number does.
+            newest_s = path.newest_s.get(frame.message_id, -math.inf)
+            comes_next = frame.vehicle_s >= newest_s
+            path.newest_s[frame.message_id] = max(newest_s, frame.vehicle_s)
+        if comes_next and not was_missing:
+            self._count_missing(path, frame, ahead, now_s)
+        path.missing.discard(frame.number)
+        if comes_next:
+            return _Sort.AGAIN if by_other else _Sort.NEXT
+        if by_other:
+            return _Sort.AGAIN
+        return _Sort.LATE if was_missing else _Sort.OTHER
+
+    def _count_missing(self, path: _Path, frame: Frame, ahead: int, now_s: float) -> None:
+        path.newest = frame.number
+        if path.missing:
+            recent = range(1, _NUMBERS // 2)
+            path.missing = {n for n in path.missing if (frame.number - n) % _NUMBERS in recent}
+        if 1 < ahead <= _MOST_LOST:
+            path.missing |= {(frame.number - n) % _NUMBERS for n in range(1, ahead)}
+            if self.path in (None, frame.path):
+                self._this(now_s).lost += ahead - 1
+
+    def _this(self, now_s: float) -> _Second:
+        if not self._seconds or self._seconds[-1].second != math.floor(now_s):
+            self._seconds.append(_Second(math.floor(now_s)))
+        return self._seconds[-1]
+
+    def _within(self, seconds: int, now_s: float) -> Iterator[_Second]:
+        return (each for each in self._seconds if each.second >= math.floor(now_s) - seconds)

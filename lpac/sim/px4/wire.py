@@ -1,0 +1,51 @@
+"""What becomes of MAVLink messages between a vehicle and its computer."""
+
+import heapq
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkWire:
+    """`loss` is the share that is lost, either way; 1 is a wire that is cut.
+
+    Of what the vehicle says, the share `late` comes late, and the share `twice` comes at once and
+    late, by a time drawn from `late_s`.
+    """
+
+    loss: float = 0.0
+    twice: float = 0.0
+    late: float = 0.0
+    late_s: tuple[float, float] = (0.06, 0.11)
+
+
+class OnTheWire:
+    """What is on its way. Deterministic for a seed and what is sent."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+        self._late: list[tuple[float, int, Any]] = []
+        self._count = 0
+
+    def is_lost(self, wire: MavlinkWire) -> bool:
+        """Whether the next message is."""
+        return wire.loss > 0.0 and self._random.random() < wire.loss
+
+    def pass_on(self, said: Sequence[Any], wire: MavlinkWire, now_s: float) -> list[Any]:
+        """What arrives now, of what is said now and of what was late."""
+        arrived = []
+        for message in said:
+            if self.is_lost(wire):
+                continue
+            is_late = self._random.random() < wire.late
+            if is_late or self._random.random() < wire.twice:
+                self._count += 1
+                at_s = now_s + self._random.uniform(*wire.late_s)
+                heapq.heappush(self._late, (at_s, self._count, message))
+            if not is_late:
+                arrived.append(message)
+        while self._late and self._late[0][0] <= now_s:
+            arrived.append(heapq.heappop(self._late)[2])
+        return arrived
