@@ -75,7 +75,7 @@ def test_the_programs_that_it_starts_are_its_own(lpac: Path, folder: Path) -> No
         lpac, folder, "sim", "--vehicle", "mavlink", "-n", "1", "--duration", "1", "--out", "flight"
     )
     assert "of these robots and vehicles" in flown.stderr
-    assert "1 flight logs" in flown.stdout, flown.stderr
+    assert "1 flight log\n" in flown.stdout, flown.stderr
     log = (folder / "flight" / "robots" / "0" / "robot.log").read_text()
     assert "working directory was imported" not in log
     told = run(lpac, folder, "report", "flight/robots")

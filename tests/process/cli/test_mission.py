@@ -242,7 +242,7 @@ def test_fleet_flies_as_it_is_told(field: Field) -> None:
     done = field.lpac("mission", "disarm", "r1")
     assert done.code == 1
     assert re.search(r"r1 +FAILED +in the air: land it first", done.out)
-    assert "disarm: 0 of 1 robots did it; failed: r1" in done.err
+    assert "disarm: 0 of 1 robot did it; failed: r1" in done.err
 
     field.do("mission", "start")
     assert states(field) == [_S.MISSION] * 3
