@@ -79,7 +79,8 @@ class Readiness:
         self._right: dict[str, int | float | None] = {}
         self._look_due_s = self._fence_due_s = -math.inf
         self._uploaded: tuple[Origin, Fence] | None = None
-        self._fence_changed = False
+        # How often it must still be found there.
+        self._fence_doubts = 0
         # Of this flight.
         self.px4_change: Px4Change | None = None
         self._changed: tuple[str, ...] = ()
@@ -105,7 +106,7 @@ class Readiness:
             # What flew goes on, for all that is known.
             if not vehicle.armed:
                 self._forget()
-                self._uploaded, self._fence_changed = None, False
+                self._uploaded, self._fence_doubts = None, 0
             return
         # Nothing is set while it is not sure which vehicle answers.
         if vehicle.armed is None or vehicle.other_system_ids:
@@ -165,7 +166,7 @@ class Readiness:
             fence=robot.fence,
             reach=robot.reach,
             fence_uploaded=origin is not None and self._uploaded == (origin, robot.fence),
-            fence_changed=self._fence_changed,
+            fence_changed=self._fence_doubts > 0,
             origin=origin,
             position=position,
             position_m=None if odometry is None else odometry.position_m,
@@ -236,17 +237,20 @@ class Readiness:
         log.warning("PX4 parameter set", change=change, why=why)
 
     def _look_at_fence(self, now_s: float) -> None:
-        """What others have changed is told before it is uploaded, and until the next look."""
+        """What others have changed is told before it is uploaded, and until two looks found it.
+
+        The first may know no more than that it was there a moment after the upload.
+        """
         if self._uploaded is None:
             return
         try:
             if self._setup.has_fence():
-                self._fence_changed = False
+                self._fence_doubts = max(self._fence_doubts - 1, 0)
                 return
         except OSError as error:
             log.warning("fence not read", error=str(error))
         else:
-            self._fence_changed = True
+            self._fence_doubts = 2
             log.warning("fence was changed by somebody else")
         self._uploaded, self._fence_due_s = None, now_s + _TRY_AGAIN_S
 

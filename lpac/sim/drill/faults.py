@@ -172,8 +172,6 @@ _CRITICAL_FOR_PX4 = ParameterIs("BAT_LOW_THR", 0.5), ParameterIs("BAT_CRIT_THR",
 _EACH_SECOND = range(180)
 # Noticed after 3 s at most, and set back at once.
 _SET_BACK_S = 5.0
-_BEYOND_AIRSPEED = "wind beyond its airspeed carries it, whatever it is told"
-_STORM_CARRIES_M = POSITION_ERROR_M + 5.0 + _CARRIED_M
 _NOBODY = "nothing happens"
 _ADRIFT = "without a position the wind carries it as it comes down, over the fence or onto another"
 
@@ -643,9 +641,9 @@ _ENERGY_AND_AIR = (
     Fault(
         name="storm", what="a storm of 16 m/s carries a robot over the fence, for 10 s",
         promise="it is flown back; 5 m beyond the fence PX4 holds it, and it lands after 60 s",
-        uncovered=_BEYOND_AIRSPEED,
+        uncovered="wind beyond its airspeed carries it, whatever it is told",
         does=(*_once(WindBlows(_STORM_M_S)), Do(_STORM_S, WindBlows())), watched_s=90.0,
-        beyond_fence_m=_STORM_CARRIES_M,
+        beyond_fence_m=POSITION_ERROR_M + 5.0 + _CARRIED_M,
         bounds=(ComesBack(_STORM_S + 30.0), FliesOn(20.0)),
     ),
     Fault(
@@ -768,16 +766,17 @@ _PEOPLE = (
     ),
     Fault(
         name="fence-cleared",
-        what="another ground station clears PX4's fence, over which a storm carries it 5 s later",
+        what="another ground station clears PX4's fence; 5 s later the robot is 3 m beyond it",
         promise="an alarm, and the robot has uploaded it again: PX4 holds the vehicle",
         does=(
-            *_once(FenceCleared()), Do(_SET_BACK_S, WindBlows(_STORM_M_S)),
-            Do(_SET_BACK_S + _STORM_S, WindBlows()),
+            *_once(FenceCleared()), Do(_SET_BACK_S, EstimateJumpsOut(8.0)),
+            # Where it really is: it was carried nowhere.
+            Do(_SET_BACK_S + 5.0, ModeIs(Px4Mode.LAND)),
         ),
-        uncovered=_BEYOND_AIRSPEED,
-        beyond_fence_m=_STORM_CARRIES_M,
+        uncovered="who does not know where it is tells the others a wrong place as it comes down",
         bounds=(
-            FliesOn(_SET_BACK_S, 0.9, "hit"), Holds(_SET_BACK_S + _STORM_S), FliesOn(20.0),
+            FliesOn(_SET_BACK_S, 0.9, "hit"), Holds(_SET_BACK_S + 1.5), FliesOn(20.0),
+            Down(_SET_BACK_S + 5.0 + _LANDING_S),
         ),
     ),
     Fault(
