@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
 
-from edge.core.vehicle import VehicleState
+from edge.core.vehicle import Gps, VehicleState
 
 _FIX_3D = 3
 # Asked for at 5 and 20 Hz. An autopilot may keep sending what its estimator made up long before, so
@@ -22,6 +22,10 @@ _GPS_SILENT_S = 1.5
 _POSITION_OLD_S = 0.6
 # An estimate of a vehicle's sensors is never twice the same.
 _FROZEN_S = 1.0
+# Nor is what a receiver measures, which has noise even at rest: three repeats are no coincidence.
+_STUCK_REPEATS = 3
+# A receiver's velocity errs by some 0.3 m/s, an estimate's by up to 0.9 m/s.
+_MAX_VELOCITY_OFFSET_M_S = 2.0
 # Asked for at 5 Hz, sent once a second by itself; what is older says nothing about now.
 _ESTIMATOR_HEARD_S = 2.5
 # As long as a jump counts as one: longer than any `doubtful_after_s` that makes sense.
@@ -30,6 +34,8 @@ _JUMP_S = 1.0
 _NOT_LOOKED_S = 0.5
 # What comes and goes faster is bad all along.
 _CLEAR_S = 0.5
+# A receiver that contradicts itself is not believed again before it was consistent for so long.
+_BELIEVED_AFTER_S = 1.0
 # An accuracy so much worse than allowed is no position.
 _HOPELESS = 2.0
 
@@ -53,9 +59,12 @@ class PositionCause(StrEnum):
     FROZEN = "frozen"
     GPS_SILENT = "gps_silent"
     NO_FIX = "no_fix"
+    GPS_STUCK = "gps_stuck"
     NOT_ESTIMATED = "not_estimated"
     INACCURATE = "inaccurate"
     DISAGREES = "disagrees"
+    VELOCITY_DISAGREES = "velocity_disagrees"
+    SLIPS = "slips"
     GLITCH = "glitch"
     JUMPED = "jumped"
     FEW_SATELLITES = "few_satellites"
@@ -65,16 +74,21 @@ class PositionCause(StrEnum):
         return cls.UNKNOWN if isinstance(value, str) else None
 
 
+_GRAVITY = {cause: rank for rank, cause in enumerate(PositionCause)}
+_CONTRADICTIONS = (PositionCause.GPS_STUCK, PositionCause.SLIPS)
 _WORDS = {
     PositionCause.UNKNOWN: "it is not known",
     PositionCause.OLD: "it does not come any more",
     PositionCause.FROZEN: "it stands still, as no estimate does",
     PositionCause.GPS_SILENT: "nothing new comes from the GPS receiver",
     PositionCause.NO_FIX: "GPS has no fix",
+    PositionCause.GPS_STUCK: "the GPS receiver repeats the same fix",
     PositionCause.NOT_ESTIMATED: "the autopilot's estimator does not vouch for it",
     PositionCause.INACCURATE: "GPS is accurate to {value:.1f} m only",
     PositionCause.DISAGREES: "the GPS fix is {value:.1f} m away from the estimate",
-    PositionCause.GLITCH: "the autopilot's estimator takes the GPS for wrong",
+    PositionCause.VELOCITY_DISAGREES: "the GPS velocity is {value:.1f} m/s off the estimate",
+    PositionCause.SLIPS: "the GPS place moved by {value:.1f} m in another way than its velocity",
+    PositionCause.GLITCH: "the autopilot's estimator rejects the GPS",
     PositionCause.JUMPED: "it jumped",
     PositionCause.FEW_SATELLITES: "GPS sees {value:.0f} satellites only",
 }
@@ -84,9 +98,10 @@ _WORDS = {
 class PositionLimits:
     """How good is good enough in flight, and for how long it must not be.
 
-    `max_accuracy_m` is the receiver's own figure, `max_offset_m` the distance of its fix from the
-    estimate. A position is doubtful once something spoke against it for `doubtful_after_s`, never
-    silent for 0.5 s; lost once there was none for `lost_after_s`, or it stayed doubtful for
+    `max_accuracy_m` is the receiver's own figure; `max_offset_m` is the distance of its fix from
+    the estimate, and how far it may move in 10 s in another way than its own velocity says. A
+    position is doubtful once something spoke against it for `doubtful_after_s`, never silent for
+    0.5 s; lost once there was none for `lost_after_s`, or it stayed doubtful for
     `doubtful_lost_after_s`; and good again once nothing spoke against it for `good_after_s`.
 
     Raises ValueError if a number is not finite or out of its range.
@@ -122,7 +137,9 @@ class PositionLimits:
 class PositionJudgement:
     """What the position is worth, since `since_s`; `cause` is what speaks against it now, or spoke.
 
-    `value` is what was measured where the cause has a number. From `bad_since_s` on something
+    `value` is what was measured where the cause has a number. `contradicted_at_s` is when the
+    receiver last contradicted itself: an estimator that believes it is led astray within seconds,
+    and better off without it. From `bad_since_s` on something
     spoke against it, never silent for 0.5 s; from `none_since_s` on there was no position, from
     `good_since_s` on nothing spoke against it; None if it is not so now.
     """
@@ -134,6 +151,7 @@ class PositionJudgement:
     bad_since_s: float | None = None
     none_since_s: float | None = None
     good_since_s: float | None = None
+    contradicted_at_s: float = -math.inf
     looked_from_s: float = math.inf
     looked_at_s: float = -math.inf
 
@@ -141,6 +159,11 @@ class PositionJudgement:
     def text(self) -> str:
         """For people: why the position is not good; "" if it is."""
         return "" if self.cause is None else _WORDS[self.cause].format(value=self.value)
+
+    @property
+    def distrusts_gps(self) -> bool:
+        """Whether the receiver contradicts itself, or did so a moment ago."""
+        return self.looked_at_s - self.contradicted_at_s < _BELIEVED_AFTER_S
 
 
 class _Finding(NamedTuple):
@@ -159,7 +182,8 @@ def judge(
         # Nobody knows what was in between: all counts from now on.
         looked_from_s = now_s
         before = replace(before, bad_since_s=None, none_since_s=None, good_since_s=None)
-    findings = tuple(_findings(vehicle, limits, now_s))
+    found = _findings(vehicle, limits, now_s)
+    findings = tuple(sorted(found, key=lambda finding: _GRAVITY[finding.cause]))
     without = tuple(finding for finding in findings if finding.is_none)
     none_since_s = _since(before.none_since_s, without, looked_from_s)
     good_since_s = None
@@ -170,6 +194,7 @@ def judge(
         bad_since_s = None
     if findings:
         bad_since_s = _since(bad_since_s, findings, looked_from_s)
+    contradicts = any(finding.cause in _CONTRADICTIONS for finding in findings)
     quality = before.quality
     doubtful_s = now_s - before.since_s if quality is PositionQuality.DOUBTFUL else 0.0
     if (
@@ -194,6 +219,7 @@ def judge(
         bad_since_s=bad_since_s,
         none_since_s=none_since_s,
         good_since_s=good_since_s,
+        contradicted_at_s=now_s if contradicts else before.contradicted_at_s,
         looked_from_s=looked_from_s,
         looked_at_s=now_s,
     )
@@ -209,7 +235,7 @@ def _since(
 
 
 def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> Iterator[_Finding]:
-    """All that speaks against the position now, the gravest first."""
+    """All that speaks against the position now."""
     if vehicle.position_local_m is None or vehicle.origin is None:
         yield _Finding(PositionCause.UNKNOWN, True, now_s)
     elif now_s - vehicle.position_at_s > _POSITION_OLD_S:
@@ -217,7 +243,20 @@ def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> It
         yield _Finding(PositionCause.OLD, True, vehicle.position_at_s)
     elif now_s - vehicle.position_changed_at_s > _FROZEN_S:
         yield _Finding(PositionCause.FROZEN, True, vehicle.position_changed_at_s + _FROZEN_S)
-    gps = vehicle.gps
+    yield from _findings_of_receiver(vehicle.gps, limits, now_s)
+    estimator = vehicle.estimator
+    if estimator is not None and now_s - estimator.at_s <= _ESTIMATOR_HEARD_S:
+        if not estimator.horizontal:
+            yield _Finding(PositionCause.NOT_ESTIMATED, True, now_s)
+        if estimator.glitch:
+            yield _Finding(PositionCause.GLITCH, False, now_s)
+    if now_s - vehicle.jumped_at_s <= _JUMP_S:
+        yield _Finding(PositionCause.JUMPED, False, vehicle.jumped_at_s)
+
+
+def _findings_of_receiver(
+    gps: Gps | None, limits: PositionLimits, now_s: float
+) -> Iterator[_Finding]:
     if gps is None or now_s - gps.at_s > _GPS_SILENT_S:
         # From when it was noticed: a pause of the receiver must not land a drone at once.
         yield _Finding(
@@ -225,20 +264,20 @@ def _findings(vehicle: VehicleState, limits: PositionLimits, now_s: float) -> It
         )
     elif gps.fix < _FIX_3D:
         yield _Finding(PositionCause.NO_FIX, True, now_s)
-    estimator = vehicle.estimator
-    known = estimator is not None and now_s - estimator.at_s <= _ESTIMATOR_HEARD_S
-    if estimator is not None and known and not estimator.horizontal:
-        yield _Finding(PositionCause.NOT_ESTIMATED, True, now_s)
-    if gps is not None and gps.fix >= _FIX_3D:
-        accuracy_m, offset_m = gps.accuracy_m, gps.offset_m
-        if accuracy_m is not None and not accuracy_m <= limits.max_accuracy_m:
-            hopeless = not accuracy_m <= _HOPELESS * limits.max_accuracy_m
-            yield _Finding(PositionCause.INACCURATE, hopeless, now_s, accuracy_m)
-        if offset_m is not None and not offset_m <= limits.max_offset_m:
-            yield _Finding(PositionCause.DISAGREES, False, now_s, offset_m)
-    if estimator is not None and known and estimator.glitch:
-        yield _Finding(PositionCause.GLITCH, False, now_s)
-    if now_s - vehicle.jumped_at_s <= _JUMP_S:
-        yield _Finding(PositionCause.JUMPED, False, vehicle.jumped_at_s)
-    if gps is not None and gps.fix >= _FIX_3D and gps.satellites < limits.min_satellites:
+    if gps is None or gps.fix < _FIX_3D:
+        return
+    if gps.repeats >= _STUCK_REPEATS:
+        yield _Finding(PositionCause.GPS_STUCK, True, now_s)
+    accuracy_m = gps.accuracy_m
+    if accuracy_m is not None and not accuracy_m <= limits.max_accuracy_m:
+        hopeless = not accuracy_m <= _HOPELESS * limits.max_accuracy_m
+        yield _Finding(PositionCause.INACCURATE, hopeless, now_s, accuracy_m)
+    for cause, value, limit in (
+        (PositionCause.DISAGREES, gps.offset_m, limits.max_offset_m),
+        (PositionCause.VELOCITY_DISAGREES, gps.velocity_offset_m_s, _MAX_VELOCITY_OFFSET_M_S),
+        (PositionCause.SLIPS, gps.slip_m, limits.max_offset_m),
+    ):
+        if value is not None and not value <= limit:
+            yield _Finding(cause, True, now_s, value)
+    if gps.satellites < limits.min_satellites:
         yield _Finding(PositionCause.FEW_SATELLITES, False, now_s, gps.satellites)

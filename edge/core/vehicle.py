@@ -40,6 +40,8 @@ class Action(StrEnum):
     LAND = "land"
     DISARM = "disarm"
     KILL = "kill"
+    IGNORE_GPS = "ignore_gps"
+    USE_GPS = "use_gps"
 
 
 class ActionResult(NamedTuple):
@@ -67,8 +69,11 @@ class Gps:
     """The receiver's own view: `fix` is MAVLink's GPS_FIX_TYPE (3 is 3-D), `hdop` without unit.
 
     `accuracy_m` is the horizontal accuracy that it claims for itself, None if it claims none.
-    `offset_m` is how far in the plane its fix lies from the estimator's position, None if one of
-    them is not known. `at_s` is when its last new measurement was received.
+    `offset_m` and `velocity_offset_m_s` are how far in the plane its fix is from the estimator's
+    position and velocity, None if one of them is not known. `slip_m` is how far in the plane its
+    place has moved lately in another way than its velocity says, None if it tells no velocity.
+    `at_s` is when its last new measurement was received, `moved_at_s` when one last told another
+    place, and `repeats` how many have told the same place since.
     """
 
     fix: int
@@ -76,14 +81,18 @@ class Gps:
     hdop: float
     accuracy_m: float | None = None
     offset_m: float | None = None
+    velocity_offset_m_s: float | None = None
+    slip_m: float | None = None
     at_s: float = float("-inf")
+    moved_at_s: float = float("-inf")
+    repeats: int = 0
 
 
 class EstimatorStatus(NamedTuple):
     """What the autopilot's estimator says of itself.
 
     `horizontal` is whether it vouches for a position and a velocity in the plane, `glitch` whether
-    it takes the GPS for wrong; heard at `at_s`.
+    it rejects the GPS; heard at `at_s`.
     """
 
     horizontal: bool
@@ -119,6 +128,7 @@ class VehicleState:
     why it takes over; the gravest come first. `remote_control` tells whether it hears one.
     `link_lost` is the share of the autopilot's messages that were lost on the way in the last ten
     seconds, in steps of 5 %, and `link_twice` whether they arrive more than once.
+    `ignores_gps`: its estimator was told to go without the receiver.
     `version` is its firmware's, such as "1.17.0".
     `result` is the outcome of the last command that ended.
     """
@@ -145,6 +155,7 @@ class VehicleState:
     battery: float | None = None
     voltage_v: float | None = None
     gps: Gps | None = None
+    ignores_gps: bool | None = None
     estimator: EstimatorStatus | None = None
     armable: bool | None = None
     problems: tuple[AutopilotReason, ...] = ()

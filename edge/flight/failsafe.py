@@ -18,6 +18,8 @@ Parameters = Mapping[str, int | float | None]
 
 # Altitude drifts by 1.6 m under velocity setpoints.
 _CEILING_MARGIN_M = 2.0
+# Which of the receiver's measurements the estimator uses: bit 0 place, 1 height, 2 velocity.
+GPS_CONTROL = "EKF2_GPS_CTRL"
 _ROUNDING = 1e-6  # A REAL32 parameter holds 0.3 as 0.30000001.
 
 _NO_FAILSAFE = "fly on with the last command: NO FAILSAFE"
@@ -313,6 +315,13 @@ def required(
             121212,
             "with any other value PX4 may stop the motors in the air",
             values=(121212,),
+        ),
+        Requirement(
+            GPS_CONTROL,
+            7,
+            "the position comes from the GPS receiver; a robot has PX4 ignore one that contradicts "
+            "itself, and sets it back",
+            values=(7, 5, 13, 15),
         ),
         Requirement(
             "EKF2_HGT_REF",

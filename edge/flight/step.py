@@ -23,14 +23,7 @@ from edge.flight.state import (
 )
 from edge.flight.transitions import TRANSITIONS, Transition
 from edge.messages.codes import Reason, Refusal, RefusalCode
-from edge.messages.mission import (
-    AIRBORNE,
-    ON_GROUND,
-    STEERED,
-    FlightState,
-    Order,
-    OrderKind,
-)
+from edge.messages.mission import AIRBORNE, ON_GROUND, STEERED, FlightState, Order, OrderKind
 
 _S = FlightState
 
@@ -84,7 +77,7 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
         asked_at_s=inputs.now_s if asked else flight.asked_at_s,
         armed_asked=flight.armed_asked or Action.ARM in asked,
     )
-    return Decision(flight, actions + asked, alarms(tick), new_trial, row)
+    return Decision(flight, actions + asked + _ask_of_gps(tick), alarms(tick), new_trial, row)
 
 
 def _look(t: Tick) -> FlightMemory:
@@ -269,6 +262,18 @@ def _ask(t: Tick) -> tuple[Action, ...]:
     if flight.state in (_S.ARMING, *STEERED) and streamed and not flight.reached:
         return _again(t, Action.OFFBOARD)
     return ()
+
+
+def _ask_of_gps(t: Tick) -> tuple[Action, ...]:
+    """Have the estimator go without a receiver that contradicts itself, until the flight is over.
+
+    Then PX4 keeps its place by its other sensors for seconds, and its height after that.
+    """
+    ignores = t.inputs.vehicle.ignores_gps
+    flies = t.flight.state in AIRBORNE and t.inputs.vehicle.armed is not False and not t.silent
+    if flies and t.inputs.position.distrusts_gps:
+        return () if ignores else (Action.IGNORE_GPS,)
+    return (Action.USE_GPS,) if ignores else ()
 
 
 def _again(t: Tick, action: Action) -> tuple[Action, ...]:

@@ -13,7 +13,7 @@ from edge.core.logger import log
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement
-from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
+from edge.flight.failsafe import GPS_CONTROL, PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Px4Change, Robot
@@ -285,6 +285,9 @@ class Readiness:
             return
         # What was not answered is not thereby changed.
         values = {n: was if read[n] is None else read[n] for n, was in self._right.items()}
+        if self._vehicle.state().ignores_gps:
+            # By the control loop, which sets it back.
+            values[GPS_CONTROL] = self._right.get(GPS_CONTROL)
         wrong: tuple[str, ...] = ()
         if check_parameters(self._requirements, values):
             wrong = _differences(self._right, values)

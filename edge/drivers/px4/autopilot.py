@@ -485,7 +485,7 @@ class MavsdkAutopilot:
             "MISSION_COUNT": self._on_mission_count,
         }
         telemetry = {name: self._on_telemetry(name) for name in self._telemetry.messages}
-        for name, act in (answers | telemetry).items():
+        for name, act in (*answers.items(), *telemetry.items()):
             direct.subscribe_message(name, self._hears(name, act))
         assert self._datagrams is not None
         self._datagrams.follow(system_id)

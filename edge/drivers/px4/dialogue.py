@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from edge.core.logger import log
 from edge.core.vehicle import Action, ActionResult, VehicleState
 from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
+from edge.flight.failsafe import GPS_CONTROL
 
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
 
@@ -34,6 +35,8 @@ _ORIGIN_URGENT_S = 0.1
 # A heartbeat that is so late was lost; it alone tells the mode.
 _HEARTBEAT_LATE_S, _HEARTBEAT_AGAIN_S = 1.2, 0.3
 _EVENTS_AGAIN_S = 0.2
+# Whether to use the GPS is asked again and again, until PX4 says that it is so.
+_OF_GPS, _GPS_AGAIN_S, _INT32 = (Action.IGNORE_GPS, Action.USE_GPS), 0.2, 6
 # How late a request may come because nobody looked.
 _LOOK_S = 0.2
 
@@ -129,6 +132,9 @@ class Dialogue:
         self._apart_until_s = -math.inf
         self._events_at_s = -math.inf
         self._heard = (False, 0)
+        # What is to become of the GPS receiver, and when that was said last.
+        self._gps: Action | None = None
+        self._gps_at_s = -math.inf
 
     @property
     def running(self) -> Action | None:
@@ -140,6 +146,10 @@ class Dialogue:
 
         They end as "superseded". An action that waits or is being carried out is not queued again.
         """
+        if action in _OF_GPS:
+            self._gps = action
+            self.next_s = -math.inf
+            return
         if action is self.running or any(action is queued for queued, _ in self._queue):
             return
         overrides = _COMMANDS[action].overrides
@@ -172,6 +182,11 @@ class Dialogue:
     def say(self, now_s: float, vehicle: VehicleState | None) -> list[Message]:
         """What to send now to a vehicle of which so much is known; None: no vehicle was found."""
         said: list[Message] = []
+        if self._gps is not None and now_s >= self._gps_at_s + _GPS_AGAIN_S:
+            value = 0.0 if self._gps is Action.IGNORE_GPS else self._telemetry.gps_control
+            fields = {"param_id": GPS_CONTROL, "param_value": value, "param_type": _INT32}
+            said.append(("PARAM_SET", fields))
+            self._gps, self._gps_at_s = None, now_s
         while self._carry_on(now_s, said, vehicle):
             pass
         self.next_s = now_s + _LOOK_S

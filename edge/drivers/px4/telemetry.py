@@ -5,12 +5,13 @@ Messages come as MAVLink's common dialect names them, with their fields in MAVLi
 
 import math
 import re
+import struct
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict
 from threading import Lock
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 from edge.core.vehicle import (
     AutopilotReason,
@@ -23,13 +24,14 @@ from edge.core.vehicle import (
 )
 from edge.drivers.px4.events import Px4Events, without_repetition
 from edge.drivers.px4.raw_mavlink import mode_name
+from edge.flight.failsafe import GPS_CONTROL
 
 Fields = Mapping[str, Any]
 
 # Message -> how often PX4 shall send it, Hz. HEARTBEAT is not among them: PX4 keeps that at 1 Hz.
 RATES_HZ = {
     1: 5.0,  # SYS_STATUS
-    24: 5.0,  # GPS_RAW_INT
+    24: 10.0,  # GPS_RAW_INT: the sooner one that repeats itself is noticed
     32: 20.0,  # LOCAL_POSITION_NED
     33: 5.0,  # GLOBAL_POSITION_INT
     49: 5.0,  # GPS_GLOBAL_ORIGIN: sent when it changes, so this bounds how late
@@ -68,6 +70,12 @@ _WARNING = 4
 _ON_GROUND = 1
 _UNKNOWN_UINT16 = 0xFFFF
 _FIX_3D = 3
+# What PX4's estimator takes from a receiver by default: place, height and velocity.
+_ALL_OF_GPS: float = struct.unpack("<f", struct.pack("<i", 7))[0]
+# How long a receiver's slip counts: an echo passes, and a drift of 0.5 m/s comes to 5 m.
+_SLIP_S = 10.0
+# After a longer pause nobody knows how the receiver moved.
+_SLIP_WITHIN_S = 1.0
 _M_PER_DEG = 111_195.0  # of latitude: a sphere is good enough for differences of metres
 _REFUSAL = re.compile(r"^(?:\w+ denied|preflight fail)[:!]?\s*", re.IGNORECASE)
 
@@ -99,10 +107,13 @@ class Px4Telemetry:
         # whether it had not said so by the time that it was disarmed.
         self._in_air_at_s = self._landed_at_s = -math.inf
         self._disarmed_aloft = False
+        self._fix: _Fix | None = None
         self._gps_time_us: int | None = None
         self._jump_at_s: float | None = None
         self._origin: GlobalOrigin | None = None
         self._origin_at_s = -math.inf
+        # What EKF2_GPS_CTRL was before the receiver was ignored.
+        self.gps_control = _ALL_OF_GPS
         self._texts: deque[tuple[float, str]] = deque(maxlen=16)
         self._events = Px4Events()
         self._failsafe_at_s = -math.inf
@@ -116,6 +127,7 @@ class Px4Telemetry:
             "GPS_GLOBAL_ORIGIN": self._on_gps_global_origin,
             "ESTIMATOR_STATUS": self._on_estimator_status,
             "EXTENDED_SYS_STATE": self._on_extended_sys_state,
+            "PARAM_VALUE": self._on_param_value,
             "VFR_HUD": self._on_vfr_hud,
             "STATUSTEXT": self._on_statustext,
             "EVENT": self._events.hear,
@@ -261,22 +273,27 @@ class Px4Telemetry:
     def _on_gps_raw_int(self, fields: Fields, now_s: float) -> None:
         hundredths, satellites = fields["eph"], fields["satellites_visible"]
         accuracy_mm, has_fix = fields["h_acc"], fields["fix_type"] >= _FIX_3D
-        at_s = -math.inf if self._heard.gps is None else self._heard.gps.at_s
-        if fields["time_usec"] != self._gps_time_us:
-            # PX4 goes on telling of a receiver from which nothing comes any more.
-            self._gps_time_us, at_s = fields["time_usec"], now_s - self._clock.delay_s
-        offset_m = None
-        if has_fix:
-            place = GlobalOrigin(fields["lat"] / 1e7, fields["lon"] / 1e7, 0.0)
-            offset_m = self._offset_m(place)
+        before = self._heard.gps or Gps(fix=0, satellites=0, hdop=math.inf)
+        heard_at_s = now_s - self._clock.delay_s
+        # PX4 goes on telling of a receiver from which nothing comes any more.
+        is_new = fields["time_usec"] != self._gps_time_us
+        self._gps_time_us = fields["time_usec"]
+        last, fix = self._fix, _fix(fields) if has_fix else None
+        moved = last is None or fix is None or fix.place != last.place
+        if is_new or fix is None:
+            self._fix = fix if fix is None or last is None else fix.after(last)
         self._change(
             gps=Gps(
                 fix=fields["fix_type"],
                 satellites=0 if satellites == 0xFF else satellites,
                 hdop=math.inf if hundredths == _UNKNOWN_UINT16 else hundredths / 100.0,
                 accuracy_m=accuracy_mm / 1e3 if accuracy_mm and has_fix else None,
-                offset_m=offset_m,
-                at_s=at_s,
+                offset_m=None if fix is None else self._offset_m(fix.place),
+                velocity_offset_m_s=None if fix is None else self._velocity_offset_m_s(fix),
+                slip_m=None if self._fix is None else self._fix.length_of_slip_m,
+                at_s=heard_at_s if is_new else before.at_s,
+                moved_at_s=heard_at_s if moved else before.moved_at_s,
+                repeats=0 if moved else before.repeats + is_new,
             )
         )
 
@@ -288,15 +305,30 @@ class Px4Telemetry:
         north_m, east_m, _ = _shift_m(origin, place)
         return math.hypot(north_m - position_m[0], east_m - position_m[1])
 
+    def _velocity_offset_m_s(self, fix: "_Fix") -> float | None:
+        velocity_m_s = self._heard.velocity_local_m_s
+        if fix.velocity_m_s is None or velocity_m_s is None:
+            return None
+        return math.dist(fix.velocity_m_s, velocity_m_s[:2])
+
     def _on_estimator_status(self, fields: Fields, now_s: float) -> None:
         flags, wanted = fields["flags"], _VELOCITY_HORIZ | _POS_HORIZ_ABS
+        # The estimator rejects what lies beyond a ratio of 1.
+        ratios = fields["vel_ratio"], fields["pos_horiz_ratio"]
+        rejects = any(ratio is not None and ratio > 1.0 for ratio in ratios)
         self._change(
             estimator=EstimatorStatus(
                 horizontal=flags & wanted == wanted,
-                glitch=bool(flags & _GPS_GLITCH),
+                glitch=bool(flags & _GPS_GLITCH) or rejects,
                 at_s=now_s - self._clock.delay_s,
             )
         )
+
+    def _on_param_value(self, fields: Fields, _: float) -> None:
+        if fields["param_id"] == GPS_CONTROL:
+            # An integer's bits, as a float's.
+            self.gps_control = fields["param_value"] or self.gps_control
+            self._change(ignores_gps=fields["param_value"] == 0.0)
 
     def _on_global_position_int(self, fields: Fields, _: float) -> None:
         changes: dict[str, float] = {"height_above_home_m": fields["relative_alt"] / 1e3}
@@ -415,6 +447,50 @@ class Px4Telemetry:
         version = fields["flight_sw_version"]
         if version:
             self._change(version=".".join(str(version >> bits & 0xFF) for bits in (24, 16, 8)))
+
+
+class _Fix(NamedTuple):
+    """One measurement of a receiver: its time, place, and north and east velocity.
+
+    `slip_m` is how far its place has moved lately in another way than its velocity says.
+    """
+
+    time_s: float
+    place: GlobalOrigin
+    velocity_m_s: tuple[float, float] | None
+    slip_m: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def length_of_slip_m(self) -> float | None:
+        return None if self.velocity_m_s is None else math.hypot(*self.slip_m)
+
+    def after(self, last: "_Fix") -> "_Fix":
+        """The same, with the slip since an earlier one added."""
+        between_s = self.time_s - last.time_s
+        if self.velocity_m_s is None or last.velocity_m_s is None:
+            return self
+        if not 0.0 < between_s <= _SLIP_WITHIN_S:
+            return self
+        moved_m, kept = _shift_m(last.place, self.place), math.exp(-between_s / _SLIP_S)
+        north_m, east_m = (
+            kept * slip_m + moved - (was_m_s + is_m_s) / 2.0 * between_s
+            for slip_m, moved, was_m_s, is_m_s in zip(
+                last.slip_m, moved_m, last.velocity_m_s, self.velocity_m_s, strict=False
+            )
+        )
+        return self._replace(slip_m=(north_m, east_m))
+
+
+def _fix(fields: Fields) -> _Fix:
+    """The measurement of a GPS_RAW_INT that has a fix."""
+    place = GlobalOrigin(fields["lat"] / 1e7, fields["lon"] / 1e7, fields["alt"] / 1e3)
+    speed, course = fields["vel"], fields["cog"]
+    velocity_m_s = None
+    if _UNKNOWN_UINT16 not in (speed, course):
+        course_rad = math.radians(course / 100.0)
+        speed_m_s = speed / 100.0
+        velocity_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
+    return _Fix(fields["time_usec"] / 1e6, place, velocity_m_s)
 
 
 class _VehicleClock:

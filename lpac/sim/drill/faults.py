@@ -74,7 +74,9 @@ from lpac.sim.drill.injections import (
     RadioCut,
     RadioIs,
     ReceiverJumps,
+    ReceiverLies,
     ReceiverReports,
+    ReceiverSticks,
     RemoteControl,
     SecondGroundDies,
     SecondGroundHolds,
@@ -116,6 +118,8 @@ _HOME_S = 35.0 + _LANDING_S
 # begun to land.
 _BRAKED = Stands(2.0, 5.0, speed_m_s=0.8)
 _BRAKED_LATER = Stands(2.6, 6.0, speed_m_s=0.8)
+# Displaced by a receiver that lies, as long as PX4 keeps a place without it.
+_NEAR_STILL = StaysNear(0.0, 5.0, 10.0)
 # Without a ground they stand, but part before they come down where they are.
 _WAIT = Stands(7.0, 12.5, "all", may_part=True)
 # Full thrust lifts less than the weight: the vehicle sinks at 1.2 m/s in the end, or 0.3 m/s.
@@ -542,13 +546,68 @@ _POSITIONS = (
     ),
     Fault(
         name="gps-jumps", what="a robot's fix jumps by 9 m, and back after 5 s",
-        promise="it stands, and flies on once nothing spoke against it for 3 s",
+        promise="it stands, and lands after 2.5 s",
         does=(*_once(ReceiverJumps(9.0)), Do(5.0, ReceiverJumps(0.0))), watched_s=30.0,
+        beyond_fence_m=POSITION_ERROR_M + 10.0,
+        bounds=(_BRAKED, Lands(3.5), StaysNear(0.0, 60.0, 10.0), Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="gps-jumps-for-a-moment", what="a robot's fix jumps by 9 m, and back after 1 s",
+        promise="it stands, and flies on once nothing spoke against it for 3 s",
+        does=(*_once(ReceiverJumps(9.0)), Do(1.0, ReceiverJumps(0.0))), watched_s=30.0,
         beyond_fence_m=POSITION_ERROR_M + 9.0,
         bounds=(
             NotFaster(2.2, 25.0), NotLandedBefore(30.0), FliesOn(30.0, 0.9, "hit", 12.0),
             FliesOn(20.0),
         ),
+    ),
+    Fault(
+        name="receiver-stuck", what="a robot's receiver repeats its last fix, with a velocity of 0",
+        promise="it stops within 1.5 s, lands 2 s later, and the wind has it from 5 s on",
+        uncovered=_ADRIFT,
+        does=_once(ReceiverSticks()), beyond_fence_m=ADRIFT_M,
+        bounds=(_BRAKED, Lands(3.5), _NEAR_STILL, Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="receiver-stuck-in-still-air", what="the same, and no wind blows",
+        promise="it stops within 1.5 s, lands 2 s later, and is displaced by at most 10 m",
+        does=_once(ReceiverSticks()), beyond_fence_m=POSITION_ERROR_M + 10.0, exact=True,
+        bounds=(Lands(3.5), StaysNear(0.0, 60.0, 10.0), Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="receiver-creeps", what="a robot's fix walks off at 2 m/s, and its velocity is honest",
+        promise="it stops within 3.7 s, lands 2 s later, and the wind has it 5 s later",
+        uncovered=_ADRIFT,
+        does=_once(ReceiverLies(creep_m_s=2.0)), beyond_fence_m=ADRIFT_M,
+        bounds=(Lands(6.5), _NEAR_STILL, Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="receiver-races", what="a robot's receiver tells a velocity that is wrong by 3 m/s",
+        promise="it stops within 1 s, lands 5 s after the fault, and the wind has it 5 s later",
+        uncovered=_ADRIFT,
+        does=_once(ReceiverLies(velocity_bias_m_s=3.0)), beyond_fence_m=ADRIFT_M,
+        bounds=(Lands(5.5), _NEAR_STILL, Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="receiver-scatters", what="a robot's fixes scatter by 10 m, and claim to be accurate",
+        promise="it stops within 1.5 s, lands, and the wind has it from 5 s on",
+        uncovered=_ADRIFT,
+        does=_once(ReceiverLies(scatter_m=10.0)), beyond_fence_m=ADRIFT_M,
+        bounds=(Lands(8.0), _NEAR_STILL, Down(_LANDING_S), FliesOn(20.0)),
+    ),
+    Fault(
+        name="receiver-stuck-in-takeoff", what="a robot's receiver repeats its fix as it climbs",
+        promise="it lands, and the wind has it from 5 s on",
+        uncovered=_ADRIFT,
+        phase="takeoff", does=(Do(10.0, ReceiverSticks()),), beyond_fence_m=ADRIFT_M,
+        bounds=(Down(60.0), TakesOff("others")),
+    ),
+    Fault(
+        name="receiver-stuck-in-return", what="a robot's receiver repeats its fix on its way home",
+        promise="it lands, and the wind has it from 5 s on",
+        uncovered=_ADRIFT,
+        phase="return", does=_once(ReceiverSticks()), beyond_fence_m=ADRIFT_M,
+        bounds=(_NEAR_STILL, Down(60.0), LandsAtPad(_AT_PAD_M, "others")),
     ),
     Fault(
         name="estimate-freezes", what="a robot's autopilot tells the same position again and again",

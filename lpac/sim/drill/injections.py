@@ -120,6 +120,29 @@ class ReceiverJumps(VehicleInjection):
 
 
 @dataclass(frozen=True, slots=True)
+class ReceiverSticks(VehicleInjection):
+    """The receiver repeats its last place as a fresh fix, with a velocity of 0."""
+
+    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+        vehicle.receiver.stuck = True
+
+
+@dataclass(frozen=True, slots=True)
+class ReceiverLies(VehicleInjection):
+    """The receiver's places walk off, its velocity is biased (both outwards), or places scatter."""
+
+    creep_m_s: float = 0.0
+    velocity_bias_m_s: float = 0.0
+    scatter_m: float = 0.0
+
+    def apply(self, vehicle: Px4Vehicle, robot: int, around: Surroundings) -> None:
+        outwards = np.array([*around.outwards(robot), 0.0])
+        vehicle.receiver.creep_m_s = self.creep_m_s * outwards
+        vehicle.receiver.velocity_bias_m_s = self.velocity_bias_m_s * outwards
+        vehicle.receiver.scatter_m = self.scatter_m
+
+
+@dataclass(frozen=True, slots=True)
 class EstimateFreezes(VehicleInjection):
     """Position and velocity go on being told, and are the old ones."""
 

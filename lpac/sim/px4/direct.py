@@ -112,6 +112,11 @@ class DirectVehicle:
         for name, fields in self._dialogue.say(now_s, self.state()):
             if name == "REQUEST_EVENT":
                 self._send(request_event(**fields))
+            elif name == "PARAM_SET":
+                encoded = {**fields, "param_id": fields["param_id"].encode()}
+                self._send(
+                    mavlink.MAVLink_param_set_message(self._system_id, _AUTOPILOT, **encoded)
+                )
             else:
                 self._send(
                     mavlink.MAVLink_command_long_message(self._system_id, _AUTOPILOT, **fields)

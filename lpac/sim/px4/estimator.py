@@ -23,8 +23,11 @@ DEAD_RECKONING_S = 5.0
 GPS_FUSION_S = 7.0
 GPS_REGAIN_S = 1.2
 DEAD_RECKONING_DRIFT_M = 0.5  # per square root of a second
-# A fix further off than PX4's gate is rejected, for so long; any other is followed smoothly.
-GPS_GATE_M, GPS_REJECTED_S, GPS_FOLLOW_S = 5.0, 7.0, 2.0
+# A fix further off than PX4's gates is rejected, for so long; any other is followed smoothly. Rates
+# of the correction, as a real PX4 v1.17 was seen to follow a receiver that repeats itself: of the
+# position, the velocity and the tilt (as an acceleration) by the place, of the velocity by its own.
+GPS_GATE_M, GPS_GATE_M_S, GPS_REJECTED_S = 5.0, 4.0, 7.0
+GPS_BY_PLACE, GPS_VELOCITY_BY_VELOCITY = (0.96, 0.33, 0.12), 0.25
 
 
 class Estimator:
@@ -40,6 +43,8 @@ class Estimator:
         self._gps_lost_since_s = -math.inf
         self._gps_back_at_s = -math.inf
         self._followed_m: F64 = np.zeros(3)
+        self.velocity_error_m_s: F64 = np.zeros(3)
+        self._tilt_error_m_s2: F64 = np.zeros(3)
         self._rejects_since_s = math.inf
 
     @property
@@ -112,11 +117,20 @@ class Estimator:
         is_back = self._time_s >= self._gps_back_at_s
         return is_back and self._time_s - self._gps_lost_since_s < without_gps_s
 
-    def step(self, time_s: float, dt_s: float, has_gps: bool, jump_m: F64, draws: F64) -> None:
-        """One step of time: `jump_m` (3,) is what the fix jumped by, `draws` (6,) are normal."""
+    def step(
+        self, time_s: float, dt_s: float, has_gps: bool, off_m: F64, off_m_s: F64, draws: F64
+    ) -> None:
+        """One step of time: the fix's place and velocity err by `off_m` and `off_m_s` (3,).
+
+        `draws` (6,) are normal.
+        """
         self._time_s = time_s
         if has_gps:
-            self._follow(jump_m, dt_s)
+            self._follow(off_m, off_m_s, dt_s)
+        else:
+            # Without it, gravity tells the tilt.
+            self._tilt_error_m_s2 = np.zeros(3)
+            self._followed_m = self._followed_m + self.velocity_error_m_s * dt_s
         if not has_gps:
             self._gps_lost_since_s = min(self._gps_lost_since_s, time_s)
         elif not self.has_gps:
@@ -131,15 +145,20 @@ class Estimator:
         step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
         self._drift_m = self._drift_m + step_m * draws[3:6] * (1.0, 1.0, 0.0)
 
-    def _follow(self, jump_m: F64, dt_s: float) -> None:
-        """Go after a fix that jumped; where that is too far to be true, wait, then start over."""
-        off_m = jump_m - self._followed_m
-        far_m = math.hypot(*off_m.tolist())
-        if far_m <= GPS_GATE_M:
-            self._rejects_since_s = math.inf
-            if far_m:
-                self._followed_m = self._followed_m + off_m * (dt_s / GPS_FOLLOW_S)
-        else:
-            self._rejects_since_s = min(self._rejects_since_s, self._time_s)
-            if self._time_s - self._rejects_since_s >= GPS_REJECTED_S:
-                self._followed_m = jump_m.copy()
+    def _follow(self, off_m: F64, off_m_s: F64, dt_s: float) -> None:
+        """Go after a fix that lies; where it is too far off to be true, wait, then start over."""
+        place_m, speed_m_s = off_m - self._followed_m, off_m_s - self.velocity_error_m_s
+        far = math.hypot(*place_m.tolist()) > GPS_GATE_M
+        far = far or math.hypot(*speed_m_s.tolist()) > GPS_GATE_M_S
+        self._rejects_since_s = min(self._rejects_since_s, self._time_s) if far else math.inf
+        if self._time_s - self._rejects_since_s >= GPS_REJECTED_S:
+            self._followed_m, self.velocity_error_m_s = off_m.copy(), off_m_s.copy()
+            return
+        rates = self.velocity_error_m_s, self._tilt_error_m_s2, np.zeros(3)
+        if not far:
+            by_position, by_velocity, by_tilt = (gain * place_m for gain in GPS_BY_PLACE)
+            by_velocity = by_velocity + GPS_VELOCITY_BY_VELOCITY * speed_m_s
+            rates = rates[0] + by_position, rates[1] + by_velocity, by_tilt
+        self._followed_m = self._followed_m + rates[0] * dt_s
+        self.velocity_error_m_s = self.velocity_error_m_s + rates[1] * dt_s
+        self._tilt_error_m_s2 = self._tilt_error_m_s2 + rates[2] * dt_s

@@ -459,7 +459,9 @@ class Px4Link:
                 0, 0, 0, 0, 0, unknown, unknown, unknown, unknown, 0xFF
             )
         self._gps_told_at_s = vehicle.time_s
-        speed_cm_s = round(100.0 * math.hypot(vehicle.velocity_m_s[0], vehicle.velocity_m_s[1]))
+        v_north, v_east, _ = vehicle.fix_velocity_m_s.tolist()
+        speed_cm_s = round(100.0 * math.hypot(v_north, v_east))
+        course_cdeg = round(100.0 * math.degrees(math.atan2(v_east, v_north))) % 36000
         place = _as_integers(vehicle.global_fix)
         if vehicle.gps_lost:
             fix, satellites, dilutions, accuracies_m = 0, 0, (10000, 10000), (100.0,) * 3
@@ -472,7 +474,7 @@ class Px4Link:
             *place,
             *dilutions,
             speed_cm_s,
-            0xFFFF,
+            course_cdeg,
             satellites,
             place[2],
             *(round(accuracy_m * 1e3) for accuracy_m in accuracies_m),

@@ -53,6 +53,7 @@ PARAMETERS: dict[str, int | float] = {
     # Kept for clients to read; the simulated vehicle does not act on them.
     "CBRK_FLIGHTTERM": 121212,
     "EKF2_HGT_REF": 1,
+    "EKF2_GPS_CTRL": 7,  # bits: 0 place, 1 height, 2 velocity; 0: without the receiver
     "MAV_SYS_ID": 1,
     "MAV_TYPE": 2,
     "SYS_AUTOSTART": 10040,

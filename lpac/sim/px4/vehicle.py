@@ -46,6 +46,7 @@ from lpac.sim.px4.modes import (
     Px4Mode,
 )
 from lpac.sim.px4.parameters import PARAMETERS
+from lpac.sim.px4.receiver import Receiver
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon, WorldOrigin
 
@@ -175,7 +176,8 @@ class Px4Vehicle:
 
     Fields that a test may set at any time: `parameters`, `wind_m_s`, `gust_m_s` (standard
     deviation), `gps_bias_m`, `gps_lost` (the receiver lives, without satellites), `gps_jump_m` (3,)
-    (its fix is off by that much at once, and the estimator must see what to make of it),
+    (its fix is off by that much at once, and the estimator must see what to make of it, as of the
+    other faults of its `receiver`),
     `gps_offset_m` and `gps_drift_m_s` (3,) (what fix and estimate are off besides, and how that
     goes on; no bound keeps it), `compass_jump_rad`,
     `gps_told_m` (the accuracy that it says to have, if not its own), `estimate_frozen` (position
@@ -223,14 +225,14 @@ class Px4Vehicle:
         self.velocity_m_s = self.acceleration_m_s2 = np.zeros(3)
         self.heading_rad, self.yaw_rate_rad_s = heading_rad, 0.0
 
-        self.wind_m_s: F64 = np.zeros(3)
         self.gust_m_s = 0.0
-        self._gust = self.air_m_s = self.compensated_wind_m_s = np.zeros(3)
+        self.wind_m_s = self._gust = self.air_m_s = self.compensated_wind_m_s = np.zeros(3)
         self.battery_remaining, self._battery_warning = 1.0, 1
 
         self.gps_lost = self.estimate_frozen = False
         self.gps_jump_m = self.gps_offset_m = self.gps_drift_m_s = np.zeros(3)
         self.gps_told_m: float | None = None
+        self.receiver = Receiver()
         self._frozen: tuple[F64, F64] | None = None
         self.dead_sensors: set[SimulatedSensor] = set()
         self._dead_since_s: dict[SimulatedSensor, float] = {}
@@ -272,8 +274,7 @@ class Px4Vehicle:
         """(3,), world frame: where the vehicle takes itself to be."""
         if self._frozen is not None:
             return self._frozen[0]
-        errors_m = self.gps_bias_m + self._walk_m + self.gps_offset_m + self.estimator.error_m
-        return self.position_m + errors_m
+        return self.position_m + self._shared_error_m + self.estimator.error_m
 
     @property
     def estimated_velocity_m_s(self) -> F64:
@@ -303,11 +304,24 @@ class Px4Vehicle:
 
         It errs as the estimate does, which follows it, and has noise besides; it comes late.
         """
+        return self._world.to_global(self.receiver.place_m(self._honest_fix_m()))
+
+    @property
+    def fix_velocity_m_s(self) -> F64:
+        """(3,), world frame: how fast the receiver says to move."""
+        return self.receiver.velocity_m_s(self.velocity_m_s)
+
+    def _honest_fix_m(self) -> F64:
         noise_m = np.zeros(3) if self._errors is None else self._errors.fix_m(self.time_s)
         late_m = self.position_m - GPS_LAG_S * self.velocity_m_s
-        errors_m = self.gps_bias_m + self._walk_m + self.gps_offset_m + self.gps_jump_m
-        fix_m = late_m + errors_m + noise_m
-        return self._world.to_global(fix_m)
+        fix_m: F64 = late_m + self._shared_error_m + self.gps_jump_m + noise_m
+        return fix_m
+
+    @property
+    def _shared_error_m(self) -> F64:
+        """(3,): what fix and estimate err by together."""
+        error_m: F64 = self.gps_bias_m + self._walk_m + self.gps_offset_m
+        return error_m
 
     @property
     def gps_accuracy_m(self) -> tuple[float, float, float]:
@@ -524,13 +538,15 @@ class Px4Vehicle:
         self._estimate(dt_s)
         self.gps_offset_m = self.gps_offset_m + self.gps_drift_m_s * dt_s
         self.air_m_s = self.wind_m_s + self._gust
+        self._velocity_error_m_s = self.estimator.velocity_error_m_s
         if self._errors is not None:
             self._walk_m = self._errors.position_m(self.time_s, self.gps_bias_m) - self.gps_bias_m
             self._compass_rad = self._errors.heading_rad(self.time_s) + self.compass_jump_rad
             self.air_m_s = self.air_m_s + self._errors.wind_m_s(self.time_s)
             # Who stands on the ground is known to.
             lifted = min(max(-float(self.position_m[2]) / _ERRS_FROM_M, 0.0), 1.0)
-            self._velocity_error_m_s = lifted * self._errors.velocity_m_s(self.time_s)
+            errors_m_s = lifted * self._errors.velocity_m_s(self.time_s)
+            self._velocity_error_m_s = self._velocity_error_m_s + errors_m_s
         if self.home_m is None and self.estimator.has_attitude and self.estimator.has_gps:
             self.home_m = self.estimated_position_m
         if self.armed:
@@ -552,7 +568,11 @@ class Px4Vehicle:
     def _estimate(self, dt_s: float) -> None:
         draws = self._rng.standard_normal(10)
         has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
-        self.estimator.step(self.time_s, dt_s, has_gps, self.gps_jump_m, draws[:6])
+        has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
+        self.receiver.step(dt_s, self._honest_fix_m(), self._rng)
+        off_m = self.gps_jump_m + self.receiver.off_m(self.position_m + self._shared_error_m)
+        off_m_s = (self.fix_velocity_m_s - self.velocity_m_s) * (1.0, 1.0, 0.0)
+        self.estimator.step(self.time_s, dt_s, has_gps, off_m, off_m_s, draws[:6])
         decay = dt_s / VERTICAL_DRIFT_TIME_S
         self._vertical_drift_m_s += -self._vertical_drift_m_s * decay + VERTICAL_DRIFT_M_S * float(
             draws[6]

@@ -40,10 +40,17 @@ def run(
     return changes
 
 
-def sets(**fields: Any) -> Callable[[Px4Vehicle], None]:
-    def do(vehicle: Px4Vehicle) -> None:
+def sets(**fields: Any) -> Callable[[object], None]:
+    def do(of: object) -> None:
         for name, value in fields.items():
-            setattr(vehicle, name, value)
+            setattr(of, name, value)
+
+    return do
+
+
+def lies(**fields: Any) -> Callable[[Px4Vehicle], None]:
+    def do(vehicle: Px4Vehicle) -> None:
+        sets(**fields)(vehicle.receiver)
 
     return do
 
@@ -65,7 +72,17 @@ LASTING = [
     pytest.param(sets(estimate_frozen=True), PositionCause.FROZEN, 1.5, 3.4, id="frozen"),
     pytest.param(sets(gps_told_m=11.0), PositionCause.INACCURATE, 0.8, 2.5, id="hopeless"),
     pytest.param(sets(gps_told_m=6.0), PositionCause.INACCURATE, 0.8, None, id="inaccurate"),
-    pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, None, id="jumps"),
+    pytest.param(jumps(7.0), PositionCause.DISAGREES, 0.8, 2.5, id="jumps"),
+    pytest.param(lies(stuck=True), PositionCause.GPS_STUCK, 1.2, 2.8, id="stuck"),
+    pytest.param(
+        lies(creep_m_s=np.array([2.0, 0.0, 0.0])), PositionCause.SLIPS, 3.5, 5.5, id="creeps"
+    ),
+    pytest.param(
+        lies(velocity_bias_m_s=np.array([0.0, 3.0, 0.0])), PositionCause.VELOCITY_DISAGREES, 0.8,
+        # In between the estimate follows it.
+        4.3,
+        id="wrong velocity",
+    ),
 ]  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """A fleet of real robot nodes under a real ground, on one simulated clock."""
 
 import dataclasses
+import math
 import re
 import tempfile
 from collections.abc import Callable
@@ -241,6 +242,34 @@ def test_a_robot_says_what_befell_it_and_the_other_flies_on(
     assert not fleet.ground.command(Start(("r0",))).done
     again = fleet.ground.snapshot.robots[0].status
     assert again is not None and again.state is not FlightState.MISSION
+
+
+def test_a_receiver_that_repeats_itself_is_ignored_until_the_robot_has_landed() -> None:
+    fleet = _on_their_way(for_a_pilot=False).copy()
+    vehicle = fleet.vehicles[0].vehicle
+    vehicle.receiver.stuck = True
+    at_m, began_s = vehicle.position_m, vehicle.time_s
+
+    def lands(told: FleetSnapshot) -> bool:
+        return told.robots[0].status is not None and (
+            told.robots[0].status.state is FlightState.LAND
+        )
+
+    def is_down(_: FleetSnapshot) -> bool:
+        return not vehicle.armed
+
+    assert fleet.ground.carry_out(_until(lambda _: not vehicle.parameters["EKF2_GPS_CTRL"], 1.5))
+    assert fleet.ground.carry_out(_until(lands, 4.0))
+    assert vehicle.time_s - began_s <= 3.5
+    said = fleet.ground.snapshot.robots[0].status
+    assert said is not None and said.reason.code is ReasonCode.POSITION_LOST
+    assert "repeats" in said.reason.text
+    # It was changed by the robot itself, and nobody is told otherwise.
+    assert ReasonCode.PX4_CHANGED not in {reason.code for reason in said.alarms}
+    assert math.dist(vehicle.position_m[:2], at_m[:2]) < 5.0
+    assert fleet.ground.carry_out(_until(is_down, 60.0))
+    fleet.ground.carry_out(_pass(2.0))
+    assert vehicle.parameters["EKF2_GPS_CTRL"] == 7
 
 
 def gf_action_is(value: int) -> Callable[[SimulatedFleet], None]:

@@ -73,6 +73,21 @@ WITHOUT: list[tuple[dict[str, Any], PositionCause, str]] = [
         PositionCause.NOT_ESTIMATED,
         "the autopilot's estimator does not vouch for it",
     ),
+    (
+        {"gps": dataclasses.replace(GPS, offset_m=7.0)},
+        PositionCause.DISAGREES,
+        "the GPS fix is 7.0 m away from the estimate",
+    ),
+    (
+        {"gps": dataclasses.replace(GPS, velocity_offset_m_s=2.1)},
+        PositionCause.VELOCITY_DISAGREES,
+        "the GPS velocity is 2.1 m/s off the estimate",
+    ),
+    (
+        {"gps": dataclasses.replace(GPS, slip_m=5.1)},
+        PositionCause.SLIPS,
+        "the GPS place moved by 5.1 m in another way than its velocity",
+    ),
     ({"position_local_m": None}, PositionCause.UNKNOWN, "it is not known"),
     ({"origin": None}, PositionCause.UNKNOWN, "it is not known"),
 ]
@@ -83,11 +98,6 @@ POOR: list[tuple[dict[str, Any], PositionCause, str]] = [
         "GPS is accurate to 5.1 m only",
     ),
     (
-        {"gps": dataclasses.replace(GPS, offset_m=7.0)},
-        PositionCause.DISAGREES,
-        "the GPS fix is 7.0 m away from the estimate",
-    ),
-    (
         {"gps": dataclasses.replace(GPS, satellites=5)},
         PositionCause.FEW_SATELLITES,
         "GPS sees 5 satellites only",
@@ -95,7 +105,7 @@ POOR: list[tuple[dict[str, Any], PositionCause, str]] = [
     (
         {"estimator": EstimatorStatus(True, True, 1e9)},
         PositionCause.GLITCH,
-        "the autopilot's estimator takes the GPS for wrong",
+        "the autopilot's estimator rejects the GPS",
     ),
 ]
 
@@ -204,7 +214,7 @@ def test_a_pause_of_the_receiver_stops_a_robot_and_does_not_land_it() -> None:
 # Each row of docs/safety.md's table of wrong positions that the judgement has times for: the cause,
 # after how long, and what happens as they stand there; what is told; and when, in s after it is
 # told (or after the last that was), the position is doubtful and lost.
-_STOPS = "stop, and on when nothing speaks against it for 3 s; LAND after 60 s"
+_LANDS = "stop; LAND 2 s after it was told"
 WRONG: list[tuple[str, str, str, list[dict[str, Any]], float, float]] = [
     ("no fix", "told within 0.3 s, and 0.4 s", "stop; LAND 2 s after it was told",
      [NO_FIX], 0.4, 2.0),
@@ -222,10 +232,19 @@ WRONG: list[tuple[str, str, str, list[dict[str, Any]], float, float]] = [
      [{"gps": dataclasses.replace(GPS, accuracy_m=10.1)}], 0.4, 2.0),
     ("accuracy between 1.5 m and 5 m", "", "heights keep robots apart; before takeoff more room is "
      "asked for", [{"gps": dataclasses.replace(GPS, accuracy_m=5.0)}], math.inf, math.inf),
-    ("the position jumps by 1 m or more, or the receiver lies 5 m from the estimate", "0.4 s",
-     _STOPS, [{"jumped_at_s": 0.0}], 0.4, math.inf),
-    ("the position jumps by 1 m or more, or the receiver lies 5 m from the estimate", "0.4 s",
-     _STOPS, [{"gps": dataclasses.replace(GPS, offset_m=5.1)}], 0.4, 60.4),
+    ("the position jumps by 1 m or more", "0.4 s",
+     "stop, and on when nothing speaks against it for 3 s", [{"jumped_at_s": 0.0}], 0.4, math.inf),
+    ("fix and estimate are more than 5 m or 2 m/s apart", "0.2 s and 0.4 s", _LANDS,
+     [{"gps": dataclasses.replace(GPS, offset_m=5.1)}], 0.4, 2.0),
+    ("fix and estimate are more than 5 m or 2 m/s apart", "0.2 s and 0.4 s", _LANDS,
+     [{"gps": dataclasses.replace(GPS, velocity_offset_m_s=2.1)}], 0.4, 2.0),
+    ("the fix moves otherwise than its own velocity says, by more than 5 m in 10 s",
+     "as long as that takes, and 0.4 s",
+     "PX4 goes without it, at once; stop; LAND 2 s after it was noticed",
+     [{"gps": dataclasses.replace(GPS, slip_m=5.1)}], 0.4, 2.0),
+    ("the receiver repeats the same fix", "three repeats, 0.3 s to 0.8 s, and 0.4 s",
+     "PX4 goes without it, at once; stop; LAND 2 s after it was noticed", [{"gps_repeats": 3}],
+     0.4, 2.0),
     ("the receiver jumps by less than 5 m", "never", "nothing: PX4 takes it for true and follows "
      "smoothly", [{"gps": dataclasses.replace(GPS, offset_m=4.9)}], math.inf, math.inf),
     ("frozen values", "1 s and 0.4 s", "stop; LAND 2 s after the freeze was noticed",
@@ -255,9 +274,14 @@ def test_wrong_positions_are_noticed_when_the_table_says(
         for name in changes.keys() & {"position_at_s", "position_changed_at_s", "jumped_at_s"}:
             changes[name] += since_s
         silent = changes.pop("gps_at_s", None) is not None
+        repeats = changes.pop("gps_repeats", 0)
         vehicle = heard(watch.now_s, **changes)
         if silent:
             vehicle = dataclasses.replace(vehicle, gps=dataclasses.replace(GPS, at_s=since_s))
+        if repeats:
+            told_at_s = {"at_s": watch.now_s, "moved_at_s": since_s}
+            stuck = dataclasses.replace(GPS, repeats=repeats, **told_at_s)
+            vehicle = dataclasses.replace(vehicle, gps=stuck)
         watch.look(vehicle)
         found.setdefault(watch.judgement.quality, watch.now_s - since_s)
     assert found[_Q.GOOD] == pytest.approx(TICK_S)

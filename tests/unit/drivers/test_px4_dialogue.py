@@ -1,6 +1,8 @@
 """What is asked of PX4, and how often: by the messages that would be on the wire."""
 
+import itertools
 import math
+import struct
 from collections import Counter
 from collections.abc import Callable
 from typing import Any
@@ -62,6 +64,41 @@ class Conversation:
     def most_within(self, seconds: float) -> int:
         at_s = [time_s for time_s, _, _ in self.said]
         return max(sum(begin <= each < begin + seconds for each in at_s) for begin in at_s)
+
+
+def test_whether_to_use_the_gps_is_asked_five_times_a_second_and_set_back_to_what_it_was() -> None:
+    talk = Conversation()
+    said: list[tuple[float, float]] = []
+
+    def as_often_as(action: Action, for_s: float) -> None:
+        until_s = talk.now_s + for_s
+        while talk.now_s < until_s:
+            talk.dialogue.command(action, talk.now_s)
+            for name, fields in talk.dialogue.say(talk.now_s, talk.vehicle):
+                if name == "PARAM_SET":
+                    assert (fields["param_id"], fields["param_type"]) == ("EKF2_GPS_CTRL", 6)
+                    said.append((talk.now_s, fields["param_value"]))
+            talk.now_s += TICK_S
+
+    def of_bits(number: int) -> float:
+        (value,) = struct.unpack("<f", struct.pack("<i", number))
+        return float(value)
+
+    def px4_says(number: int) -> None:
+        fields = {"param_id": "EKF2_GPS_CTRL", "param_value": of_bits(number)}
+        talk.telemetry.hear("PARAM_VALUE", fields, talk.now_s)
+
+    px4_says(5)
+    assert talk.telemetry.state(talk.now_s).ignores_gps is False
+    as_often_as(Action.IGNORE_GPS, 1.0)
+    assert [value for _, value in said] == [0.0] * 5
+    between_s = [b - a for (a, _), (b, _) in itertools.pairwise(said)]
+    assert min(between_s) > 0.19
+    px4_says(0)
+    assert talk.telemetry.state(talk.now_s).ignores_gps is True
+    said.clear()
+    as_often_as(Action.USE_GPS, 0.1)
+    assert [value for _, value in said] == [of_bits(5)]
 
 
 def test_every_stream_is_asked_for_one_after_another() -> None:

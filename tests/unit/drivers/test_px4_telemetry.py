@@ -1,6 +1,7 @@
 """What the robot concludes, second by second, from the bytes that a real PX4 v1.17 sent."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
@@ -39,8 +40,11 @@ class Conclusion(NamedTuple):
     judgement: PositionJudgement
 
 
-def conclusions(name: str) -> list[Conclusion]:
-    """One ten times a second."""
+def conclusions(
+    name: str,
+    receiver: Callable[[float, dict[str, Any]], dict[str, Any]] = lambda _, fields: fields,
+) -> list[Conclusion]:
+    """One ten times a second; `receiver` alters what GPS_RAW_INT says at a time, s."""
     telemetry, judgement = Px4Telemetry(), PositionJudgement()
     found: list[Conclusion] = []
     for heard_s, message in (r for r in recorded(name) if r.is_px4):
@@ -49,7 +53,10 @@ def conclusions(name: str) -> list[Conclusion]:
             judgement = judge(judgement, vehicle, PositionLimits(), now_s)
             found.append(Conclusion(now_s, vehicle, judgement))
         if message.get_type() in telemetry.messages:
-            telemetry.hear(message.get_type(), message.to_dict(), heard_s)
+            fields = message.to_dict()
+            if message.get_type() == "GPS_RAW_INT":
+                fields = receiver(heard_s, fields)
+            telemetry.hear(message.get_type(), fields, heard_s)
     return found
 
 
@@ -135,6 +142,44 @@ def test_a_thrust_that_is_not_told_any_more_is_not_known() -> None:
     telemetry.hear("VFR_HUD", {"throttle": 48}, 10.0)
     assert telemetry.state(12.0).thrust == 0.48
     assert telemetry.state(13.0).thrust is None
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_real_receiver_never_contradicts_itself(name: str) -> None:
+    found = [c for c in conclusions(name) if c.vehicle.gps is not None and c.vehicle.gps.fix >= 3]
+    assert not any(c.judgement.distrusts_gps for c in found)
+    gps = [c.vehicle.gps for c in found if c.vehicle.gps is not None]
+    assert max(each.repeats for each in gps) == 0
+    assert max(each.slip_m for each in gps if each.slip_m is not None) < 3.0
+    off_m_s = [each.velocity_offset_m_s for each in gps if each.velocity_offset_m_s is not None]
+    assert 0.0 < max(off_m_s) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("lie", "cause"),
+    [
+        (lambda fix, since_s: fix | STUCK, PositionCause.GPS_STUCK),
+        (lambda fix, since_s: fix | {"lat": fix["lat"] + round(180.0 * since_s)},
+         PositionCause.DISAGREES),
+        (lambda fix, since_s: fix | {"vel": 350}, PositionCause.VELOCITY_DISAGREES),
+    ],
+)  # fmt: skip
+def test_a_receiver_that_lies_in_a_real_flight_is_noticed(
+    lie: Callable[[dict[str, Any], float], dict[str, Any]],
+    cause: PositionCause,
+) -> None:
+    """From 30 s on, in the mission: the same fix, a place that walks off, a wrong velocity."""
+
+    def altered(time_s: float, message: dict[str, Any]) -> dict[str, Any]:
+        return lie(message, time_s - 30.0) if time_s > 30.0 else message
+
+    found = [c for c in conclusions("normal", altered) if 30.0 < c.time_s < 38.0]
+    assert cause in {c.judgement.cause for c in found}
+    assert any(c.judgement.distrusts_gps for c in found)
+    assert found[-1].judgement.quality is _Q.LOST
+
+
+STUCK = {"lat": 399526551, "lon": -751650343, "alt": 12743, "vel": 0, "cog": 0}
 
 
 def test_gps_lost_in_the_mission() -> None:
