@@ -82,6 +82,8 @@ HOVER_A, IDLE_A = 12.0, 0.5
 ASSUMED_OHM = 0.02
 # What the receiver of PX4's own simulator says of itself.
 GPS_ACCURACY_M, GPS_ACCURACY_M_S, GPS_SATELLITES = (0.9, 1.78), 0.4, 10
+# No receiver tells the same place twice.
+FIX_NOISE_M, FIX_NOISE_RAD_S = 0.02, np.array([7.3, 9.1, 5.7])
 # How old a fix is when it is told.
 GPS_LAG_S = 0.1
 
@@ -312,7 +314,9 @@ class Px4Vehicle:
         return self.receiver.velocity_m_s(self.velocity_m_s)
 
     def _honest_fix_m(self) -> F64:
-        noise_m = np.zeros(3) if self._errors is None else self._errors.fix_m(self.time_s)
+        noise_m = FIX_NOISE_M * np.sin(self.time_s * FIX_NOISE_RAD_S)
+        if self._errors is not None:
+            noise_m = noise_m + self._errors.fix_m(self.time_s)
         late_m = self.position_m - GPS_LAG_S * self.velocity_m_s
         fix_m: F64 = late_m + self._shared_error_m + self.gps_jump_m + noise_m
         return fix_m
