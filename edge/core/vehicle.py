@@ -11,6 +11,11 @@ from typing import NamedTuple
 Vector = tuple[float, float, float]
 
 
+# PX4's parameter of which of a receiver's measurements its estimator uses: bit 0 place, 1 height,
+# 2 velocity; 0: it goes without the receiver.
+GPS_CONTROL = "EKF2_GPS_CTRL"
+
+
 class Mode(StrEnum):
     """The autopilot's flight modes, as far as the robot must tell them apart."""
 
@@ -72,8 +77,8 @@ class Gps:
     `offset_m` and `velocity_offset_m_s` are how far in the plane its fix is from the estimator's
     position and velocity, None if one of them is not known. `slip_m` is how far in the plane its
     place has moved lately in another way than its velocity says, None if it tells no velocity.
-    `at_s` is when its last new measurement was received, `moved_at_s` when one last told another
-    place, and `repeats` how many have told the same place since.
+    `at_s` is when its last new measurement was received, and `repeats` how many have told the same
+    place since another one.
     """
 
     fix: int
@@ -84,7 +89,6 @@ class Gps:
     velocity_offset_m_s: float | None = None
     slip_m: float | None = None
     at_s: float = float("-inf")
-    moved_at_s: float = float("-inf")
     repeats: int = 0
 
 

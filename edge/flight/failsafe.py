@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from edge.core.vehicle import GPS_CONTROL
+
 RemoteControl = Literal["pilot", "none"]
 Parameters = Mapping[str, int | float | None]
 
 # Altitude drifts by 1.6 m under velocity setpoints.
 _CEILING_MARGIN_M = 2.0
-# Which of the receiver's measurements the estimator uses: bit 0 place, 1 height, 2 velocity.
-GPS_CONTROL = "EKF2_GPS_CTRL"
 _ROUNDING = 1e-6  # A REAL32 parameter holds 0.3 as 0.30000001.
 
 _NO_FAILSAFE = "fly on with the last command: NO FAILSAFE"

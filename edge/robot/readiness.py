@@ -13,7 +13,8 @@ from edge.core.logger import log
 from edge.core.mailbox import Neighbour
 from edge.core.ports import Odometry, Vehicle, VehicleSetup
 from edge.core.position import PositionJudgement
-from edge.flight.failsafe import GPS_CONTROL, PARAMETERS, Requirement, explain, required
+from edge.core.vehicle import GPS_CONTROL
+from edge.flight.failsafe import PARAMETERS, Requirement, explain, required
 from edge.flight.failsafe import check as check_parameters
 from edge.flight.preflight import PreflightInputs, failed_checks
 from edge.flight.state import Px4Change, Robot

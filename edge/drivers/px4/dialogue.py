@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from edge.core.logger import log
-from edge.core.vehicle import Action, ActionResult, VehicleState
+from edge.core.vehicle import GPS_CONTROL, Action, ActionResult, VehicleState
 from edge.drivers.px4.telemetry import RATES_HZ, Px4Telemetry
-from edge.flight.failsafe import GPS_CONTROL
 
 _HEARTBEAT, _GPS_GLOBAL_ORIGIN, _AUTOPILOT_VERSION, _EXTENDED_SYS_STATE = 0, 49, 148, 245
 

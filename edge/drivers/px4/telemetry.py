@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from edge.core.vehicle import (
+    GPS_CONTROL,
     AutopilotReason,
     EstimatorStatus,
     GlobalOrigin,
@@ -24,7 +25,6 @@ from edge.core.vehicle import (
 )
 from edge.drivers.px4.events import Px4Events, without_repetition
 from edge.drivers.px4.raw_mavlink import mode_name
-from edge.flight.failsafe import GPS_CONTROL
 
 Fields = Mapping[str, Any]
 
@@ -292,7 +292,6 @@ class Px4Telemetry:
                 velocity_offset_m_s=None if fix is None else self._velocity_offset_m_s(fix),
                 slip_m=None if self._fix is None else self._fix.length_of_slip_m,
                 at_s=heard_at_s if is_new else before.at_s,
-                moved_at_s=heard_at_s if moved else before.moved_at_s,
                 repeats=0 if moved else before.repeats + is_new,
             )
         )

@@ -30,6 +30,8 @@ from tests.px4_recordings import RECORDINGS, recorded
 TICK_S = 0.1
 
 _Q, _M = PositionQuality, Mode
+# A place and a velocity.
+STUCK = {"lat": 399526551, "lon": -751650343, "alt": 12743, "vel": 0, "cog": 0}
 
 
 class Conclusion(NamedTuple):
@@ -177,9 +179,6 @@ def test_a_receiver_that_lies_in_a_real_flight_is_noticed(
     assert cause in {c.judgement.cause for c in found}
     assert any(c.judgement.distrusts_gps for c in found)
     assert found[-1].judgement.quality is _Q.LOST
-
-
-STUCK = {"lat": 399526551, "lon": -751650343, "alt": 12743, "vel": 0, "cog": 0}
 
 
 def test_gps_lost_in_the_mission() -> None:
