@@ -279,7 +279,7 @@ def test_wrong_positions_are_noticed_when_the_table_says(
         if silent:
             vehicle = dataclasses.replace(vehicle, gps=dataclasses.replace(GPS, at_s=since_s))
         if repeats:
-            stuck = dataclasses.replace(GPS, repeats=repeats, at_s=watch.now_s, moved_at_s=since_s)
+            stuck = dataclasses.replace(GPS, repeats=repeats, at_s=watch.now_s)
             vehicle = dataclasses.replace(vehicle, gps=stuck)
         watch.look(vehicle)
         found.setdefault(watch.judgement.quality, watch.now_s - since_s)
