@@ -45,6 +45,7 @@ def live_map(
     from lpac.fleet.settings import load_fleet
     from lpac.ground.map.access import Access, reached_at
     from lpac.ground.map.server import serve
+    from lpac.ground.station.client import subscribe
 
     require_host("--host", host)
     config = load_fleet(fleet)
@@ -74,6 +75,11 @@ def live_map(
             typer.echo(f"map of {config.fleet}: {address}")
         typer.echo("commands the fleet" if operate else "only observes; --operate commands")
         typer.echo("Ctrl-C ends it, and nothing else")
+        try:
+            with subscribe(config.fleet):
+                pass
+        except OSError as error:
+            typer.echo(f"{error}; until then the map shows nothing")
         if open_page:
             webbrowser.open(addresses[0])
 

@@ -79,9 +79,16 @@ class Opened:
 
 @contextmanager
 def opened(
-    address: str, size: tuple[int, int] = (1280, 800), theme: Literal["light", "dark"] = "light"
+    address: str,
+    size: tuple[int, int] = (1280, 800),
+    theme: Literal["light", "dark"] = "light",
+    *,
+    shows: str = "#robots tr[data-robot]",
 ) -> Iterator[Opened]:
-    """Open the map at `address`; skips the test where there is no Chromium."""
+    """Open the map at `address`, and wait until it shows that.
+
+    Skips the test where there is no Chromium.
+    """
     if CHROMIUM is None:
         pytest.skip("needs: sudo apt install chromium")
     with sync_playwright() as playwright:
@@ -103,7 +110,7 @@ def opened(
             page.on("request", lambda asked: seen.hosts.add(urlsplit(asked.url).hostname or ""))
             page.on("websocket", lambda asked: seen.hosts.add(urlsplit(asked.url).hostname or ""))
             page.goto(address)
-            page.wait_for_selector("#robots tr[data-robot]")
+            page.wait_for_selector(shows)
             yield seen
         finally:
             browser.close()

@@ -9,6 +9,7 @@ import ssl
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from urllib.error import HTTPError
@@ -17,11 +18,13 @@ from urllib.request import HTTPCookieProcessor, build_opener, urlopen
 
 import aiohttp
 import pytest
+from typer.testing import CliRunner
 
 from edge.core.address import is_loopback
 from edge.messages.codes import CheckCode, FailedCheck
 from edge.messages.mission import ON_GROUND
 from lpac.analysis.snapshot import FleetSnapshot
+from lpac.cli.main import app
 from lpac.fleet.authority import AuthorityError, create_authority
 from lpac.fleet.web_certificate import web_certificate
 from lpac.ground.map import connections
@@ -488,6 +491,86 @@ def test_a_flight_by_clicks(few: FlownFleet) -> None:
         seen.act("land", sure=True)
         seen.wait_for_states({"r0": "landed", "r1": "landed"})
         check_innocence(seen)
+
+
+def test_a_page_without_a_ground(few: FlownFleet) -> None:
+    """It says what is missing and what to do, and goes on by itself."""
+    with (
+        live_map(few.fleet_toml) as address,
+        opened(address, shows="#banner >> text=no ground station runs") as seen,
+    ):
+        banner = seen.page.inner_text("#banner")
+        assert "start `lpac ground`" in banner and "nothing to show" in banner
+        assert seen.page.inner_text("#link") == "no ground"
+        with lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"):
+            seen.page.wait_for_selector("#robots tr[data-robot]")
+            seen.page.wait_for_selector("#banner", state="hidden")
+        check_innocence(seen)
+
+
+def test_the_terminal_says_that_there_is_no_ground(
+    few: FlownFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def serve(fleet: str, *, ready: Callable[[list[str]], None], **_: object) -> None:
+        ready(["http://127.0.0.1:8300/"])
+
+    monkeypatch.setattr("lpac.ground.map.server.serve", serve)
+    said = CliRunner().invoke(app, ["map", "--fleet", str(few.fleet_toml)]).stdout.splitlines()
+    assert said[0].endswith("http://127.0.0.1:8300/")
+    assert "start `lpac ground`; until then the map shows nothing" in said[-1]
+
+
+# Where a robot is drawn the pointer finds it, up to 24 px beside it, and so in all four corners
+# around; gives the number of such points, and what lies over the map there.
+OVER_ROBOTS = """async () => {
+  for (let frame = 0; frame < 2; frame++) await new Promise(requestAnimationFrame);
+  const canvas = document.querySelector("#map");
+  const { left, top, right, bottom } = canvas.getBoundingClientRect();
+  const finds = (clientX, clientY) => {
+    canvas.dispatchEvent(new PointerEvent("pointermove", { clientX, clientY }));
+    return canvas.classList.contains("over");
+  };
+  let points = 0;
+  const over = new Set();
+  for (let x = left; x < right; x += 4) {
+    for (let y = top; y < bottom; y += 4) {
+      if (![-12, 12].every((dx) => [-12, 12].every((dy) => finds(x + dx, y + dy)))) continue;
+      points++;
+      const element = document.elementFromPoint(x, y);
+      if (element !== canvas) over.add(element.closest("[id]").id);
+    }
+  }
+  return [points, [...over]];
+}"""
+
+
+def test_nothing_covers_a_robot(few: FlownFleet) -> None:
+    """Wherever in the world it is, on a phone too; nor when the map has something to say."""
+
+    def check() -> None:
+        for width, height in ((390, 844), (768, 1024), (1280, 800)):
+            seen.page.set_viewport_size({"width": width, "height": height})
+            points, over = seen.page.evaluate(OVER_ROBOTS)
+            # Some fifteen for each robot.
+            assert (points > 30, over) == (True, []), (width, height)
+
+    said = dict(few.says)
+    corners_m = (0.0, 0.0), (0.0, 32.0), (32.0, 0.0)
+    for robot, (x_m, y_m) in enumerate(corners_m):
+        few.says[robot] = partial(replace, position_m=(x_m, y_m, 5.0))
+    with live_map(few.fleet_toml) as address, ExitStack() as ground:
+        ground.enter_context(lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"))
+        with opened(address) as seen:
+            for name in ("r0", "r1", "r2"):
+                seen.page.wait_for_selector(f"tr[data-robot={name}] >> text=5.0 m")
+            check()
+            seen.page.keyboard.press("h")
+            ground.close()
+            seen.page.wait_for_selector("#toasts >> text=lpac mission hold")
+            seen.page.wait_for_selector("#banner >> text=lpac ground")
+            check()
+    few.says.clear()
+    few.says |= said
 
 
 def test_the_command_is_taken_by_a_click(few: FlownFleet, short_path: Path) -> None:

@@ -312,6 +312,9 @@ export class MapCanvas {
     const robots = (this.snapshot?.robots ?? []).filter((robot) => robot.position_m);
     this.paintFence(c);
     this.paintWorld(c);
+    // Below the robots, which nothing may cover.
+    this.paintNorth(c, w);
+    this.paintScale(c, h);
     if (this.layers.cells) this.paintCells(c);
     if (this.layers.places) this.paintPlaces(c);
     if (this.layers.links) this.paintLinks(c);
@@ -322,8 +325,6 @@ export class MapCanvas {
     robots.sort((a, b) => (a.name === this.selected) - (b.name === this.selected));
     for (const robot of robots) this.paintRobot(c, robot);
     if (this.layers.names) for (const robot of robots) this.paintName(c, robot);
-    this.paintNorth(c, w);
-    this.paintScale(c, h);
   }
 
   paintWorld(c) {

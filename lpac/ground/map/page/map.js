@@ -287,7 +287,8 @@ function showLink() {
   setClass($("#link"), `pill link ${gone ? "gone" : "live"}`);
   setText($("#link"), gone ? (socket ? "no ground" : "no map server") : "ground live");
   $("#banner").hidden = !gone;
-  setText($("#banner"), snapshot && gone ? `${gone}. Below is the last that was heard.` : gone);
+  const below = snapshot ? "Below is the last that was heard." : "Until then there is nothing to show.";
+  setText($("#banner"), gone && `${gone}. ${below}`);
   document.body.classList.toggle("gone", Boolean(gone));
 }
 
