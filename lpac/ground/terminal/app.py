@@ -243,9 +243,9 @@ class Watch(App[str]):
 
     def _look_at(self, snapshot: FleetSnapshot, setup: FleetSetup, now_s: float) -> None:
         self._alarms = alarms(setup, snapshot, self._before.take(snapshot, now_s))
-        for robot, severity in gravest(self._alarms).items():
-            if severity != "note":
-                self._up_until_s[robot] = severity, now_s + _STAYS_UP_S
+        for robot, alarm in gravest(self._alarms).items():
+            if alarm.severity != "note":
+                self._up_until_s[robot] = alarm.severity, now_s + _STAYS_UP_S
         lasting = {r: sev for r, (sev, until_s) in self._up_until_s.items() if now_s < until_s}
         self._rows = in_order(setup, snapshot, self._alarms, lasting)
         if not _flying(snapshot):

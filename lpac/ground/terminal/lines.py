@@ -4,6 +4,7 @@ Widths are those of a terminal's cells.
 """
 
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
@@ -50,6 +51,17 @@ def line(width: int, *spans: Span) -> Line:
         out.append(Span(text, span.style))
         left -= cell_len(text)
     return (*out, Span(" " * left))
+
+
+def wrapped(width: int, first: Line, text: Span) -> list[Line]:
+    """The text after `first`, on as many lines as it needs; nothing of it is cut."""
+    indent = sum(cell_len(span.text) for span in first)
+    parts = textwrap.wrap(text.text, max(width - indent, 1)) or [""]
+    starts = [first, *[(Span(" " * indent),)] * (len(parts) - 1)]
+    return [
+        line(width, *start, Span(part, text.style))
+        for start, part in zip(starts, parts, strict=True)
+    ]
 
 
 # Numbers

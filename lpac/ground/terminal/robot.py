@@ -20,6 +20,7 @@ from lpac.ground.terminal.lines import (
     fit,
     line,
     number,
+    wrapped,
 )
 from lpac.ground.terminal.table import (
     ID,
@@ -36,18 +37,19 @@ def detail(row: Row, snapshot: FleetSnapshot, alarms: Sequence[Alarm], width: in
     """All that is known of a robot."""
     robot, status = row.robot, row.robot.status
     lines = [_detail_title(robot, width)]
-    lines += [
-        _fact("alarm", alarm.text, width, alarm.severity)
-        for alarm in alarms
-        if alarm.robot == robot.name
-    ]
+    for alarm in alarms:
+        if alarm.robot == robot.name:
+            lines += _fact("alarm", alarm.text, width, alarm.severity)
     if status is None:
-        return [*lines, _fact("", "it was never heard", width, "faint")]
-    lines += [_fact("not taken", each.text, width, "warning") for each in status.not_taken]
+        return [*lines, *_fact("", "it was never heard", width, "faint")]
+    for each in status.not_taken:
+        lines += _fact("not taken", each.text, width, "warning")
     if status.state in ON_GROUND:
-        lines += [_fact("not ready", each.text, width) for each in status.failed_checks]
-    facts = _facts(row, status, snapshot)
-    lines += [_fact(name, text, width) for name, text in facts.items() if text]
+        for check in status.failed_checks:
+            lines += _fact("not ready", check.text, width)
+    for name, text in _facts(row, status, snapshot).items():
+        if text:
+            lines += _fact(name, text, width)
     return [
         *lines,
         line(width),
@@ -213,8 +215,8 @@ def _program(row: Row, status: RobotStatus) -> str:
     return f"up {duration(status.uptime_s)}, start {status.boot_nonce:x}{clock}"
 
 
-def _fact(name: str, text: str, width: int, style: TextStyle = "") -> Line:
-    return line(width, Span(f"{name:<10} ", "faint"), Span(text, style))
+def _fact(name: str, text: str, width: int, style: TextStyle = "") -> list[Line]:
+    return wrapped(width, (Span(f"{name:<10} ", "faint"),), Span(text, style))
 
 
 def _neighbour_table(row: Row, status: RobotStatus) -> list[Line]:

@@ -20,6 +20,7 @@ from lpac.ground.alarms import (
     LIMITS,
     SEVERITIES,
     Alarm,
+    AlarmCode,
     Severity,
 )
 from lpac.ground.terminal.lines import Line, Span, TextStyle, age, fit, line, number
@@ -43,7 +44,7 @@ class Row(NamedTuple):
     """A robot, and the gravest of its alarms."""
 
     robot: RobotSnapshot
-    severity: Severity | None
+    alarm: Alarm | None
     setup: FleetSetup
 
 
@@ -104,7 +105,7 @@ def table_row(shown: Sequence[Column], row: Row) -> Line:
     spans = []
     for column in shown:
         text, style = column.cell(row)
-        if not row.robot.fresh and column.cell not in (_mark, _name, _link):
+        if not row.robot.fresh and column.cell not in (_mark, _name, _link, _reason):
             style = "faint"
         spans += [Span(fit(text, column.width, right=not column.left), style), Span(" ")]
     return tuple(spans[:-1])
@@ -121,11 +122,13 @@ def state_style(status: RobotStatus) -> TextStyle:
 
 
 def _mark(row: Row) -> Span:
-    return Span("") if row.severity is None else Span(MARKS[row.severity], row.severity)
+    return Span("") if row.alarm is None else Span(MARKS[row.alarm.severity], row.alarm.severity)
 
 
 def _name(row: Row) -> Span:
-    return Span(row.robot.name, row.severity if row.severity not in (None, "note") else "strong")
+    alarm = row.alarm
+    grave = alarm is not None and alarm.severity != "note"
+    return Span(row.robot.name, alarm.severity if alarm is not None and grave else "strong")
 
 
 def _state(row: Row) -> Span:
@@ -231,22 +234,30 @@ def _margin(row: Row) -> Span:
 
 
 def _reason(row: Row) -> Span:
-    return Span("" if row.robot.status is None else row.robot.status.reason.text)
+    """Why it has its mark, before why it is in its state."""
+    status, alarm = row.robot.status, row.alarm
+    if status is None:
+        return Span("")
+    if alarm is None:
+        return Span(status.reason.text)
+    # Its state says that it is not ready.
+    short = alarm.code is AlarmCode.NOT_READY
+    return Span(status.failed_checks[0].text if short else alarm.text, alarm.severity)
 
 
-# Left to right. At 80 columns, one of them for the scroll bar, ranks up to 9 have room: who reads
+# Left to right. At 80 columns, one of them for the scroll bar, ranks up to 8 have room: who reads
 # why a robot is as it is sees where it is on the map.
 _COLUMNS = (
     Column(0, "", "", 1, _mark, left=True),
     Column(2, "state", "", 9, _state, left=True),
-    Column(4, "bat", "%", 3, _battery),
+    Column(5, "bat", "%", 3, _battery),
     Column(8, "GPS", "sat", 3, _of_status(_satellites)),
-    Column(5, "mode", "", 8, _of_status(lambda s: Span(s.mode or "-")), left=True),
-    Column(10, "x", "m", 5, _of_status(_coordinate(0, 5))),
-    Column(11, "y", "m", 5, _of_status(_coordinate(1, 5))),
-    Column(6, "h", "m", 4, _of_status(_coordinate(2, 4))),
+    Column(6, "mode", "", 8, _of_status(lambda s: Span(s.mode or "-")), left=True),
+    Column(9, "x", "m", 5, _of_status(_coordinate(0, 5))),
+    Column(10, "y", "m", 5, _of_status(_coordinate(1, 5))),
+    Column(7, "h", "m", 4, _of_status(_coordinate(2, 4))),
     Column(16, "v", "m/s", 3, _of_status(lambda s: Span(number(speed_m_s(s), 3)))),
-    Column(9, "feat", "s", 4, _of_status(_features)),
+    Column(11, "feat", "s", 4, _of_status(_features)),
     Column(12, "neigh", "n", 5, _of_status(_neighbours)),
     Column(14, "", "Hz", 3, _rate),
     Column(13, "", "s", 3, _of_status(_oldest)),
@@ -255,7 +266,7 @@ _COLUMNS = (
     Column(17, "fence", "m", 5, _margin),
     Column(18, "bundle", "", ID, _of_status(lambda s: Span(s.bundle_id[:ID])), left=True),
     Column(19, "world", "", ID, _of_status(lambda s: Span(s.world_id[:ID])), left=True),
-    Column(7, "reason", "", _NARROWEST_REASON, _reason, left=True),
+    Column(4, "reason", "", _NARROWEST_REASON, _reason, left=True),
 )
 
 
@@ -269,20 +280,20 @@ def in_order(
 
     `lasting` are robots that are kept up for a while, so that nothing jumps to and fro.
     """
-    severities = gravest(alarms)
-    places = dict(severities) | dict(lasting or {})
+    worst = gravest(alarms)
+    places = {name: alarm.severity for name, alarm in worst.items()} | dict(lasting or {})
 
     def place(row: Row) -> int:
         severity = places.get(row.robot.name, "note")
         return SEVERITIES.index(severity)
 
-    rows = [Row(robot, severities.get(robot.name), setup) for robot in snapshot.robots]
+    rows = [Row(robot, worst.get(robot.name), setup) for robot in snapshot.robots]
     return sorted(rows, key=place)
 
 
-def gravest(alarms: Iterable[Alarm]) -> dict[str, Severity]:
-    """Each robot's gravest severity; the alarms come in order."""
-    severities: dict[str, Severity] = {}
+def gravest(alarms: Iterable[Alarm]) -> dict[str, Alarm]:
+    """Each robot's gravest alarm; they come in order."""
+    worst: dict[str, Alarm] = {}
     for alarm in alarms:
-        severities.setdefault(alarm.robot, alarm.severity)
-    return severities
+        worst.setdefault(alarm.robot, alarm)
+    return worst

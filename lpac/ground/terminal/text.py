@@ -1,12 +1,23 @@
 """What `lpac watch` says above and below its table; nothing here has a clock or a terminal."""
 
 from collections.abc import Iterable, Sequence
+from itertools import accumulate
 
 from edge.messages.mission import GroundState
 from lpac.analysis.snapshot import FleetSetup, FleetSnapshot
 from lpac.ground.alarms import Alarm, Severity
 from lpac.ground.station.protocol import CommandReport
-from lpac.ground.terminal.lines import Line, Span, direction, duration, fit, line, plain, some
+from lpac.ground.terminal.lines import (
+    Line,
+    Span,
+    direction,
+    duration,
+    fit,
+    line,
+    plain,
+    some,
+    wrapped,
+)
 from lpac.ground.terminal.table import ID, MARKS, columns, fence_size, heading, in_order, table_row
 
 _OTHER_KEYS = {
@@ -133,16 +144,22 @@ def _fence(setup: FleetSetup, ground: GroundState | None) -> Span:
 
 
 def alarm_lines(alarms: Sequence[Alarm], width: int) -> list[Line]:
-    """The alarms, those of several robots with the same text in one line."""
+    """The alarms, those of several robots with the same text once."""
+    return [line for one in _each_alarm(alarms, width) for line in one]
+
+
+def _each_alarm(alarms: Sequence[Alarm], width: int) -> list[list[Line]]:
     robots: dict[tuple[Severity, str], list[str]] = {}
     for severity, robot, _, text in alarms:
         robots.setdefault((severity, text), []).append(robot or "fleet")
     who = 14
     return [
-        line(
+        wrapped(
             width,
-            Span(f"{MARKS[severity]} ", severity),
-            Span(f"{fit(some(names, who), who)} ", "" if severity == "note" else severity),
+            (
+                Span(f"{MARKS[severity]} ", severity),
+                Span(f"{fit(some(names, who), who)} ", "" if severity == "note" else severity),
+            ),
             Span(text, "" if severity == "note" else severity),
         )
         for (severity, text), names in robots.items()
@@ -151,11 +168,12 @@ def alarm_lines(alarms: Sequence[Alarm], width: int) -> list[Line]:
 
 def few_alarms(alarms: Sequence[Alarm], width: int, height: int) -> list[Line]:
     """As many as there is room for, and how many more there are."""
-    lines = alarm_lines(alarms, width)
+    each = _each_alarm(alarms, width)
+    lines = [line for one in each for line in one]
     if not lines:
         return [line(width, Span("no alarms", "good"))]
     if len(lines) > height:
-        hidden = len(lines) - height + 1
+        hidden = sum(end > height - 1 for end in accumulate(map(len, each)))
         lines = [*lines[: height - 1], line(width, Span(f"  {hidden} more: a shows all", "faint"))]
     return lines
 

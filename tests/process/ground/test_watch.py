@@ -276,7 +276,7 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
             shown = seen.lines("body")
             assert shown[0].startswith("! r29 ")
             # The reason begins where it does in every other line.
-            assert all(line[48] == " " != line[47] for line in shown), shown
+            assert all(line[43] == " " != line[42] for line in shown), shown
             await seen.press("end")
             await seen.until(lambda: "r28 " in seen.text("body"))
             why, more = seen.lines("selected")

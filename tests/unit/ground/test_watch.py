@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
+from edge.messages.codes import texts
 from edge.messages.mission import FlightState, GroundState
 from lpac.analysis.snapshot import RobotSnapshot
 from lpac.ground.alarms import Alarm, AlarmCode, alarms
@@ -19,12 +20,12 @@ from lpac.ground.station.protocol import (
     ResultCode,
     RobotResult,
 )
-from lpac.ground.terminal.lines import Line, age, fit, number, some
+from lpac.ground.terminal.lines import Line, age, fit, number, plain, some
 from lpac.ground.terminal.robot import detail, in_short
 from lpac.ground.terminal.table import Row, columns, heading, in_order, table_row
 from lpac.ground.terminal.text import all_of_it, few_alarms, header, outcome
-from tests.said import reason, reasons
-from tests.unit.ground.snapshots import ORIGIN, robot, setup, snapshot, status
+from tests.said import checks, reason, reasons
+from tests.unit.ground.snapshots import ORIGIN, on_ground, robot, setup, snapshot, status
 
 _S = FlightState
 
@@ -63,7 +64,11 @@ odd_statuses = st.builds(
 def test_no_value_moves_a_column(said: Any, age_s: Any, name: str, width: int) -> None:
     fleet = replace(setup(3), robots={name: 1, "r0": 0})
     shown = columns(fleet, width)
-    row = Row(RobotSnapshot(name, 1, said, age_s, rates_hz={"0": math.nan}), "warning", fleet)
+    row = Row(
+        RobotSnapshot(name, 1, said, age_s, rates_hz={"0": math.nan}),
+        Alarm("warning", name, AlarmCode.OWN, "x"),
+        fleet,
+    )
     ordinary = Row(robot(status(0)), None, fleet)
     cells = [column.width + 1 for column in shown]
     for line in (*heading(shown), table_row(shown, row), table_row(shown, ordinary)):
@@ -77,7 +82,9 @@ def test_no_value_moves_a_column(said: Any, age_s: Any, name: str, width: int) -
 
 def test_what_is_seen_at_80_columns() -> None:
     tops = "".join(span.text for span in heading(columns(setup(30), 79))[0])
-    assert " ".join(tops.split()) == "name state bat GPS mode h feat link reason"
+    assert " ".join(tops.split()) == "name state bat GPS mode h link reason"
+    narrow = "".join(span.text for span in heading(columns(setup(30), 59))[0])
+    assert " ".join(narrow.split()) == "name state bat link reason"
     wider = "".join(span.text for span in heading(columns(setup(30), 99))[0])
     assert " ".join(wider.split()) == "name state bat GPS mode x y h feat neigh link reason"
 
@@ -164,12 +171,36 @@ def test_robots_with_alarms_are_on_top_and_stay_there_for_a_while() -> None:
     rows = in_order(setup(4), seen, told)
     assert [row.robot.name for row in rows] == ["r3", "r2", "r0", "r1"]
     rows = in_order(setup(4), seen, told[1:], {"r3": "critical"})
-    assert [(row.robot.name, row.severity) for row in rows[:2]] == [("r3", None), ("r2", "warning")]
+    assert [(row.robot.name, row.alarm) for row in rows[:2]] == [("r3", None), ("r2", told[1])]
 
 
 def test_what_is_printed_once() -> None:
     seen = snapshot(robot(status(0)), robot(status(1, alarms=reasons("position lost"))))
-    text = all_of_it(setup(2), seen, alarms(setup(2), seen), 80)
+    text = all_of_it(setup(2), seen, alarms(setup(2), seen), 79)
     assert text.splitlines()[3] == "! r1             position lost"
-    row = "! r1   mission    90  14 offboard  4.0  0.1  0.1 mission started"
+    row = "! r1   mission    90  14 offboard  4.0  0.1 position lost"
     assert text.splitlines()[-2].startswith(row)
+
+
+def test_80_columns_show_all_that_is_critical() -> None:
+    """Why a robot has its mark is in its row, before why it is in its state; no alarm is cut."""
+    own = reasons("position lost: no horizontal accuracy is estimated", "only 1.2 m to robot 2")
+    seen = snapshot(
+        robot(status(0)),
+        robot(status(1, alarms=own)),
+        robot(status(2), age_s=9.0),
+        robot(on_ground(3, state=_S.PREFLIGHT, failed_checks=checks("mission origin is not set"))),
+    )
+    told = alarms(setup(4), seen)
+    text = all_of_it(setup(4), seen, told, 79).splitlines()
+    rows = {line[2:4]: line for line in text[-4:]}
+    assert "position lost: no horizontal accur…" in rows["r1"]
+    assert "not heard any more, last in the ai…" in rows["r2"]
+    assert rows["r3"].endswith(" mission origin is not set")
+    assert rows["r0"].endswith(" mission started")
+    views = (
+        all_of_it(setup(4), seen, told, 79),
+        plain(detail(Row(seen.robots[1], told[0], setup(4)), seen, told, 79)),
+    )
+    for view in views:
+        assert texts(own) in " ".join(view.split())
