@@ -32,7 +32,8 @@ come from, whose docstrings say more. They change only with a new minor version,
 says how. What is neither in `__all__` nor on the page "Interfaces" of the documentation may change
 at any time. Constants: `SHIPPED_BUNDLE` is the path of the policy that flies if no other is named,
 `FIELD_SCALE` the `ModelScale` of the paper's field tests, `BASELINES` the names of all baselines,
-`SET_UPS` sizes of worlds and teams, by name. What is wrong raises ValueError (`BundleError` is
+`SET_UPS` sizes of worlds and teams, by name, `VERDICT_RULE` by what a method is called better, in
+words. What is wrong raises ValueError (`BundleError` is
 one), in one line that says what to do, or OSError for a file that is not there or cannot be used.
 
 Nothing is imported before it is used: matplotlib with what draws, the simulated whole robots with

@@ -76,7 +76,8 @@ class Gps:
     `accuracy_m` is the horizontal accuracy that it claims for itself, None if it claims none.
     `offset_m` and `velocity_offset_m_s` are how far in the plane its fix is from the estimator's
     position and velocity, None if one of them is not known. `slip_m` is how far in the plane its
-    place has moved lately in another way than its velocity says, None if it tells no velocity.
+    place has moved lately in another way than its velocity says, jumps apart; None if it tells no
+    velocity.
     `at_s` is when its last new measurement was received, and `repeats` how many have told the same
     place since another one.
     """

@@ -12,7 +12,7 @@ import lpac.api
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "api.md").read_text()
-CONSTANTS = {"BASELINES", "FIELD_SCALE", "SET_UPS", "SHIPPED_BUNDLE"}
+CONSTANTS = {"BASELINES", "FIELD_SCALE", "SET_UPS", "SHIPPED_BUNDLE", "VERDICT_RULE"}
 
 
 def public(name: str) -> object:

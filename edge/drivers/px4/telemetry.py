@@ -75,7 +75,7 @@ _ALL_OF_GPS: float = struct.unpack("<f", struct.pack("<i", 7))[0]
 # How long a receiver's slip counts: an echo passes, and a drift of 0.5 m/s comes to 5 m.
 _SLIP_S = 10.0
 # After a longer pause nobody knows how the receiver moved.
-_SLIP_WITHIN_S = 1.0
+_SLIP_WITHIN_S, _SLIP_JUMP_M = 1.0, 3.0
 _M_PER_DEG = 111_195.0  # of latitude: a sphere is good enough for differences of metres
 _REFUSAL = re.compile(r"^(?:\w+ denied|preflight fail)[:!]?\s*", re.IGNORECASE)
 
@@ -470,13 +470,20 @@ class _Fix(NamedTuple):
             return self
         if not 0.0 < between_s <= _SLIP_WITHIN_S:
             return self
-        moved_m, kept = _shift_m(last.place, self.place), math.exp(-between_s / _SLIP_S)
-        north_m, east_m = (
-            kept * slip_m + moved - (was_m_s + is_m_s) / 2.0 * between_s
-            for slip_m, moved, was_m_s, is_m_s in zip(
-                last.slip_m, moved_m, last.velocity_m_s, self.velocity_m_s, strict=False
+        slipped_m = tuple(
+            moved_m - (was_m_s + is_m_s) / 2.0 * between_s
+            for moved_m, was_m_s, is_m_s in zip(
+                _shift_m(last.place, self.place)[:2],
+                last.velocity_m_s,
+                self.velocity_m_s,
+                strict=True,
             )
         )
+        kept = math.exp(-between_s / _SLIP_S)
+        north_m, east_m = (kept * slip_m for slip_m in last.slip_m)
+        # A jump is noticed by itself, as of the estimate.
+        if math.hypot(*slipped_m) < _SLIP_JUMP_M:
+            north_m, east_m = north_m + slipped_m[0], east_m + slipped_m[1]
         return self._replace(slip_m=(north_m, east_m))
 
 

@@ -33,7 +33,7 @@ def test_as_many_robots_fly_as_the_machine_carries(
         (("--vehicle", "mavlink"), 5),
         (("--vehicle", "mavlink", "--no-script"), 5),
         (("--vehicle", "mavlink", "--robots", "auto"), 5),
-        (("--vehicle", "px4", "--px4", "build"), 1),
+        (("--vehicle", "px4", "--px4", "build"), 2),
         (("--vehicle", "mavlink", "-n", "7"), 7),
         (("--vehicle", "simulated"), 10),
     ],
