@@ -334,7 +334,7 @@ def _draw_snapshot(axes: Axes, flight: FlightRecord, time_s: float) -> None:
 
 def _add_snapshot_legend(figure: Any, *, has_world: bool) -> None:
     handles: list[Any] = [
-        _robot_handle(style.SWARM, "robot, its number"),
+        _robot_handle(style.SWARM, "robot, its name"),
         Line2D([], [], color=style.SWARM, lw=1.0, label="path so far"),
     ]
     if has_world:
@@ -349,7 +349,7 @@ def _draw_field(axes: Axes, flight: FlightRecord) -> list[Any]:
     """The world as it was seen in the end, the fence, and each robot; gives the legend's."""
     _draw_world(axes, flight, flight.duration_s)
     _draw_cells(axes, flight, flight.duration_s)
-    handles: list[Any] = [_robot_handle(FAINT, "robot at the end, its number")]
+    handles: list[Any] = [_robot_handle(FAINT, "robot at the end, its name")]
     begin_s, end_s = (0.0, flight.duration_s) if flight.duration_s else (flight.from_s, flight.to_s)
     colours = {r.name: style.robot_colour(i) for i, r in enumerate(flight.robots)}
     for robot in flight.robots:

@@ -152,6 +152,11 @@ def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> 
     return read_files([*paths, *truths], progress)
 
 
+def simulated_name(robot_id: int) -> str:
+    """What `lpac sim` calls a robot."""
+    return f"r{robot_id}"
+
+
 def read_files(paths: Sequence[Path], progress: Progress = lambda *_: None) -> Logs:
     """Read these logs of robots and grounds, and files that tell where vehicles were."""
     reader = _LogReader()
@@ -242,9 +247,11 @@ class _LogReader:
         program = (metadata.robot_id, metadata.boot_nonce)
         self._logs.metadata.append(metadata)
         self._logs.programs_logged.add(program)
-        if path.parent.name == "logs" and not path.parts[-3].isdigit():
-            # As `lpac fleet pull` calls the robots' folders.
-            self._logs.names.setdefault(metadata.robot_id, path.parts[-3])
+        if path.parent.name == "logs":
+            # `lpac fleet pull` calls the robots' folders by their names, a simulator by their ids.
+            folder = path.parts[-3]
+            name = simulated_name(int(folder)) if folder.isdecimal() else folder
+            self._logs.names.setdefault(metadata.robot_id, name)
         return program
 
     def _take_from_robot(

@@ -168,7 +168,8 @@ class GroundNode:
             else:
                 status = decode(RobotStatus, data)
                 if source != f"robot/{status.robot_id}":
-                    raise MessageError(f"it says that it is robot {status.robot_id}")
+                    said = self._names.get(f"robot/{status.robot_id}", f"robot {status.robot_id}")
+                    raise MessageError(f"it says that it is {said}")
                 self.station.hear_status(status)
         except MessageError as error:
             # Another version of the program, say.

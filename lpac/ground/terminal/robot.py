@@ -85,11 +85,11 @@ def _detail_title(robot: RobotSnapshot, width: int) -> Line:
     status = robot.status
     name = Span(f"{robot.name} ", "strong")
     if status is None:
-        return line(width, name, Span(f"(robot {robot.robot_id})", "faint"))
+        return line(width, name, Span(f"(id {robot.robot_id})", "faint"))
     heard = f"heard {age(robot.age_s).strip()} s ago"
     left = (
         name,
-        Span(f"(robot {robot.robot_id})  ", "faint"),
+        Span(f"(id {robot.robot_id})  ", "faint"),
         Span(state_word(status), state_style(status)),
         Span(f": {status.reason.text}"),
     )

@@ -17,7 +17,7 @@ from edge.core.world import rasterize
 from edge.messages.mission import AIRBORNE, ON_GROUND, FlightState
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.flight import FlightRecord, StateChange, changes_of
-from lpac.analysis.logs import LoggedStatus, Logs, read_files
+from lpac.analysis.logs import LoggedStatus, Logs, read_files, simulated_name
 from lpac.analysis.trials import find_missions, record_of, whole_record
 from lpac.analysis.truth import TRUTH, TrueTrack, write_truth
 from lpac.ground.station.client import GroundError
@@ -164,7 +164,7 @@ class FleetFlight:
         places_m = self.record.places_at(0.0)
         return [
             tuple(round(metres, 3) for metres in places_m[name]) if name in places_m else None
-            for name in map(str, range(len(self.robots)))
+            for name in (simulated_name(robot) for robot in range(len(self.robots)))
         ]
 
     def _separation(self) -> dict[str, Any] | None:
@@ -173,7 +173,7 @@ class FleetFlight:
             return None
         return {
             "distance_m": least.distance_m,
-            "robots": [int(name) for name in least.robots],
+            "robots": [r.robot_id for r in self.record.robots if r.name in least.robots],
             "time_s": self.since_start_s(least.time_s),
         }
 
@@ -368,6 +368,7 @@ def flight_of(
     assert manifest.perception is not None and layout.features is not None
     truth = {robot: _in_mission_frame(layout, t, unix_s) for robot, t in enumerate(tracks)}
     logs.truths.append(truth)
+    logs.names |= {robot: simulated_name(robot) for robot in truth}
     if truth_in is not None:
         write_truth(truth, truth_in / TRUTH)
     importance = rasterize(
@@ -520,7 +521,7 @@ def summary_lines(flight: FleetFlight) -> list[str]:
     least = record.true_separation
     if least is not None:
         lines.append(
-            f"least true separation in the air: {least.distance_m:.2f} m, robots "
+            f"least true separation in the air: {least.distance_m:.2f} m, "
             f"{' and '.join(least.robots)} at {flight.since_start_s(least.time_s):.0f} s"
         )
     position_error_m = scenario.budget.position_m

@@ -208,7 +208,6 @@ def test_sim_writes_a_flight_over_a_world_file(tmp_path: Path) -> None:
         (["sim", "--world", "tests"], "tests: is a folder; a file is needed"),
         (["sim", "--features", "0"], "--features 0: the world would have nothing in it to cover"),
         (["sim", "--world", "/dev/null"], "/dev/null: the world would have nothing in it"),
-        (),
         (["sim", "--starts", "Makefile"], "Makefile: line 1: must be 'x y', in m"),
         (["sim", "--starts", "/dev/null"], "/dev/null: has 0 starts, and there are 10 robots"),
         (["sim", "--policy-hz", "0"], "--policy-hz 0: must be from 0.1 to 100"),
@@ -301,6 +300,11 @@ def test_whole_robots_have_knobs_too(tmp_path: Path) -> None:
     assert len(set(costs.values())) == len(options), costs
     began_m = np.array(flights["starts"]["start_positions_m"])[:, :2]
     np.testing.assert_allclose(began_m, [[4, 4], [20, 4], [4, 20]], atol=1.0)
+
+
+def test_sim_calls_robots_by_their_names() -> None:
+    told = lpac("sim", "--vehicle", "simulated", "-n", 2, "--duration", 4).stdout
+    assert re.search(r"least true separation in the air: [\d.]+ m, r0 and r1 at ", told), told
 
 
 def test_sim_has_the_knobs_of_an_experiment(tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def test_an_operator_watches_holds_and_lands(tmp_path: Path) -> None:
                 if seen.text("heading").startswith("r1 "):
                     break
                 await seen.press(key)
-            r1 = "r1 (robot 1)  hold: ground commands hold"
+            r1 = "r1 (id 1)  hold: ground commands hold"
             await seen.until(lambda: seen.text("heading").startswith(r1))
             await seen.press("L")
             await seen.until(lambda: "Land r1 where it is?" in seen.text("message"))
@@ -284,14 +284,14 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
             assert more.startswith(" fence margin 6.0 m   bundle 79929121   world c64e4b1b ")
             assert seen.text("body").count("\n") == 10
             await seen.press("enter")
-            r28 = "r28 (robot 28)  mission: mission started"
+            r28 = "r28 (id 28)  mission: mission started"
             await seen.until(lambda: seen.text("heading").startswith(r28))
             # Who was selected stays so, wherever his row goes.
             snapshots[0] = snapshot(*odd, *flying[:-1], heard(28, battery=0.1), late)
             await seen.press("escape")
             await seen.until(lambda: "battery critical: 10%" in seen.text("alarms"))
             await seen.press("home", "enter")
-            await seen.until(lambda: seen.text("heading").startswith("r28 (robot 28)"))
+            await seen.until(lambda: seen.text("heading").startswith("r28 (id 28)"))
             await seen.press("a")
             await seen.until(lambda: "position lost" in seen.text("body"))
 

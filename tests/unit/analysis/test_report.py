@@ -333,12 +333,12 @@ def test_from_the_robots_logs_alone(tmp_path: Path, ahead_s: float) -> None:
     (tmp_path / "world.env").write_text(WORLD)
     found = examined(tmp_path)
     (values,) = found.summary()["trials"]
-    assert values["robots"] == ["0", "1", "2"]
+    assert values["robots"] == ["r0", "r1", "r2"]
     assert not values["messages"]["ages_corrected"]
     takeoffs = [(c["robot"], c["text"], c["done"]) for c in values["commands"]]
     assert sorted(takeoffs) == [
-        ("0", "takeoff", True), ("1", "takeoff", True),
-        ("2", "takeoff: not ready: battery", False),
+        ("r0", "takeoff", True), ("r1", "takeoff", True),
+        ("r2", "takeoff: not ready: battery", False),
     ]  # fmt: skip
     if ahead_s:
         assert ["clocks differ" in note for note in found.notes] == [True]
@@ -362,7 +362,7 @@ def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     Writer((FIRST,)).robots(tmp_path)
     found = examined(tmp_path)
     (values,) = found.summary()["trials"]
-    assert values["cost"]["initial"] is None and values["end_m"].keys() == {"0", "1", "2"}
+    assert values["cost"]["initial"] is None and values["end_m"].keys() == {"r0", "r1", "r2"}
     assert [f"world {id_of(WORLD)} is not here" in note for note in found.notes] == [True]
     write(found, tmp_path / "out", (0.0,), lambda *_: None)
     assert (tmp_path / "out/t1/snapshots.png").exists()
@@ -489,7 +489,7 @@ def test_one_name_flown_twice_is_two_trials(tmp_path: Path) -> None:
     (tmp_path / "a/robots/0").rename(tmp_path / "a/robots/alpha")
     logs = read_logs([tmp_path / name for name in "ab"], lambda *_: None)
     assert [mission.name for mission in find_missions(logs)] == ["t1", "t1 (2)"]
-    assert [logs.name(robot) for robot in range(3)] == ["alpha", "1", "2"]
+    assert [logs.name(robot) for robot in range(3)] == ["alpha", "r1", "r2"]
 
 
 def landed(status: RobotStatus, _: float) -> RobotStatus:
@@ -623,7 +623,7 @@ def test_odd_flights_have_a_report_too(
     if change is nowhere:
         assert values["cost"]["initial"] is None and values["end_m"] == {}
     elif change is alone:
-        assert (values["trial"], values["robots"]) == ("no name", ["1"])
+        assert (values["trial"], values["robots"]) == ("no name", ["r1"])
         assert values["separation"] is None and values["cost"]["normalized"] > 0.0
     else:
         assert values["duration_s"] == 0.25
@@ -653,7 +653,7 @@ def test_what_is_not_understood_is_left_out_and_told(
     writer.written = written
     writer.robots(tmp_path)
     found = examined(tmp_path)
-    assert found.summary()["trials"][0]["robots"] == ["0", "2"]
+    assert found.summary()["trials"][0]["robots"] == ["r0", "r2"]
     told = [re.sub("^.*/", "", note) for note in found.notes]
     assert told[0].startswith(f"robot-1-0001.mcap: {why}") and "left out: 88 of topic" in told[0]
 
@@ -673,8 +673,8 @@ def test_numbers_that_are_not_finite_are_not_known(tmp_path: Path) -> None:
     (tmp_path / "world.env").write_text(WORLD)
     found = examined(tmp_path)
     (values,) = found.summary()["trials"]
-    assert found.notes == () and values["robots"] == ["0", "1", "2"]
-    assert values["end_m"].keys() == {"0", "2"} and values["loops"]["control"]["p99_ms"] == 4.0
+    assert found.notes == () and values["robots"] == ["r0", "r1", "r2"]
+    assert values["end_m"].keys() == {"r0", "r2"} and values["loops"]["control"]["p99_ms"] == 4.0
     text = Page(write(found, tmp_path / "out", (0.0,), lambda *_: None).read_text()).text
     assert "80 %" in text and "nan" not in text
 

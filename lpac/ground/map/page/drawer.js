@@ -121,7 +121,7 @@ export class Drawer {
       ["runs for", clock(s.uptime_s)],
       ["heard", `${age(age_s)} ago, status ${s.sequence}`],
       ["clock", clock_offset_s === null ? "–" : `${clock_offset_s >= 0 ? "+" : "−"}${Math.abs(clock_offset_s * 1000).toFixed(0)} ms`],
-      ["ids", `robot ${s.robot_id}, system ${s.system_id ?? "–"}, start ${s.boot_nonce}`],
+      ["ids", `${s.robot_id}, system ${s.system_id ?? "–"}, start ${s.boot_nonce}`],
     ]);
   }
 
