@@ -53,6 +53,7 @@ HELP = (
     "lag    lateness of its loops in the last minute, 99th percentile",
     "link   age of what it said last",
     "fence  distance from the fence's line, inside it",
+    "reason its gravest alarm; without one, why it is in its state",
 )
 
 
