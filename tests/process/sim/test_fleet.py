@@ -216,9 +216,9 @@ def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None
     scenario = FleetScenario(robots=2, seed=3, duration_s=22.0, secure=True, transport="router")
     record = fly_programs(scenario, tmp_path, SHIPPED, pilots=[taken])
     [absence] = absences_of(record)
-    assert absence.robot == "0"
+    assert absence.robot == "r0"
     assert np.allclose((absence.from_s, absence.until_s), taken[1:], atol=3.0)
-    truth, fence = record.truth["0"], record.fence
+    truth, fence = record.truth["r0"], record.fence
     assert fence is not None
     away = (truth.time_s > absence.from_s) & (truth.time_s < absence.until_s)
     inside_m = [fence.distance_m(x, y) for x, y, _ in truth.position_m[away][::25].tolist()]

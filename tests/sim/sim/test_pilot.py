@@ -17,7 +17,7 @@ def test_it_is_out_of_the_fence_and_back_in_its_mission(tmp_path: Path) -> None:
     flown = fly_simulated(scenario, tmp_path, SHIPPED, pilots=[taken])
     assert (flown.problem, flown.all_landed) == (None, True)
     [absence] = absences_of(flown.record)
-    assert absence.robot == "0"
+    assert absence.robot == "r0"
     # It says so with its next status, and the script sees it with the next picture.
     assert np.allclose((absence.from_s, absence.until_s), taken[1:], atol=2.0)
     truth = flown.robots[0].truth

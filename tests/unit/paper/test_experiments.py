@@ -231,8 +231,8 @@ def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
     told = write_repeatability(records, tmp_path, MADE_BY, "Whole robots.")
     for name, trial in told["trials"].items():
         assert trial["final_true"] != trial["final"] and set(trial["final_positions_m"]) == {
-            "0",
-            "1",
+            "r0",
+            "r1",
         }
         # From the takeoff command on, before which nobody moves.
         began_s = told["mission_from_s"][name]
