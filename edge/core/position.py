@@ -26,6 +26,9 @@ _FROZEN_S = 1.0
 _STUCK_REPEATS = 3
 # A receiver's velocity errs by some 0.3 m/s, an estimate's by up to 0.9 m/s.
 _MAX_VELOCITY_OFFSET_M_S = 2.0
+# Where they are apart and the fix's places say so much of it, the receiver's velocity is the wrong
+# one: PX4's estimator would take it over within a second.
+_SLIP_BESIDE_VELOCITY_M = 1.0
 # Asked for at 5 Hz, sent once a second by itself; what is older says nothing about now.
 _ESTIMATOR_HEARD_S = 2.5
 # As long as a jump counts as one: longer than any `doubtful_after_s` that makes sense.
@@ -272,10 +275,13 @@ def _findings_of_receiver(
     if accuracy_m is not None and not accuracy_m <= limits.max_accuracy_m:
         hopeless = not accuracy_m <= _HOPELESS * limits.max_accuracy_m
         yield _Finding(PositionCause.INACCURATE, hopeless, now_s, accuracy_m)
+    off_m_s, slip_limit_m = gps.velocity_offset_m_s, limits.max_offset_m
+    if off_m_s is not None and not off_m_s <= _MAX_VELOCITY_OFFSET_M_S:
+        slip_limit_m = min(slip_limit_m, _SLIP_BESIDE_VELOCITY_M)
     for cause, value, limit in (
         (PositionCause.DISAGREES, gps.offset_m, limits.max_offset_m),
-        (PositionCause.VELOCITY_DISAGREES, gps.velocity_offset_m_s, _MAX_VELOCITY_OFFSET_M_S),
-        (PositionCause.SLIPS, gps.slip_m, limits.max_offset_m),
+        (PositionCause.VELOCITY_DISAGREES, off_m_s, _MAX_VELOCITY_OFFSET_M_S),
+        (PositionCause.SLIPS, gps.slip_m, slip_limit_m),
     ):
         if value is not None and not value <= limit:
             yield _Finding(cause, True, now_s, value)
