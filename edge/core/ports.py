@@ -132,7 +132,7 @@ class Vehicle(Protocol):
 
 
 class VehicleSetup(Protocol):
-    """What a vehicle must be for a flight. Each method waits for it, and may raise OSError.
+    """Vehicle setup for a flight. Each method waits for the vehicle, and may raise OSError.
 
     Called from one thread alone, preflight's, every two seconds: on the ground, where what is wrong
     is set, and in flight, where somebody else may change it.

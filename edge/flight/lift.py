@@ -40,7 +40,7 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Lift:
-    """What is remembered from tick to tick.
+    """State kept from tick to tick.
 
     `slack_m` is how far it may still be from its height, since it is on its way. It has been
     further off since `off_since_s`, and moved and pushed as what stands since `stands_since_s`;

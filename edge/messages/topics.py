@@ -94,7 +94,7 @@ ReceiveCallback = Callable[[str, bytes], bool | None]
 
 
 class Knocking(Protocol):
-    """What a member knocks with, and knows others' knocks by."""
+    """Maker of a member's knocks, and verifier of others'."""
 
     def knock(self) -> bytes:
         """A new datagram, which says who this is."""

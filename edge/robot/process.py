@@ -328,7 +328,7 @@ class _Program:
 
 
 def host_alarms(doors: Iterable[DoorStatus], short: str) -> Iterator[Reason]:
-    """What the operator must see of the radio's ports, and of descriptors that are short."""
+    """Yield the operator's alarms: flooded or full radio ports, and short descriptors."""
     if short:
         yield Reason(ReasonCode.DESCRIPTORS_SHORT, f"{short}: soon nobody can connect")
     for door in doors:

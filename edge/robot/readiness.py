@@ -238,7 +238,7 @@ class Readiness:
         log.warning("PX4 parameter set", change=change, why=why)
 
     def _look_at_fence(self, now_s: float) -> None:
-        """What others have changed is told before it is uploaded, and until two looks found it.
+        """Report a fence that others changed before uploading it, until two looks find it.
 
         The first may know no more than that it was there a moment after the upload.
         """

@@ -153,7 +153,7 @@ def read_logs(folders: Sequence[Path], progress: Progress = lambda *_: None) -> 
 
 
 def simulated_name(robot_id: int) -> str:
-    """What `lpac sim` calls a robot."""
+    """A robot's name in `lpac sim`."""
     return f"r{robot_id}"
 
 

@@ -1,4 +1,4 @@
-"""What is shown of a fleet of programs while it runs: on stderr, and live on a terminal."""
+"""Display of a fleet of programs while it runs: on stderr, and live on a terminal."""
 
 import time
 from collections import Counter

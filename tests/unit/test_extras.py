@@ -1,4 +1,4 @@
-"""What a person is told to type for an extra that is missing."""
+"""Install command shown for an extra that is missing."""
 
 import json
 import re

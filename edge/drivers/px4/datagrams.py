@@ -63,7 +63,7 @@ class Datagrams:
         self._thread.start()
 
     def follow(self, system_id: int) -> None:
-        """Whom `send` and `state` are about."""
+        """Select the vehicle by system ID."""
         self._system_id = system_id
 
     def close(self) -> None:

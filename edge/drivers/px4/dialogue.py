@@ -1,4 +1,4 @@
-"""What is said to PX4 besides setpoints, and when: a flight's commands, and requests.
+"""Commands and requests to PX4, and their timing; setpoints are sent elsewhere.
 
 No socket, thread or clock. PX4 loses acknowledgements when commands come in bursts, so at most one
 command and one request wait for an answer at any time, requests keep apart, and each has a period
@@ -179,7 +179,7 @@ class Dialogue:
             self.next_s = -math.inf
 
     def say(self, now_s: float, vehicle: VehicleState | None) -> list[Message]:
-        """What to send now to a vehicle of which so much is known; None: no vehicle was found."""
+        """Return the messages due now; `vehicle` is its last state, None if none was found."""
         said: list[Message] = []
         if self._gps is not None and now_s >= self._gps_at_s + _GPS_AGAIN_S:
             value = 0.0 if self._gps is Action.IGNORE_GPS else self._telemetry.gps_control

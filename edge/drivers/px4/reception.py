@@ -59,7 +59,7 @@ class _Path:
 
 
 class _Second:
-    """What came within one second."""
+    """Frame counts of one second."""
 
     def __init__(self, second: int) -> None:
         self.second = second
@@ -177,7 +177,7 @@ class VehicleFrames:
         return max(path.newest_s.values(), default=-math.inf) < newest_s - _LATE_S
 
     def _sort(self, frame: Frame, path: _Path, now_s: float) -> _Sort:
-        """What it is among the frames of its own path, and of those that were taken."""
+        """Classify a frame against those of its own path and those that were taken."""
         taken = self._taken.get(frame.content)
         by_other = taken is not None and taken[1] != frame.path
         silent = now_s - path.heard_at_s > _SILENT_S

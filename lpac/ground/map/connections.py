@@ -26,7 +26,7 @@ _KEPT_S = 15.0
 
 @dataclass(slots=True)
 class _Place:
-    """What is known of a connection from its beginning, before any TLS."""
+    """Connection state, kept from its beginning, before any TLS."""
 
     asked: bool = False
     ended: asyncio.Event = field(default_factory=asyncio.Event)

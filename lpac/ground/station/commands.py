@@ -866,7 +866,7 @@ def _obeying_words(safety_action: str) -> Effect:
 def _came_down(
     safety_action: str, flown: RobotStatus | None, status: RobotStatus
 ) -> tuple[str, ResultCode]:
-    """What became of a robot on the ground; `flown` is what it last said of its flight, if any."""
+    """Say how a robot came down; `flown` is the last status of its flight, if any."""
     if flown is not None and status.state is _S.FAULT:
         code, text = _why(status)
         return text, code

@@ -173,7 +173,7 @@ class GroundProcess:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """What the next start has to know, and misses if it cannot be written: said once."""
+        """Warn once if state that the next start needs cannot be written."""
         try:
             yield
         except OSError as error:

@@ -238,7 +238,7 @@ class MotorWeakens(VehicleInjection):
 
 @dataclass(frozen=True, slots=True)
 class WireIs(VehicleInjection):
-    """What becomes of all MAVLink messages between computer and autopilot."""
+    """Faults of all MAVLink messages between computer and autopilot."""
 
     wire: MavlinkWire
 

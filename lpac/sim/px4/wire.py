@@ -1,4 +1,4 @@
-"""What becomes of MAVLink messages between a vehicle and its computer."""
+"""Loss, delay and repeats of MAVLink between vehicle and computer."""
 
 import heapq
 import random
@@ -22,7 +22,7 @@ class MavlinkWire:
 
 
 class OnTheWire:
-    """What is on its way. Deterministic for a seed and what is sent."""
+    """Delayed messages. Deterministic for a seed and what is sent."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -34,7 +34,7 @@ class OnTheWire:
         return wire.loss > 0.0 and self._random.random() < wire.loss
 
     def pass_on(self, said: Sequence[Any], wire: MavlinkWire, now_s: float) -> list[Any]:
-        """What arrives now, of what is said now and of what was late."""
+        """Return the messages that arrive now, late ones included."""
         arrived = []
         for message in said:
             if self.is_lost(wire):

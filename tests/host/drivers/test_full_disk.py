@@ -1,4 +1,4 @@
-"""What the programs write, on a disk that is full or read-only: real ones, of memory."""
+"""Writes to a disk that is full or read-only: a real file system, in memory."""
 
 import contextlib
 import errno

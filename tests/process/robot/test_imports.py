@@ -1,4 +1,4 @@
-"""What a robot needs in flight is loaded before it: an import reads the disk, and may fail."""
+"""Imports done before flight, since each reads the disk and may fail."""
 
 import subprocess
 import sys

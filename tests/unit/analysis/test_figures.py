@@ -1,4 +1,4 @@
-"""What figures say beside their curves."""
+"""Text of figures beside their curves."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is shown of a fleet of programs while it runs, as it then stands on the terminal."""
+"""Display of a fleet of programs while it runs, as it stands on the terminal."""
 
 import io
 import re
@@ -35,7 +35,7 @@ class Terminal:
         return self._bytes.getvalue().decode()
 
     def lines(self) -> list[str]:
-        """What stands there: as a terminal does what it is told."""
+        """Render the output as a terminal would show it."""
         lines, row = [""], 0
         for told in re.findall(r"\x1b\[[\d;?]*[A-Za-z]|\r|\n|[^\x1b\r\n]+", self.text):
             if told == "\n":

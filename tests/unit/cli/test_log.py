@@ -1,4 +1,4 @@
-"""What commands say of logs: damaged ones, empty ones, and ones whose clock was set."""
+"""Commands' output on logs that are damaged or empty, or whose clock was set."""
 
 import contextlib
 import json

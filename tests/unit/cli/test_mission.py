@@ -29,7 +29,7 @@ from tests.unit.cli.test_fleet import write_fleet
 
 
 class Terminal(io.StringIO):
-    """What a person types."""
+    """Stdin of a terminal."""
 
     def isatty(self) -> bool:
         return True

@@ -30,7 +30,7 @@ def test_names_that_people_type_again_are_never_broken(
 
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> "Queue[str]":
-    """What is said without a terminal, as often as it can be."""
+    """Progress lines without a terminal, at the full rate."""
     said: Queue[str] = Queue()
     monkeypatch.setattr("sys.stderr", io.StringIO())
     monkeypatch.setattr(printing, "LINE_EVERY_S", 0.0)

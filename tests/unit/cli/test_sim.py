@@ -1,4 +1,4 @@
-"""What `lpac sim` and scripts say of a world in which there is nothing to cover."""
+"""Refusal of a world with nothing to cover, by `lpac sim` and scripts."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What MAVSDK says becomes lines of the robot's log; nothing is printed past it."""
+"""MAVSDK's output as lines of the robot's log, with nothing printed past it."""
 
 import mavsdk.plugins.param.param
 import pytest

@@ -1,4 +1,4 @@
-"""What is asked of PX4, and how often: by the messages that would be on the wire."""
+"""Requests to PX4 and their timing, by the messages that would be on the wire."""
 
 import itertools
 import math

@@ -27,7 +27,7 @@ class Arrival(NamedTuple):
 def stream(
     path: str, begin_s: float, end_s: float, *, boot_s: float = 0.0, name: str = "a", first: int = 0
 ) -> Iterator[Arrival]:
-    """What a vehicle says; its messages without a time say the same again and again."""
+    """Yield a vehicle's messages; heartbeats and states never change their content."""
     due = [(begin_s + 0.001 * kind, kind) for kind in RATES_HZ]
     heapq.heapify(due)
     number = first

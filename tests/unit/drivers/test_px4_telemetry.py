@@ -346,7 +346,7 @@ FLOWN_UNTIL_S = {"gps": 26.8, "sensors_die": 8.5, "kill": 30.0}
 
 
 class Said:
-    """What a vehicle says of its flight, from message to message."""
+    """Telemetry of a flight, fed message by message."""
 
     def __init__(self) -> None:
         self.telemetry, self.now_s = Px4Telemetry(), 100.0

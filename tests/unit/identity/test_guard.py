@@ -406,7 +406,7 @@ def thief(robot_id: int, ahead_ms: float, sequence: int = 2**32 - 1) -> Member:
 def speak(
     hearer: Member, member: Member, until_s: float, topic: Topic = MESSAGE
 ) -> list[tuple[str, bytes, Speaker]]:
-    """What is heard of a member that speaks four times a second, and shows its card."""
+    """Return what is heard of a member that speaks at 4 Hz and shows its card."""
     before = len(hearer.heard)
     while hearer.now_s < until_s:
         hearer.now_s += 0.25

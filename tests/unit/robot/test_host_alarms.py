@@ -1,4 +1,4 @@
-"""What an operator reads of a robot's computer: its descriptors, and floods of its port."""
+"""Operator alarms of a robot's computer: its descriptors, and floods of its port."""
 
 import resource
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a flight is told of how good it was, and the flights that it is compared with."""
+"""Verdict on a flight, and the flights that it is compared with."""
 
 import json
 import math
@@ -68,7 +68,7 @@ def test_only_flights_like_those_that_were_flown_are_compared() -> None:
     ],
 )
 def test_the_fence_has_one_verdict(margin_m: float, true_margin_m: float, line: str) -> None:
-    """Who is truly beyond it by what estimates may err has kept it, and that is said."""
+    """Count a crossing within the estimates' error as kept, and explain it."""
     told = _fence_line(margin_m, true_margin_m, 4.0)
     assert told.startswith(f"fence {line}")
     explained = "within the 4 m by which estimates may err" in told
