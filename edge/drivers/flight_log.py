@@ -46,7 +46,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 import zstandard
@@ -189,6 +189,7 @@ class FlightLog:
         self._sync_period_s = sync_period_s
         self._synced_at_s = time.monotonic()
         self._segment: _Segment | None = None
+        self._newest: Path | None = None
         self._stopped = self._closed = False
         with self._stopping_on_error():
             self._begin_segment()
@@ -265,7 +266,7 @@ class FlightLog:
 
     def _sync(self, segment: "_Segment") -> None:
         if self._spare_bytes() < segment.pending_bytes:
-            self._delete_oldest(segment.pending_bytes, but=segment.path)
+            self._delete_oldest(segment.pending_bytes)
         if self._spare_bytes() < segment.pending_bytes:
             # Its end fits into what is left free.
             segment.close()
@@ -303,20 +304,22 @@ class FlightLog:
             segment.abandon()
             path.unlink(missing_ok=True)
             raise
-        self._segment = segment
+        self._segment, self._newest = segment, path
         if self._stopped:
             self._stopped = False
             log.warning("flight log goes on", path=str(path))
 
-    def _delete_oldest(
-        self, wanted_bytes: int, new_bytes: int = 0, but: Path | None = None
-    ) -> None:
-        """Delete segments until `wanted_bytes` are to spare, and the total has `new_bytes` left."""
+    def _delete_oldest(self, wanted_bytes: int, new_bytes: int = 0) -> None:
+        """Delete segments until `wanted_bytes` are to spare, and the total has `new_bytes` left.
+
+        The newest one of this flight stays, however full others make the disk.
+        """
         segments = _segments(self._directory, self._metadata.log_name)
-        sizes = {path: path.stat().st_size for _, path in sorted(segments.items()) if path != but}
+        sizes = {path: path.stat().st_size for _, path in sorted(segments.items())}
+        older = {path: size for path, size in sizes.items() if path != self._newest}
         # Where others fill the disk none is deleted in vain.
-        helps = self._spare_bytes() + sum(sizes.values()) >= wanted_bytes
-        for path, size in list(sizes.items()):
+        helps = self._spare_bytes() + sum(older.values()) >= wanted_bytes
+        for path, size in older.items():
             is_within = sum(sizes.values()) + new_bytes <= self._max_total_bytes
             if is_within and not (helps and self._spare_bytes() < wanted_bytes):
                 break
@@ -426,34 +429,47 @@ def repair(path: Path, out: Path, missing: Callable[[Missing], None] = warn) -> 
 
     Raises FlightLogError if nothing is; OSError.
     """
-    count = 0
-    with out.open("xb") as file:
-        writer = Writer(file, 2**20, CompressionType.ZSTD)
-        writer.start()
-        schemas, channels = {0: 0}, dict[int, int]()
-        for records in _whole(path, missing):
-            for record in records:
-                match record:
-                    case Metadata(name, texts):
-                        writer.add_metadata(name, texts)
-                        for number, topic in _topics_in(record).items():
-                            channels.setdefault(number, writer.register_channel(topic, "json", 0))
-                    case Schema(number, data, encoding, name):
-                        schemas[number] = writer.register_schema(name, encoding, data)
-                    case Channel():
-                        schema = schemas.get(record.schema_id, 0)
-                        channels[record.id] = writer.register_channel(record.topic, "json", schema)
-                    case Message():
-                        channel = channels[record.channel_id]
-                        writer.add_message(
-                            channel, record.log_time, record.data, record.publish_time
-                        )
-                        count += 1
-        writer.finish()  # type: ignore[no-untyped-call]
-    if not count:
-        out.unlink()
-        raise FlightLogError(f"{path}: holds no whole message")
+    file = _new_file(out)
+    try:
+        with file:
+            count = _copy_whole(path, file, missing)
+        if not count:
+            raise FlightLogError(f"{path}: holds no whole message")
+    except BaseException:
+        out.unlink(missing_ok=True)
+        raise
     return count
+
+
+def _copy_whole(path: Path, file: BinaryIO, missing: Callable[[Missing], None]) -> int:
+    """How many messages of a segment are whole, and now in the file, too."""
+    count = 0
+    writer = Writer(file, 2**20, CompressionType.ZSTD)
+    writer.start()
+    schemas, channels = {0: 0}, dict[int, int]()
+    for records in _whole(path, missing):
+        for record in records:
+            match record:
+                case Metadata(name, texts):
+                    writer.add_metadata(name, texts)
+                    for number, topic in _topics_in(record).items():
+                        channels.setdefault(number, writer.register_channel(topic, "json", 0))
+                case Schema(number, data, encoding, name):
+                    schemas[number] = writer.register_schema(name, encoding, data)
+                case Channel():
+                    schema = schemas.get(record.schema_id, 0)
+                    channels[record.id] = writer.register_channel(record.topic, "json", schema)
+                case Message():
+                    channel = channels[record.channel_id]
+                    writer.add_message(channel, record.log_time, record.data, record.publish_time)
+                    count += 1
+    writer.finish()  # type: ignore[no-untyped-call]
+    return count
+
+
+def _new_file(path: Path) -> BinaryIO:
+    """A file that others may not read, since it tells places."""
+    return open(path, "xb", opener=partial(os.open, mode=0o640))
 
 
 def _message(data: bytes) -> dict[str, Any]:
@@ -585,7 +601,7 @@ class _Segment:
         self.max_bytes = max_bytes
         self.pending_messages = 0
         # Where a fleet flew is not for everybody who has a login.
-        self._file = open(path, "xb", opener=partial(os.open, mode=0o640))  # noqa: SIM115
+        self._file = _new_file(path)
         self._topics = topics
         self._texts: dict[str, str] | None = None  # to be repeated
         # The chunks are closed by `sync` alone.

@@ -64,6 +64,26 @@ def numbers(folder: Path) -> list[int]:
     ]
 
 
+def test_a_disk_that_others_fill_does_not_cost_the_flight_so_far(disk: Path) -> None:
+    folder = disk / "logs"
+    with contextlib.closing(FlightLog(folder, METADATA, sync_period_s=0)) as log:
+        for number in range(16):
+            log.record("policy", NOW_S, {"number": number, "array": NOISE})
+            log.flush()
+        filler = disk / "filler"
+        with filler.open("wb", buffering=0) as file:
+            while free_share(disk) >= 0.1:
+                file.write(bytes(4096))
+        for number in range(16, 30):
+            log.record("policy", NOW_S, {"number": number, "array": NOISE})
+            log.flush()
+        assert not log.recording and numbers(folder)[:16] == list(range(16))
+        filler.unlink()
+        log.flush()
+        assert log.recording
+    assert numbers(folder)[:16] == list(range(16))
+
+
 def test_a_log_leaves_room_and_deletes_its_oldest(disk: Path) -> None:
     folder = disk / "logs"
     folder.mkdir()

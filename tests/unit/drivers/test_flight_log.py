@@ -354,7 +354,11 @@ def test_what_is_whole_of_a_damaged_log_is_repaired(a_flight: Path, tmp_path: Pa
             assert len(list(make_reader(file, validate_crcs=True).iter_messages())) == 9
         with pytest.raises(FileExistsError):
             repair(damaged, out)
+        assert out.stat().st_mode & 0o007 == 0
         out.unlink()
+    with pytest.raises(OSError):
+        repair(tmp_path / "absent.mcap", out)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("sync_period_s", [0, 1000])
