@@ -42,9 +42,9 @@ IDENTITY_JSON = "identity.json"
 GROUP_KEYS = "group-keys"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Identity:
-    """One start of a member's program."""
+    """One start of a member's program; `start_is_kept` says whether the disk has its number."""
 
     folder: Path
     membership: Membership
@@ -52,6 +52,7 @@ class Identity:
     tls: TlsFiles
     revocations: bytes
     group_keys: tuple[bytes, ...]
+    start_is_kept: bool = True
 
     def guard(self, clock_s: Callable[[], float]) -> SignedGuard:
         """What the program speaks and hears through; `clock_s` is its monotonic clock."""
@@ -63,8 +64,8 @@ class Identity:
 
         Raises OSError that names the file.
         """
-        if _last_start(self.folder / _START) < self.membership.start:
-            _write(self.folder / _START, f"{self.membership.start}\n".encode())
+        if not self.start_is_kept:
+            _keep_start(self)
         kept = _revocations_in(self.folder)
         if kept == guard.revocations:
             return
@@ -85,12 +86,21 @@ def load_identity(folder: Path, *, fleet: str, unix_s: float) -> Identity:
     last, unix_ms = _last_start(folder / _START), int(unix_s * 1e3)
     identity = _load(folder, fleet, max(last + 1, unix_ms))
     try:
-        _write(folder / _START, f"{identity.membership.start}\n".encode())
+        _keep_start(identity)
     except OSError:
         if unix_ms <= last:
             # The next start would have the same number; this grows until the computer restarts.
-            return _load(folder, fleet, last + 1 + time.monotonic_ns() // 10**6 % _DAY_MS)
+            identity = _load(folder, fleet, last + 1 + time.monotonic_ns() // 10**6 % _DAY_MS)
+        identity.start_is_kept = False
     return identity
+
+
+def _keep_start(identity: Identity) -> None:
+    """Write its number, once: `lpac fleet up` resets one that a wrong clock made too great."""
+    path, start = identity.folder / _START, identity.membership.start
+    if _last_start(path) < start:
+        _write(path, f"{start}\n".encode())
+    identity.start_is_kept = True
 
 
 def listening_identity(folder: Path, *, fleet: str) -> Identity:

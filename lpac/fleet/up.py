@@ -139,15 +139,17 @@ async def _bring_up(
     except RemoteError as error:
         problems.append(str(error))
     clock = await measure_clock(session, unix_time_s)
-    if abs(clock.offset_s) > GOOD_CLOCK_OFFSET_S + clock.uncertainty_s:
+    is_right = abs(clock.offset_s) <= GOOD_CLOCK_OFFSET_S + clock.uncertainty_s
+    if not is_right:
         port = robot.mavlink_port
-        if answer := await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
+        if await step("set_clock", offset_s=clock.offset_s, mavlink_port=port):
             done.append(f"its clock was set by {-clock.offset_s:+.2f} s")
-            if answer["ahead"]:
-                problems.append(
-                    "its program started by a clock more than a day ahead, and is not listened to: "
-                    f"`lpac fleet restart --robots {robot.name}`"
-                )
+            is_right = True
+    if is_right and (await step("renumber_starts")).get("ahead"):
+        problems.append(
+            "its program started by a clock more than a day ahead, and is not listened to: "
+            f"`lpac fleet restart --robots {robot.name}`"
+        )
     if locked and has_group_keys(config):
         try:
             if await give_group_keys(session, config, robot):

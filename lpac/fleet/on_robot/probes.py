@@ -1,6 +1,6 @@
 """What the robot's computer has and does, as it is: facts only; the laptop judges them.
 
-Nothing here changes anything, but `set_clock`.
+Nothing here changes anything, but `set_clock` and `renumber_starts`.
 """
 
 import contextlib
@@ -50,8 +50,7 @@ def set_clock(offset_s: float, mavlink_port: int) -> Dict[str, Any]:
     """Take `offset_s` off the wall clock at once, and set the battery-backed clock if there is one.
 
     Refused while the vehicle is armed. On the ground the program may run meanwhile: it counts
-    monotonic time. Only the flight log's times jump as the clock does. Starts of the program that
-    were numbered by a clock far `ahead`, which nobody listens to, are numbered anew.
+    monotonic time. Only the flight log's times jump as the clock does.
     """
     service.refuse_in_flight(mavlink_port, "setting the clock")
     try:
@@ -60,6 +59,18 @@ def set_clock(offset_s: float, mavlink_port: int) -> Dict[str, Any]:
         raise Refused(
             "its clock cannot be set: the system does not let root do that (a container?)"
         ) from None
+    kept = False
+    if glob.glob("/dev/rtc*") and shutil.which("hwclock"):
+        kept = run(["hwclock", "-w"]).returncode == 0
+    return {"unix_time_s": time.time(), "hardware_clock": kept}
+
+
+@call
+def renumber_starts() -> Dict[str, Any]:
+    """Number the program's starts by the clock again if the last was more than a day `ahead` of it.
+
+    Nobody listens to such a start. The clock must be right.
+    """
     now_ms, ahead = int(1e3 * time.time()), False
     try:
         with open(_START, "r+") as file:
@@ -70,10 +81,7 @@ def set_clock(offset_s: float, mavlink_port: int) -> Dict[str, Any]:
                 file.write("%d\n" % now_ms)
     except (OSError, ValueError):  # None yet.
         pass
-    kept = False
-    if glob.glob("/dev/rtc*") and shutil.which("hwclock"):
-        kept = run(["hwclock", "-w"]).returncode == 0
-    return {"unix_time_s": time.time(), "hardware_clock": kept, "ahead": ahead}
+    return {"ahead": ahead}
 
 
 # The computer

@@ -46,6 +46,37 @@ def test_a_member_is_who_the_authority_says(authority: Authority, tmp_path: Path
     assert guard.revocations == authority.revocations
 
 
+def test_a_start_that_was_numbered_anew_stays_so_while_the_program_runs(
+    authority: Authority, tmp_path: Path
+) -> None:
+    """Its clock was far ahead when it started; `lpac fleet up` set both right."""
+    folder = tmp_path / "r3"
+    new_member(authority, folder, Role.ROBOT, "r3", 3)
+    identity = load_identity(folder, fleet="demo", unix_s=3e9)
+    (folder / "start").write_text("2000000000000\n")
+    identity.keep(identity.guard(lambda: 0.0))
+    again = load_identity(folder, fleet="demo", unix_s=2.000000001e9)
+    assert again.membership.start == 2_000_000_001_000
+
+
+def test_a_start_that_could_not_be_written_is_written_later_once(
+    authority: Authority, tmp_path: Path
+) -> None:
+    folder, start = tmp_path / "r3", tmp_path / "r3" / "start"
+    new_member(authority, folder, Role.ROBOT, "r3", 3)
+    obstacle = folder / "start-new"
+    obstacle.mkdir()
+    identity = load_identity(folder, fleet="demo", unix_s=2e9)
+    guard = identity.guard(lambda: 0.0)
+    with pytest.raises(OSError, match="start"):
+        identity.keep(guard)
+    obstacle.rmdir()
+    for text in ("2000000000000\n", "1000\n"):
+        identity.keep(guard)
+        assert start.read_text() == text
+        start.write_text("1000\n")
+
+
 def test_robots_share_a_key_that_is_renewed_when_one_is_a_member_no_more(
     authority: Authority, tmp_path: Path
 ) -> None:
