@@ -140,7 +140,7 @@ class Guard(Protocol):
         """Robots that number their starts further ahead of the clock than one can be wrong."""
 
     def hear_time(self, unix_s: float) -> None:
-        """It is so late now; robots whose start lies more than a day ahead are not heard."""
+        """It is at least so late; robots whose start lies more than a day ahead are not heard."""
 
     def refused(self) -> dict[str, int]:
         """How many messages were nobody's, by why."""
@@ -326,7 +326,10 @@ class SignedGuard:
 
     def hear_time(self, unix_s: float) -> None:
         """See `Guard`."""
-        self._unix_offset_s = unix_s - self._clock_s()
+        offset_s = unix_s - self._clock_s()
+        # A clock that is set back in flight makes nobody's start too great who was heard before.
+        if self._unix_offset_s is None or offset_s > self._unix_offset_s:
+            self._unix_offset_s = offset_s
 
     def refused(self) -> dict[str, int]:
         """See `Guard`."""
@@ -466,7 +469,8 @@ class SignedGuard:
         reason = (
             RefusedMessage.NO_ENVELOPE if envelope is None else self._shown(topic, key, envelope)
         )
-        if reason is not None:
+        # Shown again and again, it is no less the member's, but it may be of an earlier start.
+        if reason not in (None, RefusedMessage.REPLAYED):
             self._refuse(reason, key)
         return reason is None
 
@@ -496,9 +500,7 @@ class SignedGuard:
             return RefusedMessage.REVOKED
         if card.fingerprint not in self._cards:
             return RefusedMessage.NOT_ALLOWED  # Somebody has a newer card in its place.
-        # Shown again and again, it is no less the member's.
-        refused = self._overtaken(key, card, envelope)
-        return refused if refused is RefusedMessage.START_AHEAD else None
+        return self._overtaken(key, card, envelope)
 
     def _receive_revocations(self, key: str, data: bytes) -> None:
         if data != self.revocations and not self.hear_revocations(data):

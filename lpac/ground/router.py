@@ -26,6 +26,8 @@ def serve_router(path: Path, stop: Stop, on_listening: Callable[[str], None]) ->
     identity = load_own_identity(config, None)
     tls = None if identity is None else identity.tls
     members = None if identity is None else identity.guard(time.monotonic)
+    if members is not None:
+        members.hear_time(time.time())
     allow_most_descriptors()
     with ZenohRouter(fleet=config.fleet, listen=(config.router,), tls=tls, members=members):
         on_listening(config.router)

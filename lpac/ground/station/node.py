@@ -34,8 +34,9 @@ from lpac.ground.station.station import Station
 
 _WORLD_PERIOD_S = 0.5
 _AHEAD = (
-    "is not listened to: its program started more than a day from now. Either its clock was wrong "
-    "(`lpac fleet up`, then `lpac fleet restart`), or somebody has its key (`lpac fleet revoke`)"
+    "is not listened to: its program started more than a day from now. Either this computer's "
+    "clock is behind, or the robot's was wrong (`lpac fleet up`, then `lpac fleet restart`), or "
+    "somebody has its key (`lpac fleet revoke`)"
 )
 # Ticks are not exact.
 _EARLY_S = 0.1

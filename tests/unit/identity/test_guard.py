@@ -464,6 +464,28 @@ def test_a_start_that_was_heard_before_the_time_was_known_mutes_nobody_for_good(
     assert speak(one, begun(2, 4.0), 5.0)
 
 
+def test_a_clock_that_is_set_back_makes_nobody_deaf_in_flight(one: Member) -> None:
+    one.guard.hear_time(NOW_S)
+    two = begun(2, -60.0)
+    assert speak(one, two, 1.0)
+    one.guard.hear_time(NOW_S - 30 * 86_400.0)
+    assert len(speak(one, two, 2.0)) == 4 and not one.guard.robots_ahead()
+
+
+def test_a_card_of_an_earlier_start_is_not_taken_for_the_robots(one: Member) -> None:
+    """The link would take an earlier start for the one that lives."""
+    shown = one.guard.subscriptions({})[CARD]
+
+    def card(member: Member) -> bytes:
+        return member.guard.seal(CARD, member.guard._membership.card_data)
+
+    former = card(robot(2, start=1))
+    assert shown("robot/2/card", former) is True
+    assert shown("robot/2/card", card(robot(2, start=2))) is True
+    assert shown("robot/2/card", former) is False
+    assert one.guard.refused() == {}
+
+
 def test_a_ground_is_heard_whatever_its_clock_was(one: Member) -> None:
     """Robots in flight hear their ground, though its laptop's clock was wrong once."""
     one.guard.hear_time(NOW_S)
