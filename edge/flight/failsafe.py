@@ -291,8 +291,9 @@ def required(
         Requirement(
             "COM_DISARM_LAND",
             2.0,
-            "s from a landing until the motors stop; 0 or less is never",
-            above=0.0,
+            "s from a landing until the motors stop, late enough to be told of it; 0 or less "
+            "is never",
+            above=0.5,
             up_to=5.0,
         ),
         Requirement(

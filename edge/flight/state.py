@@ -123,6 +123,7 @@ class FlightMemory:
     seen to act, `remote_control_at_s` when the remote control was last heard, `ground_at_s` when
     the ground was last not lost. `alone_since_s` is set while the vehicle hovers for no reason that
     anybody gave: since when nobody has answered.
+    `gps_ignored`: this program had the estimator go without the receiver, and has to set that back.
     `armed_by` is whose takeoff order this program armed it by, `disarmed_at_s` when the vehicle was
     last known to be disarmed.
     `obeyed_expiry_s` is the last obeyed order's, `trial` the mission that was started last.
@@ -139,6 +140,7 @@ class FlightMemory:
     reached: bool = False
     silent_until_s: float = -math.inf
     failsafe_at_s: float = -math.inf
+    gps_ignored: bool = False
     remote_control_at_s: float = -math.inf
     ground_at_s: float = -math.inf
     alone_since_s: float | None = None

@@ -69,15 +69,17 @@ def step(robot: Robot, flight: FlightMemory, inputs: FlightInputs) -> Decision:
     if taken is not None:
         flight, new_trial = obeyed(flight, taken)
     tick = Tick(robot, flight, inputs)
-    asked = _ask(tick)
+    asked, of_gps = _ask(tick), _ask_of_gps(tick)
     flight = replace(
         flight,
         tick_at_s=inputs.now_s,
         target_m=_target_m(tick),
         asked_at_s=inputs.now_s if asked else flight.asked_at_s,
         armed_asked=flight.armed_asked or Action.ARM in asked,
+        gps_ignored=Action.IGNORE_GPS in of_gps
+        or (flight.gps_ignored and inputs.vehicle.ignores_gps is not False),
     )
-    return Decision(flight, actions + asked + _ask_of_gps(tick), alarms(tick), new_trial, row)
+    return Decision(flight, actions + asked + of_gps, alarms(tick), new_trial, row)
 
 
 def _look(t: Tick) -> FlightMemory:
@@ -265,15 +267,18 @@ def _ask(t: Tick) -> tuple[Action, ...]:
 
 
 def _ask_of_gps(t: Tick) -> tuple[Action, ...]:
-    """Have the estimator go without a receiver that contradicts itself, until the flight is over.
+    """Have the estimator go without a receiver that contradicts itself, while it does.
 
-    Then PX4 keeps its place by its other sensors for seconds, and its height after that.
+    Then PX4 keeps its place by its other sensors for seconds, and its height after that. What is
+    set back is what this program has set: another one may want no receiver on purpose.
     """
-    ignores = t.inputs.vehicle.ignores_gps
-    flies = t.flight.state in AIRBORNE and t.inputs.vehicle.armed is not False and not t.silent
-    if flies and t.inputs.position.distrusts_gps:
-        return () if ignores else (Action.IGNORE_GPS,)
-    return (Action.USE_GPS,) if ignores else ()
+    vehicle = t.inputs.vehicle
+    if t.silent or not vehicle.connected:
+        return ()
+    if t.inputs.position.distrusts_gps and vehicle.armed is not False:
+        flies = t.flight.state in AIRBORNE
+        return (Action.IGNORE_GPS,) if flies and not vehicle.ignores_gps else ()
+    return (Action.USE_GPS,) if t.flight.gps_ignored and vehicle.ignores_gps else ()
 
 
 def _again(t: Tick, action: Action) -> tuple[Action, ...]:

@@ -211,6 +211,9 @@ class RobotNode:
     def control_step(self) -> None:
         """Read the newest of everything, decide, send at most one setpoint; the rate of control."""
         clock = self._ports.clock
+        # Here, since preflight may wait for the vehicle for seconds.
+        self._control.peers = self._inbox.peers(clock.monotonic_s())
+        self._control.revoked = self._guard.revoked_robots()
         flying = self._control.tick(clock.monotonic_s())
         self._ports.watchdog.feed(flying=flying)
         now_s = clock.monotonic_s()
@@ -305,8 +308,6 @@ class RobotNode:
             control.px4_change = self.readiness.px4_change
         now_s = self._ports.clock.monotonic_s()
         peers = self._inbox.peers(now_s)
-        control.peers = peers
-        control.revoked = self._guard.revoked_robots()
         if not is_due:
             return
         # A robot's own wall clock may be wrong: there is no internet on a field.

@@ -279,6 +279,7 @@ class Readiness:
         if self._parameter_problems != () or self._uploaded is None:
             return
         try:
+            ignored_gps = self._vehicle.state().ignores_gps
             read = self._setup.read_parameters(PARAMETERS)
             has_fence = self._setup.has_fence()
         except OSError as error:
@@ -286,7 +287,7 @@ class Readiness:
             return
         # What was not answered is not thereby changed.
         values = {n: was if read[n] is None else read[n] for n, was in self._right.items()}
-        if self._vehicle.state().ignores_gps:
+        if ignored_gps or self._vehicle.state().ignores_gps:
             # By the control loop, which sets it back.
             values[GPS_CONTROL] = self._right.get(GPS_CONTROL)
         wrong: tuple[str, ...] = ()

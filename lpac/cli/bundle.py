@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from lpac.cli.apps import new_app
-from lpac.cli.printing import working
 
 app = new_app("bundle", "Look at a policy bundle; verify or time it on this machine.")
 
@@ -118,8 +117,7 @@ def benchmark(
     from edge.robot.benchmark import benchmark as measure
 
     bundle = load_bundle(path)
-    with working("measuring"):
-        result = measure(load_policy(bundle), neighbours, seconds)
+    result = measure(load_policy(bundle), neighbours, seconds)
     if as_json:
         steps = {
             step.step: {**dataclasses.asdict(step), "share": step.share} for step in result.steps

@@ -9,6 +9,7 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from functools import partial, wraps
 from pathlib import Path
@@ -290,17 +291,22 @@ def sim(
 
         flown: Literal["mavlink", "px4"] = "px4" if vehicle is VehicleKind.PX4 else "mavlink"
         check_px4(vehicle, px4)
-        fleet_scenario = FleetScenario(
-            robots=_as_many_as_carried(bundle, flown) if count is None else count,
-            seed=seed,
-            duration_s=duration,
-            features=world_features,
-            random_feature_count=features,
-            errors=errors,
-            sensor=sensor,
-            secure=secure,
-            transport="mesh" if transport is None else transport.value,
-            pads_m=starts_m,
+        fleet_scenario = _sized(
+            FleetScenario(
+                robots=1 if count is None else count,
+                seed=seed,
+                duration_s=duration,
+                features=world_features,
+                random_feature_count=features,
+                errors=errors,
+                sensor=sensor,
+                secure=secure,
+                transport="mesh" if transport is None else transport.value,
+                pads_m=starts_m,
+            ),
+            count,
+            bundle,
+            flown,
         )
 
         settings: Settings = {
@@ -493,6 +499,18 @@ def _robot_count(text: str | None, vehicle: VehicleKind) -> int | None:
         return int(text)
     except ValueError:
         raise ValueError(f"--robots {text!r}: must be a number, or auto") from None
+
+
+def _sized(
+    scenario: "FleetScenario", count: int | None, bundle: Path, vehicle: Literal["mavlink", "px4"]
+) -> "FleetScenario":
+    """With as many robots as this machine carries, unless their number was given.
+
+    What is wrong with a flight is said before the machine is measured.
+    """
+    if count is not None:
+        return scenario
+    return replace(scenario, robots=_as_many_as_carried(bundle, vehicle))
 
 
 def _as_many_as_carried(bundle: Path, vehicle: Literal["mavlink", "px4"]) -> int:

@@ -33,5 +33,5 @@ def test_a_robot_installs_nothing_that_it_does_not_need() -> None:
     names = {re.match(r"[\w-]+", requirement)[0] for requirement in project["dependencies"]}  # type: ignore[index]
     assert names == {
         "eclipse-zenoh", "geographiclib", "mavsdk", "mcap", "msgspec", "numpy", "onnxruntime",
-        "pynacl", "typer", "zstandard",
+        "pynacl", "structlog", "typer", "zstandard",
     }  # fmt: skip

@@ -457,6 +457,8 @@ class MavsdkAutopilot:
             self._next_renewal_s = now_s + _RENEW_S
             self._look_for_vehicles()
         with self._wake:
+            # Looking takes a while, and a command may have come meanwhile.
+            now_s = time.monotonic()
             said = self._dialogue.say(now_s, self.state() if self._link is not None else None)
         for name, fields in said:
             self._send(name, **fields)

@@ -278,7 +278,7 @@ class Px4Telemetry:
         # PX4 goes on telling of a receiver from which nothing comes any more.
         is_new = fields["time_usec"] != self._gps_time_us
         self._gps_time_us = fields["time_usec"]
-        last, fix = self._fix, _fix(fields) if has_fix else None
+        last, fix = self._fix, self._measured(fields) if has_fix else None
         moved = last is None or fix is None or fix.place != last.place
         if is_new or fix is None:
             self._fix = fix if fix is None or last is None else fix.after(last)
@@ -295,6 +295,21 @@ class Px4Telemetry:
                 repeats=0 if moved else before.repeats + is_new,
             )
         )
+
+    def _measured(self, fields: Fields) -> "_Fix":
+        place = GlobalOrigin(fields["lat"] / 1e7, fields["lon"] / 1e7, fields["alt"] / 1e3)
+        speed, course = fields["vel"], fields["cog"]
+        velocity_m_s = None
+        if _UNKNOWN_UINT16 not in (speed, course):
+            speed_m_s, estimated_m_s = speed / 100.0, self._heard.velocity_local_m_s
+            if estimated_m_s is not None:
+                # Some of PX4's drivers, such as DroneCAN's, tell the speed with the climb in it.
+                level_m_s = math.sqrt(max(speed_m_s**2 - estimated_m_s[2] ** 2, 0.0))
+                seen_m_s = math.hypot(*estimated_m_s[:2])
+                speed_m_s = min(speed_m_s, level_m_s, key=lambda each: abs(each - seen_m_s))
+            course_rad = math.radians(course / 100.0)
+            velocity_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
+        return _Fix(fields["time_usec"] / 1e6, place, velocity_m_s)
 
     def _offset_m(self, place: GlobalOrigin) -> float | None:
         """How far in the plane a place is from the newest position."""
@@ -485,18 +500,6 @@ class _Fix(NamedTuple):
         if math.hypot(*slipped_m) < _SLIP_JUMP_M:
             north_m, east_m = north_m + slipped_m[0], east_m + slipped_m[1]
         return self._replace(slip_m=(north_m, east_m))
-
-
-def _fix(fields: Fields) -> _Fix:
-    """The measurement of a GPS_RAW_INT that has a fix."""
-    place = GlobalOrigin(fields["lat"] / 1e7, fields["lon"] / 1e7, fields["alt"] / 1e3)
-    speed, course = fields["vel"], fields["cog"]
-    velocity_m_s = None
-    if _UNKNOWN_UINT16 not in (speed, course):
-        course_rad = math.radians(course / 100.0)
-        speed_m_s = speed / 100.0
-        velocity_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
-    return _Fix(fields["time_usec"] / 1e6, place, velocity_m_s)
 
 
 class _VehicleClock:
