@@ -146,6 +146,17 @@ def test_a_thrust_that_is_not_told_any_more_is_not_known() -> None:
     assert telemetry.state(13.0).thrust is None
 
 
+def test_a_speed_that_has_the_climb_in_it_is_no_contradiction() -> None:
+    """As DroneCAN's receivers tell it."""
+
+    def with_climb(time_s: float, fix: dict[str, Any]) -> dict[str, Any]:
+        # In takeoff, at the vehicle's greatest climb rate.
+        return fix | {"vel": round(math.hypot(fix["vel"], 150))} if 10.5 < time_s < 13.0 else fix
+
+    found = [c for c in conclusions("normal", with_climb) if 10.5 < c.time_s < 16.0]
+    assert {c.judgement.quality for c in found} == {_Q.GOOD}
+
+
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_a_real_receiver_never_contradicts_itself(name: str) -> None:
     found = [c for c in conclusions(name) if c.vehicle.gps is not None and c.vehicle.gps.fix >= 3]

@@ -113,7 +113,12 @@ def codes(decision: Decision) -> list[ReasonCode]:
 
 
 class World:
-    """One robot's decisions, a crude PX4, and a ground; `heartbeats` come `latency_s` late."""
+    """One robot's decisions, a crude PX4, and a ground; `heartbeats` come `latency_s` late.
+
+    `repeats` is how often its receiver has told the same fix.
+    """
+
+    repeats = 0
 
     def __init__(
         self, phase_s: float = 0.35, latency_s: float = 0.1, *, flown_again: bool = False
@@ -405,6 +410,7 @@ class World:
                 0.8,
                 self.accuracy_m,
                 at_s=min(self.now_s, self.silent_from_s),
+                repeats=self.repeats,
             ),
             height_above_home_m=self.height_m,
             remote_control=self.remote_control,
@@ -1200,6 +1206,30 @@ def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:
     assert ReasonCode.OUTSIDE_FENCE in codes(world._decide(world._hear()))
     world.run(20.0)
     assert world.position_m[:2] == pytest.approx((31.0, 16.0), abs=0.2)
+
+
+def test_a_receiver_that_repeats_itself_is_ignored_as_long_as_it_does(world: World) -> None:
+    world.fly()
+    world.repeats = 3
+    world.run(0.3)
+    ignored = world.asked(Action.IGNORE_GPS)
+    assert ignored
+    world.heard = replace(world.heard, ignores_gps=True)
+    world.run(0.5)
+    world.stop(1.0)
+    world.run(0.5)
+    # PX4 says that it is so; nor is the receiver given back where the control loop was silent.
+    assert (world.asked(Action.IGNORE_GPS), world.asked(Action.USE_GPS)) == (ignored, 0)
+    world.repeats = 0
+    world.run(5.0)
+    assert world.asked(Action.USE_GPS)
+
+
+def test_a_vehicle_that_flies_without_a_receiver_on_purpose_is_left_so(world: World) -> None:
+    world.heard = replace(world.heard, ignores_gps=True)
+    world.fly()
+    world.run(3.0)
+    assert not world.asked(Action.USE_GPS) and not world.asked(Action.IGNORE_GPS)
 
 
 def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
