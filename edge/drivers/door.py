@@ -34,6 +34,8 @@ Address = ipaddress.IPv4Address
 
 # So many refused within a second are a flood; one member that cannot knock calls twice.
 _MANY, _WITHIN_S = 8, 1.0
+# After a start all others call at once, and are strangers until they have knocked.
+_SETTLES_S = 2.0
 # It is over once so few came for so long.
 _FEW, _CALM_S = 30, 10.0
 _ONE_IN = 16
@@ -45,7 +47,7 @@ _MOST_USED = 0.8
 # The filter jumps to its end from each address, by 8 bits.
 _MOST_ADDRESSES = 240
 
-_SO_ATTACH_FILTER, _SO_MEMINFO = 26, 55
+_SO_ATTACH_FILTER, _SO_DETACH_FILTER, _SO_MEMINFO = 26, 27, 55
 _DROPS = 8  # of SO_MEMINFO's numbers
 _BACKLOG, _MOST_BACKLOG = 6, 7  # of TCP_INFO's 32-bit words, for a socket that listens
 _SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF; behind it, the source address of IPv4
@@ -76,6 +78,29 @@ class DoorStatus(NamedTuple):
     queue_full: bool
 
 
+class Flood:
+    """Whether strangers flood a port that is open since `began_s`, by how many were refused."""
+
+    def __init__(self, began_s: float) -> None:
+        """Times are a monotonic clock's."""
+        self._settled_s = began_s + _SETTLES_S
+        self._recent: deque[tuple[float, int]] = deque()
+        self._flooded = False
+
+    def look(self, now_s: float, refused: int) -> bool:
+        """So many were refused until now: whether it is flooded."""
+        recent = self._recent
+        recent.append((now_s, refused))
+        while now_s - recent[0][0] > _CALM_S:
+            recent.popleft()
+        since_s = max(now_s - _WITHIN_S, self._settled_s)
+        lately = refused - next((count for at_s, count in recent if at_s >= since_s), refused)
+        is_long = now_s - recent[0][0] > _CALM_S - _WITHIN_S
+        is_over = is_long and refused - recent[0][1] < _FEW
+        self._flooded = lately >= _MANY or (self._flooded and not is_over)
+        return self._flooded
+
+
 class Door:
     """Watches a socket of this process that listens, in a thread of its own."""
 
@@ -103,6 +128,7 @@ class Door:
         except OSError:
             self._knocks.close()
             raise
+        self._flood = Flood(time.monotonic())
         self._end = Event()
         self._thread = Thread(target=self._run, name="door", daemon=True)
         self._thread.start()
@@ -121,18 +147,26 @@ class Door:
         with self._listening, self._knocks:
             while not self._end.is_set():
                 try:
+                    self._attach()
                     self._watch()
                 except Exception as error:
-                    log.error("the radio's port is not watched", exc_info=error)
+                    # Unwatched, it would learn of no member any more: better open to all.
+                    with contextlib.suppress(OSError):
+                        self._listening.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+                    with contextlib.suppress(Exception):
+                        log.error("the radio's port is not watched", exc_info=error)
                     self._end.wait(_CALM_S)
 
     def _watch(self) -> None:
-        recent: deque[tuple[float, int]] = deque()
-        learns_s, looks_s, allowed = 0.0, 0.0, 0.0
+        learns_s, looks_s, allowed = 0.0, 0.0, _MOST_KNOCKS_HZ
         counted_s = time.monotonic()
         poll = select.poll()
         poll.register(self._knocks, select.POLLIN)
         while not self._end.is_set():
+            if allowed < 1.0:
+                # Those beyond the rate stay in the kernel's buffer, which drops what it cannot
+                # hold at no cost here.
+                self._end.wait(_LOOKS_S)
             knocks = bool(poll.poll(1e3 * _LOOKS_S))
             now_s = time.monotonic()
             allowed = min(allowed + _MOST_KNOCKS_HZ * (now_s - counted_s), _MOST_KNOCKS_HZ)
@@ -140,27 +174,20 @@ class Door:
             if knocks:
                 with contextlib.suppress(BlockingIOError):
                     data, (address, _) = self._knocks.recvfrom(_KNOCK_BYTES)
-                    if allowed >= 1.0 and self._members.is_knock(data):
+                    allowed -= 1.0
+                    if self._members.is_knock(data):
                         self._let_in([address])
-                    allowed = max(allowed - 1.0, 0.0)
             if now_s >= learns_s:
                 learns_s = now_s + _LEARNS_S
                 self._let_in(self._met())
             if now_s < looks_s:
                 continue
             looks_s = now_s + _LOOKS_S
-            refused = _drops(self._listening) - self._drops_before
-            recent.append((now_s, refused))
-            while now_s - recent[0][0] > _CALM_S:
-                recent.popleft()
-            self._look(now_s, recent)
+            self._look(now_s)
 
-    def _look(self, now_s: float, recent: deque[tuple[float, int]]) -> None:
-        was, refused = self._status.flooded, recent[-1][1]
-        lately = refused - next(count for at_s, count in recent if now_s - at_s <= _WITHIN_S)
-        is_long = now_s - recent[0][0] > _CALM_S - _WITHIN_S
-        is_over = is_long and refused - recent[0][1] < _FEW
-        flooded = lately >= _MANY or (was and not is_over)
+    def _look(self, now_s: float) -> None:
+        was, refused = self._status.flooded, _drops(self._listening) - self._drops_before
+        flooded = self._flood.look(now_s, refused)
         self._status = DoorStatus(flooded, refused, _queue_is_full(self._listening))
         if flooded == was:
             return

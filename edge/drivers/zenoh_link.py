@@ -108,8 +108,8 @@ class ZenohLink:
         `listen` and `connect` are endpoints, `tcp/<host>:<port>`, or with `tls` all of them
         `tls/<host>:<port>`; without `listen` a peer takes a free port. It opens even if nobody
         answers, a client even without its router, and connects later. `scouting` finds others by
-        multicast. With `members` it keeps strangers from the port that it listens on, and knocks
-        at others' (`edge.drivers.door`).
+        multicast. With `members` it keeps strangers from the port that it listens on, unless those
+        that scouting finds call there, and knocks at others' (`edge.drivers.door`).
 
         `subscriptions` maps topics to callbacks. They are called with the key below `lpac/<fleet>/`
         and the data, from zenoh's threads, several at once; what this session publishes is not
@@ -132,7 +132,6 @@ class ZenohLink:
         self._closed = Event()
         self._entering: Thread | None = None
         self._session: zenoh.Session | None = None
-        self._members = members
         self._doors: list[Door] = []
         self._knocking: Thread | None = None
         if members is not None:
@@ -142,7 +141,9 @@ class ZenohLink:
             self._knocking.start()
         self._publishers: dict[Topic, zenoh.Publisher] = {}
         config = _config(self._prefix, self._session_id, mode, listen, connect, scouting, tls)
-        enter = partial(self._enter, config, subscriptions or {})
+        # Members that found this port by scouting do not know where to knock.
+        known = None if scouting else members
+        enter = partial(self._enter, config, subscriptions or {}, known)
         if mode == "client":
             # zenoh opens no client without its router, which may come, or come back, in flight.
             self._entering = Thread(target=self._enter_in_time, args=(enter,), daemon=True)
@@ -235,9 +236,14 @@ class ZenohLink:
         except zenoh.ZError as error:
             self._failed("close", error)
 
-    def _enter(self, config: zenoh.Config, subscriptions: Mapping[Topic, ReceiveCallback]) -> None:
+    def _enter(
+        self,
+        config: zenoh.Config,
+        subscriptions: Mapping[Topic, ReceiveCallback],
+        known: Knocking | None,
+    ) -> None:
         """Raises LinkError."""
-        session, doors = _open_behind_doors(config, self._members)
+        session, doors = _open_behind_doors(config, known)
         try:
             self._publishers = self._declare(session, subscriptions)
         except BaseException:
@@ -259,13 +265,14 @@ class ZenohLink:
 
     def _knock(self, members: Knocking, connect: Sequence[str]) -> None:
         """At each port that it is to be connected to, until it is."""
-        places = [endpoint.partition("/")[2].rpartition(":") for endpoint in connect]
+        places = [endpoint.partition("/")[2] for endpoint in connect]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
             udp.setblocking(False)
             while True:
                 met = () if self._session is None else _met(self._session)
-                for host, _, port in places:
-                    if host not in met and not is_loopback(host):
+                for place in places:
+                    host, _, port = place.rpartition(":")
+                    if place not in met and not is_loopback(host):
                         with suppress(OSError):  # No network yet, or nobody of that name.
                             udp.sendto(members.knock(), (host, int(port)))
                 if self._closed.wait(_KNOCKS_EVERY_S):
@@ -563,20 +570,24 @@ def _open_behind_doors(
             found.close()
         else:
             try:
-                doors.append(Door(found, members, partial(_met, session)))
+                doors.append(Door(found, members, partial(_met_addresses, session)))
             except OSError as error:
                 log.error("the radio's port is open to strangers", exc_info=error)
     return session, doors
 
 
 def _met(session: zenoh.Session) -> list[str]:
-    """The IPv4 addresses of all who are connected."""
+    """The IPv4 addresses of all who are connected, each with its port."""
     try:
         links = session.info.links()
     except zenoh.ZError:  # closed
         return []
-    places = (re.fullmatch(r"\w+/([0-9.]+):[0-9]+", str(link.dst)) for link in links)
+    places = (re.fullmatch(r"\w+/([0-9.]+:[0-9]+)", str(link.dst)) for link in links)
     return [place[1] for place in places if place is not None]
+
+
+def _met_addresses(session: zenoh.Session) -> list[str]:
+    return [place.partition(":")[0] for place in _met(session)]
 
 
 def _open(config: zenoh.Config) -> zenoh.Session:
