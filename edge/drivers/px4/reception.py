@@ -2,8 +2,9 @@
 
 A router, or a second path, may bring frames twice, late or out of order: one that was taken before,
 or is older than the newest, is not taken. MAVLink numbers the frames of a link by one byte, so what
-is lost on the way can be counted. That byte comes round within seconds: where it alone does not
-tell what is late, the vehicle's own time does, of those messages that have it.
+is lost on the way can be counted; a router may merge several links of one vehicle into one path,
+each with its own numbers. That byte comes round within seconds: where it alone does not tell what
+is late, the vehicle's own time does, of those messages that have it.
 """
 
 import math
@@ -14,6 +15,8 @@ from typing import NamedTuple
 
 _NUMBERS = 256
 _MOST_PATHS = 8
+_MOST_STREAMS = 4
+_MOST_OVERTAKEN = 16
 # A greater gap is another stream, or a link that was silent.
 _MOST_LOST = 64
 _REMEMBERED_S = 3.0
@@ -48,14 +51,38 @@ class _Sort(Enum):
     OTHER = "other"
 
 
+class _Stream:
+    """The numbers of one MAVLink sequence; `is_late` by the vehicle's time of its newest."""
+
+    def __init__(self, number: int) -> None:
+        self.newest = number
+        # What the first frame overtook is not a stream of its own.
+        self.missing = {(number - n) % _NUMBERS for n in range(1, _MOST_OVERTAKEN + 1)}
+        self.is_late = False
+        self.heard_at_s = -math.inf
+
+
 class _Path:
-    """The numbers of one path's frames, and the vehicle's time of the newest of each message."""
+    """The streams of one path, and the vehicle's time of the newest of each message."""
 
     def __init__(self) -> None:
-        self.newest: int | None = None
-        self.missing: set[int] = set()
+        self.streams: list[_Stream] = []
         self.newest_s: dict[int, float] = {}
         self.heard_at_s = -math.inf
+
+    def nearest(self, number: int, now_s: float) -> _Stream | None:
+        """Return the stream that has the fewest numbers left before this one."""
+        oldest_s = -math.inf if now_s - self.heard_at_s <= _SILENT_S else now_s
+        oldest_s = max(oldest_s, now_s - _REMEMBERED_S)
+        self.streams = [s for s in self.streams if s.heard_at_s >= oldest_s]
+        return min(self.streams, key=lambda s: (number - s.newest - 1) % _NUMBERS, default=None)
+
+    def begin_stream(self, number: int) -> _Stream:
+        """Add a stream, in place of the one silent longest if there are too many."""
+        if len(self.streams) == _MOST_STREAMS:
+            self.streams.remove(min(self.streams, key=lambda s: s.heard_at_s))
+        self.streams.append(_Stream(number))
+        return self.streams[-1]
 
 
 class _Second:
@@ -78,7 +105,8 @@ class VehicleFrames:
         self._paths: dict[Hashable, _Path] = {}
         # Of each message that has the vehicle's time: that of the newest, when it came, and whence.
         self._newest: dict[int, tuple[float, float, Hashable]] = {}
-        self._taken: dict[Hashable, tuple[float, Hashable]] = {}
+        # Of each content: when it was taken, by which path, and of which stream; oldest first.
+        self._taken: dict[Hashable, tuple[float, Hashable, _Stream | None]] = {}
         self._seconds: deque[_Second] = deque(maxlen=_LOSS_S + 1)
 
     def take(self, frame: Frame, now_s: float) -> bool:
@@ -90,8 +118,10 @@ class VehicleFrames:
         self._forget_paths(now_s)
         path = self._paths.setdefault(frame.path, _Path())
         back_s = self._back_s(frame)
-        is_old = back_s > 0.0 if frame.vehicle_s is not None else self._is_late(path)
-        sort = self._sort(frame, path, now_s)
+        sort, stream = self._sort(frame, path, now_s)
+        is_old = back_s > 0.0
+        if frame.vehicle_s is None:
+            is_old = self._is_late(path) or (stream is not None and stream.is_late)
         path.heard_at_s = now_s
         second = self._this(now_s)
         second.again += sort is _Sort.AGAIN
@@ -100,7 +130,9 @@ class VehicleFrames:
         if is_old or sort is not _Sort.NEXT:
             return False
         second.taken += 1
-        self._taken[frame.content] = now_s, frame.path
+        # A key that is assigned to again would keep its old place.
+        self._taken.pop(frame.content, None)
+        self._taken[frame.content] = now_s, frame.path, stream
         if frame.vehicle_s is not None:
             second.timed += 1
             self._newest[frame.message_id] = frame.vehicle_s, now_s, frame.path
@@ -133,7 +165,7 @@ class VehicleFrames:
 
     def _forget(self, now_s: float) -> None:
         while self._taken:
-            content, (at_s, _) = next(iter(self._taken.items()))
+            content, (at_s, _, _) = next(iter(self._taken.items()))
             if now_s - at_s <= _REMEMBERED_S:
                 return
             del self._taken[content]
@@ -176,38 +208,47 @@ class VehicleFrames:
         newest_s = max((newest_s for newest_s, _, _ in self._newest.values()), default=-math.inf)
         return max(path.newest_s.values(), default=-math.inf) < newest_s - _LATE_S
 
-    def _sort(self, frame: Frame, path: _Path, now_s: float) -> _Sort:
-        """Classify a frame against those of its own path and those that were taken."""
+    def _sort(self, frame: Frame, path: _Path, now_s: float) -> tuple[_Sort, _Stream | None]:
+        """Classify a frame against its path's and those that were taken, and find its stream."""
         taken = self._taken.get(frame.content)
         by_other = taken is not None and taken[1] != frame.path
-        silent = now_s - path.heard_at_s > _SILENT_S
-        ahead = 1 if silent or path.newest is None else (frame.number - path.newest) % _NUMBERS
-        if taken is not None and not by_other and ahead != 1:
-            return _Sort.AGAIN
-        comes_next = 0 < ahead <= _MOST_LOST
-        was_missing = not comes_next and frame.number in path.missing
+        stream = path.nearest(frame.number, now_s)
+        ahead = 0 if stream is None else (frame.number - stream.newest) % _NUMBERS
+        # Once its numbers have come round, a stream may say the same with the same number.
+        came_round = stream is None or (ahead == 1 and taken is not None and taken[2] is stream)
+        if taken is not None and not by_other and not came_round:
+            return _Sort.AGAIN, stream
+        follows = 0 < ahead <= _MOST_LOST
+        was_missing = not follows and any(frame.number in s.missing for s in path.streams)
+        comes_next, is_late = not was_missing, False
         if frame.vehicle_s is not None:
             # Time tells more than a number does.
             newest_s = path.newest_s.get(frame.message_id, -math.inf)
             comes_next = frame.vehicle_s >= newest_s
+            is_late = frame.vehicle_s < newest_s - _BACK_S
             path.newest_s[frame.message_id] = max(newest_s, frame.vehicle_s)
-        if comes_next and not was_missing:
-            self._count_missing(path, frame, ahead, now_s)
-        path.missing.discard(frame.number)
+            if stream is not None and follows:
+                # With no other stream there is nothing newer to take instead.
+                stream.is_late = is_late and len(path.streams) > 1
+        if not was_missing and not is_late:
+            if stream is None or not follows:
+                stream, ahead = path.begin_stream(frame.number), 1
+            self._count_missing(stream, frame, ahead, now_s)
         if comes_next:
-            return _Sort.AGAIN if by_other else _Sort.NEXT
+            return _Sort.AGAIN if by_other else _Sort.NEXT, stream
         if by_other:
-            return _Sort.AGAIN
-        return _Sort.LATE if was_missing else _Sort.OTHER
+            return _Sort.AGAIN, stream
+        return _Sort.LATE if was_missing else _Sort.OTHER, stream
 
-    def _count_missing(self, path: _Path, frame: Frame, ahead: int, now_s: float) -> None:
-        path.newest = frame.number
-        if path.missing:
-            recent = range(1, _NUMBERS // 2)
-            path.missing = {n for n in path.missing if (frame.number - n) % _NUMBERS in recent}
-        if 1 < ahead <= _MOST_LOST:
-            path.missing |= {(frame.number - n) % _NUMBERS for n in range(1, ahead)}
-            if self.path in (None, frame.path):
+    def _count_missing(self, stream: _Stream, frame: Frame, ahead: int, now_s: float) -> None:
+        stream.newest, stream.heard_at_s = frame.number, now_s
+        if stream.missing:
+            # All that do not seem to follow: what is late begins no stream.
+            recent = range(1, _NUMBERS - _MOST_LOST)
+            stream.missing = {n for n in stream.missing if (frame.number - n) % _NUMBERS in recent}
+        if ahead > 1:
+            stream.missing |= {(frame.number - n) % _NUMBERS for n in range(1, ahead)}
+            if self.path in (None, frame.path) and not stream.is_late:
                 self._this(now_s).lost += ahead - 1
 
     def _this(self, now_s: float) -> _Second:

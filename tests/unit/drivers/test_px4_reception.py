@@ -25,15 +25,17 @@ class Arrival(NamedTuple):
 
 
 def stream(
-    path: str, begin_s: float, end_s: float, *, boot_s: float = 0.0, name: str = "a", first: int = 0
-) -> Iterator[Arrival]:
+    path: str, begin_s: float, end_s: float, *,
+    boot_s: float = 0.0, name: str = "a", first: int = 0, others_hz: float = RATES_HZ[OTHERS],
+) -> Iterator[Arrival]:  # fmt: skip
     """Yield a vehicle's messages; heartbeats and states never change their content."""
-    due = [(begin_s + 0.001 * kind, kind) for kind in RATES_HZ]
+    rates_hz = {**RATES_HZ, OTHERS: others_hz}
+    due = [(begin_s + 0.001 * kind, kind) for kind in rates_hz]
     heapq.heapify(due)
     number = first
     while due[0][0] < end_s:
         at_s, kind = heapq.heappop(due)
-        heapq.heappush(due, (at_s + 1.0 / RATES_HZ[kind], kind))
+        heapq.heappush(due, (at_s + 1.0 / rates_hz[kind], kind))
         vehicle_s = at_s - boot_s if kind == POSITION else None
         said = vehicle_s if kind in (POSITION, OTHERS) else "as ever"
         said = at_s if kind == OTHERS else said
@@ -62,6 +64,56 @@ def test_a_good_link() -> None:
     assert heard(frames, said) == said
     assert frames.lost(30.0) == 0.0
     assert not frames.arrives_twice(30.0) and not frames.has_others(30.0)
+
+
+def merged(first: int) -> list[Arrival]:
+    """Two MAVLink channels of one vehicle, 150 and 60 frames a second, on one path."""
+    return [
+        *stream("a", 0.0, 60.0, name="1", others_hz=124.0),
+        *stream("a", 0.0, 60.0, name="2", others_hz=34.0, first=first),
+    ]
+
+
+@pytest.mark.parametrize("first", [70, 100, 180])
+def test_merged_channels_of_one_vehicle_are_all_taken(first: int) -> None:
+    frames, said = VehicleFrames(), merged(first)
+    assert len(heard(frames, said)) == len(said)
+    assert all(frames.lost(float(now_s)) == 0.0 for now_s in range(60))
+    assert not frames.arrives_twice(60.0) and not frames.has_others(60.0)
+
+
+@pytest.mark.parametrize("first", [70, 100, 180])
+def test_what_merged_channels_lose_is_counted(first: int) -> None:
+    draw = random.Random(4)
+    frames = VehicleFrames()
+    arrived = [a for a in merged(first) if draw.random() >= 0.2]
+    assert len(heard(frames, arrived)) > 0.9 * len(arrived)
+    assert frames.lost(60.0) == pytest.approx(0.2, abs=0.051)
+    assert not frames.arrives_twice(60.0) and not frames.has_others(60.0)
+
+
+@pytest.mark.parametrize("by_s", [0.0, 0.08, 1.0])
+def test_merged_channels_that_come_twice_are_taken_once(by_s: float) -> None:
+    frames, said = VehicleFrames(), merged(100)
+    taken = heard(frames, [*said, *later(said, by_s)])
+    assert len(taken) == len({(a.order, a.frame.content) for a in taken})
+    assert frames.arrives_twice(60.0) and not frames.has_others(60.0)
+
+
+def test_a_copy_older_than_what_is_remembered_is_not_taken_for_another_channel() -> None:
+    frames, said = VehicleFrames(), list(stream("a", 0.0, 60.0))
+    taken = heard(frames, [*said, *later(said, 4.0)])
+    assert len(taken) - len(said) < 0.005 * len(said)
+
+
+def test_what_is_remembered_is_bounded() -> None:
+    frames, most = VehicleFrames(), 0
+    for n in range(200 * 256):
+        # The numbers come round each second: the heartbeat is the same, byte for byte.
+        content = "heartbeat" if n % 256 == 0 else n
+        assert frames.take(Frame("a", n % 256, content, HEARTBEAT), n / 256.0)
+        most = max(most, len(frames._taken))
+    assert most <= 4 * 256
 
 
 @pytest.mark.parametrize("share", [0.05, 0.1, 0.2, 0.3])
