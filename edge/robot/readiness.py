@@ -279,7 +279,6 @@ class Readiness:
         if self._parameter_problems != () or self._uploaded is None:
             return
         try:
-            ignored_gps = self._vehicle.state().ignores_gps
             read = self._setup.read_parameters(PARAMETERS)
             has_fence = self._setup.has_fence()
         except OSError as error:
@@ -287,9 +286,8 @@ class Readiness:
             return
         # What was not answered is not thereby changed.
         values = {n: was if read[n] is None else read[n] for n, was in self._right.items()}
-        if ignored_gps or self._vehicle.state().ignores_gps:
-            # By the control loop, which sets it back.
-            values[GPS_CONTROL] = self._right.get(GPS_CONTROL)
+        # In flight that is the control loop's; where others set it, the position is soon lost.
+        values[GPS_CONTROL] = self._right.get(GPS_CONTROL)
         wrong: tuple[str, ...] = ()
         if check_parameters(self._requirements, values):
             wrong = _differences(self._right, values)

@@ -825,7 +825,10 @@ class Px4Vehicle:
         if on_ground and to_down >= 0.0:
             to_north = to_east = to_down = 0.0
         parameters = self.parameters
-        v_north, v_east, v_down = (self.velocity_m_s + self._velocity_error_m_s).tolist()
+        # Level, it is the air that slows it, whatever it takes its velocity to be.
+        is_level = self.mode is Px4Mode.DESCEND
+        error_m_s = np.zeros(3) if is_level else self._velocity_error_m_s
+        v_north, v_east, v_down = (self.velocity_m_s + error_m_s).tolist()
         north, east = _shorten(
             (to_north - v_north) / lag_s, (to_east - v_east) / lag_s, parameters["MPC_ACC_HOR"]
         )
