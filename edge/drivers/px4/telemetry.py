@@ -106,6 +106,8 @@ class Px4Telemetry:
         # Since it was armed: when it last said that it is in the air, and first that it landed; and
         # whether it had not said so by the time that it was disarmed.
         self._in_air_at_s = self._landed_at_s = -math.inf
+        # By the vehicle's own clock: what was held up on its way comes in one go.
+        self._boot_s = self._landed_at_boot_s = 0.0
         self._disarmed_aloft = False
         self._fix: _Fix | None = None
         self._gps_time_us: int | None = None
@@ -246,7 +248,8 @@ class Px4Telemetry:
             self._in_air_at_s = self._landed_at_s = -math.inf
             self._change(height_jumped_m=0.0, fell=False)
         elif self._heard.armed and not armed:
-            landed = -math.inf < self._landed_at_s <= now_s - _LANDED_BEFORE_S
+            landed_s = max(now_s - self._landed_at_s, self._boot_s - self._landed_at_boot_s)
+            landed = self._landed_at_s > -math.inf and landed_s >= _LANDED_BEFORE_S
             self._disarmed_aloft = self._in_air_at_s > -math.inf and not landed
             # Within that time nobody comes down and is disarmed unheard.
             lately = now_s - self._in_air_at_s < _CONNECTED_WITHIN_S
@@ -360,7 +363,7 @@ class Px4Telemetry:
         if in_air and self._heard.armed:
             self._in_air_at_s, self._landed_at_s = now_s, -math.inf
         elif in_air is False and self._landed_at_s == -math.inf:
-            self._landed_at_s = now_s
+            self._landed_at_s, self._landed_at_boot_s = now_s, self._boot_s
         self._change(in_air=in_air)
 
     def _on_vfr_hud(self, fields: Fields, now_s: float) -> None:
@@ -379,7 +382,7 @@ class Px4Telemetry:
         position_m = _vector(fields, "x", "y", "z")
         velocity_m_s = _vector(fields, "vx", "vy", "vz")
         boot_s = fields["time_boot_ms"] / 1e3
-        restarts = self._clock.restarts
+        restarts, self._boot_s = self._clock.restarts, boot_s
         at_s = now_s - self._clock.hear(boot_s, now_s)
         if self._clock.restarts > restarts and not self._heard.armed:
             self._change(fell=self._disarmed_aloft)

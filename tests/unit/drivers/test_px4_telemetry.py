@@ -394,6 +394,20 @@ def test_a_landing_is_told_before_the_motors_stop() -> None:
     assert not said.fell
 
 
+def test_a_landing_that_was_held_up_on_its_way_is_none_the_less_one() -> None:
+    """All that was said within two seconds comes in one go."""
+    said = Said()
+    said.fly()
+    boot_s = said.now_s
+    said.now_s += 2.4
+    said.landed_state(in_air=True)
+    said.position(boot_s + 0.2)
+    said.landed_state(in_air=False)
+    said.position(boot_s + 2.3)
+    said.heartbeat(armed=False)
+    assert not said.fell
+
+
 @pytest.mark.parametrize("started_anew", [False, True])
 def test_what_is_disarmed_in_the_air_falls(started_anew: bool) -> None:
     said = Said()
