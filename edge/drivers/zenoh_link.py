@@ -572,7 +572,7 @@ def _open_behind_doors(
             try:
                 doors.append(Door(found, members, partial(_met_addresses, session)))
             except OSError as error:
-                log.error("the radio's port is open to strangers", exc_info=error)
+                log.error("the radio's port is open to strangers", why=str(error))
     return session, doors
 
 
