@@ -75,4 +75,5 @@ log.close()
     # It goes on in a new file, where that can be.
     assert all(line.startswith("flight log ") for line in others)
     found = [message["number"] for _, _, message in logged(tmp_path)]
-    assert found == list(range(len(found))) and len(found) >= least
+    # What could not be written is dropped, and counted; the rest comes in its order.
+    assert found[:least] == list(range(least)) and found == sorted(set(found))
