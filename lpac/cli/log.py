@@ -31,9 +31,10 @@ def trials(
         try:
             for _, time_s, status in read(path, "status", missing=_say):
                 uptime_s = status.get("uptime_s")
-                if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
-                    uptime_s = 0.0
                 program = (path.stem.rpartition("-")[0], str(status.get("boot_nonce")))
+                if not (isinstance(uptime_s, float | int) and 0.0 <= uptime_s <= time_s):
+                    # What tells none goes by its clock alone.
+                    program, uptime_s = (program[0], ""), time_s
                 began_s[program] = time_s - uptime_s
                 key = (*program, str(status.get("trial", "")))
                 first_s, last_s = times.get(key, (uptime_s, uptime_s))
