@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from edge.core.logger import show
 from edge.policy.bundle import Bundle, load_bundle, make_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from lpac.sim.fleet.load import robots_carried
@@ -91,6 +92,12 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
         return (yield)
     finally:
         _running.clear()
+
+
+@pytest.fixture(autouse=True)
+def logger() -> None:
+    """Undo what a program that an earlier test ran in this process made of the logger."""
+    show("warning")
 
 
 @pytest.fixture(scope="session")

@@ -69,6 +69,7 @@ class SimulatedFleet(SimulatedRobots):
         See `SimulatedRobots` for the others. Raises what `Layout` does.
         """
         self.members = SimulatedMembers("simulated") if scenario.secure else None
+        self._last_start: dict[str, int] = {}
         super().__init__(
             scenario,
             folder,
@@ -133,7 +134,10 @@ class SimulatedFleet(SimulatedRobots):
     def _guard(self, role: Role, name: str, robot_id: int | None, start: int) -> Guard:
         if self.members is None:
             return Unguarded()
-        start += int(1e3 * self.schedule.unix_s())
+        # As `edge.drivers.identity_folder` numbers the starts of a real program.
+        unix_ms = int(1e3 * self.schedule.unix_s())
+        start = max(start + unix_ms, self._last_start.get(name, 0) + 1)
+        self._last_start[name] = start
         return self.members.guard(role, name, robot_id, start, self.schedule.monotonic_s)
 
 
