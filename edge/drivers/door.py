@@ -34,8 +34,9 @@ Address = ipaddress.IPv4Address
 
 # So many refused within a second are a flood; one member that cannot knock calls twice.
 _MANY, _WITHIN_S = 8, 1.0
-# After a start all others call at once, and are strangers until they have knocked.
-_SETTLES_S = 2.0
+# After a start all others call at once, and are strangers until they have knocked: fifty of them,
+# twice a second each, are fewer than that.
+_SETTLES_S, _MOST_AT_START = 2.0, 200
 # It is over once so few came for so long.
 _FEW, _CALM_S = 30, 10.0
 _ONE_IN = 16
@@ -97,7 +98,8 @@ class Flood:
         lately = refused - next((count for at_s, count in recent if at_s >= since_s), refused)
         is_long = now_s - recent[0][0] > _CALM_S - _WITHIN_S
         is_over = is_long and refused - recent[0][1] < _FEW
-        self._flooded = lately >= _MANY or (self._flooded and not is_over)
+        begins = lately >= _MANY or (now_s < self._settled_s and refused >= _MOST_AT_START)
+        self._flooded = begins or (self._flooded and not is_over)
         return self._flooded
 
 

@@ -52,6 +52,12 @@ def test_a_flood_is_one_from_the_third_second_on_until_ten_calm_ones() -> None:
     assert not any(flooded[:40]) and all(flooded[60:280]) and not flooded[-1]
 
 
+def test_more_than_a_fleet_is_a_flood_before_that() -> None:
+    """zenoh takes in each that passes, and turns them away at ten a second."""
+    flooded = seen(Flood(100.0), 102.0, lambda at_s: int(1000 * (at_s - 100.0)))
+    assert not any(flooded[:4]) and all(flooded[5:])
+
+
 def test_a_door_that_fails_is_open(port: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever is not let in yet would be kept out for as long; even where nothing can be said."""
     monkeypatch.setattr(door, "_CALM_S", 0.2)
