@@ -276,7 +276,7 @@ class Readiness:
         """Whether all is as preflight found it; what is not is set back, if that is allowed."""
         self._look_due_s = now_s + _LOOK_AGAIN_S
         # Armed by others, or before this program was started: nothing was found right.
-        if self._parameter_problems != () or self._uploaded is None:
+        if self._parameter_problems or not self._right or self._uploaded is None:
             return
         try:
             read = self._setup.read_parameters(PARAMETERS)

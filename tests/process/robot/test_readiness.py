@@ -174,6 +174,32 @@ def test_an_armed_vehicle_is_left_alone(tmp_path: Path) -> None:
         assert CheckCode.NOT_DISARMED in codes(checked(asked).failed)
 
 
+def test_a_look_that_fails_before_arming_ends_no_watch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicle = new_vehicle()
+    with readiness(tmp_path, vehicle, "set") as (asked, made):
+        now_s = time.monotonic()
+        asked.prepare(now_s, assignment(asked))
+
+        def unanswered(_: object) -> None:
+            raise OSError("no answer")
+
+        with monkeypatch.context() as link:
+            link.setattr(asked._setup, "read_parameters", unanswered)
+            asked.prepare(now_s + 31.0, assignment(asked))
+        assert CheckCode.FAILSAFE_NOT_READ in codes(checked(asked).failed)
+        with made.server.stepped:
+            assert vehicle.arm() is MavResult.ACCEPTED
+        vehicle.parameters["COM_OBL_RC_ACT"] = 3
+        deadline_s = time.monotonic() + 60.0
+        while asked._vehicle.state().armed is not True:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.05)
+        asked.prepare(now_s + 62.0, assignment(asked))
+        assert asked.px4_change is not None and "COM_OBL_RC_ACT" in asked.px4_change.text
+
+
 @pytest.mark.parametrize(
     ("facts", "code"),
     [
