@@ -350,8 +350,9 @@ def _doors(config: FleetConfig, robot: RobotHost, facts: Facts) -> DoctorCheck:
     if config.keys is None:
         return DoctorCheck(name, "ok", found)
     if not facts["drops_strangers"]:
-        found += "; the kernel cannot drop strangers: whoever floods the radio's port closes it"
-        return DoctorCheck(name, "warning", found, "keep strangers out of the Wi-Fi")
+        found += "; whoever floods the radio's port closes it: the kernel lets root alone filter"
+        allow = "keep strangers out of the Wi-Fi, or let the program filter: docs/security.md"
+        return DoctorCheck(name, "warning", found, allow)
     return DoctorCheck(name, "ok", f"{found}; the kernel drops strangers who flood it")
 
 

@@ -260,6 +260,7 @@ def container(**about: object) -> list[dict[str, object]]:
             "commanders", "FAILED", "voxl-microdds-agent runs",
         ),
         (put("units.old_ros.enabled", True), "commanders", "FAILED", "starts at the next boot"),
+        (put("drops_strangers", False), "doors", "warning", "lets root alone filter"),
         (put("card", None), "card", "FAILED", "no card"),
         (put("card", "{"), "card", "FAILED", "its card: "),
         (put("card", '{"fleet":"x","authority":"00","card":"00"}'), "card", "FAILED", "not signed"),
