@@ -593,7 +593,7 @@ _POSITIONS = (
         promise="it stops within 1.5 s, and lands; 5 s after PX4 rejects it the wind has it",
         uncovered=_ADRIFT,
         does=_once(ReceiverLies(scatter_m=10.0)), beyond_fence_m=ADRIFT_M,
-        bounds=(Lands(66.0), _NEAR_STILL, Down(_LANDING_S), FliesOn(20.0)),
+        bounds=(Lands(35.0), _NEAR_STILL, Down(_LANDING_S), FliesOn(20.0)),
     ),
     Fault(
         name="receiver-stuck-in-takeoff", what="a robot's receiver repeats its fix as it climbs",
