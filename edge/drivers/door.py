@@ -50,6 +50,7 @@ _MOST_ADDRESSES = 240
 
 _SO_ATTACH_FILTER, _SO_DETACH_FILTER, _SO_MEMINFO = 26, 27, 55
 _DROPS = 8  # of SO_MEMINFO's numbers
+_PKTINFO, _PKTINFO_BYTES = 8, 12  # IP_PKTINFO, which ends with the address that a datagram was for
 _BACKLOG, _MOST_BACKLOG = 6, 7  # of TCP_INFO's 32-bit words, for a socket that listens
 _SOURCE = 0xFFF00000 + 12  # SKF_NET_OFF; behind it, the source address of IPv4
 _RANDOM = 0xFFFFF000 + 56  # SKF_AD_OFF + SKF_AD_RANDOM
@@ -117,6 +118,7 @@ class Door:
         self._listening = listening
         listening.setblocking(False)
         self._knocks = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._knocks.setsockopt(socket.IPPROTO_IP, _PKTINFO, 1)
         self._knocks.bind(listening.getsockname())
         self._knocks.setblocking(False)
         self._members = members
@@ -175,9 +177,9 @@ class Door:
             counted_s = now_s
             if knocks:
                 with contextlib.suppress(BlockingIOError):
-                    data, (address, _) = self._knocks.recvfrom(_KNOCK_BYTES)
+                    data, place, address = self._next_knock()
                     allowed -= 1.0
-                    if self._members.is_knock(data):
+                    if self._members.is_knock(data, place):
                         self._let_in([address])
             if now_s >= learns_s:
                 learns_s = now_s + _LEARNS_S
@@ -186,6 +188,14 @@ class Door:
                 continue
             looks_s = now_s + _LOOKS_S
             self._look(now_s)
+
+    def _next_knock(self) -> tuple[bytes, str, str]:
+        """A datagram, the place that it was sent to, and the address that it is from."""
+        data, [(_, _, info)], _, (address, _) = self._knocks.recvmsg(
+            _KNOCK_BYTES, socket.CMSG_SPACE(_PKTINFO_BYTES)
+        )
+        to = socket.inet_ntoa(info[_PKTINFO_BYTES - 4 : _PKTINFO_BYTES])
+        return data, f"{to}:{self._knocks.getsockname()[1]}", address
 
     def _look(self, now_s: float) -> None:
         was, refused = self._status.flooded, _drops(self._listening) - self._drops_before

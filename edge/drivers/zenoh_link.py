@@ -274,7 +274,8 @@ class ZenohLink:
                     host, _, port = place.rpartition(":")
                     if place not in met and not is_loopback(host):
                         with suppress(OSError):  # No network yet, or nobody of that name.
-                            udp.sendto(members.knock(), (host, int(port)))
+                            address = socket.gethostbyname(host)
+                            udp.sendto(members.knock(f"{address}:{port}"), (address, int(port)))
                 if self._closed.wait(_KNOCKS_EVERY_S):
                     return
 

@@ -338,11 +338,11 @@ class SignedGuard:
 
     # At the port, before there is a connection: see `edge.drivers.door`
 
-    def knock(self) -> bytes:
+    def knock(self, place: str) -> bytes:
         """See `edge.messages.topics.Knocking`: the own card, in an envelope for this alone."""
-        return self._seal(_knock_key(self.card), self._membership.card_data)
+        return self._seal(_knock_key(self.card, place), self._membership.card_data)
 
-    def is_knock(self, data: bytes) -> bool:
+    def is_knock(self, data: bytes, place: str) -> bool:
         """See `edge.messages.topics.Knocking`. A robot's own knock, said again, is none."""
         envelope = read_envelope(data)
         if envelope is None or envelope.fingerprint in self._revoked:
@@ -351,7 +351,7 @@ class SignedGuard:
             card = verified(Card, envelope.payload, self._authority)
         except CardError:
             return False
-        key = _knock_key(card)
+        key = _knock_key(card, place)
         is_theirs = card.fingerprint == envelope.fingerprint and envelope.is_from(
             card.public_key, Address(self._authority, key)
         )
@@ -557,8 +557,9 @@ class _SigningLink:
         return self._link.sends_again
 
 
-def _knock_key(card: Card) -> str:
-    return f"{'ground' if card.robot_id is None else f'robot/{card.robot_id}'}/knock"
+def _knock_key(card: Card, place: str) -> str:
+    """It has the place, so that nobody who overhears a knock knocks elsewhere with it."""
+    return f"{'ground' if card.robot_id is None else f'robot/{card.robot_id}'}/knock/{place}"
 
 
 def _is_of(card: Card, topic: Topic, key: str) -> bool:

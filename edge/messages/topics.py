@@ -96,11 +96,11 @@ ReceiveCallback = Callable[[str, bytes], bool | None]
 class Knocking(Protocol):
     """Maker of a member's knocks, and verifier of others'."""
 
-    def knock(self) -> bytes:
-        """A new datagram, which says who this is."""
+    def knock(self, place: str) -> bytes:
+        """A new datagram, which says who this is, for the port at `place`: IPv4 address:port."""
 
-    def is_knock(self, data: bytes) -> bool:
-        """Whether a member sent it, for the first time."""
+    def is_knock(self, data: bytes, place: str) -> bool:
+        """Whether a member sent it to that port, for the first time."""
 
 
 class TlsFiles(NamedTuple):

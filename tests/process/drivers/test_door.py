@@ -22,12 +22,14 @@ class Members:
 
     def __init__(self) -> None:
         self.knocks = 0
+        self.place = ""
 
-    def knock(self) -> bytes:
-        return b"knock"
+    def knock(self, place: str) -> bytes:
+        return place.encode()
 
-    def is_knock(self, _: bytes) -> bool:
+    def is_knock(self, data: bytes, place: str) -> bool:
         self.knocks += 1
+        self.place = place
         return False
 
 
@@ -95,6 +97,7 @@ def test_knocks_beyond_the_rate_wait_their_turn(port: socket.socket) -> None:
     with closing(one), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for so_far in range(100, 700, 100):
             knock(so_far)
+    assert members.place == "127.0.0.1:{1}".format(*port.getsockname())
 
 
 def test_with_scouting_the_port_is_open_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,12 +143,12 @@ def test_a_member_knocks_at_each_port_of_an_address(
         missed.settimeout(60.0)
         # A round that began before the connection did may end after it.
         for _ in range(2):
-            assert missed.recv(100) == b"knock"
+            assert missed.recv(100) == absent.removeprefix("tcp/").encode()
         met.settimeout(0.0)
         with suppress(BlockingIOError):
             while met.recv(100):
                 pass
         for _ in range(2):
-            assert missed.recv(100) == b"knock"
+            assert missed.recv(100) == absent.removeprefix("tcp/").encode()
         with pytest.raises(BlockingIOError):
             met.recv(100)

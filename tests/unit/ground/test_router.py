@@ -14,6 +14,8 @@ from edge.identity.guard import SignedGuard
 from lpac.fleet.authority import create_authority, new_member
 from lpac.ground import router
 
+PLACE = "192.0.2.1:7447"
+
 
 def test_no_knock_of_a_start_far_ahead_opens_the_routers_port(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -40,7 +42,7 @@ def test_no_knock_of_a_start_far_ahead_opens_the_routers_port(
 
     def knock(ahead_s: float) -> bytes:
         folder, unix_s = tmp_path / "r1", time.time() + ahead_s
-        return load_identity(folder, fleet="demo", unix_s=unix_s).guard(time.monotonic).knock()
+        return load_identity(folder, fleet="demo", unix_s=unix_s).guard(time.monotonic).knock(PLACE)
 
-    assert guard.is_knock(knock(0.0))
-    assert not guard.is_knock(knock(30 * 86_400.0))
+    assert guard.is_knock(knock(0.0), PLACE)
+    assert not guard.is_knock(knock(30 * 86_400.0), PLACE)

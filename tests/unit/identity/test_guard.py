@@ -514,28 +514,35 @@ def test_a_robot_hears_that_another_has_its_key(one: Member) -> None:
     assert one.guard.robots_said_twice() == {1}
 
 
+PLACE = "192.0.2.1:7447"
+
+
 def test_a_knock_counts_once_and_of_members_alone(one: Member) -> None:
     """Of one that was never heard, too; a stranger who recorded it gets in nowhere with it."""
     two, ground = robot(2), Member(membership(Role.OPERATOR, "ann"))
     for member in (two, ground):
-        knock = member.guard.knock()
-        assert one.guard.is_knock(knock) and not one.guard.is_knock(knock)
-        assert one.guard.is_knock(member.guard.knock())
-        changed = bytearray(member.guard.knock())
+        knock = member.guard.knock(PLACE)
+        assert not one.guard.is_knock(knock, "192.0.2.2:7447")
+        assert one.guard.is_knock(knock, PLACE) and not one.guard.is_knock(knock, PLACE)
+        assert one.guard.is_knock(member.guard.knock(PLACE), PLACE)
+        changed = bytearray(member.guard.knock(PLACE))
         changed[-1] ^= 1
-        assert not one.guard.is_knock(bytes(changed))
+        assert not one.guard.is_knock(bytes(changed), PLACE)
     # Nor with the own one, nor a card that was shown, nor as another.
-    assert not one.guard.is_knock(one.guard.knock())
-    assert not one.guard.is_knock(two.guard.seal(CARD, two.guard._membership.card_data))
-    assert not one.guard.is_knock(robot(2, authority=OTHER_FLEET).guard.knock())
+    assert not one.guard.is_knock(one.guard.knock(PLACE), PLACE)
+    assert not one.guard.is_knock(two.guard.seal(CARD, two.guard._membership.card_data), PLACE)
+    assert not one.guard.is_knock(robot(2, authority=OTHER_FLEET).guard.knock(PLACE), PLACE)
     thief = robot(3)
     assert not one.guard.is_knock(
-        thief.guard._seal("robot/2/knock", membership(Role.ROBOT, "r2", 2).card_data)
+        thief.guard._seal(f"robot/2/knock/{PLACE}", membership(Role.ROBOT, "r2", 2).card_data),
+        PLACE,
     )
     revoked = signed(Revocations(1, (two.guard.card.fingerprint.hex(),)), AUTHORITY)
-    assert one.guard.hear_revocations(revoked) and not one.guard.is_knock(two.guard.knock())
+    assert one.guard.hear_revocations(revoked) and not one.guard.is_knock(
+        two.guard.knock(PLACE), PLACE
+    )
 
 
 @given(st.binary(max_size=300))
 def test_no_bytes_are_a_knock(data: bytes) -> None:
-    assert not robot(1).guard.is_knock(data)
+    assert not robot(1).guard.is_knock(data, PLACE)
