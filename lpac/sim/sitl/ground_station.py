@@ -29,11 +29,13 @@ _HEARTBEAT_PERIOD_S = 0.5
 _MODES = {custom: mode for mode, custom in CUSTOM_MODES.items() if mode is not Px4Mode.DESCEND}
 # PX4 misses a remote control after half a second, and takes a pilot's mode only with one.
 _STICKS_PERIOD_S, _MODE_AGAIN_S, _PARAMETERS_AGAIN_S = 0.05, 0.3, 0.5
-# Full sticks; PX4's own are curved, slack in the middle, and 10 m/s.
+# Full sticks; PX4's own (v1.17) are slack in the middle, and 10 m/s. Their curve is fixed.
 _STICKS_M_S = 4.0
+_STICKS = np.linspace(-1.0, 1.0, 201)
+_CURVE = 0.4 * _STICKS + 0.6 * _STICKS**3
 _AS_THE_STICKS_SAY = {
     "MPC_VEL_MANUAL": _STICKS_M_S, "MPC_Z_VEL_MAX_UP": 3.0, "MPC_Z_VEL_MAX_DN": 1.5,
-    "MPC_XY_MAN_EXPO": 0.0, "MPC_Z_MAN_EXPO": 0.0, "MPC_HOLD_DZ": 0.0,
+    "MAN_DEADZONE": 0.0,
 }  # fmt: skip
 # A receiver that was calibrated: which channel is which stick, from 1 on, and 1000 to 2000 us each.
 _CHANNELS = {
@@ -270,9 +272,9 @@ class RealVehicle:
             (cos * north + sin * east) / _STICKS_M_S,
             -down / _AS_THE_STICKS_SAY["MPC_Z_VEL_MAX_UP" if down < 0.0 else "MPC_Z_VEL_MAX_DN"],
         )
-        roll, pitch, throttle = (round(1500.0 + 500.0 * min(max(s, -1.0), 1.0)) for s in shares)
+        roll, pitch, throttle = np.rint(1500.0 + 500.0 * np.interp(shares, _CURVE, _STICKS))
         return mavlink.MAVLink_rc_channels_override_message(
-            self._system, 1, roll, pitch, throttle, 1500, 0, 0, 0, 0
+            self._system, 1, int(roll), int(pitch), int(throttle), 1500, 0, 0, 0, 0
         )
 
     def _receive(self) -> bytes:
