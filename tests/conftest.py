@@ -13,6 +13,7 @@ from edge.core.logger import show
 from edge.policy.bundle import Bundle, load_bundle, make_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from lpac.sim.fleet.load import robots_carried
+from tests.published import AUTHORS_TAPS, MADE, sources
 
 ROOT = Path(__file__).parents[1]
 SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
@@ -123,6 +124,18 @@ def sharing_bundle() -> Bundle:
     perception = dataclasses.replace(manifest.perception, shared_map_cell=8)
     files = {name: bundle.files[name] for name in manifest.files}
     return make_bundle(dataclasses.replace(manifest, perception=perception), files)
+
+
+@pytest.fixture(scope="session", params=sources(AUTHORS_TAPS))
+def authors_taps(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of tensors as the paper's authors published theirs."""
+    if request.param != MADE:
+        return Path(request.param)
+    states = pytest.importorskip("tests.unit.export.states", reason="torch makes the tensors")
+    folder = tmp_path_factory.mktemp("authors") / "authors_taps"
+    folder.mkdir()
+    states.write_authors_taps(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

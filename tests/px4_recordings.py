@@ -1,4 +1,4 @@
-"""Recordings of what a real PX4 and a robot's program said to each other (../shared/data)."""
+"""Recordings of what a real PX4 and a robot's program said to each other: data/px4_v1.17."""
 
 import gzip
 import struct
@@ -6,12 +6,11 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
-import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.conftest import ROOT
 
-FOLDER = ROOT.parent / "shared" / "data" / "px4_v1.17"
+FOLDER = ROOT / "tests" / "data" / "px4_v1.17"
 RECORDINGS = (
     "normal", "gps", "kill", "stop", "pilot", "battery", "battery_fast", "refused", "sensors_die",
 )  # fmt: skip
@@ -33,11 +32,8 @@ class Recorded(NamedTuple):
 
 
 def frames(name: str) -> Iterator[tuple[float, bytes]]:
-    """Each frame of one recording, both directions in order: s from the first; or a skip."""
-    path = FOLDER / f"{name}.tlog.gz"
-    if not path.exists():
-        pytest.skip(f"needs the recording {path.name} of a real PX4 in ../shared/data/px4_v1.17")
-    data, at = gzip.decompress(path.read_bytes()), 0
+    """Each frame of one recording, both directions in order: s from the first."""
+    data, at = gzip.decompress((FOLDER / f"{name}.tlog.gz").read_bytes()), 0
     first_us = struct.unpack_from(">Q", data)[0]
     while at < len(data):
         time_us = struct.unpack_from(">Q", data, at)[0]
@@ -50,7 +46,7 @@ def frames(name: str) -> Iterator[tuple[float, bytes]]:
 
 @cache
 def recorded(name: str) -> tuple[Recorded, ...]:
-    """Everything in one recording, in order; or a skip where there is none."""
+    """Everything in one recording, in order."""
     parser = mavlink.MAVLink(None)
     return tuple(
         Recorded(time_s, message)

@@ -1,7 +1,7 @@
 """The simulated PX4 says what a real one said: recordings of a real PX4 v1.17 are replayed.
 
-Each recording (../shared/data/px4_v1.17, see its README) holds what a robot and its PX4 said to
-each other. The robot's side goes to a simulated vehicle together with what was done to the vehicle
+Each recording (tests/data/px4_v1.17, see its README) holds what a robot and its PX4 said to each
+other. The robot's side goes to a simulated vehicle together with what was done to the vehicle
 meanwhile, and then the words of both are compared: what is told, how often, and when it changes.
 
 All times are PX4's own, s since it started: the machine that it ran on was slow, in jerks, and so

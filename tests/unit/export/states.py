@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,18 @@ from export.parameters import read_parameters
 
 ROOT = Path(__file__).parents[3]
 State = dict[str, torch.Tensor]
+
+# How the paper's authors named the files of their tensors, one each.
+_AUTHORS_FILES = (
+    (r"gnn_backbone\.graph_conv_(\d)\.lins\.(\d)\.weight", r"lin_\1_\2"),
+    (r"gnn_backbone\.graph_conv_(\d)\.bias", r"bias_\1"),
+    (r"gnn_mlp\.lins\.(\d)\.weight", r"mlp_lin_\1"),
+    (r"gnn_mlp\.lins\.(\d)\.bias", r"mlp_bias_\1"),
+    (r"gnn_mlp\.norms\.(\d)\.module\.(\w+)", r"mlp_norm_\1_\2"),
+    (r"output_linear\.weight", "outlayer_wts"),
+    (r"output_linear\.bias", "outlayer_bias"),
+    (r"(actions_\w+)", r"\1"),
+)
 
 
 def random_state(
@@ -71,6 +84,16 @@ def random_state(
     weight("output_linear.weight", 2, 32)
     bias("output_linear.bias", 2)
     return state
+
+
+def write_authors_taps(folder: Path) -> None:
+    """Write random tensors of the authors' network (L = 5, K = 3), a file each as they did."""
+    for name, tensor in random_state(layers=5, hops=3, latent=256, cnn_latent=32).items():
+        if not name.startswith("cnn_backbone."):
+            [file] = [
+                found.expand(to) for was, to in _AUTHORS_FILES if (found := re.fullmatch(was, name))
+            ]
+            torch.save(tensor, folder / f"{file}.pt")
 
 
 def random_bundle(**sizes: int) -> Bundle:

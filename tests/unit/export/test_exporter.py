@@ -22,7 +22,6 @@ from tests.unit.export.states import random_state
 
 POLICIES = ROOT / "policies"
 NAME = "lpac_l2_k3_n10_512"
-AUTHORS_TAPS = ROOT.parent / "shared" / "data" / "authors_taps"
 
 
 def run(*arguments: str | Path) -> Result:
@@ -74,7 +73,6 @@ def cnn_of(checkpoint: Path) -> Cnn:
     return cnn
 
 
-@pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
 @pytest.mark.parametrize(
     ("changed", "why"),
     [
@@ -106,18 +104,18 @@ def test_a_bundle_beside_the_checkpoint_knows_what_it_was_trained_with(tmp_path:
     export_bundle(tmp_path / f"{NAME}.pt", POLICIES / f"{NAME}.toml")
 
 
-def test_the_authors_taps_with_a_cnn_are_a_whole_policy(tmp_path: Path) -> None:
+def test_the_authors_taps_with_a_cnn_are_a_whole_policy(authors_taps: Path, tmp_path: Path) -> None:
     parameters, whole = POLICIES / f"{NAME}.toml", POLICIES / f"{NAME}.pt"
-    bundle = export_bundle(AUTHORS_TAPS, parameters, cnn=whole)
+    bundle = export_bundle(authors_taps, parameters, cnn=whole)
     assert bundle.manifest.perception is not None and "cnn.onnx" in bundle.files
     assert bundle.files["cnn.onnx"] == load_bundle(POLICIES / NAME).files["cnn.onnx"]
     sha256 = hashlib.sha256(whole.read_bytes()).hexdigest()
     assert bundle.manifest.provenance["cnn_sha256"] == sha256
     with pytest.raises(CheckpointError, match="has no CNN"):
-        export_bundle(AUTHORS_TAPS, parameters, cnn=AUTHORS_TAPS)
+        export_bundle(authors_taps, parameters, cnn=authors_taps)
     torch.save(random_state(), tmp_path / "small.pt")
     with pytest.raises(CheckpointError, match="gives 8 features, expected the 32"):
-        export_bundle(AUTHORS_TAPS, parameters, cnn=tmp_path / "small.pt")
+        export_bundle(authors_taps, parameters, cnn=tmp_path / "small.pt")
 
 
 def test_two_exports_give_the_same_bytes(tmp_path: Path) -> None:
@@ -166,13 +164,12 @@ def test_a_checkpoint_of_five_images_sees_what_was_explored(tmp_path: Path) -> N
     assert all(check.passed for check in LpacPolicy(bundle).verify())
 
 
-@pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
-def test_authors_taps_give_a_bundle_without_perception(tmp_path: Path) -> None:
-    result = run(*(AUTHORS_TAPS, "--params", POLICIES / f"{NAME}.toml", "-o", tmp_path / "bundle"))
+def test_authors_taps_give_a_bundle_without_perception(authors_taps: Path, tmp_path: Path) -> None:
+    result = run(*(authors_taps, "--params", POLICIES / f"{NAME}.toml", "-o", tmp_path / "bundle"))
     assert result.exit_code == 0, result.output
     assert "none: this checkpoint has no CNN" in result.output
     manifest = load_bundle(tmp_path / "bundle").manifest
-    assert manifest.name == "authors_taps"
+    assert manifest.name == authors_taps.name
     assert manifest.perception is None
     lpac = LpacManifest.of(manifest)
     assert lpac.images is None and lpac.geometry.layers == 5

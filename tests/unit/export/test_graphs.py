@@ -20,7 +20,6 @@ from tests.unit.export.reference_lpac import reference_lpac
 from tests.unit.export.states import State, random_state
 
 POLICY = ROOT / "policies" / "lpac_l2_k3_n10_512.pt"
-AUTHORS_TAPS = ROOT.parent / "shared" / "data" / "authors_taps"
 
 TOLERANCE = 1e-5
 # On another processor the sums are rounded in another order: keep this much below the tolerance.
@@ -142,9 +141,8 @@ def test_shipped_policy_matches() -> None:
     assert_graphs_match_lpac(state, 32, checkpoint)
 
 
-@pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
-def test_authors_taps_match_torch_and_tagconv() -> None:
-    checkpoint = read_checkpoint(AUTHORS_TAPS)
+def test_authors_taps_match_torch_and_tagconv(authors_taps: Path) -> None:
+    checkpoint = read_checkpoint(authors_taps)
     assert checkpoint.cnn is None
     assert checkpoint.geometry.hops == 3
     assert checkpoint.geometry.feature_sizes == (34, 256, 256, 256, 256, 256)
@@ -163,10 +161,10 @@ def test_authors_taps_match_torch_and_tagconv() -> None:
         layer = geometric.TAGConv(truth.shape[1], 256, K=3)
         layer.load_state_dict(
             {
-                "bias": torch.load(AUTHORS_TAPS / f"bias_{i}.pt", "cpu", weights_only=True),
+                "bias": torch.load(authors_taps / f"bias_{i}.pt", "cpu", weights_only=True),
                 **{
                     f"lins.{k}.weight": torch.load(
-                        AUTHORS_TAPS / f"lin_{i}_{k}.pt", "cpu", weights_only=True
+                        authors_taps / f"lin_{i}_{k}.pt", "cpu", weights_only=True
                     )
                     for k in range(4)
                 },

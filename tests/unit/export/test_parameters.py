@@ -9,9 +9,9 @@ from edge.core.schema import ConfigError
 from edge.policy.bundle import Training
 from export.parameters import read_parameters
 from tests.conftest import ROOT
+from tests.published import AUTHORS_PARAMETERS, MADE, sources
 
 OURS = ROOT / "policies" / "lpac_l2_k3_n10_512.toml"
-THEIRS = ROOT.parent / "shared" / "data" / "coverage_control_params"
 
 COVERAGE_CONTROL = """
 NumRobots = 1
@@ -32,6 +32,48 @@ MaxRobotSpeed = 3
 TimeStep = 0.1
 [Algorithm]
 EpisodeSteps = 2100
+"""
+# With all that the shipped policy's authors set; `{size}` is that of the world.
+AUTHORS_FILE = """
+NumRobots = 1
+[Environment]
+[Environment.Maps]
+Resolution = 1
+WorldMapSize = {size} # cells
+RobotMapSize = {size}
+LocalMapSize = 256
+[Environment.Maps.UpdateSettings]
+UpdateRobotMap = true
+UpdateSensorView = true
+UpdateExplorationMap = false
+UpdateSystemMap = true
+[Environment.IDF]
+NumGaussianFeatures = 1
+TruncationBND = 2
+Norm = 1
+MinSigma = 40
+MaxSigma = 60
+MinPeak = 6
+MaxPeak = 10
+UnknownImportance = 0.5
+RobotMapUseUnknownImportance = false
+[RobotModel]
+SensorSize = 64
+CommunicationRange = 256
+MaxRobotSpeed = 5
+RobotInitDist = {size}
+RobotPosHistorySize = 40
+TimeStep = 0.2
+[RobotModel.AddNoise]
+AddNoisePositions = false
+PositionsNoiseSigma = 0.1
+[Algorithm]
+EpisodeSteps = 2100
+[Algorithm.Global-CVT]
+LloydMaxIterations = 1000
+LloydNumTries = 20
+[Algorithm.Exploration]
+NumFrontiers = 10
 """
 OUR_FILE = """
 [perception]
@@ -58,14 +100,26 @@ def test_the_shipped_file() -> None:
     assert training == Training(max_speed=5.0, time_step=0.2)
 
 
-@pytest.mark.skipif(not THEIRS.is_dir(), reason="CoverageControl's files are not in this checkout")
-def test_coverage_control_file_says_the_same_as_ours() -> None:
+@pytest.fixture(params=sources(AUTHORS_PARAMETERS))
+def authors_parameters(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A folder of CoverageControl's files, as the paper's authors published theirs."""
+    if request.param != MADE:
+        return Path(request.param)
+    for size in (512, 1024):
+        path = tmp_path / f"coverage_control_params_{size}.toml"
+        path.write_text(AUTHORS_FILE.format(size=size))
+    return tmp_path
+
+
+def test_coverage_control_file_says_the_same_as_ours(authors_parameters: Path) -> None:
     theirs, ours = (
-        read_parameters(THEIRS / "coverage_control_params_512.toml"),
+        read_parameters(authors_parameters / "coverage_control_params_512.toml"),
         read_parameters(OURS),
     )
     assert (theirs.perception, theirs.training) == (ours.perception, ours.training)
-    perception = read_parameters(THEIRS / "coverage_control_params_1024.toml").perception
+    perception = read_parameters(
+        authors_parameters / "coverage_control_params_1024.toml"
+    ).perception
     assert perception.world_size == 1024
 
 

@@ -16,7 +16,7 @@ from edge.policy.lpac.images import MAP_CHANNELS, PolicyImages
 from edge.policy.lpac.policy import LpacPolicy, position_feature
 from edge.policy.lpac.verify import swarm_velocities
 from edge.robot.pac import Pac, PacParameters
-from tests.conftest import ROOT, SHIPPED
+from tests.conftest import SHIPPED
 
 torch = pytest.importorskip("torch", reason="torch is the oracle here")
 tag_conv = pytest.importorskip(
@@ -27,7 +27,6 @@ from export.exporter import export_bundle  # noqa: E402
 from tests.unit.export.reference_lpac import reference_lpac  # noqa: E402
 from tests.unit.export.states import State, random_state  # noqa: E402
 
-AUTHORS_TAPS = ROOT.parent / "shared" / "data" / "authors_taps"
 PARAMETERS = SHIPPED.with_suffix(".toml")
 TOLERANCE = 1e-5
 ROBOTS = (1, 2, 10, 50)
@@ -153,12 +152,11 @@ def lpac_velocities(model: object, images: F32, positions: F32, neighbours: Neig
     return velocities
 
 
-@pytest.mark.skipif(not AUTHORS_TAPS.is_dir(), reason="the authors' taps are not in this checkout")
-def test_the_authors_network_decentralised_is_their_network(tmp_path: Path) -> None:
+def test_the_authors_network_decentralised_is_their_network(authors_taps: Path) -> None:
     def tensor(name: str) -> object:
-        return torch.load(AUTHORS_TAPS / f"{name}.pt", "cpu", weights_only=True)
+        return torch.load(authors_taps / f"{name}.pt", "cpu", weights_only=True)
 
-    policy = LpacPolicy(export_bundle(AUTHORS_TAPS, PARAMETERS))
+    policy = LpacPolicy(export_bundle(authors_taps, PARAMETERS))
     geometry = policy.geometry
     names = {
         "gnn_mlp.lins.0.weight": "mlp_lin_0", "gnn_mlp.lins.0.bias": "mlp_bias_0",
