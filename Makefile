@@ -27,8 +27,8 @@ check: lint ## style, types, and the quick tests: what a commit has to pass, in 
 
 BY_FILE := --dist loadfile --no-loadscope-reorder
 test: lint ## style, types, and every test; as root with real robot hosts too: an hour on two cores
-	@failed=0; \
-	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest "$$@" || failed=1; }; \
+	@failed=0; rm -f out/skipped; \
+	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest --skipped out/skipped "$$@" || failed=1; }; \
 	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
 	some --numprocesses auto $(BY_FILE) -m real_time tests/process tests/host; \
 	some -m alone tests/process tests/host; \

@@ -1,6 +1,7 @@
 """What all tests share: their tiers, and the shipped policy."""
 
 import dataclasses
+import json
 import signal
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from edge.core.logger import show
 from edge.policy.bundle import Bundle, load_bundle, make_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from lpac.sim.fleet.load import robots_carried
+from tests.needs import in_one_line
 from tests.published import AUTHORS_TAPS, MADE, sources
 
 ROOT = Path(__file__).parents[1]
@@ -52,6 +54,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--skipped", type=Path, metavar="FILE",
+        help="gathers what was skipped, so that the last of several runs tells of all of them",
+    )  # fmt: skip
     group = parser.getgroup("attacks")
     group.addoption(
         "--tries", type=int, default=60, help="attacks before each hold and kill of an operator"
@@ -93,6 +99,23 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
         return (yield)
     finally:
         _running.clear()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Say in a run's last line what was skipped, and what would have run it."""
+    reporter = config.pluginmanager.get_plugin("terminalreporter")
+    if reporter is None or hasattr(config, "workerinput"):
+        return
+    skipped = [(r.nodeid, r.longrepr[2]) for r in reporter.getreports("skipped")]
+    file: Path | None = config.option.skipped
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with file.open("a+") as lines:
+            lines.writelines(json.dumps(skip) + "\n" for skip in skipped)
+            lines.seek(0)
+            skipped = [json.loads(line) for line in lines]
+    if line := in_one_line(skipped):
+        reporter.write_line(line)
 
 
 @pytest.fixture(autouse=True)

@@ -2,16 +2,16 @@
 
 import fcntl
 import functools
-import os
 import platform
-import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from lpac.sim.hosts.base import NEEDED
 from tests.conftest import ROOT
+from tests.needs import missing
 
 BuildImage = Callable[[str], Path]
 
@@ -19,11 +19,8 @@ BuildImage = Callable[[str], Path]
 @pytest.fixture(scope="session")
 def build_image() -> BuildImage:
     """Builds the image for an architecture, if something in it changed; returns its tree."""
-    if os.geteuid() != 0:
-        pytest.skip("needs root: the image is built and entered with chroot")
-    missing = [tool for tool in ("buildah", "mmdebstrap") if shutil.which(tool) is None]
-    if missing:
-        pytest.skip(f"needs: sudo apt install {' '.join(missing)}")
+    if lacks := missing("buildah", "mmdebstrap", root=True):
+        pytest.skip(lacks)
 
     @functools.cache
     def build(architecture: str) -> Path:
@@ -39,8 +36,11 @@ def build_image() -> BuildImage:
 
 
 @pytest.fixture(scope="session")
-def amd64_image(build_image: BuildImage) -> Path:
+def amd64_image(request: pytest.FixtureRequest) -> Path:
     """The folder of the image for robot hosts on this machine."""
     if platform.machine() != "x86_64":
         pytest.skip("robot hosts are x86-64")
+    if lacks := missing("buildah", *NEEDED, root=True):
+        pytest.skip(lacks)
+    build_image: BuildImage = request.getfixturevalue("build_image")
     return build_image("amd64").parent

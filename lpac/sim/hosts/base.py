@@ -24,7 +24,7 @@ PACKAGES = (
 )  # fmt: skip
 
 # Program -> the Debian package that has it.
-_NEEDED = {
+NEEDED = {
     "systemd-nspawn": "systemd-container",
     "mmdebstrap": "mmdebstrap",
     "ssh": "openssh-client",
@@ -79,7 +79,7 @@ class NoHostsError(ValueError):
 
 def require_tools() -> None:
     """Raises NoHostsError unless this machine can run robot hosts."""
-    packages = [package for program, package in _NEEDED.items() if not shutil.which(program)]
+    packages = [package for program, package in NEEDED.items() if not shutil.which(program)]
     if packages:
         raise NoHostsError(f"robot hosts need: sudo apt install {' '.join(packages)}")
     if os.geteuid() != 0:

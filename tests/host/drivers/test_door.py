@@ -15,8 +15,9 @@ import pytest
 
 from edge.identity.card import Role
 from lpac.fleet.authority import create_authority, new_member
+from tests.needs import needs
 
-pytestmark = pytest.mark.skipif(os.geteuid() != 0, reason="needs root: it makes networks")
+pytestmark = needs("ip", root=True)
 
 ROBOT, GROUND, STRANGER = "10.213.0.1", "10.213.0.2", "10.213.0.3"
 PORT = 7447

@@ -15,6 +15,7 @@ from edge.drivers.flight_log import FlightLog, FlightMetadata, Missing, read
 from edge.drivers.identity_folder import load_identity
 from edge.identity.card import Role
 from lpac.fleet.authority import create_authority, new_member
+from tests.needs import missing
 from tests.said import lines_said
 
 METADATA = FlightMetadata(3, 77, "ab" * 32, "policies/x", "{}", "0.1.0")
@@ -25,8 +26,8 @@ NOW_S = 1.7e9
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Path]:
     """It has 2 MB."""
-    if os.geteuid() != 0:
-        pytest.skip("needs root: mounts a disk")
+    if lacks := missing(root=True):
+        pytest.skip(lacks)
     folder = tmp_path / "disk"
     folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", folder], check=True)

@@ -1,7 +1,6 @@
 """A robot's computer listens to its autopilot, and lands a vehicle whose program is gone."""
 
 import math
-import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -16,8 +15,9 @@ from lpac.sim.px4.link import Px4Link
 from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.server import Instance, Px4Server
 from lpac.sim.px4.vehicle import Px4Vehicle
+from tests.needs import needs
 
-needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root: it listens to a network")
+needs_root = needs(root=True)
 
 
 @pytest.fixture

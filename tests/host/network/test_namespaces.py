@@ -1,13 +1,13 @@
 """`lpac bench network` in network namespaces."""
 
 import json
-import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.needs import missing
 from tests.process.cli.test_cli import error_line, lpac
 
 NAMES = ("lpac-t1", "lpac-t2")
@@ -20,8 +20,8 @@ def ip(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.fixture
 def namespaces() -> Iterator[tuple[str, ...]]:
     """Two, joined by a cable, of which the second has no address."""
-    if os.geteuid() != 0:
-        pytest.skip("needs root: network namespaces are made")
+    if lacks := missing("ip", root=True):
+        pytest.skip(lacks)
     for name in NAMES:
         ip("netns", "delete", name)
         if ip("netns", "add", name).returncode:

@@ -6,7 +6,6 @@ vehicles are on UDP. Judged by where the vehicles truly were.
 
 import json
 import math
-import shutil
 import subprocess
 import sys
 from dataclasses import asdict
@@ -19,6 +18,7 @@ from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
 from tests.conftest import ROOT, SHIPPED
+from tests.needs import missing
 from tests.process.sim.fleet_rig import FleetRig
 
 pytestmark = pytest.mark.real_time
@@ -55,9 +55,8 @@ def test_all_hold_and_land_where_they_are_if_no_radio_comes_back(tmp_path: Path)
 
 def in_own_network(*command_line: str) -> subprocess.CompletedProcess[str]:
     """What became of a program in a network of its own; skips without the tools for one."""
-    missing = [tool for tool in ("unshare", "ip", "iptables") if shutil.which(tool) is None]
-    if missing:
-        pytest.skip("needs: sudo apt install util-linux iproute2 iptables")
+    if lacks := missing("unshare", "ip", "iptables"):
+        pytest.skip(lacks)
     run = [*OWN_NETWORK, 'ip link set lo up && exec "$@"', "sh", *command_line]
     return subprocess.run(run, cwd=ROOT, capture_output=True, text=True, check=False)
 

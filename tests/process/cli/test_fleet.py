@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -14,10 +13,11 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.host.fleet.field import lpac_fleet
+from tests.needs import needs
 from tests.process.cli.test_cli import error_line, lpac
 from tests.unit.cli.test_fleet import write_fleet
 
-needs_ssh = pytest.mark.skipif(shutil.which("ssh") is None, reason="needs OpenSSH's ssh")
+needs_ssh = needs("ssh")
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The radio: real sessions here and in processes of their own."""
 
 import json
-import shutil
 import signal
 import socket
 import subprocess
@@ -22,6 +21,7 @@ from edge.drivers.zenoh_link import LinkError, ZenohLink, ZenohRouter
 from edge.messages.topics import EXPLORED, MESSAGE, ORDER, STATE, STATUS, WORLD, Topic
 from lpac.sim.ports import free_ports
 from tests.conftest import ROOT
+from tests.needs import missing
 
 # Robots as a process. A line on its standard input opens them, each further one is answered with
 # what every robot hears and sees, and the end of the input closes them.
@@ -546,9 +546,11 @@ def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
         }
         for robot_id in nearby + far_away
     ]
+    if lacks := missing("ip", "unshare"):
+        pytest.skip(lacks)
     isolated = ["unshare", "--user", "--map-root-user", "--net"]
-    if not shutil.which("ip") or subprocess.run([*isolated, "true"], check=False).returncode:
-        pytest.skip("needs network namespaces")
+    if subprocess.run([*isolated, "true"], check=False).returncode:
+        pytest.skip("needs the right to make a network namespace")
 
     def enter(robots: Robots) -> list[str]:
         user = ["nsenter", "--preserve-credentials", "--user", "--net"]

@@ -21,6 +21,7 @@ import pytest
 from playwright.sync_api import Page, sync_playwright
 
 from tests.conftest import ROOT
+from tests.needs import missing
 
 CHROMIUM = shutil.which("chromium")
 PATIENCE_S = 120.0
@@ -89,8 +90,8 @@ def opened(
 
     Skips the test where there is no Chromium.
     """
-    if CHROMIUM is None:
-        pytest.skip("needs: sudo apt install chromium")
+    if lacks := missing("chromium"):
+        pytest.skip(lacks)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=CHROMIUM, args=[*_ARGUMENTS], timeout=PATIENCE_S * 1000.0

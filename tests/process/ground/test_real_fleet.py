@@ -5,7 +5,6 @@ own.
 """
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -40,6 +39,7 @@ from lpac.ground.station.protocol import (
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from tests.conftest import ROOT, SHIPPED
+from tests.needs import missing
 from tests.process.ground.browser import MOST_TRIES, live_map, opened
 from tests.said import problem
 
@@ -376,11 +376,8 @@ def lossy_network() -> Iterator[tuple[list[str], str]]:
 
     Yields what enters it, and this machine's address there.
     """
-    if os.geteuid() != 0:
-        pytest.skip("needs root: a network namespace")
-    missing = [tool for tool in ("ip", "iptables") if shutil.which(tool) is None]
-    if missing:
-        pytest.skip("needs: sudo apt install iproute2 iptables")
+    if lacks := missing("ip", "iptables", root=True):
+        pytest.skip(lacks)
     pid = os.getpid()
     name, here = f"lpac-{pid}", f"lp{pid}"
     # The range for tests of networks, four addresses for each process.

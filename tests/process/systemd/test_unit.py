@@ -8,14 +8,13 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import ROOT
+from tests.needs import needs
 
 UNITS = tuple(ROOT / "systemd" / f"lpac-{name}.service" for name in ("robot", "land"))
 # Of systemd 252's scale, 10 the worst. What keeps it from less is what the robot is for, network,
 # and keys that a VOXL2's systemd does not know.
 EXPOSURE = 2.0
-needs_analyze = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="needs: sudo apt install systemd"
-)
+needs_analyze = needs("systemd-analyze")
 
 
 def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
