@@ -15,6 +15,7 @@ PACKAGES = {
     "buildah": "buildah",
     "chromium": "chromium",
     "iptables": "iptables",
+    "ssh-keygen": "openssh-client",
     "systemd-analyze": "systemd",
     "unshare": "util-linux",
 }

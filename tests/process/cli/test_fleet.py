@@ -178,6 +178,7 @@ def test_ctrl_c_ends_all_sessions_in_order(here: Path, times: int) -> None:
     assert not any(map(is_there, begun))
 
 
+@needs("ssh", "ssh-keygen", "rsync")
 def test_the_laptop_is_looked_at_and_what_it_lacks_is_named(tmp_path: Path) -> None:
     fleet = write_fleet(tmp_path, 22)
 
