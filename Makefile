@@ -7,12 +7,12 @@ POLICY := policies/lpac_l2_k3_n10_512
 unexport PYTHONDONTWRITEBYTECODE
 RUN := .venv/bin/python -m
 
-.PHONY: help demo fly setup check test redteam lint hooks bench docs export image lock deploy start \
-	stop status fleet-demo screenshots clean
+.PHONY: help demo fly setup check check-lowest test redteam lint hooks bench docs export image lock \
+	deploy start stop status fleet-demo screenshots clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 
 demo: .venv/sim ## ten robots cover an unknown world: out/demo/demo.png (no torch needed)
 	.venv/bin/lpac demo --out out/demo
@@ -24,6 +24,11 @@ setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install
 
 check: lint ## style, types, and the quick tests: what a commit has to pass, in four minutes on two cores
 	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
+
+LOWEST := out/lowest
+# Old releases warn of what their own dependencies have deprecated since.
+check-lowest: $(LOWEST)/installed ## the quick tests with Python 3.11 and the lowest versions that pyproject.toml allows
+	$(LOWEST)/bin/pytest --numprocesses auto -W ignore::DeprecationWarning tests/unit tests/sim
 
 BY_FILE := --dist loadfile --no-loadscope-reorder
 test: lint ## style, types, and every test; as root with real robot hosts too: an hour on two cores
@@ -68,8 +73,7 @@ LOCK := .venv/bin/uv pip compile --quiet --python-version 3.11 --generate-hashes
 	--python-platform aarch64-manylinux_2_28 --only-binary :all: --upgrade \
 	--custom-compile-command 'make lock'
 
-lock: | .venv/bin/pip ## pin the image's packages to the newest versions, with their hashes
-	.venv/bin/pip install --quiet --disable-pip-version-check uv
+lock: | .venv/bin/uv ## pin the image's packages to the newest versions, with their hashes
 	$(LOCK) pyproject.toml --output-file deploy/docker/requirements.lock
 	echo 'hatchling>=1.27' | $(LOCK) - --output-file deploy/docker/build.lock
 	.venv/bin/python deploy/docker/lock_debian.py
@@ -97,6 +101,18 @@ clean: ## remove .venv and everything made
 	@echo "installing what '$*' needs into .venv: this can take some minutes"
 	.venv/bin/pip install --disable-pip-version-check --editable '.[$*]'
 	@touch $@
+
+# uv chooses the versions, pip installs: from where .venv has its packages, torch among them.
+$(LOWEST)/installed: pyproject.toml | .venv/bin/uv
+	.venv/bin/uv venv --quiet --clear --seed --python 3.11 $(LOWEST)
+	.venv/bin/uv pip compile --quiet --python $(LOWEST)/bin/python --resolution lowest-direct \
+		--extra test pyproject.toml --output-file $(LOWEST)/constraints.txt
+	$(LOWEST)/bin/pip install --disable-pip-version-check --constraint $(LOWEST)/constraints.txt \
+		--editable '.[test]'
+	@touch $@
+
+.venv/bin/uv: | .venv/bin/pip
+	.venv/bin/pip install --quiet --disable-pip-version-check uv
 
 .venv/bin/pip:
 	@test -n '$(PYTHON)' || { echo 'make: Python 3.11 or newer is needed: sudo apt install python3'; exit 1; }

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy.testing  # noqa: F401 - older ones start lscpu when they are first used
 import pytest
 from hypothesis import HealthCheck, settings
 
