@@ -187,6 +187,9 @@ def prove(directory: str, release: str) -> Dict[str, Any]:
         say(command)
         lpac = ["/usr/bin/lpac", "bundle", command, "/release/bundle", "--json"]
         done = run_inside(path, [*lpac, *options])
+        if done.returncode != 0 and command == "benchmark":
+            # Something else may have run beside the first.
+            done = run_inside(path, [*lpac, *options])
         if done.returncode != 0:
             raise Refused("bundle %s on the robot: %s" % (command, reason(done)))
         reports[command] = json.loads(done.stdout)
