@@ -38,7 +38,7 @@ class VehicleTruth:
     """One vehicle: `time_s` (T,) ascending, `position_m` and `velocity_m_s` (T, 3).
 
     `mode` (T,) has `Px4Mode`s' numbers, `setpoint_at_s` (T,) when the last setpoint had come,
-    `is_velocity` (T,) whether that was one, as in a mission. `velocity_error_m_s` and
+    `is_velocity` (T,) whether that moved it in the plane, as in a mission. `velocity_error_m_s` and
     `commands` (T,) are as in `Truth`.
     """
 

@@ -168,7 +168,7 @@ class Truth:
     armed: bool
     landed: bool
     setpoint_at_s: float = -math.inf
-    follows: Literal["position", "velocity"] | None = None
+    follows: Literal["position", "velocity", "stop"] | None = None
     velocity_error_m_s: float = 0.0
     commands: int = 0
 
@@ -1053,10 +1053,12 @@ class Px4Vehicle:
             )
         )
 
-    def _follows(self) -> Literal["position", "velocity"] | None:
+    def _follows(self) -> Literal["position", "velocity", "stop"] | None:
         if self._setpoint is None:
             return None
-        return "velocity" if math.isnan(self._setpoint.position_m[0]) else "position"
+        if not math.isnan(self._setpoint.position_m[0]):
+            return "position"
+        return "velocity" if self._setpoint.velocity_m_s[:2].any() else "stop"
 
 
 def _axis(velocity_m_s: float, error_m: float, gain: float, drift_m_s: float) -> float:

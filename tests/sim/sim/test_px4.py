@@ -191,6 +191,13 @@ def test_an_offboard_position_is_one_of_the_local_frame() -> None:
     assert speed_m_s(vehicle) < 0.2
 
 
+def test_its_truth_tells_a_stop_from_a_flight() -> None:
+    vehicle = in_offboard(velocity(1.0))
+    before = vehicle.truth[-1]
+    run(vehicle, 0.5, velocity(0.0, down=0.3))
+    assert (before.follows, vehicle.truth[-1].follows) == ("velocity", "stop")
+
+
 def test_hold_stops_at_once() -> None:
     vehicle = in_offboard(velocity(1.0))
     run(vehicle, 5.0, velocity(1.0))
