@@ -154,8 +154,9 @@ class Pac:
         # Set by whoever wants it, done by the thread that the memory, or the agent, belongs to.
         self._forget_map = False
         self._reset_agent = False
-        # Which mission it is in, so that maps of another one are not taken.
-        self._trial = 0
+        # Which mission it is in, and which its map is of: those of another one are not taken.
+        self._trial = self._map_trial = 0
+        # Changed as a whole, before the features, so that no message goes without a map.
         self._told = _Told(0, None)
         self._sequence = 0
         self._features: _Timed | None = None
@@ -210,7 +211,7 @@ class Pac:
         if self._forget_map:
             self._forget_map = False
             self._memory = RobotMemory(self._perception)
-            self._told = _Told(self._trial, None)
+            self._map_trial = self._trial
         odometry = self._finite_odometry()
         if odometry is None:
             return None
@@ -223,7 +224,7 @@ class Pac:
         neighbours = self.mailbox.neighbours(now_s)
         heard = self._to_model([neighbour.position_m for neighbour in neighbours])
         near = neighbours_in_range(own, heard, self._perception.communication_range)
-        trial = self._told.trial
+        trial = self._map_trial
         for neighbour, is_near in zip(neighbours, near, strict=True):
             if is_near and neighbour.shared is not None and neighbour.trial == trial:
                 self._memory.hear(neighbour.shared)

@@ -1,7 +1,7 @@
 """One robot's steps: what they do, and what they do when something is missing."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -539,3 +539,29 @@ def test_what_others_have_seen_is_heard_within_one_mission(sharing_bundle: Bundl
     assert explored(0.4) == pytest.approx(alone, rel=0.01)
     other.forget("second")
     assert explored(0.8) == pytest.approx(both, rel=0.01)
+
+
+def test_no_message_goes_without_a_map_while_a_new_mission_begins(sharing_bundle: Bundle) -> None:
+    """Its neighbours would refuse it; each loop is a thread of its own."""
+    policy = LpacPolicy(sharing_bundle)
+    meanwhile: list[Callable[[], None]] = []
+
+    class Looking(World):
+        def view(self, position: F64) -> F32 | None:
+            if meanwhile:
+                meanwhile.pop()()
+            return super().view(position)
+
+    robot, other = make_robot(policy, Looking()), make_robot(policy, World(), 2)
+    told: list[Rejection | None] = []
+
+    def infer() -> None:
+        tick = robot.infer(0.2)
+        assert tick is not None
+        told.append(other.receive(tick.message, 0.2))
+
+    meanwhile.append(lambda: robot.forget("second"))
+    robot.perceive(0.0)
+    meanwhile.append(infer)
+    robot.perceive(0.2)
+    assert told == [None] and not meanwhile
