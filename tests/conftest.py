@@ -121,7 +121,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 @pytest.fixture(autouse=True)
 def logger() -> None:
-    """Undo what a program that an earlier test ran in this process made of the logger."""
+    """Reset the logger, which a command run by an earlier test in this process may have set."""
     show("warning")
 
 
@@ -156,9 +156,8 @@ def authors_taps(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPa
     if request.param != MADE:
         return Path(request.param)
     states = pytest.importorskip("tests.unit.export.states", reason="torch makes the tensors")
-    folder = tmp_path_factory.mktemp("authors") / "authors_taps"
-    folder.mkdir()
-    states.write_authors_taps(folder)
+    state = states.random_state(layers=5, hops=3, latent=256, cnn_latent=32)
+    folder: Path = states.tap_folder(state, tmp_path_factory.mktemp("authors") / "authors_taps")
     return folder
 
 

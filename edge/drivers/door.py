@@ -190,7 +190,7 @@ class Door:
             self._look(now_s)
 
     def _next_knock(self) -> tuple[bytes, str, str]:
-        """A datagram, the place that it was sent to, and the address that it is from."""
+        """Receive a knock: its data, its destination's address:port, and its sender's address."""
         data, [(_, _, info)], _, (address, _) = self._knocks.recvmsg(
             _KNOCK_BYTES, socket.CMSG_SPACE(_PKTINFO_BYTES)
         )

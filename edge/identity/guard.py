@@ -558,7 +558,7 @@ class _SigningLink:
 
 
 def _knock_key(card: Card, place: str) -> str:
-    """It has the place, so that nobody who overhears a knock knocks elsewhere with it."""
+    """Return the key that a knock is signed for: it names the destination, against replay."""
     return f"{'ground' if card.robot_id is None else f'robot/{card.robot_id}'}/knock/{place}"
 
 

@@ -154,9 +154,9 @@ class Pac:
         # Set by whoever wants it, done by the thread that the memory, or the agent, belongs to.
         self._forget_map = False
         self._reset_agent = False
-        # Which mission it is in, and which its map is of: those of another one are not taken.
+        # The mission that it is in, and that of its map: maps of another mission are not merged.
         self._trial = self._map_trial = 0
-        # Changed as a whole, before the features, so that no message goes without a map.
+        # Replaced as a whole, before the features, so that no message is sent without a map.
         self._told = _Told(0, None)
         self._sequence = 0
         self._features: _Timed | None = None

@@ -126,8 +126,8 @@ def facts(directory: str, mavlink_port: int, names: List[str]) -> Dict[str, Any]
 def _drops_strangers() -> bool:
     """Whether a program without privileges can keep strangers from the radio's port.
 
-    It takes what `edge.drivers.door` does. Hardened kernels allow it to root alone, as who runs
-    this is; hence a child that is nobody.
+    A child that runs as nobody attaches a filter, as `edge.drivers.door` does: hardened kernels
+    allow that to root alone.
     """
     child = os.fork()
     if child == 0:

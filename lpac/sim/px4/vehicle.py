@@ -157,8 +157,8 @@ class Truth:
     """What is really so at one time: world frame, m and m/s.
 
     `setpoint_at_s` is when the last setpoint came, -inf before the first, and `follows` what it
-    asked for. `velocity_error_m_s` is how wrong its estimate of the horizontal velocity is, and
-    `commands` how many commands have been sent to it so far.
+    asked for: a stop is a velocity of zero in the plane. `velocity_error_m_s` is how wrong its
+    estimate of the horizontal velocity is, and `commands` how many commands have been sent to it.
     """
 
     time_s: float

@@ -86,14 +86,16 @@ def random_state(
     return state
 
 
-def write_authors_taps(folder: Path) -> None:
-    """Write random tensors of the authors' network (L = 5, K = 3), a file each as they did."""
-    for name, tensor in random_state(layers=5, hops=3, latent=256, cnn_latent=32).items():
+def tap_folder(state: State, folder: Path) -> Path:
+    """Write the state's GNN and action network as the paper's authors store theirs."""
+    folder.mkdir()
+    for name, tensor in state.items():
         if not name.startswith("cnn_backbone."):
             [file] = [
                 found.expand(to) for was, to in _AUTHORS_FILES if (found := re.fullmatch(was, name))
             ]
             torch.save(tensor, folder / f"{file}.pt")
+    return folder
 
 
 def random_bundle(**sizes: int) -> Bundle:

@@ -13,7 +13,7 @@ import torch
 
 from export.checkpoint import Checkpoint, CheckpointError, read_checkpoint
 from export.graphs import build_graphs
-from tests.unit.export.states import State, random_state
+from tests.unit.export.states import State, random_state, tap_folder
 
 TAP = "gnn_backbone.graph_conv_1.lins.1.weight"
 NORM = "cnn_backbone.batch_norm0"
@@ -36,26 +36,6 @@ def error_of(content: object, folder: Path) -> str:
     assert "\n" not in text
     assert text.startswith(f"{folder / 'model.pt'}: ")
     return text.removeprefix(f"{folder / 'model.pt'}: ")
-
-
-def tap_folder(state: State, folder: Path) -> Path:
-    """The state's GNN and action network as the authors store theirs."""
-    names = (
-        (r"gnn_backbone\.graph_conv_(\d)\.lins\.(\d)\.weight", r"lin_\1_\2"),
-        (r"gnn_backbone\.graph_conv_(\d)\.bias", r"bias_\1"),
-        (r"gnn_mlp\.lins\.(\d)\.weight", r"mlp_lin_\1"),
-        (r"gnn_mlp\.lins\.(\d)\.bias", r"mlp_bias_\1"),
-        (r"gnn_mlp\.norms\.(\d)\.module\.(\w+)", r"mlp_norm_\1_\2"),
-        (r"output_linear\.weight", "outlayer_wts"),
-        (r"output_linear\.bias", "outlayer_bias"),
-        (r"(actions_\w+)", r"\1"),
-    )
-    folder.mkdir()
-    for key, tensor in state.items():
-        for pattern, name in names:
-            if match := re.fullmatch(pattern, key):
-                torch.save(tensor, folder / f"{match.expand(name)}.pt")
-    return folder
 
 
 def test_every_size_is_read_from_the_tensors(tmp_path: Path) -> None:
