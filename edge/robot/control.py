@@ -382,7 +382,8 @@ class FlightControl:
             if beacon.state is FlightState.PILOT or _is_off_height(beacon)
         }
         return tuple(
-            neighbour._replace(is_piloted=neighbour.robot_id in piloted)
+            # Flight has no use for their maps, and the log would hold each of them at each tick.
+            neighbour._replace(is_piloted=neighbour.robot_id in piloted, shared=None)
             for neighbour in (*heard, *told)
         )
 
