@@ -2,7 +2,6 @@
 
 import json
 import math
-import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -44,7 +43,7 @@ def rehearse(
         names = addressed(subscriber.setup, to.robots)
         _require_disarmed(subscriber, names)
         try:
-            _watch(subscriber, names, time.monotonic() + seconds, as_json=as_json)
+            _watch(subscriber, names, subscriber.now_s + seconds, as_json=as_json)
         except KeyboardInterrupt:
             return
 
@@ -62,13 +61,13 @@ def _watch(
     if console.is_terminal and not as_json:
         live.start()
     try:
-        while time.monotonic() < end_s:
+        while subscriber.now_s < end_s:
             if as_json:
                 _print_json(subscriber, names)
             elif not console.is_terminal:
                 for row in _rows(subscriber, names):
                     console.print(_line(row), soft_wrap=True)
-            wait_s = min(_PERIOD_S, end_s - time.monotonic())
+            wait_s = min(_PERIOD_S, end_s - subscriber.now_s)
             subscriber.wait_for(lambda _: False, max(0.0, wait_s))
             _require_disarmed(subscriber, names)
     finally:

@@ -38,7 +38,7 @@ from tests.flown import PRECISE, QUICK, FlownRobot
 _S = FlightState
 STEP_S = 0.05
 # What robots think and say to each other matters little here, and takes the most time.
-_SETTINGS = {"rates": {"perception_hz": 2.0, "policy_hz": 2.0, "control_hz": 5.0}}
+SPARING = {"rates": {"perception_hz": 2.0, "policy_hz": 2.0, "control_hz": 5.0}}
 
 # How far a fleet has come: its robots have found themselves; are ready; hover; fly the mission.
 Stage = Literal["standing", "ready", "hovering", "flying"]
@@ -142,6 +142,12 @@ class Field:
         robot.start()
         return FieldRobot(self.fleet, robot)
 
+    def copy(self) -> "Field":
+        """The same once more, to which other things happen."""
+        for robot in self.robots:
+            robot.vehicle.truth.clear()
+        return Field(self.fleet.copy())
+
     def step(self) -> None:
         self.run(STEP_S)
 
@@ -196,7 +202,7 @@ def _flown(n: int, spares: int, stage: Stage, secure: bool) -> Field:
             )
             fleet = SimulatedFleet(
                 scenario, Path(folder), SHIPPED,
-                operator="alice", settings=_SETTINGS, spares=spares, vehicle_step_s=0.1,
+                operator="alice", settings=SPARING, spares=spares, vehicle_step_s=0.1,
             )  # fmt: skip
         for each in fleet.vehicles:
             each.vehicle.parameters |= QUICK
