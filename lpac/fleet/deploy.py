@@ -1,5 +1,6 @@
 """A release's way to a robot: travel, be checked whole, prove itself, switch; or change nothing."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 from lpac.fleet.cards import open_authority
@@ -75,24 +76,33 @@ async def _bring(
     if place["complete"]:
         return 0
     target, like = f":{place['incoming']}", place["like"]
-    options = ["--delete", "--partial", _MODES]
-    try:
-        sent_bytes = await rsync(
-            config, robot, [f"{release.image.folder}/"], f"{target}/root/",
-            options=[*options, *(f"--link-dest={folder}/root" for folder in like)],
-            sudo=held.found["sudo"], on_share=lambda share: report("image", share),
-        )  # fmt: skip
-        sent_bytes += await rsync(
-            config, robot, [f"{release.folder}/"], f"{target}/",
-            options=[*options, "--exclude=/root", *(f"--link-dest={folder}" for folder in like)],
-            sudo=held.found["sudo"], on_share=lambda share: report("policy", share),
-        )  # fmt: skip
-    except FleetError as error:
-        if "disk is full" in str(error):
-            await session.call("discard", directory=config.directory, release=release.id)
-        raise
-    report("check", None)
-    await session.call("accept", directory=config.directory, release=release.id)
+
+    async def send(step: str, folder: Path, below: str, *options: str) -> int:
+        try:
+            return await rsync(
+                config, robot, [f"{folder}/"], f"{target}{below}/",
+                options=["--delete", "--partial", _MODES, *options,
+                         *(f"--link-dest={folder}{below}" for folder in like)],
+                sudo=held.found["sudo"], on_share=lambda share: report(step, share),
+            )  # fmt: skip
+        except FleetError as error:
+            if "disk is full" in str(error):
+                await session.call("discard", directory=config.directory, release=release.id)
+            raise
+
+    async def accept() -> None:
+        report("check", None)
+        await session.call("accept", directory=config.directory, release=release.id)
+
+    sent_bytes = await send("policy", release.folder, "", "--exclude=/root")
+    if place["has_image"]:
+        try:
+            await accept()
+            return sent_bytes
+        except RemoteError:
+            pass  # The image that was there is damaged.
+    sent_bytes += await send("image", release.image.folder, "/root")
+    await accept()
     return sent_bytes
 
 

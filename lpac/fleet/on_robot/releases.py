@@ -16,7 +16,7 @@ import time
 from typing import Any, Dict, List, Optional, Set
 
 from lpac.fleet.on_robot import service, signatures
-from lpac.fleet.on_robot.calls import Refused, call, reason, run, say, write_whole
+from lpac.fleet.on_robot.calls import Refused, call, must, reason, run, say, write_whole
 
 _MARGIN_BYTES = 100000000
 _KEPT = 3
@@ -94,7 +94,8 @@ def prepare(
     """Make room for a release; what is already here of it need not travel.
 
     A release that is here, but damaged, is mended. Returns whether it is here whole (`complete`),
-    the folder to fill (`incoming`), and folders of releases that may hold equal files (`like`).
+    the folder to fill (`incoming`), whether that has the `image` of an earlier release already
+    (`has_image`; unchecked), and folders of releases that may hold equal files (`like`).
     Raises Refused if the vehicle is armed, or the disk has no room.
     """
     require_lock()
@@ -113,8 +114,9 @@ def prepare(
     answer["like"] = [os.path.join(directory, "releases", name) for name in likely[:_KEPT]]
     if not answer["complete"]:
         os.makedirs(target, exist_ok=True)
-        here = (_versions(directory, name) or {} for name in likely)
-        needed = 0 if any(versions.get("image") == image for versions in here) else size_bytes
+        same = [n for n in likely if (_versions(directory, n) or {}).get("image") == image]
+        answer["has_image"] = bool(same)
+        needed = 0 if same else size_bytes
         needed = max(0, needed - _size(target)) + _MARGIN_BYTES
         free = shutil.disk_usage(directory).free
         if free < needed:
@@ -123,7 +125,15 @@ def prepare(
                 "but not the newest (`lpac fleet pull`, then `lpac fleet exec`)"
                 % (free // 1e6, needed // 1e6)
             )
+        if same:
+            _link_image(os.path.join(directory, "releases", same[0]), target)
     return answer
+
+
+def _link_image(release: str, target: str) -> None:
+    """Let `target` share the files of the release's image: links, which take no room."""
+    shutil.rmtree(os.path.join(target, "root"), ignore_errors=True)
+    must(["cp", "-al", os.path.join(release, "root"), target])
 
 
 def _is_whole(directory: str, release: str, incoming: str) -> bool:
@@ -156,7 +166,7 @@ def accept(directory: str, release: str) -> Dict[str, Any]:
     require_lock()
     incoming = os.path.join(directory, "incoming", release)
     _check(incoming, release)
-    os.sync()
+    _sync_disks(directory)
     os.rename(incoming, os.path.join(directory, "releases", release))
     _sync_folder(os.path.join(directory, "releases"))
     return {}
@@ -286,8 +296,7 @@ def _settle(directory: str, last_good: Optional[str]) -> None:
         _unlink(directory, "last-good")
     elif last_good != linked(directory, "last-good"):
         _link(directory, "last-good", last_good)
-    # Unit and links may lie on several file systems.
-    os.sync()
+    _sync_disks(directory, service.UNIT_PATH)
     _unlink(directory, "pending")
 
 
@@ -445,6 +454,12 @@ def _link(directory: str, name: str, release: str) -> None:
 def _unlink(directory: str, name: str) -> None:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(os.path.join(directory, name))
+
+
+def _sync_disks(*paths: str) -> None:
+    """Write out the file systems of these paths; another one's logs may take long."""
+    if run(["sync", "--file-system", *paths], timeout_s=120.0).returncode != 0:
+        os.sync()
 
 
 def _sync_folder(path: str) -> None:

@@ -6,10 +6,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Thread
-from typing import Self
+from typing import NamedTuple, Self
 
 import pytest
 
@@ -19,7 +20,7 @@ from tests.needs import needs
 
 pytestmark = needs("ip", root=True)
 
-ROBOT, GROUND, STRANGER = "10.213.0.1", "10.213.0.2", "10.213.0.3"
+ROBOT, GROUND, STRANGER, OTHER = "10.213.0.1", "10.213.0.2", "10.213.0.3", "10.213.0.4"
 PORT = 7447
 PATIENCE_S = 30.0
 # A flood ends by itself, whatever becomes of the test.
@@ -151,109 +152,134 @@ def ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True, capture_output=True)
 
 
+class Air(NamedTuple):
+    """Four computers on one network, and their identities: the folder of each one's keys."""
+
+    number: int
+    keys: Path
+
+    def name(self, of: str) -> str:
+        """Its namespace."""
+        return f"lpac-door-{os.getpid()}-{self.number}-{of}"
+
+    def link(self, of: str, state: str) -> None:
+        ip("-n", self.name("air"), "link", "set", f"to{of[-1]}", state)
+
+    def start(self, at: str, script: str, *arguments: str) -> Program:
+        return Program(self.name(at), script, *arguments)
+
+    def member(self, at: str, mode: str = "peer", script: str = _COMMON + _MEMBER) -> Program:
+        """The ground's at GROUND; elsewhere robot 2's."""
+        who, robot_id = ("ground", "") if at == GROUND else ("r2", "2")
+        return self.start(at, script, str(self.keys / who), mode, robot_id)
+
+    def robot(self) -> Program:
+        return self.start(ROBOT, _COMMON + _ROBOT, str(self.keys / "r1"))
+
+    def flood(self, kind: str, rate_hz: int) -> Program:
+        return self.start(STRANGER, _FLOOD, kind, str(rate_hz), str(LONGEST_S))
+
+
 @pytest.fixture
-def air() -> Iterator[Callable[[str], str]]:
-    """Three computers on one network: the name of each one's namespace."""
+def airs(tmp_path: Path) -> Iterator[Callable[[], Air]]:
+    """Makes one more that has nothing to do with the others."""
     with ExitStack() as made:
 
-        def name(of: str) -> str:
-            return f"lpac-door-{os.getpid()}-{of}"
+        def add(air: Air, of: str) -> str:
+            ip("netns", "add", air.name(of))
+            made.callback(ip, "netns", "del", air.name(of))
+            ip("-n", air.name(of), "link", "set", "lo", "up")
+            return air.name(of)
 
-        def add(of: str) -> None:
-            ip("netns", "add", name(of))
-            made.callback(ip, "netns", "del", name(of))
-            ip("-n", name(of), "link", "set", "lo", "up")
+        def make() -> Air:
+            number = len(list(tmp_path.iterdir()))
+            air = Air(number, tmp_path / str(number))
+            bridge = add(air, "air")
+            ip("-n", bridge, "link", "add", "name", "bridge0", "type", "bridge")
+            ip("-n", bridge, "link", "set", "bridge0", "up")
+            for address in (ROBOT, GROUND, STRANGER, OTHER):
+                port, computer = f"to{address[-1]}", add(air, address)
+                ip("-n", bridge, "link", "add", port, "type", "veth",
+                   "peer", "name", "wlan0", "netns", computer)  # fmt: skip
+                ip("-n", bridge, "link", "set", port, "master", "bridge0", "up")
+                ip("-n", computer, "address", "add", f"{address}/24", "dev", "wlan0")
+                ip("-n", computer, "link", "set", "wlan0", "up")
+            authority = create_authority(air.keys / "authority", "demo")
+            for robot_id in (1, 2):
+                new_member(
+                    authority, air.keys / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id
+                )
+            new_member(authority, air.keys / "ground", Role.OPERATOR, "alice")
+            return air
 
-        add("air")
-        ip("-n", name("air"), "link", "add", "name", "bridge0", "type", "bridge")
-        ip("-n", name("air"), "link", "set", "bridge0", "up")
-        for address in (ROBOT, GROUND, STRANGER):
-            add(address)
-            port = f"to{address[-1]}"
-            ip("link", "add", port, "netns", name("air"), "type", "veth",
-               "peer", "name", "wlan0", "netns", name(address))  # fmt: skip
-            ip("-n", name("air"), "link", "set", port, "master", "bridge0", "up")
-            ip("-n", name(address), "address", "add", f"{address}/24", "dev", "wlan0")
-            ip("-n", name(address), "link", "set", "wlan0", "up")
-        yield name
-
-
-@pytest.fixture
-def keys(tmp_path: Path) -> Callable[[str], str]:
-    authority = create_authority(tmp_path / "authority", "demo")
-    for robot_id in (1, 2):
-        new_member(authority, tmp_path / f"r{robot_id}", Role.ROBOT, f"r{robot_id}", robot_id)
-    new_member(authority, tmp_path / "ground", Role.OPERATOR, "alice")
-    return lambda name: str(tmp_path / name)
+        yield make
 
 
-@pytest.mark.parametrize(
-    ("kind", "rate_hz"), [("junk", 20), ("junk", 200), ("junk", 2000), ("idle", 500)]
-)
-def test_members_come_in_while_strangers_flood_a_robots_port(
-    kind: str, rate_hz: int, air: Callable[[str], str], keys: Callable[[str], str]
-) -> None:
+def test_members_come_in_while_strangers_flood(airs: Callable[[], Air]) -> None:
+    """Several floods at once, each on a network of its own: what takes long is waiting."""
+    floods: list[tuple[Callable[..., None], tuple[object, ...]]] = [
+        (members_come_in_to_a_robot, ("junk", 20)),
+        (members_come_in_to_a_robot, ("junk", 200)),
+        (members_come_in_to_a_robot, ("junk", 2000)),
+        (members_come_in_to_a_robot, ("idle", 500)),
+        (members_come_in_to_the_router, (20,)),
+        (members_come_in_to_the_router, (2000,)),
+        (strangers_come_in_again_when_the_flood_is_over, ()),
+    ]
+    with ThreadPoolExecutor(len(floods)) as pool:
+        running = [pool.submit(case, airs(), *flood) for case, flood in floods]
+    for done in running:
+        done.result()
+
+
+def members_come_in_to_a_robot(air: Air, kind: str, rate_hz: int) -> None:
     """One that was never there, one that stalled, that started again, whose network was gone."""
     with ExitStack() as programs:
-
-        def start(at: str, script: str, *arguments: str) -> Program:
-            return programs.enter_context(Program(air(at), script, *arguments))
-
-        robot = start(ROBOT, _COMMON + _ROBOT, keys("r1"))
+        robot = programs.enter_context(air.robot())
         robot.says("calm")
-        start(STRANGER, _FLOOD, kind, str(rate_hz), str(LONGEST_S)).says("floods")
+        programs.enter_context(air.flood(kind, rate_hz)).says("floods")
         robot.says("flooded")
-        ground = start(GROUND, _COMMON + _MEMBER, keys("ground"), "peer", "")
+        ground = programs.enter_context(air.member(GROUND))
+        other = programs.enter_context(air.member(OTHER))
         ground.says("heard")
-        # Longer than the lease.
+        other.says("heard")
         ground.signal(signal.SIGSTOP)
-        time.sleep(3.0)
+        air.link(OTHER, "down")
+        time.sleep(3.0)  # longer than the lease
+        air.link(OTHER, "up")
+        other.says("heard")
         ground.signal(signal.SIGCONT)
         ground.says("heard")
         ground.__exit__()
-        ground = start(GROUND, _COMMON + _MEMBER, keys("ground"), "peer", "")
+        ground = programs.enter_context(air.member(GROUND))
         ground.says("heard")
-        ip("-n", air("air"), "link", "set", "to2", "down")
-        time.sleep(3.0)
-        before = len(ground.lines)
-        ip("-n", air("air"), "link", "set", "to2", "up")
-        ground.says("heard")
-        assert len(ground.lines) > before
         robot.__exit__()
-        start(ROBOT, _COMMON + _ROBOT, keys("r1"))
+        programs.enter_context(air.robot())
         ground.says("heard")
+        other.says("heard")
 
 
-@pytest.mark.parametrize("rate_hz", [20, 2000])
-def test_members_come_in_while_strangers_flood_the_router(
-    rate_hz: int, air: Callable[[str], str], keys: Callable[[str], str]
-) -> None:
+def members_come_in_to_the_router(air: Air, rate_hz: int) -> None:
     """As where robots speak by multicast, and to the ground by way of the router."""
     with ExitStack() as programs:
-
-        def start(at: str, script: str, *arguments: str) -> Program:
-            return programs.enter_context(Program(air(at), script, *arguments))
-
-        start(ROBOT, _COMMON + _ROUTER, keys("ground")).says("calm")
-        start(STRANGER, _FLOOD, "junk", str(rate_hz), str(LONGEST_S)).says("floods")
+        router = air.start(ROBOT, _COMMON + _ROUTER, str(air.keys / "ground"))
+        programs.enter_context(router).says("calm")
+        programs.enter_context(air.flood("junk", rate_hz)).says("floods")
         time.sleep(1.0)
-        start(GROUND, _COMMON + _MEMBER, keys("r2"), "client", "2")
-        ground = start(GROUND, _COMMON + _MEMBER, keys("ground"), "client", "")
-        ground.says("heard")
+        programs.enter_context(air.member(OTHER, "client"))
+        programs.enter_context(air.member(GROUND, "client")).says("heard")
 
 
-def test_strangers_come_in_again_when_the_flood_is_over(
-    air: Callable[[str], str], keys: Callable[[str], str]
-) -> None:
+def strangers_come_in_again_when_the_flood_is_over(air: Air) -> None:
     """As a member that cannot knock does: seldom, but in time."""
-    with Program(air(ROBOT), _COMMON + _ROBOT, keys("r1")) as robot:
+    with air.robot() as robot:
         robot.says("calm")
-        with Program(air(STRANGER), _FLOOD, "junk", "100", str(LONGEST_S)) as flood:
+        with air.flood("junk", 100) as flood:
             flood.says("floods")
             robot.says("flooded")
         robot.says("calm")
         silent = _COMMON.replace("members=guard", "members=None") + _MEMBER
-        with Program(air(GROUND), silent, keys("ground"), "peer", "") as ground:
+        with air.member(GROUND, script=silent) as ground:
             until_s = time.monotonic() + 4 * PATIENCE_S
             while not ground.lines:
                 assert time.monotonic() < until_s
@@ -261,16 +287,17 @@ def test_strangers_come_in_again_when_the_flood_is_over(
 
 
 def test_no_stranger_speaks_for_a_vehicle_that_was_left_alone(
-    air: Callable[[str], str], tmp_path: Path
+    airs: Callable[[], Air], tmp_path: Path
 ) -> None:
+    air = airs()
     toml = tmp_path / "robot.toml"
     url = "udpin://127.0.0.1:14551"
     toml.write_text(f'[autopilot]\nurl = "{url}"\nsystem_id = 7\n[flight]\nhover_land_s = 0.0\n')
-    with Program(air(ROBOT), _LEFT_ALONE, str(toml)) as alone:
+    with air.start(ROBOT, _LEFT_ALONE, str(toml)) as alone:
         alone.says("listens")
-        with Program(air(STRANGER), _VEHICLE, ROBOT) as stranger:
+        with air.start(STRANGER, _VEHICLE, ROBOT) as stranger:
             for _ in range(5):
                 stranger.says("told nothing")
-            with Program(air(ROBOT), _VEHICLE, "127.0.0.1") as vehicle:
+            with air.start(ROBOT, _VEHICLE, "127.0.0.1") as vehicle:
                 vehicle.says("told to land")
             assert "told to land" not in stranger.lines

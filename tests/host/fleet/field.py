@@ -3,19 +3,25 @@
 import asyncio
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from lpac.fleet.cards import give_card
 from lpac.fleet.hold import hold
+from lpac.fleet.release import Image, load_image
 from lpac.fleet.settings import FleetConfig, RobotHost, load_fleet
 from lpac.sim.fleet.keys import OPERATOR
+from lpac.sim.hosts.base import NoHostsError
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
-from tests.conftest import ROOT
+from tests.conftest import ROOT, SHIPPED
 
 SILENT = "it does not answer: it is off, or out of reach"
 
@@ -55,6 +61,19 @@ def running_lpac_fleet(
             process.kill()
 
 
+@contextmanager
+def booted(image: Path, folder: Path, count: int) -> Iterator[SimulatedHosts]:
+    """Robot computers, the last one without a slot. Skips where this machine can have none."""
+    with ExitStack() as stack:
+        try:
+            hosts = stack.enter_context(
+                SimulatedHosts(count, folder, image=image, bundle=SHIPPED, spares=1)
+            )
+        except NoHostsError as reason:
+            pytest.skip(str(reason))
+        yield hosts
+
+
 def unwatched(_: str, __: float | None) -> None:
     """A report that nobody reads."""
 
@@ -65,6 +84,30 @@ def name_robot(hosts: SimulatedHosts, host: SimulatedHost) -> None:
     host.run(f"mkdir -p /etc/lpac; echo '{json.dumps(identity)}' > /etc/lpac/robot.json")
     config = load_fleet(hosts.fleet_toml)
     asyncio.run(_give_card(config, config.robots[host.name]))
+
+
+def give_image(host: SimulatedHost, image: Image) -> None:
+    """Let it have the image, of 170 MB, as if a release with it had been there: none travels."""
+    earlier = host.root / "opt/lpac/releases/earlier"
+    if not earlier.parent.exists():
+        shutil.copytree(image.folder, earlier / "root", symlinks=True)
+        (earlier / "versions.json").write_text(json.dumps({"image": image.id}))
+
+
+def deploy_to(hosts: SimulatedHosts, *names: str) -> dict[str, dict[str, Any]]:
+    """Give the robots their identity, if they are new, and the release; what `deploy` says of each.
+
+    Only the policy and the configuration travel.
+    """
+    image = load_image(load_fleet(hosts.fleet_toml).image)
+    for host in hosts:
+        if host.name in names and not (host.root / "opt/lpac").exists():
+            name_robot(hosts, host)
+            give_image(host, image)
+    done = lpac_fleet(hosts.fleet_toml, "deploy", "--json", "--robots", ",".join(names))
+    assert done.returncode == 0, done.stderr
+    robots: dict[str, dict[str, Any]] = json.loads(done.stdout)["robots"]
+    return robots
 
 
 async def _give_card(config: FleetConfig, robot: RobotHost) -> None:

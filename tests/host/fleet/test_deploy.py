@@ -21,7 +21,14 @@ from lpac.fleet.release import Release, make_release
 from lpac.fleet.session import FleetError, RemoteError, UnreachableError, connect
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
-from tests.host.fleet.field import armed, await_said, name_robot, running_lpac_fleet, unwatched
+from tests.host.fleet.field import (
+    armed,
+    await_said,
+    deploy_to,
+    name_robot,
+    running_lpac_fleet,
+    unwatched,
+)
 from tests.host.fleet.laptop import Laptop, boot_nonce
 
 
@@ -29,9 +36,7 @@ from tests.host.fleet.laptop import Laptop, boot_nonce
 def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
     """r1 and r2 run a first release; r3 is there, whatever it has."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
-    for index in range(2):
-        name_robot(hosts, hosts[index])
-        laptop.deploy(index)
+    deploy_to(hosts, "r1", "r2")
     return laptop
 
 
@@ -54,31 +59,36 @@ def test_a_second_deploy_sends_nothing_and_disturbs_nothing(laptop: Laptop) -> N
     assert boot_nonce(laptop.overview(0)) == before
 
 
-def test_a_changed_file_travels_alone_and_rollback_brings_the_former_back(laptop: Laptop) -> None:
-    former = laptop.overview(0)["current"]
-    release = laptop.release(0, laptop.changed())
-    done = laptop.deploy(0, release)
-    assert done.release == release.id != former
-    # The world, the lock of versions, and the manifest of 2,000 files.
-    assert done.sent_bytes < 0.01 * release.size_bytes
-    now = laptop.overview(0)
-    assert (now["current"], now["last_good"], now["pending"]) == (release.id, former, None)
-    assert now["service"]["enabled"]
-    assert laptop.roll_back(0) == former
-    assert laptop.overview(0)["current"] == former
-    with pytest.raises(RemoteError, match="no earlier release"):
-        laptop.roll_back(0)
+def test_of_two_operators_the_second_waits(laptop: Laptop) -> None:
+    async def both() -> None:
+        async with connect(laptop.config, laptop.robot(0)) as session:
+            await session.call(
+                "lock", directory=laptop.config.directory, who="alice@field", mavlink_port=14551
+            )
+            with pytest.raises(RemoteError, match="alice@field is changing this robot"):
+                await deploy(laptop.config, laptop.robot(0), laptop.release(0), unwatched)
+
+    asyncio.run(both())
+    assert laptop.deploy(0).summary in ("unchanged", "runs")
 
 
-def test_only_what_the_authority_signed_runs_and_nothing_older(
+def test_a_changed_file_travels_alone_and_only_rollback_goes_back(
     laptop: Laptop, tmp_path: Path
 ) -> None:
+    """What the authority has not signed does not run, nor does anything older."""
     assert laptop.config.keys is not None
     authority = Authority(laptop.config.keys, laptop.config.fleet)
     stranger = create_authority(tmp_path / "keys", laptop.config.fleet)
     robot = next(m for m in authority.members() if m.name == laptop.hosts[0].name)
+    first = laptop.overview(0)["current"]
     former = laptop.release(0, laptop.changed())
-    laptop.deploy(0, former)
+    done = laptop.deploy(0, former)
+    assert done.release == former.id != first
+    # The world, the lock of versions, and the manifest of 2,000 files.
+    assert done.sent_bytes < 0.01 * former.size_bytes
+    now = laptop.overview(0)
+    assert (now["current"], now["last_good"], now["pending"]) == (former.id, first, None)
+    assert now["service"]["enabled"]
     recorded = laptop.hosts[0].run(f"cat /opt/lpac/releases/{former.id}/signature.pem")
     release = laptop.release(0, laptop.changed())
     laptop.deploy(0, release)
@@ -103,54 +113,54 @@ def test_only_what_the_authority_signed_runs_and_nothing_older(
     assert "older than one" in refused(former, recorded)
     with pytest.raises(RemoteError, match="older than one"):
         laptop.switch(0, former)
-    # Rollback alone goes backwards; and who deploys the same again signs it anew.
+    # Rollback alone goes backwards, once; and who deploys the same again signs it anew.
     assert laptop.roll_back(0) == former.id
+    assert laptop.overview(0)["current"] == former.id
+    with pytest.raises(RemoteError, match="no earlier release"):
+        laptop.roll_back(0)
     assert laptop.deploy(0, release).summary == "runs"
-    laptop.deploy(0)
 
 
-@pytest.mark.parametrize("mishap", ["cut", "full"])
-def test_a_transfer_that_breaks_off_leaves_what_runs_and_a_repeat_finishes(
-    laptop: Laptop, mishap: str
+def test_a_transfer_that_breaks_off_changes_nothing_and_a_repeat_finishes(
+    laptop: Laptop,
 ) -> None:
+    """The network is gone, then the disk is full, then the laptop's program is killed."""
     host = laptop.hosts[2]
     host.reset()
     name_robot(laptop.hosts, host)
     release = laptop.release(2)
-    seen: list[float] = []
-
-    def at_a_third(step: str, share: float | None) -> None:
-        if step == "image" and share is not None and share >= 0.3 and not seen:
-            seen.append(share)
-            {"cut": host.cut, "full": host.fill_disk}[mishap]()
-
-    with pytest.raises(FleetError) as error:
-        laptop.deploy(2, release, at_a_third)
-    assert seen
-    if mishap == "full":
-        assert "its disk is full" in str(error.value)
-        host.free_disk()
-    else:
-        assert isinstance(error.value, UnreachableError)
-        host.heal()
-    assert laptop.overview(2)["current"] is None
-
-    await_free(host)
-    assert laptop.deploy(2, release).summary == "runs"
-
-
-def test_a_killed_laptop_program_leaves_the_robot_whole_and_free(laptop: Laptop) -> None:
-    host = laptop.hosts[2]
-    host.reset()
-    name_robot(laptop.hosts, host)
     incoming = host.root / "opt" / "lpac" / "incoming"
+
+    def breaks_off(mishap: Callable[[], None]) -> FleetError:
+        seen: list[float] = []
+
+        def at_a_third(step: str, share: float | None) -> None:
+            if step == "image" and share is not None and share >= 0.3 and not seen:
+                seen.append(share)
+                mishap()
+
+        with pytest.raises(FleetError) as error:
+            laptop.deploy(2, release, at_a_third)
+        assert seen
+        return error.value
+
+    def is_whole_and_free() -> None:
+        assert laptop.overview(2)["current"] is None
+        await_free(host)
+
+    assert isinstance(breaks_off(host.cut), UnreachableError)
+    host.heal()
+    is_whole_and_free()
+    assert any(incoming.iterdir())  # for the repeat
+    assert "its disk is full" in str(breaks_off(host.fill_disk))
+    host.free_disk()
+    is_whole_and_free()
     with running_lpac_fleet(laptop.hosts.fleet_toml, "deploy", "--robots", host.name) as program:
         await_true(lambda: any(incoming.glob("*/root/usr/lib/*/*")))
         program.send_signal(signal.SIGKILL)
         program.communicate()
-    assert laptop.overview(2)["current"] is None
-    await_free(host)
-    assert laptop.deploy(2).summary == "runs"
+    is_whole_and_free()
+    assert laptop.deploy(2, release).summary == "runs"
 
 
 def test_a_full_disk_is_found_before_anything_travels(laptop: Laptop) -> None:
@@ -239,55 +249,32 @@ def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop)
     assert len(after["releases"]) <= 3  # of the seven and more that it has had
 
 
-@pytest.mark.parametrize("program", ["runs", "stopped"])
-def test_an_armed_robot_refuses(laptop: Laptop, program: str) -> None:
+def test_an_armed_robot_refuses_whether_its_program_runs_or_not(laptop: Laptop) -> None:
     host, stop = laptop.hosts[1], {"mavlink_port": laptop.robot(1).mavlink_port, "disable": False}
     laptop.call(1, "start", directory=laptop.config.directory)
-    if program == "stopped":
-        laptop.call(1, "stop", **stop, in_flight=False)
-    before = laptop.overview(1)
-    with armed(host):
-        if program == "runs":
-            await_said(host, '"armed":true')
+    before, release = laptop.overview(1), laptop.release(1, laptop.changed())
+    pending = {"release": before["current"], "former": None}
+
+    def refuses() -> None:
         with pytest.raises(RemoteError, match="the vehicle is armed: deploying is refused"):
-            laptop.deploy(1, laptop.release(1, laptop.changed()))
+            laptop.deploy(1, release)
         with pytest.raises(RemoteError, match="the vehicle is armed: stopping is refused"):
             laptop.call(1, "stop", **stop, in_flight=False)
-        after = laptop.overview(1)
-        assert after["current"] == before["current"]
-        if program == "runs":
-            assert boot_nonce(after) == boot_nonce(before)
-            laptop.call(1, "stop", **stop, in_flight=True)
-            assert laptop.overview(1)["service"]["active"] == "inactive"
 
-
-def test_an_interrupted_switch_is_not_finished_in_flight(laptop: Laptop) -> None:
-    host = laptop.hosts[1]
-    laptop.call(1, "start", directory=laptop.config.directory)
-    before = laptop.overview(1)
-    pending = {"release": before["current"], "former": None}
-    (host.root / "opt/lpac/pending").write_text(json.dumps(pending))
     with armed(host):
         await_said(host, '"armed":true')
-        with pytest.raises(RemoteError, match="the vehicle is armed: deploying is refused"):
-            laptop.deploy(1)
+        refuses()
+        # Nor is a switch that was interrupted finished in flight.
+        (host.root / "opt/lpac/pending").write_text(json.dumps(pending))
+        refuses()
         after = laptop.overview(1)
-    assert (after["current"], after["pending"]) == (before["current"], pending)
-    assert boot_nonce(after) == boot_nonce(before)
-    (host.root / "opt/lpac/pending").unlink()
-
-
-def test_of_two_operators_the_second_waits(laptop: Laptop) -> None:
-    async def both() -> None:
-        async with connect(laptop.config, laptop.robot(0)) as session:
-            await session.call(
-                "lock", directory=laptop.config.directory, who="alice@field", mavlink_port=14551
-            )
-            with pytest.raises(RemoteError, match="alice@field is changing this robot"):
-                await deploy(laptop.config, laptop.robot(0), laptop.release(0), unwatched)
-
-    asyncio.run(both())
-    assert laptop.deploy(0).summary in ("unchanged", "runs")
+        assert (after["current"], after["pending"]) == (before["current"], pending)
+        assert boot_nonce(after) == boot_nonce(before)
+        (host.root / "opt/lpac/pending").unlink()
+        laptop.call(1, "stop", **stop, in_flight=True)
+        assert laptop.overview(1)["service"]["active"] == "inactive"
+        refuses()
+        assert laptop.overview(1)["current"] == before["current"]
 
 
 def test_a_robot_with_another_host_key_gets_nothing(laptop: Laptop) -> None:

@@ -14,7 +14,6 @@ import pytest
 from edge.identity.card import Role
 from lpac.fleet.authority import new_member
 from lpac.fleet.cards import open_authority
-from lpac.fleet.deploy import deploy
 from lpac.fleet.doctor import (
     DoctorCheck,
     Examination,
@@ -22,12 +21,11 @@ from lpac.fleet.doctor import (
     examine,
 )
 from lpac.fleet.operations import Outcome, for_each
-from lpac.fleet.release import load_common, make_release
 from lpac.fleet.settings import RobotHost, load_fleet
 from lpac.fleet.up import bring_up
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
-from tests.host.fleet.field import SILENT, armed, lpac_fleet, name_robot, unwatched
+from tests.host.fleet.field import SILENT, armed, deploy_to, lpac_fleet, name_robot, unwatched
 
 
 @pytest.fixture(scope="module")
@@ -194,13 +192,12 @@ def test_a_clock_that_cannot_be_set_is_no_go(enrolled: SimulatedHosts) -> None:
 
 
 def test_up_starts_what_was_switched_off_and_says_go(
-    enrolled: SimulatedHosts, tmp_path: Path
+    enrolled: SimulatedHosts,
 ) -> None:
     host = enrolled[0]
     config = load_fleet(enrolled.fleet_toml)
     robot = config.robots[host.name]
-    release = make_release(config, robot, load_common(config), tmp_path)
-    asyncio.run(deploy(config, robot, release, unwatched))
+    deploy_to(enrolled, host.name)
     hub = host.root / "etc/modalai/voxl-vision-hub.conf"
     hub.write_text(hub.read_text().replace("figure_eight", "off"))
 

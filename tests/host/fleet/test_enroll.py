@@ -8,11 +8,12 @@ from pathlib import Path
 import pytest
 
 from lpac.fleet.enroll import _robot
+from lpac.fleet.release import load_image
 from lpac.fleet.settings import load_fleet
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
-from tests.host.fleet.field import armed, lpac_fleet
+from tests.host.fleet.field import armed, give_image, lpac_fleet
 from tests.needs import needs
 
 EXAMPLE = ROOT / "docs" / "fleet.toml"
@@ -108,8 +109,9 @@ def outcomes(text: str) -> dict[str, str]:
     }
 
 
-def as_a_lab_left_it(new: SimulatedHost) -> None:
+def as_a_lab_left_it(new: SimulatedHost, image: Path) -> None:
     """A password, and three programs that may command the vehicle."""
+    give_image(new, load_image(image))
     (new.root / "root/.ssh/authorized_keys").write_text("ssh-ed25519 AAAA another's")
     new.run(f"echo 'root:{PASSWORD}' | chpasswd; echo PermitRootLogin yes >> /etc/ssh/sshd_config")
     new.run("systemctl restart ssh")
@@ -141,7 +143,7 @@ def test_from_a_password_to_a_robot_of_the_fleet(
     tmp_path: Path,
     person: dict[str, str],
 ) -> None:
-    as_a_lab_left_it(new)
+    as_a_lab_left_it(new, load_fleet(fleet_file).image)
     comment = "/* made by voxl-configure: 'offboard_mode': // \"x\" */\n"
     hub = new.root / "etc/modalai/voxl-vision-hub.conf"
     original = comment + hub.read_text()

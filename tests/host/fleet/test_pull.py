@@ -18,7 +18,7 @@ from lpac.fleet.session import FleetError
 from lpac.fleet.settings import load_fleet
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
-from tests.host.fleet.field import armed, lpac_fleet, unwatched
+from tests.host.fleet.field import armed, deploy_to, lpac_fleet, unwatched
 
 LOGS = "var/lib/private/lpac/logs"
 # In the past, so that no file is taken for one that still grows.
@@ -46,16 +46,17 @@ def write_ulog(host: SimulatedHost, session: str, ended_s: float, data: bytes) -
 
 
 @pytest.fixture(scope="module")
-def flown(deployed: SimulatedHosts) -> SimulatedHosts:
+def flown(hosts: SimulatedHosts) -> SimulatedHosts:
     """r1 has flown the trials A and B; r4, a spare, nothing."""
-    r1 = deployed[0]
+    deploy_to(hosts, "r1", "r4")
+    r1 = hosts[0]
     r1.run("systemctl stop lpac-robot; rm -f /var/lib/private/lpac/logs/*")
     write_logs(r1.root / LOGS, 1, [("A", FIRST_S), ("B", FIRST_S + 100.0)])
     write_ulog(r1, "sess001", FIRST_S - 500.0, b"before")
     write_ulog(r1, "sess002", FIRST_S + 12.0, b"of A")
     write_ulog(r1, "sess003", FIRST_S + 112.0, b"of B")
     (r1.root / "data/px4/param/parameters").write_bytes(b"EKF2_HGT_REF")
-    return deployed
+    return hosts
 
 
 def pulled(hosts: SimulatedHosts, trial: str | None, out: Path) -> Coroutine[None, None, Pulled]:

@@ -8,7 +8,7 @@ import pytest
 from lpac.fleet.on_robot.service import UNIT
 from lpac.fleet.session import RemoteError
 from lpac.sim.hosts.hosts import SimulatedHosts
-from tests.host.fleet.field import armed, lpac_fleet, name_robot
+from tests.host.fleet.field import armed, deploy_to, lpac_fleet
 from tests.host.fleet.laptop import Laptop, boot_nonce
 
 OTHERS_UNIT = "/etc/systemd/system/lpac-robot.service.d/60-others.conf"
@@ -16,12 +16,9 @@ OTHERS_UNIT = "/etc/systemd/system/lpac-robot.service.d/60-others.conf"
 
 @pytest.fixture(scope="module")
 def laptop(hosts: SimulatedHosts, tmp_path_factory: pytest.TempPathFactory) -> Laptop:
-    """r1 runs a second release, and has the first to go back to."""
+    """r1 runs a release."""
     laptop = Laptop(hosts, tmp_path_factory.mktemp("releases"))
-    hosts[0].reset()
-    name_robot(hosts, hosts[0])
-    laptop.deploy(0)
-    laptop.deploy(0, laptop.release(0, laptop.changed()))
+    deploy_to(hosts, "r1")
     return laptop
 
 
@@ -40,14 +37,12 @@ def test_a_program_that_was_not_restarted_does_not_run_the_release(laptop: Lapto
         assert laptop.overview(0)["service"]["active"] != "active"
     finally:
         host.run(f"rm {OTHERS_UNIT} && systemctl daemon-reload")
-    assert laptop.deploy(0, laptop.release(0, laptop.changed())).summary == "runs"
-
-
-def test_a_damaged_release_is_mended_by_deploying_it_again(laptop: Laptop) -> None:
-    host = laptop.hosts[0]
+    # One that is damaged is mended by deploying it again.
     release = laptop.release(0, laptop.changed())
-    laptop.deploy(0, release)
+    assert laptop.deploy(0, release).summary == "runs"
     host.run("rm /opt/lpac/current/world.env && systemctl restart lpac-robot || true")
+    # The releases share the files of their image.
+    host.run("echo damaged > /opt/lpac/current/root/usr/share/lpac/versions.json")
     assert laptop.deploy(0, release).summary == "runs"
     assert boot_nonce(laptop.overview(0))
 

@@ -11,7 +11,14 @@ from lpac.fleet.writer import assign
 from lpac.sim.hosts.host import SimulatedHost
 from lpac.sim.hosts.hosts import SimulatedHosts
 from tests.conftest import ROOT
-from tests.host.fleet.field import SILENT, armed, await_said, lpac_fleet
+from tests.host.fleet.field import SILENT, armed, await_said, deploy_to, lpac_fleet
+
+
+@pytest.fixture(scope="module")
+def deployed(hosts: SimulatedHosts) -> SimulatedHosts:
+    """r3, which flies, and r4, a spare, have the release."""
+    deploy_to(hosts, "r3", "r4")
+    return hosts
 
 
 @pytest.fixture

@@ -41,7 +41,7 @@ def namespaces() -> Iterator[tuple[str, ...]]:
 def test_each_robot_is_in_its_namespace(namespaces: tuple[str, ...], tmp_path: Path) -> None:
     asked = (
         "bench", "network", "robots", "-n", 2, "--middleware", "zenoh", "--repetitions", 1,
-        "--seconds", 2, "--namespaces", ",".join(namespaces), "--out", tmp_path, "--json",
+        "--seconds", 1, "--namespaces", ",".join(namespaces), "--out", tmp_path, "--json",
     )  # fmt: skip
     refused = error_line(lpac(*asked))
     assert refused.startswith("lpac: --namespaces: lpac-t2 has no IPv4 address")

@@ -203,7 +203,7 @@ def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
     with host.stepped:
         assert host.vehicle.armed and host.vehicle.mode is Px4Mode.HOLD
     changed = tomlkit.parse(text)
-    changed["flight"]["hover_land_s"] = 10.0
+    changed["flight"]["hover_land_s"] = 1.0
     changed["policy"]["bundle"] = "nowhere"
     toml.write_text(tomlkit.dumps(changed))
     # An old systemd has started it for the hang before, with the former configuration.
