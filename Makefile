@@ -33,7 +33,8 @@ check-lowest: $(LOWEST)/installed ## the quick tests with Python 3.11 and the lo
 BY_FILE := --dist loadfile --no-loadscope-reorder
 test: lint ## style, types, and every test; as root with real robot hosts too: an hour on two cores
 	@failed=0; rm -f out/skipped; \
-	some() { echo ".venv/bin/pytest $$*"; .venv/bin/pytest --skipped out/skipped "$$@" || failed=1; }; \
+	some() { $(RUN) tests.quiet || exit 1; \
+		echo ".venv/bin/pytest $$*"; .venv/bin/pytest --skipped out/skipped "$$@" || failed=1; }; \
 	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
 	some --numprocesses auto $(BY_FILE) -m real_time tests/process tests/host; \
 	some -m alone tests/process tests/host; \

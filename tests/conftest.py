@@ -24,8 +24,13 @@ SHIPPED = ROOT / "policies" / "lpac_l2_k3_n10_512"
 # The folders below tests/, each a marker; README.md there says what belongs in which.
 TIERS = ("unit", "sim", "process", "host")
 
-# What a machine has to carry, with room to spare, for two files to fly beside each other.
-ROBOTS_AT_ONCE = 9
+# A file that flies in real time flies two or three robots at a time.
+ROBOTS_OF_A_FILE = 2.5
+# The files whose flights take longest begin first, so that none is left alone at the end.
+LONGEST = (
+    "test_robot.py", "test_real_fleet.py", "test_walkthrough.py", "test_fleet.py",
+    "test_attacks.py",
+)  # fmt: skip
 
 # What no test in unit/ and sim/ does, as Python's audit events name it.
 OTHERS_ONLY = {
@@ -69,7 +74,7 @@ def pytest_configure(config: pytest.Config) -> None:
     for tier in TIERS:
         config.addinivalue_line("markers", f"{tier}: what is in tests/{tier}")
     config.addinivalue_line(
-        "markers", "real_time: flies robots in real time: one more file does so beside it at most"
+        "markers", "real_time: flies robots in real time: three more files do so beside it at most"
     )
     config.addinivalue_line(
         "markers", "alone: measures, or flies very many: nothing else runs meanwhile"
@@ -77,10 +82,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """How many files fly in real time at once: on a machine that carries no two fleets, one."""
+    """Files that fly in real time at once: as many as the machine carries, four at most."""
     if config.option.markexpr != "real_time":
         return None
-    return 2 if robots_carried(SHIPPED, "mavlink") >= ROBOTS_AT_ONCE else 1
+    return min(max(1, round(robots_carried(SHIPPED, "mavlink") / ROBOTS_OF_A_FILE)), 4)
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m chooses by marker
@@ -90,6 +95,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if tier not in TIERS:
             raise pytest.UsageError(f"{item.path} is in none of the tiers {', '.join(TIERS)}")
         item.add_marker(tier)
+    if config.option.markexpr == "real_time":
+        items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.hookimpl(wrapper=True)

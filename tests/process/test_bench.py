@@ -9,8 +9,6 @@ pytest.importorskip("torch_geometric", reason="the benches compare with it")
 from bench import command, footprint, hearing, loops, simulated
 from tests.unit.test_bench import check_frame, kept
 
-pytestmark = pytest.mark.alone
-
 
 def test_footprint(tmp_path: Path) -> None:
     result = kept(footprint.measure(runs=1), tmp_path)
@@ -26,6 +24,7 @@ def test_command(tmp_path: Path) -> None:
     assert 0.0 < figures["python -c pass"]["median"] < figures["lpac --help"]["median"]
 
 
+@pytest.mark.real_time
 def test_loops(tmp_path: Path) -> None:
     result = kept(loops.measure(robots=1, mission_s=6.0, beside_busy=False), tmp_path)
     check_frame(result, "loops", targets=6)

@@ -19,8 +19,8 @@ from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.sitl.build import require_build
 
-# Of a robot with its vehicle and its part of a ground, with room for whatever else runs.
-_CORES_EACH = 0.33
+# A robot with its vehicle and its part of a ground takes 0.12 of a core, averaged over a flight.
+_CORES_EACH = 0.16
 # What a late machine broke says nothing, and is flown again.
 _TRIES = 3
 

@@ -31,9 +31,10 @@ from lpac.sim.fleet.listener import FleetListener
 from lpac.sim.fleet.pilot import PilotFlight
 from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
 from tests.conftest import ROOT, SHIPPED
+from tests.flown import PRECISE
 from tests.process.cli.test_cli import error_line, lpac
 
-ROBOTS = 5
+ROBOTS = 3
 
 OUTWARDS = (
     FlightState.PREFLIGHT, FlightState.ARMING, FlightState.TAKEOFF, FlightState.HOLD,
@@ -51,22 +52,54 @@ class Flight(NamedTuple):
     out: Path
 
 
+@contextmanager
+def launched(*arguments: object, vehicle: str = "mavlink") -> Iterator[subprocess.Popen[str]]:
+    """`lpac sim --vehicle ...` in the background."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lpac.cli.main", "sim", "--vehicle", vehicle, *map(str, arguments)],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "1000", "PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    with process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+                process.wait(180.0)
+
+
+def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
+    assert stream is not None
+    lines = []
+    for line in stream:
+        lines.append(line)
+        match = re.search(pattern, line)
+        if match:
+            return match
+    raise AssertionError(f"{pattern!r} is not among {lines}")
+
+
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Flown until Ctrl-C; other fleets of this folder fly to the end of their missions."""
     out = tmp_path_factory.mktemp("fleet")
     # Other missions of this folder are flown in a mesh, and by way of a router.
-    result = lpac(
-        "sim", "--vehicle", "mavlink", "-n", ROBOTS, "--duration", 20, "--json", "--out", out,
-        "--secure", "--transport", "multicast",
-    )  # fmt: skip
-    assert result.stdout, result.stderr
-    return Flight(json.loads(result.stdout), out)
+    with launched(
+        "-n", ROBOTS, "--json", "--out", out, "--secure", "--transport", "multicast",
+    ) as process:  # fmt: skip
+        read_until(process.stderr, f" s  mission; robots: {ROBOTS} mission$")
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=180.0)
+    assert output, errors
+    assert process.returncode == 1
+    return Flight(json.loads(output), out)
 
 
 @pytest.mark.real_time
-def test_all_robots_take_off_cover_and_land(flight: Flight) -> None:
+def test_all_robots_take_off_and_cover_and_ctrl_c_lands_them(flight: Flight) -> None:
     told, _ = flight
-    assert told["problem"] is None and told["all_landed"], told
+    assert told["problem"] == "stopped by Ctrl-C" and told["all_landed"], told
     for robot in told["fleet"]:
         states = [change["state"] for change in robot["timeline"]]
         back = states[::-1]
@@ -181,39 +214,13 @@ def test_with_multicast_robots_hear_each_other_without_the_router(tmp_path: Path
         assert any(at_s > gone_unix_s for _, at_s, _ in read(log, "received"))
 
 
-@contextmanager
-def launched(*arguments: object, vehicle: str = "mavlink") -> Iterator[subprocess.Popen[str]]:
-    """`lpac sim --vehicle ...` in the background."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "lpac.cli.main", "sim", "--vehicle", vehicle, *map(str, arguments)],
-        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "1000", "PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
-    with process:
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                process.send_signal(signal.SIGTERM)
-                process.wait(180.0)
-
-
-def read_until(stream: IO[str] | None, pattern: str) -> re.Match[str]:
-    assert stream is not None
-    lines = []
-    for line in stream:
-        lines.append(line)
-        match = re.search(pattern, line)
-        if match:
-            return match
-    raise AssertionError(f"{pattern!r} is not among {lines}")
-
-
 @pytest.mark.real_time
 def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None:
     """As tests/sim/sim/test_pilot.py has it on the simulated clock."""
     taken = PilotFlight(robot=0, from_s=1.0, until_s=19.0)
-    scenario = FleetScenario(robots=2, seed=3, duration_s=22.0, secure=True, transport="router")
+    scenario = FleetScenario(
+        robots=2, seed=3, duration_s=22.0, secure=True, transport="router", budget=PRECISE
+    )
     record = fly_programs(scenario, tmp_path, SHIPPED, pilots=[taken])
     [absence] = absences_of(record)
     assert absence.robot == "r0"
@@ -223,17 +230,6 @@ def test_a_pilot_takes_a_robot_out_of_the_fence_and_back(tmp_path: Path) -> None
     away = (truth.time_s > absence.from_s) & (truth.time_s < absence.until_s)
     inside_m = [fence.distance_m(x, y) for x, y, _ in truth.position_m[away][::25].tolist()]
     assert min(inside_m) < -1.0 and inside_m[-1] > 0.0
-
-
-@pytest.mark.real_time
-def test_ctrl_c_lands_all() -> None:
-    with launched("-n", 2, "--json") as process:
-        read_until(process.stderr, r" s  mission$")
-        process.send_signal(signal.SIGINT)
-        output, _ = process.communicate(timeout=180.0)
-    told = json.loads(output)
-    assert process.returncode == 1
-    assert told["problem"] == "stopped by Ctrl-C" and told["all_landed"]
 
 
 @pytest.mark.real_time

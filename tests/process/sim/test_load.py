@@ -11,8 +11,6 @@ from lpac.sim.fleet.load import robots_carried
 from lpac.sim.fleet.processes import OVERLOADED_S, Fleet
 from tests.conftest import SHIPPED
 
-pytestmark = pytest.mark.alone
-
 STEPS = (
     "assemble", "preflight", "takeoff", "start", "mission", "return",
     "landing all robots where they are",
@@ -29,6 +27,7 @@ def test_two_cores_carry_three_px4s(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 3 <= robots_carried(SHIPPED, "px4") < 5
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize("in_the_air", [False, True])
 def test_a_flight_that_falls_behind_ends_early_and_says_so_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_the_air: bool

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations, groupby, pairwise
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from lpac.ground.procedure import fresh_snapshot
 from lpac.ground.station.client import subscribe
 from lpac.ground.station.commands import in_words
 from lpac.ground.station.protocol import SNAPSHOT_PERIOD_S
+from lpac.sim.cores import over_cores
 from lpac.sim.experiment import FIELD_SCALE
 from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario, Layout
@@ -156,6 +158,7 @@ def places_m(snapshot: FleetSnapshot) -> F64:
 
 def on_the_simulated_clock(folder: Path, draw: int) -> SeenFlight:
     """Each start of a robot's program draws the phases of its clocks."""
+    folder = folder / f"simulated-{draw}"
     fleet = SimulatedFleet(SCENARIO, folder, SHIPPED)
     for robot in fleet.robots * draw:
         robot.stop()
@@ -209,7 +212,7 @@ def watching(fleet: str, see: Callable[[FleetSnapshot], None]) -> Iterator[None]
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory: pytest.TempPathFactory) -> "Flights":
     folder = tmp_path_factory.mktemp("same")
-    simulated = [on_the_simulated_clock(folder / f"simulated-{i}", i) for i in range(DRAWS)]
+    simulated = list(over_cores(partial(on_the_simulated_clock, folder), range(DRAWS)))
     for attempt in range(MOST_FLIGHTS):
         programs = as_programs(folder / f"programs-{attempt}")
         if not programs.held_up():
