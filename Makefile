@@ -22,15 +22,17 @@ fly: .venv/sim ## ten robot programs, or as many as this machine carries, fly si
 
 setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install what a workstation needs: simulator, plots, torch, onnx, deployment, ground control, Foxglove
 
+# Files that take long come first; tests of one file share what they fly.
+BY_FILE := --dist loadfile --no-loadscope-reorder
+QUICK := --numprocesses auto $(BY_FILE) tests/sim tests/unit
 check: lint ## style, types, and the quick tests: what a commit has to pass, in four minutes on two cores
-	.venv/bin/pytest --numprocesses auto tests/unit tests/sim
+	.venv/bin/pytest $(QUICK)
 
 LOWEST := out/lowest
 # Old releases warn of what their own dependencies have deprecated since.
 check-lowest: $(LOWEST)/installed ## the quick tests with Python 3.11 and the lowest versions that pyproject.toml allows
-	$(LOWEST)/bin/pytest --numprocesses auto -W ignore::DeprecationWarning tests/unit tests/sim
+	$(LOWEST)/bin/pytest -W ignore::DeprecationWarning $(QUICK)
 
-BY_FILE := --dist loadfile --no-loadscope-reorder
 test: lint ## style, types, and every test; as root with real robot hosts too: an hour on two cores
 	@failed=0; rm -f out/skipped; \
 	some() { $(RUN) tests.quiet || exit 1; \
@@ -49,7 +51,7 @@ redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/sec
 lint: .venv/test ## style, and strict types of the product and its tests
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	.venv/bin/mypy
+	.venv/bin/mypy --num-workers auto
 
 hooks: .venv/test ## each git commit then checks style and types of what it holds
 	.venv/bin/pre-commit install

@@ -185,7 +185,12 @@ def harms(
     _do(fleet, Start())
     _pass(fleet, 5.0)
     undisturbed = _flown(fleet, Lie.NOTHING, seed, mission_s)
-    return {lie: _harm(_flown(fleet, lie, seed, mission_s), undisturbed) for lie in lies}
+    return {
+        lie: _harm(
+            undisturbed if lie is Lie.NOTHING else _flown(fleet, lie, seed, mission_s), undisturbed
+        )
+        for lie in lies
+    }
 
 
 def held_up(ready: SimulatedFleet, hovering: SimulatedFleet, seed: int) -> HeldUp:

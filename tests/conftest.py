@@ -1,11 +1,13 @@
 """What all tests share: their tiers, and the shipped policy."""
 
 import dataclasses
+import gc
 import json
 import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy.testing  # noqa: F401 - older ones start lscpu when they are first used
 import pytest
@@ -66,7 +68,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )  # fmt: skip
     group = parser.getgroup("attacks")
     group.addoption(
-        "--tries", type=int, default=60, help="attacks before each hold and kill of an operator"
+        "--tries", type=int, default=40, help="attacks before each hold and kill of an operator"
     )
 
 
@@ -97,6 +99,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         item.add_marker(tier)
     if config.option.markexpr == "real_time":
         items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage no more among what was imported, torch for one: it stays."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -130,6 +138,22 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 def logger() -> None:
     """Reset the logger, which a command run by an earlier test in this process may have set."""
     show("warning")
+
+
+@pytest.fixture
+def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw each figure once, and small: for those who only want it to be there."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - most tests draw nothing
+
+    savefig = Figure.savefig
+
+    def sketch(drawn: Figure, to: Any, **options: Any) -> None:
+        if isinstance(to, Path) and to.suffix == ".pdf":
+            to.write_bytes(b"%PDF")
+        else:
+            savefig(drawn, to, **options, dpi=20)
+
+    monkeypatch.setattr(Figure, "savefig", sketch)
 
 
 @pytest.fixture(scope="session")

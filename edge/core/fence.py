@@ -50,13 +50,12 @@ class Fence:
             raise ValueError(
                 f"ceiling_m = {self.ceiling_m}: must be finite and above floor_m = {self.floor_m}"
             )
-        corners = np.array(self.vertices_m)
-        if not _is_convex(corners):
+        depth_m = _depth_m(self.vertices_m)
+        if depth_m is None:
             raise ValueError(
                 f"vertices_m = {[list(vertex) for vertex in self.vertices_m]}: must be the "
                 "corners of a convex polygon, in order, none twice"
             )
-        depth_m = self.distance_m(*_centroid(corners))
         if not depth_m > self.buffer_m:
             raise ValueError(
                 f"buffer_m = {self.buffer_m}: must be below {depth_m:.3g}, "
@@ -129,6 +128,15 @@ def _edges(vertices_m: tuple[tuple[float, ...], ...]) -> Edges:
     for shared in edges:
         shared.flags.writeable = False
     return edges
+
+
+@functools.lru_cache(maxsize=64)  # robots tell the same one with every status
+def _depth_m(vertices_m: tuple[tuple[float, ...], ...]) -> float | None:
+    """Return how far a polygon's centroid is inside its line; None if it is not convex."""
+    corners = np.array(vertices_m)
+    if not _is_convex(corners):
+        return None
+    return float(_edges(vertices_m).distances_m(np.array(_centroid(corners))).min())
 
 
 def _cut(corners: F64, inward: F64, offset_m: float) -> F64:

@@ -11,7 +11,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from edge.core import F64
+from edge.core.changes import plain
 from edge.core.fence import Fence
 from edge.core.schema import from_mapping
 from edge.drivers.flight_log import FlightLogError, FlightMetadata, Missing, read, read_metadata
@@ -198,7 +199,7 @@ class _LogReader:
 
     def take_status(self, status: RobotStatus) -> None:
         """Take what a robot said, as its log would have it."""
-        logged = json.loads(json.dumps(asdict(status)))
+        logged = json.loads(json.dumps(plain(status)))
         self._take_status((status.robot_id, status.boot_nonce), logged)
 
     def read(self, path: Path) -> None:

@@ -6,7 +6,8 @@ import pytest
 
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
-from bench import command, footprint, hearing, loops, simulated
+from bench import command, footprint, hearing, loops, scaling, simulated
+from bench.reference_swarm import is_installed
 from tests.unit.test_bench import check_frame, kept
 
 
@@ -32,6 +33,17 @@ def test_loops(tmp_path: Path) -> None:
     assert set(loops.LOOPS) | {"preflight", "status", "log", "rx"} <= taken["cpu_percent"].keys()
     assert len(result["figures"]["taken_with_keys"]) == 1
     assert taken["threads"] > 8 and 10.0 < taken["private_mb"] < taken["resident_mb"]
+
+
+def test_scaling(tmp_path: Path) -> None:
+    result = kept(scaling.measure([(2, 0.4, 1)]), tmp_path)
+    simulators = {scaling.EXACT, scaling.BATCHED}
+    if is_installed():
+        simulators.add(scaling.REFERENCE)
+    check_frame(result, "scaling", targets=3 + (len(simulators) - 2))
+    flights = result["figures"]["2"]
+    assert set(flights) == simulators
+    assert {flight["world_size"] for flight in flights.values()} == {229}
 
 
 def test_simulated(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from rich.console import Console
 pytest.importorskip("torch_geometric", reason="the benches compare with it")
 
 from bench import closed_loop, policy, position, scaling
-from bench.reference_swarm import is_installed
 from bench.report import Report
+from edge.policy.bundle import Bundle
 
 
 def kept(report: Report, folder: Path) -> dict[str, Any]:
@@ -42,16 +42,12 @@ def test_policy(tmp_path: Path) -> None:
     assert sum(operator["flop"] for operator in cnn["operators"]) == cnn["flop"] > 30e6
 
 
-def test_scaling(tmp_path: Path) -> None:
-    result = kept(scaling.measure([(1, 0.4, 1), (2, 0.4, 1)]), tmp_path)
-    simulators = {scaling.EXACT, scaling.BATCHED}
-    if is_installed():
-        simulators.add(scaling.REFERENCE)
-    check_frame(result, "scaling", targets=3 + 2 * (len(simulators) - 2))
-    for robots, world_size in ((1, 162), (2, 229)):
-        flights = result["figures"][str(robots)]
-        assert set(flights) == simulators
-        assert {flight["world_size"] for flight in flights.values()} == {world_size}
+@pytest.mark.parametrize(("robots", "world_size"), [(1, 162), (2, 229), (10, 512)])
+def test_robots_of_the_scaling_bench_have_as_much_room_each(
+    shipped_bundle: Bundle, robots: int, world_size: int
+) -> None:
+    perception = scaling.world_for(shipped_bundle, robots).manifest.perception
+    assert perception is not None and perception.world_size == world_size
 
 
 def test_closed_loop(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ is late, the vehicle's own time does, of those messages that have it.
 
 import math
 from collections import deque
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable
 from enum import Enum
 from typing import NamedTuple
 
@@ -144,7 +144,7 @@ class VehicleFrames:
 
     def lost(self, now_s: float) -> float:
         """The share of the frames that were lost in the last ten seconds, in steps of 5 %."""
-        seconds = tuple(self._within(_LOSS_S, now_s))
+        seconds = self._within(_LOSS_S, now_s)
         taken, lost = sum(s.taken for s in seconds), sum(s.lost for s in seconds)
         return round(20.0 * lost / (taken + lost)) / 20.0 if taken + lost >= _LEAST_FRAMES else 0.0
 
@@ -158,7 +158,7 @@ class VehicleFrames:
         Time goes back again and again then, or things are said of one time by two paths that are
         not the same.
         """
-        seconds = tuple(self._within(_OTHERS_S, now_s))
+        seconds = self._within(_OTHERS_S, now_s)
         others = sum(s.others for s in seconds)
         least = max(_LEAST_OTHERS, _OTHERS_SHARE * sum(s.timed for s in seconds))
         return others >= least and others > sum(s.again for s in seconds)
@@ -256,5 +256,6 @@ class VehicleFrames:
             self._seconds.append(_Second(math.floor(now_s)))
         return self._seconds[-1]
 
-    def _within(self, seconds: int, now_s: float) -> Iterator[_Second]:
-        return (each for each in self._seconds if each.second >= math.floor(now_s) - seconds)
+    def _within(self, seconds: int, now_s: float) -> list[_Second]:
+        oldest = math.floor(now_s) - seconds
+        return [each for each in self._seconds if each.second >= oldest]

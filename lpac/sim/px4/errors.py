@@ -140,7 +140,7 @@ class Errors:
 
         It is noise of a few decimetres, and an echo of up to 3.5 m for some seconds.
         """
-        noise_m = [math.fsum(wave.about(time_s) for wave in waves) for waves in self._fix]
+        noise_m = [math.fsum([wave.about(time_s) for wave in waves]) for waves in self._fix]
         since_s = time_s % self._echo_every_s - (self._echo_every_s - self._echo_for_s)
         echo = math.sin(math.pi * since_s / self._echo_for_s) if since_s > 0.0 else 0.0
         fix_m: F64 = np.array(noise_m) + echo * self._echo_m
@@ -148,7 +148,9 @@ class Errors:
 
     def velocity_m_s(self, time_s: float) -> F64:
         """(3,), north, east, down: what the estimate of the velocity errs by; 0 down."""
-        north, east = (math.fsum(wave.about(time_s) for wave in waves) for waves in self._velocity)
+        north, east = (
+            math.fsum([wave.about(time_s) for wave in waves]) for waves in self._velocity
+        )
         return np.array([north, east, 0.0])
 
     def gps_accuracy_m(self, time_s: float) -> tuple[float, float]:
@@ -168,7 +170,7 @@ class Errors:
 
     def height_m(self, time_s: float) -> float:
         """By how much lower than at the start the vehicle takes itself to be, where it is."""
-        return math.fsum(wave.at(time_s) for wave in self._height)
+        return math.fsum([wave.at(time_s) for wave in self._height])
 
     def heading_rad(self, time_s: float) -> float:
         """By how much the compass is wrong; the estimator may notice in flight, in one go."""

@@ -39,18 +39,16 @@ class Estimator:
         self._time_s = 0.0
         self._noise_m = noise_m
         self._drift_m: F64 = np.zeros(3)
+        # Noise, what dead reckoning has gathered, jumps it believes: north, east, down.
+        self.error_m: F64 = noise_m
         # It has never been there.
         self._gps_lost_since_s = -math.inf
         self._gps_back_at_s = -math.inf
         self._followed_m: F64 = np.zeros(3)
         self.velocity_error_m_s: F64 = np.zeros(3)
         self._tilt_error_m_s2: F64 = np.zeros(3)
+        self._followed_once = False
         self._rejects_since_s = math.inf
-
-    @property
-    def error_m(self) -> F64:
-        """(3,), north, east, down: noise, what dead reckoning has gathered, jumps it believes."""
-        return self._noise_m + self._drift_m + self._followed_m
 
     @property
     def has_origin(self) -> bool:
@@ -126,7 +124,10 @@ class Estimator:
         """
         self._time_s = time_s
         if has_gps:
-            self._follow(off_m, off_m_s, dt_s)
+            # Mostly there is nothing to follow, and never was.
+            self._followed_once = self._followed_once or bool(off_m.any() or off_m_s.any())
+            if self._followed_once:
+                self._follow(off_m, off_m_s, dt_s)
         else:
             # Without it, gravity tells the tilt.
             self._tilt_error_m_s2 = np.zeros(3)
@@ -141,9 +142,10 @@ class Estimator:
         self._noise_m = self._noise_m * (1.0 - decay) + NOISE_M * draws[:3] * math.sqrt(2.0 * decay)
         if self.has_gps:
             self._drift_m = np.zeros(3)
-            return
-        step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
-        self._drift_m = self._drift_m + step_m * draws[3:6] * (1.0, 1.0, 0.0)
+        else:
+            step_m = DEAD_RECKONING_DRIFT_M * math.sqrt(dt_s)
+            self._drift_m = self._drift_m + step_m * draws[3:6] * (1.0, 1.0, 0.0)
+        self.error_m = self._noise_m + self._drift_m + self._followed_m
 
     def _follow(self, off_m: F64, off_m_s: F64, dt_s: float) -> None:
         """Go after a fix that lies; where it is too far off to be true, wait, then start over."""

@@ -1,6 +1,6 @@
 """PX4's modes, what each needs, and what its failsafe parameters mean."""
 
-from enum import Enum, IntEnum
+from enum import IntEnum, StrEnum
 
 
 class Px4Mode(IntEnum):
@@ -62,7 +62,7 @@ class FailsafeAction(IntEnum):
     STOP_MOTORS = 7
 
 
-class FailsafeCause(Enum):
+class FailsafeCause(StrEnum):
     """Why a failsafe acts."""
 
     OFFBOARD_LOST = "offboard signal lost"

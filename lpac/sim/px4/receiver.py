@@ -1,5 +1,6 @@
 """Ways in which a simulated GPS receiver tells what is not so, and its vehicle does not know."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,12 +32,12 @@ class Receiver:
     _scattered_m: F64 = field(default_factory=_zeros)
     _stuck_at_m: F64 | None = None
 
-    def step(self, dt_s: float, fix_m: F64, rng: np.random.Generator) -> None:
-        """One step of time; `fix_m` (3,) is what it would tell."""
+    def step(self, dt_s: float, fix_m: Callable[[], F64], rng: np.random.Generator) -> None:
+        """One step of time; `fix_m` gives what it would tell, (3,)."""
         if not self.stuck:
             self._stuck_at_m = None
         elif self._stuck_at_m is None:
-            self._stuck_at_m = fix_m
+            self._stuck_at_m = fix_m()
         self._crept_m = self._crept_m + self.creep_m_s * dt_s
         if self.scatter_m:
             self._scattered_m = self.scatter_m * rng.standard_normal(3) * _IN_THE_PLANE

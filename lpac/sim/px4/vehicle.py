@@ -573,7 +573,7 @@ class Px4Vehicle:
         draws = self._rng.standard_normal(10)
         has_gps = not self.gps_lost and SimulatedSensor.GPS not in self.dead_sensors
         has_gps = has_gps and bool(self.parameters["EKF2_GPS_CTRL"])
-        self.receiver.step(dt_s, self._honest_fix_m(), self._rng)
+        self.receiver.step(dt_s, self._honest_fix_m, self._rng)
         off_m = self.gps_jump_m + self.receiver.off_m(self.position_m + self._shared_error_m)
         off_m_s = (self.fix_velocity_m_s - self.velocity_m_s) * (1.0, 1.0, 0.0)
         self.estimator.step(self.time_s, dt_s, has_gps, off_m, off_m_s, draws[:6])

@@ -155,7 +155,7 @@ def test_gusts_and_its_estimate_disturb_a_velocity_that_is_followed() -> None:
 def test_a_velocity_is_estimated_as_badly_as_by_a_real_px4_in_its_own_simulation() -> None:
     """Of one the error was 0.1 to 0.5 m/s rms in flight, at most 0.9 m/s; below 0.1 m/s before."""
     errors_m_s = []
-    for seed in range(20):
+    for seed in range(8):
         vehicle = flying(Errors(seed, seed))
         vehicle.set_mode(Px4Mode.HOLD)
         before = len(vehicle.truth)
@@ -170,7 +170,7 @@ def test_a_velocity_is_estimated_as_badly_as_by_a_real_px4_in_its_own_simulation
 
 
 def test_who_lands_keeps_to_its_place_though_its_velocity_is_wrong() -> None:
-    for seed in range(10):
+    for seed in range(5):
         vehicle = flying(Errors(seed, seed))
         vehicle.set_mode(Px4Mode.LAND)
         fly(vehicle, 3.0)

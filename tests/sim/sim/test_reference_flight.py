@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import pytest
 
 from edge.core import F32, F64
 from edge.core.ports import OdometrySource
@@ -76,9 +75,8 @@ def flown_in_the_library(flown: SimulatedFlight) -> F64:
     return np.array(costs)
 
 
-@pytest.mark.parametrize(("world", "loss"), [(100, 0.0), (101, 0.0), (102, 0.3)])
-def test_the_library_sees_about_the_same_flight(world: int, loss: float) -> None:
-    """60 s of the policy that ships, over worlds that it was neither trained nor chosen on.
+def test_the_library_sees_about_the_same_flight() -> None:
+    """60 s of the policy that ships, over a world that it was neither trained nor chosen on.
 
     The library's raster differs by some 1e-4 from ours, and so, in time, do the flights: in ten of
     them by up to 0.09 of the first cost at some time, and by 0.025 at the end (on average 0.286
@@ -89,10 +87,10 @@ def test_the_library_sees_about_the_same_flight(world: int, loss: float) -> None
         bundle=str(FIELD),
         flown_by=load_bundle(FIELD).id,
         world_set="validation",
-        world=world,
+        world=102,
         set_up="field",
         duration_s=60.0,
-        loss=loss,
+        loss=0.3,
     )
     [(_, flown)] = fly_group((flight,))
     costs = flown_in_the_library(flown)

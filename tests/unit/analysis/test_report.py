@@ -358,6 +358,7 @@ def test_from_the_grounds_log_alone(tmp_path: Path) -> None:
     assert "no log of any robot is here" in note
 
 
+@pytest.mark.usefixtures("sketched")
 def test_without_a_world_there_is_no_cost(tmp_path: Path) -> None:
     Writer((FIRST,)).robots(tmp_path)
     found = examined(tmp_path)
@@ -397,6 +398,7 @@ def test_robots_logs_alone_have_the_sizes_of_the_bundle_they_flew(tmp_path: Path
     assert not [n for n in examined(tmp_path, bundle=SHIPPED).notes if "bundle" in n]
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_world_without_importance_has_no_normalised_cost(tmp_path: Path) -> None:
     writer = Writer((FIRST, SECOND))
     writer.world = "CircularBND 100 100 20 0\n"
@@ -457,6 +459,7 @@ def test_the_swarm_shares_no_curves_colour() -> None:
     assert SWARM not in {colour for colour, _ in CURVES}
 
 
+@pytest.mark.usefixtures("sketched")
 def test_restarts_and_alarms_are_told(tmp_path: Path) -> None:
     writer = Writer((FIRST,))
 
@@ -609,6 +612,7 @@ def at_once(status: RobotStatus, at_s: float) -> RobotStatus:
     return dataclasses.replace(status, state=S.MISSION if at_s == 20.0 else S.IDLE)
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("change", [nowhere, alone, at_once])
 def test_odd_flights_have_a_report_too(
     tmp_path: Path, change: Callable[[RobotStatus, float], RobotStatus]
@@ -658,6 +662,7 @@ def test_what_is_not_understood_is_left_out_and_told(
     assert told[0].startswith(f"robot-1-0001.mcap: {why}") and "left out: 88 of topic" in told[0]
 
 
+@pytest.mark.usefixtures("sketched")
 def test_numbers_that_are_not_finite_are_not_known(tmp_path: Path) -> None:
     writer = Writer((FIRST,))
 
@@ -728,6 +733,7 @@ def test_mistakes_are_one_line(tmp_path: Path, flown: Path) -> None:
     assert "--times 0,x: must be numbers such as 0,20,60" in str(result.exception)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_the_command_prints_the_summary(tmp_path: Path, flown: Path) -> None:
     arguments = ["report", str(flown), "--trial", "t2", "--out", str(tmp_path), "--times", "0"]
     result = CliRunner().invoke(app, arguments)

@@ -23,6 +23,8 @@ from lpac.evaluate.flights import BASELINES
 from lpac.paper.report import LOGS, write_network, write_transfer
 from lpac.sim.experiment import Scenario, fly
 
+pytestmark = pytest.mark.usefixtures("sketched")
+
 MADE_BY = {"command": "lpac paper ..."}
 
 

@@ -78,6 +78,7 @@ def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
         assert (folder / "figures" / f"{figure}.png").stat().st_size > 5_000
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_network_that_sees_what_was_explored_is_trained_alike(tmp_path: Path) -> None:
     channels = MAP_CHANNELS[5]
     config = read(tmp_path, ("[network]\n", f"[network]\nchannels = {list(channels)}\n"))
@@ -91,6 +92,7 @@ def test_a_network_that_sees_what_was_explored_is_trained_alike(tmp_path: Path) 
     assert explored.min() == 0.0 and explored.max() == 1.0
 
 
+@pytest.mark.usefixtures("sketched")
 def test_stopped_anywhere_it_goes_on_and_comes_to_the_same(
     trained: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +119,7 @@ def test_stopped_anywhere_it_goes_on_and_comes_to_the_same(
         assert torch.equal(tensor, weights(folder)[name]), name
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_killed_worker_costs_one_shard(tmp_path: Path) -> None:
     # In worlds of their own shards.
     config = read(tmp_path, ("[2, 3]", "[30, 31]"), ("[0, 1]", "[0, 0]"))
