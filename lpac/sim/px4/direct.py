@@ -44,11 +44,14 @@ class DirectVehicle:
         self._uploaded: tuple[FencePolygon, ...] = ()
         self._dialogue = Dialogue(self._telemetry)
         self._frames = VehicleFrames()
+        # What it told at a time, unless something has come or been said since: a robot asks often.
+        self._told: tuple[float, VehicleState] | None = None
         # Nobody else listens on this link: what the robot does not read costs time alone.
         self._link.silence(self._telemetry.messages)
 
     def step(self, dt_s: float) -> None:
         """Let the vehicle fly on, and hear what it says."""
+        self._told = None
         self.vehicle.step(dt_s)
         now_s = self._clock.monotonic_s()
         for name, fields in self._said(now_s):
@@ -64,10 +67,9 @@ class DirectVehicle:
     def state(self) -> VehicleState:
         """The newest of everything."""
         now_s = self._clock.monotonic_s()
-        return self._telemetry.state(
-            now_s, system_id=self._system_id, result=self._dialogue.result,
-            link_lost=self._frames.lost(now_s), link_twice=self._frames.arrives_twice(now_s),
-        )  # fmt: skip
+        if self._told is None or self._told[0] != now_s:
+            self._told = now_s, self._state(now_s)
+        return self._told[1]
 
     def send(self, setpoint: Setpoint) -> Setpoint | None:
         """Send it once."""
@@ -108,8 +110,15 @@ class DirectVehicle:
 
     # What it sends
 
+    def _state(self, now_s: float) -> VehicleState:
+        return self._telemetry.state(
+            now_s, system_id=self._system_id, result=self._dialogue.result,
+            link_lost=self._frames.lost(now_s), link_twice=self._frames.arrives_twice(now_s),
+        )  # fmt: skip
+
     def _say(self, now_s: float) -> None:
-        for name, fields in self._dialogue.say(now_s, self.state()):
+        self._told = None
+        for name, fields in self._dialogue.say(now_s, self._state(now_s)):
             if name == "REQUEST_EVENT":
                 self._send(request_event(**fields))
             elif name == "PARAM_SET":

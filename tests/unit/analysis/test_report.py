@@ -7,7 +7,6 @@ import json
 import math
 import re
 import shutil
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from html.parser import HTMLParser
@@ -307,6 +306,7 @@ def test_message_ages_are_corrected_and_losses_counted(found: Examined) -> None:
     assert found.notes == ("t1: lasted 10.0 s: no snapshot at 11 s",)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_the_page_holds_everything(tmp_path: Path, found: Examined) -> None:
     html = write(found, tmp_path, (0.0, 5.0, 11.0), lambda *_: None).read_text()
     page = Page(html)
@@ -320,9 +320,7 @@ def test_the_page_holds_everything(tmp_path: Path, found: Examined) -> None:
     common = [tmp_path / name for name in ("repeatability", "costs")]
     for path in common + [tmp_path / trial / name for trial in ("t1", "t2") for name in figures]:
         assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
-        png = path.with_suffix(".png").read_bytes()
-        width, height = struct.unpack(">II", png[16:24])
-        assert png.startswith(b"\x89PNG") and width > 1000 and height > 250
+        assert path.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     summary = json.loads((tmp_path / "report.json").read_text())
     assert summary == json.loads(json.dumps(found.summary()))
 
@@ -594,7 +592,9 @@ def test_nothing_of_a_figure_is_cut(tmp_path: Path) -> None:
         figures.loops(trial),
     ):  # fmt: skip
         save(figure, tmp_path / "figure")
+        assert (tmp_path / "figure.pdf").read_bytes().startswith(b"%PDF")
         pixels = imread(tmp_path / "figure.png")
+        assert pixels.shape[0] > 250 and pixels.shape[1] > 1000
         edges = (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1])
         assert all((edge == 1.0).all() for edge in edges), figure
 
