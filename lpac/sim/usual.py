@@ -47,10 +47,10 @@ def usual_points(scenario: Scenario, bundle_id: str) -> Usual | None:
 def usual_whole(scenario: FleetScenario, bundle_id: str) -> Usual | None:
     """Of the nearest number of robots that was flown; None if nothing like it was."""
     alike = replace(
-        scenario, seed=WHOLE.seed, robots=WHOLE.robots, duration_s=WHOLE.duration_s,
-        secure=WHOLE.secure, transport=WHOLE.transport,
+        WHOLE, seed=scenario.seed, robots=scenario.robots, duration_s=scenario.duration_s,
+        secure=scenario.secure, transport=scenario.transport,
     )  # fmt: skip
-    if alike != WHOLE or scenario.duration_s < WHOLE.duration_s:
+    if alike != scenario or scenario.duration_s < WHOLE.duration_s:
         return None
     return _nearest("whole", scenario.robots, bundle_id)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import error_line, lpac
 from tests.needs import missing
-from tests.process.cli.test_cli import error_line, lpac
 
 NAMES = ("lpac-t1", "lpac-t2")
 

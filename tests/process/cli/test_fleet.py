@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.command import error_line, lpac
 from tests.conftest import ROOT
 from tests.host.fleet.field import lpac_fleet
 from tests.needs import needs
-from tests.process.cli.test_cli import error_line, lpac
 from tests.unit.cli.test_fleet import write_fleet
 
 needs_ssh = needs("ssh")

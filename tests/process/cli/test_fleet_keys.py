@@ -9,8 +9,8 @@ import pytest
 
 from edge.drivers.identity_folder import load_identity
 from edge.identity.card import Role
+from tests.command import error_line, lpac
 from tests.conftest import ROOT
-from tests.process.cli.test_cli import error_line, lpac
 
 
 @pytest.fixture

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from edge.messages.mission import FlightState
+from tests.command import error_line, lpac
 from tests.conftest import ROOT
 from tests.live import FlownFleet, until
-from tests.process.cli.test_cli import error_line, lpac
 from tests.process.ground.conftest import wait_for_snapshot
 from tests.sim.cli.test_mission import write_script
 

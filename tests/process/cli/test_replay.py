@@ -14,8 +14,8 @@ from edge.flight.record import FlightTick, TickReader, TickWriter
 from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.policy import LpacPolicy
+from tests.command import error_line, lpac
 from tests.conftest import SHIPPED
-from tests.process.cli.test_cli import error_line, lpac
 from tests.record_flights import RECORDED
 from tests.unit.policy.test_replay import Messages, fly
 

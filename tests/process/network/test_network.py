@@ -17,8 +17,8 @@ from lpac.network.measure import NetworkFleet
 from lpac.network.middleware import MIDDLEWARES, NOTHING
 from lpac.network.results import MEASURES
 from lpac.network.stations import LOOPBACK
+from tests.command import error_line, lpac
 from tests.conftest import ROOT
-from tests.process.cli.test_cli import error_line, lpac
 
 # What nothing waits for within that time will not come, however busy the machine is.
 PATIENCE_S = 120.0

@@ -12,7 +12,7 @@ import pytest
 
 from lpac.ablate.config import read_ablation
 from lpac.ablate.run import AblationRun
-from tests.process.cli.test_cli import error_line, lpac
+from tests.command import error_line, lpac
 from tests.training import here
 from tests.unit.ablate.test_config import written
 

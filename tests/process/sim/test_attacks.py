@@ -31,9 +31,9 @@ from lpac.sim.fleet.ground import GroundProgram
 from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.processes import Fleet
 from lpac.sim.px4.modes import Px4Mode
+from tests.command import error_line, lpac
 from tests.conftest import SHIPPED
 from tests.flown import QUICK
-from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.fleet_rig import FleetRig, flies_on
 
 pytestmark = pytest.mark.real_time

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.process.cli.test_cli import error_line, lpac
+from tests.command import error_line, lpac
 
 # Of programs, the ground, a position, a battery, and a pilot. The longest first.
 FAULTS = (

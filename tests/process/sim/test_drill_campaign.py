@@ -20,7 +20,7 @@ from lpac.sim.cores import over_cores
 from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.field import DrilledRobots
-from tests.process.cli.test_cli import error_line, lpac
+from tests.command import error_line, lpac
 
 # They soon come down.
 LANDED, GONE = FAULTS["landed"], FAULTS["ground-dies"]

@@ -1,8 +1,8 @@
 """What is broken in the program shows in the drill: each mutation breaks a promise of its fault."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import pytest
@@ -25,11 +25,23 @@ from lpac.sim.drill.field import DrilledRobots
 from lpac.sim.drill.simulated import SimulatedDrill
 from lpac.sim.fleet.layout import FleetScenario, Layout
 from lpac.sim.fleet.robots import SimulatedWatchdog
+from lpac.sim.fleet.simulated import SimulatedFleet
 from tests.conftest import SHIPPED
 
 # Each flies as many robots as it shows with.
 PAIR = 2
 Mutation = Callable[[pytest.MonkeyPatch], None]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def soon() -> Iterator[None]:
+    """Coarser physics; and what a mutation keeps in the air is not waited for as long as else."""
+    with pytest.MonkeyPatch.context() as patch:
+        coarse = partial(SimulatedFleet, vehicle_step_s=0.05)
+        patch.setattr("lpac.sim.drill.simulated.SimulatedFleet", coarse)
+        patch.setattr("lpac.sim.drill.flight._ALL_DOWN_S", 20.0)
+        patch.setattr("lpac.ground.station.commands._LANDING_S", 40.0)
+        yield
 
 
 def swapped(first: ReasonCode, second: ReasonCode) -> Mutation:

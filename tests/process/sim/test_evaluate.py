@@ -22,7 +22,7 @@ from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, 
 from lpac.radio.records import RadioRecord, write_records
 from lpac.sim.cluster import over_ray
 from lpac.sim.ticks import Clocks
-from tests.process.cli.test_cli import error_line, lpac
+from tests.command import error_line, lpac
 
 PLAIN = ("-k", 2, "--duration", 2, "--baseline", "decentralized-cvt-prior")
 

@@ -30,9 +30,9 @@ from lpac.sim.fleet.layout import FleetScenario
 from lpac.sim.fleet.listener import FleetListener
 from lpac.sim.fleet.pilot import PilotFlight
 from lpac.sim.fleet.processes import Fleet, SimulatedFleetError
+from tests.command import error_line, lpac
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
-from tests.process.cli.test_cli import error_line, lpac
 
 ROBOTS = 3
 

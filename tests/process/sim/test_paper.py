@@ -5,7 +5,7 @@ from pathlib import Path
 
 from edge.policy.bundle import load_bundle
 from lpac.cli.options import DEFAULT_BUNDLE
-from tests.process.cli.test_cli import error_line, lpac
+from tests.command import error_line, lpac
 
 
 def test_rates_and_asynchrony_are_flown_and_kept(tmp_path: Path) -> None:

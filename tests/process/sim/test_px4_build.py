@@ -25,8 +25,8 @@ from lpac.sim.px4.world import WorldOrigin
 from lpac.sim.sitl import ordinary
 from lpac.sim.sitl.build import Px4Build, _require_alone
 from lpac.sim.sitl.log import read_setpoints, read_truth
+from tests.command import error_line, lpac
 from tests.conftest import ROOT
-from tests.process.cli.test_cli import error_line, lpac
 from tests.process.sim.test_fleet import launched, pid_of, read_until
 from tests.ulog import HEADER, message
 

@@ -18,8 +18,8 @@ from lpac.sim.cluster import over_ray
 from lpac.train.config import read_config
 from lpac.train.rollout import ShardTask, fly_shard, plan_round
 from lpac.train.run import TrainingRun
+from tests.command import error_line, lpac
 from tests.conftest import SHIPPED
-from tests.process.cli.test_cli import error_line, lpac
 from tests.training import SMALL, here, read, said
 
 # Shards enough to be killed between; and few candidates.

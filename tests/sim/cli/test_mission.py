@@ -1,16 +1,15 @@
 """`lpac mission` and `lpac site` in this process, with grounds and robots on a simulated clock."""
 
 import contextlib
-import io
 import json
 import math
 import re
 import shutil
 import signal
-import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ import pytest
 from edge.messages.codec import decode
 from edge.messages.mission import FlightState, Order, OrderKind
 from edge.messages.topics import ORDER
-from lpac.cli.main import main
 from lpac.ground.procedure import Procedure, Until
 from lpac.ground.station.protocol import (
     CommandReport,
@@ -33,6 +31,7 @@ from lpac.ground.station.protocol import (
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.simulated import SimulatedFleet, SimulatedGround
 from lpac.sim.radio import RadioLink
+from tests.command import called
 from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE, QUICK
 from tests.sim.ground.field import SPARING, Field, FieldRobot
@@ -43,20 +42,6 @@ SCRIPT = ROOT / "docs" / "script.toml"
 # By how much a place that a robot takes itself to be at errs here.
 NOISE_M = 0.5
 PADS_M = ((2.0, 2.0), (6.0, 2.0), (10.0, 2.0))
-
-
-class Done(NamedTuple):
-    """What a command left."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def robots(self) -> dict[str, Any]:
-        """Of --json."""
-        robots: dict[str, Any] = json.loads(self.out)["robots"]
-        return robots
 
 
 class Looking:
@@ -96,34 +81,19 @@ class Commanded:
     def ground(self) -> SimulatedGround:
         return self.fleet.grounds[self.at]
 
-    def lpac(self, *arguments: str | Path) -> Done:
-        """The command, in this process."""
-        out, err = io.StringIO(), io.StringIO()
-        code: int | str | None = 0
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", ["lpac", *map(str, arguments)])
-            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-                try:
-                    main()
-                except SystemExit as stop:
-                    code = stop.code
-        if isinstance(code, str):
-            return Done(1, out.getvalue(), f"{err.getvalue()}{code}\n")
-        return Done(code or 0, out.getvalue(), err.getvalue())
-
-    def do(self, *arguments: str | Path) -> Done:
+    def do(self, *arguments: str | Path) -> "CompletedProcess[str]":
         """The command, which must be done by all."""
-        done = self.lpac(*arguments)
-        assert done.code == 0, done
+        done = called(*arguments)
+        assert done.returncode == 0, done
         return done
 
     def refused(self, *arguments: str | Path) -> str:
         """The line that says why the command was not done."""
-        done = self.lpac(*arguments)
-        assert done.code == 1, done
-        last = done.err.splitlines()[-1]
+        done = called(*arguments)
+        assert done.returncode == 1, done
+        last = done.stderr.splitlines()[-1]
         assert last.startswith("lpac: ")
-        assert "Traceback" not in done.err
+        assert "Traceback" not in done.stderr
         return last.removeprefix("lpac: ")
 
     def stand(self, places_m: Mapping[int, Sequence[float]]) -> None:
@@ -281,7 +251,7 @@ def test_without_origin_nothing_takes_off(stages: Stages, tmp_path: Path) -> Non
 def test_fleet_flies_as_it_is_told(field: Commanded) -> None:
     field.do("mission", "enable")
     done = field.do("mission", "takeoff", "--interval", "0.1", "--json")
-    assert {name: robot["done"] for name, robot in done.robots.items()} == {
+    assert {name: robot["done"] for name, robot in json.loads(done.stdout)["robots"].items()} == {
         "r0": True, "r1": True, "r2": True,
     }  # fmt: skip
     assert "r0, r1, r2 are armed" in field.refused("mission", "world", field.folder / "world.env")
@@ -290,10 +260,10 @@ def test_fleet_flies_as_it_is_told(field: Commanded) -> None:
     assert "armed: carry disarmed robots only" in field.refused("mission", "rehearse")
     assert "r0 is armed: land first" in field.refused("mission", "assign", "--seconds", "0.5")
 
-    done = field.lpac("mission", "disarm", "r1")
-    assert done.code == 1
-    assert re.search(r"r1 +FAILED +in the air: land it first", done.out)
-    assert "disarm: 0 of 1 robot did it; failed: r1" in done.err
+    done = called("mission", "disarm", "r1")
+    assert done.returncode == 1
+    assert re.search(r"r1 +FAILED +in the air: land it first", done.stdout)
+    assert "disarm: 0 of 1 robot did it; failed: r1" in done.stderr
 
     field.do("mission", "start")
     assert field.states() == [_S.MISSION] * 3
@@ -340,10 +310,10 @@ NEAR = ("39.9530", "-75.1648", "0.5")  # not where the field's origin is
 
 def test_origin_is_as_given_or_as_robots_stand(field: Commanded) -> None:
     before = field.robots[0].said.origin
-    far = field.lpac("mission", "origin", "-33.86", "-151.2", "0.5")
-    assert re.search(r"NOTE: robots are up to 1\d+\.\d km from this origin", far.err)
+    far = called("mission", "origin", "-33.86", "-151.2", "0.5")
+    assert re.search(r"NOTE: robots are up to 1\d+\.\d km from this origin", far.stderr)
     # Nor do they take it up.
-    assert far.code == 1 and "0 of 3 robots did it; failed: r0, r1, r2" in far.err
+    assert far.returncode == 1 and "0 of 3 robots did it; failed: r0, r1, r2" in far.stderr
     assert field.robots[0].said.origin == before
     field.do("mission", "origin", *NEAR)
     origin = field.robots[0].said.origin
@@ -351,14 +321,16 @@ def test_origin_is_as_given_or_as_robots_stand(field: Commanded) -> None:
     assert (origin.latitude_deg, origin.longitude_deg) == (39.9530, -75.1648)
 
     done = field.do("mission", "origin", "--from", "r1", "--seconds", "0.5")
-    assert re.search(r"r1 stands within 0\.\d\d m, its heading is within 0\.\d deg", done.err)
+    assert re.search(r"r1 stands within 0\.\d\d m, its heading is within 0\.\d deg", done.stderr)
     origin = field.robots[0].said.origin
     assert origin is not None
     assert origin.heading_deg == pytest.approx(ORIGIN.heading_deg, abs=0.1)
 
     # r2 stands 4 m to the right of r1.
     done = field.do("mission", "origin", "--from", "r1", "--toward", "r2", "--seconds", "0.5")
-    told = re.search(r"(.\..) m apart: 1 m of GPS error turns the heading by (\d+) deg", done.err)
+    told = re.search(
+        r"(.\..) m apart: 1 m of GPS error turns the heading by (\d+) deg", done.stderr
+    )
     assert told is not None
     assert float(told[1]) == pytest.approx(4.0, abs=NOISE_M)
     turned_deg = math.degrees(math.atan2(1.0, float(told[1])))
@@ -394,7 +366,7 @@ def test_world_is_parsed_and_sent(field: Commanded, tmp_path: Path) -> None:
     done = field.do("mission", "world", file)
     world_id = field.robots[0].said.world_id
     assert world_id != before
-    assert f"world: small.env, {world_id}" in done.err
+    assert f"world: small.env, {world_id}" in done.stderr
 
 
 def test_robots_get_the_slots_of_the_pads_where_they_stand(field: Commanded) -> None:
@@ -405,7 +377,7 @@ def test_robots_get_the_slots_of_the_pads_where_they_stand(field: Commanded) -> 
 
     field.stand({0: PADS_M[1], 1: PADS_M[0]})
     done = field.do("mission", "assign", "--seconds", "0.5", "--json")
-    pads = {name: robot["pad"] for name, robot in done.robots.items()}
+    pads = {name: robot["pad"] for name, robot in json.loads(done.stdout)["robots"].items()}
     assert pads == {"r0": 1, "r1": 0, "r2": 2}
     assert slots() == [1, 0, 2]
 
@@ -434,7 +406,7 @@ def test_site_is_saved_and_used_again(field: Commanded) -> None:
     field.stand({i: (6.0 + 4.0 * i, 8.0) for i in range(3)})
     field.do("mission", "fence", "set", "0,0", "30,0", "30,30", "0,30")
     done = field.do(*park)
-    slots = json.loads(done.out)["slots"]
+    slots = json.loads(done.stdout)["slots"]
     saved_m = [slot["pad_m"] for slot in slots]
     for pad_m, place_m in zip(saved_m, [(6.0, 8.0), (10.0, 8.0), (14.0, 8.0)], strict=True):
         assert math.dist(pad_m, place_m) < NOISE_M
@@ -460,11 +432,11 @@ def test_site_is_saved_and_used_again(field: Commanded) -> None:
         assert list(robot.said.landing_point_m) == slot["landing_point_m"]
     (field.folder / "sites" / "torn.toml").write_text("[origin")
     done = field.do("site", "list")
-    assert re.search(r"torn +unreadable *\n", done.out)
-    assert "torn.toml: no TOML" in done.err
-    assert re.search(r"park .* used last *\n", done.out)
-    assert re.search(r"yard .* 3 +\n", done.out)
-    assert "pads of site park" in field.do("mission", "assign", "--seconds", "0.5").err
+    assert re.search(r"torn +unreadable *\n", done.stdout)
+    assert "torn.toml: no TOML" in done.stderr
+    assert re.search(r"park .* used last *\n", done.stdout)
+    assert re.search(r"yard .* 3 +\n", done.stdout)
+    assert "pads of site park" in field.do("mission", "assign", "--seconds", "0.5").stderr
     assert "yard has another origin than the fleet" in field.refused(
         "mission", "assign", "--site", "yard"
     )
@@ -480,10 +452,10 @@ def test_rehearsal_shows_the_command_from_the_nose(field: Commanded) -> None:
     assert re.search(
         r"r1: x [56]\.. m, y [12]\.. m, nose (0|360) deg, inside the fence by [34]\.. m, "
         r"commanded: \S \d\.\d m/s, [a-z-]+ \d+ deg( left| right)?\n",
-        done.out,
+        done.stdout,
     )
     done = field.do("mission", "rehearse", "--robots", "r1", "--seconds", "0.5", "--json")
-    seen = json.loads(done.out.splitlines()[0])
+    seen = json.loads(done.stdout.splitlines()[0])
     assert math.dist(seen["position_m"], PADS_M[1]) < NOISE_M
     assert seen["commanded"]["arrow"] in "↑↗→↘↓↙←↖"
 
@@ -518,14 +490,14 @@ def test_example_script_is_flown(field: Commanded) -> None:
     field.do("mission", "again", "paper-4")
     script = write_script(field.folder, 3.0)
     done = field.do("mission", "run", script, "--yes", "--json")
-    assert "left the mission" not in done.err
-    lines = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in done.err.splitlines()]
+    assert "left the mission" not in done.stderr
+    lines = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in done.stderr.splitlines()]
     in_trial = ["reset maps", "preflight, 60 s", "takeoff", "start", "mission, 3 s",
                 "r2 is given to a pilot", "r2 is back in the mission", "return"]  # fmt: skip
     steps = [line.partition(": ")[2] if line.startswith("trial") else line for line in lines]
     assert [step for step in steps if step in in_trial] == [*in_trial, *in_trial]
     assert steps[0] == "origin"
-    *ended, outcome = map(json.loads, done.out.splitlines())
+    *ended, outcome = map(json.loads, done.stdout.splitlines())
     assert ended[-1]["step"] == "trial 2 of 2: return" and ended[-1]["duration_s"] > 0.0
     assert outcome == {"script": str(script), "done": True, "problem": None}
     assert lines[-1].endswith("script.toml: done")
@@ -539,11 +511,13 @@ def test_interrupted_script_holds_the_fleet(field: Commanded) -> None:
 
     script = write_script(field.folder, 600.0, **{"at_s = 1.5": "at_s = 599.5"})
     field.once(lambda: field.states() == [_S.MISSION, _S.MISSION, _S.PILOT], interrupt)
-    done = field.lpac("mission", "run", script, "--yes")
-    assert done.code == 130
+    done = called("mission", "run", script, "--yes")
+    assert done.returncode == 130
     assert field.states()[:2] == [_S.HOLD, _S.HOLD]
-    assert "interrupted; " in done.err
-    assert "next `lpac mission land`, `lpac mission return`, or `lpac mission resume`" in done.err
+    assert "interrupted; " in done.stderr
+    assert (
+        "next `lpac mission land`, `lpac mission return`, or `lpac mission resume`" in done.stderr
+    )
 
 
 def test_script_starts_again_who_holds_by_itself_and_gives_way_to_people(field: Commanded) -> None:
@@ -563,10 +537,10 @@ def test_script_starts_again_who_holds_by_itself_and_gives_way_to_people(field: 
         field.ground.node.begin(SafetyCommand("hold"))
 
     field.once(lambda: field.states() == [_S.MISSION] * 3, hang)
-    done = field.lpac("mission", "run", script, "--yes")
-    assert done.code == 1
-    assert re.search(r"r0 left the mission: hold: control was silent for \d\.\d s", done.err)
-    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in done.err
+    done = called("mission", "run", script, "--yes")
+    assert done.returncode == 1
+    assert re.search(r"r0 left the mission: hold: control was silent for \d\.\d s", done.stderr)
+    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in done.stderr
     field.field.until(lambda: field.states() == [_S.HOLD] * 3)
 
 
@@ -607,10 +581,10 @@ def test_hold_is_the_operators_also_while_the_script_starts_a_robot(field: Comma
 
     field.hears(field.robots[2], heard)
     field.once(starts, lambda: field.ground.node.begin(SafetyCommand("hold")))
-    done = field.lpac("mission", "run", write_script(field.folder, 600.0), "--yes")
-    assert done.code == 1
-    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in done.err
-    assert "told to hold" not in done.err
+    done = called("mission", "run", write_script(field.folder, 600.0), "--yes")
+    assert done.returncode == 1
+    assert "mission (steps[2]): alice commands hold: the fleet is theirs" in done.stderr
+    assert "told to hold" not in done.stderr
 
 
 def test_script_says_what_is_missing(field: Commanded) -> None:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from edge.messages.mission import FlightState, Place
+from edge.messages.mission import FlightState, Place, world_id
 from lpac.ground.station.protocol import (
     Enable,
     NextTrial,
@@ -14,6 +14,7 @@ from lpac.ground.station.protocol import (
     ResultCode,
     Resume,
     RobotCommand,
+    RobotResult,
     SafetyCommand,
     SetFence,
     SetOrigin,
@@ -408,3 +409,28 @@ def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.Monke
     assert hold.report is not None
     assert problem(hold.report) is ProblemCode.DEFECT
     field.done(SafetyCommand("land", wait=True))
+
+
+def test_what_is_done_when() -> None:
+    assert problem(a_field(1).do(TAKEOFF)) is ProblemCode.NO_ORIGIN
+    field = a_field(3, "ready")
+    report = field.done(TAKEOFF)
+    assert report.results[0] == RobotResult("r0", ResultCode.DONE, "at its height, 5 m")
+    field.done(Start())
+    assert problem(field.do(SetWorld(OTHER_WORLD, "w.env"))) is ProblemCode.ARMED
+    field.done(RobotCommand("pilot", ("r1",)))
+    assert field.each_state() == [_S.MISSION, _S.PILOT, _S.MISSION]
+    field.done(RobotCommand("rejoin", ("r1",)))
+    assert field.each_state()[1] is _S.HOLD
+
+
+def test_who_joins_late_has_the_state() -> None:
+    field = a_field(3)
+    late = field.robots[2].program
+    late.stop()
+    field.run(5.0)
+    assert not_done(field.do(SetOrigin(ORIGIN))) == {"r2": ResultCode.NOT_HEARD}
+    assert not_done(field.do(SetWorld(OTHER_WORLD, "w.env"))) == {"r2": ResultCode.NOT_HEARD}
+    late.start()
+    field.until(lambda: late.status and late.status.origin == ORIGIN)
+    field.until(lambda: field.robots[2].said.world_id == world_id(OTHER_WORLD))

@@ -55,6 +55,8 @@ def test_only_flights_like_those_that_were_flown_are_compared() -> None:
     assert usual_whole(replace(whole, errors=False), BUNDLE_ID) is None
     assert usual_whole(replace(whole, duration_s=20.0), BUNDLE_ID) is None
     assert usual_whole(replace(whole, random_feature_count=3), BUNDLE_ID) is None
+    pads_m = tuple((4.0 * i, 4.0) for i in range(4))
+    assert usual_whole(replace(whole, pads_m=pads_m), BUNDLE_ID) is None
 
 
 @pytest.mark.parametrize(
