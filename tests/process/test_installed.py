@@ -1,4 +1,4 @@
-"""The wheel in an environment of its own, used from a folder that is not this repository."""
+"""The wheel: what is in it, and its use in an environment of its own, from another folder."""
 
 import os
 import signal
@@ -6,31 +6,40 @@ import subprocess
 import sys
 import sysconfig
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
+from lpac.cli.options import DEFAULT_BUNDLE
 from tests.conftest import ROOT, SHIPPED
 
 PATIENCE_S = 60.0
 LOADED_FROM_HERE = "raise SystemExit('a folder of the working directory was imported')"
 
 
+PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+
+
 @pytest.fixture(scope="module")
-def lpac(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`lpac` of the wheel; it shares this environment's packages, not its editable install."""
-    folder = tmp_path_factory.mktemp("installed")
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
     options = ["--no-deps", "--no-build-isolation"]
-    subprocess.run([*pip, "wheel", *options, "-w", folder, ROOT], check=True, cwd=folder)
-    (wheel,) = folder.glob("lpac_edge-*.whl")
-    environment = folder / "venv"
+    subprocess.run([*PIP, "wheel", *options, "-w", folder, ROOT], check=True, cwd=folder)
+    (built,) = folder.glob("lpac_edge-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def lpac(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """`lpac` of the wheel; it shares this environment's packages, not its editable install."""
+    environment = tmp_path_factory.mktemp("installed") / "venv"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", environment], check=True)
     python = environment / "bin" / "python"
     subprocess.run(
-        [*pip, "--python", python, "install", "--no-deps", "--no-index", wheel], check=True
+        [*PIP, "--python", python, "install", "--no-deps", "--no-index", wheel], check=True
     )
     (site,) = environment.glob("lib/python*/site-packages")
     # A folder that a .pth file names has its own .pth files, the editable install's, left unread.
@@ -58,6 +67,20 @@ def environment(folder: Path) -> dict[str, str]:
     """Without this repository; the ground's socket is in the folder."""
     kept = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     return kept | {"XDG_RUNTIME_DIR": str(folder)}
+
+
+def test_the_wheel_holds_everything_below_three_names(wheel: Path) -> None:
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert {name.split("/")[0] for name in names} == {"edge", "export", "lpac"}
+    made = {path for part in ("edge", "export", "lpac") for path in (ROOT / part).rglob("*")}
+    for path in made:
+        if path.is_file() and "__pycache__" not in path.parts:
+            assert str(path.relative_to(ROOT)) in names
+    shipped = {name.removeprefix("lpac/_shipped/") for name in names if "/_shipped/" in name}
+    assert shipped == {
+        *(str(path.relative_to(ROOT)) for path in DEFAULT_BUNDLE.iterdir()),
+        *(f"systemd/{path.name}" for path in (ROOT / "systemd").iterdir()),
+    }
 
 
 def test_the_policy_is_found(lpac: Path, folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from importlib import metadata
 from typing import Any
 
@@ -59,3 +60,12 @@ def test_nothing_else_sends_people_to_an_index() -> None:
     told = re.compile(rb"pip install '?lpac[-_]edge(\[[\w,]*\])?'?(?! @|` finds)")
     found = {path for path in TEXTS if path.is_file() and told.search(path.read_bytes())}
     assert found == set()
+
+
+def test_a_robot_installs_nothing_that_it_does_not_need() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {re.match(r"[\w-]+", requirement)[0] for requirement in project["dependencies"]}  # type: ignore[index]
+    assert names == {
+        "eclipse-zenoh", "geographiclib", "mavsdk", "mcap", "msgspec", "numpy", "onnxruntime",
+        "pynacl", "structlog", "typer", "zstandard",
+    }  # fmt: skip

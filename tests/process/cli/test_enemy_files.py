@@ -11,9 +11,9 @@ import subprocess
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -30,38 +30,61 @@ GIGABYTE = 10**9
 BRACKETS = b"[" * 100_000
 
 
-# The command, which says at its end how much memory it had at most, kB. What draws figures takes
-# longer to load than a refusal may.
-COMMAND = """
-import atexit, re, sys
+# Commands in one process, what they printed, and how much memory that had at most, kB. What draws
+# figures takes longer to load than a refusal may.
+COMMANDS = """
+import contextlib, io, json, re, sys
 from pathlib import Path
-most = Path(sys.argv.pop(1))
-known = re.compile(r"VmHWM:\\s+(\\d+) kB")
-atexit.register(lambda: most.write_text(known.search(Path("/proc/self/status").read_text())[1]))
-atexit.register(lambda: None if "matplotlib" not in sys.modules else print("matplotlib is loaded"))
 from lpac.cli.main import main
-main()
+ended = []
+for sys.argv in json.loads(sys.argv[1]):
+    out, err = io.StringIO(), io.StringIO()
+    code = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+    if isinstance(code, str):
+        err.write(code)
+        code = 1
+    ended.append((code, out.getvalue(), err.getvalue()))
+most = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())
+print(json.dumps([ended, int(most[1]), "matplotlib" in sys.modules]))
 """
 
 
-def lpac(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """The command has taken little memory, and has loaded nothing that draws."""
-    most_kb = folder / "most-kB"
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def lpac(*commands: Sequence[object]) -> list[Ended]:
+    """The commands, one after another, take little memory, and load nothing that draws."""
+    typed = [["lpac", *map(str, command)] for command in commands]
     done = subprocess.run(
-        [sys.executable, "-c", COMMAND, str(most_kb), *map(str, arguments)],
+        [sys.executable, "-c", COMMANDS, json.dumps(typed)],
         cwd=ROOT, capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"},
     )  # fmt: skip
-    assert int(most_kb.read_text()) * 1024 < MOST_BYTES
-    assert "matplotlib is loaded" not in done.stdout
-    return done
+    assert (done.returncode, done.stderr) == (0, "")
+    ended, most_kb, draws = json.loads(done.stdout)
+    assert most_kb * 1024 < MOST_BYTES
+    assert not draws
+    return [Ended(*each) for each in ended]
 
 
-def refused(folder: Path, *arguments: object) -> str:
+def refused(*command: object) -> str:
     """The one line that the command leaves."""
-    done = lpac(folder, *arguments)
-    assert done.returncode == 1, done.stderr
-    (line,) = done.stderr.strip().splitlines()
+    return line_of(*lpac(command))
+
+
+def line_of(ended: Ended) -> str:
+    assert ended.code == 1, ended
+    (line,) = ended.err.strip().splitlines()
     assert line.startswith("lpac: ") and "defect" not in line
     return line
 
@@ -93,9 +116,7 @@ def test_archives_that_unpack_to_gigabytes(tmp_path: Path) -> None:
     path = tmp_path / "bundle.zip"
     path.write_bytes(zip_of("manifest.json", GIGABYTE, zipfile.ZIP_DEFLATED))
     assert path.stat().st_size < 2e6
-    assert "bundle.zip: has 1000 MB; a bundle at most 34" in refused(
-        tmp_path, "bundle", "verify", path
-    )
+    assert "bundle.zip: has 1000 MB; a bundle at most 34" in refused("bundle", "verify", path)
 
 
 def test_a_file_of_gigabytes_is_not_read(tmp_path: Path) -> None:
@@ -107,16 +128,16 @@ def test_a_file_of_gigabytes_is_not_read(tmp_path: Path) -> None:
         with (folder / name).open("wb") as file:
             file.truncate(4 * GIGABYTE)
         path = folder / name if name == "bundle.zip" else folder
-        assert "has 4000 MB; a bundle at most 34" in refused(tmp_path, "bundle", "verify", path)
+        assert "has 4000 MB; a bundle at most 34" in refused("bundle", "verify", path)
 
 
 @pytest.mark.parametrize("text", [BRACKETS, b'{"a":' * 100_000, b" " * 10**7])
 def test_manifests_of_brackets(tmp_path: Path, text: bytes) -> None:
     (tmp_path / "manifest.json").write_bytes(text)
     (tmp_path / "bundle.id").write_text("")
-    refused(tmp_path.parent, "bundle", "verify", tmp_path)
+    refused("bundle", "verify", tmp_path)
     (tmp_path / "bundle.id").write_text(f"{hashlib.sha256(text).hexdigest()}\n")
-    line = refused(tmp_path.parent, "bundle", "verify", tmp_path)
+    line = refused("bundle", "verify", tmp_path)
     assert "manifest.json is not JSON" in line or "manifest.json has 10000000 bytes" in line
 
 
@@ -128,7 +149,7 @@ def test_golden_outputs_that_unpack_to_gigabytes(tmp_path: Path, golden: bytes) 
     bundle = with_golden(load_bundle(SHIPPED), golden)
     for name, content in bundle.files.items():
         (tmp_path / name).write_bytes(content)
-    assert "golden.npz: " in refused(tmp_path.parent, "bundle", "verify", tmp_path)
+    assert "golden.npz: " in refused("bundle", "verify", tmp_path)
 
 
 def chunk(content: bytes, stated: int | None = None, name: bytes = b"zstd") -> bytes:
@@ -208,20 +229,19 @@ LOGS: dict[str, Callable[[Path], None]] = {
 
 @pytest.mark.parametrize("name", LOGS)
 def test_logs(tmp_path: Path, name: str) -> None:
+    """Nothing is made of them, and they are listed all the same."""
     folder = tmp_path / "logs"
     folder.mkdir()
     LOGS[name](folder / "robot-0-0007.mcap")
-    refused(tmp_path, "replay", folder)
-    refused(tmp_path, "report", folder, "--out", tmp_path / "report")
-
-
-@pytest.mark.parametrize("name", LOGS)
-def test_logs_are_listed_all_the_same(tmp_path: Path, name: str) -> None:
-    LOGS[name](tmp_path / "robot-0-0007.mcap")
-    result = lpac(tmp_path, "log", "trials", tmp_path, "--json")
-    assert result.returncode == 0
-    json.loads(result.stdout)
-    assert all(line.startswith("lpac: ") for line in result.stderr.splitlines())
+    replayed, reported, listed = lpac(
+        ("replay", folder), ("report", folder, "--out", tmp_path / "report"),
+        ("log", "trials", folder, "--json"),
+    )  # fmt: skip
+    line_of(replayed)
+    line_of(reported)
+    assert listed.code == 0
+    json.loads(listed.out)
+    assert all(line.startswith("lpac: ") for line in listed.err.splitlines())
 
 
 def test_a_log_whose_writer_was_stopped_for_long_is_whole(tmp_path: Path) -> None:

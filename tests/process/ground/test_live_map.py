@@ -432,7 +432,20 @@ def set_an_origin_that_is_missed(seen: Opened, fleet: str) -> None:
     seen.page.wait_for_selector(f"#origin >> text={ORIGIN.latitude_deg:.5f}")
 
 
-def test_a_flight_by_clicks(few: FlownFleet) -> None:
+def take_the_command_back(seen: Opened, few: FlownFleet, runtime: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(runtime))
+        with lpac("ground", "--fleet", str(few.fleet_toml), "--name", "bob"):
+            wait_for_snapshot(few.name)
+            assert command(few.name, TakeCommand()).done
+            seen.act("command")
+            seen.page.wait_for_selector("#ask >> text=Take the command from bob?")
+            seen.page.click("#ask-yes")
+            seen.page.wait_for_selector("#commander >> text=alice")
+            seen.page.wait_for_selector("#command", state="hidden")
+
+
+def test_a_flight_by_clicks(few: FlownFleet, short_path: Path) -> None:
     with (
         lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"),
         live_map(few.fleet_toml, "--operate") as address,
@@ -490,21 +503,7 @@ def test_a_flight_by_clicks(few: FlownFleet) -> None:
         seen.wait_for_states({"r0": "hold", "r1": "hold"})
         seen.act("land", sure=True)
         seen.wait_for_states({"r0": "landed", "r1": "landed"})
-        check_innocence(seen)
-
-
-def test_a_page_without_a_ground(few: FlownFleet) -> None:
-    """It says what is missing and what to do, and goes on by itself."""
-    with (
-        live_map(few.fleet_toml) as address,
-        opened(address, shows="#banner >> text=no ground station runs") as seen,
-    ):
-        banner = seen.page.inner_text("#banner")
-        assert "start `lpac ground`" in banner and "nothing to show" in banner
-        assert seen.page.inner_text("#link") == "no ground"
-        with lpac("ground", "--fleet", str(few.fleet_toml), "--name", "alice"):
-            seen.page.wait_for_selector("#robots tr[data-robot]")
-            seen.page.wait_for_selector("#banner", state="hidden")
+        take_the_command_back(seen, few, short_path)
         check_innocence(seen)
 
 
@@ -530,15 +529,24 @@ OVER_ROBOTS = """async () => {
     canvas.dispatchEvent(new PointerEvent("pointermove", { clientX, clientY }));
     return canvas.classList.contains("over");
   };
+  // In any square of 24 px that is found there is a point of a grid of 16 px.
+  const near = new Map();
+  for (let x = left; x < right; x += 16) {
+    for (let y = top; y < bottom; y += 16) {
+      if (!finds(x, y)) continue;
+      for (let dx = -12; dx <= 12; dx += 4) {
+        for (let dy = -12; dy <= 12; dy += 4) near.set(`${x + dx} ${y + dy}`, [x + dx, y + dy]);
+      }
+    }
+  }
   let points = 0;
   const over = new Set();
-  for (let x = left; x < right; x += 4) {
-    for (let y = top; y < bottom; y += 4) {
-      if (![-12, 12].every((dx) => [-12, 12].every((dy) => finds(x + dx, y + dy)))) continue;
-      points++;
-      const element = document.elementFromPoint(x, y);
-      if (element !== canvas) over.add(element.closest("[id]").id);
-    }
+  for (const [x, y] of near.values()) {
+    if (x < left || x >= right || y < top || y >= bottom) continue;
+    if (![-12, 12].every((dx) => [-12, 12].every((dy) => finds(x + dx, y + dy)))) continue;
+    points++;
+    const element = document.elementFromPoint(x, y);
+    if (element !== canvas) over.add(element.closest("[id]").id);
   }
   return [points, [...over]];
 }"""
@@ -573,34 +581,19 @@ def test_nothing_covers_a_robot(few: FlownFleet) -> None:
     few.says |= said
 
 
-def test_the_command_is_taken_by_a_click(few: FlownFleet, short_path: Path) -> None:
-    ground = "ground", "--fleet", str(few.fleet_toml), "--name"
-    with (
-        lpac(*ground, "alice"),
-        live_map(few.fleet_toml, "--operate") as address,
-        opened(address) as seen,
-    ):
-        page = seen.page
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("XDG_RUNTIME_DIR", str(short_path))
-            with lpac(*ground, "bob"):
-                wait_for_snapshot(few.name)
-                assert command(few.name, TakeCommand()).done
-                seen.act("command")
-                page.wait_for_selector("#ask >> text=Take the command from bob?")
-                page.click("#ask-yes")
-                page.wait_for_selector("#commander >> text=alice")
-                page.wait_for_selector("#command", state="hidden")
-        check_innocence(seen)
-
-
 def test_a_page_that_observes(few: FlownFleet) -> None:
-    """It has nothing to command with; and it comes back by itself when the ground does."""
+    """It has nothing to command with, says what is missing, and goes on when the ground does."""
     with live_map(few.fleet_toml) as address, ExitStack() as first:
         ground = "ground", "--fleet", str(few.fleet_toml), "--name", "alice"
-        first.enter_context(lpac(*ground))
-        with opened(address, theme="dark") as seen:
+        no_ground = "#banner >> text=no ground station runs"
+        with opened(address, theme="dark", shows=no_ground) as seen:
             page = seen.page
+            banner = page.inner_text("#banner")
+            assert "start `lpac ground`" in banner and "nothing to show" in banner
+            assert page.inner_text("#link") == "no ground"
+            first.enter_context(lpac(*ground))
+            page.wait_for_selector("#robots tr[data-robot]")
+            page.wait_for_selector("#banner", state="hidden")
             assert page.is_hidden("#bar")
             assert "lpac mission hold" in page.inner_text("#observing")
             page.keyboard.press("h")

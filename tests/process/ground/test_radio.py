@@ -4,6 +4,7 @@ import json
 import os
 import re
 import subprocess
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from lpac.sim.fleet.robots import OpenLink, SimulatedRobot
 from lpac.sim.radio import Subscriptions
 from tests.host.fleet.field import lpac_fleet
 from tests.live import ORIGIN, FlownFleet
-from tests.process.ground.conftest import GroundStation, NewStation, all_heard
+from tests.process.ground.conftest import GroundStation, all_heard
 
 NAMES = ("r0", "r1", "r2")
 
@@ -47,11 +48,36 @@ class _ThinLink:
         self._link.publish(topic, data)
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[ThinAir]:
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ThinAir]:
     """Three robots r0, r1, r2, and r3, a spare."""
-    with ThinAir(tmp_path, 3, spares=1) as running:
+    with ThinAir(tmp_path_factory.mktemp("air"), 3, spares=1) as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def deaf(fleet: ThinAir) -> Iterator[GroundStation]:
+    """Their ground, before there is an origin."""
+    # A socket's path must be short.
+    with tempfile.TemporaryDirectory(prefix="lpac-") as runtime:
+        log = fleet.folder / "ground.log"
+        station = GroundStation(fleet.fleet_toml, Path(runtime), "alice", log)
+        station.start()
+        try:
+            station.wait_for(all_heard)
+            yield station
+        finally:
+            station.kill()
+
+
+@pytest.fixture(scope="module")
+def station(deaf: GroundStation) -> GroundStation:
+    """Their ground, when robots know where they are."""
+    assert deaf.command(SetOrigin(ORIGIN)).done
+    deaf.wait_for(
+        lambda p: all(r.status and len(r.status.neighbour_messages) == 3 for r in p.robots)
+    )
+    return deaf
 
 
 Answer = subprocess.CompletedProcess[str]
@@ -71,23 +97,10 @@ def told(answer: Answer) -> dict[str, Any]:
     return found
 
 
-def listening(fleet: FlownFleet, new_station: NewStation) -> GroundStation:
-    """A ground whose robots know where they are."""
-    station = new_station(fleet.fleet_toml)
-    station.wait_for(all_heard)
-    assert station.command(SetOrigin(ORIGIN)).done
-    station.wait_for(
-        lambda p: all(r.status and len(r.status.neighbour_messages) == 3 for r in p.robots)
-    )
-    return station
-
-
 def test_without_an_origin_the_operator_is_told_what_to_do_first(
-    fleet: ThinAir, new_station: NewStation
+    fleet: ThinAir, deaf: GroundStation
 ) -> None:
-    station = new_station(fleet.fleet_toml)
-    station.wait_for(all_heard)
-    answer = ask(station, fleet)
+    answer = ask(deaf, fleet)
     assert (answer.returncode, answer.stdout) == (1, "")
     assert answer.stderr.splitlines()[-1] == (
         "lpac: radio: r0, r1, r2: no mission origin, and so no position to speak of: first "
@@ -102,9 +115,8 @@ def test_without_a_ground_it_says_so(fleet: ThinAir, tmp_path: Path) -> None:
 
 
 def test_idle_robots_on_the_ground_speak_as_in_a_mission(
-    fleet: ThinAir, new_station: NewStation, tmp_path: Path
+    fleet: ThinAir, station: GroundStation, tmp_path: Path
 ) -> None:
-    station = listening(fleet, new_station)
     records = tmp_path / "radio.jsonl"
     answer = ask(
         station, fleet, "--seconds", 12, "--json", "--record", records, "--out", tmp_path / "out"
@@ -133,10 +145,10 @@ def test_idle_robots_on_the_ground_speak_as_in_a_mission(
     assert (tmp_path / "out" / "radio.png").stat().st_size > 10_000
 
 
-def test_who_is_heard_badly_is_named(fleet: ThinAir, new_station: NewStation) -> None:
-    station = listening(fleet, new_station)
+def test_who_is_heard_badly_is_named(fleet: ThinAir, station: GroundStation) -> None:
     fleet.muffled = frozenset({1})
     answer = ask(station, fleet, "--seconds", 10)
+    fleet.muffled = frozenset()
     assert answer.returncode == 1
     last = answer.stderr.splitlines()[-1]
     assert last.startswith("lpac: radio: the others hear ") and " of r1" in last
@@ -166,12 +178,11 @@ esac
 
 
 @pytest.fixture
-def computers(fleet: ThinAir, tmp_path: Path) -> str:
+def computers(fleet: ThinAir, tmp_path: Path) -> Iterator[str]:
     """The PATH with which robots are such computers."""
+    before = fleet.fleet_toml.read_text()
     text = re.sub(
-        r'host = "r(\d)\.invalid"',
-        lambda found: f'host = "127.0.0.{int(found[1]) + 1}"',
-        fleet.fleet_toml.read_text(),
+        r'host = "r(\d)\.invalid"', lambda found: f'host = "127.0.0.{int(found[1]) + 1}"', before
     )
     fleet.fleet_toml.write_text(text)
     folder = tmp_path / "programs"
@@ -180,13 +191,13 @@ def computers(fleet: ThinAir, tmp_path: Path) -> str:
         program = folder / name
         program.write_text(f"#!/bin/sh\n{script}")
         program.chmod(0o755)
-    return f"{folder}:{os.environ['PATH']}"
+    yield f"{folder}:{os.environ['PATH']}"
+    fleet.fleet_toml.write_text(before)
 
 
 def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
-    fleet: ThinAir, new_station: NewStation, computers: str
+    fleet: ThinAir, station: GroundStation, computers: str
 ) -> None:
-    station = listening(fleet, new_station)
     answer = ask(station, fleet, "--seconds", 10, "--json", path=computers)
     found = told(answer)
     for robot in found["robots"].values():
@@ -205,9 +216,8 @@ def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
 
 
 def test_a_bulk_stream_that_breaks_off_is_told(
-    fleet: ThinAir, new_station: NewStation, computers: str
+    fleet: ThinAir, station: GroundStation, computers: str
 ) -> None:
-    station = listening(fleet, new_station)
     ssh = Path(computers.partition(":")[0], "ssh")
     ssh.write_text("#!/bin/sh\necho 'ssh: connect: Connection refused' >&2\nexit 255\n")
     answer = ask(station, fleet, "--seconds", 10, "--load", path=computers)
@@ -218,9 +228,9 @@ def test_a_bulk_stream_that_breaks_off_is_told(
 
 
 def test_robots_of_a_simulated_fleet_have_no_computer_to_load_the_radio_from(
-    fleet: ThinAir, new_station: NewStation
+    fleet: ThinAir, station: GroundStation
 ) -> None:
-    answer = ask(listening(fleet, new_station), fleet, "--load")
+    answer = ask(station, fleet, "--load")
     assert answer.returncode == 1
     assert answer.stderr.splitlines() == [
         "lpac: --load: the robots are no computers that could send a bulk stream"

@@ -24,6 +24,7 @@ from lpac.ground.station.protocol import (
     Start,
     Takeoff,
 )
+from tests.command import called
 from tests.conftest import ROOT
 from tests.live import ORIGIN, FlownFleet
 from tests.process.ground.conftest import PATIENCE_S, all_heard, wait_for_snapshot
@@ -158,12 +159,11 @@ def assert_costs_are_of_the_last_statuses(entries: list[tuple[str, float, dict[s
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
-    with FlownFleet(tmp_path, 1) as fleet:
-        recorder = Recorder(fleet.fleet_toml)
-        with recorder.process:
-            recorder.wait_for("waiting for it")
-            recorder.process.send_signal(number)
-            assert recorder.end() == 0
+    recorder = Recorder(FlownFleet(tmp_path, 1).fleet_toml)  # which does not run
+    with recorder.process:
+        recorder.wait_for("waiting for it")
+        recorder.process.send_signal(number)
+        assert recorder.end() == 0
     (path,) = (tmp_path / "logs").iterdir()
     assert path.read_bytes().endswith(MAGIC)
 
@@ -178,14 +178,6 @@ def test_it_ends_in_order(tmp_path: Path, number: signal.Signals) -> None:
 def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path, below: str, why: str) -> None:
     file = tmp_path / "file"
     file.write_text("")
-    with FlownFleet(tmp_path, 1) as fleet:
-        done = subprocess.run(
-            [
-                sys.executable, "-m", "lpac.cli.main", "record", "--fleet", str(fleet.fleet_toml),
-                "--out", str(file / below),
-            ],
-            cwd=ROOT, capture_output=True, text=True, check=False,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
+    done = called("record", "--fleet", FlownFleet(tmp_path, 1).fleet_toml, "--out", file / below)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == f"lpac: {file / below}: cannot be made: {why}\n"

@@ -302,11 +302,11 @@ def test_thirty_robots_at_80_columns_and_24_lines() -> None:
 
 
 def test_without_a_ground_process_it_is_one_line(tmp_path: Path) -> None:
-    with FlownFleet(tmp_path, 1, name="nobody") as fleet:
-        done = subprocess.run(
-            lpac("watch", "--once", "--fleet", fleet.fleet_toml), env=environment(),
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+    fleet = FlownFleet(tmp_path, 1, name="nobody")  # which does not run
+    done = subprocess.run(
+        lpac("watch", "--once", "--fleet", fleet.fleet_toml), env=environment(),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     text = "lpac: no ground station runs for fleet nobody here: start `lpac ground`\n"
     assert (done.returncode, done.stdout, done.stderr) == (1, "", text)
 

@@ -12,7 +12,7 @@ import pytest
 
 from lpac.ablate.config import read_ablation
 from lpac.ablate.run import AblationRun
-from tests.command import error_line, lpac
+from tests.command import called, error_line
 from tests.training import here
 from tests.unit.ablate.test_config import written
 
@@ -23,7 +23,7 @@ def test_it_says_what_it_came_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     path, out = written(tmp_path), tmp_path / "run"
     AblationRun(read_ablation(path), out, lambda now: None).run(here)
     before = {each: each.read_bytes() for each in out.rglob("*") if each.is_file()}
-    result = lpac("ablate", path, "--out", out)
+    result = called("ablate", path, "--out", out)
     assert result.returncode == 0, (result.stdout, result.stderr)
     told = json.loads((out / "ablation.json").read_text())
     assert "6 worlds of the validation set from 2 on, n3, 1 s; cost at the end" in result.stdout
@@ -33,7 +33,7 @@ def test_it_says_what_it_came_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert variant["verdict"] is None or row.rstrip().endswith(variant["verdict"])
     assert "2 training seeds: this says something about these policies" in result.stdout
     assert before.items() <= {each: each.read_bytes() for each in before}.items()
-    again = lpac("ablate", path, "--out", out, "--json")
+    again = called("ablate", path, "--out", out, "--json")
     assert json.loads(again.stdout) == told
 
 
@@ -45,7 +45,7 @@ def test_what_ends_it_is_one_line(tmp_path: Path) -> None:
         while not list(out.glob("base-0/data/*-*.npz")):
             assert process.poll() is None
             time.sleep(0.02)
-        second = error_line(lpac("ablate", path, "--out", out))
+        second = error_line(called("ablate", path, "--out", out))
         assert f"is in use by process {process.pid} on this machine" in second
         os.killpg(process.pid, signal.SIGINT)
         _, told = process.communicate()
@@ -57,5 +57,5 @@ def test_what_ends_it_is_one_line(tmp_path: Path) -> None:
 def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
     """Others are in tests/unit/ablate."""
     path = written(tmp_path, ("train.network.hops = 0", "train.dagger.rounds = 0"))
-    told = error_line(lpac("ablate", path, "--out", tmp_path / "run"))
+    told = error_line(called("ablate", path, "--out", tmp_path / "run"))
     assert "parts.toml: no-features: train.dagger.rounds = 0: must be the base's, 1" in told

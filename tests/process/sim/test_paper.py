@@ -5,7 +5,7 @@ from pathlib import Path
 
 from edge.policy.bundle import load_bundle
 from lpac.cli.options import DEFAULT_BUNDLE
-from tests.command import error_line, lpac
+from tests.command import called, error_line, lpac
 
 
 def test_rates_and_asynchrony_are_flown_and_kept(tmp_path: Path) -> None:
@@ -45,13 +45,15 @@ def test_trials_are_flown_over_cores(tmp_path: Path) -> None:
 
 
 def test_mistakes_are_one_line(tmp_path: Path) -> None:
-    no_worlds = lpac("paper", "async", "-k", 0, "--out", tmp_path)
+    no_worlds = called("paper", "async", "-k", 0, "--out", tmp_path)
     assert error_line(no_worlds) == "lpac: worlds = 0: must be at least 1"
-    assert "absent" in error_line(lpac("paper", "async", "--bundle", "absent"))
-    assert error_line(lpac("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
-    assert error_line(lpac("paper", "e3", "--world", -1)) == "lpac: world = -1: must be at least 0"
-    no_build = lpac("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
+    assert "absent" in error_line(called("paper", "async", "--bundle", "absent"))
+    assert error_line(called("paper", "e2", "--trials", 1)).startswith("lpac: --trials 1: must be")
+    assert (
+        error_line(called("paper", "e3", "--world", -1)) == "lpac: world = -1: must be at least 0"
+    )
+    no_build = called("paper", "e3", "--vehicle", "px4", "--out", tmp_path)
     assert error_line(no_build) == "lpac: --vehicle px4 needs --px4 with PX4's build folder"
-    no_px4 = lpac("paper", "e1", "--px4", tmp_path, "--out", tmp_path / "new")
+    no_px4 = called("paper", "e1", "--px4", tmp_path, "--out", tmp_path / "new")
     assert error_line(no_px4) == "lpac: --px4 does nothing with --vehicle point"
     assert not (tmp_path / "new").exists()

@@ -11,16 +11,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from ray.cluster_utils import Cluster
 
 from edge.policy.bundle import load_bundle
-from lpac.sim.cluster import over_ray
 from lpac.train.config import read_config
-from lpac.train.rollout import ShardTask, fly_shard, plan_round
 from lpac.train.run import TrainingRun
-from tests.command import error_line, lpac
-from tests.conftest import SHIPPED
-from tests.training import SMALL, here, read, said
+from tests.command import called, error_line, lpac
+from tests.training import SMALL, here, said
 
 # Shards enough to be killed between; and few candidates.
 LONGER = (
@@ -73,7 +69,7 @@ def test_what_ends_it_is_one_line_and_loses_nothing(config: Path, tmp_path: Path
         until_there_is("data/*-*.npz", out, process)
         # Or the first would be done before the second has begun.
         os.killpg(process.pid, signal.SIGSTOP)
-        second = lpac("train", config, "--out", out)
+        second = called("train", config, "--out", out)
         assert f"is in use by process {process.pid} on this machine" in error_line(second)
         os.killpg(process.pid, signal.SIGINT)
         os.killpg(process.pid, signal.SIGCONT)
@@ -114,22 +110,7 @@ def workers(pid: int) -> list[int]:
 def test_what_cannot_be_is_one_line(config: Path, tmp_path: Path) -> None:
     """Others are in tests/unit/train."""
     config.write_text(SMALL.replace("rounds = 1", "rounds = -1"))
-    assert "dagger: rounds = -1: must be at least 0" in error_line(lpac("train", config))
+    assert "dagger: rounds = -1: must be at least 0" in error_line(called("train", config))
     config.write_text(SMALL)
-    told = error_line(lpac("train", config, "--ray", "127.0.0.1:1", "--out", tmp_path / "run"))
+    told = error_line(called("train", config, "--ray", "127.0.0.1:1", "--out", tmp_path / "run"))
     assert "no Ray cluster at 127.0.0.1:1" in told
-
-
-@pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_a_cluster_of_two_nodes_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
-    config = read(tmp_path, ("[2, 3]", "[30, 31]")).config
-    bundle = load_bundle(SHIPPED)
-    tasks = [ShardTask(shard, bundle) for shard in plan_round(config.data, config.dagger, 0, 0)]
-    there, own = (
-        {shard.name: shard.states for shard in pool(fly_shard, tasks)}
-        for pool in (over_ray(cluster.address), here)
-    )
-    assert there.keys() == own.keys() and len(own) == 2
-    for name, states in own.items():
-        assert (there[name].velocities == states.velocities).all()
-        assert (there[name].inputs["images"] == states.inputs["images"]).all()

@@ -1,30 +1,52 @@
-"""Campaigns of flights: over cores, over a Ray cluster, killed and gone on with."""
+"""Flights over cores and over a Ray cluster, and campaigns that are killed and gone on with."""
 
 import json
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 from ray.cluster_utils import Cluster
 
+from edge.policy.bundle import load_bundle
 from lpac.analysis.logs import read_logs
 from lpac.analysis.truth import TRUTH, load_truth
 from lpac.cli.options import DEFAULT_BUNDLE
+from lpac.evaluate.flights import LLOYD, POLICY, EvaluationFlight, KeptFlights, costs_of
 from lpac.sim.cluster import over_ray
 from lpac.sim.cores import over_cores
 from lpac.sim.drill.campaign import Campaign, FlightOutcome, fly_order
 from lpac.sim.drill.faults import FAULTS
 from lpac.sim.drill.field import DrilledRobots
-from tests.command import error_line, lpac
+from lpac.train.rollout import ShardTask, fly_shard, plan_round
+from tests.command import called, error_line, lpac
+from tests.conftest import SHIPPED
+from tests.training import here, read
 
 # They soon come down.
 LANDED, GONE = FAULTS["landed"], FAULTS["ground-dies"]
 DRILLED = DrilledRobots(2, str(DEFAULT_BUNDLE))
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A Ray cluster of two nodes on this machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        # Its workers would wait for all other tests' processes.
+        patch.setenv("RAY_worker_niceness", "0")
+        nodes: Any = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+        )
+        nodes.add_node(num_cpus=1)
+        yield nodes
+        nodes.shutdown()
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +73,35 @@ def test_a_cluster_of_two_nodes_flies_the_same(
     campaign = Campaign(tmp_path, "simulated", DRILLED)
     again = campaign.fly([LANDED, GONE], [1], partial(over_ray(cluster.address), fly_order))
     assert {(outcome.fault, outcome.seed): outcome for outcome in again} == flown
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_an_evaluation_over_a_cluster_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    bundle_id = load_bundle(DEFAULT_BUNDLE).id
+    flights = [
+        EvaluationFlight(
+            flier=flier, bundle=str(DEFAULT_BUNDLE), flown_by=bundle_id, world_set="validation",
+            world=0, set_up="field", duration_s=1.0,
+        )
+        for flier in (POLICY, LLOYD)
+    ]  # fmt: skip
+    flown = dict(KeptFlights(tmp_path).fly(flights, over_ray(cluster.address)))
+    assert flown == dict(pair for flight in flights for pair in costs_of((flight,)))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_training_over_a_cluster_flies_the_same(cluster: Cluster, tmp_path: Path) -> None:
+    config = read(tmp_path, ("[2, 3]", "[30, 31]")).config
+    bundle = load_bundle(SHIPPED)
+    tasks = [ShardTask(shard, bundle) for shard in plan_round(config.data, config.dagger, 0, 0)]
+    there, own = (
+        {shard.name: shard.states for shard in pool(fly_shard, tasks)}
+        for pool in (over_ray(cluster.address), here)
+    )
+    assert there.keys() == own.keys() and len(own) == 2
+    for name, states in own.items():
+        assert (there[name].velocities == states.velocities).all()
+        assert (there[name].inputs["images"] == states.inputs["images"]).all()
 
 
 def test_a_campaign_that_was_killed_goes_on(tmp_path: Path) -> None:
@@ -114,4 +165,4 @@ def test_what_cannot_be_is_one_line(tmp_path: Path) -> None:
         (("-n", 1), "--robots 1: must be from 2 to 10"),
         (("--ray", "127.0.0.1:1"), "127.0.0.1:1"),
     ):
-        assert text in error_line(lpac("drill", *arguments, "--out", tmp_path))
+        assert text in error_line(called("drill", *arguments, "--out", tmp_path))
