@@ -29,8 +29,9 @@ def called(*arguments: object) -> subprocess.CompletedProcess[str]:
     """The command, in this process: what it would have printed, and its exit code."""
     out, err = io.StringIO(), io.StringIO()
     code: int | str | None = 0
+    typed = ["lpac", *map(str, arguments)]
     with pytest.MonkeyPatch.context() as patch, contextlib.chdir(ROOT):
-        patch.setattr(sys, "argv", ["lpac", *map(str, arguments)])
+        patch.setattr(sys, "argv", typed)
         patch.setenv("COLUMNS", _COLUMNS)
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             try:
@@ -41,7 +42,7 @@ def called(*arguments: object) -> subprocess.CompletedProcess[str]:
         code, last = 1, f"{code}\n"
     else:
         code, last = code or 0, ""
-    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue() + last)
+    return subprocess.CompletedProcess(typed, code, out.getvalue(), err.getvalue() + last)
 
 
 def error_line(result: subprocess.CompletedProcess[str]) -> str:

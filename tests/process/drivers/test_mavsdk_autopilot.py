@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from geographiclib.geodesic import Geodesic
+from pymavlink.dialects.v20 import common as mavlink
 
 from edge.core.vehicle import Action, Mode, Position, Setpoint, Vector, VehicleState, Velocity
 from edge.drivers.px4.autopilot import AutopilotError, MavsdkAutopilot
@@ -75,9 +76,12 @@ def served(*links: Px4Link, port: int) -> Iterator[Px4Server]:
 @contextmanager
 def connected(vehicle: Px4Vehicle) -> Iterator[tuple[MavsdkAutopilot, Px4Server]]:
     (port,) = free_ports(1)
+    link = Px4Link(vehicle, system_id=7)
+    # MAVSDK waits for two of them, which PX4 sends once a second.
+    link._set_interval(mavlink.MAVLINK_MSG_ID_HEARTBEAT, 0.1)
     with (
         MavsdkAutopilot(f"udpin://127.0.0.1:{port}", system_id=7) as autopilot,
-        served(Px4Link(vehicle, system_id=7), port=port) as server,
+        served(link, port=port) as server,
     ):
         wait(
             autopilot,
@@ -535,9 +539,11 @@ def test_parameters_are_asked_for_one_by_one_only_once_one_of_them_changed(
 
     monkeypatch.setattr(Px4Link, "_on_param_request_read", on_param_request_read)
     names = ["COM_OBL_RC_ACT", "COM_OF_LOSS_T", "NO_SUCH"]
+    # What does not exist is waited for in each of these calls.
+    monkeypatch.setattr("edge.drivers.px4.autopilot._ABSENT_AFTER_CALLS", 2)
     with connected(vehicle) as (autopilot, server):
         before = {"COM_OBL_RC_ACT": 0, "COM_OF_LOSS_T": 1.0, "NO_SUCH": None}
-        for _ in range(6):
+        for _ in range(3):
             assert autopilot.read_parameters(names) == before
         asked.clear()
         assert autopilot.read_parameters(names) == before

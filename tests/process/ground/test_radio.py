@@ -6,6 +6,7 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -198,8 +199,12 @@ def computers(fleet: ThinAir, tmp_path: Path) -> Iterator[str]:
 def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
     fleet: ThinAir, station: GroundStation, computers: str
 ) -> None:
-    answer = ask(station, fleet, "--seconds", 10, "--json", path=computers)
-    found = told(answer)
+    def listen(*options: str) -> dict[str, Any]:
+        return told(ask(station, fleet, "--seconds", 10, "--json", *options, path=computers))
+
+    with ThreadPoolExecutor() as pool:
+        with_load = pool.submit(listen, "--load")
+        found, loaded = listen(), with_load.result()
     for robot in found["robots"].values():
         assert robot["wifi_problem"] is None
         assert robot["wifi"] == {
@@ -209,7 +214,6 @@ def test_radios_tell_of_signal_rate_and_channel_and_a_bulk_stream_is_told(
     assert room["rate_told"]
     assert room["rate_mbit_s"] == pytest.approx(144.4)
     assert room["busy_share"] == pytest.approx(0.3, abs=0.01)
-    loaded = told(ask(station, fleet, "--seconds", 10, "--json", "--load", path=computers))
     assert loaded["bulk_stream"]["robot"] == "r0"
     assert loaded["bulk_stream"]["rate_mbit_s"] > 0.0
     assert loaded["room"]["busy_share"] is None
