@@ -194,7 +194,7 @@ def test_a_program_that_hangs_in_flight_is_restarted_and_leaves_the_vehicle_in_h
         assert host.vehicle.armed and host.vehicle.mode is Px4Mode.HOLD
 
 
-def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
+def test_a_program_that_cannot_start_is_given_up_and_its_vehicle_landed(
     host: SimulatedHost, config: FleetConfig
 ) -> None:
     """In the air, in hold, as the test before left it."""
@@ -204,7 +204,7 @@ def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
         assert host.vehicle.armed and host.vehicle.mode is Px4Mode.HOLD
     changed = tomlkit.parse(text)
     changed["flight"]["hover_land_s"] = 1.0
-    changed["policy"]["bundle"] = "nowhere"
+    changed["fleet"] = 3
     toml.write_text(tomlkit.dumps(changed))
     # An old systemd has started it for the hang before, with the former configuration.
     host.run("systemctl stop lpac-land; systemctl reset-failed lpac-robot || true")
@@ -216,7 +216,12 @@ def test_a_vehicle_whose_program_systemd_gives_up_is_landed(
     assert Px4Mode.LAND in modes
     said = "journalctl --unit lpac-land --output cat"
     wait_until(lambda: "nobody has taken the vehicle: land" in host.run(said))
+    for line in ("Start request repeated too quickly", "lpac: /release/robot.toml: fleet = 3"):
+        wait_until(partial(is_in_journal, host, line))
+    traceback = journal(host).partition("Traceback")[2]
+    assert not traceback, traceback
     toml.write_text(text)
+    host.run("systemctl reset-failed lpac-robot")
 
 
 def take_off(ground: GroundProgram) -> None:
@@ -232,9 +237,7 @@ def take_off(ground: GroundProgram) -> None:
             ground.command(SafetyCommand("land", wait=True))
 
 
-def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_says(
-    host: SimulatedHost, config: FleetConfig
-) -> None:
+def test_it_lives_where_the_drop_in_says(host: SimulatedHost, config: FleetConfig) -> None:
     elsewhere = dataclasses.replace(config, directory="/data/lpac")
     for name, text in drop_ins(elsewhere, config.robots[host.name]).items():
         path = host.root / f"etc/systemd/system/{Path(name).stem}.service.d" / name
@@ -248,14 +251,6 @@ def test_a_program_that_cannot_start_is_given_up_and_lives_where_the_drop_in_say
     host.run("systemctl restart lpac-robot")
     assert len(list(logs.glob("*.mcap"))) == count + 1
     host.run("systemctl stop lpac-robot")
-
-    (host.root / "data/lpac/current/robot.toml").write_text("fleet = 3\n")
-    host.run("systemctl reset-failed lpac-robot; systemctl start lpac-robot || true")
-    wait_until(lambda: shown(host, "ActiveState")["ActiveState"] == "failed")
-    for line in ("Start request repeated too quickly", "lpac: /release/robot.toml: fleet = 3"):
-        wait_until(partial(is_in_journal, host, line))
-    traceback = journal(host).partition("Traceback")[2]
-    assert not traceback, traceback
 
 
 def test_nothing_was_added_to_the_release(host: SimulatedHost, amd64_image: Path) -> None:
