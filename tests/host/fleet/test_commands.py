@@ -181,13 +181,18 @@ def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -
     world.write_text(text + text.splitlines()[-1] + "\n")
     operator.hosts[1].power_off()
     try:
-        deployed = operator("deploy", "--robots", "r1,r2")
-        assert operator("logs", "--robots", "r1,r2").returncode == 1
-        ran = operator("exec", "--robots", "r1,r2", "true")
+        both = ("--robots", "r1,r2")
+        with (
+            running_lpac_fleet(operator.fleet_toml, "logs", *both) as logs,
+            running_lpac_fleet(operator.fleet_toml, "exec", *both, "true") as ran,
+        ):
+            deployed = operator("deploy", *both)
+            logs.communicate()
+            _, complaints = ran.communicate()
     finally:
         operator.hosts[1].power_on()
         world.write_text(text)
-    assert deployed.returncode == ran.returncode == 1
+    assert deployed.returncode == logs.returncode == ran.returncode == 1
     table, notes = deployed.stdout.split("\n\n")
     of_r1, of_r2 = (line.split() for line in table.splitlines()[1:])
     assert of_r1[1] != before and of_r1[-1] == "runs"
@@ -196,7 +201,7 @@ def test_a_robot_that_is_off_is_named_and_the_others_do_it(operator: Operator) -
     assert notes.split(maxsplit=1) == ["r2", SILENT + "\n"]
     assert deployed.stderr.splitlines()[-1] == "lpac: deployed on 1 of 2 robots; failed: r2"
     # ssh's own complaint comes first.
-    assert ran.stderr.splitlines()[1:] == [
+    assert complaints.splitlines()[1:] == [
         f"r2  {SILENT}", "lpac: succeeded on 1 of 2 robots; failed: r2",
     ]  # fmt: skip
 

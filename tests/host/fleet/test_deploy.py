@@ -212,41 +212,38 @@ def test_a_release_that_does_not_run_well_is_taken_back(laptop: Laptop) -> None:
     assert after["service"]["fresh"]
 
 
-def test_the_robot_finishes_a_switch_without_the_laptop(laptop: Laptop) -> None:
-    host = laptop.hosts[0]
-    release = laptop.release(0, laptop.changed())
+def test_a_switch_is_finished_without_the_laptop_and_after_a_loss_of_power(laptop: Laptop) -> None:
+    """At the switch r1 loses the network, and r2 its power, which a repeat mends."""
+    r1, r2 = laptop.hosts[:2]
+    releases = [laptop.release(index, laptop.changed()) for index in range(2)]
+    former = laptop.overview(1)["current"]
 
-    def cut_at_the_switch(step: str, _: float | None) -> None:
-        if step == "health":
-            host.cut()
+    async def breaks_off(index: int, mishap: Callable[[], None]) -> None:
+        def report(step: str, _: float | None) -> None:
+            if step == "health":
+                mishap()
 
-    with pytest.raises(UnreachableError):
-        laptop.deploy(0, release, cut_at_the_switch)
-    host.heal()
-    await_free(host)
+        with pytest.raises(UnreachableError):
+            await deploy(laptop.config, laptop.robot(index), releases[index], report)
+
+    async def both() -> None:
+        await asyncio.gather(breaks_off(0, r1.cut), breaks_off(1, r2.power_off))
+
+    asyncio.run(both())
+    r1.heal()
+    await_free(r1)
     after = laptop.overview(0)
-    assert (after["current"], after["pending"]) == (release.id, None)
+    assert (after["current"], after["pending"]) == (releases[0].id, None)
     assert after["service"]["fresh"]
+    assert len(after["releases"]) <= 3  # of the six and more that it has had
 
-
-def test_a_loss_of_power_during_the_switch_is_mended_by_a_repeat(laptop: Laptop) -> None:
-    host = laptop.hosts[0]
-    former = laptop.overview(0)["current"]
-    release = laptop.release(0, laptop.changed())
-
-    def lose_power_at_the_switch(step: str, _: float | None) -> None:
-        if step == "health":
-            host.power_off()
-
-    with pytest.raises(UnreachableError):
-        laptop.deploy(0, release, lose_power_at_the_switch)
-    host.power_on()
-    pending = laptop.overview(0)["pending"]
+    r2.power_on()
+    pending = laptop.overview(1)["pending"]
+    release = releases[1]
     assert (pending["release"], pending["former"]) == (release.id, former)
-    assert laptop.deploy(0, release).summary.endswith(f"finished: the robot runs {release.id}")
-    after = laptop.overview(0)
+    assert laptop.deploy(1, release).summary.endswith(f"finished: the robot runs {release.id}")
+    after = laptop.overview(1)
     assert (after["current"], after["last_good"], after["pending"]) == (release.id, former, None)
-    assert len(after["releases"]) <= 3  # of the seven and more that it has had
 
 
 def test_an_armed_robot_refuses_whether_its_program_runs_or_not(laptop: Laptop) -> None:

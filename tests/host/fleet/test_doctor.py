@@ -6,6 +6,7 @@ import json
 import re
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,7 @@ def test_up_says_no_go_with_the_reasons(enrolled: SimulatedHosts) -> None:
 
 def test_up_waits_for_a_robot_that_is_just_switched_on(enrolled: SimulatedHosts) -> None:
     config = load_fleet(enrolled.fleet_toml)
+    config = replace(config, ssh=replace(config.ssh, connect_timeout_s=1.0))
     robot = config.robots["r1"]
     waits: list[str] = []
 
