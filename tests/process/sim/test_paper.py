@@ -3,14 +3,21 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from edge.policy.bundle import load_bundle
 from lpac.cli.options import DEFAULT_BUNDLE
 from tests.command import called, error_line, lpac
 
 
-def test_rates_and_asynchrony_are_flown_and_kept(tmp_path: Path) -> None:
+def test_rates_and_asynchrony_are_flown_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process, over its cores; for as long as it takes to cover."""
+    for module in ("asynchrony", "asynchrony_report"):
+        monkeypatch.setattr(f"lpac.paper.{module}.TIMES_S", (5.0, 10.0, 20.0))
     command = ("paper", "async", "--quick", "-k", 1, "--out", tmp_path, "--json")
-    result = lpac(*command)
+    result = called(*command)
     assert result.returncode == 0, (result.stdout, result.stderr)
     told = json.loads(result.stdout)
     assert told["bundle_id"] == load_bundle(DEFAULT_BUNDLE).id and told["worlds"] == 1
@@ -25,7 +32,7 @@ def test_rates_and_asynchrony_are_flown_and_kept(tmp_path: Path) -> None:
     assert (tmp_path / "rates.png").exists() and (tmp_path / "README.md").exists()
     # What was flown is kept: a world more is all that is flown then.
     flown = (tmp_path / "flights.jsonl").read_bytes()
-    assert lpac(*command).stdout == result.stdout
+    assert called(*command).stdout == result.stdout
     assert (tmp_path / "flights.jsonl").read_bytes() == flown
 
 
