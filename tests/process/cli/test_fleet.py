@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.command import error_line, lpac
+from tests.command import called, error_line, lpac
 from tests.conftest import ROOT
 from tests.host.fleet.field import lpac_fleet
 from tests.needs import needs
@@ -37,21 +37,21 @@ def test_help_names_the_commands() -> None:
 
 def test_a_fleet_or_robot_that_is_not_there(tmp_path: Path, nobody: Path) -> None:
     missing = tmp_path / "other.toml"
-    assert str(missing) in error_line(lpac("fleet", "status", "--fleet", missing))
-    line = error_line(lpac("fleet", "stop", "--fleet", nobody, "--robots", "r1,r9"))
+    assert str(missing) in error_line(called("fleet", "status", "--fleet", missing))
+    line = error_line(called("fleet", "stop", "--fleet", nobody, "--robots", "r1,r9"))
     assert "'r9'" in line and "r1, r2, r3" in line
 
 
 def test_deploy_needs_an_image_before_it_asks_any_robot(nobody: Path) -> None:
-    line = error_line(lpac("fleet", "deploy", "--fleet", nobody))
+    line = error_line(called("fleet", "deploy", "--fleet", nobody))
     assert line.endswith("no image: no image is there: run `make image`")
 
 
 @pytest.mark.parametrize("command", ["start", "restart", "rollback"])
 def test_a_spare_is_left_out(nobody: Path, command: str) -> None:
-    line = error_line(lpac("fleet", command, "--fleet", nobody, "--robots", "r3"))
+    line = error_line(called("fleet", command, "--fleet", nobody, "--robots", "r3"))
     assert "r3" in line and "spare" in line
-    result = lpac("fleet", command, "--fleet", nobody)
+    result = called("fleet", command, "--fleet", nobody)
     assert result.stderr.startswith("left out, since a spare is not ")
     assert result.stderr.endswith("0 of 2 robots; failed: r1, r2\n")
 
@@ -75,7 +75,7 @@ def test_each_robot_that_does_not_answer_is_named_with_the_reason(nobody: Path) 
 )
 def test_json_has_every_robot(nobody: Path, command: tuple[str, ...]) -> None:
     name, *options = command
-    result = lpac("fleet", name, "--fleet", nobody, "--robots", "r1,r2", "--json", *options)
+    result = called("fleet", name, "--fleet", nobody, "--robots", "r1,r2", "--json", *options)
     assert result.returncode == 1
     problem = "nothing listens on its ssh port"
     assert json.loads(result.stdout) == {
@@ -90,7 +90,7 @@ def test_json_has_every_robot(nobody: Path, command: tuple[str, ...]) -> None:
 @needs_ssh
 @pytest.mark.parametrize("follow", [[], ["-f"]])
 def test_logs_of_a_robot_that_does_not_answer(nobody: Path, follow: list[str]) -> None:
-    result = lpac("fleet", "logs", "--fleet", nobody, "--robots", "r2", *follow)
+    result = called("fleet", "logs", "--fleet", nobody, "--robots", "r2", *follow)
     assert (result.returncode, result.stdout) == (1, "")
     assert result.stderr.splitlines() == [
         "r2  nothing listens on its ssh port",
@@ -129,10 +129,10 @@ def test_a_login_shell_that_prints_is_named(
     here: Path, monkeypatch: pytest.MonkeyPatch, greeting: str
 ) -> None:
     monkeypatch.setenv("GREETING", greeting + "\\n")
-    result = lpac("fleet", "status", "--fleet", here, "--robots", "r1")
+    result = called("fleet", "status", "--fleet", here, "--robots", "r1")
     assert error_line(result) == "lpac: reached 0 of 1 robot; failed: r1"
     assert "its login shell prints" in result.stdout and greeting in result.stdout
-    result = lpac("fleet", "logs", "--fleet", here, "--robots", "r1")
+    result = called("fleet", "logs", "--fleet", here, "--robots", "r1")
     assert result.stderr.startswith(f"r1  journalctl printed {greeting!r}")
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from edge.drivers.identity_folder import load_identity
 from edge.identity.card import Role
-from tests.command import error_line, lpac
+from tests.command import called, error_line
 from tests.conftest import ROOT
 
 
@@ -23,7 +23,7 @@ def fleet(tmp_path: Path) -> Path:
 
 
 def members(fleet: Path) -> list[dict[str, Any]]:
-    told = lpac("fleet", "members", "--fleet", fleet, "--json")
+    told = called("fleet", "members", "--fleet", fleet, "--json")
     assert told.returncode == 0, told.stderr
     known: list[dict[str, Any]] = json.loads(told.stdout)
     return known
@@ -31,48 +31,48 @@ def members(fleet: Path) -> list[dict[str, Any]]:
 
 def test_an_authority_its_operators_and_who_is_revoked(fleet: Path, tmp_path: Path) -> None:
     assert "make one with `lpac fleet init`" in error_line(
-        lpac("fleet", "members", "--fleet", fleet)
+        called("fleet", "members", "--fleet", fleet)
     )
-    made = lpac("fleet", "init", "--fleet", fleet, "--name", "ann")
+    made = called("fleet", "init", "--fleet", fleet, "--name", "ann")
     assert made.returncode == 0 and "keep a copy of that folder" in made.stdout
     assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o700
-    assert "has an authority already" in error_line(lpac("fleet", "init", "--fleet", fleet))
+    assert "has an authority already" in error_line(called("fleet", "init", "--fleet", fleet))
 
     for name, options, role in (
         ("bob", (), Role.OPERATOR),
         ("eve", ("--observer",), Role.OBSERVER),
     ):
         out = tmp_path / name
-        made = lpac("fleet", "operator", name, "--fleet", fleet, "--out", out, *options)
+        made = called("fleet", "operator", name, "--fleet", fleet, "--out", out, *options)
         assert made.returncode == 0 and f"{name} is an {role} of fleet demo" in made.stdout
         card = load_identity(out, fleet="demo", unix_s=2e9).card
         assert (card.name, card.role) == (name, role)
         assert not (out / "authority.key").exists()
-    again = lpac("fleet", "operator", "bob", "--fleet", fleet, "--out", tmp_path / "bob")
+    again = called("fleet", "operator", "bob", "--fleet", fleet, "--out", tmp_path / "bob")
     assert "is there already: give a new folder" in error_line(again)
     assert [m["name"] for m in members(fleet)] == ["ann", "bob", "eve"]
 
-    assert "known: ann, bob, eve" in error_line(lpac("fleet", "revoke", "r9", "--fleet", fleet))
+    assert "known: ann, bob, eve" in error_line(called("fleet", "revoke", "r9", "--fleet", fleet))
     # Without a ground nobody knows what it does now.
-    assert "add --in-flight" in error_line(lpac("fleet", "revoke", "bob", "--fleet", fleet))
+    assert "add --in-flight" in error_line(called("fleet", "revoke", "bob", "--fleet", fleet))
     assert not any(m["revoked"] for m in members(fleet))
-    done = lpac("fleet", "revoke", "bob", "--fleet", fleet, "--in-flight")
+    done = called("fleet", "revoke", "bob", "--fleet", fleet, "--in-flight")
     assert done.returncode == 0 and "bob is revoked (1 card)" in done.stdout
     assert {m["name"]: m["revoked"] for m in members(fleet)} == {
         "ann": False, "bob": True, "eve": False,
     }  # fmt: skip
-    table = lpac("fleet", "members", "--fleet", fleet).stdout
+    table = called("fleet", "members", "--fleet", fleet).stdout
     assert "revoked" in table and "observer" in table
 
 
 def test_an_insecure_fleet_has_no_keys(fleet: Path) -> None:
     text = fleet.read_text().replace('keys = "keys"', "insecure = true")
     fleet.write_text(text)
-    assert "has no keys: insecure = true" in error_line(lpac("fleet", "init", "--fleet", fleet))
+    assert "has no keys: insecure = true" in error_line(called("fleet", "init", "--fleet", fleet))
     fleet.write_text(f'keys = "keys"\n{text}')
-    assert "insecure = true: not with keys" in error_line(lpac("fleet", "init", "--fleet", fleet))
+    assert "insecure = true: not with keys" in error_line(called("fleet", "init", "--fleet", fleet))
 
 
 def test_one_robots_options_are_not_for_all(fleet: Path) -> None:
-    line = error_line(lpac("fleet", "enroll", "--fleet", fleet, "--user", "voxl"))
+    line = error_line(called("fleet", "enroll", "--fleet", fleet, "--user", "voxl"))
     assert line == "lpac: --user is one robot's: give its name too"

@@ -14,7 +14,7 @@ from edge.flight.record import FlightTick, TickReader, TickWriter
 from edge.messages.mission import FlightState
 from edge.policy.bundle import Bundle
 from edge.policy.lpac.policy import LpacPolicy
-from tests.command import error_line, lpac
+from tests.command import called, error_line, lpac
 from tests.conftest import SHIPPED
 from tests.record_flights import RECORDED
 from tests.unit.policy.test_replay import Messages, fly
@@ -59,7 +59,7 @@ def test_a_flight_is_computed_again(
         ]  # fmt: skip
     assert f"{shipped_bundle.id[:12]}: computes what it computed in flight" in text.stdout
 
-    report = json.loads(lpac("replay", tmp_path / "a", last, "--json").stdout)
+    report = json.loads(called("replay", tmp_path / "a", last, "--json").stdout)
     assert report["bundle"] == shipped_bundle.id and report["robots"] == [0]
     assert report["outputs"]["message"] == {"ticks": 6, "differing": 0, "largest_difference": 0.0}
 
@@ -68,24 +68,24 @@ def test_a_difference_is_shown_and_fails(
     tmp_path: Path, shipped_bundle: Bundle, flown: Messages
 ) -> None:
     log = write_log(tmp_path, shipped_bundle, altered(flown))
-    result = lpac("replay", log)
+    result = called("replay", log)
     assert "1 differ, largest difference 0.25" in result.stdout
     assert "not what was computed in flight: velocity by up to 0.25" in error_line(result)
-    result = lpac("replay", log, "--json")
+    result = called("replay", log, "--json")
     assert result.returncode != 0
     assert json.loads(result.stdout)["outputs"]["velocity"]["differing"] == 1
 
 
 def test_flights_are_decided_again() -> None:
     """Logs without a policy need no bundle."""
-    result = lpac("replay", RECORDED / "normal.mcap", RECORDED / "killed.mcap", "--json")
+    result = called("replay", RECORDED / "normal.mcap", RECORDED / "killed.mcap", "--json")
     assert result.returncode == 0, result.stderr
     report = json.loads(result.stdout)
     assert report["bundle"] is None and report["outputs"] == {}
     for flight in report["flights"]:
         assert flight["robot"] == 0 and flight["ticks"] > 30
         assert flight["differing"] == 0 and flight["differences"] == []
-    text = lpac("replay", RECORDED / "killed.mcap").stdout
+    text = called("replay", RECORDED / "killed.mcap").stdout
     ticks = report["flights"][1]["ticks"]
     assert text.startswith(f"killed            {ticks} ticks, 0 differ\n")
 
@@ -101,12 +101,12 @@ def test_a_decision_that_differs_is_shown_and_fails(tmp_path: Path, shipped_bund
             tick = FlightTick(tick.given, dataclasses.replace(tick.made, flight=landing))
         messages.append((topic, unix_time_s, writer.message(tick)))
     log = write_log(tmp_path, shipped_bundle, messages)
-    result = lpac("replay", log)
+    result = called("replay", log)
     assert "1 differ" in result.stdout
     (row,) = [line for line in result.stdout.splitlines() if " state " in line]
     assert row.split()[2:] == ["4.0", "s", "1", "state", "land", "hold"]
     assert "not what was decided in flight: 1 ticks differ" in error_line(result)
-    (flight,) = json.loads(lpac("replay", log, "--json").stdout)["flights"]
+    (flight,) = json.loads(called("replay", log, "--json").stdout)["flights"]
     (difference,) = [d for d in flight["differences"] if d["what"] == "state"]
     assert (difference["then"], difference["now"], difference["ticks"]) == ("land", "hold", 1)
 
@@ -123,9 +123,9 @@ def test_another_place_for_the_bundle(
     tmp_path: Path, shipped_bundle: Bundle, flown: Messages
 ) -> None:
     log = write_log(tmp_path, shipped_bundle, flown, tmp_path / "on the robot")
-    line = error_line(lpac("replay", log))
+    line = error_line(called("replay", log))
     assert "on the robot: there is no such file or folder" in line and "give --bundle" in line
-    assert lpac("replay", log, "--bundle", SHIPPED).returncode == 0
+    assert called("replay", log, "--bundle", SHIPPED).returncode == 0
 
 
 def test_mistakes_are_one_line(tmp_path: Path, shipped_bundle: Bundle, flown: Messages) -> None:
@@ -146,4 +146,4 @@ def test_mistakes_are_one_line(tmp_path: Path, shipped_bundle: Bundle, flown: Me
     shutil.copy(cases["no policy ticks"], tmp_path / "cut.mcap")
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "cut.mcap").read_bytes()[:60])
     for text, log in cases.items():
-        assert text in error_line(lpac("replay", log)), text
+        assert text in error_line(called("replay", log)), text

@@ -139,7 +139,7 @@ def _lines(path: Path) -> list[str]:
 def test_a_flight_again_is_that_flight_with_logs_and_figure(
     tmp_path: Path, flown: dict[tuple[str, int], FlightOutcome]
 ) -> None:
-    result = lpac("drill", "--fault", "landed", "--seed", 1, "-n", 2, "--out", tmp_path, "--json")
+    result = called("drill", "--fault", "landed", "--seed", 1, "-n", 2, "--out", tmp_path, "--json")
     assert result.returncode == 0, (result.stdout, result.stderr)
     [told] = json.loads(result.stdout)["faults"]
     first = flown["landed", 1]

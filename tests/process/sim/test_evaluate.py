@@ -95,7 +95,7 @@ def test_with_the_radio_that_a_field_had(tmp_path: Path) -> None:
     write_records(records, [said])
     options = ("-k", 1, "--duration", 1, "--baseline", "clairvoyant-cvt", "--transport",
         "multicast", "--wifi", records, "--out", tmp_path)  # fmt: skip
-    result = lpac("evaluate", *options)
+    result = called("evaluate", *options)
     assert result.returncode == 0, result.stderr
     assert "field, multicast by the model: 1 worlds" in result.stdout
     assert "data_rate_mbit_s = 100  # from the radios' rates, 1 record\n" in result.stdout
@@ -156,7 +156,7 @@ def test_interrupted_it_is_one_line(tmp_path: Path) -> None:
 
 def test_whether_one_is_better(tmp_path: Path) -> None:
     """Clairvoyant against what stays where it sees something, over few seconds."""
-    result = lpac(
+    result = called(
         "evaluate", "--compare", "clairvoyant-cvt", "decentralized-cvt", "-k", 6, "--duration", 4,
         "--baseline", "clairvoyant-cvt", "--out", tmp_path, "--set", "test",
     )  # fmt: skip
