@@ -60,10 +60,9 @@ def test_nothing_is_said_before_the_first_command() -> None:
     assert {robot.said.obeyed_sequence for robot in field.robots} == {-1}
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_commands_arrive_although_messages_are_lost(seed: int) -> None:
+def test_commands_arrive_although_messages_are_lost() -> None:
     """And come twice, and overtake each other."""
-    field = a_field(3, seed=seed)
+    field = a_field(3, seed=1)
     field.air = replace(field.air, loss=0.3, duplication=0.2, delay_s=0.1)
     field.done(SetOrigin(ORIGIN))
     field.done(Enable())

@@ -13,7 +13,7 @@ from lpac.sim.fleet.layout import APART_M, FleetScenario, Layout
 from tests.conftest import SHIPPED
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("robots", [1, 10, 16])
 def test_where_a_fleet_stands(seed: int, robots: int) -> None:
     layout = Layout(FleetScenario(robots=robots, seed=seed), SHIPPED)
