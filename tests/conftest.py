@@ -102,9 +102,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage no more among what was imported, torch for one: it stays."""
+    """Collect garbage no more among what was imported, torch for one, and seldom among the old."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(700, 10, 100)
 
 
 @pytest.hookimpl(wrapper=True)
