@@ -257,7 +257,8 @@ def test_fleet_flies_as_it_is_told(field: Commanded) -> None:
     assert "r0, r1, r2 are armed" in field.refused("mission", "world", field.folder / "world.env")
     assert "are armed" in field.refused("mission", "origin", *AT)
     assert "are armed" in field.refused("mission", "fence", "on")
-    assert "armed: carry disarmed robots only" in field.refused("mission", "rehearse")
+    why = field.refused("mission", "rehearse", "--seconds", "0.5")
+    assert "armed: carry disarmed robots only" in why
     assert "r0 is armed: land first" in field.refused("mission", "assign", "--seconds", "0.5")
 
     done = called("mission", "disarm", "r1")
