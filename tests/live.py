@@ -2,19 +2,15 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 from edge.messages.codec import decode, encode
-from edge.messages.mission import Order, RobotStatus
-from edge.messages.topics import ORDER, STATUS, Topic
+from edge.messages.mission import RobotStatus
+from edge.messages.topics import STATUS, Topic
 from lpac.sim.fleet.layout import ORIGIN, FleetScenario
 from lpac.sim.fleet.live import LiveFleet
 from lpac.sim.fleet.robots import OpenLink, SimulatedRobot
-from lpac.sim.px4.direct import DirectVehicle
-from lpac.sim.px4.vehicle import Px4Vehicle
 from lpac.sim.radio import Subscriptions
 from tests.conftest import SHIPPED
 from tests.flown import PRECISE, QUICK, FlownRobot
@@ -33,22 +29,18 @@ class FlownFleet(LiveFleet):
 
     They stand along the lower edge of the field, 4 m from each other, and then in further rows,
     with their noses along the y axis; nearer, those that take off at once would wait for each
-    other. `says[i]` changes what others hear of robot i, `hears[i]` is asked whether an order
-    reaches it.
+    other. `says[i]` changes what others hear of robot i.
     """
 
-    def __init__(
-        self, folder: Path, n: int, *, spares: int = 0, name: str = "", absent: int = 0
-    ) -> None:
+    def __init__(self, folder: Path, n: int, *, spares: int = 0, name: str = "") -> None:
         self.says: dict[int, Callable[[RobotStatus], RobotStatus]] = {}
-        self.hears: dict[int, Callable[[Order], bool]] = {}
         pads_m = tuple((2.0 + 4.0 * (i % 8), 2.0 + 4.0 * (i // 8)) for i in range(n + spares))
         scenario = FleetScenario(
             robots=n + spares, seed=3, errors=False, budget=PRECISE, pads_m=pads_m
         )
         super().__init__(
             scenario, folder, SHIPPED,
-            name=name, absent=absent, spares=spares,
+            name=name, spares=spares,
             settings=SPARING if n > 10 else None, vehicle_step_s=0.05 if n > 10 else 0.02,
         )  # fmt: skip
         for each in self.vehicles:
@@ -56,32 +48,9 @@ class FlownFleet(LiveFleet):
             each.vehicle.heading_rad = math.radians(ORIGIN.heading_deg)
         self.flown = [FlownRobot(robot) for robot in self.robots]
 
-    def stand(self, robot_id: int, place_m: Sequence[float]) -> None:
-        """Carry a robot there: (x, y) of the mission frame."""
-        with self.paused():
-            north_m, east_m = self.layout.to_world_m(np.array(place_m[:2]))
-            self.flown[robot_id].vehicle.position_m = np.array([north_m, east_m, 0.0])
-
-    def duplicate(self, robot_id: int) -> None:
-        """A second program that says that it is this robot, beside the field."""
-        with self.paused():
-            place_m = self.layout.to_world_m(np.array([31.0, 31.0]))
-            vehicle = Px4Vehicle(seed=99, start_m=place_m)
-            second = DirectVehicle(vehicle, robot_id + 1, self.schedule)
-            self.second_program(robot_id, second).start()
-
     def _open_link(self, robot: SimulatedRobot, subscriptions: Subscriptions) -> OpenLink:
-        robot_id = robot.config.robot_id
-        hear = subscriptions[ORDER]
-
-        def hear_order(key: str, data: bytes) -> None:
-            order = decode(Order, data)
-            may = self.hears.get(robot_id)
-            if order.robot_id != robot_id or may is None or may(order):
-                hear(key, data)
-
-        link = super()._open_link(robot, {**subscriptions, ORDER: hear_order})
-        return _ChangedLink(link, robot_id, self.says)
+        link = super()._open_link(robot, subscriptions)
+        return _ChangedLink(link, robot.config.robot_id, self.says)
 
 
 class _ChangedLink:

@@ -53,6 +53,7 @@ def test_simulated(tmp_path: Path) -> None:
     assert flight["simulated_s"] > 10.0 and flight["cpu_s"] > 0.0
 
 
+@pytest.mark.alone
 def test_hearing(tmp_path: Path) -> None:
     result = kept(hearing.measure(others=(9,), seconds=2.0, robots=2), tmp_path)
     check_frame(result, "hearing", targets=1)

@@ -125,15 +125,10 @@ def prepare(
                 "but not the newest (`lpac fleet pull`, then `lpac fleet exec`)"
                 % (free // 1e6, needed // 1e6)
             )
-        if same:
-            _link_image(os.path.join(directory, "releases", same[0]), target)
+        if same and not os.path.isdir(os.path.join(target, "root")):
+            # Links, which take no room.
+            must(["cp", "-al", os.path.join(directory, "releases", same[0], "root"), target])
     return answer
-
-
-def _link_image(release: str, target: str) -> None:
-    """Let `target` share the files of the release's image: links, which take no room."""
-    shutil.rmtree(os.path.join(target, "root"), ignore_errors=True)
-    must(["cp", "-al", os.path.join(release, "root"), target])
 
 
 def _is_whole(directory: str, release: str, incoming: str) -> bool:
@@ -458,8 +453,10 @@ def _unlink(directory: str, name: str) -> None:
 
 def _sync_disks(*paths: str) -> None:
     """Write out the file systems of these paths; another one's logs may take long."""
-    if run(["sync", "--file-system", *paths], timeout_s=120.0).returncode != 0:
-        os.sync()
+    with contextlib.suppress(Refused):
+        if run(["sync", "--file-system", *paths], timeout_s=120.0).returncode == 0:
+            return
+    os.sync()
 
 
 def _sync_folder(path: str) -> None:

@@ -53,15 +53,11 @@ class LiveFleet(SimulatedRobots):
         bundle: Path,
         *,
         name: str = "",
-        absent: int = 0,
         settings: Settings | None = None,
         spares: int = 0,
         vehicle_step_s: float = VEHICLE_STEP_S,
     ) -> None:
-        """The programs of the last `absent` robots are not started yet.
-
-        See `SimulatedRobots` for the others. Raises what `Layout` does.
-        """
+        """See `SimulatedRobots`. Raises what `Layout` does."""
         self.name = name or f"live-{secrets.token_hex(3)}"
         self.ports = free_ports(scenario.robots)
         super().__init__(
@@ -76,14 +72,13 @@ class LiveFleet(SimulatedRobots):
             vehicle_step_s=vehicle_step_s,
         )
         self._began_s = 0.0
-        self._present = self.robots[: scenario.robots - absent]
         self._arrived: deque[_Arrived] = deque()
         self._lock = threading.RLock()
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live fleet", daemon=True)
 
     def __enter__(self) -> Self:
-        for robot in self._present:
+        for robot in self.robots:
             robot.start()
         self.schedule.run_until(_WARM_S)
         self._began_s = time.monotonic() - _WARM_S

@@ -86,27 +86,33 @@ def name_robot(hosts: SimulatedHosts, host: SimulatedHost) -> None:
     asyncio.run(_give_card(config, config.robots[host.name]))
 
 
-def give_image(host: SimulatedHost, image: Image) -> None:
-    """Let it have the image, of 170 MB, as if a release with it had been there: none travels."""
+def give_image(host: SimulatedHost, image: Image, image_id: str | None = None) -> None:
+    """Let it have the files of the image, of 170 MB, from an earlier release: none travels.
+
+    With an `image_id` of another image: only the files are the same.
+    """
     earlier = host.root / "opt/lpac/releases/earlier"
     if not earlier.parent.exists():
         shutil.copytree(image.folder, earlier / "root", symlinks=True)
-        (earlier / "versions.json").write_text(json.dumps({"image": image.id}))
+        (earlier / "versions.json").write_text(json.dumps({"image": image_id or image.id}))
 
 
-def deploy_to(hosts: SimulatedHosts, *names: str) -> dict[str, dict[str, Any]]:
+def deploy_to(
+    hosts: SimulatedHosts, *names: str, image_id: str | None = None
+) -> dict[str, dict[str, Any]]:
     """Give the robots their identity, if they are new, and the release; what `deploy` says of each.
 
-    Only the policy and the configuration travel.
+    Only the policy and the configuration travel. See `give_image` for `image_id`.
     """
     image = load_image(load_fleet(hosts.fleet_toml).image)
     for host in hosts:
         if host.name in names and not (host.root / "opt/lpac").exists():
             name_robot(hosts, host)
-            give_image(host, image)
+            give_image(host, image, image_id)
     done = lpac_fleet(hosts.fleet_toml, "deploy", "--json", "--robots", ",".join(names))
     assert done.returncode == 0, done.stderr
     robots: dict[str, dict[str, Any]] = json.loads(done.stdout)["robots"]
+    assert all(robot["sent_bytes"] < 5_000_000 for robot in robots.values()), robots
     return robots
 
 

@@ -78,7 +78,7 @@ def program(
             running.kill()
 
 
-@pytest.mark.real_time
+@pytest.mark.alone
 def test_a_program_that_hangs_or_dies_leaves_nobody_flying_or_hovering() -> None:
     hangs = ("process", "interpreter", "loop")
     ways = (*hangs, "killed", "stopped, then killed", "continued", "taken", "taken and left")

@@ -531,7 +531,7 @@ with ZenohLink(fleet="test", robot_id=1, connect=["tcp/127.0.0.1:1"]):
     )
 
 
-@pytest.mark.real_time
+@pytest.mark.alone
 def test_robots_out_of_reach_make_nobody_deaf_and_come_back() -> None:
     """Two robots in one network namespace, seven in another, and a link between them.
 

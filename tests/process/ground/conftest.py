@@ -115,11 +115,9 @@ class GroundStation:
         self.process.kill()
         self.process.wait()
 
-    def command(
-        self, request: Request, on_progress: Callable[[CommandProgress], None] = lambda _: None
-    ) -> CommandReport:
+    def command(self, request: Request) -> CommandReport:
         with self._here():
-            return client.command(self.fleet, request, on_progress)
+            return client.command(self.fleet, request)
 
     def begin(self, request: Request) -> "Pending":
         """A command that runs beside the test; its first progress tells that it was taken."""

@@ -176,8 +176,9 @@ def test_a_ground_that_hangs(
 def test_robots_land_when_their_files_say(on_ground: FlownFleet) -> None:
     text = on_ground.fleet_toml.read_text()
     flight = "battery_critical = 0.2\nground_timeout_s = 4.0\nground_lost_land_s = 30.0\n"
-    on_ground.fleet_toml.write_text(text.replace("[robot.flight]\n", f"[robot.flight]\n{flight}"))
-    setup = load_ground(on_ground.fleet_toml, "alice").setup
+    changed = on_ground.fleet_toml.with_name("changed.toml")
+    changed.write_text(text.replace("[robot.flight]\n", f"[robot.flight]\n{flight}"))
+    setup = load_ground(changed, "alice").setup
     assert setup.battery_critical == 0.2
     assert (setup.ground_timeout_s, setup.ground_lost_land_s) == (4.0, 30.0)
 
@@ -200,7 +201,7 @@ def test_another_fleet_is_not_reached(on_ground: FlownFleet, new_station: NewSta
     text = on_ground.fleet_toml.read_text()
     other = on_ground.fleet_toml.with_name("other.toml")
     other.write_text(text.replace(on_ground.name, f"{on_ground.name}x"))
-    station = new_station(other)
+    station = new_station(other, "mallory")
     before = [robot.said.obeyed_sequence for robot in on_ground.flown]
     report = station.command(SetOrigin(ORIGIN))
     assert not_done(report) == dict.fromkeys(("r0", "r1", "r2"), ResultCode.NOT_HEARD)

@@ -148,8 +148,10 @@ def test_idle_robots_on_the_ground_speak_as_in_a_mission(
 
 def test_who_is_heard_badly_is_named(fleet: ThinAir, station: GroundStation) -> None:
     fleet.muffled = frozenset({1})
-    answer = ask(station, fleet, "--seconds", 10)
-    fleet.muffled = frozenset()
+    try:
+        answer = ask(station, fleet, "--seconds", 10)
+    finally:
+        fleet.muffled = frozenset()
     assert answer.returncode == 1
     last = answer.stderr.splitlines()[-1]
     assert last.startswith("lpac: radio: the others hear ") and " of r1" in last

@@ -43,6 +43,7 @@ STOLEN = 1
 # A TLS record that promises more than comes: the first bytes of a ClientHello.
 HALF_A_HELLO = bytes.fromhex("1603010200010001fc0303")
 _S = FlightState
+Repeated = Callable[[Callable[[], None]], None]
 
 
 @pytest.fixture(scope="module")
@@ -120,22 +121,27 @@ def attack(rig: FleetRig, session: zenoh.Session, seal: Callable[[Topic, bytes],
         session.put(f"{prefix}ground/state", data)
 
 
-def nothing_comes_of(rig: FleetRig, once: Callable[[], None]) -> None:
-    """It is done eight times while the robots fly, and all of them go on with their mission."""
-    rig.start()
-    sequence = rig.status(0).obeyed_sequence
-    for _ in range(8):
-        once()
-        # Long enough for something to come of it.
-        rig.wait_status(0, partial(_is_later, rig.status(0).sequence))
-    for robot in ROBOTS:
-        vehicle, status = rig.vehicle(robot), rig.status(robot)
-        assert vehicle.armed and not vehicle.landed
-        assert flies_on(status), (robot, status.state, status.reason)
-        assert (status.operator, status.obeyed_sequence) == ("sim", sequence)
-    snapshot = rig.ground.told.snapshot
-    assert rig.ground.running and snapshot.commander == "sim"
-    assert all(robot.fresh and not robot.duplicate for robot in snapshot.robots)
+@pytest.fixture
+def nothing_comes_of(rig: FleetRig, pytestconfig: pytest.Config) -> Repeated:
+    """It is done again and again while the robots fly, and all go on with their mission."""
+
+    def is_done(once: Callable[[], None]) -> None:
+        rig.start()
+        sequence = rig.status(0).obeyed_sequence
+        for _ in range(rounds(pytestconfig, 8)):
+            once()
+            # Long enough for something to come of it.
+            rig.wait_status(0, partial(_is_later, rig.status(0).sequence))
+        for robot in ROBOTS:
+            vehicle, status = rig.vehicle(robot), rig.status(robot)
+            assert vehicle.armed and not vehicle.landed
+            assert flies_on(status), (robot, status.state, status.reason)
+            assert (status.operator, status.obeyed_sequence) == ("sim", sequence)
+        snapshot = rig.ground.told.snapshot
+        assert rig.ground.running and snapshot.commander == "sim"
+        assert all(robot.fresh and not robot.duplicate for robot in snapshot.robots)
+
+    return is_done
 
 
 def _is_later(sequence: int, status: RobotStatus) -> bool:
@@ -146,7 +152,7 @@ def as_it_is(_: Topic, data: bytes) -> bytes:
     return data
 
 
-def test_without_a_key_nobody_gets_in(rig: FleetRig) -> None:
+def test_without_a_key_nobody_gets_in(rig: FleetRig, nothing_comes_of: Repeated) -> None:
     keys = rig.fleet.folder / "keys"
     one_sided = {
         "root_ca_certificate": str(keys / "authority.pem"), "enable_mtls": False,
@@ -160,12 +166,12 @@ def test_without_a_key_nobody_gets_in(rig: FleetRig) -> None:
             for opened in (plain, nameless):
                 attack(rig, opened, as_it_is)
 
-        nothing_comes_of(rig, once)
+        nothing_comes_of(once)
         assert not plain.info.peers_zid() and not nameless.info.peers_zid()
 
 
 def test_another_fleet_of_the_same_name_does_not_meet_this_one(
-    rig: FleetRig, tmp_path: Path
+    rig: FleetRig, nothing_comes_of: Repeated, tmp_path: Path
 ) -> None:
     authority = create_authority(tmp_path / "keys", rig.fleet.name)
     new_member(authority, tmp_path / "keys", Role.OPERATOR, "sim")
@@ -181,13 +187,15 @@ def test_another_fleet_of_the_same_name_does_not_meet_this_one(
         session(rig.fleet, certified(other.tls)) as opened,
     ):
         guard = SignedGuard(other.membership, lambda: 0.0)
-        nothing_comes_of(rig, lambda: attack(rig, opened, guard.seal))
+        nothing_comes_of(lambda: attack(rig, opened, guard.seal))
         assert link.peers() == 0 and not opened.info.peers_zid()
     assert not heard.is_set()
 
 
 @pytest.mark.parametrize("mode", ["peer", "router"])
-def test_a_stolen_robots_key_commands_nobody(rig: FleetRig, mode: str) -> None:
+def test_a_stolen_robots_key_commands_nobody(
+    rig: FleetRig, nothing_comes_of: Repeated, mode: str
+) -> None:
     """Nor do the operator's own messages, said again by whoever has heard them, or routes them."""
     stolen = stolen_identity(rig)
     # It does not speak as itself here: then the others would take it for that robot's next start.
@@ -210,7 +218,7 @@ def test_a_stolen_robots_key_commands_nobody(rig: FleetRig, mode: str) -> None:
                 if not key.startswith(f"{prefix}robot/{STOLEN}/"):
                     opened.put(key, data)
 
-        nothing_comes_of(rig, once)
+        nothing_comes_of(once)
         # It was in, and heard what members hear.
         if mode == "peer":
             assert len(opened.info.peers_zid()) >= len(ROBOTS)
@@ -222,7 +230,7 @@ def stolen_identity(rig: FleetRig) -> Identity:
     return load_identity(folder, fleet=rig.fleet.name, unix_s=1.0)
 
 
-def test_half_open_connections_hold_nobody_up(rig: FleetRig) -> None:
+def test_half_open_connections_hold_nobody_up(rig: FleetRig, nothing_comes_of: Repeated) -> None:
     """Those that say nothing, and those that begin with TLS and do not go on."""
     places = [e.removeprefix("tls/").rsplit(":", 1) for e in rig.fleet.endpoints]
     with ExitStack() as stack:
@@ -231,7 +239,7 @@ def test_half_open_connections_hold_nobody_up(rig: FleetRig) -> None:
             half = stack.enter_context(socket.create_connection((host, int(port)), 5.0))
             if i % 2:
                 half.sendall(HALF_A_HELLO)
-        nothing_comes_of(rig, lambda: None)
+        nothing_comes_of(lambda: None)
         rig.done(SafetyCommand("hold"))
         rig.command(Resume())
         rig.start()

@@ -441,6 +441,11 @@ def test_site_is_saved_and_used_again(field: Commanded) -> None:
     assert "yard has another origin than the fleet" in field.refused(
         "mission", "assign", "--site", "yard"
     )
+    # The site used last counts only while the fleet has its origin.
+    field.stand_at_pads()
+    field.do("mission", "fence", "on")
+    field.do("mission", "origin", *AT[:2], "30.5")
+    assert "pads of fleet.toml" in field.do("mission", "assign", "--seconds", "0.5").stderr
 
     field.do("mission", "enable")
     field.do("mission", "takeoff", "--robots", "r0")

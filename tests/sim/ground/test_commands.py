@@ -413,13 +413,15 @@ def test_a_command_with_a_defect_takes_nothing_with_it(monkeypatch: pytest.Monke
 
 def test_what_is_done_when() -> None:
     assert problem(a_field(1).do(TAKEOFF)) is ProblemCode.NO_ORIGIN
-    field = a_field(3, "ready")
+    field = a_field(3, "ready", spares=1)
     report = field.done(TAKEOFF)
     assert report.results[0] == RobotResult("r0", ResultCode.DONE, "at its height, 5 m")
     field.done(Start())
+    # A spare does not fly by default, but has the state.
+    assert field.robots[3].state is _S.PREFLIGHT
     assert problem(field.do(SetWorld(OTHER_WORLD, "w.env"))) is ProblemCode.ARMED
     field.done(RobotCommand("pilot", ("r1",)))
-    assert field.each_state() == [_S.MISSION, _S.PILOT, _S.MISSION]
+    assert field.each_state()[:3] == [_S.MISSION, _S.PILOT, _S.MISSION]
     field.done(RobotCommand("rejoin", ("r1",)))
     assert field.each_state()[1] is _S.HOLD
 

@@ -86,6 +86,7 @@ def test_the_highest_takes_off_first_and_in_intervals() -> None:
                 began_s.setdefault(robot.robot_id, field.now_s)
     assert running.report.done
     assert list(began_s) == [3, 2, 1, 0]
+    assert [p.robot for p in running.news() if p.text == "takes off"] == ["r3", "r2", "r1", "r0"]
     apart_s = [b - a for a, b in itertools.pairwise(began_s.values())]
     assert all(2.7 < passed_s < 3.6 for passed_s in apart_s), apart_s
 

@@ -2100,16 +2100,10 @@ def test_every_transition_is_taken_in_some_scenario() -> None:
     assert [row for row in TRANSITIONS if not reasons[row.when, row.target]] == []
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    scenario=st.sampled_from(scenarios()),
-    phase_s=st.floats(0.0, 1.0),
-    latency_s=st.floats(0.0, 1.0),
-)
-def test_late_telemetry_changes_no_outcome(
-    scenario: Callable[[World], None], phase_s: float, latency_s: float
-) -> None:
-    scenario(World(phase_s, latency_s, flown_again=True))
+def test_late_telemetry_changes_no_outcome() -> None:
+    draw = random.Random(0)
+    for scenario in scenarios():
+        scenario(World(draw.random(), draw.random(), flown_again=True))
 
 
 def test_the_page_for_people_has_the_same_table() -> None:
@@ -2199,7 +2193,7 @@ def reasons_by_row() -> Mapping[tuple[str, FlightState], set[str]]:
 # Whatever comes
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**32),
     begin=st.sampled_from([World.enable, World.ready, World.hover, World.fly]),
