@@ -21,6 +21,7 @@ from edge.flight.replay import FlightReplay
 from edge.identity.guard import Unguarded
 from edge.messages.codes import CheckCode, ReasonCode
 from edge.messages.mission import FlightState
+from edge.policy.bundle import load_bundle
 from edge.policy.lpac.policy import LpacPolicy
 from edge.policy.lpac.replay import replay
 from edge.robot.readiness import Checks
@@ -50,7 +51,7 @@ from lpac.sim.px4.modes import Px4Mode
 from lpac.sim.px4.wire import MavlinkWire
 from lpac.sim.px4.world import FencePolygon
 from lpac.sim.radio import GROUND
-from tests.conftest import SHIPPED
+from tests.conftest import ROOT, SHIPPED
 from tests.flown import PRECISE
 
 DRONE_M = 0.5
@@ -691,6 +692,8 @@ def test_nobody_takes_off_who_is_not_ready(tmp_path: Path) -> None:
 
 
 LOGGED = low_flight(2, 1, 3.0)
+# Its robots share maps.
+SHARING = ROOT / "policies" / "field" / "field"
 
 
 class Logged(NamedTuple):
@@ -703,20 +706,20 @@ class Logged(NamedTuple):
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory: pytest.TempPathFactory) -> Logged:
     folder = tmp_path_factory.mktemp("logged")
-    return Logged(fly_simulated(LOGGED, folder, SHIPPED, logs=True), folder)
+    return Logged(fly_simulated(LOGGED, folder, SHARING, logs=True), folder)
 
 
-def test_what_the_robots_logged_is_what_they_computed(
-    shipped_policy: LpacPolicy, logged: Logged
-) -> None:
+def test_what_the_robots_logged_is_what_they_computed(logged: Logged) -> None:
     """Flight logs as the robots' programs write them."""
+    policy = LpacPolicy(load_bundle(SHARING))
+    neighbours = 0
     for robot, record in enumerate(logged.flight.robots):
         (log,) = record.logs
         assert log == f"robots/{robot}/logs/robot-{robot}-0001.mcap"
         messages = list(read(logged.folder / log))
         states = {message["state"] for topic, _, message in messages if topic == "status"}
         assert {FlightState.MISSION, FlightState.LANDED} <= states
-        for compared in replay(shipped_policy, messages):
+        for compared in replay(policy, messages):
             assert compared.ticks > 0 and compared.differing == 0
         flight = FlightReplay()
         for topic, unix_time_s, message in messages:
@@ -724,8 +727,10 @@ def test_what_the_robots_logged_is_what_they_computed(
                 flight.run(unix_time_s, message)
                 heard = message["given"].get("inputs", {}).get("neighbours", ())
                 assert all(Neighbour(*told).shared is None for told in heard), "maps fill the disk"
+                neighbours += len(heard)
         ticks = sum(topic == "control" for topic, _, _ in messages)
         assert (flight.ticks, flight.passed_over, flight.differing) == (ticks, 0, 0)
+    assert neighbours > 0
 
 
 def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
@@ -753,7 +758,7 @@ def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
 
 def test_flights_beside_each_other_are_told_apart(tmp_path: Path, logged: Logged) -> None:
     """Also of the same world; each is as long as it was."""
-    longer = fly_simulated(low_flight(2, 1, 6.0), tmp_path, SHIPPED, logs=True)
+    longer = fly_simulated(low_flight(2, 1, 6.0), tmp_path, SHARING, logs=True)
     flown = [logged.flight, longer]
     both = examine([logged.folder, tmp_path], Wanted(), lambda *_: None)
     reported = sorted(both.trials, key=_duration_s)
@@ -772,8 +777,8 @@ def test_recorded_steps_of_the_policy_are_the_same_flight(
     """As on a CPU whose onnxruntime rounds otherwise."""
     velocity = LpacPolicy.velocity
     monkeypatch.setattr(LpacPolicy, "velocity", lambda *inputs: velocity(*inputs) * 1.01)
-    other = fly_simulated(LOGGED, tmp_path / "other", SHIPPED)
-    again = fly_simulated(LOGGED, tmp_path / "again", SHIPPED, recorded=logged.folder)
+    other = fly_simulated(LOGGED, tmp_path / "other", SHARING)
+    again = fly_simulated(LOGGED, tmp_path / "again", SHARING, recorded=logged.folder)
     for robot, first in zip(again.robots, logged.flight.robots, strict=True):
         np.testing.assert_array_equal(robot.truth.position_m, first.truth.position_m)
     assert not any(robot.logs for robot in (*other.robots, *again.robots))
@@ -783,7 +788,7 @@ def test_recorded_steps_of_the_policy_are_the_same_flight(
 
 def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -> None:
     def recorded(scenario: FleetScenario, folder: Path) -> None:
-        fly_simulated(scenario, tmp_path / "flown", SHIPPED, recorded=folder)
+        fly_simulated(scenario, tmp_path / "flown", SHARING, recorded=folder)
 
     with pytest.raises(RecordingError, match="has no flight log of robot 2"):
         recorded(low_flight(3, 1, 3.0), logged.folder)
@@ -791,7 +796,7 @@ def test_records_of_another_flight_are_refused(tmp_path: Path, logged: Logged) -
         recorded(low_flight(2, 2, 3.0), logged.folder)
     two = tmp_path / "two"
     for number in (1, 2):
-        flight = fly_simulated(low_flight(1, 1, 2.0), two, SHIPPED, logs=True)
+        flight = fly_simulated(low_flight(1, 1, 2.0), two, SHARING, logs=True)
         assert flight.robots[0].logs == (f"robots/0/logs/robot-0-000{number}.mcap",)
     with pytest.raises(RecordingError, match="holds logs of more than one flight"):
         recorded(low_flight(1, 1, 2.0), two)
