@@ -26,18 +26,18 @@ setup: .venv/sim .venv/export .venv/fleet .venv/ground .venv/foxglove ## install
 BY_FILE := --dist loadfile --no-loadscope-reorder
 QUICK := --numprocesses auto $(BY_FILE) tests/sim tests/unit
 check: lint ## style, types, and the quick tests: what a commit has to pass, in two and a half minutes on two cores
-	.venv/bin/pytest $(QUICK)
+	.venv/bin/pytest $(QUICK) -m 'not slow'
 
 LOWEST := out/lowest
 # Old releases warn of what their own dependencies have deprecated since.
-check-lowest: $(LOWEST)/installed ## the quick tests with Python 3.11 and the lowest versions that pyproject.toml allows
+check-lowest: $(LOWEST)/installed ## unit and sim tests with Python 3.11 and the lowest versions that pyproject.toml allows
 	$(LOWEST)/bin/pytest -W ignore::DeprecationWarning $(QUICK)
 
 test: lint ## style, types, and every test; as root with real robot hosts too: 20 minutes on two cores
 	@failed=0; rm -f out/skipped; \
 	some() { $(RUN) tests.quiet || exit 1; \
 		echo ".venv/bin/pytest $$*"; .venv/bin/pytest --skipped out/skipped "$$@" || failed=1; }; \
-	some --numprocesses 3 $(BY_FILE) -m 'not real_time and not alone'; \
+	some --numprocesses 4 $(BY_FILE) -m 'not real_time and not alone'; \
 	some --numprocesses auto $(BY_FILE) -m real_time tests/process tests/host; \
 	some -m alone tests/process tests/host; \
 	exit $$failed

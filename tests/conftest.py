@@ -76,6 +76,9 @@ def pytest_configure(config: pytest.Config) -> None:
     for tier in TIERS:
         config.addinivalue_line("markers", f"{tier}: what is in tests/{tier}")
     config.addinivalue_line(
+        "markers", "slow: in unit/ and sim/, left to `make test` by `make check`"
+    )
+    config.addinivalue_line(
         "markers", "real_time: flies robots in real time: three more files do so beside it at most"
     )
     config.addinivalue_line(

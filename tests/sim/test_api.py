@@ -49,6 +49,7 @@ def page(drawn: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path
     yield folder
 
 
+@pytest.mark.slow
 def test_the_page_runs(page: Path) -> None:
     made = {path.name for path in page.iterdir()}
     assert made >= {"out", "flight.png", "snapshots.pdf", "curves.png"}

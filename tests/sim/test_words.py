@@ -206,6 +206,7 @@ def ask(field: Field, told: list[object], request: Request) -> None:
     told.append((type(request), report.problem and report.problem.code, results))
 
 
+@pytest.mark.slow
 def test_the_ground_commands_the_same(wordless: Wordless) -> None:
     spoken = commanded()
     wordless()

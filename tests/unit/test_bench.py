@@ -29,6 +29,7 @@ def check_frame(result: dict[str, Any], name: str, targets: int) -> None:
     assert all(isinstance(target["met"], bool) for target in result["targets"])
 
 
+@pytest.mark.slow
 def test_policy(tmp_path: Path) -> None:
     result = kept(policy.measure(rounds=2, round_s=0.001), tmp_path)
     check_frame(result, "policy", targets=4)

@@ -489,6 +489,7 @@ def write_script(folder: Path, duration_s: float, **changes: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_example_script_is_flown(field: Commanded) -> None:
     assert "asks before the next trial takes off" in field.refused(
         "mission", "run", write_script(field.folder, 3.0)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from edge.core.world import GaussianFeature, format_world, parse_world
 from edge.policy.bundle import load_bundle, make_bundle, write_bundle
@@ -86,6 +87,7 @@ def test_a_bundle_that_is_not_verified_flies_as_a_point_with_a_warning(tmp_path:
     assert "wrong: swarm of the bundle do not compute its golden outputs here" in told.stderr
 
 
+@pytest.mark.slow
 def test_sim_has_the_knobs_of_an_experiment(tmp_path: Path) -> None:
     """Each of them changes the flight, and starts are where the file says."""
     starts = tmp_path / "starts.txt"

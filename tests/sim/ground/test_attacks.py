@@ -159,6 +159,7 @@ def alarms_of(field: Field, robot: str, before: FleetSnapshot | None = None) -> 
     return {alarm.code for alarm in told if alarm.robot == robot}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sequences_ahead"),
     [("alice", 5), ("alice", 2**48), ("mallory", 10**5), ("mallory", 2**48)],
@@ -200,6 +201,7 @@ def test_a_robot_that_lies_of_whom_it_obeys_takes_no_command_away(
     field.until(lambda: {robot.state for robot in honest} == {_S.LAND}, 3.0)
 
 
+@pytest.mark.slow
 def test_a_stolen_robots_lies_move_nobody_beyond_the_limits(tmp_path: Path) -> None:
     lies = (Lie.BESIDE_EACH, Lie.BOTH)
     ready = ready_fleet(2, 1, tmp_path)
@@ -214,6 +216,7 @@ def test_a_stolen_robots_lies_move_nobody_beyond_the_limits(tmp_path: Path) -> N
     assert kept.from_mission == 2 and kept.from_mission_after == 0
 
 
+@pytest.mark.slow
 def test_a_man_in_the_middle_makes_nobody_do_what_was_not_asked(
     request: pytest.FixtureRequest,
 ) -> None:
@@ -319,6 +322,7 @@ class Enemy:
         return STATUS, seal(STATUS, encode(status))
 
 
+@pytest.mark.slow
 def test_hold_land_and_kill_act_whatever_single_message_came_before(
     request: pytest.FixtureRequest,
 ) -> None:

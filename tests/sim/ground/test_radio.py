@@ -46,6 +46,7 @@ def test_on_the_ground_all_is_heard_of_all_also_before_anybody_is_enabled() -> N
         assert pair.age_p99_s is not None and pair.age_p99_s <= 0.2
 
 
+@pytest.mark.slow
 def test_what_the_radio_loses_is_counted_as_lost_whatever_comes_twice_or_overtaken() -> None:
     field = a_field(3, "ready", seed=1)
     field.air = replace(field.air, loss=0.3, duplication=0.1)

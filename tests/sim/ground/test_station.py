@@ -226,6 +226,7 @@ def an_observed_return(slow: int) -> Field:
     return Field(_observed_return(slow).fleet.copy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["alice", "bob"])
 def test_whom_somebody_holds_in_a_return_stays(by: str) -> None:
     field = an_observed_return(slow=1)
@@ -249,6 +250,7 @@ def test_whom_somebody_holds_in_a_return_stays(by: str) -> None:
     field.done(SafetyCommand("land", robots=("r1",), wait=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["alice", "bob"])
 def test_who_waits_in_a_return_may_be_held(by: str) -> None:
     field = an_observed_return(slow=0)
@@ -867,6 +869,7 @@ REQUESTS = st.sampled_from([
 NAMES = ("alice", "bob", "carol")
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(
     steps=st.lists(

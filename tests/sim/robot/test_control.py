@@ -735,6 +735,7 @@ def test_who_flies_lower_has_the_first_choice_of_a_place_beside(flown: Flown) ->
         assert (math.dist(place_m, first_m) >= 6.0) == gives_way
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("state", "height_m", "at_most_m"),
     [

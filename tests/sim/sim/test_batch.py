@@ -122,6 +122,7 @@ def test_robots_that_see_what_they_explored_fly_the_same(
         assert_same(batched, fly(scenario, bundle))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scenario",
     [

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lpac.paper.experiments import absences_of, perturbed_by
 from lpac.sim.fleet.clocked import fly_simulated
@@ -11,6 +12,7 @@ from lpac.sim.fleet.pilot import PilotFlight
 from tests.conftest import SHIPPED
 
 
+@pytest.mark.slow
 def test_it_is_out_of_the_fence_and_back_in_its_mission(tmp_path: Path) -> None:
     taken = PilotFlight(robot=0, from_s=3.0, until_s=23.0)
     scenario = FleetScenario(robots=2, seed=3, duration_s=28.0)

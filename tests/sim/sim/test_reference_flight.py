@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 
 from edge.core import F32, F64
 from edge.core.ports import OdometrySource
@@ -75,6 +76,7 @@ def flown_in_the_library(flown: SimulatedFlight) -> F64:
     return np.array(costs)
 
 
+@pytest.mark.slow
 def test_the_library_sees_about_the_same_flight() -> None:
     """60 s of the policy that ships, over a world that it was neither trained nor chosen on.
 

@@ -150,6 +150,7 @@ def watch_separation(fleet: SimulatedFleet) -> list[float]:
     return least_m
 
 
+@pytest.mark.slow
 def test_a_fleet_flies_its_mission_and_lands_on_its_pads(tmp_path: Path) -> None:
     fleet = a_fleet(tmp_path)
     apart_m = watch_separation(fleet)
@@ -224,6 +225,7 @@ def killed(fleet: SimulatedFleet) -> None:
     fleet.ground.node.begin(RobotCommand("kill", ("r0",)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "state", "reason"),
     [
@@ -337,6 +339,7 @@ def test_a_vehicle_that_others_change_on_the_ground_is_not_ready_until_it_is_set
     assert as_preflight_found_it(fleet)
 
 
+@pytest.mark.slow
 @BY_SOMEBODY_ELSE
 def test_a_vehicle_that_others_change_in_flight_is_set_back(
     changed: Callable[[SimulatedFleet], None], code: CheckCode
@@ -432,6 +435,7 @@ def returns_for_it(told: FleetSnapshot) -> bool:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wires", "code", "text"),
     [
@@ -528,6 +532,7 @@ def test_robots_that_lose_the_ground_hold_and_land() -> None:
     assert not any(each.vehicle.armed for each in fleet.vehicles)
 
 
+@pytest.mark.slow
 def test_a_script_is_flown_on_the_simulated_clock_although_messages_are_lost(
     tmp_path: Path,
 ) -> None:
@@ -569,6 +574,7 @@ class _Listener(ScriptListener):
         return True
 
 
+@pytest.mark.slow
 def test_a_flight_tells_of_itself_and_is_the_same_twice(tmp_path: Path) -> None:
     def flown(name: str) -> FleetFlight:
         scenario = FleetScenario(robots=2, seed=4, duration_s=10.0)
@@ -709,6 +715,7 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> Logged:
     return Logged(fly_simulated(LOGGED, folder, SHARING, logs=True), folder)
 
 
+@pytest.mark.slow
 def test_what_the_robots_logged_is_what_they_computed(logged: Logged) -> None:
     """Flight logs as the robots' programs write them."""
     policy = LpacPolicy(load_bundle(SHARING))
@@ -756,6 +763,7 @@ def test_the_report_says_the_same_as_the_flight(logged: Logged) -> None:
         assert reported.mission_share(robot) == flown.mission_share > 0.5
 
 
+@pytest.mark.slow
 def test_flights_beside_each_other_are_told_apart(tmp_path: Path, logged: Logged) -> None:
     """Also of the same world; each is as long as it was."""
     longer = fly_simulated(low_flight(2, 1, 6.0), tmp_path, SHARING, logs=True)
@@ -771,6 +779,7 @@ def _duration_s(record: FlightRecord) -> float:
     return record.duration_s
 
 
+@pytest.mark.slow
 def test_recorded_steps_of_the_policy_are_the_same_flight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logged: Logged
 ) -> None:

@@ -306,6 +306,7 @@ def test_message_ages_are_corrected_and_losses_counted(found: Examined) -> None:
     assert found.notes == ("t1: lasted 10.0 s: no snapshot at 11 s",)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sketched")
 def test_the_page_holds_everything(tmp_path: Path, found: Examined) -> None:
     html = write(found, tmp_path, (0.0, 5.0, 11.0), lambda *_: None).read_text()
@@ -567,6 +568,7 @@ def test_without_any_position_for_seconds_the_cost_does_not_jump(tmp_path: Path)
         )
 
 
+@pytest.mark.slow
 def test_nothing_of_a_figure_is_cut(tmp_path: Path) -> None:
     """Each state, an alarm and a restart: as many entries as a legend may have."""
     writer = Writer((FIRST,))

@@ -80,6 +80,7 @@ def test_cost_and_cells_match_the_library(features: tuple[Feature, ...], robots:
     np.testing.assert_allclose(cells.centroid, [cell.centroid for cell in theirs], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "our_goals"),
     [

@@ -263,6 +263,7 @@ def test_the_ground_writes_what_it_likes(tmp_path: Path) -> None:
         read_metadata(path)
 
 
+@pytest.mark.slow
 def test_a_file_cut_at_any_byte_is_read_up_to_there(tmp_path: Path) -> None:
     whole, cut = tmp_path / "robot-3-0001.mcap", tmp_path / "cut.mcap"
     # Only one topic: the schemas of a robot's others are more of the same.
@@ -323,6 +324,7 @@ def a_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "robot-3-0001.mcap"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flip", [0xFF, 0x01, 0x04])
 def test_a_flipped_byte_anywhere_costs_at_most_what_is_said_to_be_missing(
     a_flight: Path, tmp_path: Path, flip: int
@@ -361,6 +363,7 @@ def test_what_is_whole_of_a_damaged_log_is_repaired(a_flight: Path, tmp_path: Pa
     assert not out.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sync_period_s", [0, 1000])
 def test_the_size_bounds_hold(tmp_path: Path, sync_period_s: int) -> None:
     foreign = [tmp_path / name for name in ("robot-33-0001.mcap", "robot-3-0001.txt")]
@@ -386,6 +389,7 @@ def test_the_size_bounds_hold(tmp_path: Path, sync_period_s: int) -> None:
     assert read_metadata(max(tmp_path.glob("robot-3-*.mcap"))) == METADATA
 
 
+@pytest.mark.slow
 def test_small_messages_do_not_break_the_bound_either(tmp_path: Path) -> None:
     """Then the index is most of the file."""
     with flight_log(tmp_path, max_segment_bytes=2**18, sync_period_s=0) as log:

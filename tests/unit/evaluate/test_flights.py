@@ -70,6 +70,7 @@ def test_who_is_lost_does_not_count(flight: EvaluationFlight) -> None:
     assert flown.positions_m.shape[1] == 8
 
 
+@pytest.mark.slow
 def test_whole_robots_begin_where_points_from_pads_do(flight: EvaluationFlight) -> None:
     point = dataclasses.replace(flight, robot="point-from-pad", set_up="n3", world=4)
     [(_, of_point)] = costs_of((point,))

@@ -2100,6 +2100,7 @@ def test_every_transition_is_taken_in_some_scenario() -> None:
     assert [row for row in TRANSITIONS if not reasons[row.when, row.target]] == []
 
 
+@pytest.mark.slow
 def test_late_telemetry_changes_no_outcome() -> None:
     draw = random.Random(0)
     for scenario in scenarios():

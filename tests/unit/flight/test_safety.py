@@ -533,6 +533,7 @@ def test_the_nearest_neighbour_is_where_it_has_flown_to_since() -> None:
     assert nearest((0.0, 0.0, 0.0), []) is None
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=40)
 @given(st.data())
 def test_robots_at_one_height_that_all_fly_to_one_point_keep_apart_and_inside(

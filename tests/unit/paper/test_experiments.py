@@ -148,6 +148,7 @@ def test_in_a_log_robots_are_taken_while_a_pilot_has_them(shipped_bundle: Bundle
     assert away.any() and np.isnan(told.neighbours[away, 4]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sketched")
 def test_trials_and_worlds_are_reported(shipped_bundle: Bundle, tmp_path: Path) -> None:
     trials = {
@@ -202,6 +203,7 @@ def test_trials_of_different_teams_are_compared_by_name(shipped_bundle: Bundle) 
         spread_of(trials)
 
 
+@pytest.mark.slow
 def test_whole_robots_fly_the_same_worlds(tmp_path: Path) -> None:
     """From pads with room between them; what is drawn has where they truly were."""
     plan, points = whole_transferability(DEFAULT_BUNDLE, 2), transferability(2)

@@ -27,6 +27,7 @@ def test_where_a_fleet_stands(seed: int, robots: int) -> None:
     assert np.all((errors_m >= 1.0) & (errors_m <= 5.0))
 
 
+@pytest.mark.slow
 def test_more_robots_than_fit_are_refused_with_how_many_do() -> None:
     with pytest.raises(
         ValueError, match=r"robots = 20: (\d+) fit on 32 x 32 m, with pads 8 m apart"

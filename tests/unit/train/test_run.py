@@ -42,6 +42,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     return folder / "run", TrainingRun(read(folder), folder / "run", quiet).run(here)
 
 
+@pytest.mark.slow
 def test_what_comes_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
     folder, told = trained
     bundle = load_bundle(folder / "small")
@@ -78,6 +79,7 @@ def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
         assert (folder / "figures" / f"{figure}.png").stat().st_size > 5_000
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sketched")
 def test_a_network_that_sees_what_was_explored_is_trained_alike(tmp_path: Path) -> None:
     channels = MAP_CHANNELS[5]
