@@ -14,6 +14,8 @@ import pytest
 from lpac.analysis.statistics import VERDICT_RULE
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = ROOT / "examples"
 PAGE = (ROOT / "docs" / "api.md").read_text()
 # What each script needs, and what it leaves; what they say is for people.
@@ -49,7 +51,6 @@ def page(drawn: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path
     yield folder
 
 
-@pytest.mark.slow
 def test_the_page_runs(page: Path) -> None:
     made = {path.name for path in page.iterdir()}
     assert made >= {"out", "flight.png", "snapshots.pdf", "curves.png"}

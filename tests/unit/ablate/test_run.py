@@ -14,6 +14,8 @@ from lpac.sim.cores import Outcome, Task
 from tests.training import here
 from tests.unit.ablate.test_config import written
 
+pytestmark = pytest.mark.slow
+
 
 class StoppedError(Exception):
     """Somebody stopped it."""
@@ -43,7 +45,6 @@ def ablated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Ablati
     return folder / "run", told
 
 
-@pytest.mark.slow
 def test_what_comes_of_it(ablated: tuple[Path, list[AblationProgress]]) -> None:
     folder, _ = ablated
     told = json.loads((folder / "ablation.json").read_text())
@@ -80,7 +81,6 @@ def test_how_far_it_is(ablated: tuple[Path, list[AblationProgress]]) -> None:
     assert left_s and all(seconds >= 0.0 for seconds in left_s)
 
 
-@pytest.mark.slow
 def test_stopped_it_goes_on_and_comes_to_the_same(
     ablated: tuple[Path, list[AblationProgress]], tmp_path: Path
 ) -> None:

@@ -29,6 +29,8 @@ from lpac.train.rollout import (
     plan_round,
 )
 
+pytestmark = pytest.mark.slow
+
 DATA = DataConfig(flights=2, states=4, duration_s=6.0, disturbances=Disturbances(loss=(0.2, 0.5)))
 DAGGER = DaggerConfig(rounds=1, flights=4, duration_s=6.0, expert_flights=0.5)
 

@@ -21,6 +21,8 @@ from lpac.train.progress import RunProgress
 from lpac.train.run import TrainingRun
 from tests.training import here, read, said
 
+pytestmark = pytest.mark.slow
+
 
 class StoppedError(Exception):
     """Somebody stopped it."""
@@ -42,7 +44,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     return folder / "run", TrainingRun(read(folder), folder / "run", quiet).run(here)
 
 
-@pytest.mark.slow
 def test_what_comes_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
     folder, told = trained
     bundle = load_bundle(folder / "small")
@@ -79,7 +80,6 @@ def test_the_card_tells_of_it(trained: tuple[Path, dict[str, Any]]) -> None:
         assert (folder / "figures" / f"{figure}.png").stat().st_size > 5_000
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("sketched")
 def test_a_network_that_sees_what_was_explored_is_trained_alike(tmp_path: Path) -> None:
     channels = MAP_CHANNELS[5]
