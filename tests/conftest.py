@@ -105,7 +105,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Collect garbage no more among what was imported, torch for one, and seldom among the old."""
+    """Exempt imported modules from garbage collection, and collect old objects less often."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(700, 10, 100)
@@ -146,7 +146,7 @@ def logger() -> None:
 
 @pytest.fixture
 def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Draw each figure once, and small: for those who only want it to be there."""
+    """Draw each figure once, at a low resolution, for tests that only need the files."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - most tests draw nothing
 
     savefig = Figure.savefig

@@ -44,7 +44,7 @@ class DirectVehicle:
         self._uploaded: tuple[FencePolygon, ...] = ()
         self._dialogue = Dialogue(self._telemetry)
         self._frames = VehicleFrames()
-        # What it told at a time, unless something has come or been said since: a robot asks often.
+        # Time and state of the last answer: a robot asks several times a tick. Messages clear it.
         self._told: tuple[float, VehicleState] | None = None
         # Nobody else listens on this link: what the robot does not read costs time alone.
         self._link.silence(self._telemetry.messages)

@@ -75,7 +75,7 @@ def test_of_two_operators_the_second_waits(laptop: Laptop) -> None:
 def test_a_changed_file_travels_alone_and_only_rollback_goes_back(
     laptop: Laptop, tmp_path: Path
 ) -> None:
-    """What the authority has not signed does not run, nor does anything older."""
+    """A robot runs only releases that the authority signed, and none that is older."""
     assert laptop.config.keys is not None
     authority = Authority(laptop.config.keys, laptop.config.fleet)
     stranger = create_authority(tmp_path / "keys", laptop.config.fleet)

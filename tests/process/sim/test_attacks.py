@@ -123,7 +123,7 @@ def attack(rig: FleetRig, session: zenoh.Session, seal: Callable[[Topic, bytes],
 
 @pytest.fixture
 def nothing_comes_of(rig: FleetRig, pytestconfig: pytest.Config) -> Repeated:
-    """It is done again and again while the robots fly, and all go on with their mission."""
+    """Repeat an attack while the robots fly, and check that all go on with their mission."""
 
     def is_done(once: Callable[[], None]) -> None:
         rig.start()

@@ -120,7 +120,7 @@ class Commanded:
         looks = self.fleet.schedule.every(0.05, look)
 
     def hears(self, robot: FieldRobot, heard: Callable[[Order], bool]) -> None:
-        """What the robot is ordered reaches it if `heard` says so."""
+        """Let an order reach the robot only if `heard` says so."""
         link = robot.program._link
         assert isinstance(link, RadioLink)
         hear = link._subscriptions[ORDER]
