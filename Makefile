@@ -34,13 +34,7 @@ check-lowest: $(LOWEST)/installed ## unit and sim tests with Python 3.11 and the
 	$(LOWEST)/bin/pytest -W ignore::DeprecationWarning $(QUICK)
 
 test: lint ## style, types, and every test; as root with real robot hosts too: 22 minutes on two cores
-	@failed=0; rm -f out/skipped; \
-	some() { $(RUN) tests.quiet || exit 1; \
-		echo ".venv/bin/pytest $$*"; .venv/bin/pytest --skipped out/skipped "$$@" || failed=1; }; \
-	some --numprocesses 4 $(BY_FILE) -m 'not real_time and not alone'; \
-	some --numprocesses auto $(BY_FILE) -m real_time tests/process tests/host; \
-	some -m alone tests/process tests/host; \
-	exit $$failed
+	@tests/all.sh
 
 redteam: .venv/test ## attacks on a fleet with keys and on one without: docs/security.md, "Attacks that were tried"
 	.venv/bin/pytest -v --tries 1000 tests/sim/ground/test_attacks.py tests/process/sim/test_attacks.py \
