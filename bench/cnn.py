@@ -110,7 +110,7 @@ def _profile(model: bytes, images: F32, flops: list[int]) -> list[dict[str, Any]
         events = json.loads(Path(session.end_profiling()).read_text())
     times_us: dict[tuple[str, str], list[float]] = defaultdict(list)
     for event in events:
-        if event["cat"] == "Node":
+        if event["cat"] == "Node" and event["name"].endswith("_kernel_time"):
             times_us[event["name"], event["args"]["op_name"]].append(event["dur"])
     counted = iter(flops)
     return [

@@ -280,6 +280,8 @@ def _queue(transport: Transport, wifi: Wifi, traffic: Traffic) -> tuple[float, A
     robots = traffic.robots
     if transport == "multicast":
         load = _airtime(transport, wifi, traffic, robots)
+        if not load.message_s:
+            return 0.0, load
         return min(load.message_s * _waiting(load.total), wifi.queue_s), load
     # How often a message for one station comes to its queue.
     messages = [f for f in _flows(traffic, robots) if f.topic in _MESSAGES]

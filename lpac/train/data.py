@@ -36,12 +36,12 @@ class Shards:
 
     def add(self, name: str, states: States, facts: Mapping[str, Any]) -> None:
         """Keep a shard, and in the manifest `facts` of it. Raises OSError."""
-        inputs = {f"{_INPUT}{key}": rows for key, rows in states.inputs.items()}
+        arrays: dict[str, Any] = {f"{_INPUT}{key}": rows for key, rows in states.inputs.items()}
         new = self._folder / "new.npz"
         with new.open("wb") as file:
             np.savez_compressed(
-                file, allow_pickle=False, velocities=states.velocities, robots=states.robots,
-                adjacency=states.adjacency, **inputs,
+                file, velocities=states.velocities, robots=states.robots,
+                adjacency=states.adjacency, **arrays,
             )  # fmt: skip
         new.replace(self._path(name))
         self._kept.add(

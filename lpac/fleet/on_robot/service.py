@@ -109,7 +109,7 @@ def hear_heartbeat(port: int, wait_s: float = _HEARTBEAT_WAIT_S) -> Optional[Dic
 
 def _datagram(packet: bytes, port: int) -> bytes:
     """What an IPv4 packet carries to a UDP port; nothing if it is another packet."""
-    header = 4 * (packet[0] & 0x0F) if packet else 0
+    header = max(20, 4 * (packet[0] & 0x0F)) if packet else 0
     if len(packet) < header + 8 or packet[9] != socket.IPPROTO_UDP:
         return b""
     _, destination = struct.unpack_from("!HH", packet, header)

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from edge.drivers.px4 import raw_mavlink
@@ -105,6 +105,7 @@ def test_pruning_never_removes_what_runs_nor_what_a_rollback_needs(
 
 
 @given(st.binary(max_size=300))
+@example(bytes(8))
 def test_no_datagram_breaks_the_listener(data: bytes) -> None:
     service._datagram(data, 14551)
     service._datagram(b"\x45" + data, 14551)

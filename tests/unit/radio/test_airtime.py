@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from edge.core.memory import EXPLORED_CELLS
@@ -214,6 +214,11 @@ def test_a_faster_channel_takes_less(
 
 
 @given(transports, wifis, traffics)
+@example(
+    "multicast",
+    Wifi(data_rate_mbit_s=6.0, multicast_rate_mbit_s=1.0, ground_wired=False),
+    Traffic(robots=28, message_hz=0.0),
+)
 def test_loss_and_delay_are_bounded(transport: Transport, wifi: Wifi, traffic: Traffic) -> None:
     loss, delay_s = link_quality(transport, wifi, traffic)
     assert 0.0 <= loss <= 1.0
