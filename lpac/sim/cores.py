@@ -60,8 +60,9 @@ def over_processes(
 
 
 def _from_workers(workers: int, tasks: int, path: str) -> Generator[Any, None, None]:
-    # A fork would inherit threads that do not run there.
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (path,))
+    with _without_interrupts():
+        # A fork would inherit threads that do not run there.
+        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (path,))
     try:
         with _without_interrupts():
             given: list[Future[Any]] = [pool.submit(_do_nth, n) for n in range(tasks)]
@@ -71,18 +72,22 @@ def _from_workers(workers: int, tasks: int, path: str) -> Generator[Any, None, N
         raise ChildProcessError("a worker process was killed") from None
     except BaseException:
         # What nobody waits for ends now.
-        for worker in active_children():
-            worker.terminate()
+        with _without_interrupts():
+            for worker in active_children():
+                worker.terminate()
         raise
     finally:
-        pool.shutdown(cancel_futures=True)
+        with _without_interrupts():
+            pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
     """Ctrl-C comes at the end, and to no process that begins here.
 
-    A worker that is interrupted, or loses its parent, while it begins prints a traceback.
+    A worker that is interrupted, or loses its parent, while it begins prints a traceback. A pool
+    whose shutdown is interrupted leaves workers that print one, and names of semaphores with
+    multiprocessing's resource tracker, which warns of them after the program's last line.
     """
     # It unblocks the signal when it begins.
     resource_tracker.ensure_running()
