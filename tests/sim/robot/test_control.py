@@ -30,6 +30,7 @@ from edge.core.wire import FLOAT_PAYLOADS
 from edge.core.world import random_features, rasterize
 from edge.drivers.px4.telemetry import Px4Telemetry
 from edge.drivers.world_sensor import WorldSensor
+from edge.flight.state import FlightInputs
 from edge.identity.card import Role
 from edge.identity.guard import Speaker
 from edge.messages.beacon import Beacon, HeardBeacon
@@ -37,6 +38,7 @@ from edge.messages.codec import encode
 from edge.messages.codes import CheckCode, FailedCheck, Reason, ReasonCode, RefusalCode
 from edge.messages.mission import (
     ON_GROUND,
+    Echo,
     FlightState,
     GroundState,
     Order,
@@ -82,6 +84,7 @@ class DirectAutopilot:
         self.vehicle = vehicle
         self.commands: list[Action] = []
         self.result: ActionResult | None = None
+        self.failsafe = False
 
     def state(self) -> VehicleState:
         vehicle = self.vehicle
@@ -100,6 +103,7 @@ class DirectAutopilot:
             mode=MODES[vehicle.mode],
             armed=vehicle.armed,
             in_air=not vehicle.landed,
+            failsafe=self.failsafe,
             heartbeat_at_s=vehicle.time_s,
             battery=vehicle.battery_remaining,
             result=self.result,
@@ -268,17 +272,20 @@ class Flown:
         at_s = self.now_s - age_s
         self.control.peers = tuple(HeardBeacon(beacon, at_s) for beacon in beacons)
 
-    def silent(self) -> tuple[Neighbour, ...]:
-        """Whom the last tick took for silent."""
+    def inputs(self) -> FlightInputs:
+        """What the last tick knew."""
         topic, message = self.records[-1]
         assert topic == "flight"
-        silent: tuple[Neighbour, ...] = message["given"].inputs.fell_silent
-        return silent
+        inputs: FlightInputs = message["given"].inputs
+        return inputs
+
+    def silent(self) -> tuple[Neighbour, ...]:
+        """Whom the last tick took for silent."""
+        return self.inputs().fell_silent
 
     def lands_beside_m(self) -> tuple[float, float] | None:
         """Where the last tick was to land, if not at its landing point."""
-        beside_m: tuple[float, float] | None = self.records[-1][1]["given"].inputs.lands_beside_m
-        return beside_m
+        return self.inputs().lands_beside_m
 
     def odometry(self) -> Vector:
         odometry = self.navigation.odometry()
@@ -383,6 +390,29 @@ def test_it_stays_at_its_height_when_the_estimate_of_it_jumps(
         flown.until(FlightState.LANDED)
 
 
+def test_the_grounds_word_is_as_old_as_it_is_by_the_clock_of_whoever_says_it(flown: Flown) -> None:
+    flown.until(FlightState.PREFLIGHT)
+
+    def age_s(base: int, ahead_s: float, late_s: float = 0.0, boot_nonce: int = 11) -> float:
+        """Once a ground whose clock is so far ahead has spoken, so long ago."""
+        said_s = flown.now_s - late_s
+        echo = Echo(boot_nonce, uptime_s=said_s, held_s=0.0)
+        flown.say(time_base=base, time_s=said_s + ahead_s, echoes={"3": echo})
+        flown.tick()
+        return flown.control.ground_age_s(flown.now_s)
+
+    # Another start of this program is not answered for this one.
+    assert age_s(1, 1000.0, boot_nonce=12) < 0.3 and flown.pac.clock.at(flown.now_s) is None
+    assert age_s(1, 1000.0) < 0.3 and flown.pac.clock.at(flown.now_s) is not None
+    # What was overtaken on its way is not the newest.
+    assert age_s(1, 1000.0, late_s=2.0) < 0.3
+    # Another ground's clock begins anew.
+    assert [age_s(2, 5.0) for _ in range(20)][-1] < 0.3
+    for _ in range(20):
+        flown.tick()
+    assert flown.control.ground_age_s(flown.now_s) > 1.5
+
+
 def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
     flown.take_off()
     flown.explore("a")
@@ -416,6 +446,44 @@ def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
     flown.until(FlightState.LANDED)
     flown.tick()
     assert place() == ELSEWHERE
+
+
+def test_what_was_known_by_one_origin_is_forgotten_with_another(flown: Flown) -> None:
+    def known() -> tuple[list[int], list[int], bool]:
+        """Who fell silent, who is kept away from, and whether its landing point is taken."""
+        inputs = flown.inputs()
+        silent, kept_away = (
+            [each.robot_id for each in some] for some in (inputs.fell_silent, inputs.neighbours)
+        )
+        return silent, kept_away, inputs.lands_beside_m is not None
+
+    flown.until(FlightState.PREFLIGHT)
+    x_m, y_m = flown.control.assignment.robot.parameters.landing_point_m
+    others = (
+        peer(5, FlightState.LANDED, (x_m + 1.0, y_m, 0.0)),
+        peer(6, FlightState.MISSION, (60.0, 0.0, 9.0)),
+        peer(7, FlightState.HOLD, (90.0, 0.0, 9.0)),
+    )
+    # Where somebody is by another one tells nothing.
+    flown.peers(*(dataclasses.replace(each, frame_id=0) for each in others))
+    flown.tick()
+    assert known() == ([], [], False)
+    flown.peers(*others)
+    flown.tick()
+    flown.control.revoked = frozenset({7})
+    flown.peers()
+    flown.tick()
+    assert known() == ([6], [7], True)
+    flown.say(fence=dataclasses.replace(flown.control.assignment.robot.fence, ceiling_m=29.0))
+    flown.tick()
+    assert known() == ([6], [7], True)
+    one_look = flown.pac.explored().sum()
+    flown.say(origin=dataclasses.replace(ORIGIN, latitude_deg=ORIGIN.latitude_deg - 5e-5))
+    flown.tick()
+    assert known() == ([], [], False)
+    flown.tick()
+    flown.tick()
+    assert flown.pac.explored().sum() <= one_look
 
 
 def test_a_program_that_starts_in_flight_takes_the_origin_it_hears(flown: Flown) -> None:
@@ -459,6 +527,15 @@ def test_fence_and_place_are_taken_up_together_on_the_ground_and_given_back(flow
     flown.tick()
     assert flies_by(flown) == configured
     assert not flown.control.not_taken
+    # Killed, it may have fallen anywhere.
+    flown.say(safety_action="none")
+    flown.until(FlightState.PREFLIGHT)
+    assert flown.order("takeoff").accepted and flown.order("kill").accepted
+    flown.say(fence=FENCE)
+    flown.tick()
+    text = "not known to be on the ground: keeps its fence"
+    assert flown.control.not_taken == (FailedCheck(CheckCode.KEEPS_FENCE, text),)
+    assert flies_by(flown) == configured
 
 
 def test_a_place_outside_the_fence_leaves_both_as_they_were_and_keeps_it_down(flown: Flown) -> None:
@@ -599,8 +676,9 @@ def test_checks_count_for_their_origin_and_not_for_long(
 
 def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
     flown.take_off()
-    flown.peers(peer(5, FlightState.TAKEOFF), peer(6, FlightState.HOLD))
-    assert why(flown.order("start", "a")) is RefusalCode.OTHERS_TAKE_OFF
+    for state in (FlightState.ARMING, FlightState.TAKEOFF):
+        flown.peers(peer(5, state), peer(6, FlightState.HOLD))
+        assert why(flown.order("start", "a")) is RefusalCode.OTHERS_TAKE_OFF
     flown.peers(peer(5, FlightState.HOLD))
     assert flown.order("start", "a").accepted
 
@@ -608,10 +686,11 @@ def test_it_does_not_start_while_others_take_off(flown: Flown) -> None:
 def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: Flown) -> None:
     flown.take_off()
     x_m, y_m, height_m = flown.odometry()
-    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)))
+    near = peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m))
+    flown.peers(near, age_s=1.4)
     assert why(flown.order("start", "a")) is RefusalCode.TOO_CLOSE
-    # What it said two seconds ago tells nothing, nor does a place in another frame.
-    flown.peers(peer(5, FlightState.HOLD, (x_m + 1.0, y_m, height_m)), age_s=2.0)
+    # What it said a while ago tells nothing.
+    flown.peers(near, age_s=1.6)
     assert flown.order("start", "a").accepted
 
 
@@ -623,6 +702,8 @@ def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: F
         # It sinks, and hangs there.
         (FlightState.MISSION, -1.4, False),
         (FlightState.MISSION, -1.6, True),
+        # It is on its way to its height.
+        (FlightState.TAKEOFF, -1.6, False),
     ],
 )
 def test_who_is_flown_by_a_pilot_or_off_its_height_is_kept_away_from_further(
@@ -691,8 +772,12 @@ def test_it_lands_beside_where_who_fell_silent_may_have_come_down(flown: Flown) 
     flown.peers(peer(5, FlightState.MISSION, (x_m + 1.0, y_m, 14.0)))
     flown.tick()
     flown.peers()
+    # A radio may lose a few beacons.
+    for _ in range(28):
+        flown.tick()
+        assert flown.lands_beside_m() is None
     # Long after it must be down.
-    for _ in range(1200):
+    for _ in range(1172):
         flown.tick()
     assert flown.silent() == ()
     flown.say(safety_action="return")
@@ -767,6 +852,18 @@ def test_who_flies_and_tells_no_place_is_taken_to_be_where_it_last_was(
         assert [robot.position_m for robot in flown.silent()] == still
 
 
+def test_it_knows_how_long_its_battery_lasts_and_the_way_home(flown: Flown) -> None:
+    flown.say(fence=FENCE, places={"3": PLACE})
+    flown.take_off()
+    energy, robot = flown.control.energy, flown.control.assignment.robot
+    assert energy is not None and energy.home_s is not None
+    left = flown.vehicle.battery_remaining - robot.parameters.battery_critical
+    assert energy.lasts_s == pytest.approx(900.0 * left, rel=0.02)
+    flight_s = math.dist(flown.odometry()[:2], PLACE.landing_point_m) / robot.limits.max_speed_m_s
+    # At 0.7 of its speed, after one lower robot, from 9.5 m down; and the reserve.
+    assert energy.home_s == pytest.approx(flight_s / 0.7 + 10.0 + 24.0 + 60.0, abs=0.7)
+
+
 @pytest.mark.parametrize("on_stop", [Action.HOLD, Action.LAND])
 def test_what_it_leaves_behind(flown: Flown, on_stop: Action) -> None:
     leave = flown.control.leave
@@ -784,7 +881,14 @@ def test_what_it_leaves_behind(flown: Flown, on_stop: Action) -> None:
     assert leave(on_stop) is on_stop
     # The watchdog was first.
     flown.vehicle.set_mode(Px4Mode.HOLD)
+    flown.vehicle.step(0.02)
     assert leave(on_stop) is on_stop
+    # PX4's own failsafe was: neither this program nor its watchdog takes it from that.
+    flown.autopilot.failsafe = True
+    assert leave(on_stop) is None
+    flown.tick()
+    assert not flown.sent
+    flown.autopilot.failsafe = False
     # PX4 lands by itself, or a pilot came, and no tick has seen it yet.
     flown.vehicle.set_mode(Px4Mode.LAND)
     flown.vehicle.step(0.02)

@@ -39,7 +39,7 @@ from edge.flight.guidance import (
     MissionVelocity,
     guide,
 )
-from edge.flight.orders import ORDERS
+from edge.flight.orders import ORDERS, refusal
 from edge.flight.safety import Closest, MotionLimits
 from edge.flight.state import (
     FlightInputs,
@@ -721,7 +721,12 @@ def test_only_the_commander_orders_but_anybody_kills(world: World) -> None:
         assert why(answer) is RefusalCode.OTHER_COMMANDER
         world.reads(answer.refusal, "op commands, not eve")
     assert world.actions == []
-    assert world.give(replace(world.new_order("kill"), operator="eve")).accepted
+    world.obey("reset")
+    obeyed_s = world.flight.obeyed_expiry_s
+    kill = replace(world.new_order("kill"), operator="eve", expires_at_uptime_s=obeyed_s - 5.0)
+    assert world.give(kill).accepted
+    # Nor does that make older orders count again.
+    assert world.flight.obeyed_expiry_s == obeyed_s
 
 
 def test_without_a_ground_only_kill_is_taken(world: World) -> None:
@@ -786,6 +791,27 @@ def test_the_next_trial_is_reset_on_the_ground_or_in_hold_and_then_started(world
     decision = world.tick()
     assert decision.flight.state is FlightState.MISSION
     assert decision.flight.trial == "third"
+
+
+def test_an_order_is_refused_where_what_it_needs_is_not_known_or_lost() -> None:
+    world = World()
+    world.robot = replace(ROBOT, on_remote_control_lost="land")
+    world.hover()
+    lost: dict[str, object] = {"remote_control_at_s": world.now_s - 2.0}
+    cases: tuple[tuple[OrderKind, dict[str, object], dict[str, object], RefusalCode], ...] = (
+        ("disarm", {"in_air": None}, {}, RefusalCode.ARMED_NOT_KNOWN),
+        ("disarm", {"in_air": False, "armed": None}, {}, RefusalCode.ARMED_NOT_KNOWN),
+        ("start", {"armed": None}, {}, RefusalCode.NOT_IN_THE_AIR),
+        ("start", {"remote_control": False}, lost, RefusalCode.REMOTE_CONTROL_LOST),
+        ("start", {}, {"datum_m": None}, RefusalCode.PLACE_NOT_KNOWN),
+        ("start", {}, {"reached": False}, RefusalCode.NOT_IN_OFFBOARD),
+    )
+    for kind, heard, memory, code in cases:
+        flight = replace(world.flight, **memory)  # type: ignore[arg-type]
+        vehicle = replace(world._hear(), **heard)  # type: ignore[arg-type]
+        t = Tick(world.robot, flight, world.inputs(vehicle))
+        refused = refusal(t, world.new_order(kind))
+        assert refused is not None and refused.code is code, (kind, heard, memory)
 
 
 def test_a_reset_is_taken_though_the_state_changes_in_the_same_tick(world: World) -> None:
@@ -1185,6 +1211,11 @@ def test_what_stands_on_the_ground_is_landed_whatever_the_autopilot_says(world: 
     assert world.why == (FlightState.LAND, ReasonCode.ON_GROUND)
     # Its motors lift again, and PX4 lands: they idle.
     world.sinks_m_s = 0.0
+    while world.flight.landed_since_s is None:
+        world.tick()
+    for action, at_s in ((Action.DISARM, world.flight.since_s - 1.0), (Action.LAND, world.now_s)):
+        world.heard = replace(world.heard, result=ActionResult(action, False, "denied", at_s))
+        assert ReasonCode.DISARM_REFUSED not in codes(world.tick())
     world.run(8.0)
     assert world.height_m == 0.0 and world.armed
     assert ReasonCode.DISARM_REFUSED in codes(world.tick())
@@ -1199,8 +1230,11 @@ def test_disarm_is_taken_from_what_stands_whatever_the_autopilot_says(world: Wor
     world.never_lands = True
     world.sinks_m_s = 4.0
     world.until(FlightState.LAND, 8.0)
+    world.refuses = {Action.DISARM: "denied"}
     world.obey("disarm")
     assert world.why == (FlightState.PILOT, ReasonCode.DISARM_ORDERED)
+    # He who has it knows, and may fly it.
+    assert ReasonCode.DISARM_REFUSED not in codes(world.tick())
 
 
 def test_hold_outside_the_fence_comes_back_inside(world: World) -> None:
@@ -1508,6 +1542,7 @@ def test_what_was_not_told_while_the_program_stood_still_is_not_lost(world: Worl
     world.fly()
     world.remote_control = world.battery = None
     world.stop(3.0)
+    assert ReasonCode.BATTERY_NOT_KNOWN not in codes(world.tick())
     world.remote_control, world.battery = True, 0.9
     world.run(4.0)
     assert world.state() is FlightState.HOLD
@@ -1523,6 +1558,9 @@ def test_who_lands_where_it_is_does_not_land_beside_its_landing_point(world: Wor
     assert ReasonCode.LANDS_BESIDE in codes(world.tick())
     world.battery = 0.05
     world.until(FlightState.LAND, 2.0)
+    assert ReasonCode.LANDS_BESIDE not in codes(world.tick())
+    world.pilot()
+    world.until(FlightState.PILOT, 4.0)
     assert ReasonCode.LANDS_BESIDE not in codes(world.tick())
 
 
@@ -1636,6 +1674,7 @@ def test_offboard_refused_leaves_it_to_the_pilot(world: World) -> None:
     world.run(3.5)
     assert world.state() is FlightState.HOLD
     world.until(FlightState.PILOT, 2.0)
+    assert world.why == (FlightState.PILOT, ReasonCode.PILOT)
     world.mode = world.intended = Mode.HOLD
     world.run(3.0)
     world.obey("rejoin")
@@ -1687,6 +1726,9 @@ def test_a_pilot_wins_over_the_autopilots_failsafe(world: World) -> None:
         world.run(3.0)
         world.pilot()
         world.until(FlightState.PILOT, 2.5)
+        # PX4 still warns of why it acted.
+        warned = world._decide(replace(world._hear(), failsafe=True))
+        assert ReasonCode.FAILSAFE not in codes(warned)
         world.run(4.0)
         assert world.mode is Mode.POSITION
         world.pilot(0.0, 0.0, -1.0)

@@ -29,15 +29,30 @@ def test_nothing_heard_is_infinitely_old() -> None:
     assert make_inbox().ground(10.0) == (None, math.inf)
     assert make_inbox().order(0.0) is None
     assert make_inbox().peers(10.0) == ()
+    assert make_inbox().ground_unix_s(10.0) is None
+
+
+def test_a_flood_leaves_what_came_last() -> None:
+    inbox = make_inbox()
+    for number in range(1000):
+        inbox.put_ground(b"", ANYBODY, 0.0)
+        inbox.put_order(encode(dataclasses.replace(ORDER, order_id=str(number))), ANYBODY, 0.0)
+    inbox.ground(0.0)
+    assert inbox.not_understood_count == 16
+    taken = []
+    while (order := inbox.order(0.0)) is not None:
+        taken.append(order.order_id)
+    assert taken == [str(number) for number in range(936, 1000)]
 
 
 def test_the_ground_state_ages_until_the_next_comes() -> None:
     inbox = make_inbox()
     inbox.put_ground(encode(STATE), ANYBODY, 1.0)
     assert inbox.ground(1.5) == (STATE, 0.5)
-    assert inbox.ground(3.0) == (STATE, 2.0)
-    inbox.put_ground(encode(STATE), ANYBODY, 3.0)
-    assert inbox.ground(3.0) == (STATE, 0.0)
+    assert inbox.ground(3.0) == (STATE, 2.0) and inbox.ground_unix_s(3.0) is None
+    clocked = dataclasses.replace(STATE, unix_time_s=1e9)
+    inbox.put_ground(encode(clocked), ANYBODY, 3.0)
+    assert inbox.ground(3.0) == (clocked, 0.0) and inbox.ground_unix_s(3.5) == 1e9 + 0.5
 
 
 def test_an_older_state_that_arrives_late_does_not_count() -> None:
@@ -172,6 +187,10 @@ def test_peers_are_who_was_heard_lately_and_the_newest_counts() -> None:
     # Its clock was set back while it was away.
     inbox.put_beacon(NEIGHBOUR, 5.0)
     assert [peer.beacon for peer in inbox.peers(5.1)] == [NEIGHBOUR]
+    # So also where nobody asked in between.
+    older = dataclasses.replace(NEIGHBOUR, sequence=1)
+    inbox.put_beacon(older, 8.1)
+    assert [peer.beacon for peer in inbox.peers(8.2)] == [older]
 
 
 def test_who_speaks_another_version_is_named_for_as_long_as_it_does() -> None:
@@ -248,6 +267,9 @@ def test_of_who_does_not_command_only_a_hold_counts() -> None:
         # It ends with whoever says it, and with what the commander says next.
         assert inbox.ground(2.5)[0] == state
         assert obeyed(robot_safety_actions={"3": "hold"}) == ("hold", after)
+        goes_on = dataclasses.replace(state, sequence=after)
+        inbox.put_ground(encode(goes_on), ann, 1.05)
+        assert inbox.ground(1.05)[0] == goes_on
         landing = dataclasses.replace(state, sequence=after, safety_action="land")
         inbox.put_ground(encode(landing), ann, 1.1)
         assert inbox.ground(1.1)[0] == landing

@@ -1,11 +1,48 @@
-"""How a robot's program ends."""
+"""How a robot's program ends, and what it tells of its threads meanwhile."""
 
 import threading
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 from edge.robot.process import _Program
 from tests.said import lines_said
+
+
+def nothing(*_: Any) -> None:
+    pass
+
+
+def program_of(keep_news: Callable[[], None] | None = None, **steps: Any) -> _Program:
+    """Whose other steps do nothing."""
+    names = ("control", "perception", "policy", "preflight", "status")
+    node: Any = SimpleNamespace(
+        **{f"{name}_step": nothing for name in names} | steps, leave=nothing, identity_problem=""
+    )
+    config: Any = SimpleNamespace(
+        rates=SimpleNamespace(control_hz=10.0, perception_hz=5.0, policy_hz=2.5), on_stop="land"
+    )
+    recorder: Any = SimpleNamespace(flush=nothing)
+    rest: Any = SimpleNamespace()
+    return _Program(config, node, rest, rest, recorder, rest, keep_news)
+
+
+def test_what_cannot_be_kept_is_told_for_as_long_and_logged_once() -> None:
+    problems: list[OSError | None] = [OSError(28, "No space left on device", "revoked")]
+
+    def keep() -> None:
+        if problems[-1] is not None:
+            raise problems[-1]
+
+    program = program_of(keep)
+    with lines_said() as lines:
+        program._write_step()
+        program._write_step()
+    assert program._node.identity_problem.startswith("revoked: ")
+    assert [line["event"] for line in lines] == ["identity not written"]
+    problems.append(None)
+    program._write_step()
+    assert program._node.identity_problem == ""
 
 
 def test_preflight_that_waits_for_its_vehicle_is_no_hanging_loop() -> None:
@@ -15,19 +52,7 @@ def test_preflight_that_waits_for_its_vehicle_is_no_hanging_loop() -> None:
         waits.set()
         closed.wait()
 
-    def nothing(*_: Any) -> None:
-        pass
-
-    node: Any = SimpleNamespace(
-        control_step=nothing, perception_step=nothing, policy_step=nothing,
-        preflight_step=read_parameters, status_step=nothing, leave=nothing,
-    )  # fmt: skip
-    config: Any = SimpleNamespace(
-        rates=SimpleNamespace(control_hz=10.0, perception_hz=5.0, policy_hz=2.5), on_stop="land"
-    )
-    recorder: Any = SimpleNamespace(flush=nothing)
-    rest: Any = SimpleNamespace()
-    program = _Program(config, node, rest, rest, recorder, rest, None)
+    program = program_of(preflight_step=read_parameters)
     with lines_said() as lines:
         program.start()
         assert waits.wait(20.0)

@@ -60,6 +60,15 @@ def test_deadlines_are_absolute(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (status.ticks, status.overruns) == (50, 0)
     lateness_ms = status.lateness_p50_ms, status.lateness_p99_ms, status.lateness_max_ms
     assert lateness_ms == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    assert loop.age_s() == pytest.approx(0.015)
+
+
+def test_lateness_is_that_of_the_last_minute() -> None:
+    loop = Loop("test", 0.5, lambda: None)
+    loop._latenesses_s.extend(tick / 1e3 for tick in range(200))
+    status = loop.status()
+    lateness_ms = status.lateness_p50_ms, status.lateness_p99_ms, status.lateness_max_ms
+    assert lateness_ms == pytest.approx((140.0, 198.0, 199.0))
 
 
 def test_a_long_tick_leaves_deadlines_out_instead_of_running_twice(
@@ -83,8 +92,13 @@ def test_a_step_that_raises_is_counted_and_the_loop_goes_on() -> None:
         raise RuntimeError("broken")
 
     loop = Loop("test", 0.01, step)
-    run_until(loop, done)
-    assert loop.status().failures == loop.status().ticks >= 6
+    with lines_said() as lines:
+        run_until(loop, done)
+    failures = loop.status().failures
+    assert failures == loop.status().ticks >= 6 and loop.age_s() is None
+    # A log that fills the disk helps nobody: of the first, the second, the fourth and so on.
+    logged = [line["failures"] for line in lines]
+    assert logged == [2**n for n in range(len(logged))] and 4 in logged
 
 
 def test_a_loop_that_hangs_does_not_hold_up_its_stop() -> None:
