@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from edge.identity.guard import CardProblem
 from edge.messages.mission import FlightState, Place, world_id
 from lpac.ground.station.protocol import (
     Enable,
@@ -40,6 +41,19 @@ def two_stations(n: int = 2, stage: Stage = "ready") -> Field:
     field.join("bob")
     field.run(1.0)
     return field
+
+
+@pytest.mark.parametrize("request_", [TAKEOFF, Start()])
+def test_who_has_no_good_card_sets_nobody_in_motion(
+    monkeypatch: pytest.MonkeyPatch, request_: Request
+) -> None:
+    field = a_field(1, "ready")
+    guard = field.fleet.grounds["alice"].node._guard
+    monkeypatch.setattr(type(guard), "card_problem", lambda *_: CardProblem.EXPIRED)
+    report = field.do(request_)
+    assert problem(report) is ProblemCode.MAY_NOT
+    assert report.problem is not None
+    assert report.problem.text.startswith("the card of alice is expired: it needs a new one")
 
 
 # A hold keeps robots on the ground, too

@@ -1,5 +1,6 @@
 """Doctor on facts that no robot computer here can have, and on what tools print."""
 
+import asyncio
 import copy
 import dataclasses
 import hashlib
@@ -19,9 +20,11 @@ from lpac.fleet.doctor import (
     Diagnosis,
     DoctorCheck,
     Examination,
+    _check_vehicle,
     diagnose,
     is_configured,
     judge,
+    measure_clock,
     on,
 )
 from lpac.fleet.laptop import iptables_blocks, nft_blocks, rsync_version
@@ -179,13 +182,20 @@ def test_an_accuracy_that_is_too_bad_for_the_landing_points_is_no_go(config: Fle
 
 
 @pytest.mark.parametrize(
-    ("ahead_s", "verdict"), [(3600.0, "FAILED"), (-0.3, "warning"), (0.0, "ok")]
+    ("ahead_s", "verdict", "found"),
+    [
+        (3600.0, "FAILED", "1.0 h ahead of"),
+        (-0.51, "warning", "510 ms behind"),
+        (-0.3, "warning", "300 ms behind"),
+        (0.06, "ok", "60 ms ahead of"),
+    ],
 )
-def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str) -> None:
+def test_a_wrong_clock(config: FleetConfig, ahead_s: float, verdict: str, found: str) -> None:
     fleet = {name: well(config, name) for name in ("r1", "r2", "r3")}
     fleet["r1"] = fleet["r1"]._replace(clock=ClockOffset(ahead_s, 0.01))
     checks = {check.name: check for check in judge(config, config.robots["r1"], fleet)}
     assert checks["clock"].verdict == verdict
+    assert checks["clock"].found == f"{found} the laptop's (± 10 ms)"
     assert checks["clock"].fix == ("" if verdict == "ok" else "lpac fleet up")
 
 
@@ -235,7 +245,10 @@ def container(**about: object) -> list[dict[str, object]]:
         (put("identity", None), "enrolled", "FAILED", "never enrolled"),
         (put("identity.robot", "r2"), "enrolled", "FAILED", "answers r2 of fleet demo"),
         (put("pending", {"release": "a"}), "release", "FAILED", "interrupted"),
-        (put("versions.bundle", "b2"), "release", "FAILED", "that of r2, r3"),
+        *(
+            (put(f"versions.{part}", "x2"), "release", "FAILED", f"its {part} is x2, another")
+            for part in ("image", "bundle", "world")
+        ),
         (put("robot_toml", "0" * 64), "release", "FAILED", "is not the one of fleet.toml"),
         (put("service.active", "failed"), "program", "FAILED", "it is failed"),
         (put("service.fresh", False), "program", "FAILED", "says nothing"),
@@ -249,12 +262,24 @@ def container(**about: object) -> list[dict[str, object]]:
         (put("hottest_c", 80.0), "processor", "warning", "80 °C"),
         (put("hottest_c", 91.0), "processor", "FAILED", "91 °C"),
         (put("memory.available_bytes", 1e8), "memory", "FAILED", "100 of 8000 MB"),
+        (
+            put("disks", [
+                {"path": "/opt", "free_bytes": 2e9, "total_bytes": 9e9},
+                {"path": "/var", "free_bytes": 3e8, "total_bytes": 9e9},
+            ]),
+            "disk", "warning", "300 of 9000 MB free at /var",
+        ),
+        (put("service.status.system_id", 9), "mavlink", "FAILED", "system id 9, configured is 1"),
+        (put("service.status.autopilot", False), "mavlink", "FAILED", "the autopilot is silent"),
         (put("wifi", []), "wifi", "skipped", "no wireless interface"),
         (put("px4", "1.12.3-0.1"), "px4", "FAILED", "older than 1.14"),
         (put("units.voxl-px4.active", False), "px4", "FAILED", "voxl-px4 does not run"),
         (put("vision_hub", None), "vision-hub", "skipped", "no voxl-vision-hub"),
         (put("vision_hub", {"problem": "it is no JSON"}), "vision-hub", "FAILED", "no JSON"),
         (put("vision_hub.en_localhost_mavlink_udp", False), "vision-hub", "FAILED", "not true"),
+        (put("vision_hub.en_localhost_mavlink_udp", None), "vision-hub", "FAILED", "not true"),
+        (put("vision_hub.offboard_mode", None), "vision-hub", "FAILED", "offboard_mode is not set"),
+        (put("vision_hub.localhost_udp_port_number", 1), "vision-hub", "FAILED", "UDP port 1, "),
         (
             put("units.voxl-microdds-agent.active", True),
             "commanders", "FAILED", "voxl-microdds-agent runs",
@@ -270,6 +295,14 @@ def container(**about: object) -> list[dict[str, object]]:
             "doors", "warning", "may reach PX4's MAVLink: udp 14556 (voxl-mavlink-s)",
         ),
         (
+            put("open_ports", [{"protocol": "udp", "port": 14550, "program": "?"}]),
+            "doors", "warning", "may reach PX4's MAVLink: udp 14550 (?)",
+        ),
+        (
+            put("open_ports", [{"protocol": "udp", "port": 7447, "program": "python3"}]),
+            "doors", "ok", "ssh and the radio alone",
+        ),
+        (
             put("open_ports", [{"protocol": "tcp", "port": 80, "program": "voxl-portal"}]),
             "doors", "warning", "listen to the network: tcp 80 (voxl-portal)",
         ),
@@ -280,6 +313,10 @@ def container(**about: object) -> list[dict[str, object]]:
         (put("containers", container(image="me/ros:1")), "containers", "FAILED", "image me/ros"),
         (
             put("containers", container(name="old_ros", running=False, restarts="always")),
+            "containers", "FAILED", "(a predecessor) comes back by itself",
+        ),
+        (
+            put("containers", container(name="old_ros", running=False, restarts="unless-stopped")),
             "containers", "FAILED", "(a predecessor) comes back by itself",
         ),
         (
@@ -314,6 +351,73 @@ def test_each_fault_is_named_with_its_fix(
     assert one.verdict == verdict
     assert found in one.found
     assert bool(one.fix) == (verdict in ("FAILED", "warning"))
+
+
+def test_a_robot_is_judged_beside_the_others(config: FleetConfig) -> None:
+    def check(name: str, robot: RobotHost, fleet: dict[str, Examination]) -> DoctorCheck:
+        return {check.name: check for check in judge(config, robot, fleet)}[name]
+
+    r1, fleet = config.robots["r1"], {name: well(config, name) for name in ("r1", "r2")}
+    # Nobody is right where no half agrees.
+    fleet["r2"].facts["versions"]["image"] = "i2"
+    assert check("release", r1, fleet).found.endswith("another one than that of r2")
+    # Who is off has its own fault; who answers, and is heard badly, is named.
+    for about, verdict, found in (
+        ({"r2": PING, "r3": {**PING, "loss": 1.0}}, "ok", "1 robot: slowest answer within 3.0 ms"),
+        ({"r2": {**PING, "loss": 1.0}}, "FAILED", "no answer from r2"),
+        ({"r2": {**PING, "loss": 0.2}}, "warning", "r2: 20 % lost, 3 ms"),
+        ({"r2": {**PING, "mean_ms": 80.0}}, "warning", "r2: 0 % lost, 80 ms"),
+    ):
+        fleet["r1"] = fleet["r1"]._replace(pings=about)
+        assert check("radio", r1, fleet)[1:3] == (verdict, found)
+    # A card is for one robot, and ssh may have another port.
+    assert check("card", r1, {"r1": well(config, "r2")}).found == "its card is r2's"
+    doors = [{"protocol": "tcp", "port": port, "program": "sshd"} for port in (22, 2222)]
+    fleet["r1"].facts["open_ports"][:] = doors
+    moved = dataclasses.replace(r1, port=2222)
+    assert (
+        check("doors", moved, fleet).found == "other programs listen to the network: tcp 22 (sshd)"
+    )
+    # Of two radios the one that is connected counts.
+    link = fleet["r1"].facts["wifi"][0]
+    fleet["r1"].facts["wifi"][:] = [{**link, "name": "wlan1", "connected": False}, link]
+    assert check("wifi", r1, fleet).verdict == "ok"
+    spare = config.robots["r11"]
+    fleet["r11"] = fleet["r1"]
+    assert check("program", spare, fleet)[1:3] == ("FAILED", "it is a spare, and its program runs")
+
+
+def test_the_vehicle_is_asked_only_where_nothing_speaks_against_it(config: FleetConfig) -> None:
+    class Silent:
+        """Nobody may be called."""
+
+    facts: dict[str, Any] = copy.deepcopy(dict(well(config, "r1").facts))
+    facts["service"]["active"] = "inactive"
+    facts["heartbeat"] = {"armed": False}
+    for change, why in (
+        (put("current", None), "it has no release"),
+        (put("service.active", "active"), "its program runs"),
+        (put("pending", {}), "a switch of releases was interrupted"),
+        (put("heartbeat", None), "PX4 does not answer"),
+        (put("heartbeat.armed", True), "the vehicle is armed"),
+    ):
+        changed = copy.deepcopy(facts)
+        change(changed)
+        session: Any = Silent()
+        asked = _check_vehicle(config, config.robots["r1"], session, changed)
+        assert asyncio.run(asked) == why
+
+
+def test_the_quickest_exchange_tells_the_clock() -> None:
+    """The robot is 5 s ahead; of the other exchanges one way took longer than the other."""
+    times_s = iter([0.0, 5.3, 0.4, 1.0, 6.01, 1.02, 2.0, 7.1, 2.3, 3.0, 8.1, 3.3, 4.0, 9.1, 4.3])
+
+    class Asked:
+        async def call(self, function: str) -> dict[str, float]:
+            return {"unix_time_s": next(times_s)}
+
+    session: Any = Asked()
+    assert asyncio.run(measure_clock(session, lambda: next(times_s))) == pytest.approx((5.0, 0.01))
 
 
 def test_what_was_changed_and_not_deployed_is_no_go(config: FleetConfig) -> None:
@@ -392,6 +496,14 @@ def test_iptables_rules() -> None:
     opened = UFW + "-A ufw-user-input -p tcp -m multiport --dports 80,7000:7999 -j ACCEPT\n"
     assert iptables_blocks(opened, [7447]) == []
     assert iptables_blocks("-P INPUT ACCEPT\n-P OUTPUT ACCEPT\n", [7447]) == []
+    for rules in (
+        "-P INPUT DROP\n-A INPUT -p all -j ACCEPT\n",
+        "-P INPUT ACCEPT\n-A INPUT -p udp --dport 7447 -j DROP\n",
+        "-P INPUT DROP\n-A INPUT -p tcp --dports 22,7000:7447 -j ACCEPT\n",
+    ):
+        assert iptables_blocks(rules, [7447]) == []
+    # One of the fleet's ports is enough.
+    assert iptables_blocks("-A INPUT -p tcp --dport 7448 -j DROP\n", [7447, 7448]) == ["input"]
     assert iptables_blocks(
         "-P OUTPUT ACCEPT\n-A OUTPUT -p tcp --dport 7447 -j REJECT\n", [7447]
     ) == ["output"]
@@ -419,4 +531,23 @@ def test_nft_rules() -> None:
     opened = [named, *closed, rule(to_port("@open"), accept)]
     assert nft_blocks({"nftables": opened}, [7447]) == []
     assert nft_blocks({"nftables": opened}, [7451]) == ["input"]
+    assert nft_blocks({"nftables": opened}, [7440]) == []
     assert nft_blocks({"nftables": []}, [7447]) == []
+    # A chain that accepts by default, with rules against the port; in another table nothing counts.
+    waved = base | {"policy": "accept"}
+    udp = {"match": {"op": "==", "left": {"meta": {"key": "l4proto"}}, "right": "udp"}}
+    other = rule(accept)
+    other["rule"]["table"] = "nat"
+    inner = {"rule": place | {"chain": "inner", "expr": [to_port(7447), {"reject": None}]}}
+    unless = to_port(22)
+    unless["match"]["op"] = "!="
+    for rules, blocked in (
+        ([rule(to_port(7447), {"reject": None})], True),
+        ([rule(unless, {"drop": None})], True),
+        ([rule(udp, {"drop": None})], False),
+        ([other, rule(to_port(7447), {"drop": None})], True),
+        ([rule({"goto": {"target": "inner"}}), inner], True),
+        ([rule(to_port(7447), {"drop": None}), rule({"xt": None})], False),
+    ):
+        found = nft_blocks({"nftables": [{"chain": waved}, *rules]}, [7447])
+        assert found == (["input"] if blocked else [])

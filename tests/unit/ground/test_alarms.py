@@ -12,7 +12,7 @@ from edge.core.fence import Fence
 from edge.messages.codes import CheckCode, FailedCheck, ReasonCode
 from edge.messages.mission import FlightState, GroundState, LoopStatus, Origin
 from lpac.analysis.snapshot import FleetSnapshot
-from lpac.ground.alarms import SEVERITIES, Alarm, AlarmCode, Severity, alarms
+from lpac.ground.alarms import SEVERITIES, Alarm, AlarmCode, Before, Severity, alarms
 from tests.said import checks, reason, reasons
 from tests.unit.ground.snapshots import (
     FENCE,
@@ -79,6 +79,20 @@ OTHER_FENCE = replace(FENCE, ceiling_m=30.0)
         ),
         ({"battery": 0.15}, "critical", _C.BATTERY, "battery critical: 15%"),
         ({"battery": 0.3}, "warning", _C.BATTERY, "battery low: 30%"),
+        # In the air in whatever state, or with motors that turn; or neither.
+        ({"state": _S.FAULT, "battery": 0.15}, "critical", _C.BATTERY, "battery critical: 15%"),
+        (
+            {"state": _S.PILOT, "in_air": None, "battery": 0.3},
+            "warning",
+            _C.BATTERY,
+            "battery low: 30%",
+        ),
+        (
+            {"state": _S.PILOT, "in_air": False, "armed": False, "battery": 0.15},
+            "note",
+            _C.BATTERY,
+            "battery low: 15%",
+        ),
         (
             {"battery": 0.2, "alarms": (reason("battery low: 20%", ReasonCode.BATTERY_LOW),)},
             "critical",
@@ -197,6 +211,7 @@ def test_messages_that_come_late_are_as_bad_as_lost_ones(arrivals: tuple[int, ..
     # Three of four: a policy flies with that.
     assert told(fleet(known={"arrivals": {"2": (4, 0, 3)}})) == ()
     assert told(fleet(known={"arrivals": {"2": (2, 0, 0)}})) == (), "too few to tell"
+    assert told(fleet(known={"rates_hz": {}})) == (), "no rates are known yet"
 
 
 def beside_each_other(*numbers: int, badly: Callable[[int, int], bool]) -> FleetSnapshot:
@@ -238,9 +253,13 @@ def test_where_nobody_hears_anybody_each_robot_is_told_once() -> None:
 
 
 def test_a_robot_that_falls_silent_says_nothing_else() -> None:
-    seen = fleet(said={"battery": 0.1, "alarms": reasons("position lost")}, known={"age_s": 2.5})
+    said = {"battery": 0.1, "alarms": reasons("position lost")}
     text = "not heard any more, last in the air in mission"
-    assert told(seen) == (Alarm("critical", "r1", _C.SILENT, text),)
+    silent = Alarm("critical", "r1", _C.SILENT, text)
+    assert told(fleet(said=said, known={"age_s": 2.5})) == (silent,)
+    # Who speaks in its name is heard by the envelopes.
+    found = told(fleet(said=said, known={"age_s": 2.5, "duplicate": True}))
+    assert found[0] == silent and [alarm.code for alarm in found[1:]] == [_C.DUPLICATE_ID]
 
 
 def test_a_silent_robot_on_the_ground_is_less_grave() -> None:
@@ -252,8 +271,11 @@ def test_a_silent_robot_on_the_ground_is_less_grave() -> None:
 
 def test_robots_that_were_never_heard_are_one_alarm() -> None:
     silent = [replace(robot(status(i)), status=None, age_s=None) for i in (1, 2)]
-    (alarm,) = told(snapshot(robot(on_ground(0, failed_checks=())), *silent))
-    assert alarm == ("note", "", _C.NOT_HEARD_YET, "not heard yet: r1 r2")
+    seen = snapshot(robot(on_ground(0, failed_checks=())), *silent)
+    assert told(seen) == (Alarm("note", "", _C.NOT_HEARD_YET, "not heard yet: r1 r2"),)
+    # A spare may be switched off.
+    (alarm,) = alarms(replace(SETUP, slots=SETUP.slots[:2]), seen)
+    assert alarm.text == "not heard yet: r1"
     assert told(snapshot(*silent)) == (
         Alarm("note", "", _C.NOT_HEARD_YET, "no robot is heard yet"),
     )
@@ -270,6 +292,11 @@ def test_a_new_state_may_take_a_moment_to_be_obeyed() -> None:
     assert told(now, fleet()) == ()
     assert {a.text for a in told(now, now)} == {"does not obey what the ground says"}
     assert {a.severity for a in told(now, now)} == {"critical"}
+    late = replace(fleet(known={"age_s": 1.5}), ground=hold)
+    assert {a.robot for a in told(late, late)} == {"r0", "r2"}
+    pictures = Before()
+    assert [pictures.take(fleet(), 0.0), pictures.take(now, 1.9)] == [None, None]
+    assert [pictures.take(late, 3.8), pictures.take(now, 4.5)] == [fleet(), now]
 
 
 def test_a_robot_obeys_another_operator() -> None:
@@ -297,24 +324,65 @@ def test_loops_that_miss_ticks_or_fail() -> None:
     assert told(with_loop(failed), with_loop(failed)) == ()
 
 
-def test_nobody_commands_robots_in_the_air() -> None:
-    (alarm,) = told(replace(fleet(), commander="", ground=None))
-    assert alarm == (
-        "critical",
-        "",
-        _C.NOBODY_COMMANDS,
-        "nobody commands the fleet, and 3 fly: hold or land them",
-    )
+GROUND = GroundState(4, "alice", ORIGIN, enabled=True, safety_action="hold")
 
 
-def test_a_commander_that_fell_silent() -> None:
-    (alarm,) = told(replace(fleet(), commander="bob", commander_age_s=2.5))
-    assert alarm == (
-        "critical",
-        "",
-        _C.COMMANDER_SILENT,
-        "bob commands, but is not heard: hold takes over",
-    )
+@pytest.mark.parametrize(
+    ("changes", "seen", "expected"),
+    [
+        (
+            {},
+            {"commander": "", "ground": None},
+            (
+                "critical",
+                _C.NOBODY_COMMANDS,
+                "nobody commands the fleet, and 3 fly: hold or land them",
+            ),
+        ),
+        (
+            {},
+            {"commander": "bob", "commander_age_s": 2.5},
+            ("critical", _C.COMMANDER_SILENT, "bob commands, but is not heard: hold takes over"),
+        ),
+        (
+            {},
+            {"shares_name": True},
+            (
+                "critical",
+                _C.NAME_SHARED,
+                "another ground station speaks as alice: two may command by turns",
+            ),
+        ),
+        (
+            {"insecure": True},
+            {},
+            ("warning", _C.INSECURE, "insecure: whoever is on the network can fly this fleet"),
+        ),
+        (
+            {"world": ""},
+            {},
+            (
+                "warning",
+                _C.WORLD_NOT_HERE,
+                "the robots' world c64e4b1b is not here: no density, no cost; "
+                "`lpac mission world FILE`",
+            ),
+        ),
+        (
+            {},
+            {"ground": replace(GROUND, safety_action_by="bob")},
+            ("warning", _C.HELD_BY_OTHERS, "bob asks 3 robots to hold"),
+        ),
+        ({}, {"ground": replace(GROUND, safety_action_by="alice")}, None),
+    ],
+)
+def test_what_the_whole_fleet_has(
+    changes: dict[str, Any],
+    seen: dict[str, Any],
+    expected: tuple[Severity, AlarmCode, str] | None,
+) -> None:
+    found = alarms(replace(SETUP, **changes), replace(fleet(), **seen))
+    assert found == (() if expected is None else (Alarm(expected[0], "", *expected[1:]),))
 
 
 def test_a_fleet_whose_files_say_when_a_battery_is_critical() -> None:
@@ -323,23 +391,9 @@ def test_a_fleet_whose_files_say_when_a_battery_is_critical() -> None:
     assert alarm == ("critical", "r1", _C.BATTERY, "battery critical: 22%")
 
 
-def test_a_world_that_is_not_here() -> None:
-    (alarm,) = alarms(replace(SETUP, world=""), fleet())
-    assert alarm == (
-        "warning",
-        "",
-        _C.WORLD_NOT_HERE,
-        "the robots' world c64e4b1b is not here: no density, no cost; `lpac mission world FILE`",
-    )
-
-
-def test_hold_of_another_station() -> None:
-    held = GroundState(
-        4, "alice", ORIGIN, enabled=True, safety_action="hold", safety_action_by="bob"
-    )
-    assert told(replace(fleet(), ground=held)) == (
-        Alarm("warning", "", _C.HELD_BY_OTHERS, "bob asks 3 robots to hold"),
-    )
+def test_robots_have_another_world_than_the_ground_told() -> None:
+    seen = replace(fleet(), ground=replace(GROUND, safety_action="none", world_id="0123456789"))
+    assert {alarm.text for alarm in told(seen)} == {"world c64e4b1b, not the fleet's 01234567"}
 
 
 numbers = st.none() | st.floats(0.0, 3.0)

@@ -18,14 +18,14 @@ from typer.testing import CliRunner
 
 from edge.drivers.flight_log import ROBOT_TOPICS, FlightLog
 from edge.messages.codec import encode
-from edge.messages.mission import FlightState, explored_to_bytes
+from edge.messages.mission import FlightState, GroundState, explored_to_bytes
 from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, GroundEvent
 from lpac.cli.foxglove import _LAYOUT, app
 from lpac.ground.foxglove.channels import Channels
 from lpac.ground.foxglove.logs import convert, ground_logs
 from lpac.ground.foxglove.view import FRAME, FoxgloveView
-from lpac.ground.record import TOPICS, GroundMetadata, Recording
+from lpac.ground.record import TOPICS, Cost, GroundMetadata, Recording
 from tests.foxglove_client import decoded
 from tests.unit.ground.snapshots import FENCE, on_ground, robot, setup, snapshot, status
 
@@ -97,6 +97,17 @@ def test_the_cells_are_those_of_the_world(shown: dict[str, list[Any]]) -> None:
     (fence,) = shown["/fence"][0]["entities"]
     corners = [(p.get("x", 0.0), p.get("y", 0.0)) for p in fence["lines"][0]["points"]]
     assert corners == list(FENCE.vertices_m)
+    # Who is known, and does not count for the cost, has no cell.
+    view = FoxgloveView()
+    list(view.take("setup", NOW_S, dataclasses.asdict(setup(2))))
+    for number in range(2):
+        list(
+            view.take("status", NOW_S, dataclasses.asdict(status(number)) | {"name": f"r{number}"})
+        )
+    cost = dataclasses.asdict(Cost("t1", ("r0",), True, 1.0, None, None, None))
+    counted = [each.message for each in view.take("cost", NOW_S, cost)][1]
+    understood = decoded("foxglove.SceneUpdate", type(counted).get_schema().data, counted.encode())
+    assert [entity["id"] for entity in understood["entities"]] == ["r0"]
 
 
 @pytest.mark.parametrize("topic", ["/density", "/seen"])
@@ -131,6 +142,7 @@ def test_what_was_seen_by_how_many() -> None:
 def test_a_row_for_each_robot_in_the_fleets_order(shown: dict[str, list[Any]]) -> None:
     fleet = shown["/fleet"][-1]
     assert [row["name"] for row in fleet["robots"]] == ["r0", "r1", "r2"]
+    assert fleet["robots"][0]["heard_s_ago"] >= 1.0
     assert fleet["trial"] == "t1" and 0.0 < fleet["seen_share"] < 0.1
     assert shown["/robot/r1"][-1]["battery"] == 0.5
     (said,) = shown["/log"]
@@ -147,6 +159,16 @@ def test_a_robot_that_knows_nothing_of_itself_is_a_row() -> None:
     due = {shown.topic: shown.message for shown in view.tick(NOW_S)}
     assert due.keys() == {"/fleet", "/fence", "/seen"}
     assert due["/fleet"].robots[0].height_m is None
+
+
+def test_the_fence_is_the_one_that_the_ground_told() -> None:
+    view = FoxgloveView()
+    told = dataclasses.replace(FENCE, vertices_m=((0.0, 0.0), (40.0, 0.0), (0.0, 40.0)))
+    list(view.take("setup", NOW_S, dataclasses.asdict(setup(1))))
+    list(view.take("state", NOW_S, dataclasses.asdict(GroundState(4, "alice", fence=told))))
+    (fence,) = (shown.message for shown in view.tick(NOW_S) if shown.topic == "/fence")
+    understood = decoded("foxglove.SceneUpdate", type(fence).get_schema().data, fence.encode())
+    assert len(understood["entities"][0]["lines"][0]["points"]) == 3
 
 
 def test_what_is_not_a_logs_is_one_line() -> None:
@@ -175,6 +197,7 @@ def test_a_log_becomes_what_was_shown_live(tmp_path: Path, shown: dict[str, list
     with (tmp_path / "out.mcap").open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
             assert schema is not None
+            assert NOW_S - 1.0 < message.log_time / 1e9 <= NOW_S
             if channel.message_encoding == "json":
                 understood = json.loads(message.data)
             else:
@@ -190,6 +213,11 @@ def test_without_a_grounds_log_it_says_what_helps(tmp_path: Path) -> None:
         ground_logs(tmp_path)
     with pytest.raises(ValueError, match="is not a folder"):
         ground_logs(tmp_path / "absent")
+    names = [f"ground-{number}.mcap" for number in range(9)]
+    for name in reversed(names):
+        (tmp_path / name).touch()
+    (tmp_path / "ground-9.mcap").mkdir()
+    assert [path.name for path in ground_logs(tmp_path)] == names
 
 
 def test_the_commands_write_what_they_say(tmp_path: Path) -> None:

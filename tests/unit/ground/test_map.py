@@ -10,8 +10,17 @@ from edge.core.address import is_loopback
 from edge.messages.mission import ON_GROUND, FlightState, GroundState
 from lpac.analysis.snapshot import FleetSnapshot
 from lpac.ground.map.access import Access
-from lpac.ground.map.view import Missions, detail_view
-from tests.unit.ground.snapshots import LOOP, robot, setup, status
+from lpac.ground.map.view import Missions, detail_view, setup_view, snapshot_view
+from tests.unit.ground.snapshots import (
+    FENCE,
+    LOOP,
+    ORIGIN,
+    on_ground,
+    robot,
+    setup,
+    snapshot,
+    status,
+)
 
 
 @pytest.mark.parametrize(
@@ -27,6 +36,8 @@ from tests.unit.ground.snapshots import LOOP, robot, setup, status
         ("127.0.0.1:8300", "http://evil.example", False),
         ("127.0.0.1:8300", "http://127.0.0.1:5000", False),
         ("127.0.0.1:8300", "null", False),
+        ("127.0.0.1:8300", "", False),
+        ("127.0.0.1:8300", "https://127.0.0.1:8300", False),
         ("[::1", None, False),
         ("", None, False),
     ],
@@ -107,6 +118,47 @@ def test_a_mission_after_another_is_a_new_curve(
     assert (missions.time_s(waiting) is None) == anew
     missions.take(again)
     assert missions.begins(again) == anew
+
+
+def test_what_the_page_is_told_of_the_fleet() -> None:
+    fence = replace(FENCE, vertices_m=((0.0, 0.0), (20.0, 0.0), (20.0, 20.0), (0.0, 20.0)))
+    ground = GroundState(
+        4, "bob", ORIGIN, enabled=True, robot_enabled={"1": False}, fence=fence, trial="t2",
+        safety_action="land", safety_action_by="carol", robot_safety_actions={"1": "hold"},
+    )  # fmt: skip
+    turned = replace(ORIGIN, heading_deg=40.0)
+    r0 = status(
+        0, origin=turned, heading_rad=math.radians(50.0), neighbour_ages_s={"1": 0.21, "7": 1.0}
+    )
+    r1 = on_ground(1, heading_rad=math.radians(50.0), neighbour_ages_s={"0": 0.2})
+    seen = snapshot(robot(r0), robot(r1, age_s=9.0), commander="bob", ground=ground)
+    view = snapshot_view(setup(2), seen, ())
+    assert (view["own"], view["safety_action"], view["safety_action_by"]) == (
+        False,
+        "land",
+        "carol",
+    )
+    assert (view["fence"][2], max(view["buffer"])) == ([20.0, 20.0], [18.5, 18.5])
+    keys = ("fresh", "enabled", "asked", "in_air", "failed_checks", "hears")
+    assert [[robot[key] for key in keys] for robot in view["robots"]] == [
+        [True, True, "land", True, [], [[1, 0.21]]],
+        [False, False, "hold", False, ["GPS sees 3 satellites"], [[0, None]]],
+    ]
+    yaws_deg = [math.degrees(robot["yaw_rad"]) for robot in view["robots"]]
+    assert yaws_deg == pytest.approx([10.0, 20.0], abs=0.1)
+    assert [setup_view(setup(2), None)[key] for key in ("side_m", "range_m", "sensor_m")] == [
+        32.0,
+        8.0,
+        4.0,
+    ]
+
+
+def test_who_stands_on_the_ground_leaves_no_path() -> None:
+    missions = Missions()
+    missions.take(snapshot_of(FlightState.LANDED, 100.0))
+    assert missions.paths_view()["paths"] == {}
+    missions.take(snapshot_of(FlightState.MISSION, 101.0))
+    assert missions.paths_view()["paths"] == {"r1": [(5.0, 12.0)]}
 
 
 def test_numbers_that_are_none_do_not_stop_the_drawer() -> None:

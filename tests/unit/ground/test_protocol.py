@@ -150,8 +150,9 @@ def test_json_is_a_request_or_a_clear_refusal(name: str, fields: object) -> None
         (b'{"world": {"text": "Circle 1 2", "name": "w.env"}}', "w.env: record 1 (Circle)"),
         (b'{"world": {"text": "", "name": "a\\nb"}}', "must be printable"),
         (b'{"next_trial": {"trial": "a b"}}', "trial = 'a b': must be at most 32 letters"),
+        (b'{"next_trial": {"trial": "%s"}}' % (33 * b"a"), "must be at most 32 letters"),
         (b'{"reboot": {}}', "one of origin, fence"),
-        (b'{"start": {}, "land": {}}', "one of origin, fence"),
+        (b'{"start": {}, "resume": {}}', "one of origin, fence"),
     ],
 )  # fmt: skip
 def test_mistakes(line: bytes, why: str) -> None:

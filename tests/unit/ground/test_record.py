@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge.core import F64
 from edge.core.coverage import coverage_cost
 from edge.core.fence import Fence
 from edge.core.world import parse_world, rasterize
 from edge.messages.mission import FlightState, GroundState, Origin, Place
+from lpac.analysis.coverage import Coverage
 from lpac.analysis.snapshot import Explored, FleetSetup, FleetSnapshot, GroundEvent, RobotSnapshot
-from lpac.ground.record import Recording
+from lpac.ground.record import Recording, _line
 from lpac.ground.station.protocol import (
     ServerMessage,
 )
@@ -106,18 +108,55 @@ def test_the_cost_is_normalised_by_each_trials_begin() -> None:
     assert {(cost["trial"], cost["robots"]) for cost in costs} == {("t1", ("r0", "r1"))}
 
 
-def test_a_name_that_is_flown_again_begins_anew() -> None:
+def test_a_name_that_is_flown_again_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds: list[F64] = []
+
+    def lloyd(_: Coverage, positions_m: F64) -> float:
+        bounds.append(positions_m)
+        return 1.0
+
+    monkeypatch.setattr(Coverage, "lloyd", lloyd)
     kept = Kept()
     kept.recording.take(SETUP, 0.0)
     flown = ((S.MISSION, 1.0), (S.HOLD, 5.0), (S.MISSION, 6.0), (S.LANDED, 7.0), (S.HOLD, 7.0))
     for second, (state, x_m) in enumerate((*flown, (S.MISSION, 9.0)), 1):
         kept.recording.take(snapshot(float(second), second, x_m, state), float(second))
-    kept.recording.close()
+    kept.recording._pool.shutdown()
+    assert [positions_m[0, 0] for positions_m in bounds] == [1.0, 9.0]
     costs = kept.of("cost")
     first = costs[0]["cost"]
     # A pause is no new mission; after landing there is a new one.
     assert [cost["initial"] for cost in costs] == [*[first] * 5, costs[5]["cost"]]
     assert costs[5]["normalized"] == 1.0 != costs[4]["normalized"]
+
+
+def test_what_is_flown_now_is_that_of_those_who_fly() -> None:
+    kept = Kept()
+    kept.recording.take(SETUP, 0.0)
+    seen = snapshot(1.0, 1, 1.0)
+    holds, flies = (robot.status for robot in seen.robots)
+    assert holds is not None and flies is not None
+    pairs = (
+        (dataclasses.replace(holds, state=S.HOLD), dataclasses.replace(flies, trial="t2")),
+        (holds, dataclasses.replace(flies, state=S.LANDED, armed=False)),
+    )
+    for second, pair in enumerate(pairs, 1):
+        robots = tuple(
+            dataclasses.replace(robot, status=status)
+            for robot, status in zip(seen.robots, pair, strict=True)
+        )
+        told = dataclasses.replace(seen, unix_time_s=float(second), robots=robots)
+        kept.recording.take(told, float(second))
+        assert kept.recording.flying
+    assert kept.of("cost")[0]["trial"] == "t2"
+    cost = kept.recording.cost
+    assert cost is not None and cost.normalized is not None
+    assert _line(told, cost).partition("  ")[2] == (
+        f"2 of 2 robots heard  trial t1  1 in the air  cost {cost.normalized:.2f} of the initial"
+    )
+    kept.recording.take(FleetSnapshot(9.0, "ann", STATE, ()), 9.0)
+    kept.recording.close()
+    assert kept.recording.cost is None and not kept.recording.flying
 
 
 @pytest.mark.parametrize("world", ["", "Circle 1 2"])

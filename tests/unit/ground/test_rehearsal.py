@@ -1,10 +1,12 @@
 """What is shown to somebody who carries a robot."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
-from lpac.ground.rehearsal import commanded
+from lpac.ground.rehearsal import carried, commanded
+from tests.unit.ground.snapshots import FENCE, ORIGIN, status
 
 
 @pytest.mark.parametrize(
@@ -27,3 +29,12 @@ def test_command_is_told_in_the_field_and_from_the_nose(
 ) -> None:
     told = commanded(velocity_m_s, nose_deg)
     assert (told.arrow, told.words) == (arrow, words)
+
+
+def test_a_carried_robot_is_inside_the_fence_that_it_has() -> None:
+    heading_rad = math.radians(ORIGIN.heading_deg - 10.0)
+    said = status(1, heading_rad=heading_rad, policy_velocity_m_s=(0.0, 0.8))
+    seen = carried(said, replace(FENCE, vertices_m=((0.0, 0.0), (99.0, 0.0), (0.0, 99.0))))
+    assert (seen.position_m, seen.fence_m) == ((5.0, 12.0), 7.0)
+    assert seen.nose_deg == pytest.approx(350.0)
+    assert seen.commanded is not None and seen.commanded.words.endswith("ahead 10 deg right")

@@ -23,9 +23,10 @@ def test_no_knock_of_a_start_far_ahead_opens_the_routers_port(
     authority = create_authority(tmp_path / "authority", "demo")
     new_member(authority, tmp_path / "ann", Role.OPERATOR, "ann")
     new_member(authority, tmp_path / "r1", Role.ROBOT, "r1", 1)
-    opened: list[SignedGuard] = []
+    opened: list[SignedGuard | None] = []
 
-    def open_router(*, members: SignedGuard, **_: Any) -> nullcontext[None]:
+    def open_router(*, members: SignedGuard, tls: Any, **_: Any) -> nullcontext[None]:
+        assert tls == load_identity(Config.keys, fleet="demo", unix_s=time.time()).tls
         opened.append(members)
         return nullcontext()
 
@@ -34,11 +35,12 @@ def test_no_knock_of_a_start_far_ahead_opens_the_routers_port(
 
     monkeypatch.setattr(router, "load_fleet", lambda _: Config)
     monkeypatch.setattr(router, "ZenohRouter", open_router)
-    monkeypatch.setattr(router, "allow_most_descriptors", lambda: None)
+    monkeypatch.setattr(router, "allow_most_descriptors", lambda: opened.append(None))
     stop = Stop()
     stop.set()
     router.serve_router(tmp_path / "fleet.toml", stop, lambda _: None)
-    (guard,) = opened
+    allowed, guard = opened
+    assert allowed is None and guard is not None
 
     def knock(ahead_s: float) -> bytes:
         folder, unix_s = tmp_path / "r1", time.time() + ahead_s

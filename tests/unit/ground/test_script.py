@@ -1,23 +1,45 @@
 """The file of a script: what it says, and every mistake as one line."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from edge.messages.mission import Origin
+from edge.messages.mission import FlightState, Origin, RobotStatus
+from lpac.analysis.snapshot import FRESH_S, RobotSnapshot
+from lpac.ground.procedure import Procedure, Until, gather
 from lpac.ground.script import (
     MissionStep,
     OriginStep,
     Perturbation,
     PreflightStep,
     ReturnStep,
+    ScriptError,
+    ScriptRun,
     TakeoffStep,
     WorldStep,
     load_script,
+    take_site,
 )
-from lpac.ground.site import Sites
+from lpac.ground.site import SavedSite, Sites, SiteSlot
+from lpac.ground.station.protocol import (
+    CommandReport,
+    NextTrial,
+    Request,
+    ResultCode,
+    RobotCommand,
+    RobotResult,
+    SafetyCommand,
+    SetFence,
+    SetOrigin,
+    SetPlaces,
+    SetWorld,
+    Start,
+)
 from tests.conftest import ROOT
+from tests.unit.ground.snapshots import FENCE, ORIGIN, on_ground, setup, snapshot, status
 
 EXAMPLE = ROOT / "docs" / "script.toml"
 
@@ -72,6 +94,8 @@ def test_examples_comments_show_the_defaults(script: Path) -> None:
         ("at_s = 80.0", "at_s = 121.0", "perturb: at_s = 121.0: must be 0 or above"),
         ('do = "rejoin"', 'do = "kill"', r"perturb\[1\]: do = 'kill': allowed are 'pilot', "),
         ("heading_deg = 30.0", "heading_deg = 360.0", r"before\[0\] \(origin\): heading_deg = "),
+        ("heading_deg = 30.0", 'heading_deg = 30.0\ntoward_robot = "r2"',
+         r"before\[0\] \(origin\): latitude_deg, longitude_deg and heading_deg must be given, or"),
         ("heading_deg = 30.0", "", r"before\[0\] \(origin\): latitude_deg, longitude_deg and"),
         ("# from_robot", "from_robot", r"before\[0\] \(origin\): from_robot: measures the origin"),
         ('file = "world.env"', 'file = "w.env"', r"w.env: cannot be read: there is no such file"),
@@ -110,3 +134,136 @@ def test_worlds_sites_and_steps_must_be_there(script: Path) -> None:
         load_script(script, Sites(script))
     with pytest.raises(ValueError, match=r"none.toml: cannot be read: there is no such file"):
         load_script(script.with_name("none.toml"), Sites(script))
+
+
+class Told:
+    """A ground as a procedure sees it; r0 stands, r1 flies, and r2 was never heard."""
+
+    def __init__(self) -> None:
+        self.setup = setup(3)
+        self.now_s, self.unix_now_s = 100.0, 1e9
+        self.tell(on_ground(0), status(1), None)
+
+    def tell(self, *said: RobotStatus | None, age_s: float = 0.1) -> None:
+        ages_s = [None if each is None else age_s for each in said]
+        robots = (RobotSnapshot(f"r{i}", i, each, ages_s[i]) for i, each in enumerate(said))
+        self.snapshot = snapshot(*robots)
+
+
+class Heard:
+    """What a listener of a script is told."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def step(self, name: str, at_most_s: float | None) -> None: ...
+
+    def line(self, text: str) -> None:
+        self.lines.append(text)
+
+    def may(self, question: str) -> bool:
+        return True
+
+
+def result_of(procedure: Procedure[Any], answer: object) -> Any:
+    with pytest.raises(StopIteration) as done:
+        procedure.send(answer)
+    return done.value.value
+
+
+@pytest.fixture
+def run(script: Path) -> tuple[Told, Heard, ScriptRun]:
+    ground, heard = Told(), Heard()
+    loaded = replace(load_script(script, Sites(script)), steps=())
+    return ground, heard, ScriptRun(loaded, Sites(script), ground, heard)
+
+
+def test_who_flies_is_held_whoever_stands(run: tuple[Told, Heard, ScriptRun]) -> None:
+    ground, _, script = run
+    holding = script.hold()
+    assert next(holding) == SafetyCommand("hold")
+    assert result_of(holding, CommandReport()).startswith("the fleet is told to hold: next")
+    ground.tell(on_ground(0), on_ground(1), None)
+    assert result_of(script.hold(), None) == "nobody is in the air"
+
+
+def test_who_left_the_mission_is_started_again_if_it_holds_and_there_is_time(
+    run: tuple[Told, Heard, ScriptRun],
+) -> None:
+    ground, heard, script = run
+    ground.tell(*(status(i) for i in range(3)))
+    flying = script._fly_mission(MissionStep(60.0, restart=True))
+    next(flying)
+
+    def wanted(state: FlightState, after_s: float) -> list[Request | Until]:
+        """What it asks for once r1 is in that state, until it waits."""
+        ground.now_s += after_s
+        ground.tell(status(0), status(1, state=state), status(2))
+        asked = [flying.send(True)]
+        while not isinstance(asked[-1], Until):
+            asked.append(flying.send(CommandReport()))
+        return asked[:-1]
+
+    assert wanted(FlightState.MISSION, 0.0) == []
+    assert wanted(FlightState.RETURN, 1.0) == []
+    assert wanted(FlightState.HOLD, 1.0) == []
+    assert wanted(FlightState.MISSION, 1.0) == []
+    assert wanted(FlightState.HOLD, 1.0) == [Start(("r1",))]
+    assert wanted(FlightState.HOLD, 2.0) == []
+    assert wanted(FlightState.HOLD, 2.0) == [Start(("r1",))]
+    assert wanted(FlightState.HOLD, 46.0) == [], "6 s are left"
+    assert heard.lines == [f"r1 left the mission: {s}: mission started" for s in ("return", "hold")]
+
+
+def test_nothing_of_a_trial_is_left_for_the_next(run: tuple[Told, Heard, ScriptRun]) -> None:
+    _, heard, script = run
+    flying = script.fly()
+    assert isinstance(next(flying), SetOrigin)
+    assert isinstance(flying.send(CommandReport()), SetWorld)
+    script.given.add("r1")
+    script._said.add("r1")
+    assert flying.send(CommandReport()) == NextTrial("paper-1")
+    assert (script.given, script._said) == (set(), set())
+
+    script.given.add("r1")
+    rejoining = script._perturb(Perturbation(1.0, "r1", "rejoin"))
+    assert next(rejoining) == RobotCommand("rejoin", ("r1",))
+    assert isinstance(rejoining.send(CommandReport()), Until)
+    assert rejoining.send(True) == Start(("r1",))
+    result_of(rejoining, CommandReport())
+    assert script.given == set() and heard.lines[-1] == "r1 is back in the mission"
+
+    landing = script._bring_down(SafetyCommand("land", wait=True))
+    next(landing)
+    with pytest.raises(ScriptError) as failed:
+        landing.send(CommandReport((RobotResult("r1", ResultCode.NOT_HEARD, "not heard"),)))
+    assert not failed.value.hold, "held, the others would not come down"
+
+
+def test_what_a_site_needs_is_asked_again_after_the_rest() -> None:
+    site = SavedSite(ORIGIN, FENCE, (SiteSlot(0, (2.0, 2.0), (2.0, 2.0)),))
+    done = CommandReport((RobotResult("r0", ResultCode.DONE, "taken up"),))
+    failed = CommandReport((RobotResult("r0", ResultCode.NOT_TAKEN_UP, "outside"),))
+    taking = take_site(site, setup(1), ())
+    asked = [next(taking)] + [taking.send(report) for report in (done, failed, done)]
+    assert [type(each) for each in asked] == [SetOrigin, SetFence, SetPlaces, SetFence]
+    assert result_of(taking, done).done
+
+
+def test_statuses_are_gathered_from_now_on() -> None:
+    ground = Told()
+    gathering = gather(ground, ("r0", "r1"), 2.0)
+    wanted = next(gathering)
+    assert isinstance(wanted, Until) and wanted.at_most_s == 2.0 + FRESH_S
+
+    def holds(passed_s: float, *said: RobotStatus | None, age_s: float = 0.1) -> bool:
+        ground.now_s = 100.0 + passed_s
+        ground.tell(*said, age_s=age_s)
+        return wanted.condition(ground.snapshot)
+
+    assert not holds(0.5, status(0, sequence=7), None, age_s=0.6), "said before"
+    assert not holds(1.0, status(0, sequence=8), None, status(2))
+    assert not holds(2.5, status(0, sequence=8), None), "r1 is awaited"
+    assert holds(3.0, status(0, sequence=9), status(1))
+    heard = {name: [s.sequence for s in told] for name, told in result_of(gathering, True).items()}
+    assert heard == {"r0": [8, 9], "r1": [9]}

@@ -4,6 +4,7 @@ import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from edge.core.fence import Fence
 from edge.flight.margins import ErrorBudget
-from edge.messages.mission import FlightState, Origin, RobotStatus
+from edge.messages.mission import FlightState, GroundState, Origin, Place, RobotStatus
 from lpac.ground.site import (
     CLEARLY_FURTHER_M,
     MAX_PAD_DISTANCE_M,
@@ -19,19 +20,26 @@ from lpac.ground.site import (
     SavedSite,
     Sites,
     SiteSlot,
+    Standing,
     assign,
+    assign_places,
     average_position,
     bearing_deg,
     circular_mean_deg,
     distance_m,
+    furthest_m,
     origin_at,
     place_m,
+    place_now_m,
+    places_at,
     require_apart,
+    site_as_it_stands,
     standing,
     turn_deg,
     wide_fence,
 )
 from tests.said import reason
+from tests.unit.ground.snapshots import robot, setup, snapshot
 
 FENCE = Fence(((-2.0, -2.0), (34.0, -2.0), (34.0, 34.0), (-2.0, 34.0)), 1.5, 2.0, 30.0)
 SITE = SavedSite(
@@ -58,9 +66,13 @@ def status(position_deg: tuple[float, float] | None, heading_deg: float | None) 
     )  # fmt: skip
 
 
+def place_at(origin: Origin, x_m: float, y_m: float) -> tuple[float, float]:
+    return origin.frame().to_global_deg(x_m, y_m)
+
+
 def moved(start: tuple[float, float], azimuth_deg: float, by_m: float) -> tuple[float, float]:
     """The place that far away, by the mission frame's own geodesic."""
-    return Origin(*start, azimuth_deg % 360.0).frame().to_global_deg(0.0, by_m)
+    return place_at(Origin(*start, azimuth_deg % 360.0), 0.0, by_m)
 
 
 # Means
@@ -139,13 +151,13 @@ def test_robot_that_moves_or_knows_nothing_gives_no_origin() -> None:
     with pytest.raises(ValueError, match="r1 is not heard"):
         standing("r1", [])
     with pytest.raises(ValueError, match="r1 is armed: land first"):
-        standing("r1", [replace(status(centre, 10.0), armed=True)])
+        standing("r1", [status(centre, 10.0), replace(status(centre, 10.0), armed=True)])
     with pytest.raises(ValueError, match="r1 does not know its position yet"):
         standing("r1", [status(None, 10.0)])
     with pytest.raises(ValueError, match="r1: the positions have no mean"):
         standing("r1", [status((0.0, 0.0), 10.0), status((0.0, 180.0), 10.0)])
-    carried = [status(centre, 10.0), status(moved(centre, 0.0, 12.0), 10.0)]
-    with pytest.raises(ValueError, match=r"r1: its position moved by 6.0 m, allowed are 2 m"):
+    carried = [*[status(centre, 10.0)] * 2, status(moved(centre, 0.0, 12.0), 10.0)]
+    with pytest.raises(ValueError, match=r"r1: its position moved by 8.0 m, allowed are 2 m"):
         standing("r1", carried)
     turned = standing("r1", [status(centre, 10.0), status(centre, 60.0)])
     with pytest.raises(ValueError, match="r1: its heading moved by 25 deg, allowed are 10"):
@@ -198,9 +210,9 @@ def test_what_is_assigned_has_the_least_total_distance(
     )
     assert total_m == pytest.approx(least_m)
     assert len({on_pad.height for on_pad in assigned.values()}) == len(places)
-    for robot, on_pad in assigned.items():
+    for name, on_pad in assigned.items():
         assert on_pad.distance_m <= MAX_PAD_DISTANCE_M
-        others = [math.dist(named[robot], p) for h, p in enumerate(pads) if h != on_pad.height]
+        others = [math.dist(named[name], p) for h, p in enumerate(pads) if h != on_pad.height]
         assert min(others) >= on_pad.distance_m + CLEARLY_FURTHER_M
 
 
@@ -208,6 +220,55 @@ def test_fence_that_is_off_keeps_the_heights_only() -> None:
     wide = wide_fence(FENCE)
     assert wide.distance_m(0.0, 0.0) == 100.0
     assert (wide.floor_m, wide.ceiling_m) == (2.0, 30.0)
+
+
+def at(place_m: tuple[float, float], **changes: Any) -> RobotStatus:
+    """What a robot says that stands there in the mission frame."""
+    here = replace(status((48.0, 11.0), 10.0), origin=SITE.origin, position_m=(*place_m, 0.0))
+    return replace(here, **changes)
+
+
+def test_a_robots_place_is_the_mean_of_what_it_says_in_this_frame() -> None:
+    before = at((90.0, 90.0), origin=None)
+    assert place_now_m("r1", [before, at((1.0, 2.0)), at((3.0, 2.0))], SITE.origin) == (2.0, 2.0)
+    for statuses, problem in (
+        ([at((1.0, 2.0)), at((9.0, 2.0))], r"r1: its position moved by 4.0 m"),
+        ([at((1.0, 2.0)), before], "r1 has not taken up the mission's origin"),
+        ([at((1.0, 2.0)), at((1.0, 2.0), armed=True)], "r1 is armed: land first"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            place_now_m("r1", statuses, SITE.origin)
+
+
+def test_nobody_gets_places_that_are_too_close_for_how_the_fleet_measures() -> None:
+    fleet, precise = setup(2), replace(setup(2), errors=ErrorBudget(gps_m=0.1))
+    site = replace(SITE, slots=(SITE.slots[0], replace(SITE.slots[1], height=1)))
+    places_m = {"r0": (2.0, 2.0), "r1": (6.0, 2.0)}
+    expected = {"r0": Place(0, (4.0, 4.0)), "r1": Place(1, (8.0, 4.0))}
+    assert places_at(site, precise, places_m) == expected
+    assert assign_places(places_m, site.slots, precise)[1] == expected
+    for place in (
+        lambda: places_at(site, fleet, places_m),
+        lambda: assign_places(places_m, site.slots, fleet),
+    ):
+        with pytest.raises(ValueError, match="must be 8 m"):
+            place()
+
+
+def test_a_site_as_it_stands_has_the_fence_that_the_ground_told() -> None:
+    ground = GroundState(4, "alice", SITE.origin, fence=replace(FENCE, buffer_m=3.0))
+    here = place_at(SITE.origin, 0.0, 0.0)
+    stands = {"r0": Standing("r0", here, 0.1, None)}
+    saved = site_as_it_stands(setup(1), ground, stands, None, None, land_at_pads=False)
+    assert (saved.origin, saved.fence) == (SITE.origin, ground.fence)
+    with pytest.raises(ValueError, match=r"2\.0 m inside the fence, must be 3 m to land there"):
+        site_as_it_stands(setup(1), ground, stands, None, None, land_at_pads=True)
+
+
+def test_the_furthest_robot_is_one_that_is_heard() -> None:
+    near, far = (place_at(SITE.origin, 0.0, y_m) for y_m in (30.0, 900.0))
+    seen = snapshot(robot(status(near, None)), robot(status(far, None), age_s=60.0))
+    assert furthest_m(SITE.origin, seen) == pytest.approx(30.0)
 
 
 # Files
@@ -230,6 +291,8 @@ def test_site_is_read_as_it_was_saved(tmp_path: Path) -> None:
     sites.save("park", other)
     assert sites.load("park") == other
     assert sorted(p.name for p in path.parent.iterdir()) == ["park.toml", "used"]
+    path.unlink()
+    assert sites.used() is None
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from edge.messages.codes import texts
-from edge.messages.mission import FlightState, GroundState
+from edge.messages.codes import Refusal, RefusalCode, texts
+from edge.messages.mission import FlightState, GroundState, OrderResult
 from lpac.analysis.snapshot import RobotSnapshot
 from lpac.ground.alarms import Alarm, AlarmCode, alarms
 from lpac.ground.station.protocol import (
@@ -22,10 +22,19 @@ from lpac.ground.station.protocol import (
 )
 from lpac.ground.terminal.lines import Line, age, fit, number, plain, some
 from lpac.ground.terminal.robot import detail, in_short
-from lpac.ground.terminal.table import Row, columns, heading, in_order, table_row
-from lpac.ground.terminal.text import all_of_it, few_alarms, header, outcome
+from lpac.ground.terminal.table import MARKS, Row, columns, heading, in_order, table_row
+from lpac.ground.terminal.text import KEYS, all_of_it, few_alarms, header, lost, outcome
 from tests.said import checks, reason, reasons
-from tests.unit.ground.snapshots import ORIGIN, on_ground, robot, setup, snapshot, status
+from tests.unit.ground.snapshots import (
+    FENCE,
+    LOOP,
+    ORIGIN,
+    on_ground,
+    robot,
+    setup,
+    snapshot,
+    status,
+)
 
 _S = FlightState
 
@@ -96,7 +105,8 @@ def test_what_is_seen_at_80_columns() -> None:
         (number(-0.04, 5), "  0.0"), (number(1e9, 5), ">9999"), (number(-1e9, 5), "<-999"),
         (number(math.nan, 3), "  -"),
         (number(100.0, 3, 0), "100"), (age(0.04), "0.0"), (age(9.96), " 10"), (age(999.0), "999"),
-        (age(1200.0), "20m"), (age(1e5), "28h"), (age(None), "  -"), (fit("hold", 3), "ho…"),
+        (age(1200.0), "20m"), (age(4200.0), "70m"), (age(1e5), "28h"), (age(None), "  -"),
+        (fit("hold", 3), "ho…"),
         (fit("世界", 3), "世…"), (fit("a\nb", 3), "a b"), (some(["r1", "r2", "r3"], 8), "r1 r2 r3"),
         (some(["r1", "r2", "r3"], 7), "r1 +2"),
     ],
@@ -111,8 +121,17 @@ def test_header_says_who_commands_and_who_asked() -> None:
     )
     seen = snapshot(robot(status(0)), commander="bob", ground=ground, running=("takeoff",))
     lines = ["".join(span.text for span in line) for line in header(setup(1), seen, 125.0, 90)]
+    assert [s.style for s in header(setup(1), seen, 125.0, 90)[0]][2] == "foreign"
     assert lines[0].split("  ")[:3] == ["field", "bob commands, alice observes", "trial t2"]
     assert lines[0].rstrip().endswith("mission 02:05")
+    assert plain([KEYS]) == (
+        " h HOLD   l land   r resume   Enter robot   a alarms   ? help   q quit"
+    )
+    assert plain(lost(setup(1), "it has ended", 65.0, 80)).splitlines()[:3] == [
+        " NO GROUND STATION for 01:05",
+        " It has ended.",
+        " Robots that hear none: hold after 3 s, land where they are after 13 s.",
+    ]
     assert lines[1].startswith("ENABLED  HOLD by carol  now: takeoff  fence 36x36 m, 2-100 m high")
     assert "origin 47.39774 8.54559 30°  bundle 79929121  world c64e4b1b" in lines[2]
 
@@ -131,6 +150,16 @@ def test_safety_action_of_single_robots() -> None:
     ground = GroundState(5, "alice", enabled=True, robot_safety_actions={"1": "land", "0": "hold"})
     lines = header(setup(2), snapshot(ground=ground), None, 80)
     assert "HOLD r0, LAND r1 by alice" in "".join(span.text for span in lines[1])
+    fence = replace(FENCE, vertices_m=((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)))
+    ground = GroundState(
+        5, "alice", enabled=False, safety_action="hold", robot_enabled={"1": True}, fence=fence,
+        robot_safety_actions={"0": "none", "1": "hold"}, world_id="0123456789",
+    )  # fmt: skip
+    lines = header(setup(2), snapshot(ground=ground), None, 80)
+    assert plain(lines[1:]) == (
+        "not enabled but 1  HOLD, FLY r0 by alice  fence 4x4 m, 2-100 m high\n"
+        "no origin  bundle 79929121  world 01234567"
+    )
 
 
 def test_alarms_of_many_robots_with_one_text_are_one_line() -> None:
@@ -204,3 +233,90 @@ def test_80_columns_show_all_that_is_critical() -> None:
     )
     for view in views:
         assert texts(own) in " ".join(view.split())
+
+
+def test_all_that_is_known_of_a_robot() -> None:
+    late = replace(LOOP, overruns=2, failures=1, lateness_p99_ms=80.0, lateness_max_ms=90.0)
+    said = status(
+        1, operator="bob", obeyed_sequence=3, not_taken=checks("fence: not in flight"),
+        orders=(OrderResult("1"), OrderResult("2", Refusal(RefusalCode.EXPIRED, "expired"))),
+        fence=replace(FENCE, vertices_m=((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0))),
+        battery_lasts_s=300.0, home_s=40.0, position_m=(5.0, 2.0, 4.5), gps_accuracy_m=0.4,
+        velocity_m_s=(3.0, 4.0, 0.0), policy_velocity_m_s=(0.5, -0.25), global_deg=(47.1, 8.2),
+        loops={"control": late, "radio": LOOP}, neighbour_ages_s={"0": 0.2},
+        message_counts={"accepted": 70, "replayed": 3, "expired": 0},
+        failed_checks=checks("GPS sees 3 satellites"),
+    )  # fmt: skip
+    ground = GroundState(4, "alice", ORIGIN, enabled=True, robot_safety_actions={"1": "land"})
+    seen = snapshot(robot(said, age_s=9.0, clock_offset_s=-0.25), ground=ground)
+    told = [Alarm("critical", "r1", AlarmCode.OWN, "position lost")]
+    row = Row(seen.robots[0], told[0], setup(3))
+    lines = detail(row, seen, [*told, Alarm("note", "r0", AlarmCode.OWN, "of another")], 100)
+    assert (
+        plain(lines)
+        == """\
+r1 (id 1)  mission: mission started                                                  heard 9.0 s ago
+alarm      position lost
+not taken  fence: not in flight
+vehicle    offboard, armed, in the air, battery 90%, for 300 s of which home takes 40, system id 1
+GPS        14 satellites, HDOP 0.8, accurate to 0.4 m, at 47.100000 8.200000
+position   x 5.0, y 2.0, height 4.5 of 4 m, 5.0 m/s, heading 0°
+landing    at x 2.0 m, y 2.0 m, 3.0 m away; fence margin -1.0 m
+policy     asks for 0.50 -0.25 m/s, features 0.1 s old, trial t1
+obeys      bob, state 3 of 4, asked to land
+orders     refused: expired; accepted
+release    bundle 79929121, world c64e4b1b, fence 4x4 m, 2-100 m high
+origin     47.3977420 8.5455940 30.0°
+program    up 00:30, start 7, clock -0.25 s
+
+neighbour messages   Hz   s   loop         ticks missed failed  p50  p99  max
+r0              50  2.5 0.2   control        100      2      1  0.2 80.0 90.0
+r1              50  2.5   -   radio          100      0      0  0.2  1.1  3.0
+r2              50  2.5   -
+replayed         3"""
+    )
+    assert plain(in_short(row, 100)) == (
+        " r1  mission started\n fence margin -1.0 m   bundle 79929121   world c64e4b1b   trial t1"
+    )
+    styled = [s for shown in (*lines, *in_short(row, 100)) for s in shown if s.style in MARKS]
+    assert [(span.text.strip()[:15], span.style) for span in styled] == [
+        ("heard 9.0 s ago", "critical"),
+        ("position lost", "critical"),
+        ("fence: not in f", "warning"),
+        ("control        ", "warning"),
+        ("-1.0 m", "critical"),
+    ]
+    grounded = Row(robot(on_ground(1)), None, setup(3))
+    assert "not ready  GPS sees 3 satellites" in plain(detail(grounded, seen, (), 100))
+
+
+def test_cells_say_what_is_wrong() -> None:
+    """In a row of all columns: each one's text and style."""
+    fence = replace(FENCE, vertices_m=((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)))
+    said = status(
+        1, battery=0.22, satellites=7, position_m=(5.0, 2.0, 4.5), velocity_m_s=(3.0, 4.0, 0.0),
+        feature_age_s=1.4, neighbour_ages_s={"0": 0.2, "2": 0.7}, fence=fence,
+        loops={"control": replace(LOOP, lateness_p99_ms=80.0)},
+    )  # fmt: skip
+    fleet = replace(setup(3), battery_critical=0.2)
+    heard = robot(said, rates_hz={"0": 2.0, "1": 9.0, "2": 3.0})
+    alarm = Alarm("warning", "r1", AlarmCode.OWN, "battery low")
+
+    def cells(row: Row) -> list[tuple[str, str]]:
+        shown = columns(fleet, 200)
+        return [(span.text.strip(), span.style) for span in table_row(shown, row)[::2]]
+
+    expected = [
+        ("*", "warning"), ("r1", "warning"), ("mission", "good"), ("22", "warning"),
+        ("7", "warning"), ("offboard", ""), ("5.0", ""), ("2.0", ""), ("4.5", ""), ("5.0", ""),
+        ("1.4", "warning"), ("2", ""), ("2.5", ""), ("0.7", ""), ("80", "warning"), ("0.1", ""),
+        ("-1.0", "critical"), ("79929121", ""), ("c64e4b1b", ""), ("battery low", "warning"),
+    ]  # fmt: skip
+    assert cells(Row(heard, alarm, fleet)) == expected
+    empty = replace(heard, status=replace(said, battery=0.2, ready=True), age_s=9.0)
+    loud = {0: "warning", 1: "warning", 15: "critical", 19: "warning"}
+    assert [style for _, style in cells(Row(empty, alarm, fleet))] == [
+        loud.get(i, "faint") for i in range(len(expected))
+    ]
+    fresh = cells(Row(replace(empty, age_s=0.1), alarm, fleet))
+    assert fresh[2:4] == [("mission", "good"), ("20", "critical")]
