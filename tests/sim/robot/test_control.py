@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -427,6 +428,7 @@ def test_only_another_mission_makes_it_forget_what_it_saw(flown: Flown) -> None:
         flown.tick()
         assert (flown.explored() < 0.9 * explored) is forgets
         assert flown.control.flight.trial == trial
+        assert flown.pac._trial == zlib.crc32(trial.encode())
 
 
 def test_another_origin_counts_on_the_ground_alone(flown: Flown) -> None:
@@ -692,6 +694,10 @@ def test_a_robot_whose_policy_is_silent_is_kept_away_from_by_its_beacon(flown: F
     # What it said a while ago tells nothing.
     flown.peers(near, age_s=1.6)
     assert flown.order("start", "a").accepted
+    # Nor does another program that says it is this robot.
+    flown.peers(dataclasses.replace(near, robot_id=3))
+    flown.tick()
+    assert flown.inputs().neighbours == ()
 
 
 @pytest.mark.parametrize(

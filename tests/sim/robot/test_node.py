@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+from edge.identity.envelope import OVERHEAD_BYTES
 from edge.messages.codes import CheckCode, Reason, ReasonCode
 from edge.messages.topics import MESSAGE, STATE, Topic
+from edge.robot.pac import message_bytes
 from lpac.sim.fleet.robots import SimulatedRobot
 from tests.said import codes, lines_said
 from tests.sim.ground.field import a_field
@@ -117,3 +119,14 @@ def test_what_it_publishes_and_logs_in_ten_seconds_of_flight() -> None:
     published.clear()
     field.run(10.0)
     assert published["message"] == 10
+
+
+def test_on_the_ground_it_says_as_much_as_in_flight() -> None:
+    """So that its radio can be tried there."""
+    node = a_field(1, "ready").robots[0].program.node
+    assert node is not None
+    sizes: list[int] = []
+    node._publish = lambda topic, data: sizes.append(len(data))  # type: ignore[method-assign]
+    node.policy_step()
+    least_bytes, _ = message_bytes(node._pac._policy, node._pac._parameters.payload)
+    assert sizes[0] + OVERHEAD_BYTES >= least_bytes

@@ -71,14 +71,25 @@ def test_the_next_flight_begins_with_what_the_last_one_took() -> None:
     share = fly(consumption, 400.0, 120.0)
     consumption.hear(121.0, False, share, 16.2)
     assert consumption.endurance_s == pytest.approx(400.0, rel=0.1)
-    fly(consumption, 500.0, 20.0, from_share=share, begin_s=130.0)
+    # After a quarter of a minute, in which it settles, and a whole one the next is measured.
+    fly(consumption, 800.0, 70.0, from_share=share, begin_s=130.0)
+    assert consumption.endurance_s == pytest.approx(400.0, rel=0.1)
+
+
+def test_a_pack_that_weakens_in_flight_shows_within_three_minutes() -> None:
+    consumption, share = Consumption(EnergyParameters(endurance_s=900.0)), 1.0
+    for i in range(1590):
+        share -= 0.5 / (1200.0 if i < 1200 else 400.0)
+        consumption.hear(0.5 * i, True, share, None)
     assert consumption.endurance_s == pytest.approx(400.0, rel=0.1)
 
 
 def test_a_battery_that_falls_silent_is_not_known() -> None:
     consumption = Consumption(EnergyParameters())
     consumption.hear(0.0, True, 0.8, None)
-    assert consumption.energy(CRITICAL, None) is not None
+    consumption.hear(0.5, True, math.nan, None)
+    energy = consumption.energy(CRITICAL, None)
+    assert energy is not None and energy.lasts_s == pytest.approx((0.8 - CRITICAL) * 900.0)
     consumption.hear(1.0, True, None, None)
     assert consumption.energy(CRITICAL, None) is None
 
@@ -111,6 +122,7 @@ def test_home_is_the_way_the_wait_the_landing_and_the_reserve() -> None:
     # 30 s of flight at 0.7 m/s, 2 robots to wait for, 21 s of landing.
     assert needed_s() == pytest.approx(30.0 + 20.0 + 21.0 + 60.0)
     assert needed_s(height_m=4.0) == pytest.approx(needed_s() + 2.0)
+    assert needed_s(height_m=12.0) == pytest.approx(needed_s() + 2.0)
     assert needed_s(slot=9) == pytest.approx(needed_s() + 70.0)
     assert needed_s(away_m=0.0) == pytest.approx(needed_s() - 30.0)
 

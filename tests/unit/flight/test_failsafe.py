@@ -75,6 +75,7 @@ def test_what_is_required_can_be_set_and_is_read(rc: RemoteControl) -> None:
         ("COM_RC_IN_MODE", 8, "COM_RC_IN_MODE = 8 (a ground station's sticks count (the second"),
         ("COM_FLT_TIME_MAX", 600, "COM_FLT_TIME_MAX = 600; wanted is -1 (never)"),
         ("COM_DISARM_LAND", 0.0, "COM_DISARM_LAND = 0"),
+        ("COM_DISARM_LAND", 0.5, "COM_DISARM_LAND = 0.5; wanted is above 0.5"),
         ("COM_DISARM_PRFLT", -1.0, "COM_DISARM_PRFLT = -1"),
         ("COM_ARM_ON_BOOT", 1, "COM_ARM_ON_BOOT = 1 (PX4 arms by itself after power-up)"),
         ("CBRK_FLIGHTTERM", 0, "CBRK_FLIGHTTERM = 0; wanted is 121212"),
@@ -135,7 +136,9 @@ def test_any_values_are_explained_and_each_unsafe_one_is_named(
 
 def test_defaults_of_px4_are_explained_as_they_were_flown() -> None:
     parameters: dict[str, int | float | None] = dict(PX4_DEFAULTS)
-    assert "without a remote control RETURN" in line("program dies", parameters)
+    for sticks in (0, 1, 2):
+        handed_over = {**parameters, "COM_OBL_RC_ACT": sticks}
+        assert "without a remote control RETURN" in line("program dies", handed_over)
     nothing = {**parameters, "NAV_RCL_ACT": 0}
     assert "fly on with the last command: NO FAILSAFE" in line("program dies", nothing)
     assert "hold for 5 s, then RETURN" in line("remote control is lost", parameters)
@@ -182,6 +185,7 @@ def test_what_else_is_dangerous_is_said_where_it_applies() -> None:
         "GF_MAX_VER_DIST": (30.0, "the same 30 m above"),
         "GF_MAX_HOR_DIST": (40.0, "the same 40 m away from"),
     }
+    assert "the same" not in " ".join(explain(safe("pilot")))
     for name, (value, said) in dangers.items():
         assert said not in " ".join(explain(safe("pilot")))
         assert said in " ".join(explain({**safe("pilot"), name: value}))

@@ -1278,7 +1278,11 @@ def test_ground_lost_holds_and_lands_ten_seconds_later(world: World) -> None:
     world.until(FlightState.HOLD, 4.0)
     assert world.now_s - lost_s == pytest.approx(3.0, abs=0.2)
     assert ReasonCode.GROUND_LOST in codes(world._decide(world._hear()))
-    world.until(FlightState.LAND, 11.0)
+    # Others may be in its way home, and it hears of nobody's.
+    world.battery = 0.2
+    world.run(2.0)
+    assert world.state() is FlightState.HOLD
+    world.until(FlightState.LAND, 9.0)
     assert world.now_s - lost_s == pytest.approx(13.0, abs=0.2)
     world.ground_on = True
     world.enable(safety_action="hold")
@@ -1603,12 +1607,33 @@ def test_a_stale_policy_holds(world: World) -> None:
 
 
 def test_the_autopilot_that_lands_is_left_to_land(world: World) -> None:
-    world.fly()
-    world.mode = world.intended = Mode.LAND
-    world.until(FlightState.LAND, 2.5)
-    world.enable(safety_action="hold")
-    world.until(FlightState.LANDED, 20.0)
-    assert world.asked(Action.OFFBOARD) == 1
+    for failsafe in (None, Mode.LAND):
+        world.fly()
+        rows, asked = len(world.taken), world.asked(Action.OFFBOARD)
+        world.mode = world.intended = Mode.LAND
+        world.failsafe = failsafe
+        world.until(FlightState.LAND, 2.5)
+        assert len(world.taken) == rows + 1
+        world.enable(safety_action="hold")
+        world.until(FlightState.LANDED, 20.0)
+        assert world.asked(Action.OFFBOARD) == asked
+        world.failsafe = None
+
+
+def test_a_landing_that_cannot_be_held_goes_on(world: World) -> None:
+    cases: tuple[tuple[Mode | None, float], ...] = ((None, 6.5), (Mode.LAND, 3.0))
+    for failsafe, within_s in cases:
+        world.hover()
+        world.enable(safety_action="land")
+        world.run(3.0)
+        world.refuses = {Action.OFFBOARD: "not now"}
+        world.enable(safety_action="hold")
+        world.until(FlightState.HOLD, 0.2)
+        world.failsafe = failsafe
+        world.until(FlightState.LAND, within_s)
+        assert world.why == (FlightState.LAND, ReasonCode.AUTOPILOT_LANDS)
+        world.until(FlightState.LANDED, 20.0)
+        world.refuses, world.failsafe = {}, None
 
 
 def test_a_vehicle_that_leaves_offboard_is_not_fought_for(world: World) -> None:
@@ -1633,6 +1658,11 @@ def test_the_autopilot_falls_silent_and_answers_again(world: World) -> None:
     world.until(FlightState.FAULT, 6.0)
     world.armed = False
     world.telemetry = True
+    # Without a position it may be an autopilot that was switched on anew.
+    world.silent_from_s = world.now_s
+    world.run(5.0)
+    assert world.state() is FlightState.FAULT
+    world.silent_from_s = math.inf
     world.until(FlightState.IDLE, 5.0)
 
 
@@ -1697,6 +1727,7 @@ def test_a_landing_that_the_autopilots_failsafe_interrupts_goes_on(world: World)
     assert world.state() is FlightState.LAND
     world.enable(safety_action="hold")
     world.run(0.5)
+    assert world.state() is FlightState.LAND
     world.failsafe = Mode.LAND
     world.until(FlightState.LANDED, 20.0)
     assert len(world.actions) == asked
@@ -2016,6 +2047,12 @@ def test_a_pilot_takes_it_away_and_the_operator_takes_it_back(world: World) -> N
     assert world.refuse("rejoin") is RefusalCode.NOT_AT_HEIGHT
     world.position_m[2] = SLOT_M
     world.pilot()
+    world.obey("rejoin")
+    while not world.flight.reached:
+        world.tick()
+    world.pilot()  # He takes it again at once.
+    world.until(FlightState.PILOT, 2.5)
+    assert world.why == (FlightState.PILOT, ReasonCode.PILOT)
     world.obey("rejoin")
     world.run(5.0)
     assert world.state() is FlightState.HOLD

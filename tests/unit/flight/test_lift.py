@@ -139,3 +139,25 @@ def test_a_pack_that_empties_still_carries_it() -> None:
     lift, now_s = flown(sagging)
     assert lift.hover_thrust == pytest.approx(0.9, abs=0.01)
     assert not lift.stands(now_s)
+
+
+def test_a_vehicle_whose_full_thrust_lifts_nothing_stands() -> None:
+    heavy = for_s(5.0, HOVERS._replace(thrust=0.85))
+    lift, now_s = flown([*heavy, *for_s(2.2, GROUND._replace(thrust=1.0))])
+    assert lift.stands(now_s)
+
+
+def test_what_carries_it_is_learned_in_the_air_at_its_height_alone() -> None:
+    hovering, pushes = for_s(5.0, HOVERS), HOVERS._replace(thrust=0.9)
+    for motions in (
+        for_s(5.0, pushes._replace(in_air=False)),
+        for_s(5.0, pushes._replace(height_m=4.4)),
+        # Its height is lost, and it passes through it.
+        [*for_s(3.0, HOVERS._replace(height_m=3.0)), *for_s(5.0, pushes)],
+    ):
+        lift, now_s = flown([*hovering, *motions])
+        assert lift.hover_thrust == pytest.approx(0.5)
+    # Of a long pause nobody knows more than of half a second.
+    lift, now_s = flown(hovering)
+    after = look(lift, pushes, now_s + 60.0, 60.0)
+    assert after.hover_thrust == pytest.approx(0.5 + 0.4 * 0.05)

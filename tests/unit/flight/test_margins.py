@@ -90,6 +90,18 @@ def test_within_the_takeoffs_window_heights_walk_no_further_than_allowed(
         walked_m = budget.height_common_m * window_s / 300.0
         assert walked_m == pytest.approx(budget.takeoffs_height_m)
     assert DEFAULT.takeoffs_window_s == pytest.approx(50.0)
+    assert ErrorBudget(height_common_m=0.0).takeoffs_window_s == math.inf
+
+
+def test_heights_that_err_count_where_robots_pass_each_other_and_where_they_fall() -> None:
+    # 2 m of two estimates, 0.5 m of the time between takeoffs, 0.5 m of pads, and a drone.
+    assert DEFAULT.passing_height_m == pytest.approx(3.5)
+    exact = dataclasses.replace(
+        DEFAULT, height_common_m=0.0, height_apart_m=0.0, height_control_m=0.0
+    )
+    around_m = exact.free_ground(LIMITS, 5.0, 25.0 + DEFAULT.height_m).least_m
+    assert DEFAULT.free_ground(LIMITS, 5.0, 25.0).least_m == around_m
+    assert places_apart(1.0, 1.0).or_at_least(3.0, "more").least_m == 3.0
 
 
 @pytest.mark.parametrize("share", [1.0, LESS])

@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from edge.core.frames import ModelScale
 from edge.core.schema import ConfigError
 from edge.core.wire import FLOAT_PAYLOADS
-from edge.robot.config import PolicyConfig, load_config
+from edge.robot.config import LinkConfig, PolicyConfig, load_config
+from edge.robot.pac import PacParameters
 from tests.conftest import ROOT
 
 EXAMPLE = ROOT / "docs" / "robot.toml"
@@ -83,6 +85,7 @@ def test_relative_paths_are_meant_from_the_files_folder(
         ("system_id = 1", "system_id = 0", ["autopilot: system_id = 0", "1 to 255"]),
         ("127.0.0.1:14551", "127.0.0.1", ["autopilot: url", "udpin://ADDRESS:PORT"]),
         ("127.0.0.1:14551", "127.0.0.1:99999", ["autopilot: url", "1 to 65535"]),
+        ("127.0.0.1:14551", "127.0.0.1:0", ["autopilot: url", "1 to 65535"]),
         ('"tls/0.0.0.0:7447"', '"0.0.0.0:7447"', ["link: listen", "tcp/ADDRESS:PORT"]),
         (
             '"tls/0.0.0.0:7447"',
@@ -90,6 +93,16 @@ def test_relative_paths_are_meant_from_the_files_folder(
             ["link: listen = '127.0.0.011': looks like an address", "leading zeros"],
         ),
         ("connect = []", 'connect = ["tls/10.1:7447"]', ["link: connect = '10.1': looks like"]),
+        (
+            "connect = []",
+            'connect = ["tcp/10.0.0.1:7447"]',
+            ["link: connect = 'tcp/10.0.0.1:7447': must be tls"],
+        ),
+        (
+            "connect = []",
+            'connect = []\ngroup = "239.1.2.3:0"\ninterface = "10.0.0.1"',
+            ["link: group = '239.1.2.3:0'", "1 to 65535"],
+        ),
         ("connect = []", 'connect = ["tls/10.0.0.1:\u0667"]', ["connect = ", "tls/ADDRESS:PORT"]),
         (
             "connect = []",
@@ -152,6 +165,38 @@ def test_a_mistake_is_one_line_that_names_it(
     message = refusal(tmp_path, with_line(old, new))
     for name in names:
         assert name in message
+
+
+def test_the_loop_takes_what_the_file_says() -> None:
+    config = load_config(EXAMPLE)
+    policy = replace(
+        config.policy, env_scale=8.0, velocity_scale=0.5, max_message_age_s=0.5, max_input_age_s=1.5
+    )
+    config = replace(config, policy=policy, limits=replace(config.limits, max_speed_m_s=1.0))
+    expected = PacParameters(ModelScale(8.0, 0.5), 1.0, 0.5, 1.5, "float16")
+    assert config.pac(FLOAT_PAYLOADS) == expected
+
+
+HERE, THERE = ("tcp/127.0.0.1:7447",), ("tcp/10.0.0.1:7447",)
+
+
+@pytest.mark.parametrize(
+    ("link", "leaves"),
+    [
+        (LinkConfig(listen=HERE, connect=HERE), False),
+        (LinkConfig(listen=THERE), True),
+        (LinkConfig(listen=HERE, connect=THERE), True),
+        (LinkConfig(listen=HERE, scouting=True), True),
+        # A peer that is not told where to listen does so everywhere.
+        (LinkConfig(connect=HERE), True),
+        (LinkConfig(mode="client", connect=HERE), False),
+        (LinkConfig(listen=HERE, group="239.1.2.3:7450", interface="10.0.0.1"), True),
+        (LinkConfig(listen=HERE, group="239.1.2.3:7450", interface="127.0.0.1"), False),
+        (LinkConfig(type="other", listen=HERE), True),
+    ],
+)
+def test_whether_somebody_on_another_computer_may_be_heard(link: LinkConfig, leaves: bool) -> None:
+    assert link.leaves_machine is leaves
 
 
 def test_messages_are_as_small_as_the_policy_was_judged_with() -> None:

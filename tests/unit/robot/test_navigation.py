@@ -73,6 +73,8 @@ def test_the_position_is_the_mission_frames_and_its_height_the_takeoff_points() 
     [
         {"position_local_m": None},
         {"velocity_local_m_s": None},
+        # It may be in the air, and its takeoff point is not known.
+        {"armed": True},
         {"origin": None},
         {"position_at_s": 100.1 - MAX_POSITION_AGE_S - 0.01},
     ],
@@ -137,11 +139,15 @@ def test_when_the_estimators_origin_moves_the_position_stays() -> None:
         origin=GlobalOrigin(*moved_deg, 18.0),
         position_local_m=(3.0 - north_m, 4.0 - east_m, 1.0),
     )
-    made = navigation(moved)
-    made.datum_m = 2.0
+    made._vehicle = Standing(moved)
     after = made.odometry()
     assert before is not None and after is not None
     np.testing.assert_allclose(after.position_m, before.position_m, atol=1e-4)
+    # From a mission a metre to the right it lies a metre to the left.
+    made.frame = MissionFrame(*FRAME.to_global_deg(1.0, 0.0), FRAME.heading_rad)
+    beside = made.odometry()
+    assert beside is not None
+    np.testing.assert_allclose(after.position_m, np.add(beside.position_m, (1, 0, 0)), atol=1e-4)
 
 
 def test_latitude_and_longitude_need_no_mission() -> None:

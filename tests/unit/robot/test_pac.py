@@ -539,6 +539,13 @@ def test_what_others_have_seen_is_heard_within_one_mission(sharing_bundle: Bundl
     assert explored(0.4) == pytest.approx(alone, rel=0.01)
     other.forget("second")
     assert explored(0.8) == pytest.approx(both, rel=0.01)
+    # What somebody out of range has seen is not taken, also where it comes near later.
+    there.position = (2.0, 2.0, 3.0)
+    assert explored(1.2) == pytest.approx(both, rel=0.01)
+    here.position = (6.0, 6.0, 3.0)
+    perceived = robot.perceive(9.0)
+    assert perceived is not None
+    assert float(perceived.inputs["images"][0, 3].mean()) * 256**2 == pytest.approx(alone, rel=0.01)
 
 
 def test_no_message_goes_without_a_map_while_a_new_mission_begins(sharing_bundle: Bundle) -> None:
@@ -565,3 +572,6 @@ def test_no_message_goes_without_a_map_while_a_new_mission_begins(sharing_bundle
     meanwhile.append(infer)
     robot.perceive(0.2)
     assert told == [None] and not meanwhile
+    # The map is still that of the mission before.
+    (neighbour,) = other.mailbox.neighbours(0.2)
+    assert neighbour.shared is not None and neighbour.trial == 0
